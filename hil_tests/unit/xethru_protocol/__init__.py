@@ -1,0 +1,1 @@
+"""xethru_protocol tests."""

@@ -1,0 +1,1 @@
+"""UWB-radar SLAM: one module per stage of the paper, pure cores, no I/O."""

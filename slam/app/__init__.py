@@ -1,0 +1,1 @@
+"""Composition root: sources, session runner, logs, viewer, reports, command line."""
