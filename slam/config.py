@@ -1,0 +1,298 @@
+"""What the pipeline may be told: small typed models with Table I of the paper as defaults.
+
+Wherever the paper's text leaves a choice, or prints something an expert would do otherwise, the
+choice is an option here. The default is what is printed; each option's docstring says what the
+other values correct. Lengths in metres, angles in radians unless the name says degrees.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping
+from enum import StrEnum
+from importlib import resources
+from typing import Annotated, Any, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from scipy.special import chdtri
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+# The top level of a preset file holds the values of this environment (paper, Table I).
+BASE_ENVIRONMENT = "lab"
+
+
+class ConfigError(ValueError):
+    """A preset file or an override that cannot be used; one line with file, key and remedy."""
+
+
+class BackgroundFilter(StrEnum):
+    """What happens to samples before smoothing."""
+
+    BELOW_MEAN_TO_ZERO = "below_mean_to_zero"  # as printed
+    NONE = "none"  # the mean depends on the scene, and zeroing saves no work in an FIR
+
+
+class PeakPosition(StrEnum):
+    """Where between the samples a peak lies."""
+
+    BIN = "bin"  # as printed: the sample of the local maximum
+    PARABOLA = "parabola"  # vertex through the maximum and its neighbours
+
+
+class Evidence(StrEnum):
+    """What a confirmed cluster sends to the filter."""
+
+    CENTROID = "centroid"  # as printed: mean of the whole window, so a fix counts up to 15 times
+    SINGLE_USE = "single_use"  # mean of the current pose's own fixes; the window only confirms
+
+
+class Emission(StrEnum):
+    """Which clusters of a window become observations of the current pose."""
+
+    HOLDING_CURRENT_POSE = "holding_current_pose"  # as drawn in the paper's DBSCAN figure
+    EVERY_CLUSTER = "every_cluster"  # for windows that do not overlap (stride = size)
+
+
+class ClusterCount(StrEnum):
+    """What min_observations counts."""
+
+    FIXES = "fixes"  # as printed: every observation, several of one pose too
+    DISTINCT_POSES = "distinct_poses"  # one look cannot confirm itself
+
+
+class EndOfRun(StrEnum):
+    """What happens to the poses still in the window when the run ends."""
+
+    DROP = "drop"  # as printed: Algorithm 1 stops with the teleoperation
+    FLUSH = "flush"  # they are estimated with what the window holds
+
+
+class MotionNoise(StrEnum):
+    """How the uncertainty of one motion is made up."""
+
+    PER_STEP_WORLD = "per_step_world"  # as printed: R per step, in world axes
+    PROPORTIONAL = "proportional"  # grows with distance and turn, in the robot's axes
+
+
+class GateRule(StrEnum):
+    """What the number ``gate`` means."""
+
+    MAHALANOBIS_SQ = "mahalanobis_sq"  # as printed: alpha bounds the squared distance
+    MAHALANOBIS = "mahalanobis"  # alpha read as a plain distance
+    CHI_SQUARE = "chi_square"  # probability that a true match passes
+
+
+class Assignment(StrEnum):
+    """How observations of one pose are matched to landmarks."""
+
+    NEAREST_NEIGHBOUR = "nearest_neighbour"  # as printed: one after the other, each its nearest
+    ONE_TO_ONE = "one_to_one"  # all together, no landmark twice, least total distance
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class DetectionConfig(_Model):
+    """Denoising and peak search in one frame (paper, section Signal Processing)."""
+
+    background: BackgroundFilter = BackgroundFilter.BELOW_MEAN_TO_ZERO
+    smoothing_length_bins: Annotated[int, Field(ge=3)] = 15
+    smoothing_order: Annotated[int, Field(ge=0)] = 5
+    min_peak_height: Positive = 5.5e-3
+    min_peak_prominence: Positive = 3e-3
+    min_peak_width_bins: NonNegative = 0.0
+    peak_position: PeakPosition = PeakPosition.BIN
+    min_range_m: NonNegative = 0.2
+    max_range_m: Positive = 1.5
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.smoothing_length_bins % 2 == 0:
+            raise ValueError("smoothing_length_bins must be odd")
+        if self.smoothing_order >= self.smoothing_length_bins:
+            raise ValueError("smoothing_order must be less than smoothing_length_bins")
+        if self.min_range_m >= self.max_range_m:
+            raise ValueError("min_range_m must be less than max_range_m")
+        return self
+
+
+class TrilaterationConfig(_Model):
+    """Which pairs of ranges become a fix (paper eq. 1 and 2)."""
+
+    field_of_view_deg: Annotated[float, Field(gt=0, lt=180)] = 65.0
+    # As printed the stamps of a pair are not compared; infinity keeps that.
+    max_stamp_difference_s: Annotated[float, Field(ge=0, allow_inf_nan=True)] = math.inf
+
+    @property
+    def field_of_view_rad(self) -> float:
+        """Return the opening angle of one radar, theta of the paper."""
+        return math.radians(self.field_of_view_deg)
+
+
+class WindowConfig(_Model):
+    """When a state is collected and how many make a window (Algorithm 1)."""
+
+    min_distance_m: NonNegative = 5e-3
+    min_turn_rad: NonNegative = 0.1
+    size: Annotated[int, Field(ge=1)] = 15
+    stride: Annotated[int, Field(ge=1)] = 1
+    end_of_run: EndOfRun = EndOfRun.DROP
+
+
+class ClusteringConfig(_Model):
+    """Outlier filtering by DBSCAN over the window."""
+
+    min_observations: Annotated[int, Field(ge=1)] = 9
+    search_radius_m: Positive = 0.2
+    count: ClusterCount = ClusterCount.FIXES
+    emission: Emission = Emission.HOLDING_CURRENT_POSE
+    evidence: Evidence = Evidence.CENTROID
+
+
+class MotionConfig(_Model):
+    """Motion uncertainty R of the paper, and the coefficients of its proportional alternative."""
+
+    noise: MotionNoise = MotionNoise.PER_STEP_WORLD
+    sigma_xy_m: NonNegative = 1e-4
+    sigma_heading_rad: NonNegative = 0.02
+    along_m_per_sqrt_m: NonNegative = 2e-3
+    across_m_per_sqrt_m: NonNegative = 6e-4
+    heading_rad_per_sqrt_m: NonNegative = 4.2e-3
+    heading_rad_per_rad: NonNegative = 0.01
+
+
+class ObservationConfig(_Model):
+    """Observation uncertainty Q of the paper."""
+
+    sigma_range_m: Positive = 0.15
+    sigma_bearing_rad: Positive = 1.0
+
+
+class AssociationConfig(_Model):
+    """When an observation belongs to a known landmark (alpha of the paper)."""
+
+    gate_rule: GateRule = GateRule.MAHALANOBIS_SQ
+    gate: Positive = 0.6
+    assignment: Assignment = Assignment.NEAREST_NEIGHBOUR
+
+    @model_validator(mode="after")
+    def _probability(self) -> Self:
+        if self.gate_rule is GateRule.CHI_SQUARE and self.gate >= 1:
+            raise ValueError("gate must be a probability below 1 under gate_rule chi_square")
+        return self
+
+    @property
+    def gate_threshold(self) -> float:
+        """Return the bound on the squared Mahalanobis distance of a match (2 dof).
+
+        >>> round(AssociationConfig(gate_rule=GateRule.CHI_SQUARE, gate=0.99).gate_threshold, 2)
+        9.21
+        """
+        if self.gate_rule is GateRule.MAHALANOBIS_SQ:
+            return self.gate
+        if self.gate_rule is GateRule.MAHALANOBIS:
+            return self.gate**2
+        return float(chdtri(2, 1.0 - self.gate))
+
+
+class SlamConfig(_Model):
+    """Everything one run of the pipeline is told."""
+
+    detection: DetectionConfig = DetectionConfig()
+    trilateration: TrilaterationConfig = TrilaterationConfig()
+    window: WindowConfig = WindowConfig()
+    clustering: ClusteringConfig = ClusteringConfig()
+    motion: MotionConfig = MotionConfig()
+    observation: ObservationConfig = ObservationConfig()
+    association: AssociationConfig = AssociationConfig()
+
+
+def load_preset(name: str, environment: str = BASE_ENVIRONMENT) -> SlamConfig:
+    """Return the preset ``fixtures/presets/<name>.toml`` for one environment.
+
+    Raises
+    ------
+    ConfigError
+        Unknown preset or environment, unreadable file, unknown key or value out of range.
+    """
+    folder = resources.files("fixtures") / "presets"
+    known = sorted(file.name.removesuffix(".toml") for file in folder.iterdir())
+    if name not in known:
+        raise ConfigError(f"unknown preset {name!r}; known: {', '.join(known)}")
+    file = folder / f"{name}.toml"
+    source = f"preset {name}.toml"
+    try:
+        tables = tomllib.loads(file.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{source}: not TOML: {error}") from error
+    return config_from_tables(tables, environment=environment, source=source)
+
+
+def config_from_tables(
+    tables: Mapping[str, Any], *, environment: str = BASE_ENVIRONMENT, source: str
+) -> SlamConfig:
+    """Return the configuration that the tables of a preset file describe.
+
+    Parameters
+    ----------
+    tables
+        The parsed file: one table per part of SlamConfig, and ``environment.<name>`` with the
+        values that differ there.
+    environment
+        "lab" is the top level itself; any other name must have its table.
+    source
+        What to call the tables in an error message.
+    """
+    base = {key: value for key, value in tables.items() if key != "environment"}
+    overrides = tables.get("environment", {})
+    if environment != BASE_ENVIRONMENT and environment not in overrides:
+        allowed = ", ".join([BASE_ENVIRONMENT, *sorted(overrides)])
+        raise ConfigError(f"{source}: no environment {environment!r}; known: {allowed}")
+    for part, values in overrides.get(environment, {}).items():
+        base[part] = {**base.get(part, {}), **values}
+    return _validated(base, source)
+
+
+def override(config: SlamConfig, settings: Mapping[str, object]) -> SlamConfig:
+    """Return the configuration with dotted keys replaced; text is read as the key's type.
+
+    >>> override(SlamConfig(), {"association.gate": "1.6"}).association.gate
+    1.6
+    """
+    tables = config.model_dump()
+    for key, value in settings.items():
+        part, _, field = key.partition(".")
+        tables.setdefault(part, {})
+        if not isinstance(tables[part], dict) or not field:
+            raise ConfigError(f"setting {key!r}: write it as part.key; parts: {_parts()}")
+        tables[part] = {**tables[part], field: value}
+    return _validated(tables, "setting")
+
+
+def _validated(tables: Mapping[str, Any], source: str) -> SlamConfig:
+    try:
+        return SlamConfig.model_validate(tables)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        key = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "extra_forbidden":
+            raise ConfigError(f"{source}: unknown key {key}; allowed: {_siblings(key)}") from error
+        message = first["msg"].removeprefix("Value error, ")
+        given = f" (given: {first['input']!r})" if not isinstance(first["input"], dict) else ""
+        raise ConfigError(f"{source}: {key}: {message}{given}") from error
+
+
+def _parts() -> str:
+    return ", ".join(SlamConfig.model_fields)
+
+
+def _siblings(key: str) -> str:
+    part, _, field = key.partition(".")
+    model = SlamConfig.model_fields[part].annotation if field else SlamConfig
+    assert isinstance(model, type)
+    assert issubclass(model, BaseModel)
+    return ", ".join(model.model_fields)

@@ -1,0 +1,182 @@
+"""Planar geometry: poses in SE(2), the mounts of the radars, and the pairs that can trilaterate.
+
+A pose is ``[x, y, heading]`` in [m, m, rad], heading counter-clockwise from x. The body frame has
+x forward, y left and its origin at the base footprint. Nothing here knows left from right: a pair
+is two mounts with one boresight, and the order of its members follows from the boresight alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+# Mounts closer in yaw than this look the same way; mounting tolerances are coarser by far.
+_SAME_BORESIGHT_RAD = 1e-6
+
+
+def wrap_angle(angle_rad: float) -> float:
+    """Return the angle modulo one turn, in [-pi, pi).
+
+    >>> wrap_angle(math.pi) == -math.pi
+    True
+    """
+    wrapped = math.remainder(angle_rad, math.tau)
+    return wrapped if wrapped < math.pi else -math.pi
+
+
+def wrap_angles(angles_rad: ArrayLike) -> Array:
+    """Return angles of any shape modulo one turn, in [-pi, pi)."""
+    angles = np.asarray(angles_rad, dtype=np.float64)
+    wrapped = angles - math.tau * np.round(angles / math.tau)
+    return np.where((wrapped >= math.pi) | (wrapped < -math.pi), -math.pi, wrapped)
+
+
+def compose(first: Array, second: Array) -> Array:
+    """Return the pose ``second``, given in the frame of ``first``, in the frame of the outer world.
+
+    Shapes (3,) and (3,), result (3,) with the heading wrapped.
+    """
+    cosine, sine = math.cos(first[2]), math.sin(first[2])
+    return np.array(
+        [
+            first[0] + cosine * second[0] - sine * second[1],
+            first[1] + sine * second[0] + cosine * second[1],
+            wrap_angle(first[2] + second[2]),
+        ]
+    )
+
+
+def between(origin: Array, pose: Array) -> Array:
+    """Return ``pose`` seen from ``origin``: the motion that leads from one to the other.
+
+    Shapes (3,) and (3,) in one frame, result (3,) in the frame of ``origin``, heading wrapped.
+    """
+    cosine, sine = math.cos(origin[2]), math.sin(origin[2])
+    dx, dy = pose[0] - origin[0], pose[1] - origin[1]
+    return np.array(
+        [cosine * dx + sine * dy, -sine * dx + cosine * dy, wrap_angle(pose[2] - origin[2])]
+    )
+
+
+def transform(pose: Array, points: Array) -> Array:
+    """Return points of the frame ``pose`` in the frame the pose is given in.
+
+    ``points`` has shape (2,) or (n, 2) [m]; the result has the same shape.
+    """
+    cosine, sine = math.cos(pose[2]), math.sin(pose[2])
+    rotation = np.array([[cosine, -sine], [sine, cosine]])
+    result: Array = points @ rotation.T + pose[:2]
+    return result
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mount:
+    """Where one radar sits on the robot and how its range zero is off.
+
+    Attributes
+    ----------
+    name
+        The radar's name in messages.
+    x_m, y_m
+        Antenna position in the body frame.
+    yaw_rad
+        Boresight in the body frame, counter-clockwise from forward.
+    range_offset_m
+        What this module measures too long; the front end subtracts it from every range.
+    """
+
+    name: str
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    range_offset_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RadarPair:
+    """Two radars that look the same way, and the triangle base between them.
+
+    ``first`` and ``second`` are mount indices, ordered so that the boresight lies to the left of
+    the base from first to second. On the paper's left side first is the rear radar, on its right
+    side the front one: a rotation by pi, not a mirror image.
+
+    Attributes
+    ----------
+    baseline_m
+        Distance of the two antennas, d of the paper.
+    midpoint
+        shape (2,) [m], body frame: middle of the base.
+    along, ahead
+        shape (2,) each, unit vectors, body frame: along the base from first to second, and
+        square to it on the side of the boresight.
+    boresight_rad
+        Angle of the boresight from ``along``, in (0, pi); pi/2 in the paper's rig.
+    """
+
+    first: int
+    second: int
+    baseline_m: float
+    midpoint: Array
+    along: Array
+    ahead: Array
+    boresight_rad: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rig:
+    """The mounts of all radars of one robot, index by index as frames name them."""
+
+    mounts: tuple[Mount, ...]
+
+    def pairs(self) -> tuple[RadarPair, ...]:
+        """Return every pair of mounts that look the same way, side by side."""
+        pairs = []
+        for first, second in combinations(range(len(self.mounts)), 2):
+            pair = _pair(self.mounts, first, second)
+            if pair is not None:
+                pairs.append(pair)
+        return tuple(pairs)
+
+
+def paper_rig() -> Rig:
+    """Return the paper's rig: two radars 20 cm apart on each side, 20 cm off the base footprint."""
+    return Rig(
+        mounts=(
+            Mount(name="left_rear", x_m=-0.1, y_m=0.2, yaw_rad=math.pi / 2),
+            Mount(name="left_front", x_m=0.1, y_m=0.2, yaw_rad=math.pi / 2),
+            Mount(name="right_rear", x_m=-0.1, y_m=-0.2, yaw_rad=-math.pi / 2),
+            Mount(name="right_front", x_m=0.1, y_m=-0.2, yaw_rad=-math.pi / 2),
+        )
+    )
+
+
+def _pair(mounts: Sequence[Mount], first: int, second: int) -> RadarPair | None:
+    """Return the ordered pair, or None where the two cannot form a triangle base."""
+    a, b = mounts[first], mounts[second]
+    if abs(wrap_angle(a.yaw_rad - b.yaw_rad)) > _SAME_BORESIGHT_RAD:
+        return None
+    baseline_m = math.hypot(b.x_m - a.x_m, b.y_m - a.y_m)
+    if baseline_m == 0.0:
+        return None
+    boresight_rad = wrap_angle(a.yaw_rad - math.atan2(b.y_m - a.y_m, b.x_m - a.x_m))
+    if abs(math.sin(boresight_rad)) < _SAME_BORESIGHT_RAD:
+        return None  # one looks at the other's back: no base across the view
+    if boresight_rad < 0.0:
+        return _pair(mounts, second, first)
+    along = np.array([b.x_m - a.x_m, b.y_m - a.y_m]) / baseline_m
+    return RadarPair(
+        first=first,
+        second=second,
+        baseline_m=baseline_m,
+        midpoint=np.array([a.x_m + b.x_m, a.y_m + b.y_m]) / 2,
+        along=along,
+        ahead=np.array([-along[1], along[0]]),
+        boresight_rad=boresight_rad,
+    )
