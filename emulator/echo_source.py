@@ -19,18 +19,28 @@ __all__ = ["CaptureSettings", "EchoSource"]
 class CaptureSettings:
     """What the chip samples: the part of its settings that changes the echo.
 
-    Attributes:
-        first_sample_m: Range label of sample 0 in module metres (c = 3.0e8 m/s) as it would read
-            if FRAMEAREAOFFSET were the hardware's own 0.18 m, so that a changed offset moves
-            labels and not echoes.
-        n_samples: RF samples per frame at 23.328 GHz.
-        iterations: Sweeps summed per frame.
-        pulses_per_step: Pulses per DAC step.
-        dac_min: Lowest DAC level of the sweep, 0...2047.
-        dac_max: Highest DAC level of the sweep, 0...2047.
-        dac_step: Exponent of the DAC step size, 2**dac_step.
-        tx_power: Transmitter power setting, 0 (off)...3.
-        tx_center_frequency: 3 (7.290 GHz) or 4 (8.748 GHz).
+    Attributes
+    ----------
+    first_sample_m
+        Range label of sample 0 in module metres (c = 3.0e8 m/s) as it would read
+        if FRAMEAREAOFFSET were the hardware's own 0.18 m, so that a changed offset moves
+        labels and not echoes.
+    n_samples
+        RF samples per frame at 23.328 GHz.
+    iterations
+        Sweeps summed per frame.
+    pulses_per_step
+        Pulses per DAC step.
+    dac_min
+        Lowest DAC level of the sweep, 0...2047.
+    dac_max
+        Highest DAC level of the sweep, 0...2047.
+    dac_step
+        Exponent of the DAC step size, 2**dac_step.
+    tx_power
+        Transmitter power setting, 0 (off)...3.
+    tx_center_frequency
+        3 (7.290 GHz) or 4 (8.748 GHz).
 
     Source: protocol reference 9.3, 9.4 and 9.7.
     """
@@ -60,13 +70,18 @@ class EchoSource(Protocol):
         The result depends on the arguments and the source's own scene and seed alone: never on
         the block size, the order of calls or the wall clock.
 
-        Args:
-            capture: Settings the frames are sampled with.
-            frame_counters: Shape (n_frames,), the frames' counters; they select the noise.
-            scene_times_ns: Shape (n_frames,), scene time of each counter in ns, without the
-                radar's start skew (which the source adds itself).
+        Parameters
+        ----------
+        capture
+            Settings the frames are sampled with.
+        frame_counters
+            Shape (n_frames,), the frames' counters; they select the noise.
+        scene_times_ns
+            Shape (n_frames,), scene time of each counter in ns, without the
+            radar's start skew (which the source adds itself).
 
-        Returns:
-            Shape (n_frames, n_samples), int64, clipped to [0, largest counter].
+        Returns
+        -------
+        Shape (n_frames, n_samples), int64, clipped to [0, largest counter].
         """
         ...

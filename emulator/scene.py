@@ -1,0 +1,302 @@
+"""Scene files: who stands where, how the robot drives, what its radars and wheels are like.
+
+A scene is TOML that a person reads and writes; ``load_scene`` turns it into frozen, validated
+models or one :class:`SceneError` line naming file, key and what is allowed. Lengths are true
+metres, angles in the file degrees, amplitudes normalised X4 units (full scale of the 11 bit DAC
+is +-1). Nothing here computes echoes or odometry.
+"""
+
+from __future__ import annotations
+
+import importlib.resources
+import math
+import tomllib
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StrictFloat,
+    StrictInt,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+
+from emulator.trajectory import Trajectory, drive
+
+__all__ = [
+    "LeakageSpec",
+    "NoiseSpec",
+    "OdometrySpec",
+    "PathSpec",
+    "RadarSpec",
+    "Scene",
+    "SceneError",
+    "TargetSpec",
+    "empty_room",
+    "load_scene",
+    "scene_names",
+]
+
+
+class SceneError(ValueError):
+    """A scene that cannot be used; the message is one line naming file, key and the remedy."""
+
+
+def _finite(value: object) -> object:
+    """Refuse TOML's inf and nan with words a person can act on."""
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError("must be a finite number")
+    return value
+
+
+Metres = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-1000, le=1000)]
+NotNegative = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0)]
+Positive = Annotated[StrictFloat, BeforeValidator(_finite), Field(gt=0)]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
+
+
+class _Table(BaseModel):
+    """One TOML table: frozen, and an unknown key is an error."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class RadarSpec(_Table):
+    """One X4M300 on the robot.
+
+    ``x_m``, ``y_m`` and ``yaw_deg`` place the antennas' phase centre and boresight in the body
+    frame (x forward, y left, yaw counter-clockwise). ``range_offset_m`` is added to every true
+    range (the module's own delay error; positive reads too far). ``start_skew_ms`` is how much
+    later than the nominal scene time of a counter this radar samples.
+    """
+
+    name: Name
+    serial: Annotated[str, Field(pattern=r"^[0-9]{12}$")]
+    x_m: Metres
+    y_m: Metres
+    yaw_deg: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-360, le=360)]
+    range_offset_m: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-1, le=1)] = 0.0
+    start_skew_ms: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=10_000)] = 0.0
+
+
+class TargetSpec(_Table):
+    """One reflector, in the world frame.
+
+    ``kind`` selects the amplitude law: a ``rod`` falls with R**-1.5, a ``point`` with R**-2;
+    ``amplitude_1m`` is the echo's amplitude on boresight at 1 m. The reflection phase is fixed
+    by the name (``emulator.echo``).
+    """
+
+    name: Name
+    kind: Literal["rod", "point"]
+    x_m: Metres
+    y_m: Metres
+    amplitude_1m: Annotated[StrictFloat, BeforeValidator(_finite), Field(gt=0, le=10)] = 0.015
+
+
+class PathSpec(_Table):
+    """A closed course of waypoints driven in laps, turning on the spot.
+
+    ``laps`` lists the direction of every lap: ``forward`` visits the waypoints as written and
+    returns to the first, ``backward`` the other way round. No laps: the robot stands.
+    """
+
+    waypoints_m: tuple[tuple[Metres, Metres], ...] = ((0.0, 0.0),)
+    laps: tuple[Literal["forward", "backward"], ...] = ()
+    speed_mps: Positive = 0.05
+    turn_rate_deg_per_s: Positive = 28.125
+
+    @field_validator("waypoints_m")
+    @classmethod
+    def _starts_at_origin(
+        cls, value: tuple[tuple[float, float], ...]
+    ) -> tuple[tuple[float, float], ...]:
+        along_x = len(value) < 2 or (value[1][0] > 0 and value[1][1] == 0)
+        if not value or value[0] != (0.0, 0.0) or not along_x:
+            raise ValueError(
+                "the world frame is the robot's start pose: "
+                "begin with [0.0, 0.0] and go on to a point on the positive x axis"
+            )
+        return value
+
+    def stops_m(self) -> tuple[tuple[float, float], ...]:
+        """Return every stop of the whole drive in order, (x, y) [m], world frame."""
+        first, *others = self.waypoints_m
+        stops = [first]
+        for lap in self.laps:
+            stops.extend(others if lap == "forward" else reversed(others))
+            stops.append(first)
+        return tuple(stops)
+
+
+class OdometrySpec(_Table):
+    """How the wheels drift: standard deviations of the model in ``emulator.odometry``."""
+
+    rate_hz: Annotated[StrictFloat, BeforeValidator(_finite), Field(gt=0, le=1000)] = 5.0
+    scale_sigma: NotNegative = 0.0
+    turn_scale_sigma: NotNegative = 0.0
+    curvature_sigma_rad_per_m: NotNegative = 0.0
+    along_sigma_m_per_sqrt_m: NotNegative = 0.0
+    across_sigma_m_per_sqrt_m: NotNegative = 0.0
+    heading_sigma_rad_per_sqrt_m: NotNegative = 0.0
+    heading_sigma_rad_per_rad: NotNegative = 0.0
+
+
+class NoiseSpec(_Table):
+    """White receiver noise: ``rf_sigma`` per RF sample at the named working point."""
+
+    rf_sigma: NotNegative = 5e-4
+    iterations: Annotated[StrictInt, Field(ge=1, le=255)] = 16
+    pulses_per_step: Annotated[StrictInt, Field(ge=1, le=65535)] = 300
+
+
+class LeakageSpec(_Table):
+    """The direct pulse from transmitter to receiver, at TX power 2."""
+
+    amplitude: NotNegative = 0.06
+    range_m: Metres = 0.05
+
+
+class Scene(_Table):
+    """A whole scene. ``environment`` names the preset values a SLAM run should use for it."""
+
+    name: Name
+    environment: Literal["lab", "classroom"]
+    description: str
+    radars: Annotated[tuple[RadarSpec, ...], Field(min_length=1, max_length=32)]
+    targets: tuple[TargetSpec, ...] = ()
+    path: PathSpec = PathSpec()
+    odometry: OdometrySpec = OdometrySpec()
+    noise: NoiseSpec = NoiseSpec()
+    leakage: LeakageSpec = LeakageSpec()
+
+    @model_validator(mode="after")
+    def _names_are_unique(self) -> Scene:
+        for key, values in (
+            ("radars.name", [radar.name for radar in self.radars]),
+            ("radars.serial", [radar.serial for radar in self.radars]),
+            ("targets.name", [target.name for target in self.targets]),
+        ):
+            twice = sorted({value for value in values if values.count(value) > 1})
+            if twice:
+                raise ValueError(f"{key}: each must be unique, {twice[0]!r} is used twice")
+        return self
+
+    def trajectory(self) -> Trajectory:
+        """Return the robot's true path, world frame (the start pose is the origin)."""
+        return drive(
+            self.path.stops_m(),
+            speed_mps=self.path.speed_mps,
+            turn_rate_rad_per_s=math.radians(self.path.turn_rate_deg_per_s),
+        )
+
+
+def empty_room(count: int = 1) -> Scene:
+    """Return a scene of ``count`` stock modules in a room without any reflector.
+
+    The robot stands at the origin; leakage and receiver noise are the defaults.
+    """
+    return Scene(
+        name="empty_room",
+        environment="lab",
+        description="Stock modules in an empty room.",
+        radars=tuple(
+            RadarSpec(
+                name=f"radar_{index + 1}",
+                serial=f"{100_000_000_000 + index:012d}",
+                x_m=0.0,
+                y_m=0.0,
+                yaw_deg=0.0,
+            )
+            for index in range(count)
+        ),
+    )
+
+
+def _scene_folder() -> Traversable:
+    return importlib.resources.files("fixtures") / "scenes"
+
+
+def scene_names() -> tuple[str, ...]:
+    """Return the names of the scenes that ship with the package, sorted."""
+    names = (entry.name for entry in _scene_folder().iterdir())
+    return tuple(sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml")))
+
+
+def load_scene(path_or_name: str | Path) -> Scene:
+    """Return the scene in a TOML file, or a shipped one by its name ("lab").
+
+    A string without a path separator and without ``.toml`` is a name.
+
+    Raises
+    ------
+    SceneError
+        File missing or unreadable, TOML broken, key unknown, or value refused.
+    """
+    text = str(path_or_name)
+    is_name = isinstance(path_or_name, str) and not text.endswith(".toml") and "/" not in text
+    if is_name and text not in scene_names():
+        raise SceneError(
+            f"{text}: no such scene; known are {', '.join(scene_names())}, "
+            "or give the path of a .toml file"
+        )
+    source: Traversable = _scene_folder() / f"{text}.toml" if is_name else Path(path_or_name)
+    try:
+        table = tomllib.loads(source.read_bytes().decode())
+    except OSError as error:
+        raise SceneError(f"{text}: cannot read the scene file: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise SceneError(f"{text}: not UTF-8 text at byte {error.start}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise SceneError(f"{text}: not valid TOML: {error}") from error
+    try:
+        return Scene.model_validate(table)
+    except ValidationError as error:
+        raise SceneError(f"{text}: {_one_line(error)}") from error
+
+
+def _one_line(error: ValidationError) -> str:
+    """Say the first problem in one line, and how many more there are."""
+    problems = error.errors(include_url=False)
+    first = problems[0]
+    location = first["loc"]
+    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
+    match first["type"]:
+        case "extra_forbidden":
+            allowed = ", ".join(_allowed_keys(location[:-1]))
+            said = f"unknown key; allowed are {allowed}"
+        case "missing":
+            said = "missing; this key is required"
+        case "value_error":
+            said = str(first["ctx"]["error"])
+        case _:
+            said = f"{first['msg']}, got {_short(first['input'])}"
+    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    return f"{key.removeprefix('.')}: {said}{more}" if key else f"{said}{more}"
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _allowed_keys(location: tuple[int | str, ...]) -> list[str]:
+    """Return the keys of the table at a location, by walking the models' fields."""
+    model: type[BaseModel] = Scene
+    for part in location:
+        if isinstance(part, str):
+            model = _table_type(model.model_fields[part].annotation)
+    return list(model.model_fields)
+
+
+def _table_type(annotation: Any) -> type[BaseModel]:  # noqa: ANN401 - any type expression
+    """Return the table model inside ``Table`` or ``tuple[Table, ...]``."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return _table_type(annotation.__args__[0])
