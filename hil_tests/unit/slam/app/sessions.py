@@ -1,0 +1,81 @@
+"""A made-up session for the tests of logs and viewers: known frames, poses and landmarks."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam.app.session import LogLine, RadarInfo, Scan, SessionInfo, SessionObserver, Snapshot
+from slam.frames import RadarFrame
+
+FRAME_NS = 199_261_498
+N_BINS = 1431
+
+
+def session_info(n_radars: int = 2) -> SessionInfo:
+    radars = tuple(
+        RadarInfo(
+            name=f"radar{index}",
+            serial=f"00000000000{index}",
+            port=f"port{index}",
+            x_m=0.1,
+            y_m=0.2 * index,
+            yaw_rad=1.57,
+            range_offset_m=0.0,
+            range_start_m=0.2,
+            bin_length_m=0.0064,
+            n_bins=N_BINS,
+            rate_hz=5.018533,
+            settings={"iterations": 16},
+        )
+        for index in range(n_radars)
+    )
+    return SessionInfo(
+        scene="made_up",
+        preset="paper",
+        seed=7,
+        radars=radars,
+        true_landmarks_m=np.array([[1.0, 0.5], [-0.5, 2.0]]),
+        versions={"numpy": "2"},
+    )
+
+
+def scan(counter: int, n_radars: int = 2) -> Scan:
+    t_ns = counter * FRAME_NS
+    frames = tuple(
+        RadarFrame(
+            radar=radar,
+            t_ns=t_ns,
+            counter=counter,
+            samples=np.random.default_rng((counter, radar)).normal(0, 1e-3, N_BINS).astype("f4"),
+            range_start_m=0.2,
+            bin_length_m=0.0064,
+        )
+        for radar in range(n_radars)
+    )
+    return Scan(counter=counter, t_ns=t_ns, frames=frames)
+
+
+def snapshot(counter: int) -> Snapshot:
+    pose = np.array([0.01 * counter, 0.002 * counter, 0.1])
+    return Snapshot(
+        counter=counter,
+        t_ns=counter * FRAME_NS,
+        truth=pose,
+        odometry=pose + [0.02, 0.0, 0.0],
+        estimate=pose + [0.0, 0.01, 0.0],
+        world_from_map=np.zeros(3),
+        pose_covariance=np.diag([1e-4, 1e-4, 1e-5]),
+        landmark_ids=np.array([3, 8]),
+        landmarks_m=np.array([[1.01, 0.5], [-0.5, 2.02]]),
+        landmark_covariances_m2=np.array([np.diag([4e-4, 1e-4]), [[2e-4, 1e-4], [1e-4, 2e-4]]]),
+        nis_per_dof=(0.5, 1.5) if counter % 2 else (),
+    )
+
+
+def feed(observer: SessionObserver, n_scans: int) -> None:
+    """Give an observer a whole session of two radars, without closing it."""
+    observer.on_log(LogLine(t_ns=0, radar="radar0", warning=False, text="Ping -> Pong"))
+    for counter in range(n_scans):
+        observer.on_scan(scan(counter))
+        observer.on_snapshot(snapshot(counter))
+    observer.on_log(LogLine(t_ns=5, radar="radar1", warning=True, text="CRC fault"))

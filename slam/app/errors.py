@@ -1,0 +1,30 @@
+"""What a command of `uwb-slam` may end with: one clear line and an exit code, never a traceback."""
+
+from __future__ import annotations
+
+EXIT_FAILED = 1
+EXIT_USAGE = 2
+
+
+class AppError(Exception):
+    """The thing asked for failed; the message is one line that names the thing and the remedy."""
+
+    exit_code = EXIT_FAILED
+
+
+class UsageError(AppError):
+    """The command was called wrongly, for example with a scene that does not exist."""
+
+    exit_code = EXIT_USAGE
+
+
+class RadarSilentError(AppError):
+    """A radar that was streaming sends no more frames."""
+
+
+class EmulatorError(AppError):
+    """The emulator process did not start, or ended while it was needed."""
+
+
+class OdometryError(AppError):
+    """Odometry is malformed, or does not cover a time that was asked for."""

@@ -1,0 +1,127 @@
+"""The map of a run as a picture: truth, odometry, estimate, landmarks with their uncertainty."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from slam.app.ellipse import ellipse_95, rotate_covariances
+from slam.app.session import SessionInfo, Snapshot
+from slam.app.summary import Summary
+from slam.geometry import transform
+
+_TRUTH, _ODOMETRY, _ESTIMATE, _LANDMARK = "#8a8f98", "#e08a2c", "#1f6fd0", "#c2255c"
+_MARGIN_M = 0.25
+
+# The same picture on every machine: no user style, no font that may be missing.
+_STYLE = {
+    "font.family": "DejaVu Sans",
+    "font.size": 10.0,
+    "axes.edgecolor": "#c8ccd2",
+    "axes.labelcolor": "#40444c",
+    "xtick.color": "#40444c",
+    "ytick.color": "#40444c",
+}
+
+
+def draw_map(
+    path: Path, info: SessionInfo, snapshots: tuple[Snapshot, ...], summary: Summary
+) -> None:
+    """Draw the map of a simulated run into a PNG file.
+
+    Estimate and odometry are drawn where they began, at the robot's first pose, without the
+    alignment that the ATE uses: drift is seen as it is.
+    """
+    truth = np.array([row.truth for row in snapshots])
+    place = snapshots[-1].world_from_map
+    estimate = transform(place, np.array([row.estimate[:2] for row in snapshots]))
+    odometry = transform(place, np.array([row.odometry[:2] for row in snapshots]))
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(9.0, 6.6), dpi=150, layout="constrained", facecolor="white")
+        FigureCanvasAgg(figure)
+        axes = figure.add_subplot()
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.grid(color="#eceef1", linewidth=0.8)
+        axes.set_axisbelow(True)
+        axes.plot(*odometry.T, color=_ODOMETRY, linewidth=0.9, alpha=0.9, label="wheel odometry")
+        axes.plot(*truth[:, :2].T, color=_TRUTH, linewidth=3.2, alpha=0.55, label="true path")
+        axes.plot(*estimate.T, color=_ESTIMATE, linewidth=1.0, label="radar SLAM")
+        _draw_start(axes, truth[0])
+        if len(info.true_landmarks_m):
+            axes.plot(
+                *info.true_landmarks_m.T,
+                linestyle="none",
+                marker="+",
+                markersize=11,
+                markeredgewidth=1.4,
+                color="#30343b",
+                label="true landmark",
+                zorder=4,
+            )
+        _draw_landmarks(axes, snapshots[-1])
+        axes.set_xlabel("x [m]")
+        axes.set_ylabel("y [m]")
+        axes.margins(0.06)
+        axes.tick_params(length=0)
+        _write_title(axes, summary)
+        figure.legend(loc="outside right upper", frameon=False, handlelength=1.6)
+        # No software version or date in the file: the same run gives the same bytes.
+        figure.savefig(path, metadata={"Software": None})
+
+
+def _draw_start(axes: Axes, pose: NDArray[np.float64]) -> None:
+    axes.plot(
+        *pose[:2],
+        linestyle="none",
+        marker=(3, 0, np.degrees(pose[2]) - 90.0),
+        markersize=11,
+        color="#30343b",
+        label="start",
+        zorder=5,
+    )
+
+
+def _draw_landmarks(axes: Axes, last: Snapshot) -> None:
+    if not len(last.landmark_ids):
+        return
+    points = transform(last.world_from_map, last.landmarks_m)
+    covariances = rotate_covariances(last.world_from_map[2], last.landmark_covariances_m2)
+    outlines = [ellipse_95(*pair) for pair in zip(points, covariances, strict=True)]
+    axes.add_collection(
+        PolyCollection(
+            outlines,
+            facecolors=(*mpl.colors.to_rgb(_LANDMARK), 0.14),
+            edgecolors=_LANDMARK,
+            linewidths=1.0,
+            label="95 % ellipse",
+            zorder=3,
+        )
+    )
+    axes.plot(
+        *points.T,
+        linestyle="none",
+        marker="o",
+        markersize=3.6,
+        color=_LANDMARK,
+        label="estimated landmark",
+        zorder=6,
+    )
+
+
+def _write_title(axes: Axes, summary: Summary) -> None:
+    axes.set_title(
+        f"{summary.scene}, preset {summary.preset}, seed {summary.seed}: "
+        f"ATE {1e3 * summary.ate_rmse_m:.1f} mm, "
+        f"odometry {1e3 * summary.odometry_ate_rmse_m:.1f} mm (simulated)",
+        loc="left",
+        fontsize=11,
+        color="#20242a",
+        pad=10,
+    )

@@ -1,0 +1,121 @@
+"""What a run of SLAM hands to its logs, viewer and reports: one small frozen type each.
+
+Frames of reference: `world` is the scene's; `map` is the frame SLAM works in, which begins at the
+robot's first pose; `odom` is the wheel odometry's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.frames import RadarFrame
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RadarInfo:
+    """One radar of a run: who it is, where it is mounted, how its samples lie in range.
+
+    `range_start_m` and `bin_length_m` are module metres, as FRAMEAREA was read back; the same in
+    true metres are in every RadarFrame.
+    """
+
+    name: str
+    serial: str
+    port: str
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    range_offset_m: float
+    range_start_m: float
+    bin_length_m: float
+    n_bins: int
+    rate_hz: float
+    settings: Mapping[str, object]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SessionInfo:
+    """What a run is: enough to name it, to repeat it and to read its frames."""
+
+    scene: str
+    preset: str
+    seed: int
+    radars: tuple[RadarInfo, ...]
+    true_landmarks_m: NDArray[np.float64]
+    """Shape (n, 2), world frame; (0, 2) where nobody knows."""
+    versions: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scan:
+    """The frames that share one counter, at most one per radar; a missing radar lost its frame."""
+
+    counter: int
+    t_ns: int
+    frames: tuple[RadarFrame, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Snapshot:
+    """The state of SLAM at one frame time.
+
+    Attributes
+    ----------
+    counter, t_ns
+        Frame counter and time of the state, which lags the newest frame by the paper's window.
+    truth, odometry, estimate
+        Shape (3,), [x m, y m, heading rad]; world, odom and map frame.
+    world_from_map
+        Shape (3,), the pose of the map frame in the world.
+    pose_covariance
+        Shape (3, 3), of `estimate`, map frame.
+    landmark_ids
+        Shape (m,), int64.
+    landmarks_m, landmark_covariances_m2
+        Shape (m, 2) and (m, 2, 2), map frame.
+    nis_per_dof
+        One value per observation that was associated with a landmark at this state.
+    """
+
+    counter: int
+    t_ns: int
+    truth: NDArray[np.float64]
+    odometry: NDArray[np.float64]
+    estimate: NDArray[np.float64]
+    world_from_map: NDArray[np.float64]
+    pose_covariance: NDArray[np.float64]
+    landmark_ids: NDArray[np.int64]
+    landmarks_m: NDArray[np.float64]
+    landmark_covariances_m2: NDArray[np.float64]
+    nis_per_dof: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogLine:
+    """One line about the link: a command, its answer, a fault. `t_ns` is session time."""
+
+    t_ns: int
+    radar: str
+    warning: bool
+    text: str
+
+
+class SessionObserver(Protocol):
+    """Gets everything a run produces, in order: a log, a viewer, a progress line."""
+
+    def on_scan(self, scan: Scan) -> None:
+        """Take the frames of one counter."""
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        """Take a state of SLAM."""
+
+    def on_log(self, line: LogLine) -> None:
+        """Take a line about the link."""
+
+    def close(self) -> None:
+        """Finish; called once, also after a failure."""

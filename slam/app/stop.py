@@ -1,0 +1,65 @@
+"""Stopping cleanly on SIGINT and SIGTERM.
+
+A signal only raises a flag; the program asks for it between two steps, so no file is left in the
+middle of a record. A second signal of the same kind gets Python's own handling, for a user who
+does not want to wait.
+"""
+
+from __future__ import annotations
+
+import signal
+from types import FrameType, TracebackType
+from typing import Any, Self
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class StopRequestedError(Exception):
+    """SIGINT or SIGTERM arrived; carries the signal."""
+
+    def __init__(self, received: signal.Signals) -> None:
+        super().__init__(f"stopped by {received.name}")
+        self.received = received
+
+    @property
+    def exit_code(self) -> int:
+        """What a shell expects of a program ended by this signal: 130 or 143."""
+        return 128 + int(self.received)
+
+
+class StopFlag:
+    """Catches SIGINT and SIGTERM while it is entered; `check` raises once one arrived.
+
+    Examples
+    --------
+    >>> with StopFlag() as stop:
+    ...     stop.check()  # nothing arrived: returns
+    """
+
+    def __init__(self) -> None:
+        self._received: signal.Signals | None = None
+        self._previous: dict[signal.Signals, Any] = {}
+
+    def __enter__(self) -> Self:
+        """Install the handlers. Main thread only, as Python demands."""
+        self._previous = {which: signal.signal(which, self._on_signal) for which in _SIGNALS}
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Put the previous handlers back."""
+        for which, handler in self._previous.items():
+            signal.signal(which, handler)
+
+    def check(self) -> None:
+        """Raise StopRequestedError if a signal arrived since this flag was entered."""
+        if self._received is not None:
+            raise StopRequestedError(self._received)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self._received = signal.Signals(number)
+        signal.signal(number, signal.SIG_DFL)

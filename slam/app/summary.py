@@ -1,0 +1,53 @@
+"""What a run amounts to: the numbers of summary.json and the one table a person reads."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LandmarkSummary:
+    """Landmarks against the truth, matched within 0.15 m after the trajectory's alignment."""
+
+    true: int
+    estimated: int
+    precision: float
+    recall: float
+    duplicates: int
+    rmse_m: float | None
+    """None where no landmark matched."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Summary:
+    """The numbers of one run; field names are those of summary.json and a stable contract.
+
+    `ate_rmse_m` is time-associated and SE(2)-aligned, of the causal path; `ate_icp_rmse_m` is the
+    paper's number, without time, and flatters; `nees_pose` holds (time [s], NEES) pairs of the
+    unaligned pose in the start frame; `nis_mean` is divided by its degrees of freedom.
+    """
+
+    scene: str
+    preset: str
+    seed: int
+    frames: int
+    duration_s: float
+    realtime_factor: float
+    ate_rmse_m: float
+    ate_icp_rmse_m: float
+    odometry_ate_rmse_m: float
+    final_error_m: float
+    landmarks: LandmarkSummary
+    nees_pose: tuple[tuple[float, float], ...]
+    nis_mean: float | None
+    """None where nothing was associated."""
+
+    @property
+    def ate_ratio(self) -> float:
+        """SLAM's ATE in units of odometry's; below 1 is better than driving blind."""
+        return self.ate_rmse_m / self.odometry_ate_rmse_m
+
+    def to_json(self) -> str:
+        """Return the text of summary.json: exactly these fields, no NaN."""
+        return json.dumps(asdict(self), indent=2, allow_nan=False)
