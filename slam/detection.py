@@ -1,0 +1,145 @@
+"""Front end of the paper: one raw frame in, the ranges of its echoes out.
+
+Magnitude, background to zero, Savitzky-Golay, local maxima with a least height and prominence
+(paper, section Signal Processing). Source of the order: the paper's caption of the raw
+observations, where the magnitude comes first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import correlate1d
+from scipy.signal import find_peaks, savgol_filter
+
+from slam.config import BackgroundFilter, DetectionConfig, PeakPosition
+from slam.frames import RadarFrame
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Detection:
+    """One echo seen by one radar: a range without a direction.
+
+    Attributes
+    ----------
+    radar
+        Index of the mount.
+    t_ns
+        Session time of the frame.
+    range_m
+        True metres from the antenna, the mount's range offset removed.
+    amplitude
+        Height of the smoothed peak, normalised RF units.
+    """
+
+    radar: int
+    t_ns: int
+    range_m: float
+    amplitude: float
+
+
+class PaperDetector:
+    """The paper's front end with its filters worked out once.
+
+    Parameters
+    ----------
+    config
+        Filter lengths, peak thresholds, range limits.
+    """
+
+    def __init__(self, config: DetectionConfig) -> None:
+        self.config = config
+        self._smoother = SavitzkyGolay(config.smoothing_length_bins, config.smoothing_order)
+
+    def detect(self, frame: RadarFrame, range_offset_m: float = 0.0) -> tuple[Detection, ...]:
+        """Return the echoes of one frame inside the range limits, nearest first.
+
+        Peaks are searched in the whole frame, so an echo's prominence never depends on the limits.
+
+        Parameters
+        ----------
+        frame
+            The raw frame, longer than the smoothing filter.
+        range_offset_m
+            What this module measures too long (``Mount.range_offset_m``).
+        """
+        config = self.config
+        smoothed = self.smooth(frame.samples)
+        peaks, properties = find_peaks(
+            smoothed,
+            height=config.min_peak_height,
+            prominence=config.min_peak_prominence,
+            width=config.min_peak_width_bins or None,
+        )
+        positions = peaks.astype(np.float64)
+        if config.peak_position is PeakPosition.PARABOLA:
+            positions += _vertex_offsets(smoothed, peaks)
+        ranges_m = frame.range_start_m + positions * frame.bin_length_m - range_offset_m
+        inside = (ranges_m >= config.min_range_m) & (ranges_m <= config.max_range_m)
+        return tuple(
+            Detection(radar=frame.radar, t_ns=frame.t_ns, range_m=range_m, amplitude=amplitude)
+            for range_m, amplitude in zip(
+                ranges_m[inside].tolist(),
+                properties["peak_heights"][inside].tolist(),
+                strict=True,
+            )
+        )
+
+    def smooth(self, samples: NDArray[np.float32]) -> Array:
+        """Return the magnitude, background set to zero, smoothed; shape (n_bins,), float64."""
+        magnitude = np.abs(samples, dtype=np.float64)
+        if self.config.background is BackgroundFilter.BELOW_MEAN_TO_ZERO:
+            magnitude *= magnitude >= magnitude.mean()
+        return self._smoother.smooth(magnitude)
+
+
+class SavitzkyGolay:
+    """Least-squares polynomial smoothing of equally spaced samples, as one FIR filter.
+
+    Equal to ``scipy.signal.savgol_filter`` with ``mode="interp"``: in the middle a fixed kernel,
+    at each end the polynomial fitted to the last ``length`` samples. Both are worked out once,
+    which is what makes it twenty times faster.
+
+    Parameters
+    ----------
+    length
+        Number of samples fitted, odd.
+    order
+        Order of the polynomial, less than ``length``.
+    """
+
+    def __init__(self, length: int, order: int) -> None:
+        # The filter is linear: its answers to unit impulses are its matrix.
+        response: Array = np.asarray(savgol_filter(np.eye(2 * length), length, order, axis=0))
+        half = length // 2
+        self.length = length
+        self._head = response[:half, :length].copy()
+        self._tail = response[-half:, -length:].copy()
+        # Row `length` of the matrix is an inner one: the kernel, centred on column `length`.
+        self._kernel = response[length, length - half : length + half + 1].copy()
+
+    def smooth(self, samples: Array) -> Array:
+        """Return the smoothed samples, shape (n,), n at least the filter's length."""
+        if samples.size < self.length:
+            raise ValueError(
+                f"a frame of {samples.size} bins is shorter than the smoothing filter "
+                f"({self.length}); ask the module for a longer frame area"
+            )
+        smoothed: Array = correlate1d(samples, self._kernel, mode="constant")
+        half = self.length // 2
+        smoothed[:half] = self._head @ samples[: self.length]
+        smoothed[-half:] = self._tail @ samples[-self.length :]
+        return smoothed
+
+
+def _vertex_offsets(smoothed: Array, peaks: NDArray[np.intp]) -> Array:
+    """Return how far, in bins, the parabola through each peak and its neighbours peaks off it."""
+    before, at, after = smoothed[peaks - 1], smoothed[peaks], smoothed[peaks + 1]
+    curvature = before - 2 * at + after
+    # A plateau has no curvature and its middle bin is the answer already.
+    flat = curvature >= 0
+    return np.where(flat, 0.0, 0.5 * (before - after) / np.where(flat, 1.0, curvature))

@@ -1,0 +1,293 @@
+"""Extended Kalman filter over one pose and the landmarks: pure functions from belief to belief.
+
+Words and letters: mean x, covariance P, motion Jacobian G, motion noise R, observation Jacobian H,
+observation noise Q, innovation covariance S. (R is motion and Q observation noise, as in the
+paper.) The state is ``[x, y, heading, l0x, l0y, l1x, l1y, ...]`` in the map frame, which is the
+body frame at the start of the run. A landmark's *row* is its place in that order; its *id* stays
+with it for good.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from slam.config import MotionConfig, MotionNoise
+from slam.geometry import compose, wrap_angle, wrap_angles
+
+Array = NDArray[np.float64]
+
+POSE_SIZE = 3
+LANDMARK_SIZE = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Belief:
+    """What the filter knows: a Gaussian over pose and landmarks.
+
+    Attributes
+    ----------
+    mean
+        shape (3 + 2 n,), [m, m, rad, m, m, ...], map frame; the heading lies in [-pi, pi).
+    covariance
+        shape (3 + 2 n, 3 + 2 n), symmetric.
+    landmark_ids
+        n ids in the order of the rows.
+    next_id
+        The id the next new landmark gets; ids are never used twice.
+    """
+
+    mean: Array
+    covariance: Array
+    landmark_ids: tuple[int, ...] = ()
+    next_id: int = 0
+
+    def __post_init__(self) -> None:
+        """Check that the shapes belong together and freeze the arrays."""
+        size = POSE_SIZE + LANDMARK_SIZE * len(self.landmark_ids)
+        if self.mean.shape != (size,) or self.covariance.shape != (size, size):
+            raise ValueError(
+                f"{len(self.landmark_ids)} landmarks need mean ({size},) and covariance "
+                f"({size}, {size}), got {self.mean.shape} and {self.covariance.shape}"
+            )
+        self.mean.setflags(write=False)
+        self.covariance.setflags(write=False)
+
+    @property
+    def pose(self) -> Array:
+        """Return the pose, shape (3,), [x m, y m, heading rad], map frame."""
+        return self.mean[:POSE_SIZE]
+
+    @property
+    def pose_covariance(self) -> Array:
+        """Return the covariance of the pose, shape (3, 3)."""
+        return self.covariance[:POSE_SIZE, :POSE_SIZE]
+
+    @property
+    def landmarks(self) -> Array:
+        """Return the landmarks' positions, shape (n, 2) [m], map frame, in row order."""
+        return self.mean[POSE_SIZE:].reshape(-1, LANDMARK_SIZE)
+
+    def landmark_covariance(self, row: int) -> Array:
+        """Return the covariance of one landmark's position, shape (2, 2) [m^2]."""
+        block = landmark_slice(row)
+        return self.covariance[block, block]
+
+
+def start() -> Belief:
+    """Return the belief before any motion: at the origin of the map, certain, no landmarks."""
+    return Belief(mean=np.zeros(POSE_SIZE), covariance=np.zeros((POSE_SIZE, POSE_SIZE)))
+
+
+def landmark_slice(row: int) -> slice:
+    """Return where one landmark lies in the state."""
+    begin = POSE_SIZE + LANDMARK_SIZE * row
+    return slice(begin, begin + LANDMARK_SIZE)
+
+
+def motion_noise(increment: Array, heading_rad: float, config: MotionConfig) -> Array:
+    """Return the covariance R that one motion adds to the pose, shape (3, 3), map axes.
+
+    ``per_step_world`` is the paper's diagonal, the same for every step. ``proportional`` grows
+    with the distance D and the turn a of the step, along and across the robot's axis::
+
+        diag(along^2 D, across^2 D), turned into the map;  (h sqrt(D) + h_turn |a|)^2
+
+    Parameters
+    ----------
+    increment
+        shape (3,), the motion in the body frame before it.
+    heading_rad
+        Heading before the motion, map frame.
+    config
+        Which rule, and its numbers.
+    """
+    if config.noise is MotionNoise.PER_STEP_WORLD:
+        return np.diag([config.sigma_xy_m**2, config.sigma_xy_m**2, config.sigma_heading_rad**2])
+    distance_m = math.hypot(increment[0], increment[1])
+    along = config.along_m_per_sqrt_m**2 * distance_m
+    across = config.across_m_per_sqrt_m**2 * distance_m
+    sigma_heading = config.heading_rad_per_sqrt_m * math.sqrt(
+        distance_m
+    ) + config.heading_rad_per_rad * abs(increment[2])
+    cosine, sine = math.cos(heading_rad), math.sin(heading_rad)
+    R = np.zeros((POSE_SIZE, POSE_SIZE))
+    R[0, 0] = cosine**2 * along + sine**2 * across
+    R[1, 1] = sine**2 * along + cosine**2 * across
+    R[0, 1] = R[1, 0] = cosine * sine * (along - across)
+    R[2, 2] = sigma_heading**2
+    return R
+
+
+def motion_jacobian(heading_rad: float, increment: Array) -> Array:
+    """Return G = d(pose after) / d(pose before), shape (3, 3), of moving by a body increment."""
+    cosine, sine = math.cos(heading_rad), math.sin(heading_rad)
+    G = np.eye(POSE_SIZE)
+    G[0, 2] = -sine * increment[0] - cosine * increment[1]
+    G[1, 2] = cosine * increment[0] - sine * increment[1]
+    return G
+
+
+def predict(belief: Belief, increment: Array, R: Array) -> Belief:
+    """Move the pose by an odometry increment.
+
+    ``x_r' = x_r (+) u``, ``P_rr' = G P_rr G^T + R``, ``P_rl' = G P_rl``; landmarks stay.
+
+    Parameters
+    ----------
+    belief
+        Belief before the motion.
+    increment
+        shape (3,), u: the motion in the body frame before it, [m, m, rad].
+    R
+        shape (3, 3), motion noise in map axes.
+    """
+    pose = slice(0, POSE_SIZE)
+    G = motion_jacobian(float(belief.mean[2]), increment)
+    mean, P = belief.mean.copy(), belief.covariance.copy()
+    mean[pose] = compose(belief.pose, increment)
+    moved = G @ P[pose, :]
+    P[pose, :] = moved
+    P[:, pose] = moved.T
+    corner = moved[:, pose] @ G.T
+    P[pose, pose] = (corner + corner.T) / 2 + R
+    return Belief(mean=mean, covariance=P, landmark_ids=belief.landmark_ids, next_id=belief.next_id)
+
+
+def expected_observations(pose: Array, landmarks: Array) -> Array:
+    """Return range [m] and bearing [rad] of landmarks from a pose.
+
+    ``landmarks`` has shape (n, 2), the result too; bearings in [-pi, pi).
+    """
+    dx, dy = landmarks[:, 0] - pose[0], landmarks[:, 1] - pose[1]
+    return np.column_stack([np.hypot(dx, dy), wrap_angles(np.arctan2(dy, dx) - pose[2])])
+
+
+def observation_jacobians(pose: Array, landmarks: Array) -> tuple[Array, Array]:
+    """Return d(range, bearing) / d(pose) and / d(landmark) for landmarks off the pose.
+
+    With (dx, dy) from pose to landmark and q = dx^2 + dy^2::
+
+        H_pose     = [[-dx/sqrt(q), -dy/sqrt(q),  0], [ dy/q, -dx/q, -1]]
+        H_landmark = [[ dx/sqrt(q),  dy/sqrt(q)   ], [-dy/q,  dx/q    ]]
+
+    The bearing falls by exactly as much as the heading rises: the last entry is -1, not -1/q.
+
+    Parameters
+    ----------
+    pose
+        shape (3,).
+    landmarks
+        shape (n, 2) [m].
+
+    Returns
+    -------
+    H_pose, H_landmark
+        shapes (n, 2, 3) and (n, 2, 2).
+    """
+    dx, dy = landmarks[:, 0] - pose[0], landmarks[:, 1] - pose[1]
+    q = dx**2 + dy**2
+    root = np.sqrt(q)
+    H_landmark = np.empty((len(landmarks), 2, 2))
+    H_landmark[:, 0, 0] = dx / root
+    H_landmark[:, 0, 1] = dy / root
+    H_landmark[:, 1, 0] = -dy / q
+    H_landmark[:, 1, 1] = dx / q
+    H_pose = np.zeros((len(landmarks), 2, 3))
+    H_pose[:, :, :2] = -H_landmark
+    H_pose[:, 1, 2] = -1.0
+    return H_pose, H_landmark
+
+
+def innovation(observed: Array, expected: Array) -> Array:
+    """Return observed minus expected (range, bearing), shape (..., 2), the angle in [-pi, pi)."""
+    difference: Array = observed - expected
+    difference[..., 1] = wrap_angles(difference[..., 1])
+    return difference
+
+
+def update(belief: Belief, row: int, observed: Array, Q: Array) -> Belief:
+    """Correct the belief with one range and bearing of a known landmark.
+
+    With the innovation nu, S = H P H^T + Q = L L^T and W = L^-1 H P::
+
+        x' = x + W^T L^-1 nu          P' = P - W^T W
+
+    Equal to the Joseph form ``(I - K H) P (I - K H)^T + K Q K^T`` with K = P H^T S^-1, at the cost
+    of one symmetric rank-2 downdate; W^T W is computed symmetric, so P stays so.
+
+    Parameters
+    ----------
+    belief
+        Belief before the observation.
+    row
+        Row of the landmark.
+    observed
+        shape (2,), range [m] and bearing [rad] from the base footprint.
+    Q
+        shape (2, 2), observation noise.
+    """
+    landmark = belief.landmarks[row : row + 1]
+    expected = expected_observations(belief.pose, landmark)[0]
+    H_pose, H_landmark = observation_jacobians(belief.pose, landmark)
+    H = np.hstack([H_pose[0], H_landmark[0]])
+    block = landmark_slice(row)
+    P = belief.covariance
+    # H is zero elsewhere: only five rows of P take part.
+    HP = H @ np.concatenate([P[:POSE_SIZE], P[block]])
+    S = HP[:, :POSE_SIZE] @ H_pose[0].T + HP[:, block] @ H_landmark[0].T + Q
+    L = np.linalg.cholesky((S + S.T) / 2)
+    W = solve_triangular(L, HP, lower=True)
+    whitened = solve_triangular(L, innovation(observed, expected), lower=True)
+    mean = belief.mean + W.T @ whitened
+    mean[2] = wrap_angle(mean[2])
+    return Belief(
+        mean=mean,
+        covariance=P - W.T @ W,
+        landmark_ids=belief.landmark_ids,
+        next_id=belief.next_id,
+    )
+
+
+def augment(belief: Belief, observed: Array, Q: Array) -> Belief:
+    """Add a landmark where one range and bearing put it, correlated with everything else.
+
+    ``l = p + r [cos(heading + phi), sin(heading + phi)]`` with Jacobians G_pose (2, 3) and G_obs
+    (2, 2)::
+
+        P_ll = G_pose P_rr G_pose^T + G_obs Q G_obs^T          P_lx = G_pose P_rx
+
+    It is what an update of a landmark with boundless prior covariance tends to.
+
+    Parameters
+    ----------
+    belief
+        Belief before.
+    observed
+        shape (2,), range [m] and bearing [rad] from the base footprint.
+    Q
+        shape (2, 2), observation noise.
+    """
+    r, direction = float(observed[0]), float(observed[1] + belief.mean[2])
+    cosine, sine = math.cos(direction), math.sin(direction)
+    G_pose = np.array([[1.0, 0.0, -r * sine], [0.0, 1.0, r * cosine]])
+    G_obs = np.array([[cosine, -r * sine], [sine, r * cosine]])
+    size = len(belief.mean)
+    mean = np.append(belief.mean, [belief.mean[0] + r * cosine, belief.mean[1] + r * sine])
+    P = np.empty((size + LANDMARK_SIZE, size + LANDMARK_SIZE))
+    P[:size, :size] = belief.covariance
+    cross = G_pose @ belief.covariance[:POSE_SIZE]
+    P[size:, :size] = cross
+    P[:size, size:] = cross.T
+    corner = cross[:, :POSE_SIZE] @ G_pose.T + G_obs @ Q @ G_obs.T
+    P[size:, size:] = (corner + corner.T) / 2
+    return Belief(
+        mean=mean,
+        covariance=P,
+        landmark_ids=(*belief.landmark_ids, belief.next_id),
+        next_id=belief.next_id + 1,
+    )

@@ -1,0 +1,274 @@
+"""What the numbers mean: trajectory, landmark and consistency metrics.
+
+Every trajectory error states its alignment. ``ate_rmse_m`` is the one to quote; the ICP numbers
+of the paper are computed beside it because they answer a different, kinder question.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import KDTree
+
+from slam.geometry import between, compose, transform, wrap_angle
+
+Array = NDArray[np.float64]
+
+LANDMARK_MATCH_M = 0.15
+_ICP_GATE_M = 0.5
+_ICP_ITERATIONS = 100
+
+
+def in_start_frame(poses: Array) -> Array:
+    """Return poses, shape (n, 3), seen from the first of them."""
+    return np.array([between(poses[0], pose) for pose in poses])
+
+
+def associate_times(
+    estimate_ns: NDArray[np.int64], reference_ns: NDArray[np.int64], tolerance_ns: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return index pairs of stamps that belong together, each stamp used at most once.
+
+    Parameters
+    ----------
+    estimate_ns, reference_ns
+        shapes (n,) and (m,), strictly increasing [ns].
+    tolerance_ns
+        Largest difference of a pair.
+
+    Returns
+    -------
+    estimate_rows, reference_rows
+        Equal lengths, increasing. Empty where nothing is close enough.
+    """
+    if len(estimate_ns) == 0 or len(reference_ns) == 0:
+        return np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp)
+    after = np.searchsorted(reference_ns, estimate_ns)
+    left, right = np.maximum(after - 1, 0), np.minimum(after, len(reference_ns) - 1)
+    to_left = np.abs(estimate_ns - reference_ns[left])
+    to_right = np.abs(estimate_ns - reference_ns[right])
+    nearest = np.where(to_left <= to_right, left, right)
+    difference = np.minimum(to_left, to_right)
+    # The closest estimate keeps a reference that two of them claim.
+    order = np.lexsort((difference, nearest))
+    rows = order[difference[order] <= tolerance_ns]
+    _, firsts = np.unique(nearest[rows], return_index=True)
+    estimate_rows = np.sort(rows[firsts])
+    return estimate_rows, nearest[estimate_rows]
+
+
+def align_se2(estimate_xy: Array, reference_xy: Array) -> Array:
+    """Return the rigid motion that brings an estimate closest to a reference, point by point.
+
+    Least squares over rotation and translation, no scale (Umeyama 1991 in the plane).
+
+    Parameters
+    ----------
+    estimate_xy, reference_xy
+        shape (n, 2) each [m], n >= 1; row i of one belongs to row i of the other.
+
+    Returns
+    -------
+    pose
+        shape (3,): ``transform(pose, estimate_xy)`` is the aligned estimate.
+    """
+    _check_rows(estimate_xy, reference_xy)
+    centre_e, centre_r = estimate_xy.mean(axis=0), reference_xy.mean(axis=0)
+    e, r = estimate_xy - centre_e, reference_xy - centre_r
+    cross = float(np.sum(e[:, 0] * r[:, 1] - e[:, 1] * r[:, 0]))
+    heading = math.atan2(cross, float(np.sum(e * r)))
+    rotation_only = np.array([0.0, 0.0, heading])
+    return np.append(centre_r - transform(rotation_only, centre_e), heading)
+
+
+def rmse_m(estimate_xy: Array, reference_xy: Array) -> float:
+    """Return the root mean square distance of rows that belong together, not aligned."""
+    _check_rows(estimate_xy, reference_xy)
+    return math.sqrt(float(np.mean(np.sum((estimate_xy - reference_xy) ** 2, axis=1))))
+
+
+def ate_rmse_m(estimate_xy: Array, reference_xy: Array) -> float:
+    """Return the absolute trajectory error: RMS distance after SE(2) alignment without scale.
+
+    Both have shape (n, 2) [m]; rows belong together by time.
+    """
+    return rmse_m(transform(align_se2(estimate_xy, reference_xy), estimate_xy), reference_xy)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IcpAte:
+    """Three readings of "RMS ATE after ICP"; the paper does not say which it means.
+
+    Attributes
+    ----------
+    nearest_rmse_m
+        RMS distance of the ICP-aligned points to the nearest reference point: what ICP itself
+        minimises. Time plays no part, so drift along the path costs nothing.
+    per_axis_rmse_m
+        The authors' later evaluation script: nearest neighbours looked up *before* the alignment,
+        mean over both axes together, so 1 / sqrt(2) of a distance.
+    time_rmse_m
+        RMS distance by time under the same alignment.
+    """
+
+    nearest_rmse_m: float
+    per_axis_rmse_m: float
+    time_rmse_m: float
+
+
+def icp_ate(estimate_xy: Array, reference_xy: Array) -> IcpAte:
+    """Return the paper's trajectory error in its three readings.
+
+    Both have shape (n, 2) [m], rows together by time, *both in their start frames*: ICP begins
+    with the two start poses on each other, as two SLAM systems started together are.
+    """
+    _check_rows(estimate_xy, reference_xy)
+    tree = KDTree(reference_xy)
+    _, before = tree.query(estimate_xy)
+    aligned = transform(icp_align_se2(estimate_xy, reference_xy), estimate_xy)
+    distances, _ = tree.query(aligned)
+    return IcpAte(
+        nearest_rmse_m=math.sqrt(float(np.mean(distances**2))),
+        per_axis_rmse_m=math.sqrt(float(np.mean((aligned - reference_xy[before]) ** 2))),
+        time_rmse_m=rmse_m(aligned, reference_xy),
+    )
+
+
+def icp_align_se2(estimate_xy: Array, reference_xy: Array) -> Array:
+    """Return the rigid motion, shape (3,), found by point-to-point ICP from the identity.
+
+    Points farther than 0.5 m from any reference point do not pull. Shapes (n, 2) and (m, 2) [m].
+    """
+    tree = KDTree(reference_xy)
+    pose, previous = np.zeros(3), math.inf
+    for _ in range(_ICP_ITERATIONS):
+        moved = transform(pose, estimate_xy)
+        distances, neighbours = tree.query(moved)
+        close = distances <= _ICP_GATE_M
+        if not close.any():
+            break
+        residual = float(np.mean(distances[close] ** 2))
+        if previous - residual <= 1e-9 * residual:
+            break
+        previous = residual
+        pose = compose(align_se2(moved[close], reference_xy[neighbours[close]]), pose)
+    return pose
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LandmarkScore:
+    """How a map compares with the landmarks that were there to be found.
+
+    Attributes
+    ----------
+    true, estimated, matched
+        Numbers of true landmarks, of estimates, and of one-to-one matches within 0.15 m.
+    precision, recall
+        matched / estimated and matched / true; None where the denominator is 0.
+    duplicates
+        Further estimates within 0.15 m of a matched true landmark.
+    rmse_m
+        RMS distance of the matches; None without any.
+    """
+
+    true: int
+    estimated: int
+    matched: int
+    precision: float | None
+    recall: float | None
+    duplicates: int
+    rmse_m: float | None
+
+
+def landmark_metrics(estimated_xy: Array, true_xy: Array, alignment: Array) -> LandmarkScore:
+    """Return how well estimated landmarks match the true ones.
+
+    Parameters
+    ----------
+    estimated_xy
+        shape (n, 2) [m], map frame.
+    true_xy
+        shape (m, 2) [m], world frame: the landmarks that count (``observable_landmarks``).
+    alignment
+        shape (3,), the *trajectory's* alignment (``align_se2`` of its positions). The map is not
+        fitted to the landmarks it is judged by.
+    """
+    n, m = len(estimated_xy), len(true_xy)
+    if n and m:
+        placed = transform(alignment, estimated_xy)
+        distances = np.linalg.norm(placed[:, None, :] - true_xy[None, :, :], axis=2)
+    else:
+        distances = np.empty((n, m))
+    close = distances <= LANDMARK_MATCH_M
+    # First as many matches as possible, then the least total distance.
+    rows, columns = linear_sum_assignment(np.where(close, distances, 1e6))
+    kept = close[rows, columns]
+    rows, columns = rows[kept], columns[kept]
+    others = np.setdiff1d(np.arange(n), rows)
+    matched = len(rows)
+    squared = distances[rows, columns] ** 2
+    return LandmarkScore(
+        true=m,
+        estimated=n,
+        matched=matched,
+        precision=matched / n if n else None,
+        recall=matched / m if m else None,
+        duplicates=int(close[np.ix_(others, columns)].any(axis=1).sum()),
+        rmse_m=math.sqrt(float(np.mean(squared))) if matched else None,
+    )
+
+
+def nees_pose(estimate: Array, covariance: Array, truth: Array) -> float:
+    """Return the normalised estimation error squared of a pose (3 dof), not aligned.
+
+    Parameters
+    ----------
+    estimate, truth
+        shape (3,) each, both in the start frame; the heading difference is wrapped.
+    covariance
+        shape (3, 3), positive definite.
+    """
+    error = np.array(
+        [estimate[0] - truth[0], estimate[1] - truth[1], wrap_angle(estimate[2] - truth[2])]
+    )
+    return float(error @ np.linalg.solve(covariance, error))
+
+
+def true_landmark_nis(
+    candidates: Sequence[tuple[Sequence[int], Array]],
+    origins: Sequence[int | None],
+    birthplaces: dict[int, int],
+) -> tuple[float, ...]:
+    """Return the NIS (2 dof) of observations against the landmark they are truly of, ungated.
+
+    Parameters
+    ----------
+    candidates
+        Per observation: the map's landmark ids before it and their squared Mahalanobis distances
+        (``Association.candidate_ids`` and ``mahalanobis_sq``).
+    origins
+        Per observation: index of the true landmark it came from, None for clutter.
+    birthplaces
+        True landmark index -> id of the map landmark first born from it.
+    """
+    values = []
+    for (ids, distances), origin in zip(candidates, origins, strict=True):
+        landmark_id = None if origin is None else birthplaces.get(origin)
+        if landmark_id is not None and landmark_id in ids:
+            values.append(float(distances[list(ids).index(landmark_id)]))
+    return tuple(values)
+
+
+def _check_rows(estimate_xy: Array, reference_xy: Array) -> None:
+    if estimate_xy.shape != reference_xy.shape or estimate_xy.shape[1:] != (2,):
+        raise ValueError(
+            f"trajectories must both have shape (n, 2), got {estimate_xy.shape} and "
+            f"{reference_xy.shape}; associate them by time first"
+        )
+    if len(estimate_xy) == 0:
+        raise ValueError("trajectories have no common stamps")

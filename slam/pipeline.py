@@ -1,0 +1,173 @@
+"""Algorithm 1 of the paper: radar frames and odometry in, pose and map out."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.association import Association, update_map
+from slam.clustering import Observation, filter_window
+from slam.config import EndOfRun, SlamConfig
+from slam.detection import Detection, PaperDetector
+from slam.ekf_slam import Belief, motion_noise, predict, start
+from slam.frames import RadarFrame
+from slam.geometry import Rig, between
+from slam.trilateration import Fix, Trilaterator
+from slam.window import CollectedState, has_moved
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StepResult:
+    """One estimated state, everything that led to it included.
+
+    Attributes
+    ----------
+    t_ns
+        Session time of the state, window - 1 states before the newest one.
+    odometry_pose
+        shape (3,), what odometry said there, odometry frame.
+    belief
+        Pose and landmarks after this state's observations, map frame.
+    detections, fixes
+        Ranges and trilaterated points of this state.
+    observations, associations
+        What the outlier filter let through, and what became of each.
+    rejected
+        Fixes of this state that no cluster confirmed.
+    """
+
+    t_ns: int
+    odometry_pose: Array
+    belief: Belief
+    detections: tuple[Detection, ...]
+    fixes: tuple[Fix, ...]
+    observations: tuple[Observation, ...]
+    associations: tuple[Association, ...]
+    rejected: tuple[Fix, ...]
+
+    @property
+    def nis(self) -> tuple[float, ...]:
+        """Return the normalised innovation squared (2 dof) of each landmark seen again."""
+        return tuple(a.nis for a in self.associations if a.nis is not None)
+
+
+class UwbRadarSlam:
+    """UWB radar SLAM as in the paper: fixes of two radars, DBSCAN over a window, EKF SLAM.
+
+    The map frame is the body frame at the first odometry pose.
+
+    Parameters
+    ----------
+    config
+        Table I and the options around it.
+    rig
+        Where the radars sit.
+    """
+
+    def __init__(self, config: SlamConfig, rig: Rig) -> None:
+        self.config = config
+        self.rig = rig
+        self.belief: Belief = start()
+        sensor = config.observation
+        self._Q = np.diag([sensor.sigma_range_m**2, sensor.sigma_bearing_rad**2])
+        self._detector = PaperDetector(config.detection)
+        self._trilaterator = Trilaterator(config.trilateration, rig)
+        self._window: deque[CollectedState] = deque()
+        self._collected_pose: Array | None = None  # odometry where the last state was collected
+        self._estimated_pose: Array = np.zeros(3)  # Odom[s - 1]
+        self._n_estimated = 0
+
+    def step(
+        self, frames: Sequence[RadarFrame], odometry_pose: Array, t_ns: int
+    ) -> tuple[StepResult, ...]:
+        """Take in what sensors say at one time; return the state that became ready, if any.
+
+        Parameters
+        ----------
+        frames
+            At most one frame per radar; a radar whose frame was lost is simply absent.
+        odometry_pose
+            shape (3,), [x m, y m, heading rad], odometry frame.
+        t_ns
+            Session time.
+        """
+        if not self._is_new_state(odometry_pose):
+            return ()
+        detections = self._detect(frames)
+        return self._collect(detections, odometry_pose, t_ns)
+
+    def step_detections(
+        self, detections: Sequence[Detection], odometry_pose: Array, t_ns: int
+    ) -> tuple[StepResult, ...]:
+        """Do what ``step`` does, from ranges that some other front end found."""
+        if not self._is_new_state(odometry_pose):
+            return ()
+        return self._collect(tuple(detections), odometry_pose, t_ns)
+
+    def flush(self) -> tuple[StepResult, ...]:
+        """Return the states still in the window at the end of a run, if the preset wants them."""
+        if self.config.window.end_of_run is EndOfRun.DROP:
+            self._window.clear()
+        return tuple(self._estimate() for _ in range(len(self._window)))
+
+    def _is_new_state(self, odometry_pose: Array) -> bool:
+        if self._collected_pose is None:  # Odom[0] <- origin
+            self._collected_pose = self._estimated_pose = odometry_pose
+            return False
+        return has_moved(self._collected_pose, odometry_pose, self.config.window)
+
+    def _detect(self, frames: Sequence[RadarFrame]) -> tuple[Detection, ...]:
+        return tuple(
+            detection
+            for frame in frames
+            for detection in self._detector.detect(
+                frame, self.rig.mounts[frame.radar].range_offset_m
+            )
+        )
+
+    def _collect(
+        self, detections: tuple[Detection, ...], odometry_pose: Array, t_ns: int
+    ) -> tuple[StepResult, ...]:
+        self._collected_pose = odometry_pose
+        fixes = self._trilaterator.locate(detections)
+        self._window.append(
+            CollectedState(
+                t_ns=t_ns, odometry_pose=odometry_pose, detections=detections, fixes=fixes
+            )
+        )
+        return (self._estimate(),) if len(self._window) == self.config.window.size else ()
+
+    def _estimate(self) -> StepResult:
+        """Estimate state s from the window s .. s + w - 1 (the inner part of Algorithm 1)."""
+        config, state = self.config, self._window[0]
+        filtered = filter_window(tuple(self._window), config.clustering)
+        observations = filtered.observations if self._is_update_due() else ()
+
+        u = between(self._estimated_pose, state.odometry_pose)
+        R = motion_noise(u, float(self.belief.pose[2]), config.motion)
+        predicted = predict(self.belief, u, R)
+        seen = [np.array([o.range_m, o.bearing_rad]) for o in observations]
+        self.belief, associations = update_map(predicted, seen, self._Q, config.association)
+
+        self._window.popleft()
+        self._estimated_pose = state.odometry_pose
+        self._n_estimated += 1
+        return StepResult(
+            t_ns=state.t_ns,
+            odometry_pose=state.odometry_pose,
+            belief=self.belief,
+            detections=state.detections,
+            fixes=state.fixes,
+            observations=observations,
+            associations=associations,
+            rejected=filtered.rejected,
+        )
+
+    def _is_update_due(self) -> bool:
+        return self._n_estimated % self.config.window.stride == 0

@@ -1,0 +1,175 @@
+"""Two ranges from two radars of one side become a point in the body frame (paper eq. 1 to 4).
+
+The paper calls it trilateration; it is the intersection of two circles, of which the one in front
+of the radars is kept. Everything follows from the mounts: the same formula serves both sides.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.config import TrilaterationConfig
+from slam.detection import Detection
+from slam.geometry import RadarPair, Rig
+
+Array = NDArray[np.float64]
+
+_NS_PER_S = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fix:
+    """One trilaterated point, seen once.
+
+    Attributes
+    ----------
+    pair
+        Index into ``Rig.pairs()``.
+    t_ns
+        The later of the two stamps.
+    x_m, y_m
+        Position in the body frame of the pose it was seen from.
+    detections
+        The two ranges it was made of, first and second radar of the pair.
+    """
+
+    pair: int
+    t_ns: int
+    x_m: float
+    y_m: float
+    detections: tuple[Detection, Detection]
+
+    @property
+    def range_m(self) -> float:
+        """Return the distance from the base footprint, r of the paper."""
+        return math.hypot(self.x_m, self.y_m)
+
+    @property
+    def bearing_rad(self) -> float:
+        """Return the direction from the base footprint, phi of the paper, in [-pi, pi]."""
+        return math.atan2(self.y_m, self.x_m)
+
+
+def bilaterate(
+    first_m: Array, second_m: Array, pair: RadarPair, field_of_view_rad: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Intersect range circles around two antennas and tell which intersections both radars see.
+
+    With l1, l2 the ranges (``first_m``, ``second_m``), d the baseline and u, v the coordinates
+    along the base from its middle and square to it towards the boresight::
+
+        u = (l1 - l2) (l1 + l2) / (2 d)          v = sqrt((l1^2 + l2^2) / 2 - d^2 / 4 - u^2)
+        alpha = atan2(v, u + d/2)                beta = atan2(v, d/2 - u)
+
+    alpha and beta are the paper's inner angles. Its eq. 2 gives their cosines; the angles
+    themselves, arccos of those, are compared with gamma = (pi - theta) / 2 of eq. 1. atan2 gives
+    the same angles without losing digits near 0. Seen by both means that each antenna's direction
+    to the point is less than theta / 2 off its boresight; for a boresight square to the base that
+    is exactly alpha > gamma and beta > gamma.
+
+    Parameters
+    ----------
+    first_m, second_m
+        shape (n,) each, ranges from the first and the second antenna of the pair [m].
+    pair
+        The two mounts.
+    field_of_view_rad
+        Opening angle theta of one radar.
+
+    Returns
+    -------
+    xy
+        shape (n, 2) [m], body frame; NaN where the circles do not meet.
+    accepted
+        shape (n,), True where the circles meet inside both fields of view. Ranges that are
+        negative, zero or not finite are never accepted.
+    """
+    l1, l2 = np.asarray(first_m, dtype=np.float64), np.asarray(second_m, dtype=np.float64)
+    d = pair.baseline_m
+    valid = np.isfinite(l1) & np.isfinite(l2) & (l1 > 0) & (l2 > 0)
+    l1, l2 = np.where(valid, l1, np.nan), np.where(valid, l2, np.nan)
+    # Triangle inequality, written so that NaN fails it.
+    meets = (np.abs(l1 - l2) <= d) & (l1 + l2 >= d)
+    u = np.where(meets, (l1 - l2) * (l1 + l2) / (2 * d), np.nan)
+    v = np.sqrt(np.maximum((l1**2 + l2**2) / 2 - d**2 / 4 - u**2, 0.0))
+    alpha = np.arctan2(v, u + d / 2)
+    beta = np.arctan2(v, d / 2 - u)
+    half_view = field_of_view_rad / 2
+    accepted = (
+        meets
+        & (np.abs(alpha - pair.boresight_rad) < half_view)
+        & (np.abs(math.pi - beta - pair.boresight_rad) < half_view)
+    )
+    xy = pair.midpoint + u[:, None] * pair.along + v[:, None] * pair.ahead
+    return xy, accepted
+
+
+def bilateration_jacobian(first_m: float, second_m: float, pair: RadarPair) -> Array:
+    """Return d(range, bearing) / d(l1, l2) of a fix seen from the base footprint.
+
+    Shape (2, 2): rows range [m] and bearing [rad], columns the first and the second range [m].
+    """
+    l1, l2, d = first_m, second_m, pair.baseline_m
+    u = (l1 - l2) * (l1 + l2) / (2 * d)
+    v = math.sqrt((l1**2 + l2**2) / 2 - d**2 / 4 - u**2)
+    du = np.array([l1 / d, -l2 / d])
+    dv = np.array([l1 * (d / 2 - u), l2 * (d / 2 + u)]) / (d * v)
+    x, y = pair.midpoint + u * pair.along + v * pair.ahead
+    d_xy = np.outer(pair.along, du) + np.outer(pair.ahead, dv)
+    r = math.hypot(x, y)
+    result: Array = np.array([[x / r, y / r], [-y / r**2, x / r**2]]) @ d_xy
+    return result
+
+
+class Trilaterator:
+    """Pairs the detections of one pose, every one with every one of the other radar.
+
+    K echoes seen by both radars give up to K^2 fixes. All that pass the geometry are kept, as in
+    the paper; the ghosts among them are left to the outlier filter.
+
+    Parameters
+    ----------
+    config
+        Field of view and stamp tolerance.
+    rig
+        The mounts; its pairs are worked out once.
+    """
+
+    def __init__(self, config: TrilaterationConfig, rig: Rig) -> None:
+        self.config = config
+        self.pairs = rig.pairs()
+
+    def locate(self, detections: Sequence[Detection]) -> tuple[Fix, ...]:
+        """Return the fixes of one pose from the detections of all radars."""
+        by_radar: dict[int, list[Detection]] = {}
+        for detection in detections:
+            by_radar.setdefault(detection.radar, []).append(detection)
+        fixes: list[Fix] = []
+        for index, pair in enumerate(self.pairs):
+            combinations = [
+                (a, b)
+                for a in by_radar.get(pair.first, ())
+                for b in by_radar.get(pair.second, ())
+                if abs(a.t_ns - b.t_ns) <= self.config.max_stamp_difference_s * _NS_PER_S
+            ]
+            if combinations:
+                fixes.extend(self._fixes(index, combinations))
+        return tuple(fixes)
+
+    def _fixes(self, index: int, combinations: Sequence[tuple[Detection, Detection]]) -> list[Fix]:
+        ranges_m = np.array([(a.range_m, b.range_m) for a, b in combinations])
+        xy, accepted = bilaterate(
+            ranges_m[:, 0], ranges_m[:, 1], self.pairs[index], self.config.field_of_view_rad
+        )
+        return [
+            Fix(pair=index, t_ns=max(a.t_ns, b.t_ns), x_m=x, y_m=y, detections=(a, b))
+            for (a, b), (x, y), seen in zip(
+                combinations, xy.tolist(), accepted.tolist(), strict=True
+            )
+            if seen
+        ]
