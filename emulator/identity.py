@@ -1,0 +1,73 @@
+"""What a module says about itself: the strings of SYSTEM_GET_INFO."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+__all__ = ["Identity"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Identity:
+    """The strings a stock X4M300 with sensor firmware answers.
+
+    Attributes
+    ----------
+    serial
+        Serial number, 12 digits.
+    order_code
+        Product name.
+    item_number
+        Novelda item number, form ``000ddd-ddd``.
+    firmware_id
+        Name of the firmware binary.
+    version
+        Firmware version.
+    xep_version
+        Version of the base firmware inside it.
+    build
+        Source revision, 40 hexadecimal digits.
+
+    Raises
+    ------
+    ValueError
+        When the serial number is not 12 digits.
+
+    Source: protocol reference 4.10, table of system info items.
+    """
+
+    serial: str
+    order_code: str = "X4M300"
+    item_number: str = "000112-001"
+    firmware_id: str = "Annapurna"
+    version: str = "1.6.8"
+    xep_version: str = "3.4.8"
+    build: str = "0" * 40
+
+    def __post_init__(self) -> None:
+        """Check the one field that scenes choose."""
+        if len(self.serial) != 12 or not self.serial.isascii() or not self.serial.isdigit():
+            raise ValueError(f"serial number {self.serial!r}: an X4M300 has 12 digits")
+
+    def info(self, item: int) -> str | None:
+        """Return the text of one info item; None for an item this firmware does not know.
+
+        Examples
+        --------
+        >>> Identity(serial="202611210001").info(0x01)
+        'X4M300'
+        >>> Identity(serial="202611210001").info(0x05) is None
+        True
+        """
+        return {
+            0x00: self.item_number,
+            0x01: self.order_code,
+            0x02: self.firmware_id,
+            0x03: self.version,
+            0x04: f"{self.version}+0.sha.{self.build}",
+            # 05, the application id list, is answered with an error by released firmware
+            0x06: self.serial,
+            0x07: f"{self.firmware_id}:{self.version};XEP:{self.xep_version};X4C51:2.1.0",
+            0x08: f"emulated-{self.serial}",
+            0x09: "unknown",
+        }.get(item)
