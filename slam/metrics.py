@@ -7,7 +7,6 @@ of the paper are computed beside it because they answer a different, kinder ques
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -129,9 +128,9 @@ def icp_ate(estimate_xy: Array, reference_xy: Array) -> IcpAte:
     """
     _check_rows(estimate_xy, reference_xy)
     tree = KDTree(reference_xy)
-    _, before = tree.query(estimate_xy)
+    _, before = _nearest(tree, estimate_xy)
     aligned = transform(icp_align_se2(estimate_xy, reference_xy), estimate_xy)
-    distances, _ = tree.query(aligned)
+    distances, _ = _nearest(tree, aligned)
     return IcpAte(
         nearest_rmse_m=math.sqrt(float(np.mean(distances**2))),
         per_axis_rmse_m=math.sqrt(float(np.mean((aligned - reference_xy[before]) ** 2))),
@@ -148,7 +147,7 @@ def icp_align_se2(estimate_xy: Array, reference_xy: Array) -> Array:
     pose, previous = np.zeros(3), math.inf
     for _ in range(_ICP_ITERATIONS):
         moved = transform(pose, estimate_xy)
-        distances, neighbours = tree.query(moved)
+        distances, neighbours = _nearest(tree, moved)
         close = distances <= _ICP_GATE_M
         if not close.any():
             break
@@ -239,29 +238,10 @@ def nees_pose(estimate: Array, covariance: Array, truth: Array) -> float:
     return float(error @ np.linalg.solve(covariance, error))
 
 
-def true_landmark_nis(
-    candidates: Sequence[tuple[Sequence[int], Array]],
-    origins: Sequence[int | None],
-    birthplaces: dict[int, int],
-) -> tuple[float, ...]:
-    """Return the NIS (2 dof) of observations against the landmark they are truly of, ungated.
-
-    Parameters
-    ----------
-    candidates
-        Per observation: the map's landmark ids before it and their squared Mahalanobis distances
-        (``Association.candidate_ids`` and ``mahalanobis_sq``).
-    origins
-        Per observation: index of the true landmark it came from, None for clutter.
-    birthplaces
-        True landmark index -> id of the map landmark first born from it.
-    """
-    values = []
-    for (ids, distances), origin in zip(candidates, origins, strict=True):
-        landmark_id = None if origin is None else birthplaces.get(origin)
-        if landmark_id is not None and landmark_id in ids:
-            values.append(float(distances[list(ids).index(landmark_id)]))
-    return tuple(values)
+def _nearest(tree: KDTree, points: Array) -> tuple[Array, NDArray[np.intp]]:
+    """Return distance to and row of the nearest tree point, shape (n,) each."""
+    distances, rows = tree.query(points)
+    return np.asarray(distances, dtype=np.float64), np.asarray(rows, dtype=np.intp)
 
 
 def _check_rows(estimate_xy: Array, reference_xy: Array) -> None:
