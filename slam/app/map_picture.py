@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-import matplotlib as mpl
+import matplotlib
+import matplotlib.colors
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -13,15 +15,17 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from slam.app.ellipse import ellipse_95, rotate_covariances
-from slam.app.session import SessionInfo, Snapshot
+from slam.app.runner import RunRecord
+from slam.app.session import SessionInfo
 from slam.app.summary import Summary
+from slam.ekf_slam import Belief
 from slam.geometry import transform
 
 _TRUTH, _ODOMETRY, _ESTIMATE, _LANDMARK = "#8a8f98", "#e08a2c", "#1f6fd0", "#c2255c"
 _MARGIN_M = 0.25
 
 # The same picture on every machine: no user style, no font that may be missing.
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 10.0,
     "axes.edgecolor": "#c8ccd2",
@@ -31,19 +35,17 @@ _STYLE = {
 }
 
 
-def draw_map(
-    path: Path, info: SessionInfo, snapshots: tuple[Snapshot, ...], summary: Summary
-) -> None:
+def draw_map(path: Path, info: SessionInfo, record: RunRecord, summary: Summary) -> None:
     """Draw the map of a simulated run into a PNG file.
 
     Estimate and odometry are drawn where they began, at the robot's first pose, without the
     alignment that the ATE uses: drift is seen as it is.
     """
-    truth = np.array([row.truth for row in snapshots])
-    place = snapshots[-1].world_from_map
-    estimate = transform(place, np.array([row.estimate[:2] for row in snapshots]))
-    odometry = transform(place, np.array([row.odometry[:2] for row in snapshots]))
-    with mpl.rc_context(_STYLE):
+    place = record.world_from_map
+    truth = record.truth
+    estimate = transform(place, np.array([row.belief.pose[:2] for row in record.results]))
+    odometry = transform(place, np.array([row.odometry_pose[:2] for row in record.results]))
+    with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(9.0, 6.6), dpi=150, layout="constrained", facecolor="white")
         FigureCanvasAgg(figure)
         axes = figure.add_subplot()
@@ -65,7 +67,7 @@ def draw_map(
                 label="true landmark",
                 zorder=4,
             )
-        _draw_landmarks(axes, snapshots[-1])
+        _draw_landmarks(axes, record.results[-1].belief, place)
         axes.set_xlabel("x [m]")
         axes.set_ylabel("y [m]")
         axes.margins(0.06)
@@ -88,16 +90,19 @@ def _draw_start(axes: Axes, pose: NDArray[np.float64]) -> None:
     )
 
 
-def _draw_landmarks(axes: Axes, last: Snapshot) -> None:
-    if not len(last.landmark_ids):
+def _draw_landmarks(axes: Axes, belief: Belief, place: NDArray[np.float64]) -> None:
+    if not belief.landmark_ids:
         return
-    points = transform(last.world_from_map, last.landmarks_m)
-    covariances = rotate_covariances(last.world_from_map[2], last.landmark_covariances_m2)
+    points = transform(place, belief.landmarks)
+    covariances = rotate_covariances(
+        place[2],
+        np.array([belief.landmark_covariance(row) for row in range(len(points))]),
+    )
     outlines = [ellipse_95(*pair) for pair in zip(points, covariances, strict=True)]
     axes.add_collection(
         PolyCollection(
             outlines,
-            facecolors=(*mpl.colors.to_rgb(_LANDMARK), 0.14),
+            facecolors=(*matplotlib.colors.to_rgb(_LANDMARK), 0.14),
             edgecolors=_LANDMARK,
             linewidths=1.0,
             label="95 % ellipse",

@@ -77,10 +77,9 @@ class OdometryTrack:
                 f"but a frame came at {t_ns / NS_PER_S:.2f} s"
             )
         after = int(np.searchsorted(self._stamps_ns, t_ns, side="right"))
-        if after == 0:
-            x_m, y_m, heading_rad = *self._xy_m[0], self._heading_rad[0]
-        elif after == len(self._stamps_ns):
-            x_m, y_m, heading_rad = *self._xy_m[-1], self._heading_rad[-1]
+        if after in (0, len(self._stamps_ns)):
+            row = min(after, len(self._stamps_ns) - 1)
+            (x_m, y_m), heading_rad = self._xy_m[row], self._heading_rad[row]
         else:
             before = after - 1
             step_ns = int(self._stamps_ns[after]) - int(self._stamps_ns[before])

@@ -14,7 +14,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
+import pyarrow as pa  # type: ignore[import-untyped]  # ships no stubs
 import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
@@ -269,7 +269,8 @@ class _FrameBlock:
 
 def _screen(points: NDArray[np.float64]) -> NDArray[np.float32]:
     """Turn points or vectors, shape (n, 2), y up, into Rerun's 2D views, y down."""
-    return (points * np.array([1.0, -1.0])).astype(np.float32)
+    flipped: NDArray[np.float32] = (points * np.array([1.0, -1.0])).astype(np.float32)
+    return flipped
 
 
 def _time_columns(stamps_ns: list[int], counters: list[int]) -> list[rr.TimeColumn]:

@@ -140,7 +140,7 @@ class SessionLog:
         if self._stream.closed:
             return
         with self._stream:
-            self._writer.finish()
+            self._writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
 
     def _channel(self, topic: str, message_type: str, *, latched: bool = False) -> int:
         if message_type not in self._schemas:

@@ -8,6 +8,8 @@ does not want to wait.
 from __future__ import annotations
 
 import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType, TracebackType
 from typing import Any, Self
 
@@ -15,10 +17,10 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class StopRequestedError(Exception):
-    """SIGINT or SIGTERM arrived; carries the signal."""
+    """SIGINT or SIGTERM arrived; carries the signal, and says what is left behind."""
 
-    def __init__(self, received: signal.Signals) -> None:
-        super().__init__(f"stopped by {received.name}")
+    def __init__(self, received: signal.Signals, left_behind: str = "") -> None:
+        super().__init__(f"stopped by {received.name}{left_behind}")
         self.received = received
 
     @property
@@ -39,6 +41,7 @@ class StopFlag:
     def __init__(self) -> None:
         self._received: signal.Signals | None = None
         self._previous: dict[signal.Signals, Any] = {}
+        self._at_once = False
 
     def __enter__(self) -> Self:
         """Install the handlers. Main thread only, as Python demands."""
@@ -60,6 +63,18 @@ class StopFlag:
         if self._received is not None:
             raise StopRequestedError(self._received)
 
+    @contextmanager
+    def at_once(self) -> Iterator[None]:
+        """Let a signal raise where it arrives: for waiting, where nothing is half-done."""
+        self.check()
+        self._at_once = True
+        try:
+            yield
+        finally:
+            self._at_once = False
+
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self._received = signal.Signals(number)
         signal.signal(number, signal.SIG_DFL)
+        if self._at_once:
+            self.check()

@@ -12,11 +12,11 @@ class LandmarkSummary:
 
     true: int
     estimated: int
-    precision: float
-    recall: float
+    precision: float | None
+    recall: float | None
     duplicates: int
     rmse_m: float | None
-    """None where no landmark matched."""
+    """These three are None where there is nothing to divide by."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

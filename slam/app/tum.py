@@ -77,7 +77,8 @@ def parse_tum_line(line: str) -> TumSample:
     fields = line.split()
     if len(fields) != _FIELDS:
         raise TumError(
-            f"expected 8 numbers (timestamp x y z qx qy qz qw), found {len(fields)}: {line.strip()!r}"
+            "expected 8 numbers (timestamp x y z qx qy qz qw), "
+            f"found {len(fields)}: {line.strip()!r}"
         )
     try:
         t_ns = round(Decimal(fields[0]) * NS_PER_S)
@@ -99,7 +100,8 @@ def format_tum_line(t_ns: int, pose: NDArray[np.float64]) -> str:
     """
     x, y, heading = (float(value) for value in pose)
     seconds, rest = divmod(int(t_ns), NS_PER_S)
-    return f"{seconds}.{rest:09d} {x!r} {y!r} 0 0 0 {math.sin(heading / 2)!r} {math.cos(heading / 2)!r}"
+    qz, qw = math.sin(heading / 2), math.cos(heading / 2)
+    return f"{seconds}.{rest:09d} {x!r} {y!r} 0 0 0 {qz!r} {qw!r}"
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:

@@ -1,0 +1,137 @@
+"""The command `uwb-slam`. Parses, calls, and turns what happens into one line and an exit code.
+
+Nothing heavy is imported before a command runs, so `--help` answers at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from slam.app.errors import EXIT_FAILED, AppError
+from slam.app.stop import StopFlag, StopRequestedError
+
+_Command = Callable[[argparse.Namespace, StopFlag], None]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; return 0, 1 (failed), 2 (wrong usage), 130 or 143 (stopped by a signal)."""
+    arguments = _parser().parse_args(argv)
+    command: _Command = arguments.command
+    try:
+        with StopFlag() as stop:
+            command(arguments, stop)
+            sys.stdout.flush()
+    except AppError as error:
+        return _end(str(error), error.exit_code)
+    except StopRequestedError as stopped:
+        return _end(str(stopped), stopped.exit_code)
+    except BrokenPipeError:
+        # Whoever read our output has gone; Python would complain once more while it exits.
+        sys.stderr.close()
+        return EXIT_FAILED
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        return _end(f"{where}{error.strerror or error}", EXIT_FAILED)
+    return 0
+
+
+def _end(message: str, exit_code: int) -> int:
+    line = " ".join(message.split())
+    print(f"uwb-slam: {line}", file=sys.stderr)  # noqa: T201 - a command line speaks
+    return exit_code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="uwb-slam", description="UWB-radar SLAM on emulated X4M300 radars."
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    demo = commands.add_parser(
+        "demo",
+        help="drive an emulated robot through a scene and map it",
+        description="Starts the emulator, opens its four radars through serial ports, runs SLAM "
+        "while frames arrive, and writes session, map and numbers. All numbers are simulated.",
+    )
+    demo.add_argument("--out", type=Path, default=Path("out/demo"), help="folder for the results")
+    demo.add_argument("--seed", type=_seed, default=0, help="seed of noise and odometry drift")
+    demo.add_argument("--scene", default="lab", help="name of a scene, or a scene file")
+    demo.add_argument("--preset", default="paper", help="settings of SLAM")
+    demo.set_defaults(command=_demo)
+
+    evaluate = commands.add_parser(
+        "evaluate",
+        help="compare two trajectories",
+        description="Absolute trajectory error of EST against REF, two TUM files: associated by "
+        "time, aligned by rotation and translation, root mean square of the distance.",
+    )
+    evaluate.add_argument("estimate", type=Path, metavar="EST", help="TUM file to judge")
+    evaluate.add_argument("reference", type=Path, metavar="REF", help="TUM file to judge by")
+    evaluate.add_argument("--json", action="store_true", help="print one JSON object")
+    evaluate.set_defaults(command=_evaluate)
+
+    sweep = commands.add_parser(
+        "sweep",
+        help="repeat a run over scenes, presets and seeds",
+        description="Runs every scene with every preset and seed in process, without ports, and "
+        "writes each run's summary and the statistics of each group.",
+    )
+    sweep.add_argument("--scene", nargs="+", default=["lab"], help="names or files of scenes")
+    sweep.add_argument("--preset", nargs="+", default=["paper"], help="settings of SLAM")
+    sweep.add_argument("--seeds", type=_count, default=20, help="number of seeds, from 0")
+    sweep.add_argument("--jobs", type=_count, default=1, help="processes")
+    sweep.add_argument("--json", type=Path, required=True, metavar="OUT", help="result file")
+    sweep.set_defaults(command=_sweep)
+    return parser
+
+
+def _seed(text: str) -> int:
+    return _whole_number(text, least=0)
+
+
+def _count(text: str) -> int:
+    return _whole_number(text, least=1)
+
+
+def _whole_number(text: str, *, least: int) -> int:
+    if not text.isascii() or not text.isdigit() or not least <= int(text) < 2**63:
+        raise argparse.ArgumentTypeError(f"must be a whole number, {least} or more, not {text!r}")
+    return int(text)
+
+
+def _demo(arguments: argparse.Namespace, stop: StopFlag) -> None:
+    from slam.app.demo import DemoOptions, run_demo  # heavy, see module text
+
+    options = DemoOptions(
+        out=arguments.out,
+        seed=arguments.seed,
+        scene=arguments.scene,
+        preset=arguments.preset,
+    )
+    run_demo(options, stop)
+
+
+def _evaluate(arguments: argparse.Namespace, stop: StopFlag) -> None:
+    from slam.app.evaluate import run_evaluate  # heavy, see module text
+
+    run_evaluate(arguments.estimate, arguments.reference, as_json=arguments.json)
+
+
+def _sweep(arguments: argparse.Namespace, stop: StopFlag) -> None:
+    from slam.app.sweep import SweepOptions, run_sweep  # heavy, see module text
+
+    options = SweepOptions(
+        scenes=tuple(arguments.scene),
+        presets=tuple(arguments.preset),
+        n_seeds=arguments.seeds,
+        jobs=arguments.jobs,
+        out=arguments.json,
+    )
+    run_sweep(options, stop)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,152 @@
+"""`uwb-slam demo`: the emulated robot, its radars on serial ports, SLAM while frames arrive."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slam.app.emulated_rig import (
+    FRAME_RATE_HZ,
+    RAW_CONFIG,
+    end_counter,
+    open_ports,
+    rig_of,
+    scene_and_config,
+    true_landmarks_m,
+    versions,
+)
+from slam.app.emulator_process import EmulatorProcess
+from slam.app.errors import AppError, EmulatorError, RadarSilentError
+from slam.app.evaluation import summarise
+from slam.app.link_log import LinkLog
+from slam.app.odometry import read_odometry_socket
+from slam.app.progress import Progress
+from slam.app.report_table import print_table
+from slam.app.runner import RunRecord, run_slam
+from slam.app.session import SessionInfo, SessionObserver
+from slam.app.session_log import SessionLog
+from slam.app.stop import StopFlag, StopRequestedError
+from slam.app.tum import Trajectory, write_tum
+from slam.pipeline import UwbRadarSlam
+
+OUTPUTS = (
+    "session.mcap",
+    "session.rrd",
+    "map.png",
+    "summary.json",
+    "estimate.tum",
+    "truth.tum",
+    "odometry.tum",
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DemoOptions:
+    """What the command line of `uwb-slam demo` says."""
+
+    out: Path
+    seed: int
+    scene: str
+    preset: str
+
+
+def run_demo(options: DemoOptions, stop: StopFlag) -> None:
+    """Run the emulated robot through its scene and write everything into one folder.
+
+    Parameters
+    ----------
+    options
+        Scene, seed, preset, folder.
+    stop
+        Asked between two scans.
+
+    Raises
+    ------
+    AppError
+        Something failed; one line. What was recorded until then is complete and readable.
+    StopRequestedError
+        A signal arrived; the same holds.
+    """
+    scene, config = scene_and_config(options.scene, options.preset)
+    rig = rig_of(scene)
+    landmarks_m = true_landmarks_m(scene)
+    trajectory = scene.trajectory()
+    _prepare(options.out)
+    kept = f"; what was recorded is in {options.out}"
+    with ExitStack() as stack:
+        emulator = stack.enter_context(EmulatorProcess(options.scene, options.seed))
+        # Half a second each, spent while the emulator starts.
+        from slam.app.map_picture import draw_map
+        from slam.app.rerun_view import RerunView
+
+        emulator.wait_until_ready(stop.check)
+        odometry = read_odometry_socket(emulator.odometry_socket)
+        link_log = LinkLog()
+        source = stack.enter_context(open_ports(emulator.devices, rig, link_log.on_record))
+        source.start(RAW_CONFIG, FRAME_RATE_HZ)
+        info = SessionInfo(
+            scene=scene.name,
+            preset=options.preset,
+            seed=options.seed,
+            radars=source.radars,
+            true_landmarks_m=landmarks_m,
+            versions=versions(),
+        )
+        observers: list[SessionObserver] = [link_log]
+        log = SessionLog(options.out / "session.mcap", info)
+        stack.callback(log.close)
+        log.write_odometry(odometry)
+        view = RerunView(options.out / "session.rrd", info, simulated=True)
+        stack.callback(view.close)
+        progress = Progress(info, trajectory.duration_ns, lambda: source.lost_frames)
+        stack.callback(progress.close)
+        observers += [log, view, progress]
+        link_log.attach(log, view, progress)
+        slam = UwbRadarSlam(config, rig)
+        try:
+            scans = source.scans(end_counter(trajectory.duration_ns), stop.check)
+            record = run_slam(scans, odometry, slam, trajectory.poses, observers)
+        except StopRequestedError as stopped:
+            raise StopRequestedError(stopped.received, kept) from None
+        except RadarSilentError as silent:
+            raise EmulatorError(f"{emulator.ended() or silent}{kept}") from None
+    summary = summarise(
+        record,
+        scene=scene.name,
+        preset=options.preset,
+        seed=options.seed,
+        rig=rig,
+        config=config,
+        true_landmarks_m=landmarks_m,
+    )
+    if summary is None:
+        raise AppError(f"{options.scene}: too short for SLAM, no state was estimated{kept}")
+    _write_trajectories(options.out, record)
+    (options.out / "summary.json").write_text(summary.to_json() + "\n", encoding="ascii")
+    draw_map(options.out / "map.png", info, record, summary)
+    print_table(summary, wall_s=record.wall_s, lost_frames=source.lost_frames, stream=sys.stdout)
+
+
+def _prepare(out: Path) -> None:
+    """Make the folder, and remove an earlier run's files so that no two runs mix."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for name in OUTPUTS:
+            (out / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise AppError(f"{out}: cannot be written: {error.strerror}") from None
+
+
+def _write_trajectories(out: Path, record: RunRecord) -> None:
+    """Write estimate, truth and odometry at the stamps of SLAM's states."""
+    stamps_ns = np.array([result.t_ns for result in record.results], dtype=np.int64)
+    for name, poses in (
+        ("estimate", np.array([result.belief.pose for result in record.results])),
+        ("truth", record.truth),
+        ("odometry", np.array([result.odometry_pose for result in record.results])),
+    ):
+        write_tum(out / f"{name}.tum", Trajectory(stamps_ns=stamps_ns, poses=poses))

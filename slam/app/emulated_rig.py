@@ -1,0 +1,135 @@
+"""The emulated robot as SLAM sees it: its rig, its radars on ports or in process, its truth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from importlib.metadata import version
+from platform import python_version
+
+import numpy as np
+from numpy.typing import NDArray
+from xethru_protocol.driver import X4M300, ProtocolRecord, RawConfig
+
+from emulator.device import radar_device
+from emulator.echo import echo_source
+from emulator.identity import Identity
+from emulator.loopback import LoopbackTransport
+from emulator.pace import Pace
+from emulator.scene import Scene, SceneError, load_scene
+from slam.app.emulator_process import EmulatedDevice
+from slam.app.errors import AppError, UsageError
+from slam.app.sources import RadarLink, RigSource
+from slam.app.tum import NS_PER_S
+from slam.config import ConfigError, SlamConfig, load_preset
+from slam.geometry import Mount, Rig
+from xethru_protocol.errors import XeThruError
+from xethru_protocol.x4 import real_frame_rate
+
+FRAME_RATE_HZ = 5
+RAW_CONFIG = RawConfig(frame_area_m=(0.2, 9.4))
+"""The paper's set-up: 1431 range bins from 0.2 to 9.4 module metres."""
+
+_VERSIONED = ("xethru-hil", "numpy", "scipy", "scikit-learn", "mcap", "rosbags", "rerun-sdk")
+
+RecordObserver = Callable[[str, ProtocolRecord], None]
+"""Gets a radar's name and what happened on its link."""
+
+
+def scene_and_config(scene: str, preset: str) -> tuple[Scene, SlamConfig]:
+    """Load a scene and the preset with the values for its environment.
+
+    Raises
+    ------
+    UsageError
+        One of them does not exist or is refused; one line with file, key and remedy.
+    """
+    try:
+        loaded = load_scene(scene)
+        return loaded, load_preset(preset, loaded.environment)
+    except (SceneError, ConfigError) as error:
+        raise UsageError(str(error)) from None
+
+
+def rig_of(scene: Scene) -> Rig:
+    """Return the nominal mounts of a scene's radars: what a user would write in a rig file.
+
+    The modules' own range errors stay unknown to SLAM.
+    """
+    return Rig(
+        mounts=tuple(
+            Mount(
+                name=radar.name, x_m=radar.x_m, y_m=radar.y_m, yaw_rad=math.radians(radar.yaw_deg)
+            )
+            for radar in scene.radars
+        )
+    )
+
+
+def true_landmarks_m(scene: Scene) -> NDArray[np.float64]:
+    """Return where the targets stand, shape (n, 2), world frame."""
+    return np.array([(target.x_m, target.y_m) for target in scene.targets]).reshape(-1, 2)
+
+
+def open_ports(
+    devices: tuple[EmulatedDevice, ...], rig: Rig, observer: RecordObserver
+) -> RigSource:
+    """Open emulated modules through their serial ports, as hardware would be.
+
+    Raises
+    ------
+    AppError
+        A port is missing, in use, or what answers there is no such radar.
+    """
+    links: list[RadarLink] = []
+    by_name = {device.name: device for device in devices}
+    try:
+        for mount in rig.mounts:
+            device = by_name.get(mount.name)
+            if device is None:
+                raise AppError(f"radar {mount.name}: the emulator serves {sorted(by_name)}")
+            try:
+                driver = X4M300.open(device.path, observer=_named(observer, mount.name))
+            except XeThruError as error:
+                raise AppError(f"radar {mount.name} at {device.path}: {error}") from error
+            links.append(
+                RadarLink(mount=mount, port=device.path, serial=device.serial, driver=driver)
+            )
+    except BaseException:
+        for link in links:
+            link.driver.close()
+        raise
+    return RigSource(links)
+
+
+def open_loopback(scene: Scene, seed: int) -> RigSource:
+    """Open the same emulated modules in this process: same driver, no ports, no waiting."""
+    links = []
+    for index, (radar, mount) in enumerate(zip(scene.radars, rig_of(scene).mounts, strict=True)):
+        device = radar_device(
+            Identity(serial=radar.serial),
+            echo_source(scene, index, seed),
+            Pace.ASAP,
+            skew_ns=round(radar.start_skew_ms * 1e6),
+        )
+        transport = LoopbackTransport(device, name=f"in process: {radar.name}")
+        driver = X4M300(transport, clock=transport.clock_ns)
+        links.append(
+            RadarLink(mount=mount, port=transport.name, serial=radar.serial, driver=driver)
+        )
+    return RigSource(links)
+
+
+def end_counter(duration_ns: int) -> int:
+    """Return the first frame counter after the end of the scene."""
+    period_ns = NS_PER_S / real_frame_rate(FRAME_RATE_HZ)
+    return int(duration_ns / period_ns) + 1
+
+
+def versions() -> dict[str, str]:
+    """Return the versions a run depends on."""
+    return {"python": python_version()} | {name: version(name) for name in _VERSIONED}
+
+
+def _named(observer: RecordObserver, name: str) -> Callable[[ProtocolRecord], None]:
+    return lambda record: observer(name, record)

@@ -1,0 +1,153 @@
+"""The emulator as a process of its own, owned by this one: started, watched, always ended."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import TracebackType
+from typing import IO, Self
+
+from slam.app.errors import EmulatorError
+
+_READY_LIMIT_S = 30.0
+_POLL_S = 0.2
+_END_LIMIT_S = 3.0
+_PR_SET_PDEATHSIG = 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EmulatedDevice:
+    """One emulated module, as the ready line names it."""
+
+    name: str
+    path: str
+    serial: str
+
+
+class EmulatorProcess:
+    """Runs `xethru-emulator serve` in its own process group while it is entered.
+
+    The group keeps Ctrl-C for us: we stop reading first and end the emulator afterwards. Its links
+    live in a temporary directory, so they are gone even if it is killed.
+
+    Parameters
+    ----------
+    scene
+        Name or file of the scene.
+    seed
+        Seed of noise and odometry.
+
+    """
+
+    def __init__(self, scene: str, seed: int) -> None:
+        self._scene, self._seed = scene, seed
+        self._cleanup = contextlib.ExitStack()
+        self.devices: tuple[EmulatedDevice, ...] = ()
+        self.odometry_socket = ""
+
+    def __enter__(self) -> Self:
+        """Start the process; its ports are there after `wait_until_ready`."""
+        with self._cleanup:
+            links = self._cleanup.enter_context(tempfile.TemporaryDirectory(prefix="xethru-"))
+            self._errors: IO[bytes] = self._cleanup.enter_context(tempfile.TemporaryFile())
+            command = [sys.executable, "-m", "emulator.cli", "serve", self._scene]
+            command += ["--pace", "asap", "--seed", str(self._seed), "--link-dir", links]
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=self._errors,
+                process_group=0,
+                preexec_fn=_end_with_parent(),  # one system call
+            )
+            self._cleanup.callback(self._end)
+            self._cleanup = self._cleanup.pop_all()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """End the process, by force if it does not listen, and remove its links."""
+        self._cleanup.close()
+
+    def ended(self) -> str | None:
+        """Return what became of the process if it is gone, else None."""
+        try:
+            code = self._process.wait(timeout=_POLL_S)
+        except subprocess.TimeoutExpired:
+            return None
+        how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
+        return f"the emulator ended {how}{self._last_words()}"
+
+    def wait_until_ready(self, check: Callable[[], None]) -> None:
+        """Read the ready line, which names ports and odometry socket.
+
+        Parameters
+        ----------
+        check
+            Called again and again while waiting; may raise to stop.
+
+        Raises
+        ------
+        EmulatorError
+            The process ended, or said nothing in time.
+        """
+        output = self._process.stdout
+        assert output is not None
+        line = b""
+        give_up = time.monotonic() + _READY_LIMIT_S
+        while not line.endswith(b"\n"):
+            check()
+            if time.monotonic() > give_up:
+                raise EmulatorError(f"the emulator was not ready after {_READY_LIMIT_S:g} s")
+            if select.select([output], [], [], _POLL_S)[0]:
+                part = os.read(output.fileno(), 65536)
+                if not part:
+                    raise EmulatorError(self.ended() or "the emulator closed its output")
+                line += part
+        try:
+            ready = json.loads(line)
+            self.devices = tuple(
+                EmulatedDevice(name=row["name"], path=row["path"], serial=row["serial"])
+                for row in ready["devices"]
+            )
+            self.odometry_socket = ready["odometry"]
+        except (ValueError, KeyError, TypeError):
+            raise EmulatorError(f"the emulator's ready line is unknown: {line[:200]!r}") from None
+
+    def _last_words(self) -> str:
+        self._errors.seek(0)
+        lines = self._errors.read().decode(errors="replace").split("\n")
+        said = [line.strip() for line in lines if line.strip()]
+        return f": {said[-1]}" if said else ""
+
+    def _end(self) -> None:
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+        self._process.terminate()
+        try:
+            self._process.wait(timeout=_END_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+def _end_with_parent() -> Callable[[], None] | None:
+    """Make the child get SIGTERM when we die without a chance to end it (kill -9); Linux only."""
+    if sys.platform != "linux":
+        return None
+    libc = ctypes.CDLL(None)
+    return lambda: libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)

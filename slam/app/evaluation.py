@@ -1,0 +1,133 @@
+"""The numbers of one run, from its record and what is known about the world."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.app.runner import RunRecord
+from slam.app.summary import LandmarkSummary, Summary
+from slam.app.tum import NS_PER_S
+from slam.config import SlamConfig
+from slam.geometry import Rig, between, transform
+from slam.metrics import (
+    LANDMARK_MATCH_M,
+    align_se2,
+    ate_rmse_m,
+    icp_ate,
+    landmark_metrics,
+    nees_pose,
+    true_landmark_nis,
+)
+from slam.visibility import observable_landmarks
+
+NEES_AT = (0.1, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.9, 1.0)
+"""Parts of the run at which consistency is judged; the quarters are the ends of four laps."""
+
+_NIS_DOF = 2
+
+
+def summarise(
+    record: RunRecord,
+    *,
+    scene: str,
+    preset: str,
+    seed: int,
+    rig: Rig,
+    config: SlamConfig,
+    true_landmarks_m: NDArray[np.float64],
+) -> Summary | None:
+    """Compute summary.json's numbers; None where the run was too short for any state.
+
+    Parameters
+    ----------
+    record
+        The run.
+    scene, preset, seed
+        Its names.
+    rig, config
+        What SLAM was told; decides which true landmarks count.
+    true_landmarks_m
+        Shape (n, 2), world frame.
+    """
+    if not record.results:
+        return None
+    truth_xy = record.truth[:, :2]
+    truth_in_map = np.array([between(record.world_from_map, pose) for pose in record.truth])
+    estimate = np.array([result.belief.pose for result in record.results])
+    odometry = np.array([result.odometry_pose for result in record.results])
+    last = record.results[-1]
+    alignment = align_se2(estimate[:, :2], truth_xy)
+    counting = observable_landmarks(rig, record.truth, true_landmarks_m, config)
+    score = landmark_metrics(last.belief.landmarks, true_landmarks_m[counting], alignment)
+    nis = _true_nis(record, true_landmarks_m)
+    return Summary(
+        scene=scene,
+        preset=preset,
+        seed=seed,
+        frames=record.n_frames,
+        duration_s=record.duration_ns / NS_PER_S,
+        realtime_factor=record.duration_ns / NS_PER_S / record.wall_s,
+        ate_rmse_m=ate_rmse_m(estimate[:, :2], truth_xy),
+        ate_icp_rmse_m=icp_ate(estimate[:, :2], truth_in_map[:, :2]).nearest_rmse_m,
+        odometry_ate_rmse_m=ate_rmse_m(odometry[:, :2], truth_xy),
+        final_error_m=float(np.linalg.norm(estimate[-1, :2] - truth_in_map[-1, :2])),
+        landmarks=LandmarkSummary(
+            true=score.true,
+            estimated=score.estimated,
+            precision=score.precision,
+            recall=score.recall,
+            duplicates=score.duplicates,
+            rmse_m=score.rmse_m,
+        ),
+        nees_pose=_nees(record, truth_in_map),
+        nis_mean=float(np.mean(nis)) / _NIS_DOF if nis else None,
+    )
+
+
+def _nees(record: RunRecord, truth_in_map: NDArray[np.float64]) -> tuple[tuple[float, float], ...]:
+    """Return (time [s], NEES) at the ten fixed times, from the last state at or before each."""
+    stamps_ns = np.array([result.t_ns for result in record.results])
+    values = []
+    for part in NEES_AT:
+        t_ns = round(part * record.duration_ns)
+        row = max(int(np.searchsorted(stamps_ns, t_ns, side="right")) - 1, 0)
+        belief = record.results[row].belief
+        nees = nees_pose(belief.pose, belief.pose_covariance, truth_in_map[row])
+        values.append((t_ns / NS_PER_S, nees))
+    return tuple(values)
+
+
+def _true_nis(record: RunRecord, true_landmarks_m: NDArray[np.float64]) -> list[float]:
+    """Return the NIS of every observation against the landmark it is truly of, before gates.
+
+    What an observation is truly of follows from the true pose: the true landmark within 0.15 m of
+    where it points.
+    """
+    birthplaces: dict[int, int] = {}
+    values: list[float] = []
+    for result, truth in zip(record.results, record.truth, strict=True):
+        origins = [
+            _origin(transform(truth, _body_point(o.range_m, o.bearing_rad)), true_landmarks_m)
+            for o in result.observations
+        ]
+        candidates = [(a.candidate_ids, a.mahalanobis_sq) for a in result.associations]
+        values += true_landmark_nis(candidates, origins, birthplaces)
+        for origin, association in zip(origins, result.associations, strict=True):
+            if origin is not None and association.is_new:
+                birthplaces.setdefault(origin, association.landmark_id)
+    return [value for value in values if math.isfinite(value)]
+
+
+def _body_point(range_m: float, bearing_rad: float) -> NDArray[np.float64]:
+    return np.array([range_m * math.cos(bearing_rad), range_m * math.sin(bearing_rad)])
+
+
+def _origin(point: NDArray[np.float64], true_landmarks_m: NDArray[np.float64]) -> int | None:
+    if not len(true_landmarks_m):
+        return None
+    distances_m = np.linalg.norm(true_landmarks_m - point, axis=1)
+    nearest = int(np.argmin(distances_m))
+    return nearest if distances_m[nearest] <= LANDMARK_MATCH_M else None

@@ -1,0 +1,53 @@
+"""What happens on the radars' links, as lines of a session."""
+
+from __future__ import annotations
+
+from xethru_protocol.driver import ProtocolRecord
+
+from slam.app.session import LogLine, Scan, SessionObserver, Snapshot
+
+
+class LinkLog:
+    """Stamps what the drivers report with session time and passes it on, once someone listens."""
+
+    def __init__(self) -> None:
+        self._t_ns = 0
+        self._waiting: list[LogLine] = []
+        self._listeners: tuple[SessionObserver, ...] = ()
+
+    def attach(self, *listeners: SessionObserver) -> None:
+        """Pass on what was said so far, and everything from now on."""
+        self._listeners = listeners
+        waiting, self._waiting = self._waiting, []
+        for line in waiting:
+            self._tell(line)
+
+    def on_record(self, radar: str, record: ProtocolRecord) -> None:
+        """Take one command, answer, SYSTEM message or fault of a radar's link."""
+        line = LogLine(
+            t_ns=self._t_ns,
+            radar=radar,
+            warning=record.direction == "fault",
+            text=f"{record.direction} {record.summary}",
+        )
+        if self._listeners:
+            self._tell(line)
+        else:
+            self._waiting.append(line)
+
+    def on_scan(self, scan: Scan) -> None:
+        """Keep session time."""
+        self._t_ns = scan.t_ns
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        """Nothing to do."""
+
+    def on_log(self, line: LogLine) -> None:
+        """Nothing to do: these lines come from here."""
+
+    def close(self) -> None:
+        """Nothing to do."""
+
+    def _tell(self, line: LogLine) -> None:
+        for listener in self._listeners:
+            listener.on_log(line)

@@ -1,0 +1,125 @@
+"""One run of SLAM over a stream of scans, with observers that see everything on the way."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from slam.app.odometry import OdometryTrack
+from slam.app.session import Scan, SessionObserver, Snapshot
+from slam.pipeline import StepResult, UwbRadarSlam
+
+TruthAt = Callable[[NDArray[np.int64]], NDArray[np.float64]]
+"""True poses, shape (n, 3), world frame, at n session times [ns]."""
+
+_NIS_DOF = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RunRecord:
+    """What a run leaves behind for its reports.
+
+    Attributes
+    ----------
+    results, truth
+        States of SLAM in time order, and the true pose at each, shape (n_states, 3), world frame.
+    world_from_map
+        Shape (3,): where the map frame lies in the world.
+    n_frames
+        Radar frames used, over all radars.
+    duration_ns, wall_s
+        Session time covered and the time it took.
+    """
+
+    results: tuple[StepResult, ...]
+    truth: NDArray[np.float64]
+    world_from_map: NDArray[np.float64]
+    n_frames: int
+    duration_ns: int
+    wall_s: float
+
+
+def run_slam(
+    scans: Iterable[Scan],
+    odometry: OdometryTrack,
+    slam: UwbRadarSlam,
+    truth_at: TruthAt,
+    observers: Sequence[SessionObserver] = (),
+) -> RunRecord:
+    """Feed scans to SLAM as they come and tell the observers about scans and states.
+
+    BLAS runs on one thread, here as in every other path, so that results are the same bits.
+    Truth goes to the observers only.
+
+    Raises
+    ------
+    OdometryError
+        Odometry does not cover the time of a scan.
+    """
+    results: list[StepResult] = []
+    truths: list[NDArray[np.float64]] = []
+    counter_at: dict[int, int] = {}
+    world_from_map: NDArray[np.float64] | None = None
+    n_frames = duration_ns = 0
+    started = time.monotonic()
+
+    def take(new: Iterable[StepResult]) -> None:
+        for result in new:
+            truth = truth_at(np.array([result.t_ns]))[0]
+            results.append(result)
+            truths.append(truth)
+            assert world_from_map is not None
+            snapshot = make_snapshot(result, counter_at.pop(result.t_ns), truth, world_from_map)
+            for observer in observers:
+                observer.on_snapshot(snapshot)
+
+    with threadpool_limits(limits=1):
+        for scan in scans:
+            for observer in observers:
+                observer.on_scan(scan)
+            if world_from_map is None:
+                world_from_map = truth_at(np.array([scan.t_ns]))[0]
+            counter_at[scan.t_ns] = scan.counter
+            n_frames += len(scan.frames)
+            duration_ns = scan.t_ns
+            take(slam.step(scan.frames, odometry.pose_at(scan.t_ns), scan.t_ns))
+        take(slam.flush())
+    return RunRecord(
+        results=tuple(results),
+        truth=np.array(truths).reshape(-1, 3),
+        world_from_map=np.zeros(3) if world_from_map is None else world_from_map,
+        n_frames=n_frames,
+        duration_ns=duration_ns,
+        wall_s=time.monotonic() - started,
+    )
+
+
+def make_snapshot(
+    result: StepResult,
+    counter: int,
+    truth: NDArray[np.float64],
+    world_from_map: NDArray[np.float64],
+) -> Snapshot:
+    """Reduce a result of the pipeline to what logs and viewers show."""
+    belief = result.belief
+    rows = range(len(belief.landmark_ids))
+    return Snapshot(
+        counter=counter,
+        t_ns=result.t_ns,
+        truth=truth,
+        odometry=result.odometry_pose,
+        estimate=belief.pose,
+        world_from_map=world_from_map,
+        pose_covariance=belief.pose_covariance,
+        landmark_ids=np.array(belief.landmark_ids, dtype=np.int64),
+        landmarks_m=belief.landmarks,
+        landmark_covariances_m2=np.array([belief.landmark_covariance(row) for row in rows]).reshape(
+            -1, 2, 2
+        ),
+        nis_per_dof=tuple(nis / _NIS_DOF for nis in result.nis),
+    )

@@ -1,0 +1,183 @@
+"""Where radar frames come from: drivers on ports or in process, grouped into scans.
+
+Here, and nowhere else, module metres become true metres: the module computes with light at
+3.0e8 m/s, echoes travel at 299 792 458 m/s.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from types import TracebackType
+from typing import Self
+
+from xethru_protocol.driver import X4M300, Frame, RawConfig
+
+from slam.app.errors import AppError, RadarSilentError
+from slam.app.session import RadarInfo, Scan
+from slam.frames import RadarFrame
+from slam.geometry import Mount
+from xethru_protocol.errors import Disconnected, ResponseTimeout, XeThruError
+from xethru_protocol.x4 import MODULE_SPEED_MPS, frame_time_ns
+
+LIGHT_MPS = 299_792_458.0
+TRUE_PER_MODULE_METRE = LIGHT_MPS / MODULE_SPEED_MPS
+
+_SILENCE_S = 5.0
+_POLL_S = 0.25
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RadarLink:
+    """An open driver and what it is called: its mount on the robot, its port, its serial number."""
+
+    mount: Mount
+    port: str
+    serial: str
+    driver: X4M300
+
+
+def radar_frame(radar: int, frame: Frame, rate_hz: float) -> RadarFrame:
+    """Turn a driver's frame into one for SLAM: true metres, time by the counter.
+
+    Parameters
+    ----------
+    radar
+        Index of the radar in the rig.
+    frame
+        What the driver read; its geometry is in module metres.
+    rate_hz
+        The chip's real frame rate, as read back.
+    """
+    return RadarFrame(
+        radar=radar,
+        t_ns=frame_time_ns(frame.counter, rate_hz),
+        counter=frame.counter,
+        samples=frame.samples,
+        range_start_m=frame.geometry.range_start_m * TRUE_PER_MODULE_METRE,
+        bin_length_m=frame.geometry.bin_length_m * TRUE_PER_MODULE_METRE,
+    )
+
+
+class RigSource:
+    """All radars of a robot as one stream of scans, in counter order.
+
+    Attributes
+    ----------
+    radars
+        What the modules answered, after `start`.
+    lost_frames
+        Frames missing between the counters that arrived, over all radars.
+    """
+
+    def __init__(self, links: Sequence[RadarLink]) -> None:
+        self._links = tuple(links)
+        self.radars: tuple[RadarInfo, ...] = ()
+        self.lost_frames = 0
+
+    def __enter__(self) -> Self:
+        """Nothing to do: the links are open already."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close every driver."""
+        for link in self._links:
+            link.driver.close()
+
+    def start(self, config: RawConfig, fps: int) -> None:
+        """Configure raw RF on every radar and start all streams.
+
+        Raises
+        ------
+        AppError
+            A module does not answer or refuses a setting; names the radar.
+        """
+        infos = []
+        for link in self._links:
+            try:
+                geometry = link.driver.configure_raw(config)
+            except XeThruError as error:
+                raise AppError(f"radar {link.mount.name} at {link.port}: {error}") from error
+            infos.append((link, geometry))
+        radars = []
+        for link, geometry in infos:
+            try:
+                rate_hz = link.driver.start(fps)
+            except XeThruError as error:
+                raise AppError(f"radar {link.mount.name} at {link.port}: {error}") from error
+            radars.append(
+                RadarInfo(
+                    name=link.mount.name,
+                    serial=link.serial,
+                    port=link.port,
+                    x_m=link.mount.x_m,
+                    y_m=link.mount.y_m,
+                    yaw_rad=link.mount.yaw_rad,
+                    range_offset_m=link.mount.range_offset_m,
+                    range_start_m=geometry.range_start_m,
+                    bin_length_m=geometry.bin_length_m,
+                    n_bins=geometry.n_bins,
+                    rate_hz=rate_hz,
+                    settings=asdict(config),
+                )
+            )
+        self.radars = tuple(radars)
+
+    def scans(self, end_counter: int, check: Callable[[], None]) -> Iterator[Scan]:
+        """Yield the frames of counters below `end_counter`, one scan per counter.
+
+        Parameters
+        ----------
+        end_counter
+            First counter that is not wanted any more.
+        check
+            Called once per scan and while waiting; may raise to stop.
+
+        Raises
+        ------
+        RadarSilentError
+            A radar sent no frame for 5 s, or its port is gone.
+        """
+        expected = [0] * len(self._links)
+        heads: list[Frame | None] = [None] * len(self._links)
+        while True:
+            check()
+            for radar, head in enumerate(heads):
+                if head is None:
+                    frame = self._next_frame(radar, expected[radar], check)
+                    self.lost_frames += min(frame.counter, end_counter) - expected[radar]
+                    expected[radar] = frame.counter + 1
+                    heads[radar] = frame
+            counter = min(head.counter for head in heads if head is not None)
+            if counter >= end_counter:
+                return
+            frames = []
+            for radar, head in enumerate(heads):
+                if head is not None and head.counter == counter:
+                    frames.append(radar_frame(radar, head, self.radars[radar].rate_hz))
+                    heads[radar] = None
+            yield Scan(counter=counter, t_ns=frames[0].t_ns, frames=tuple(frames))
+
+    def _next_frame(self, radar: int, expected: int, check: Callable[[], None]) -> Frame:
+        link = self._links[radar]
+        give_up = time.monotonic() + _SILENCE_S
+        while True:
+            try:
+                return link.driver.read_frame(timeout_s=_POLL_S)
+            except ResponseTimeout:
+                check()
+                if time.monotonic() > give_up:
+                    raise RadarSilentError(
+                        f"radar {link.mount.name} at {link.port}: no frame for {_SILENCE_S:g} s "
+                        f"after frame {expected - 1}"
+                    ) from None
+            except Disconnected as error:
+                raise RadarSilentError(
+                    f"radar {link.mount.name} at {link.port}: {error} after frame {expected - 1}"
+                ) from None

@@ -1,0 +1,178 @@
+"""`uwb-slam sweep`: the same run over scenes, presets and seeds, in process, on joblib."""
+
+from __future__ import annotations
+
+import json
+import signal
+import statistics
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import joblib
+import numpy as np
+from scipy.stats import chi2
+
+from emulator.odometry import scene_odometry
+from slam.app.emulated_rig import (
+    FRAME_RATE_HZ,
+    RAW_CONFIG,
+    end_counter,
+    open_loopback,
+    rig_of,
+    scene_and_config,
+    true_landmarks_m,
+)
+from slam.app.errors import AppError
+from slam.app.evaluation import summarise
+from slam.app.odometry import OdometryTrack
+from slam.app.runner import RunRecord, run_slam
+from slam.app.stop import StopFlag
+from slam.app.summary import Summary
+from slam.pipeline import UwbRadarSlam
+
+_POSE_DOF = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SweepOptions:
+    """What the command line of `uwb-slam sweep` says."""
+
+    scenes: tuple[str, ...]
+    presets: tuple[str, ...]
+    n_seeds: int
+    jobs: int
+    out: Path
+
+
+def _never() -> None:
+    """Do not stop."""
+
+
+def run_in_process(
+    scene: str, preset: str, seed: int, *, check: Callable[[], None] = _never
+) -> RunRecord:
+    """Do what the demo does without ports and processes: same driver, device, odometry text."""
+    loaded, config = scene_and_config(scene, preset)
+    trajectory = loaded.trajectory()
+    odometry = OdometryTrack.from_lines(scene_odometry(loaded, seed))
+    with open_loopback(loaded, seed) as source:
+        source.start(RAW_CONFIG, FRAME_RATE_HZ)
+        scans = source.scans(end_counter(trajectory.duration_ns), check)
+        slam = UwbRadarSlam(config, rig_of(loaded))
+        return run_slam(scans, odometry, slam, trajectory.poses)
+
+
+def run_one(scene: str, preset: str, seed: int, *, check: Callable[[], None] = _never) -> Summary:
+    """Run one cell of a sweep and return its numbers.
+
+    Raises
+    ------
+    AppError
+        The scene is too short for a single state.
+    """
+    loaded, config = scene_and_config(scene, preset)
+    summary = summarise(
+        run_in_process(scene, preset, seed, check=check),
+        scene=loaded.name,
+        preset=preset,
+        seed=seed,
+        rig=rig_of(loaded),
+        config=config,
+        true_landmarks_m=true_landmarks_m(loaded),
+    )
+    if summary is None:
+        raise AppError(f"{scene}: too short for SLAM, no state was estimated")
+    return summary
+
+
+def run_sweep(options: SweepOptions, stop: StopFlag) -> None:
+    """Run all cells, write `{"runs": [...], "groups": [...]}`, print one line per group."""
+    for scene, preset in product(options.scenes, options.presets):
+        scene_and_config(scene, preset)  # a wrong name ends the command before any run
+    if not options.out.parent.is_dir():
+        raise AppError(f"{options.out}: the folder {options.out.parent} does not exist")
+    cells = list(product(options.scenes, options.presets, range(options.n_seeds)))
+    runs: list[Summary] = []
+    for summary in _results(cells, options.jobs, stop):
+        runs.append(summary)
+        sys.stderr.write(
+            f"{len(runs)} of {len(cells)}: {summary.scene}, {summary.preset}, "
+            f"seed {summary.seed}: ATE {1e3 * summary.ate_rmse_m:.1f} mm, "
+            f"odometry {1e3 * summary.odometry_ate_rmse_m:.1f} mm\n"
+        )
+        stop.check()
+    groups = summarise_groups(runs)
+    result = {"runs": [asdict(run) for run in runs], "groups": groups}
+    options.out.write_text(json.dumps(result, indent=2, allow_nan=False) + "\n", encoding="ascii")
+    for group in groups:
+        slam, wheels = group["ate_rmse_m"], group["odometry_ate_rmse_m"]
+        sys.stdout.write(
+            f"{group['scene']}, preset {group['preset']}, {group['runs']} seeds (simulated): "
+            f"SLAM ATE median {1e3 * slam['median']:.1f} mm, p90 {1e3 * slam['p90']:.1f} mm; "
+            f"odometry median {1e3 * wheels['median']:.1f} mm\n"
+        )
+
+
+def summarise_groups(runs: Sequence[Summary]) -> list[dict[str, Any]]:
+    """Return the statistics of each scene and preset, in the order they first appear.
+
+    Every group has its number of runs, how many beat odometry, `median` and `p90` of the errors,
+    and the mean NEES over runs (ANEES) at each of the ten times with its 95 % band.
+    """
+    keys = list(dict.fromkeys((run.scene, run.preset) for run in runs))
+    return [_group([run for run in runs if (run.scene, run.preset) == key]) for key in keys]
+
+
+def _group(runs: Sequence[Summary]) -> dict[str, Any]:
+    spread = {
+        name: _spread([getattr(run, name) for run in runs])
+        for name in ("ate_rmse_m", "ate_icp_rmse_m", "odometry_ate_rmse_m", "final_error_m")
+    }
+    band = [float(chi2.ppf(tail, _POSE_DOF * len(runs))) / len(runs) for tail in (0.025, 0.975)]
+    anees = [
+        [statistics.fmean(pair[0] for pair in pairs), statistics.fmean(pair[1] for pair in pairs)]
+        for pairs in zip(*(run.nees_pose for run in runs), strict=True)
+    ]
+    nis = [run.nis_mean for run in runs if run.nis_mean is not None]
+    return {
+        "scene": runs[0].scene,
+        "preset": runs[0].preset,
+        "runs": len(runs),
+        "runs_below_odometry": sum(run.ate_ratio < 1.0 for run in runs),
+        **spread,
+        "realtime_factor": _spread([run.realtime_factor for run in runs]),
+        "anees_pose": anees,
+        "anees_band_95": band,
+        "nis_mean": statistics.fmean(nis) if nis else None,
+    }
+
+
+def _spread(values: Sequence[float]) -> dict[str, float]:
+    return {"median": float(np.median(values)), "p90": float(np.quantile(values, 0.9))}
+
+
+def _results(cells: Iterable[tuple[str, str, int]], jobs: int, stop: StopFlag) -> Iterator[Summary]:
+    """Run cells one after the other or on worker processes; results in the order of the cells."""
+    if jobs == 1:
+        for cell in cells:
+            yield run_one(*cell, check=stop.check)
+        return
+    tasks = (joblib.delayed(_run_in_worker)(*cell) for cell in cells)
+    results = iter(joblib.Parallel(n_jobs=jobs, return_as="generator")(tasks))
+    while True:
+        # Nothing is half-written while we wait, so a signal may end the waiting at once.
+        with stop.at_once():
+            summary = next(results, None)
+        if summary is None:
+            return
+        yield summary
+
+
+def _run_in_worker(scene: str, preset: str, seed: int) -> Summary:
+    # Ctrl-C reaches the whole process group; the parent answers it and ends its workers.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return run_one(scene, preset, seed)
