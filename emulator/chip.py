@@ -10,7 +10,6 @@ Source: protocol reference 4.9, 5.1, 8.4 and chapter 9.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -20,69 +19,20 @@ from numpy.typing import NDArray
 from emulator.downconversion import CHANNELS, DECIMATION, LEAD_SAMPLES, TAP_COUNT, downconvert
 from emulator.echo_source import CaptureSettings, EchoSource
 from emulator.refusal import Refusal
+from emulator.registers import Registers
+from emulator.settings import SETTERS, ChipSettings
 from emulator.timeline import Timeline
 from xethru_protocol import x4
 from xethru_protocol.codes import ErrorCode, X4Error, X4Setting
+from xethru_protocol.messages import REGISTERS, X4Value
 
-__all__ = ["Chip", "ChipFrame", "ChipSettings"]
+__all__ = ["Chip", "ChipFrame"]
 
-DAC_LEVELS = 2048
 MAX_TIMER_HZ = 65535.0
 """The firmware's frame rate is a 16-bit integer."""
 GUARD_FRAMES = 100
 """All-zero frames after which the module switches its transmitter off."""
 LARGEST_BLOCK = 32
-
-Value = int | float | tuple[float, float]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ChipSettings:
-    """Settings of the X4 as its driver keeps them after INIT. Source: protocol reference 9.3.
-
-    Attributes
-    ----------
-    fps
-        Requested frame rate, float32 value.
-    pulses_per_step
-        Low 16 bits of what was set.
-    iterations
-        Low 8 bits of what was set.
-    downconversion
-        0 for RF frames, anything else for baseband.
-    start_m
-        Requested frame area start, float32 value, module metres.
-    end_m
-        Requested frame area end, after shortening to the chip's maximum.
-    offset_m
-        Frame area offset, float32 value, module metres.
-    dac_step
-        Exponent of the DAC step, 0...3.
-    dac_min
-        Lowest DAC level.
-    dac_max
-        Highest DAC level; may lie below `dac_min`, as in the firmware.
-    tx_center_frequency
-        3 or 4.
-    tx_power
-        0 (off)...3.
-    prf_div
-        Divider of the 243 MHz clock, 4...255.
-    """
-
-    fps: float = 0.0
-    pulses_per_step: int = 10
-    iterations: int = 8
-    downconversion: int = 0
-    start_m: float = x4.FULL_AREA_M[0]
-    end_m: float = x4.FULL_AREA_M[1]
-    offset_m: float = float(np.float32(x4.DEFAULT_OFFSET_M))
-    dac_step: int = 0
-    dac_min: int = 0
-    dac_max: int = 2047
-    tx_center_frequency: int = 3
-    tx_power: int = 2
-    prf_div: int = 16
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,6 +82,7 @@ class Chip:
     def init(self) -> None:
         """Restart the chip: default settings, FPS 0, counter 0 at scene time 0."""
         self.timeline = Timeline()
+        self._registers = Registers()
         self.powered = True
         self._zero_frames = 0
         self._apply(ChipSettings())
@@ -141,25 +92,38 @@ class Chip:
         """Whether the chip's timer makes frames."""
         return self.powered and self.settings.fps > 0
 
-    def set(self, setting: X4Setting, value: Value) -> None:
+    def set(self, setting: X4Setting, value: X4Value) -> None:
         """Change one setting at once, or raise `Refusal` and change nothing."""
         if setting is X4Setting.ENABLE:
             self.powered = self.powered and value != 0
-            return
-        setter = _SETTERS.get(setting)
-        if setter is None:
+        elif setting in REGISTERS and isinstance(value, tuple):
+            address, byte = value
+            self.write_register(setting, int(address), int(byte))
+        elif setting in SETTERS:
+            changed = SETTERS[setting](self.settings, value)
+            self._check_powered()
+            self._apply(changed)
+        else:
             raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
-        changed = setter(self.settings, value)
-        if not self.powered:
-            raise Refusal(X4Error.REGISTER_TIMEOUT)
-        self._apply(changed)
 
-    def get(self, setting: X4Setting) -> Value:
+    def get(self, setting: X4Setting) -> X4Value:
         """Return what GET answers, or raise `Refusal` for a setting without getter."""
         getter = _GETTERS.get(setting)
         if getter is None:
             raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
         return getter(self)
+
+    def read_register(self, space: X4Setting, address: int) -> int:
+        """Return one register's byte; `Refusal` when the chip is off."""
+        self._check_powered()
+        return self._registers.read(space, address & 0xFF, self.settings)
+
+    def write_register(self, space: X4Setting, address: int, value: int) -> None:
+        """Write one register's byte; `Refusal` when the chip is off."""
+        self._check_powered()
+        changed = self._registers.write(space, address & 0xFF, value, self.settings)
+        if changed is not self.settings:
+            self._apply(changed)
 
     def next_frame(self) -> ChipFrame:
         """Take the next frame; its counter moves on."""
@@ -172,6 +136,10 @@ class Chip:
         self.timeline.next_counter = counter + 1
         self._guard_transmitter(bool(block.all_zero[index]))
         return ChipFrame(counter=counter & 0xFFFFFFFF, values=block.values[index])
+
+    def _check_powered(self) -> None:
+        if not self.powered:
+            raise Refusal(X4Error.REGISTER_TIMEOUT)
 
     def _apply(self, settings: ChipSettings) -> None:
         self.area = x4.frame_area(
@@ -273,90 +241,7 @@ def _baseband_values(
     return np.concatenate([i_values, q_values], axis=1)
 
 
-# ---- setters: (settings, value) -> changed settings, or Refusal --------------------------------
-
-
-def _number(value: Value) -> float:
-    if isinstance(value, tuple):
-        raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
-    return value
-
-
-def _integer(value: Value) -> int:
-    return int(_number(value))
-
-
-def _set_fps(settings: ChipSettings, value: Value) -> ChipSettings:
-    fps = _number(value)
-    # the reference is silent on NaN and infinity; a timer cannot run at either
-    return replace(settings, fps=fps if math.isfinite(fps) else 0.0)
-
-
-def _set_frame_area(settings: ChipSettings, value: Value) -> ChipSettings:
-    if not isinstance(value, tuple):
-        raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
-    start_m, end_m = value
-    if not (math.isfinite(start_m) and math.isfinite(end_m)) or start_m > end_m:
-        raise Refusal(X4Error.FRAME_AREA_END_OUT_OF_SCOPE)
-    return replace(settings, start_m=start_m, end_m=end_m)
-
-
-def _set_offset(settings: ChipSettings, value: Value) -> ChipSettings:
-    offset_m = _number(value)
-    if not math.isfinite(offset_m):
-        raise Refusal(X4Error.GENERAL_FAILURE)
-    return replace(settings, offset_m=offset_m)
-
-
-def _set_dac_step(settings: ChipSettings, value: Value) -> ChipSettings:
-    step = _integer(value) & 0xFF
-    if step > 3:
-        raise Refusal(X4Error.INVALID_DAC_STEP)
-    return replace(settings, dac_step=step)
-
-
-def _dac_level(value: Value) -> int:
-    level = _integer(value) & 0xFFFF
-    if level >= DAC_LEVELS:
-        raise Refusal(X4Error.GENERAL_FAILURE)
-    return level
-
-
-def _set_tx_center_frequency(settings: ChipSettings, value: Value) -> ChipSettings:
-    if value not in CHANNELS:
-        raise Refusal(X4Error.INVALID_TX_CENTER_FREQUENCY)
-    return replace(settings, tx_center_frequency=_integer(value))
-
-
-def _set_tx_power(settings: ChipSettings, value: Value) -> ChipSettings:
-    if value not in range(4):
-        raise Refusal(X4Error.INVALID_TX_POWER)
-    return replace(settings, tx_power=_integer(value))
-
-
-def _set_prf_div(settings: ChipSettings, value: Value) -> ChipSettings:
-    divider = _integer(value)
-    if divider < 4:
-        raise Refusal(X4Error.PRF_DIV_TOO_SMALL)
-    return replace(settings, prf_div=divider)
-
-
-_SETTERS: dict[X4Setting, Callable[[ChipSettings, Value], ChipSettings]] = {
-    X4Setting.FPS: _set_fps,
-    X4Setting.PULSESPERSTEP: lambda s, v: replace(s, pulses_per_step=_integer(v) & 0xFFFF),
-    X4Setting.ITERATIONS: lambda s, v: replace(s, iterations=_integer(v) & 0xFF),
-    X4Setting.DOWNCONVERSION: lambda s, v: replace(s, downconversion=_integer(v)),
-    X4Setting.FRAMEAREA: _set_frame_area,
-    X4Setting.DACSTEP: _set_dac_step,
-    X4Setting.DACMIN: lambda s, v: replace(s, dac_min=_dac_level(v)),
-    X4Setting.DACMAX: lambda s, v: replace(s, dac_max=_dac_level(v)),
-    X4Setting.FRAMEAREAOFFSET: _set_offset,
-    X4Setting.TXCENTERFREQUENCY: _set_tx_center_frequency,
-    X4Setting.TXPOWER: _set_tx_power,
-    X4Setting.PRFDIV: _set_prf_div,
-}
-
-_GETTERS: dict[X4Setting, Callable[[Chip], Value]] = {
+_GETTERS: dict[X4Setting, Callable[[Chip], X4Value]] = {
     X4Setting.FPS: lambda chip: _fps_read_back(chip.settings.fps),
     X4Setting.PULSESPERSTEP: lambda chip: chip.settings.pulses_per_step,
     X4Setting.ITERATIONS: lambda chip: chip.settings.iterations,

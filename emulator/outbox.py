@@ -1,6 +1,6 @@
 """What waits inside the module for the host: the firmware's 50-slot queue, and a lossless one.
 
-Both are pure: bytes and times in, bytes out.
+Both are pure: messages and times in, messages out. A message is encoded when it is taken.
 
 Source: protocol reference 8.4.
 """
@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections import deque
 from enum import Enum, auto
 from typing import NamedTuple, Protocol
+
+from xethru_protocol.messages import Command, Response
 
 __all__ = ["FirmwareOutbox", "LosslessOutbox", "MessageKind", "MessageStream", "Outbox"]
 
@@ -34,28 +36,44 @@ class MessageStream(Protocol):
         """Return when the next message is due; None while nothing streams."""
         ...
 
-    def take(self) -> bytes:
-        """Return the next message's wire bytes and move on."""
+    def take(self) -> Response:
+        """Return the next message and move on."""
         ...
 
     def skip_due_before(self, time_ns: int) -> int:
         """Give up every message due before a time; return how many (frame counters run on)."""
         ...
 
+    def command_done(self, command: Command[Response], now_ns: int) -> None:
+        """Learn that the module carried out, or refused, a command."""
+        ...
+
+    def port_opened(self, now_ns: int) -> None:
+        """Learn that a host opened the port."""
+        ...
+
+    def port_closed(self, now_ns: int) -> None:
+        """Learn that the last host closed the port."""
+        ...
+
 
 class Outbox(Protocol):
     """The queue between a module and its line."""
 
-    def put(self, kind: MessageKind, packet: bytes, now_ns: int) -> None:
-        """Queue one packet, or lose one, as the queue's rule says."""
+    def put(self, kind: MessageKind, message: Response, now_ns: int) -> None:
+        """Queue one message, or lose one, as the queue's rule says."""
         ...
 
-    def refill(self, stream: MessageStream, now_ns: int) -> None:
-        """Fetch what is due from the stream."""
+    def refill_on_time(self, stream: MessageStream, now_ns: int) -> None:
+        """Fetch what fell due, because time passed."""
         ...
 
-    def take(self, now_ns: int) -> bytes | None:
-        """Hand the oldest packet to the line; None when the queue is empty."""
+    def refill_on_demand(self, stream: MessageStream, now_ns: int) -> None:
+        """Fetch what is due, because the line takes more."""
+        ...
+
+    def take(self, now_ns: int) -> Response | None:
+        """Hand the oldest message to the line; None when the queue is empty."""
         ...
 
     def clear(self) -> None:
@@ -63,11 +81,11 @@ class Outbox(Protocol):
         ...
 
     def wake_ns(self, stream: MessageStream, now_ns: int) -> int | None:
-        """Return when `refill` should be called again; None when only `take` can change that."""
+        """Return when time alone brings the next message; None when only the line's room does."""
         ...
 
     def __len__(self) -> int:
-        """Return the number of waiting packets."""
+        """Return the number of waiting messages."""
         ...
 
 
@@ -75,32 +93,35 @@ class LosslessOutbox:
     """Queue of a device whose clock waits for the line: nothing is dropped.
 
     A stream message is fetched only when nothing else waits and it is due, so a reply stands
-    behind at most the one packet the line is already sending.
+    behind at most the one message the line is already sending.
     """
 
     def __init__(self) -> None:
-        self._packets: deque[bytes] = deque()
+        self._messages: deque[Response] = deque()
 
-    def put(self, kind: MessageKind, packet: bytes, now_ns: int) -> None:
-        """Queue one packet; the owner stops reading commands while many wait."""
+    def put(self, kind: MessageKind, message: Response, now_ns: int) -> None:
+        """Queue one message; the owner stops reading commands while many wait."""
         del kind, now_ns  # every kind is kept for as long as it takes
-        self._packets.append(packet)
+        self._messages.append(message)
 
-    def refill(self, stream: MessageStream, now_ns: int) -> None:
+    def refill_on_time(self, stream: MessageStream, now_ns: int) -> None:
+        """Fetch nothing: what is due waits in the stream until the line takes more."""
+
+    def refill_on_demand(self, stream: MessageStream, now_ns: int) -> None:
         """Fetch one due message if nothing waits."""
-        if not self._packets:
+        if not self._messages:
             due_ns = stream.next_due_ns()
             if due_ns is not None and due_ns <= now_ns:
-                self._packets.append(stream.take())
+                self._messages.append(stream.take())
 
-    def take(self, now_ns: int) -> bytes | None:
-        """Return the oldest packet."""
+    def take(self, now_ns: int) -> Response | None:
+        """Return the oldest message."""
         del now_ns
-        return self._packets.popleft() if self._packets else None
+        return self._messages.popleft() if self._messages else None
 
     def clear(self) -> None:
         """Forget everything."""
-        self._packets.clear()
+        self._messages.clear()
 
     def wake_ns(self, stream: MessageStream, now_ns: int) -> int | None:
         """Return the next due time if it lies ahead; what is already due waits for the line."""
@@ -108,19 +129,19 @@ class LosslessOutbox:
         return due_ns if due_ns is not None and due_ns > now_ns else None
 
     def __len__(self) -> int:
-        """Return the number of waiting packets."""
-        return len(self._packets)
+        """Return the number of waiting messages."""
+        return len(self._messages)
 
 
 class _Queued(NamedTuple):
     kind: MessageKind
-    packet: bytes
+    message: Response
 
 
 class FirmwareOutbox:
     """The firmware's message queue: 50 slots, and a rule for a host that stops reading.
 
-    A host counts as stalled when packets have waited for a second and none was taken. Then every
+    A host counts as stalled when messages have waited for a second and none was taken. Then every
     further message first costs the queued debug messages, and after them the oldest of any kind
     until a quarter of the slots is free. A full queue whose host still reads has no slot for
     another frame: it is lost, and the gap in the counters shows it. A reply displaces the oldest
@@ -145,8 +166,8 @@ class FirmwareOutbox:
         self._waiting_since_ns = 0
         self.frames_lost = 0
 
-    def put(self, kind: MessageKind, packet: bytes, now_ns: int) -> None:
-        """Queue one packet; see the class for what is lost when."""
+    def put(self, kind: MessageKind, message: Response, now_ns: int) -> None:
+        """Queue one message; see the class for what is lost when."""
         if self._queue and now_ns - self._waiting_since_ns >= self.STALL_NS:
             self._purge()
         if len(self._queue) >= self.SLOTS:
@@ -156,9 +177,12 @@ class FirmwareOutbox:
             self._drop_oldest()
         if not self._queue:
             self._waiting_since_ns = now_ns
-        self._queue.append(_Queued(kind, packet))
+        self._queue.append(_Queued(kind, message))
 
-    def refill(self, stream: MessageStream, now_ns: int) -> None:
+    def refill_on_demand(self, stream: MessageStream, now_ns: int) -> None:
+        """Fetch nothing: frames come when they are due, whether the line takes them or not."""
+
+    def refill_on_time(self, stream: MessageStream, now_ns: int) -> None:
         """Queue every frame due by now; without a free slot, lose it unsynthesised."""
         # A module that fell more than a second behind its own clock lost those frames.
         self.frames_lost += stream.skip_due_before(now_ns - self.STALL_NS)
@@ -172,12 +196,12 @@ class FirmwareOutbox:
                 return
             self.put(MessageKind.FRAME, stream.take(), now_ns)
 
-    def take(self, now_ns: int) -> bytes | None:
-        """Return the oldest packet; the host has proved that it reads."""
+    def take(self, now_ns: int) -> Response | None:
+        """Return the oldest message; the host has proved that it reads."""
         if not self._queue:
             return None
         self._waiting_since_ns = now_ns
-        return self._queue.popleft().packet
+        return self._queue.popleft().message
 
     def clear(self) -> None:
         """Forget everything."""
@@ -189,7 +213,7 @@ class FirmwareOutbox:
         return stream.next_due_ns()
 
     def __len__(self) -> int:
-        """Return the number of waiting packets."""
+        """Return the number of waiting messages."""
         return len(self._queue)
 
     def _purge(self) -> None:

@@ -1,0 +1,78 @@
+"""Radar frames as messages that fall due: the chip's timer under one of the two paces."""
+
+from __future__ import annotations
+
+from emulator.commands import Module
+from emulator.pace import Pace
+from xethru_protocol.codes import SensorMode
+from xethru_protocol.messages import Command, DataFloat, Response
+
+__all__ = ["ChipStream"]
+
+
+class ChipStream:
+    """Frames of a module in MANUAL mode.
+
+    Under `Pace.ASAP` the next frame is always due. Under `Pace.REALTIME` counter k is due at
+    ``scene_time_zero_ns + skew_ns + scene time of k``; a stream that starts late begins with the
+    first counter still ahead, because the chip's counter runs on.
+
+    Parameters
+    ----------
+    module
+        The module whose chip makes the frames.
+    pace
+        Which clock drives it.
+    scene_time_zero_ns
+        Device time of scene time 0, ns.
+    skew_ns
+        How much later than nominal this radar samples, ns.
+    """
+
+    def __init__(
+        self, module: Module, *, pace: Pace, scene_time_zero_ns: int = 0, skew_ns: int = 0
+    ) -> None:
+        self._module = module
+        self._pace = pace
+        self._zero_ns = scene_time_zero_ns + skew_ns
+        self._was_streaming = False
+
+    @property
+    def streaming(self) -> bool:
+        """Whether frames go to the host. Protocol reference 8.3 and 8.4."""
+        module = self._module
+        return module.modes.mode is SensorMode.XTID_SM_MANUAL and module.chip.running
+
+    def next_due_ns(self) -> int | None:
+        """Return when the next frame is due; 0, long past, under `Pace.ASAP`."""
+        if not self.streaming:
+            return None
+        if self._pace is Pace.ASAP:
+            return 0
+        timeline = self._module.chip.timeline
+        return self._zero_ns + timeline.scene_time_ns(timeline.next_counter)
+
+    def take(self) -> Response:
+        """Return the next frame; its counter moves on."""
+        frame = self._module.chip.next_frame()
+        return DataFloat(info=frame.counter, values=frame.values)
+
+    def skip_due_before(self, time_ns: int) -> int:
+        """Let the counter run past every frame due before a time."""
+        if not self.streaming or self._pace is Pace.ASAP:
+            return 0
+        return self._module.chip.timeline.skip_before(time_ns - self._zero_ns)
+
+    def command_done(self, command: Command[Response], now_ns: int) -> None:
+        """Begin with the first frame still ahead when a command started the stream."""
+        del command  # any command may have started or stopped it
+        streaming = self.streaming
+        if streaming and not self._was_streaming:
+            self.skip_due_before(now_ns)
+        self._was_streaming = streaming
+
+    def port_opened(self, now_ns: int) -> None:
+        """Change nothing: a radar does not know who listens."""
+
+    def port_closed(self, now_ns: int) -> None:
+        """Change nothing: the module streams on, and overflows."""

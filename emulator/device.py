@@ -1,0 +1,172 @@
+"""One emulated X4M300 without I/O and without a clock: bytes and times in, bytes out.
+
+`Device` joins the parts: the connection turns bytes into commands, `commands` answers them, a
+`MessageStream` makes messages of its own accord, an `Outbox` holds what waits for the line.
+
+A reset keeps the port: ACK, half a second later the module restarts, is deaf for two seconds,
+then sends BOOTING and READY. Ports that vanish on reset are not emulated here.
+
+Source: protocol reference 8.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from emulator.chip import Chip
+from emulator.chip_stream import ChipStream
+from emulator.commands import Module, answer
+from emulator.echo_source import EchoSource
+from emulator.identity import Identity
+from emulator.outbox import FirmwareOutbox, LosslessOutbox, MessageKind, MessageStream, Outbox
+from emulator.pace import Pace
+from xethru_protocol.codes import SystemCode
+from xethru_protocol.connection import Connection, Role
+from xethru_protocol.messages import Command, Response, System
+from xethru_protocol.packets import NeedData
+
+__all__ = ["BootTiming", "Device", "radar_device"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BootTiming:
+    """How long a restart takes. Protocol reference 8.1.
+
+    Attributes
+    ----------
+    ack_to_reset_ns
+        From the ACK of MOD_RESET to the restart.
+    reset_to_ready_ns
+        From the restart to the moment the transmitter starts and the queued BOOTING and READY
+        leave.
+    """
+
+    ack_to_reset_ns: int = 500_000_000
+    reset_to_ready_ns: int = 2_000_000_000
+
+
+class Device:
+    """A module as its port sees it.
+
+    The owner of the port calls `receive_data` with what arrived, `advance` when the time named
+    by `wake_ns` has come, and `next_packet` whenever the port takes more. Times are monotonic
+    and only compared with each other, so any clock will do.
+
+    Attributes
+    ----------
+    faults_seen
+        Damaged packets received so far; like the firmware, the module does not answer them.
+    """
+
+    # A host that sends commands and never reads is held back here, not in memory.
+    REPLIES_BEFORE_PAUSE = FirmwareOutbox.SLOTS
+
+    def __init__(
+        self, module: Module, stream: MessageStream, outbox: Outbox, *, boot: BootTiming
+    ) -> None:
+        self._module = module
+        self._stream = stream
+        self._outbox = outbox
+        self._boot = boot
+        self._connection = Connection(Role.MODULE)
+        self._reset_ns: int | None = None
+        self._ready_ns: int | None = None
+        self.faults_seen = 0
+
+    @property
+    def module(self) -> Module:
+        """The state behind the port, for inspection."""
+        return self._module
+
+    @property
+    def wants_data(self) -> bool:
+        """Whether more commands should be read now."""
+        return len(self._outbox) <= self.REPLIES_BEFORE_PAUSE
+
+    def receive_data(self, data: bytes, now_ns: int) -> None:
+        """Take bytes from the host and carry out the commands they complete."""
+        self.advance(now_ns)
+        if self._ready_ns is not None:
+            return  # booting: nobody listens yet
+        self._connection.receive_data(data)
+        while not isinstance(event := self._connection.next_event(), NeedData):
+            if isinstance(event, Command):
+                self._carry_out(event, now_ns)
+            else:
+                self.faults_seen += 1
+
+    def _carry_out(self, command: Command[Response], now_ns: int) -> None:
+        self._outbox.put(MessageKind.REPLY, answer(self._module, command), now_ns)
+        if self._module.reset_requested and self._reset_ns is None:
+            self._reset_ns = now_ns + self._boot.ack_to_reset_ns
+        self._stream.command_done(command, now_ns)
+
+    def advance(self, now_ns: int) -> None:
+        """Let time pass: restart when due, and queue the frames that fell due."""
+        if self._reset_ns is not None and now_ns >= self._reset_ns:
+            self._ready_ns = self._reset_ns + self._boot.reset_to_ready_ns
+            self._reset_ns = None
+            self._outbox.clear()
+            self._connection = Connection(Role.MODULE)
+            self._module.power_up()
+        if self._ready_ns is not None and now_ns >= self._ready_ns:
+            self._ready_ns = None
+            for code in (SystemCode.XTS_SPRS_BOOTING, SystemCode.XTS_SPRS_READY):
+                self._outbox.put(MessageKind.REPLY, System(code=code), now_ns)
+        self._outbox.refill_on_time(self._stream, now_ns)
+
+    def next_packet(self, now_ns: int) -> bytes | None:
+        """Return the next packet for the line, complete; None if there is nothing to send now."""
+        self._outbox.refill_on_demand(self._stream, now_ns)
+        message = self._outbox.take(now_ns)
+        return None if message is None else self._connection.send(message)
+
+    def wake_ns(self, now_ns: int) -> int | None:
+        """Return when `advance` (and then `next_packet`) should be called next; None if never.
+
+        What merely waits for the line to take it needs no waking and is not counted.
+        """
+        candidates = (self._reset_ns, self._ready_ns, self._outbox.wake_ns(self._stream, now_ns))
+        return min((time_ns for time_ns in candidates if time_ns is not None), default=None)
+
+    def port_opened(self, now_ns: int) -> None:
+        """Learn that a host opened the port."""
+        self._stream.port_opened(now_ns)
+
+    def port_closed(self, now_ns: int) -> None:
+        """Learn that the last host closed the port."""
+        self._stream.port_closed(now_ns)
+
+
+def radar_device(
+    identity: Identity,
+    source: EchoSource,
+    pace: Pace,
+    *,
+    scene_time_zero_ns: int = 0,
+    skew_ns: int = 0,
+    boot: BootTiming | None = None,
+) -> Device:
+    """Return a stock X4M300 that sees what an echo source synthesises.
+
+    Parameters
+    ----------
+    identity
+        Serial number and version strings.
+    source
+        The world in front of the antennas.
+    pace
+        `Pace.ASAP`: nothing is dropped, frames are made as the line takes them.
+        `Pace.REALTIME`: frames at absolute deadlines, firmware overflow.
+    scene_time_zero_ns
+        Device time of scene time 0 (`Pace.REALTIME`), ns.
+    skew_ns
+        How much later than nominal this radar samples, ns; the source adds the same skew to its
+        scene times.
+    boot
+        Timing of a restart; the documented one if None.
+    """
+    module = Module(identity, Chip(source))
+    stream = ChipStream(module, pace=pace, scene_time_zero_ns=scene_time_zero_ns, skew_ns=skew_ns)
+    outbox = LosslessOutbox() if pace is Pace.ASAP else FirmwareOutbox()
+    return Device(module, stream, outbox, boot=boot or BootTiming())

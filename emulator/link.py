@@ -1,0 +1,109 @@
+"""Pseudo-terminals under stable names: what a host opens instead of ``/dev/ttyACM0``."""
+
+from __future__ import annotations
+
+import os
+import tty
+from pathlib import Path
+from types import TracebackType
+
+__all__ = ["LinkError", "PtyLink"]
+
+LARGEST_READ = 4096  # what the line discipline hands out at once, and a bit
+
+
+class LinkError(Exception):
+    """A port that could not be published; the message names it and the remedy."""
+
+
+class PtyLink:
+    """One pseudo-terminal, published as a symbolic link until closed.
+
+    The slave side is raw from the start, because a client that does not set the line up itself
+    would get its bytes echoed and translated; a slave descriptor kept open preserves that, and
+    spares the master the error state of a terminal nobody has open.
+
+    Parameters
+    ----------
+    path
+        Where the link appears. A link left behind by a killed emulator is replaced.
+
+    Raises
+    ------
+    LinkError
+        When no terminal can be had, or something that is no link is in the way.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self._master_fd, self._slave_fd = os.openpty()
+        except OSError as error:
+            raise LinkError(f"{path}: no pseudo-terminal to be had: {error.strerror}") from error
+        try:
+            tty.setraw(self._slave_fd)
+            os.set_blocking(self._master_fd, False)
+            self.terminal = os.ttyname(self._slave_fd)
+            self._publish()
+        except BaseException:
+            self._close_descriptors()
+            raise
+
+    def fileno(self) -> int:
+        """Return the master's descriptor, for a selector."""
+        return self._master_fd
+
+    def read(self) -> bytes:
+        """Return what the host wrote; ``b""`` when there is nothing."""
+        try:
+            return os.read(self._master_fd, LARGEST_READ)
+        except BlockingIOError:
+            return b""
+
+    def write(self, data: memoryview) -> int:
+        """Write as much as fits; return how much."""
+        try:
+            return os.write(self._master_fd, data)
+        except BlockingIOError:
+            return 0
+
+    def close(self) -> None:
+        """Remove the link, if it is still ours, and give the terminal back."""
+        if self._master_fd < 0:
+            return
+        try:
+            if os.readlink(self.path) == self.terminal:
+                self.path.unlink()
+        except OSError:
+            pass  # somebody removed or replaced the link: then it is not ours to remove
+        self._close_descriptors()
+
+    def __enter__(self) -> PtyLink:
+        """Return the link itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the link."""
+        self.close()
+
+    def _publish(self) -> None:
+        if os.path.lexists(self.path) and not self.path.is_symlink():
+            raise LinkError(f"{self.path}: exists and is no link; remove it or use --link-dir")
+        fresh = self.path.with_name(f".{self.path.name}.{os.getpid()}")
+        try:
+            fresh.unlink(missing_ok=True)
+            fresh.symlink_to(self.terminal)
+            fresh.replace(self.path)  # atomic: a host sees the old terminal or the new one
+        except OSError as error:
+            fresh.unlink(missing_ok=True)
+            raise LinkError(f"{self.path}: cannot publish the port: {error.strerror}") from error
+
+    def _close_descriptors(self) -> None:
+        os.close(self._master_fd)
+        os.close(self._slave_fd)
+        self._master_fd = self._slave_fd = -1

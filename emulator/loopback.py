@@ -1,0 +1,88 @@
+"""A host's transport that ends in an emulated device of the same process: no port, no waiting.
+
+Time is virtual: it stands still while messages flow and jumps to the device's next deadline
+when a host waits for one, so a reset of 2.5 s takes none. Give the driver the transport's own
+clock, ``X4M300(transport, clock=transport.clock_ns)``, and its time limits are virtual too.
+"""
+
+from __future__ import annotations
+
+from emulator.device import Device
+from xethru_protocol.errors import Disconnected
+
+__all__ = ["LoopbackTransport"]
+
+NS_PER_S = 1_000_000_000
+
+
+class LoopbackTransport:
+    """An `xethru_protocol.transport.Transport` wired straight to a device.
+
+    Every read returns at most one packet, which the device makes at that moment: nothing is in
+    flight between device and host.
+
+    Parameters
+    ----------
+    device
+        The module at the other end; under `Pace.ASAP` reads never wait.
+    name
+        What errors and logs call this port.
+    """
+
+    def __init__(self, device: Device, name: str = "loopback") -> None:
+        self._device = device
+        self._name = name
+        self._now_ns = 0
+        self._open = True
+        device.port_opened(self._now_ns)
+
+    @property
+    def name(self) -> str:
+        """Name of the port."""
+        return self._name
+
+    def clock_ns(self) -> int:
+        """Return the virtual time, ns since the transport was made."""
+        return self._now_ns
+
+    def read(self, timeout_s: float) -> bytes:
+        """Return the next packet, or ``b""`` once the timeout has passed in virtual time.
+
+        Raises
+        ------
+        Disconnected
+            After `close`.
+        """
+        self._check_open()
+        deadline_ns = self._now_ns + max(round(timeout_s * NS_PER_S), 0)
+        while True:
+            self._device.advance(self._now_ns)
+            packet = self._device.next_packet(self._now_ns)
+            if packet is not None:
+                return packet
+            wake_ns = self._device.wake_ns(self._now_ns)
+            if wake_ns is None or wake_ns > deadline_ns:
+                self._now_ns = deadline_ns
+                return b""
+            self._now_ns = max(wake_ns, self._now_ns)
+
+    def write(self, data: bytes) -> None:
+        """Hand bytes to the device.
+
+        Raises
+        ------
+        Disconnected
+            After `close`.
+        """
+        self._check_open()
+        self._device.receive_data(data, self._now_ns)
+
+    def close(self) -> None:
+        """Close the port; closing twice does nothing."""
+        if self._open:
+            self._open = False
+            self._device.port_closed(self._now_ns)
+
+    def _check_open(self) -> None:
+        if not self._open:
+            raise Disconnected(f"{self._name}: the port is closed")

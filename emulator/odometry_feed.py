@@ -1,0 +1,199 @@
+"""The robot's wheel odometry on a unix socket, as TUM lines beside the radars' ports.
+
+Every client gets all lines from the first one. Under `Pace.ASAP` they come at once; under
+`Pace.REALTIME` each when its stamp is due. After the last line the socket is closed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import selectors
+import socket
+import stat
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from emulator.link import LinkError
+from emulator.pace import Pace
+
+__all__ = ["OdometryFeed"]
+
+NS_PER_S = 1_000_000_000
+MOST_CLIENTS = 64
+SEND_SIZE = 65536
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class _Client:
+    connection: socket.socket
+    next_line: int = 0
+    unsent: bytes = b""
+    blocked: bool = False
+    watched: int = field(default=0)
+
+
+class OdometryFeed:
+    """A listening unix socket that plays the odometry to each client.
+
+    Parameters
+    ----------
+    path
+        Where the socket appears; one left behind by a killed emulator is replaced.
+    lines
+        TUM lines without line ends, in time order; the stamp is exact decimal seconds.
+    pace
+        When each line may be sent.
+    scene_time_zero_ns
+        Device time of scene time 0, ns.
+
+    Raises
+    ------
+    LinkError
+        When the socket cannot be made.
+    """
+
+    def __init__(
+        self, path: Path, lines: Sequence[str], pace: Pace, *, scene_time_zero_ns: int = 0
+    ) -> None:
+        self.path = path
+        self._lines = [f"{line}\n".encode() for line in lines]
+        realtime = pace is Pace.REALTIME
+        self._due_ns = [scene_time_zero_ns + stamp_ns(line) if realtime else 0 for line in lines]
+        self._clients: list[_Client] = []
+        self._selector: selectors.BaseSelector | None = None
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            _remove_stale_socket(path)
+            self._listener.bind(os.fspath(path))
+            self._listener.listen()
+            self._listener.setblocking(False)
+        except OSError as error:
+            self._listener.close()
+            reason = error.strerror or str(error)
+            raise LinkError(f"{path}: cannot offer the odometry socket: {reason}") from error
+
+    def register(self, selector: selectors.BaseSelector) -> None:
+        """Register with the loop."""
+        self._selector = selector
+        selector.register(self._listener, selectors.EVENT_READ, self._accept)
+
+    def advance(self, now_ns: int) -> None:
+        """Send what fell due."""
+        for client in list(self._clients):
+            self._serve(client, now_ns)
+
+    def wake_ns(self, now_ns: int) -> int | None:
+        """Return when the next line falls due for a client that waits for it."""
+        del now_ns
+        return min(
+            (
+                self._due_ns[client.next_line]
+                for client in self._clients
+                if not client.blocked and client.next_line < len(self._lines)
+            ),
+            default=None,
+        )
+
+    def close(self) -> None:
+        """Close everything and remove the socket."""
+        for client in list(self._clients):
+            self._drop(client)
+        with contextlib.suppress(OSError):
+            self.path.unlink()
+        self._listener.close()
+
+    def _accept(self, events: int, now_ns: int) -> None:
+        del events
+        try:
+            connection, _ = self._listener.accept()
+        except OSError:
+            return  # the client gave up between the event and now, or we are out of descriptors
+        connection.setblocking(False)
+        if len(self._clients) >= MOST_CLIENTS:
+            connection.close()
+            return
+        client = _Client(connection=connection)
+        self._clients.append(client)
+        self._serve(client, now_ns)
+
+    def _serve(self, client: _Client, now_ns: int) -> None:
+        while not client.blocked:
+            if not client.unsent:
+                last = client.next_line
+                size = 0
+                while last < len(self._lines) and self._due_ns[last] <= now_ns and size < SEND_SIZE:
+                    size += len(self._lines[last])
+                    last += 1
+                client.unsent = b"".join(self._lines[client.next_line : last])
+                client.next_line = last
+            if not client.unsent:
+                break
+            try:
+                client.unsent = client.unsent[client.connection.send(client.unsent) :]
+            except BlockingIOError:
+                client.blocked = True
+            except OSError:
+                self._drop(client)  # the client is gone
+                return
+        if not client.unsent and client.next_line == len(self._lines):
+            self._drop(client)
+            return
+        self._watch(client)
+
+    def _watch(self, client: _Client) -> None:
+        """Wait for room when blocked, and always for the client to hang up."""
+        wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.blocked else 0)
+        if self._selector is None or client.watched == wanted:
+            return
+
+        def ready(events: int, now_ns: int) -> None:
+            if events & selectors.EVENT_READ and not _still_there(client.connection):
+                self._drop(client)
+                return
+            client.blocked = client.blocked and not events & selectors.EVENT_WRITE
+            self._serve(client, now_ns)
+
+        if client.watched:
+            self._selector.modify(client.connection, wanted, ready)
+        else:
+            self._selector.register(client.connection, wanted, ready)
+        client.watched = wanted
+
+    def _drop(self, client: _Client) -> None:
+        if client.watched and self._selector is not None:
+            self._selector.unregister(client.connection)
+        client.connection.close()
+        self._clients.remove(client)
+
+
+def stamp_ns(line: str) -> int:
+    """Return the stamp of a TUM line in ns, exactly.
+
+    Examples
+    --------
+    >>> stamp_ns("12.345678901 0 0 0 0 0 0 1")
+    12345678901
+    """
+    seconds, _, fraction = line.split(" ", 1)[0].partition(".")
+    return int(seconds) * NS_PER_S + int(fraction.ljust(9, "0")[:9] or 0)
+
+
+def _still_there(connection: socket.socket) -> bool:
+    """Read and forget what a client says; return False once it has hung up."""
+    try:
+        return bool(connection.recv(4096))
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+
+
+def _remove_stale_socket(path: Path) -> None:
+    try:
+        is_socket = stat.S_ISSOCK(path.lstat().st_mode)
+    except FileNotFoundError:
+        return
+    if is_socket:
+        path.unlink()

@@ -1,0 +1,101 @@
+"""Who opens and closes a pseudo-terminal, told by inotify (Linux only).
+
+The emulator keeps every terminal's slave side open, which hides a host's hang-up from the master
+side; the kernel's file events bring it back. Where inotify is missing, no event ever comes.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import selectors
+import struct
+from collections.abc import Callable
+
+__all__ = ["PortWatch"]
+
+_IN_CLOSE_WRITE = 0x08
+_IN_CLOSE_NOWRITE = 0x10
+_IN_OPEN = 0x20
+_IN_NONBLOCK = os.O_NONBLOCK
+_EVENT = struct.Struct("iIII")  # watch, mask, cookie, length of a name (none for a device)
+
+
+class PortWatch:
+    """Calls back when the first host opens a terminal and when the last one closes it.
+
+    Identical events that follow each other at once are merged by the kernel, so the count of two
+    hosts on one port may be off by one; it never falls below zero.
+
+    Parameters
+    ----------
+    terminal
+        Path of the slave side.
+    opened, closed
+        Called with the loop's time, ns.
+    """
+
+    def __init__(
+        self, terminal: str, *, opened: Callable[[int], None], closed: Callable[[int], None]
+    ) -> None:
+        self._opened = opened
+        self._closed = closed
+        self._hosts = 0
+        self._fd = _watch(terminal)
+
+    @property
+    def works(self) -> bool:
+        """Whether this system tells who opens a port."""
+        return self._fd >= 0
+
+    def register(self, selector: selectors.BaseSelector) -> None:
+        """Register with the loop."""
+        if self.works:
+            selector.register(self._fd, selectors.EVENT_READ, self._read)
+
+    def advance(self, now_ns: int) -> None:
+        """Do nothing: only events matter."""
+
+    def wake_ns(self, now_ns: int) -> int | None:
+        """Return None: only events matter."""
+
+    def close(self) -> None:
+        """Stop watching."""
+        if self.works:
+            os.close(self._fd)
+            self._fd = -1
+
+    def _read(self, events: int, now_ns: int) -> None:
+        del events
+        try:
+            data = os.read(self._fd, 64 * _EVENT.size)
+        except BlockingIOError:
+            return
+        for _, mask, _, _ in _EVENT.iter_unpack(data):
+            self._count(mask, now_ns)
+
+    def _count(self, mask: int, now_ns: int) -> None:
+        if mask & _IN_OPEN:
+            self._hosts += 1
+            if self._hosts == 1:
+                self._opened(now_ns)
+        elif mask & (_IN_CLOSE_WRITE | _IN_CLOSE_NOWRITE) and self._hosts:
+            self._hosts -= 1
+            if not self._hosts:
+                self._closed(now_ns)
+
+
+def _watch(terminal: str) -> int:
+    """Return an inotify descriptor that watches one path; -1 where that is not possible."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    try:
+        start, add = libc.inotify_init1, libc.inotify_add_watch
+    except AttributeError:
+        return -1  # not Linux
+    descriptor = int(start(_IN_NONBLOCK | os.O_CLOEXEC))
+    if descriptor < 0:
+        return -1
+    if add(descriptor, terminal.encode(), _IN_OPEN | _IN_CLOSE_WRITE | _IN_CLOSE_NOWRITE) < 0:
+        os.close(descriptor)
+        return -1
+    return descriptor
