@@ -28,7 +28,7 @@ class ProtocolError(XeThruError):
 
 
 class LocalProtocolError(ProtocolError):
-    """This side tried to send what the protocol cannot express."""
+    """We tried to send what the protocol cannot express."""
 
 
 class RemoteProtocolError(ProtocolError):

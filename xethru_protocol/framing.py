@@ -1,0 +1,358 @@
+"""The receiver: finds packets in any bytes (Protocol reference 1.4 with its rescan rule).
+
+What it guarantees, for any bytes in any chunks:
+
+- The packets and faults depend on the bytes only, not on how they were cut into chunks.
+- It never raises, and once it asks for data it holds less than one packet (65 544 bytes).
+- Starts are tried in the order of their position and the first that holds wins. So an intact
+  packet is found unless an earlier start makes a valid packet out of its bytes: a Normal packet
+  whose checksum happens to fit (1 in 256 for random bytes) or a NoEscape header that happens to
+  be consistent. Junk without a start cannot hide anything; a stray 7D delays what follows until
+  it is refuted, by the next unescaped 7D or 7E or at the longest possible packet.
+- Every byte is searched and parsed a bounded number of times, also in input made to hurt.
+
+The last point rests on one fact. Let a Normal packet started at s be parsed up to its
+terminator t. A 7D between the two was not a terminator, so it was escaped, so the parse is in
+the same state behind it as a parse started *at* it. Therefore all starts between s and t share
+the terminator t, and their contents are suffixes of the first's: one scan serves them all.
+"""
+
+import re
+import struct
+from collections import deque
+from typing import Final
+
+from xethru_protocol.packets import (
+    END,
+    ESCAPE,
+    MAX_NORMAL_BYTES,
+    NEED_DATA,
+    NO_ESCAPE_HEADER_BYTES,
+    NO_ESCAPE_START,
+    START,
+    FaultKind,
+    Framing,
+    FramingFault,
+    NeedData,
+    Packet,
+    encode_no_escape,
+    encode_normal,
+    unescape,
+    xor,
+)
+from xethru_protocol.plausibility import FROM_MODULE, HEAD_BYTES, MAX_LENGTH, plausible
+
+__all__ = [
+    "NEED_DATA",
+    "FaultKind",
+    "Framing",
+    "FramingFault",
+    "NeedData",
+    "Packet",
+    "PacketReader",
+    "Span",
+    "encode_no_escape",
+    "encode_normal",
+]
+
+Span = tuple[Framing, bytes, int, int, int]
+"""Framing, buffer, payload start and end in it, offset of the packet in the stream."""
+
+MAX_NORMAL_WIRE_BYTES: Final = 2 * MAX_NORMAL_BYTES + 2  # all escaped, with start and end
+
+_LENGTH = struct.Struct("<I")
+# Magic and length, then code, type and element count of a DATA FLOAT.
+_FRAME_HEADER = struct.Struct("<4sIxBB8xI")
+_ESCAPED = re.compile(rb"\x7f(.)", re.DOTALL)
+_RUN_OF_7C = re.compile(rb"\x7c{9,}")
+_NEVER: Final = 1 << 62  # a stream offset that is not reached
+
+
+class _Finder:
+    """Where a pattern comes next, remembering what was searched: no byte is searched twice."""
+
+    __slots__ = ("_found", "_pattern", "_searched")
+
+    def __init__(self, pattern: bytes) -> None:
+        self._pattern = pattern
+        self._found = -1
+        self._searched = 0
+
+    def next(self, buffer: bytes, base: int, here: int) -> int:
+        """Stream offset of the first pattern at or after ``here``; _NEVER if not in the buffer."""
+        if here <= self._found < _NEVER:
+            return self._found
+        begin = max(here, self._searched)
+        at = buffer.find(self._pattern, begin - base)
+        if at >= 0:
+            self._found = self._searched = base + at
+        else:
+            self._found = _NEVER
+            self._searched = max(begin, base + len(buffer) - len(self._pattern) + 1)
+        return self._found
+
+
+class PacketReader:
+    """Finds packets in received bytes: ``receive_data``, then ``next_packet`` until NEED_DATA.
+
+    Parameters
+    ----------
+    known_codes
+        First payload bytes that a NoEscape packet may have in this direction.
+
+    >>> reader = PacketReader()
+    >>> reader.receive_data(bytes.fromhex("7D 10 6D 7E"))
+    >>> reader.next_packet().payload.hex(), reader.next_packet()
+    ('10', <NeedData.NEED_DATA: 'need data'>)
+    """
+
+    def __init__(self, known_codes: frozenset[int] = FROM_MODULE) -> None:
+        self._known = known_codes
+        self._buffer = b""  # what is being parsed, from _pos on; never changed in place
+        self._pos = 0
+        self._base = 0  # stream offset of _buffer[0]; all other positions are stream offsets
+        self._queue: deque[bytes] = deque()  # received and not in the buffer yet
+        self._taken = 0  # bytes of the queue's first chunk that were moved to the buffer
+        self._queued = 0
+        self._missing = 1  # bytes without which parsing cannot go on
+        self._wanted = 1  # bytes worth joining to the buffer at once
+        self._damage_end = -1  # end of the bytes a fault was reported for; -1: none since a packet
+        self._starts = _Finder(b"\x7d")
+        self._bulk_starts = _Finder(NO_ESCAPE_START)
+        self._scan_from = -1  # Normal start whose terminator was looked for
+        self._scan_at = -1  # how far; every special byte in between is escaped
+        self._terminator = -1  # where it was found, else -1
+        self._next_end = -1  # next 7E at or after _scan_at, once looked up
+        self._good_starts: frozenset[int] = frozenset()  # whose checksum fits ...
+        self._good_for = -1  # ... at this terminator
+
+    def receive_data(self, data: bytes) -> None:
+        """Take bytes as they come from the port, in chunks of any size.
+
+        A ``bytes`` object is kept as it is, without a copy.
+        """
+        if data:
+            self._queue.append(bytes(data))
+            self._queued += len(data)
+
+    @property
+    def buffered(self) -> int:
+        """Bytes received that are not yet part of a reported packet or fault."""
+        return len(self._buffer) - self._pos + self._queued
+
+    def next_packet(self) -> Packet | FramingFault | NeedData:
+        """Next packet or fault, or NEED_DATA."""
+        span = self.next_span()
+        if isinstance(span, tuple):
+            framing, buffer, start, end, offset = span
+            return Packet(framing=framing, payload=buffer[start:end], offset=offset)
+        return span
+
+    def next_span(self) -> Span | FramingFault | NeedData:
+        """Like ``next_packet``, but tells where the payload lies instead of copying it."""
+        while True:
+            buffer, pos = self._buffer, self._pos
+            if len(buffer) - pos >= 23:
+                # The way of nearly every byte: a whole, consistent DATA FLOAT. It accepts
+                # nothing that _no_escape() would not.
+                magic, length, code, kind, count = _FRAME_HEADER.unpack_from(buffer, pos)
+                end = pos + 9 + length
+                if (
+                    magic == NO_ESCAPE_START
+                    and length == 14 + 4 * count
+                    and code == 0xA0
+                    and kind == 0x12
+                    and end <= len(buffer)
+                    and length <= MAX_LENGTH
+                ):
+                    self._pos = end
+                    self._damage_end = -1
+                    return Framing.NO_ESCAPE, buffer, pos + 9, end, self._base + pos
+            found = self._parse()
+            if found is not NEED_DATA:
+                return found
+            if not self._refill():
+                return NEED_DATA
+
+    def _parse(self) -> Span | FramingFault | NeedData:
+        """Next packet or fault in the buffer; NEED_DATA if ``_missing`` more bytes are needed."""
+        while True:
+            here = self._base + self._pos
+            limit = self._base + len(self._buffer)
+            start = self._starts.next(self._buffer, self._base, here)
+            bulk = self._bulk_starts.next(self._buffer, self._base, here)
+            first = min(start, bulk)
+            junk_end = first if first < _NEVER else limit - self._trailing_7c()
+            if junk_end > here:
+                self._pos = junk_end - self._base
+                clean = self._damage_end < 0
+                self._damage_end = max(self._damage_end, junk_end)
+                if clean:
+                    return FramingFault(kind=FaultKind.GARBAGE, offset=here)
+            if first == _NEVER:
+                return self._need(1, HEAD_BYTES)
+            found = self._normal(first) if first == start else self._no_escape(first)
+            if found is not None:
+                return found
+
+    def _trailing_7c(self) -> int:
+        """7Cs at the end of a buffer without a start, which may become one (at most 3)."""
+        tail = self._buffer[max(self._pos, len(self._buffer) - 3) :]
+        return len(tail) - len(tail.rstrip(b"\x7c"))
+
+    def _reject(self, kind: FaultKind, first: int, covered_end: int) -> FramingFault | None:
+        """Give up a start and go on behind it; a fault unless these bytes had theirs."""
+        self._pos = first + 1 - self._base
+        reported = first < self._damage_end
+        self._damage_end = max(self._damage_end, covered_end)
+        return None if reported else FramingFault(kind=kind, offset=first)
+
+    def _no_escape(self, first: int) -> Span | FramingFault | NeedData | None:
+        """Judge the NoEscape packet at ``first``; None if it was rejected without a report."""
+        at = first - self._base
+        have = len(self._buffer) - at
+        if have < NO_ESCAPE_HEADER_BYTES:
+            return self._need(NO_ESCAPE_HEADER_BYTES - have)
+        (length,) = _LENGTH.unpack_from(self._buffer, at + 4)
+        begin = at + NO_ESCAPE_HEADER_BYTES
+        if 1 <= length <= MAX_LENGTH:
+            head = min(length, HEAD_BYTES)
+            if have < NO_ESCAPE_HEADER_BYTES + head:
+                return self._need(NO_ESCAPE_HEADER_BYTES + head - have)
+            if plausible(length, self._buffer[begin : begin + head], self._known):
+                if have < NO_ESCAPE_HEADER_BYTES + length:
+                    return self._need(NO_ESCAPE_HEADER_BYTES + length - have)
+                self._pos = begin + length
+                self._damage_end = -1
+                return Framing.NO_ESCAPE, self._buffer, begin, begin + length, first
+        fault = self._reject(FaultKind.HEADER, first, first + len(NO_ESCAPE_START))
+        run = _RUN_OF_7C.match(self._buffer, at)
+        if run:  # a start whose length would be 7C7C7C7C: all but the last 7 of the run
+            self._pos = run.end() - 7
+            last_rejected = self._base + self._pos - 1
+            self._damage_end = max(self._damage_end, last_rejected + len(NO_ESCAPE_START))
+        return fault
+
+    def _normal(self, first: int) -> Span | FramingFault | NeedData | None:
+        """Judge the Normal packet at ``first``; None if it was rejected without a report."""
+        self._scan(first)
+        end = self._terminator
+        if (end if end >= 0 else self._scan_at) - first > MAX_NORMAL_WIRE_BYTES:
+            return self._reject(FaultKind.OVERSIZE, first, first + MAX_NORMAL_WIRE_BYTES)
+        if end < 0:
+            return self._need(1, len(self._buffer) - self._pos)
+        at, stop = first - self._base, end - self._base
+        if self._buffer[stop] == START:
+            if end == first + 1:  # doubled start: nothing is lost
+                self._pos = at + 1
+                return None
+            return self._reject(FaultKind.TRUNCATED, first, end)
+        if first == self._scan_from:
+            content = unescape(self._buffer[at + 1 : stop])
+            good = xor(content) == START
+        else:
+            if self._good_for != end:
+                self._good_starts = _good_starts(self._buffer[at:stop], first)
+                self._good_for = end
+            good = first in self._good_starts
+            content = unescape(self._buffer[at + 1 : stop]) if good else b""
+        if good and len(content) > MAX_NORMAL_BYTES:
+            return self._reject(FaultKind.OVERSIZE, first, first + MAX_NORMAL_WIRE_BYTES)
+        if good and len(content) > 1:
+            self._pos = stop + 1
+            self._damage_end = -1
+            return Framing.NORMAL, content, 0, len(content) - 1, first
+        kind = FaultKind.EMPTY if good or not content else FaultKind.CHECKSUM
+        return self._reject(kind, first, end + 1)
+
+    def _scan(self, first: int) -> None:
+        """Find the terminator of the Normal start ``first``: the next 7D or 7E not escaped."""
+        known_to = self._terminator if self._terminator >= 0 else self._scan_at
+        if not self._scan_from <= first < known_to:
+            self._scan_from, self._scan_at = first, first + 1
+            self._terminator = self._next_end = -1
+        if self._terminator >= 0:
+            return
+        buffer, base = self._buffer, self._base
+        at, end = self._scan_at - base, self._next_end - base
+        floor = max(self._scan_from + 1 - base, 0)
+        limit = base + len(buffer)
+        while True:
+            if end < at:
+                end = buffer.find(END, at)
+                if end < 0:
+                    end = len(buffer)
+            special = buffer.find(START, at, end)
+            if special < 0:
+                special = end
+            if special == len(buffer):
+                self._scan_at, self._next_end = limit, -1
+                return
+            if buffer[special - 1] != ESCAPE or special == floor:
+                break
+            before = special - 1
+            while before >= floor and buffer[before] == ESCAPE:
+                before -= 1
+            if (special - before) & 1:  # an even number of escape bytes: they escape each other
+                break
+            at = special + 1
+        self._scan_at = self._terminator = base + special
+        self._next_end = base + end
+
+    def _need(self, missing: int, wanted: int = 0) -> NeedData:
+        self._missing = missing
+        self._wanted = max(missing, wanted)
+        return NEED_DATA
+
+    def _refill(self) -> bool:
+        """Make the buffer longer by what was asked for; False if that has not arrived.
+
+        Only a packet that straddles two chunks is joined; the rest of the second chunk is
+        parsed where it is.
+        """
+        if self._queued < self._missing:
+            return False
+        self._base += self._pos
+        if self._pos == len(self._buffer):
+            self._buffer = self._queue.popleft()
+            self._pos, self._taken = self._taken, 0
+            self._base -= self._pos
+            self._queued -= len(self._buffer) - self._pos
+            return True
+        parts = [memoryview(self._buffer)[self._pos :]]
+        wanted = min(self._wanted, self._queued)
+        self._queued -= wanted
+        while wanted:
+            part = memoryview(self._queue[0])[self._taken : self._taken + wanted]
+            parts.append(part)
+            wanted -= len(part)
+            self._taken += len(part)
+            if self._taken == len(self._queue[0]):
+                self._queue.popleft()
+                self._taken = 0
+        self._buffer = b"".join(parts)
+        self._pos = 0
+        return True
+
+
+def _good_starts(packet: bytes, offset: int) -> frozenset[int]:
+    """Starts in a refuted Normal packet, itself included, from which the checksum fits.
+
+    ``packet`` lies at ``offset`` in the stream, without its terminator. One pass from the back
+    over its escaped bytes, since the content behind each is a suffix of the whole.
+    """
+    good = []
+    checksum, count, end = 0, 0, len(packet)
+    for escaped in reversed(list(_ESCAPED.finditer(packet, 1))):
+        tail = packet[escaped.end() : end]
+        checksum ^= xor(tail)
+        count += len(tail)
+        end = escaped.start()
+        if packet[end + 1] == START and checksum == START and count > 1:
+            good.append(offset + end + 1)
+        checksum ^= packet[end + 1]
+        count += 1
+    tail = packet[1:end]
+    if checksum ^ xor(tail) == START and count + len(tail) > 1:
+        good.append(offset)
+    return frozenset(good)

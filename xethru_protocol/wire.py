@@ -1,0 +1,299 @@
+"""Kinds of wire fields: what ``Annotated[type, KIND]`` in a message may say.
+
+A kind knows how one field is packed, unpacked and shown. The codec walks a message's fields in
+order; the layouts themselves stand in ``messages``. All numbers are little-endian, unpadded
+(Protocol reference, head). A kind raises ``struct.error`` or ``ValueError`` when the bytes do
+not fit; the codec turns that into `UnknownMessage`.
+"""
+# ruff: noqa: ANN401 - a kind handles whatever type its field has
+
+import struct
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+FLOAT32 = np.dtype("<f4")
+Fields = Mapping[str, Any]  # the fields before this one, by name
+
+
+class Kind(Protocol):
+    """One way to put a field on the wire."""
+
+    def pack(self, value: Any, before: Fields, bulk: bool) -> bytes:
+        """Bytes of ``value``; ``bulk`` says that the packet travels in NoEscape framing."""
+
+    def unpack(self, data: bytes, start: int, before: Fields) -> tuple[Any, int]:
+        """Value at ``start`` and the offset behind it."""
+
+    def show(self, name: str, value: Any, before: Fields) -> dict[str, Any]:
+        """JSON-able entries of a dump."""
+
+
+def _plain(value: Any) -> Any:
+    return value
+
+
+def hexadecimal(value: int) -> str:
+    """Show an id as eight hexadecimal digits."""
+    return f"0x{value:08X}"
+
+
+def short_hexadecimal(value: int) -> str:
+    """Show an id without leading zeros."""
+    return f"0x{value:X}"
+
+
+def hex_bytes(value: bytes) -> str:
+    """Show bytes as spaced upper-case hexadecimal."""
+    return value.hex(" ").upper()
+
+
+@dataclass(frozen=True, slots=True)
+class Number:
+    """One scalar: a ``struct`` code, and how a dump shows it."""
+
+    code: str
+    label: str = ""
+    shown: Callable[[Any], Any] = _plain
+
+    def pack(self, value: Any, before: Fields, bulk: bool) -> bytes:
+        """Pack the scalar."""
+        return struct.pack("<" + self.code, value)
+
+    def unpack(self, data: bytes, start: int, before: Fields) -> tuple[Any, int]:
+        """Unpack the scalar."""
+        (value,) = struct.unpack_from("<" + self.code, data, start)
+        return value, start + struct.calcsize("<" + self.code)
+
+    def show(self, name: str, value: Any, before: Fields) -> dict[str, Any]:
+        """Show it under its label, as the golden vectors name it."""
+        return {self.label or name: self.shown(value)}
+
+
+U8 = Number("B")
+U32 = Number("I")
+F32 = Number("f")
+ID32 = Number("I", shown=hexadecimal)
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """A u32 that must be a member of ``enum``; shown by its name."""
+
+    enum: Callable[[int], Any]
+    label: str
+
+    def pack(self, value: Any, before: Fields, bulk: bool) -> bytes:
+        """Pack the number behind the member."""
+        return struct.pack("<I", value)
+
+    def unpack(self, data: bytes, start: int, before: Fields) -> tuple[Any, int]:
+        """Unpack the member; ``ValueError`` if the number is none."""
+        (value,) = struct.unpack_from("<I", data, start)
+        return self.enum(value), start + 4
+
+    def show(self, name: str, value: Any, before: Fields) -> dict[str, Any]:
+        """Show the member's name."""
+        return {self.label: value.name}
+
+
+@dataclass(frozen=True, slots=True)
+class OptionalByte:
+    """A trailing u8 that may be absent (None)."""
+
+    wanted: Callable[[Fields], bool] = lambda before: True
+    required: bool = False
+    shown_if_absent: bool = False
+
+    def pack(self, value: Any, before: Fields, bulk: bool) -> bytes:
+        """Pack the byte, or nothing."""
+        return b"" if value is None else bytes((value,))
+
+    def unpack(self, data: bytes, start: int, before: Fields) -> tuple[Any, int]:
+        """Unpack the byte where this message has one."""
+        if not self.wanted(before):
+            return None, start
+        if start < len(data):
+            return data[start], start + 1
+        if self.required:
+            raise ValueError("the address is missing")
+        return None, start
+
+    def show(self, name: str, value: Any, before: Fields) -> dict[str, Any]:
+        """Show the byte; an absent one only where the vectors list it as null."""
+        return {} if value is None and not self.shown_if_absent else {name: value}
+
+
+@dataclass(frozen=True, slots=True)
+class ByDiscriminator:
+    """A value whose struct layout depends on an earlier field.
+
+    ``layouts[id]`` is ``(codes, names)``: one scalar, or a tuple of several. ``short`` lists
+    ids whose single value may also travel in one byte; which form was used is kept in the
+    field ``width_field`` (None: the normal form), so that a decoded message encodes to the
+    bytes it came from.
+    """
+
+    field: str
+    layouts: Mapping[int, tuple[str, tuple[str, ...]]]
+    short: frozenset[int]
+    width_field: str
+
+    def pack(self, value: Any, before: Fields, bulk: bool) -> bytes:
+        """Pack in the layout of the discriminator."""
+        key = before[self.field]
+        if key not in self.layouts:
+            raise ValueError(f"{key.name} cannot be set")
+        codes, names = self.layouts[key]
+        if before[self.width_field] == 1 and key in self.short:
+            codes = "B"
+        return struct.pack("<" + codes, *(value if len(names) > 1 else (value,)))
+
+    def unpack(self, data: bytes, start: int, before: Fields) -> tuple[Any, int]:
+        """Unpack in the layout of the discriminator."""
+        codes, names = self.layouts[before[self.field]]
+        if before[self.width_field] == 1:
+            codes = "B"
+        values = struct.unpack_from("<" + codes, data, start)
+        return (values if len(names) > 1 else values[0]), start + struct.calcsize("<" + codes)
+
+    def show(self, name: str, value: Any, before: Fields) -> dict[str, Any]:
+        """Show each scalar under its own name."""
+        names = self.layouts[before[self.field]][1]
+        return dict(zip(names, value if len(names) > 1 else (value,), strict=True))
+
+
+@dataclass(frozen=True, slots=True)
+class ShortForm:
+    """Pseudo field, no bytes: 1 if the value that follows travels in one byte, else None."""
+
+    field: str
+    short: frozenset[int]
+
+    def pack(self, value: Any, before: Fields, bulk: bool) -> bytes:
+        """Nothing."""
+        if value not in (None, 1):
+            raise ValueError("a value is one byte wide or as the firmware parses it (None)")
+        return b""
+
+    def unpack(self, data: bytes, start: int, before: Fields) -> tuple[Any, int]:
+        """Tell the form by the bytes that are left."""
+        return (1 if before[self.field] in self.short and len(data) - start == 1 else None), start
+
+    def show(self, name: str, value: Any, before: Fields) -> dict[str, Any]:
+        """Nothing: the value itself is shown."""
+        return {}
+
+
+@dataclass(frozen=True, slots=True)
+class Elements:
+    """Element list of REPLY and DATA: ``[u32 count] elements [trailer]``.
+
+    The count is absent when it is 0, except in NoEscape framing. REPLYs other than INT end with
+    a trailer byte; it is optional on receipt (Protocol reference 5.2, 6).
+    """
+
+    code: str  # struct code of one element; "a" float32 array, "s" text, "c" raw bytes
+    size: int
+    label: str
+    trailer: int | None = None
+    count_label: str = ""  # the name under which a dump shows the count
+    trailer_shown: bool = False
+
+    def pack(self, value: Any, before: Fields, bulk: bool) -> bytes:
+        """Pack count, elements and trailer."""
+        body = self._bytes(value)
+        count = b"" if not body and not bulk else struct.pack("<I", len(body) // self.size)
+        return count + body + (b"" if self.trailer is None else bytes((self.trailer,)))
+
+    def unpack(self, data: bytes, start: int, before: Fields) -> tuple[Any, int]:
+        """Unpack the elements; a missing count or trailer is accepted."""
+        rest = len(data) - start
+        if rest <= (0 if self.trailer is None else 1):
+            return self._value(b""), len(data)
+        (count,) = struct.unpack_from("<I", data, start)
+        begin = start + 4
+        end = begin + count * self.size
+        if end > len(data):
+            raise ValueError(f"{count} elements announced, fewer present")
+        return self._value(data[begin:end]), end
+
+    def show(self, name: str, value: Any, before: Fields) -> dict[str, Any]:
+        """Show count, elements and trailer as the golden vectors do."""
+        shown: dict[str, Any] = {}
+        if self.count_label:
+            shown[self.count_label] = len(self._bytes(value)) // self.size
+        if isinstance(value, bytes):
+            shown[self.label] = list(value) if self.trailer_shown else hex_bytes(value)
+        elif isinstance(value, str):
+            shown[self.label] = value
+        else:
+            shown[self.label] = [item.item() if hasattr(item, "item") else item for item in value]
+        if self.trailer_shown:
+            shown["trailer"] = self.trailer
+        return shown
+
+    def _bytes(self, value: Any) -> bytes:
+        if self.code == "a":
+            return np.ascontiguousarray(value, dtype=FLOAT32).tobytes()
+        if self.code == "s":
+            return str(value).encode("latin-1")
+        if self.code == "c":
+            return bytes(value)
+        return struct.pack(f"<{len(value)}{self.code}", *value)
+
+    def _value(self, body: bytes) -> Any:
+        if self.code == "a":
+            return np.frombuffer(body, dtype=FLOAT32)
+        if self.code == "s":
+            return body.decode("latin-1")  # every byte is a character: no wire text can fail
+        if self.code == "c":
+            return body
+        return struct.unpack(f"<{len(body) // self.size}{self.code}", body)
+
+
+@dataclass(frozen=True, slots=True)
+class Bins:
+    """A float32 array with one value per bin; the bin count is the field ``count_field``."""
+
+    count_field: str
+
+    def pack(self, value: Any, before: Fields, bulk: bool) -> bytes:
+        """Pack the array."""
+        array: npt.NDArray[np.float32] = np.ascontiguousarray(value, dtype=FLOAT32)
+        if array.shape != (before[self.count_field],):
+            raise ValueError(f"{array.shape} values for {before[self.count_field]} bins")
+        return array.tobytes()
+
+    def unpack(self, data: bytes, start: int, before: Fields) -> tuple[Any, int]:
+        """Unpack the array, as a view on its own copy of the bytes."""
+        end = start + 4 * before[self.count_field]
+        if end > len(data):
+            raise ValueError("fewer bins than announced")
+        return np.frombuffer(data[start:end], dtype=FLOAT32), end
+
+    def show(self, name: str, value: Any, before: Fields) -> dict[str, Any]:
+        """Show the values."""
+        return {name: value.tolist()}
+
+
+@dataclass(frozen=True, slots=True)
+class RestBytes:
+    """All bytes that are left."""
+
+    shown: Callable[[bytes], Any] = hex_bytes
+
+    def pack(self, value: Any, before: Fields, bulk: bool) -> bytes:
+        """Pack the bytes."""
+        return bytes(value)
+
+    def unpack(self, data: bytes, start: int, before: Fields) -> tuple[Any, int]:
+        """Take everything."""
+        return data[start:], len(data)
+
+    def show(self, name: str, value: Any, before: Fields) -> dict[str, Any]:
+        """Show the bytes."""
+        return {name: self.shown(value)}
