@@ -1,4 +1,4 @@
-"""Normalised innovations of true associations: is the filter as sure as it may be?"""
+"""Whether the filter is as sure as it may be: normalised innovations of true associations."""
 
 from __future__ import annotations
 

@@ -77,10 +77,9 @@ def simulate(
         frame: list[Detection] = []
         for radar, mount in enumerate(rig.mounts):
             c, s = math.cos(pose[2]), math.sin(pose[2])
-            antenna = pose[:2] + [
-                c * mount.x_m - s * mount.y_m,
-                s * mount.x_m + c * mount.y_m,
-            ]
+            antenna = pose[:2] + np.array(
+                [c * mount.x_m - s * mount.y_m, s * mount.x_m + c * mount.y_m]
+            )
             offset = landmarks - antenna
             ranges = np.hypot(offset[:, 0], offset[:, 1])
             off = np.arctan2(offset[:, 1], offset[:, 0]) - pose[2] - mount.yaw_rad
