@@ -42,8 +42,11 @@ ODOMETRY_STREAM = 1 << 63
 
 def odometry_times_ns(duration_ns: int, rate_hz: float) -> NDArray[np.int64]:
     """Return the sample times 0, 1/rate, ... up to the first at or after the end; shape (n,)."""
-    last = math.ceil(duration_ns * rate_hz / 1e9 - 1e-6)
-    return np.array([round(k * 1e9 / rate_hz) for k in range(last + 1)], dtype=np.int64)
+    period_ns = 1e9 / rate_hz
+    last = int(duration_ns / period_ns)
+    if round(last * period_ns) < duration_ns:
+        last += 1
+    return np.array([round(k * period_ns) for k in range(last + 1)], dtype=np.int64)
 
 
 def drift(

@@ -1,0 +1,129 @@
+"""The shipped rooms are as described: spacing, visibility, strength, and no symmetry.
+
+Everything here is recomputed from positions in the files, not with the emulator's echo code.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from emulator.scene import Scene, load_scene
+
+SCENES = ("lab", "classroom", "smoke")
+SIDE_M = {"lab": 2.0, "classroom": 3.0, "smoke": 1.4}
+LARGEST_RANGE_M = 1.5
+HALF_BEAM_RAD = math.radians(65 / 2)
+# The paper's detector needs a peak of 5.5e-3 after rectifying and smoothing: 8.6e-3 before.
+DETECTABLE = 8.6e-3
+WINDOW_POSES = 15
+WINDOW_HITS = 9
+
+
+def positions(scene: Scene) -> NDArray[np.float64]:
+    return np.array([(target.x_m, target.y_m) for target in scene.targets])
+
+
+def distance_to_square(point: NDArray[np.float64], side_m: float) -> float:
+    centre = np.abs(point - side_m / 2) - side_m / 2
+    outside = float(np.hypot(*np.maximum(centre, 0)))
+    return outside if outside > 0 else float(-centre.max())
+
+
+@pytest.mark.parametrize(
+    ("name", "count", "spacing_m"), [("lab", 14, 0.35), ("classroom", 10, 1.0), ("smoke", 1, 0)]
+)
+def test_targets_keep_their_distances(name: str, count: int, spacing_m: float) -> None:
+    xy = positions(load_scene(name))
+    assert len(xy) == count
+    for a, b in combinations(xy, 2):
+        assert np.hypot(*(a - b)) >= spacing_m
+    for point in xy:
+        assert 0.4 <= distance_to_square(point, SIDE_M[name]) <= 1.2
+
+
+def test_lab_is_cluttered() -> None:
+    xy = positions(load_scene("lab"))
+    gaps = [np.hypot(*(a - b)) for a, b in combinations(xy, 2)]
+    assert sum(gap < 0.5 for gap in gaps) >= 3
+
+
+@pytest.mark.parametrize("name", ["lab", "classroom"])
+@pytest.mark.parametrize("quarter_turns", [1, 2, 3])
+def test_no_rotation_of_the_square_maps_landmarks_onto_each_other(
+    name: str, quarter_turns: int
+) -> None:
+    centred = positions(load_scene(name)) - SIDE_M[name] / 2
+    rotated = centred
+    for _ in range(quarter_turns):
+        rotated = np.stack([-rotated[:, 1], rotated[:, 0]], axis=1)
+    gaps = np.hypot(*(rotated[:, np.newaxis] - centred[np.newaxis]).transpose(2, 0, 1))
+    assert (gaps.min(axis=1) < 0.15).sum() <= 1
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_radars_are_the_papers_rig(name: str) -> None:
+    radars = load_scene(name).radars
+    assert [(r.name, r.x_m, r.y_m, r.yaw_deg) for r in radars] == [
+        ("left_rear", -0.10, 0.20, 90.0),
+        ("left_front", 0.10, 0.20, 90.0),
+        ("right_rear", -0.10, -0.20, -90.0),
+        ("right_front", 0.10, -0.20, -90.0),
+    ]
+    assert {(r.range_offset_m, r.start_skew_ms) for r in radars} == {(0.0, 0.0)}
+
+
+def seen(scene: Scene) -> list[tuple[NDArray[np.float64], NDArray[np.bool_]]]:
+    """Return per radar the boresight amplitude and the in-view flag, shapes (poses, targets)."""
+    trajectory = scene.trajectory()
+    poses = trajectory.poses(np.arange(0, trajectory.duration_ns + 1, 200_000_000))
+    body = poses[:, 0] + 1j * poses[:, 1]
+    heading = np.exp(1j * poses[:, 2])
+    targets = positions(scene) @ np.array([1, 1j])
+    views = []
+    for radar in scene.radars:
+        # Complex numbers as points of the plane: an implementation unlike the emulator's.
+        centre = body + heading * (radar.x_m + 1j * radar.y_m)
+        seen_from = (targets - centre[:, np.newaxis]) / heading[:, np.newaxis]
+        angle = np.angle(seen_from * np.exp(-1j * math.radians(radar.yaw_deg)))
+        range_m = np.abs(seen_from)
+        power = {"rod": 1.5, "point": 2.0}
+        law = np.array([power[target.kind] for target in scene.targets])
+        at_1_m = np.array([target.amplitude_1m for target in scene.targets])
+        beam = np.cos(np.clip(angle, -math.pi / 2, math.pi / 2)) ** 2.0354
+        in_view = (np.abs(angle) <= HALF_BEAM_RAD) & (range_m >= 0.2) & (range_m <= LARGEST_RANGE_M)
+        views.append((at_1_m * range_m**-law * beam, in_view))
+    return views
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_each_landmark_is_detectable_often_enough_on_both_laps(name: str) -> None:
+    """Both radars of a side see it, strongly enough, in 9 of 15 successive poses."""
+    scene = load_scene(name)
+    views = seen(scene)
+    for rear, front in ((0, 1), (2, 3)):
+        both = views[rear][1] & views[front][1]
+        both &= (views[rear][0] >= DETECTABLE) & (views[front][0] >= DETECTABLE)
+        for index, target in enumerate(scene.targets):
+            in_window = np.convolve(both[:, index], np.ones(WINDOW_POSES), mode="valid")
+            assert in_window.max() >= WINDOW_HITS, (target.name, rear)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_no_echo_saturates_the_dac_window(name: str) -> None:
+    scene = load_scene(name)
+    half_window = (1100 - 949 + 1) / 2048
+    margin = 6 * scene.noise.rf_sigma
+    assert max(amplitude.max() for amplitude, _ in seen(scene)) <= half_window - margin
+    assert scene.leakage.amplitude <= half_window - margin
+
+
+def test_smoke_does_not_attenuate() -> None:
+    """Smoke has no parameter: the scene says why, and its floor and noise are the lab's."""
+    lab, smoke = load_scene("lab"), load_scene("smoke")
+    assert "smoke" in smoke.description
+    assert (smoke.noise, smoke.leakage, smoke.odometry) == (lab.noise, lab.leakage, lab.odometry)
