@@ -1,0 +1,130 @@
+"""Bytes to and from a port. The only user of pyserial.
+
+>>> from xethru_protocol.transport import SerialTransport
+>>> SerialTransport("/dev/no-such-port")
+Traceback (most recent call last):
+xethru_protocol.errors.PortUnavailable: there is no port /dev/no-such-port; 'xethru list' shows...
+"""
+
+import errno
+import os
+import select
+from typing import Protocol
+
+import serial
+
+from xethru_protocol.errors import Disconnected, PortUnavailable
+
+_CHUNK_BYTES = 65536
+_WRITE_TIMEOUT_S = 5.0
+_BAUD = 115200  # what a UART module starts with; without meaning on USB and ptys
+
+
+class Transport(Protocol):
+    """What a driver needs of a line to a module."""
+
+    @property
+    def name(self) -> str:
+        """What to call this line in messages to people."""
+
+    def read(self, timeout_s: float) -> bytes:
+        """Whatever has arrived, waiting up to ``timeout_s`` for the first byte; b"" if none.
+
+        Raises `Disconnected` if the line is gone.
+        """
+
+    def write(self, data: bytes) -> None:
+        """Send all of ``data``; raises `Disconnected` if the line is gone."""
+
+    def close(self) -> None:
+        """Release the line. May be called twice."""
+
+
+class SerialTransport:
+    """A serial port: a real module's or an emulated one's pty.
+
+    Takes an exclusive lock, so that two programs do not each get half of the bytes.
+
+    Parameters
+    ----------
+    path
+        For example ``/dev/ttyACM0`` or a link made by ``xethru-emulator``.
+
+    Raises
+    ------
+    PortUnavailable
+        If the port does not exist, is no serial port, is in use, or may not be opened.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.name = path
+        try:
+            self._port = serial.Serial(
+                path, _BAUD, timeout=0, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
+            )
+        except (OSError, ValueError) as error:  # SerialException is an OSError
+            raise PortUnavailable(_why(path, error)) from None
+        self._fd: int = self._port.fileno()
+
+    def read(self, timeout_s: float) -> bytes:
+        """See `Transport.read`."""
+        try:
+            ready, _, _ = select.select((self._fd,), (), (), max(timeout_s, 0.0))
+            if not ready:
+                return b""
+            data = os.read(self._fd, _CHUNK_BYTES)
+        except BlockingIOError:  # another reader was faster
+            return b""
+        except (OSError, ValueError) as error:  # EIO: the other end of a pty is gone
+            raise Disconnected(self._lost()) from error
+        if not data:  # readable, yet nothing there: hung up
+            raise Disconnected(self._lost())
+        return data
+
+    def write(self, data: bytes) -> None:
+        """See `Transport.write`."""
+        try:
+            self._port.write(data)
+        except serial.SerialTimeoutException:
+            raise Disconnected(
+                f"{self.name} takes no data any more; is the module hanging?"
+            ) from None
+        except (OSError, ValueError) as error:
+            raise Disconnected(self._lost()) from error
+
+    def close(self) -> None:
+        """See `Transport.close`."""
+        self._fd = -1
+        try:
+            self._port.close()
+        except OSError:
+            # The device vanished: there is nothing left to release.
+            return
+
+    def _lost(self) -> str:
+        if self._fd < 0:
+            return f"{self.name} was closed"
+        return f"{self.name} was disconnected; plug the module in again"
+
+
+def _why(path: str, error: Exception) -> str:
+    number = getattr(error, "errno", None)
+    reasons = {
+        errno.ENOENT: f"there is no port {path}; 'xethru list' shows the ports there are",
+        errno.ENXIO: f"there is no module behind {path}; plug it in again",
+        errno.EACCES: f"port {path} may not be opened by this user; "
+        "join its group (often 'dialout') and log in again",
+        errno.EBUSY: f"port {path} is in use by another program; close that first",
+        errno.EAGAIN: f"port {path} is in use by another program; close that first",
+        errno.ENOTTY: f"{path} is not a serial port",
+        errno.EISDIR: f"{path} is not a serial port",
+        errno.EINVAL: f"{path} is not a serial port",
+    }
+    if number in reasons:
+        return reasons[number]
+    text = str(error)
+    if "exclusively lock" in text:  # pyserial tells this one by its text only
+        return reasons[errno.EAGAIN]
+    if "Could not configure port" in text:
+        return reasons[errno.ENOTTY]
+    return f"port {path} cannot be opened: {text}"
