@@ -11,15 +11,14 @@ from slam.app.runner import RunRecord
 from slam.app.summary import LandmarkSummary, Summary
 from slam.app.tum import NS_PER_S
 from slam.config import SlamConfig
-from slam.geometry import Rig, between, transform
+from slam.consistency import TrueAssociationNis
+from slam.geometry import Rig, between
 from slam.metrics import (
-    LANDMARK_MATCH_M,
     align_se2,
     ate_rmse_m,
     icp_ate,
     landmark_metrics,
     nees_pose,
-    true_landmark_nis,
 )
 from slam.visibility import observable_landmarks
 
@@ -101,33 +100,11 @@ def _nees(record: RunRecord, truth_in_map: NDArray[np.float64]) -> tuple[tuple[f
 
 
 def _true_nis(record: RunRecord, true_landmarks_m: NDArray[np.float64]) -> list[float]:
-    """Return the NIS of every observation against the landmark it is truly of, before gates.
-
-    What an observation is truly of follows from the true pose: the true landmark within 0.15 m of
-    where it points.
-    """
-    birthplaces: dict[int, int] = {}
-    values: list[float] = []
-    for result, truth in zip(record.results, record.truth, strict=True):
-        origins = [
-            _origin(transform(truth, _body_point(o.range_m, o.bearing_rad)), true_landmarks_m)
-            for o in result.observations
-        ]
-        candidates = [(a.candidate_ids, a.mahalanobis_sq) for a in result.associations]
-        values += true_landmark_nis(candidates, origins, birthplaces)
-        for origin, association in zip(origins, result.associations, strict=True):
-            if origin is not None and association.is_new:
-                birthplaces.setdefault(origin, association.landmark_id)
-    return [value for value in values if math.isfinite(value)]
-
-
-def _body_point(range_m: float, bearing_rad: float) -> NDArray[np.float64]:
-    return np.array([range_m * math.cos(bearing_rad), range_m * math.sin(bearing_rad)])
-
-
-def _origin(point: NDArray[np.float64], true_landmarks_m: NDArray[np.float64]) -> int | None:
-    if not len(true_landmarks_m):
-        return None
-    distances_m = np.linalg.norm(true_landmarks_m - point, axis=1)
-    nearest = int(np.argmin(distances_m))
-    return nearest if distances_m[nearest] <= LANDMARK_MATCH_M else None
+    """Return the NIS of every observation against the landmark it is truly of, before gates."""
+    collector = TrueAssociationNis(true_landmarks_m)
+    return [
+        value
+        for result, truth in zip(record.results, record.truth, strict=True)
+        for value in collector.add(result, truth)
+        if math.isfinite(value)
+    ]

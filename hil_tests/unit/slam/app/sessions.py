@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
+from mcap.exceptions import EndOfFile
+from mcap.reader import NonSeekingReader
 
 from slam.app.session import LogLine, RadarInfo, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.frames import RadarFrame
@@ -79,3 +83,16 @@ def feed(observer: SessionObserver, n_scans: int) -> None:
         observer.on_scan(scan(counter))
         observer.on_snapshot(snapshot(counter))
     observer.on_log(LogLine(t_ns=5, radar="radar1", warning=True, text="CRC fault"))
+
+
+def surviving_counters(path: Path, topic: str) -> list[int]:
+    """Read the counters of one topic from a session that was never finished."""
+    counters = []
+    with path.open("rb") as stream:
+        try:
+            for _, channel, message in NonSeekingReader(stream).iter_messages(log_time_order=False):
+                if channel.topic == topic:
+                    counters.append(message.sequence)
+        except EndOfFile:
+            pass
+    return counters

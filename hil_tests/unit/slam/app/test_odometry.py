@@ -1,0 +1,101 @@
+"""Odometry input: the same floats on every path, interpolation the short way round."""
+
+import math
+import socket
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from slam.app.errors import OdometryError
+from slam.app.odometry import OdometryTrack, read_odometry_socket
+from slam.app.tum import format_tum_line
+
+
+def lines_of(rows: list[tuple[int, float, float, float]]) -> list[str]:
+    return [format_tum_line(t_ns, np.array(pose)) for t_ns, *pose in rows]
+
+
+def test_at_a_samples_own_time_the_pose_is_the_sample() -> None:
+    track = OdometryTrack.from_lines(lines_of([(0, 0.1, 0.2, 0.3), (10**9, 1 / 3, -2.0, 0.5)]))
+    assert track.pose_at(10**9)[:2].tolist() == [1 / 3, -2.0]
+    assert track.pose_at(0)[:2].tolist() == [0.1, 0.2]
+
+
+def test_between_two_samples_it_is_linear() -> None:
+    track = OdometryTrack.from_lines(lines_of([(0, 0.0, 0.0, 0.0), (10**9, 4.0, -8.0, 1.0)]))
+    np.testing.assert_allclose(track.pose_at(250_000_000), [1.0, -2.0, 0.25])
+
+
+@pytest.mark.parametrize("turn_rad", [0.4, -0.4])
+def test_heading_crosses_half_a_turn_the_short_way(turn_rad: float) -> None:
+    start = math.copysign(math.pi - 0.1, turn_rad)
+    track = OdometryTrack.from_lines(lines_of([(0, 0, 0, start), (100, 0, 0, start + turn_rad)]))
+    for part in (20, 50, 75):
+        expected = math.remainder(start + turn_rad * part / 100, math.tau)
+        heading_rad = float(track.pose_at(part)[2])
+        assert heading_rad == pytest.approx(expected)
+        assert -math.pi <= heading_rad < math.pi
+
+
+@given(st.lists(st.floats(-50, 50), min_size=2, max_size=20))
+def test_the_same_text_gives_the_same_floats(values: list[float]) -> None:
+    lines = lines_of([(k * 1000, value, -value, value) for k, value in enumerate(values)])
+    first, second = OdometryTrack.from_lines(lines), OdometryTrack.from_lines(list(lines))
+    for t_ns in range(0, 1000 * len(values), 333):
+        assert first.pose_at(t_ns).tobytes() == second.pose_at(t_ns).tobytes()
+
+
+def test_a_time_far_outside_is_refused() -> None:
+    track = OdometryTrack.from_lines(lines_of([(0, 0, 0, 0), (10**9, 1, 0, 0)]))
+    np.testing.assert_array_equal(track.pose_at(1_400_000_000), [1.0, 0.0, 0.0])
+    with pytest.raises(OdometryError, match=r"covers 0.00 .. 1.00 s, but a frame came at 1.60 s"):
+        track.pose_at(1_600_000_000)
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        ([], "sent no pose"),
+        (["0 0 0 0 0 0 0 1", "oops"], "line 2: expected 8 numbers"),
+        (["1 0 0 0 0 0 0 1", "0 0 0 0 0 0 0 1"], "line 2 is not later"),
+    ],
+)
+def test_bad_odometry_is_one_line(lines: list[str], said: str) -> None:
+    with pytest.raises(OdometryError, match=said):
+        OdometryTrack.from_lines(lines)
+
+
+def test_the_socket_gives_what_was_sent_however_it_was_cut(tmp_path: Path) -> None:
+    lines = lines_of([(k, k / 7, k / 11, k / 13) for k in range(200)])
+    data = "".join(f"{line}\n" for line in lines).encode()
+    path = str(tmp_path / "odom")
+    server = socket.socket(socket.AF_UNIX)
+    server.bind(path)
+    server.listen()
+
+    def serve() -> None:
+        client, _ = server.accept()
+        with client:
+            for start in range(0, len(data), 777):
+                client.sendall(data[start : start + 777])
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    track = read_odometry_socket(path)
+    thread.join()
+    server.close()
+    assert track.samples == OdometryTrack.from_lines(lines).samples
+
+
+def test_a_missing_or_silent_socket_is_named(tmp_path: Path) -> None:
+    with pytest.raises(OdometryError, match="nobody: No such file"):
+        read_odometry_socket(str(tmp_path / "nobody"))
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(tmp_path / "silent"))
+        server.listen()
+        with pytest.raises(OdometryError, match=r"silent for 0\.1 s"):
+            read_odometry_socket(str(tmp_path / "silent"), timeout_s=0.1)

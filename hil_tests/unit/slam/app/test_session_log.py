@@ -1,0 +1,189 @@
+"""The session log: what goes in comes out, in rosbags and mcap, also after a crash."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+from hil_tests.unit.slam.app.sessions import (
+    feed,
+    scan,
+    session_info,
+    snapshot,
+    surviving_counters,
+)
+from slam.app import ros_messages as ros
+from slam.app.odometry import OdometryTrack
+from slam.app.session_log import METADATA_NAME, SessionLog
+from slam.app.tum import format_tum_line
+
+N_SCANS = 300
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("log") / "session.mcap"
+    log = SessionLog(path, session_info())
+    log.write_odometry(odometry())
+    feed(log, N_SCANS)
+    log.close()
+    return path
+
+
+def odometry() -> OdometryTrack:
+    poses = [np.array([k / 3, k / 7, k / 11]) for k in range(20)]
+    return OdometryTrack.from_lines(
+        [format_tum_line(k * 200_000_000 + k, pose) for k, pose in enumerate(poses)]
+    )
+
+
+def messages(path: Path, topic: str) -> list[tuple[int, int, Any]]:
+    """Return (sequence, log time, message) of one topic, with our types."""
+    with path.open("rb") as stream:
+        return [
+            (message.sequence, message.log_time, ros.deserialise(message.data, schema.name))
+            for schema, _, message in make_reader(stream).iter_messages(topics=[topic])
+            if schema is not None
+        ]
+
+
+def test_counters_stamps_and_samples_come_back_identical(finished: Path) -> None:
+    for radar in range(2):
+        rows = messages(finished, f"/radar/radar{radar}/frame")
+        assert len(rows) == N_SCANS
+        for counter, (sequence, t_ns, message) in enumerate(rows):
+            sent = scan(counter).frames[radar]
+            assert (sequence, t_ns) == (sent.counter, sent.t_ns)
+            assert message.data.tobytes() == sent.samples.tobytes()
+            assert message.layout.dim[0].label == "range_bin"
+
+
+def test_odometry_comes_back_as_the_same_floats(finished: Path) -> None:
+    samples = tuple(ros.odometry_sample(row[2]) for row in messages(finished, "/odom"))
+    assert samples == odometry().samples
+
+
+def test_states_landmarks_and_their_covariance_come_back(finished: Path) -> None:
+    _, t_ns, cloud = messages(finished, "/landmarks")[7]
+    sent = snapshot(7)
+    assert t_ns == sent.t_ns
+    assert cloud.header.frame_id == "map"
+    points = cloud.data.view(ros.LANDMARK_DTYPE)
+    assert points["id"].tolist() == sent.landmark_ids.tolist()
+    np.testing.assert_allclose(points["x"], sent.landmarks_m[:, 0], rtol=1e-6)
+    np.testing.assert_allclose(points["cov_xy"], sent.landmark_covariances_m2[:, 0, 1], rtol=1e-6)
+    _, _, estimate = messages(finished, "/estimate")[7]
+    assert estimate.pose.position.x == sent.estimate[0]
+    _, _, truth = messages(finished, "/truth")[7]
+    assert (truth.header.frame_id, truth.pose.position.y) == ("world", sent.truth[1])
+
+
+def test_transforms_chain_to_the_estimate(finished: Path) -> None:
+    _, _, message = messages(finished, "/tf")[9]
+    by_child = {row.child_frame_id: row for row in message.transforms}
+    assert by_child["odom"].header.frame_id == "map"
+    assert by_child["base_link"].header.frame_id == "odom"
+    # both headings are equal in the made-up session, so positions simply add
+    added = [
+        by_child["odom"].transform.translation.x + by_child["base_link"].transform.translation.x,
+        by_child["odom"].transform.translation.y + by_child["base_link"].transform.translation.y,
+    ]
+    np.testing.assert_allclose(added, snapshot(9).estimate[:2], atol=1e-12)
+
+
+def test_info_is_latched_and_tells_how_to_read_frames(finished: Path) -> None:
+    ((_, _, message),) = messages(finished, "/radar/radar1/info")
+    info = json.loads(message.data)
+    assert info["serial"] == "000000000001"
+    assert (info["n_bins"], info["range_start_m"], info["rate_hz"]) == (1431, 0.2, 5.018533)
+    with finished.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    latched = {c.topic for c in summary.channels.values() if "durability: 1" in str(c.metadata)}
+    assert latched == {"/radar/radar0/info", "/radar/radar1/info", "/tf_static"}
+
+
+def test_metadata_names_the_run(finished: Path) -> None:
+    with finished.open("rb") as stream:
+        (record,) = make_reader(stream).iter_metadata()
+    assert record.name == METADATA_NAME
+    assert (record.metadata["scene"], record.metadata["seed"]) == ("made_up", "7")
+    assert json.loads(record.metadata["versions"]) == {"numpy": "2"}
+
+
+def test_link_log_keeps_radar_and_level(finished: Path) -> None:
+    rows = [row[2] for row in messages(finished, "/log")]
+    assert [(row.name, row.level, row.msg) for row in rows] == [
+        ("radar0", 20, "Ping -> Pong"),
+        ("radar1", 30, "CRC fault"),
+    ]
+
+
+def test_rosbags_opens_the_bare_file_with_its_own_types(finished: Path) -> None:
+    with AnyReader([finished]) as reader:
+        types = {c.topic: c.msgtype for c in reader.connections}
+        assert types["/landmarks"] == "sensor_msgs/msg/PointCloud2"
+        connection = next(c for c in reader.connections if c.topic == "/radar/radar0/frame")
+        (_, t_ns, raw), *_ = reader.messages([connection])
+        message: Any = reader.deserialize(raw, connection.msgtype)
+    assert t_ns == 0
+    np.testing.assert_array_equal(message.data, scan(0).frames[0].samples)
+
+
+def test_chunks_stay_below_the_limit(finished: Path) -> None:
+    with finished.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    sizes = [chunk.uncompressed_size for chunk in summary.chunk_indexes]
+    assert len(sizes) > 10
+    assert max(sizes) <= 256 * 1024
+    assert {chunk.compression for chunk in summary.chunk_indexes} == {"zstd"}
+
+
+def test_a_chunk_is_cut_after_a_second_even_if_small(tmp_path: Path) -> None:
+    now = [0]
+    path = tmp_path / "s.mcap"
+    log = SessionLog(path, session_info(), clock_ns=lambda: now[0])
+    before = path.stat().st_size
+    log.on_scan(scan(0))
+    assert path.stat().st_size == before
+    now[0] += 1_000_000_000
+    log.on_scan(scan(1))
+    assert path.stat().st_size > before
+    log.close()
+
+
+def test_a_file_that_was_never_finished_lacks_its_last_chunk_only(tmp_path: Path) -> None:
+    path = tmp_path / "s.mcap"
+    log = SessionLog(path, session_info(), clock_ns=lambda: 0)
+    feed(log, N_SCANS)
+    survived = tmp_path / "survived.mcap"
+    survived.write_bytes(path.read_bytes())
+    log.close()
+    counters = surviving_counters(survived, "/radar/radar0/frame")
+    assert counters == list(range(len(counters)))
+    # 256 KiB hold 21 scans of two radars
+    assert N_SCANS - 25 <= len(counters) < N_SCANS
+
+
+@pytest.mark.parametrize("part", [0.1, 0.5, 0.99])
+def test_a_file_cut_anywhere_is_readable_up_to_the_cut(
+    tmp_path: Path, finished: Path, part: float
+) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(finished.read_bytes()[: int(part * finished.stat().st_size)])
+    counters = surviving_counters(cut, "/radar/radar1/frame")
+    assert counters == list(range(len(counters)))
+    assert len(counters) >= part * N_SCANS - 30
+
+
+def test_closing_twice_is_harmless(tmp_path: Path) -> None:
+    log = SessionLog(tmp_path / "s.mcap", session_info())
+    log.close()
+    size = (tmp_path / "s.mcap").stat().st_size
+    log.close()
+    assert (tmp_path / "s.mcap").stat().st_size == size
