@@ -90,8 +90,7 @@ def complex_atan2(y: np.complex128, x: np.complex128) -> np.complex128:
 def observe(pose: Complex, landmark: Complex) -> Complex:
     dx, dy = landmark - pose[:2]
     bearing = complex_atan2(dy, dx) - pose[2]
-    observed: Complex = np.array([np.sqrt(dx**2 + dy**2), bearing])
-    return observed
+    return np.array([np.sqrt(dx**2 + dy**2), bearing])
 
 
 def move(pose: Complex, increment: Complex) -> Complex:
@@ -102,7 +101,8 @@ def move(pose: Complex, increment: Complex) -> Complex:
 
 def place(pose: Complex, observed: Complex) -> Complex:
     direction = pose[2] + observed[1]
-    return pose[:2] + observed[0] * np.array([np.cos(direction), np.sin(direction)])
+    placed: Complex = pose[:2] + observed[0] * np.array([np.cos(direction), np.sin(direction)])
+    return placed
 
 
 def complex_step(function: Callable[[Complex], Complex], at: Array) -> Array:
