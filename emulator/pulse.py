@@ -108,7 +108,8 @@ def sum_of_pulses(
     frame, position = frame[touches], position[touches]
     amplitude, phase_rad = amplitude[touches], phase_rad[touches]
 
-    nearest = np.rint(position)
+    # floor, not rint: ties must fall alike for odd and even bins, so that a shift is exact.
+    nearest = np.floor(position + 0.5)
     shift = position - nearest
     cycles, samples = CARRIER_CYCLES_PER_SAMPLE[tx_center_frequency]
     centre_phase = phase_rad - math.tau * cycles / samples * shift

@@ -8,10 +8,8 @@ is +-1). Nothing here computes echoes or odometry.
 
 from __future__ import annotations
 
-import importlib.resources
 import math
 import tomllib
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -42,6 +40,11 @@ __all__ = [
     "load_scene",
     "scene_names",
 ]
+
+
+# Beside this package, in the repository and in the wheel alike. Not importlib.resources on the
+# name "fixtures": a folder of that name in the user's own project would come first.
+_SHIPPED_SCENES = Path(__file__).parent.parent / "fixtures" / "scenes"
 
 
 class SceneError(ValueError):
@@ -219,14 +222,9 @@ def empty_room(count: int = 1) -> Scene:
     )
 
 
-def _scene_folder() -> Traversable:
-    return importlib.resources.files("fixtures") / "scenes"
-
-
 def scene_names() -> tuple[str, ...]:
     """Return the names of the scenes that ship with the package, sorted."""
-    names = (entry.name for entry in _scene_folder().iterdir())
-    return tuple(sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml")))
+    return tuple(sorted(path.stem for path in _SHIPPED_SCENES.glob("*.toml")))
 
 
 def load_scene(path_or_name: str | Path) -> Scene:
@@ -246,7 +244,7 @@ def load_scene(path_or_name: str | Path) -> Scene:
             f"{text}: no such scene; known are {', '.join(scene_names())}, "
             "or give the path of a .toml file"
         )
-    source: Traversable = _scene_folder() / f"{text}.toml" if is_name else Path(path_or_name)
+    source = _SHIPPED_SCENES / f"{text}.toml" if is_name else Path(path_or_name)
     try:
         table = tomllib.loads(source.read_bytes().decode())
     except OSError as error:

@@ -1,0 +1,63 @@
+"""Cost of one emulated frame, synthesis only; the emulator's bar is in the design's table."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pytest_benchmark.fixture import BenchmarkFixture
+
+from emulator.echo import echo_source
+from emulator.echo_source import CaptureSettings
+from emulator.noise import frame_noise_units
+from emulator.odometry import scene_odometry
+from emulator.scene import load_scene
+
+PAPER = CaptureSettings(
+    first_sample_m=0.19929,
+    n_samples=1431,
+    iterations=16,
+    pulses_per_step=300,
+    dac_min=949,
+    dac_max=1100,
+    dac_step=0,
+    tx_power=2,
+    tx_center_frequency=3,
+)
+FAST = replace(PAPER, pulses_per_step=10)  # the settings of 400 frames/s
+BLOCK = 32
+
+
+def note_cost(benchmark: BenchmarkFixture, frames_per_round: int) -> None:
+    if benchmark.stats is not None:  # absent under --benchmark-disable
+        median_s = benchmark.stats.stats.median
+        benchmark.extra_info["us_per_frame"] = median_s * 1e6 / frames_per_round
+
+
+@pytest.mark.parametrize("block", [1, 8, BLOCK])
+@pytest.mark.parametrize("capture", [PAPER, FAST], ids=["paper", "400fps"])
+def test_lab_frames(benchmark: BenchmarkFixture, capture: CaptureSettings, block: int) -> None:
+    """Four radars x ``block`` frames of 1431 bins among 14 rods, spread over the whole course."""
+    scene = load_scene("lab")
+    sources = [echo_source(scene, radar, 0) for radar in range(4)]
+    starts = iter(np.tile(np.arange(0, 3400, 97), 100_000).tolist())
+
+    def frames() -> None:
+        counters = np.arange(block) + next(starts)
+        for source in sources:
+            source.rf_counters(capture, counters, counters * 200_000_000)
+
+    benchmark(frames)
+    note_cost(benchmark, 4 * block)
+
+
+def test_receiver_noise(benchmark: BenchmarkFixture) -> None:
+    counters = np.arange(BLOCK)
+    benchmark(frame_noise_units, counters, 1431, seed=0, stream=1)
+    note_cost(benchmark, BLOCK)
+
+
+def test_odometry_of_a_classroom_run(benchmark: BenchmarkFixture) -> None:
+    scene = load_scene("classroom")
+    benchmark(scene_odometry, scene, 0)
