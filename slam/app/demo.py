@@ -108,8 +108,9 @@ def run_demo(options: DemoOptions, stop: StopFlag) -> None:
         link_log.attach(log, view, progress)
         slam = UwbRadarSlam(config, rig)
         try:
-            scans = source.scans(end_counter(trajectory.duration_ns), stop.check)
-            record = run_slam(scans, odometry, slam, trajectory.poses, observers)
+            with source:  # closed before the logs, which also want its last words
+                scans = source.scans(end_counter(trajectory.duration_ns), stop.check)
+                record = run_slam(scans, odometry, slam, trajectory.poses, observers)
         except StopRequestedError as stopped:
             raise StopRequestedError(stopped.received, kept) from None
         except RadarSilentError as silent:

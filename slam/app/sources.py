@@ -72,7 +72,7 @@ class RigSource:
     """
 
     def __init__(self, links: Sequence[RadarLink]) -> None:
-        self._links = tuple(links)
+        self._links = self._open_links = tuple(links)
         self.radars: tuple[RadarInfo, ...] = ()
         self.lost_frames = 0
 
@@ -86,8 +86,9 @@ class RigSource:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close every driver."""
-        for link in self._links:
+        """Stop the radars and close every driver; doing so again does nothing."""
+        open_links, self._open_links = self._open_links, ()
+        for link in open_links:
             link.driver.close()
 
     def start(self, config: RawConfig, fps: int) -> None:
