@@ -62,7 +62,7 @@ class Frame:
 
 
 def rf_or_baseband(message: DataFloat, geometry: FrameGeometry) -> Samples | None:
-    """Samples of a radar frame, or None if their number does not fit the geometry."""
+    """Return the samples of a radar frame, or None if their number does not fit the geometry."""
     values = message.values
     n = geometry.n_bins
     if not geometry.downconversion:
@@ -71,7 +71,7 @@ def rf_or_baseband(message: DataFloat, geometry: FrameGeometry) -> Samples | Non
 
 
 def baseband(message: BasebandIq) -> Samples:
-    """Samples of a profile's baseband message, shape (num_bins,), complex64."""
+    """Return the samples of a profile's baseband message, shape (num_bins,), complex64."""
     return _complex(message.i, message.q)
 
 

@@ -233,7 +233,9 @@ class PacketReader:
             self._damage_end = max(self._damage_end, last_rejected + len(NO_ESCAPE_START))
         return fault
 
-    def _normal(self, first: int) -> Span | FramingFault | NeedData | None:
+    def _normal(  # noqa: PLR0911 - one return per row of the state table
+        self, first: int
+    ) -> Span | FramingFault | NeedData | None:
         """Judge the Normal packet at ``first``; None if it was rejected without a report."""
         self._scan(first)
         end = self._terminator
@@ -336,7 +338,7 @@ class PacketReader:
 
 
 def _good_starts(packet: bytes, offset: int) -> frozenset[int]:
-    """Starts in a refuted Normal packet, itself included, from which the checksum fits.
+    """Find the starts in a refuted Normal packet, itself included, whose checksum fits.
 
     ``packet`` lies at ``offset`` in the stream, without its terminator. One pass from the back
     over its escaped bytes, since the content behind each is a suffix of the whole.

@@ -17,7 +17,7 @@ _COUNT = struct.Struct("<I")
 FROM_MODULE = frozenset(int(code) for code in ResponseCode)
 FROM_HOST = frozenset(int(code) for code in CommandCode)
 
-_ELEMENT_BYTES = {
+_ELEMENT_BYTES: dict[int, int] = {
     ElementType.XTS_SPRD_BYTE: 1,
     ElementType.XTS_SPRD_INT: 4,
     ElementType.XTS_SPRD_FLOAT: 4,
@@ -26,7 +26,7 @@ _ELEMENT_BYTES = {
 }
 # APPDATA with bulk content: (header bytes, offset of the bin count if within the head, bytes
 # per bin). Pulse-Doppler and noise maps count their bins behind the head.
-_APPDATA = {
+_APPDATA: dict[int, tuple[int, int | None, int]] = {
     AppDataId.XTS_ID_BASEBAND_IQ: (29, 9, 8),
     AppDataId.XTS_ID_BASEBAND_AMPLITUDE_PHASE: (29, 9, 8),
     AppDataId.XTS_ID_PULSEDOPPLER_FLOAT: (49, None, 4),
@@ -36,7 +36,9 @@ _APPDATA = {
 }
 
 
-def plausible(length: int, head: bytes, known: frozenset[int]) -> bool:
+def plausible(  # noqa: PLR0911 - one return per kind of message
+    length: int, head: bytes, known: frozenset[int]
+) -> bool:
     """Whether a NoEscape packet may announce ``length`` payload bytes starting with ``head``.
 
     Parameters
@@ -57,14 +59,14 @@ def plausible(length: int, head: bytes, known: frozenset[int]) -> bool:
         return True
     code = head[0]
     if code == ResponseCode.XTS_SPR_DATA:
-        size = _ELEMENT_BYTES.get(head[1])  # type: ignore[call-overload] # an IntEnum key equals its int
+        size = _ELEMENT_BYTES.get(head[1])
         return size is not None and HEAD_BYTES + _count(head, 10) * size == length
     if code == ResponseCode.XTS_SPR_REPLY and known is FROM_MODULE:
-        size = _ELEMENT_BYTES.get(head[1])  # type: ignore[call-overload] # an IntEnum key equals its int
+        size = _ELEMENT_BYTES.get(head[1])
         trailer = head[1] != ElementType.XTS_SPRD_INT
         return size is not None and HEAD_BYTES + _count(head, 10) * size + trailer == length
     if code == ResponseCode.XTS_SPR_APPDATA:
-        layout = _APPDATA.get(_count(head, 1))  # type: ignore[call-overload] # as above
+        layout = _APPDATA.get(_count(head, 1))
         if layout is None:
             return length <= _VENDOR_LIMIT
         header, count_at, size = layout

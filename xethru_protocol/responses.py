@@ -176,9 +176,9 @@ class _Baseband(Response):
 
     def __eq__(self, other: object) -> bool:
         """Equal if every bit of every field is."""
-        if type(other) is not type(self):
+        if not isinstance(other, _Baseband) or type(other) is not type(self):
             return NotImplemented
-        return self._identity() == other._identity()  # type: ignore[attr-defined] # same type as self
+        return self._identity() == other._identity()
 
     def __hash__(self) -> int:
         """Hash of all bits."""

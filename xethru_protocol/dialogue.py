@@ -1,0 +1,180 @@
+"""Commands and their answers over a transport, among everything else a module sends.
+
+The module answers commands in order and without sequence numbers, and sends frames and SYSTEM
+messages whenever it likes (Protocol reference 3). What is read is sorted at once: answers go to
+the one outstanding request, everything else to whoever wants the stream, faults are counted.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, TypeVar
+
+from xethru_protocol.codec import describe
+from xethru_protocol.codes import SystemCode, error_name
+from xethru_protocol.connection import Connection, Role
+from xethru_protocol.errors import DeviceError, ResponseTimeout
+from xethru_protocol.messages import (
+    Ack,
+    BasebandIq,
+    Command,
+    DataFloat,
+    Error,
+    Message,
+    Pong,
+    ReplyByte,
+    ReplyFloat,
+    ReplyInt,
+    ReplyString,
+    Response,
+    System,
+)
+from xethru_protocol.packets import NEED_DATA, FramingFault
+from xethru_protocol.table import ROWS
+from xethru_protocol.transport import Transport
+
+_ANSWERS = (Ack, Error, Pong, ReplyByte, ReplyInt, ReplyFloat, ReplyString)
+_STALE_READS = 64  # more than any port buffers; a bound, since a fast module never pauses
+
+ReplyT = TypeVar("ReplyT", bound=Response)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProtocolRecord:
+    """One line of the protocol log: everything on the wire but frames."""
+
+    t_ns: int
+    direction: Literal["tx", "rx", "fault", "warning"]
+    summary: str
+
+
+Observer = Callable[[ProtocolRecord], None]
+FrameMessage = DataFloat | BasebandIq
+
+
+class Dialogue:
+    """The conversation with one module.
+
+    Parameters
+    ----------
+    transport
+        An open line.
+    clock
+        Monotonic time [ns].
+    observer
+        Called with every command, answer, SYSTEM message, fault and warning; None: nobody.
+    take_frame
+        Called with every frame message and the time its last byte was read [ns].
+
+    Attributes
+    ----------
+    fault_count
+        Damaged places seen on the line.
+    stray_count
+        Answers that belong to no request.
+    reboots
+        SYSTEM BOOTING messages seen.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        clock: Callable[[], int],
+        observer: Observer | None,
+        take_frame: Callable[[FrameMessage, int], None],
+    ) -> None:
+        self.fault_count = 0
+        self.stray_count = 0
+        self.reboots = 0
+        self._transport = transport
+        self._clock = clock
+        self._observer = observer
+        self._take_frame = take_frame
+        self._connection = Connection(Role.HOST)
+        self._answers: deque[Response] = deque()
+
+    def request(self, command: Command[ReplyT], timeout_s: float) -> ReplyT:
+        """Send a command, return its reply; see `X4M300.request`."""
+        self._take_stale_input()
+        row = ROWS[type(command)]
+        content_id = row.content_id(command) if row.content_id else None
+        self._transport.write(self._connection.send(command))
+        if self._observer is not None:
+            self.tell("tx", summary(command))
+        deadline = self._clock() + round(timeout_s * 1e9)
+        while True:
+            while self._answers:
+                answer = self._answers.popleft()
+                if isinstance(answer, Error):
+                    meaning = error_name(answer.code, x4_command=row.name.startswith("X4"))
+                    raise DeviceError(answer.code, summary(command), meaning)
+                if isinstance(answer, row.replies) and (
+                    content_id is None or getattr(answer, "content_id", None) == content_id
+                ):
+                    # isinstance checked it: the row's replies are what ReplyT stands for
+                    return answer  # type: ignore[return-value]
+                self.stray_count += 1
+            left_ns = deadline - self._clock()
+            if left_ns <= 0:
+                raise self.silence(f"answer to {summary(command)}", timeout_s)
+            self.pump(left_ns * 1e-9)
+
+    def pump(self, timeout_s: float) -> bool:
+        """Read once and sort what came; False if nothing did in time."""
+        data = self._transport.read(timeout_s)
+        if not data:
+            return False
+        arrival_ns = self._clock()
+        self._connection.receive_data(data)
+        while (event := self._connection.next_event()) is not NEED_DATA:
+            if isinstance(event, DataFloat | BasebandIq):
+                self._take_frame(event, arrival_ns)
+            elif isinstance(event, FramingFault):
+                self.fault_count += 1
+                self.tell("fault", f"{event.kind.value} at byte {event.offset}")
+            elif isinstance(event, Message):
+                if isinstance(event, _ANSWERS):
+                    self._answers.append(event)
+                elif isinstance(event, System) and event.code == SystemCode.XTS_SPRS_BOOTING:
+                    self.reboots += 1
+                if self._observer is not None:
+                    self.tell("rx", summary(event))
+        return True
+
+    def silence(self, what: str, timeout_s: float) -> ResponseTimeout:
+        """Error for something that did not come, with the likeliest reason and remedy."""
+        missing = f"no {what} from {self._transport.name} within {timeout_s:g} s"
+        if self.reboots:
+            return ResponseTimeout(f"{missing}: the module restarted meanwhile; start it again")
+        if self.fault_count:
+            return ResponseTimeout(
+                f"{missing}, but bytes that are no XeThru packets; "
+                "is it another device, or another baud rate?"
+            )
+        return ResponseTimeout(f"{missing}; is it an X4M300, powered and not in its bootloader?")
+
+    def tell(self, direction: Literal["tx", "rx", "fault", "warning"], text: str) -> None:
+        """Tell the observer."""
+        if self._observer is not None:
+            self._observer(ProtocolRecord(t_ns=self._clock(), direction=direction, summary=text))
+
+    def _take_stale_input(self) -> None:
+        """Sort what arrived before a request: an answer among it belongs to no request."""
+        for _ in range(_STALE_READS):
+            if not self.pump(0.0):
+                break
+        self.stray_count += len(self._answers)
+        self._answers.clear()
+
+
+def summary(message: Message) -> str:
+    """One line about a message, for logs and errors.
+
+    >>> from xethru_protocol.messages import X4DriverSet
+    >>> from xethru_protocol.codes import X4Setting
+    >>> summary(X4DriverSet(setting=X4Setting.FPS, value=17.0))
+    'X4DRIVER_SET id=FPS value=17.0'
+    """
+    name, shown = describe(message)
+    parts = (f"{key}={value}" for key, value in shown.items() if value is not None)
+    return " ".join([name, *parts])
