@@ -116,6 +116,7 @@ class PacketReader:
         self._queued = 0
         self._missing = 1  # bytes without which parsing cannot go on
         self._wanted = 1  # bytes worth joining to the buffer at once
+        self._ended = False
         self._damage_end = -1  # end of the bytes a fault was reported for; -1: none since a packet
         self._starts = _Finder(b"\x7d")
         self._bulk_starts = _Finder(NO_ESCAPE_START)
@@ -134,6 +135,10 @@ class PacketReader:
         if data:
             self._queue.append(bytes(data))
             self._queued += len(data)
+
+    def end_data(self) -> None:
+        """Tell that no more bytes will come: what is incomplete now will be a fault."""
+        self._ended = True
 
     @property
     def buffered(self) -> int:
@@ -171,8 +176,17 @@ class PacketReader:
             found = self._parse()
             if found is not NEED_DATA:
                 return found
-            if not self._refill():
+            if self._refill():
+                continue
+            if not self._ended or not self.buffered:
                 return NEED_DATA
+            if self._queued:
+                self._need(self._queued)
+                self._refill()
+            limit = self._base + len(self._buffer)
+            fault = self._reject(FaultKind.INCOMPLETE, self._base + self._pos, limit)
+            if fault is not None:
+                return fault
 
     def _parse(self) -> Span | FramingFault | NeedData:
         """Next packet or fault in the buffer; NEED_DATA if ``_missing`` more bytes are needed."""

@@ -49,6 +49,7 @@ class FaultKind(Enum):
     EMPTY = "packet without payload"
     OVERSIZE = "packet longer than any receiver accepts"
     HEADER = "implausible NoEscape header"
+    INCOMPLETE = "packet cut off by the end of the data"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -130,7 +130,7 @@ def _record(data: bytes, position: int, layout: _Layout) -> bytes | None:
 
 
 def _record_times(meta: Path) -> dict[int, list[int]]:
-    """Read the times of the records by data type [ns since 1970]; empty without a usable meta file."""
+    """Read the records' times [ns since 1970] by data type; empty without a usable meta."""
     if not meta.is_file():
         return {}
     data = _read(meta)

@@ -1,0 +1,108 @@
+"""``xethru decode``: captured bytes to messages, packet by packet as they come."""
+
+import sys
+from collections.abc import Iterator
+from contextlib import nullcontext
+from pathlib import Path
+from typing import BinaryIO
+
+from xethru_protocol.cli.output import print_json
+from xethru_protocol.codec import decode_command, decode_response, describe, encode
+from xethru_protocol.codes import PongCode
+from xethru_protocol.errors import LocalProtocolError, XeThruError
+from xethru_protocol.framing import PacketReader
+from xethru_protocol.messages import Message, Pong, UnknownMessage
+from xethru_protocol.packets import Framing, FramingFault, Packet
+from xethru_protocol.plausibility import FROM_HOST, FROM_MODULE
+from xethru_protocol.wire import hex_bytes
+
+_CHUNK_BYTES = 65536
+
+
+class DecodeError(XeThruError):
+    """The input cannot be read as what it was said to be."""
+
+
+def decode(file: str | None, *, is_hex: bool, sender: str) -> int:
+    """Print one JSON object per packet and per fault."""
+    name = file or "standard input"
+    try:
+        with Path(file).open("rb") if file else nullcontext(sys.stdin.buffer) as source:
+            if is_hex:
+                for number, line in enumerate(source, start=1):
+                    _print_all(iter((_from_hex(line, name, number),)), sender)
+            else:
+                _print_all(_chunks(source), sender)
+    except BrokenPipeError:  # of stdout
+        raise
+    except OSError as error:
+        raise DecodeError(f"{name} cannot be read: {error.strerror}") from None
+    return 0
+
+
+def message_of(packet: Packet, sender: str) -> Message:
+    """Message of a packet from ``sender``: "host", "module", or "auto" to judge by structure.
+
+    Of two readings the one that explains every byte wins. PING and PONG look alike: a value
+    that modules answer with is a PONG.
+    """
+    payload = packet.payload
+    if sender == "host":
+        return decode_command(payload)
+    response = decode_response(payload)
+    if sender == "module" or packet.framing is Framing.NO_ESCAPE:
+        return response
+    command = decode_command(payload)
+    if not _explains(command, payload):
+        return command if isinstance(response, UnknownMessage) else response
+    if isinstance(response, Pong):
+        return response if response.value in set(PongCode) else command
+    return response if _explains(response, payload) else command
+
+
+def _explains(message: Message, payload: bytes) -> bool:
+    try:
+        return not isinstance(message, UnknownMessage) and encode(message, bulk=False) == payload
+    except LocalProtocolError:
+        return False
+
+
+def _print_all(chunks: Iterator[bytes], sender: str) -> None:
+    reader = PacketReader(FROM_HOST if sender == "host" else FROM_MODULE)
+    for chunk in chunks:
+        reader.receive_data(chunk)
+        _print_packets(reader, sender)
+    reader.end_data()
+    _print_packets(reader, sender)
+
+
+def _print_packets(reader: PacketReader, sender: str) -> None:
+    while isinstance(found := reader.next_packet(), Packet | FramingFault):
+        if isinstance(found, FramingFault):
+            print_json({"fault": found.kind.value, "offset": found.offset})
+            continue
+        name, shown = describe(message_of(found, sender))
+        print_json(
+            {
+                "framing": found.framing.value,
+                "payload_hex": hex_bytes(found.payload),
+                "message": name,
+                "fields": shown,
+            }
+        )
+
+
+def _chunks(source: BinaryIO) -> Iterator[bytes]:
+    read = getattr(source, "read1", source.read)  # read1 returns what there is, not a full chunk
+    while chunk := read(_CHUNK_BYTES):
+        yield chunk
+
+
+def _from_hex(line: bytes, name: str, number: int) -> bytes:
+    try:
+        return bytes.fromhex(line.decode("ascii"))
+    except ValueError:
+        text = line.strip()[:40].decode("ascii", "replace")
+        raise DecodeError(
+            f"{name} line {number} is not hexadecimal bytes: {text!r}; write them like 7D 10 6D 7E"
+        ) from None

@@ -1,0 +1,93 @@
+"""``xethru stream``: frames as JSON lines, or a live summary on a terminal."""
+
+import sys
+import time
+from typing import Any
+
+import numpy as np
+
+from xethru_protocol.cli.output import print_json, warn
+from xethru_protocol.driver import X4M300, Frame, RawConfig
+
+_REFRESH_NS = 200_000_000
+
+
+def stream(
+    port: str,
+    config: RawConfig,
+    *,
+    fps: float,
+    count: int | None,
+    with_samples: bool,
+    as_json: bool,
+) -> int:
+    """Print frames until ``count``, a signal, or the reader's end; the module is stopped then."""
+    with X4M300.open(port) as radar:
+        radar.configure_raw(config)
+        rate = radar.start(fps)
+        for text in radar.warnings:
+            warn(f"xethru stream: {text}")
+        timeout_s = max(2.0, 3.0 / rate)
+        live = None if as_json or with_samples or not sys.stdout.isatty() else _Live(radar)
+        try:
+            for frame in radar.frames(count, timeout_s):
+                if live is None:
+                    print_json(_as_json(frame, with_samples))
+                else:
+                    live.show(frame)
+        finally:
+            if live is not None:
+                live.end()
+            if radar.frames_lost or radar.fault_count:
+                warn(
+                    f"xethru stream: {radar.frames_lost} frames lost, "
+                    f"{radar.fault_count} damaged places on the line"
+                )
+    return 0
+
+
+def _as_json(frame: Frame, with_samples: bool) -> dict[str, Any]:
+    shown: dict[str, Any] = {
+        "counter": frame.counter,
+        "t_ns": frame.arrival_ns,
+        "bins": frame.geometry.n_bins,
+        "range_start_m": frame.geometry.range_start_m,
+        "bin_length_m": frame.geometry.bin_length_m,
+    }
+    if with_samples and frame.geometry.downconversion:
+        shown |= {"i": frame.samples.real.tolist(), "q": frame.samples.imag.tolist()}
+    elif with_samples:
+        shown["samples"] = frame.samples.tolist()
+    return shown
+
+
+class _Live:
+    """One line that is rewritten."""
+
+    def __init__(self, radar: X4M300) -> None:
+        self._radar = radar
+        self._shown_ns = 0
+        self._frames = 0
+        self._began_ns = time.monotonic_ns()
+
+    def show(self, frame: Frame) -> None:
+        """Count a frame, and say so a few times a second."""
+        self._frames += 1
+        now_ns = time.monotonic_ns()
+        if now_ns - self._shown_ns < _REFRESH_NS:
+            return
+        self._shown_ns = now_ns
+        geometry = frame.geometry
+        strongest = int(np.argmax(np.abs(frame.samples)))
+        rate = self._frames / max((now_ns - self._began_ns) * 1e-9, 1e-3)
+        sys.stdout.write(
+            f"\r{self._frames} frames, {rate:.1f}/s, {geometry.n_bins} bins, "
+            f"strongest at {geometry.range_start_m + strongest * geometry.bin_length_m:.3f} m, "
+            f"{self._radar.frames_lost} lost \x1b[K"
+        )
+        sys.stdout.flush()
+
+    def end(self) -> None:
+        """Leave the line as it is."""
+        sys.stdout.write("\n")
+        sys.stdout.flush()
