@@ -1,0 +1,155 @@
+"""Command line ``xethru-emulator``: emulated X4M300s on pseudo-terminals.
+
+Exit 0 after a clean stop by SIGINT, SIGTERM or SIGHUP, 1 when the thing failed, 2 for wrong usage.
+One JSON line on stdout says that the ports are ready; everything else goes to stderr.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from emulator.pace import Pace
+
+__all__ = ["main"]
+
+MOST_BARE = 32
+
+_SERVE_HELP = """\
+Each radar of the scene becomes a stock X4M300 on a pseudo-terminal, published as a link in the
+link directory. One JSON line on stdout says that all ports are ready:
+
+  {"ready":true,"scene_time_zero_ns":N,"odometry":"PATH or null",
+   "devices":[{"name":"...","path":"...","serial":"...","tcp":null}]}
+
+scene_time_zero_ns is the monotonic time of scene time 0; the odometry path is a unix socket that
+gives every client the wheel odometry as TUM lines. Ctrl-C, SIGTERM or SIGHUP ends it: links,
+socket and a directory of its own are removed, exit 0.
+
+pace realtime: frames at their deadlines; a host that does not keep up loses frames as on the
+real module. pace asap: as fast as the host reads, nothing is lost.
+"""
+
+_PLAY_HELP = """\
+Plays a directory of recorded baseband_iq messages (ModuleConnector's format) at the port of an
+emulated X4M300, byte-exact. Same ready line as serve.
+
+Playing begins anew for every host that opens the port: at once when the host starts the radar
+(FPS above 0, or SETMODE RUN), else half a second after it opened the port or sent its last
+command. It ends when the last host closes the port. Nothing is dropped: a host that reads slowly
+makes the recording wait. Meanwhile the module answers every command; FPS, mode and geometry
+settings are acknowledged and change nothing about what is played. (Where the system cannot tell
+who opens a port, a host's first command counts as opening it.)
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; return its exit code."""
+    arguments = _parse(argv)
+    # heavy imports only now: --help and usage errors answer at once
+    from emulator.serving import CannotServeError, play, serve
+
+    try:
+        if arguments.command == "play":
+            play(arguments.recording, arguments.rate, arguments.loop, arguments.link_dir)
+        else:
+            scene = arguments.count if arguments.bare else arguments.scene
+            serve(scene, arguments.seed, arguments.pace, arguments.link_dir)
+    except CannotServeError as error:
+        sys.stderr.write(f"xethru-emulator: {error}\n")
+        return 1
+    return 0
+
+
+def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="xethru-emulator", description="Emulated X4M300 radars on pseudo-terminals."
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+
+    serve = commands.add_parser(
+        "serve",
+        help="emulate the radars of a scene",
+        description=_SERVE_HELP,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    serve.add_argument("scene", nargs="?", metavar="SCENE", help="name or .toml file of a scene")
+    serve.add_argument("--bare", action="store_true", help="stock modules in an empty room")
+    serve.add_argument(
+        "--count", type=_count, metavar="N", help="with --bare: how many modules (default 1)"
+    )
+    serve.add_argument(
+        "--seed", type=_seed, default=0, metavar="S", help="of noise and odometry (default 0)"
+    )
+    serve.add_argument(
+        "--pace",
+        type=Pace,
+        choices=list(Pace),
+        default=Pace.REALTIME,
+        metavar="{realtime,asap}",
+        help="which clock drives the modules (default realtime)",
+    )
+    _add_link_dir(serve)
+
+    play = commands.add_parser(
+        "play",
+        help="play a recording at the port of an emulated module",
+        description=_PLAY_HELP,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    play.add_argument("recording", type=Path, metavar="RECORDING", help="directory to play")
+    play.add_argument(
+        "--rate",
+        type=_rate,
+        default=1.0,
+        metavar="R",
+        help="multiple of real time; 0: as fast as the port takes it (default 1)",
+    )
+    play.add_argument("--loop", action="store_true", help="begin again at the end")
+    _add_link_dir(play)
+
+    arguments = parser.parse_args(argv)
+    if arguments.command == "serve":
+        if arguments.bare == (arguments.scene is not None):
+            serve.error("give either a SCENE or --bare")
+        if arguments.count is not None and not arguments.bare:
+            serve.error("--count needs --bare")
+        arguments.count = arguments.count or 1
+    return arguments
+
+
+def _add_link_dir(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--link-dir",
+        type=Path,
+        metavar="D",
+        help="where the links appear (default: a fresh directory, named in the ready line)",
+    )
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if not 1 <= value <= MOST_BARE:
+        raise argparse.ArgumentTypeError(f"{value} is not in 1...{MOST_BARE}")
+    return value
+
+
+def _seed(text: str) -> int:
+    value = int(text)
+    if not 0 <= value < 2**63:
+        raise argparse.ArgumentTypeError(f"{value} is not in 0...2**63 - 1")
+    return value
+
+
+def _rate(text: str) -> float:
+    value = float(text)
+    if not (math.isfinite(value) and value >= 0):
+        raise argparse.ArgumentTypeError(f"{text} is not a finite number >= 0")
+    return value
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,95 @@
+"""Where running emulators leave word of themselves, so that other programs find their ports.
+
+``$XDG_RUNTIME_DIR/xethru`` (without that variable ``xethru-<uid>`` in the system's folder for
+temporary files) holds one ``<pid>.json`` per running emulator: its ready line with a ``pid``
+added, and the ports of those that were given no directory. What belongs to a process that is gone
+is stale, and removed by the next emulator that starts.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import stat
+import tempfile
+from pathlib import Path
+from typing import Any
+
+__all__ = ["Announcement", "fresh_port_folder", "run_directory"]
+
+_PORTS = "ports-"
+
+
+def run_directory() -> Path:
+    """Return the folder, which may not exist yet."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    if runtime and Path(runtime).is_dir():
+        return Path(runtime) / "xethru"
+    return Path(tempfile.gettempdir()) / f"xethru-{os.getuid()}"
+
+
+def fresh_port_folder() -> Path:
+    """Create an empty directory for the ports of this process."""
+    return Path(tempfile.mkdtemp(prefix=f"{_PORTS}{os.getpid()}-", dir=_private_run_directory()))
+
+
+def _private_run_directory() -> Path | None:
+    """Create the folder; None when it cannot be made or belongs to somebody else."""
+    folder = run_directory()
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        status = folder.lstat()
+    except OSError:
+        return None
+    return folder if stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() else None
+
+
+class Announcement:
+    """The entry of this process, until closed.
+
+    Without a usable folder nothing is announced: the ports work all the same.
+    """
+
+    def __init__(self, ready: dict[str, Any]) -> None:
+        self._path: Path | None = None
+        folder = _private_run_directory()
+        if folder is None:
+            return
+        _remove_stale(folder)
+        path = folder / f"{os.getpid()}.json"
+        with contextlib.suppress(OSError):
+            fresh = path.with_suffix(".new")
+            fresh.write_text(json.dumps({"pid": os.getpid(), **ready}) + "\n")
+            fresh.replace(path)
+            self._path = path
+
+    def close(self) -> None:
+        """Remove the entry."""
+        if self._path is not None:
+            with contextlib.suppress(OSError):
+                self._path.unlink()
+            self._path = None
+
+
+def _remove_stale(folder: Path) -> None:
+    for entry in folder.glob("*.json"):
+        if _is_dead(entry.stem):
+            with contextlib.suppress(OSError):
+                entry.unlink()
+    for ports in folder.glob(f"{_PORTS}*"):
+        if _is_dead(ports.name.removeprefix(_PORTS).partition("-")[0]):
+            shutil.rmtree(ports, ignore_errors=True)
+
+
+def _is_dead(pid: str) -> bool:
+    if not pid.isdigit():
+        return False  # not ours: leave it alone
+    try:
+        os.kill(int(pid), 0)
+    except ProcessLookupError:
+        return True
+    except (PermissionError, OverflowError):
+        return False
+    return False

@@ -1,0 +1,267 @@
+"""What ``serve`` and ``play`` put together: devices, ports, socket, loop; and how they end."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+from emulator.device import Device, radar_device
+from emulator.echo import echo_source
+from emulator.identity import Identity
+from emulator.link import LinkError, PtyLink
+from emulator.odometry import scene_odometry
+from emulator.odometry_feed import OdometryFeed
+from emulator.pace import Pace
+from emulator.port_watch import PortWatch
+from emulator.run_directory import Announcement, fresh_port_folder
+from emulator.scene import Scene, SceneError, empty_room, load_scene
+from emulator.server import Port, Server, Service
+
+__all__ = ["CannotServeError", "play", "serve"]
+
+NS_PER_MS = 1_000_000
+LONGEST_SOCKET_PATH = 100  # bytes; the kernel takes 107
+PLAYED_SERIAL = "000000000000"
+
+
+class CannotServeError(Exception):
+    """The emulator could not start; the message is one line with the remedy."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NamedDevice:
+    """A device and what the ready line says about it."""
+
+    name: str
+    serial: str
+    device: Device
+
+
+def serve(scene: str | int, seed: int, pace: Pace, link_dir: Path | None) -> None:
+    """Emulate the radars of a scene until a signal asks for the end.
+
+    Parameters
+    ----------
+    scene
+        Name or path of a scene, or the number of modules in an empty room.
+    seed
+        Of receiver noise and odometry.
+    pace
+        Which clock drives the modules.
+    link_dir
+        Where the links appear; a fresh directory if None.
+
+    Raises
+    ------
+    CannotServeError
+        When scene or ports cannot be had.
+    """
+    with _stop_signals() as stop, contextlib.ExitStack() as cleanup:
+        try:
+            bare = isinstance(scene, int)
+            loaded = empty_room(scene) if isinstance(scene, int) else load_scene(scene)
+            folder = cleanup.enter_context(_link_folder(link_dir))
+            zero_ns = time.monotonic_ns()
+            devices = _radar_devices(loaded, seed, pace, zero_ns)
+            feed = None
+            if not bare:
+                feed = OdometryFeed(
+                    _socket_path(folder, cleanup),
+                    scene_odometry(loaded, seed),
+                    pace,
+                    scene_time_zero_ns=zero_ns,
+                )
+                cleanup.callback(feed.close)
+            ports = _open_ports(devices, folder, cleanup)
+        except (SceneError, LinkError) as error:
+            raise CannotServeError(str(error)) from error
+        services: list[Service] = [] if feed is None else [feed]
+        ready = _ready_line(devices, folder, zero_ns, None if feed is None else feed.path)
+        _run(ports, services, ready, stop, cleanup)
+
+
+def play(recording: Path, rate: float, loop: bool, link_dir: Path | None) -> None:
+    """Play a recording at the port of an emulated module until a signal asks for the end.
+
+    Parameters
+    ----------
+    recording
+        Directory of recorded messages.
+    rate
+        Multiple of real time; 0 for as fast as the port takes it.
+    loop
+        Whether to begin again at the end.
+    link_dir
+        Where the link appears; a fresh directory if None.
+
+    Raises
+    ------
+    CannotServeError
+        When the recording cannot be read or the port not be had.
+    """
+    from emulator.playback import RecordingError, recording_device
+
+    with _stop_signals() as stop, contextlib.ExitStack() as cleanup:
+        try:
+            identity = Identity(serial=PLAYED_SERIAL)
+            device = recording_device(recording, identity, rate=rate, loop=loop)
+            folder = cleanup.enter_context(_link_folder(link_dir))
+            devices = [NamedDevice(name="player", serial=identity.serial, device=device)]
+            ports = _open_ports(devices, folder, cleanup)
+        except (RecordingError, LinkError) as error:
+            raise CannotServeError(str(error)) from error
+        watch = PortWatch(
+            os.fspath(folder / "player"), opened=device.port_opened, closed=device.port_closed
+        )
+        cleanup.callback(watch.close)
+        ready = _ready_line(devices, folder, time.monotonic_ns(), None)
+        _run(ports, [watch], ready, stop, cleanup)
+
+
+def _radar_devices(scene: Scene, seed: int, pace: Pace, zero_ns: int) -> list[NamedDevice]:
+    return [
+        NamedDevice(
+            name=radar.name,
+            serial=radar.serial,
+            device=radar_device(
+                Identity(serial=radar.serial),
+                echo_source(scene, index, seed),
+                pace,
+                scene_time_zero_ns=zero_ns,
+                skew_ns=round(radar.start_skew_ms * NS_PER_MS),
+            ),
+        )
+        for index, radar in enumerate(scene.radars)
+    ]
+
+
+def _open_ports(
+    devices: Sequence[NamedDevice], folder: Path, cleanup: contextlib.ExitStack
+) -> list[Port]:
+    links = [cleanup.enter_context(PtyLink(folder / named.name)) for named in devices]
+    return [Port(link, named.device) for link, named in zip(links, devices, strict=True)]
+
+
+def _ready_line(
+    devices: Sequence[NamedDevice], folder: Path, zero_ns: int, odometry: Path | None
+) -> dict[str, object]:
+    return {
+        "ready": True,
+        "scene_time_zero_ns": zero_ns,
+        "odometry": None if odometry is None else os.fspath(odometry),
+        "devices": [
+            {
+                "name": named.name,
+                "path": os.fspath(folder / named.name),
+                "serial": named.serial,
+                "tcp": None,
+            }
+            for named in devices
+        ],
+    }
+
+
+def _run(
+    ports: Sequence[Port],
+    services: Sequence[Service],
+    ready: dict[str, object],
+    stop: _Stop,
+    cleanup: contextlib.ExitStack,
+) -> None:
+    server = Server(ports, services)
+    cleanup.callback(server.close)
+    stop.attach(server)
+    cleanup.callback(stop.detach)  # a second signal must not reach a loop that is being closed
+    cleanup.callback(Announcement(ready).close)
+    _say_ready(ready)
+    server.run()
+
+
+def _say_ready(ready: dict[str, object]) -> None:
+    if sys.stdout is None:  # started with stdout closed: serve without a word
+        return
+    try:
+        sys.stdout.write(json.dumps(ready, separators=(",", ":")) + "\n")
+        sys.stdout.flush()
+    except OSError as error:
+        # nobody will ever learn our ports; and the interpreter must not try to flush again
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise CannotServeError(f"stdout: cannot write the ready line: {error.strerror}") from error
+
+
+class _Stop:
+    """A request to end that may come before there is a loop to end."""
+
+    def __init__(self) -> None:
+        self._server: Server | None = None
+        self._requested = False
+
+    def attach(self, server: Server) -> None:
+        self._server = server
+        if self._requested:
+            server.stop()
+
+    def request(self, number: int, frame: FrameType | None) -> None:
+        del number, frame
+        self._requested = True
+        if self._server is not None:
+            self._server.stop()
+
+    def detach(self) -> None:
+        self._server = None
+
+
+@contextlib.contextmanager
+def _stop_signals() -> Iterator[_Stop]:
+    """Turn SIGINT, SIGTERM and SIGHUP into an orderly end, from here to the last clean-up."""
+    stop = _Stop()
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, stop.request) for number in numbers}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _link_folder(wanted: Path | None) -> Iterator[Path]:
+    """Provide the directory of the links; remove it afterwards if we made it and it is empty."""
+    if wanted is None:
+        folder = fresh_port_folder()
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+        return
+    existed = wanted.exists()
+    try:
+        wanted.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LinkError(f"{wanted}: cannot make the link directory: {error.strerror}") from error
+    try:
+        yield wanted.absolute()
+    finally:
+        if not existed:
+            with contextlib.suppress(OSError):  # somebody else uses it too
+                wanted.rmdir()
+
+
+def _socket_path(folder: Path, cleanup: contextlib.ExitStack) -> Path:
+    """Return where the odometry socket goes: among the links, if the kernel takes such a path."""
+    path = folder / "odometry.sock"
+    if len(os.fsencode(path)) <= LONGEST_SOCKET_PATH:
+        return path
+    short = Path(tempfile.mkdtemp(prefix="xethru-"))
+    cleanup.callback(shutil.rmtree, short, ignore_errors=True)
+    return short / "odometry.sock"
