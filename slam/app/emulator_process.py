@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 from typing import IO, Self
 
@@ -37,8 +38,8 @@ class EmulatedDevice:
 class EmulatorProcess:
     """Runs `xethru-emulator serve` in its own process group while it is entered.
 
-    The group keeps Ctrl-C for us: we stop reading first and end the emulator afterwards. Its links
-    live in a temporary directory, so they are gone even if it is killed.
+    The group keeps Ctrl-C for us: we stop reading first and end the emulator afterwards. It removes
+    its links when it ends; if it was killed, we remove them.
 
     Parameters
     ----------
@@ -58,10 +59,9 @@ class EmulatorProcess:
     def __enter__(self) -> Self:
         """Start the process; its ports are there after `wait_until_ready`."""
         with self._cleanup:
-            links = self._cleanup.enter_context(tempfile.TemporaryDirectory(prefix="xethru-"))
             self._errors: IO[bytes] = self._cleanup.enter_context(tempfile.TemporaryFile())
             command = [sys.executable, "-m", "emulator.cli", "serve", self._scene]
-            command += ["--pace", "asap", "--seed", str(self._seed), "--link-dir", links]
+            command += ["--pace", "asap", "--seed", str(self._seed)]
             self._process = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
@@ -143,6 +143,16 @@ class EmulatorProcess:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        self._remove_links()
+
+    def _remove_links(self) -> None:
+        left = [Path(device.path) for device in self.devices]
+        left += [Path(self.odometry_socket)] if self.odometry_socket else []
+        for path in left:
+            path.unlink(missing_ok=True)
+        for folder in {path.parent for path in left}:
+            with contextlib.suppress(OSError):  # gone already, or somebody else uses it
+                folder.rmdir()
 
 
 def _end_with_parent() -> Callable[[], None] | None:

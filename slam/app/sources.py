@@ -12,12 +12,11 @@ from dataclasses import asdict, dataclass
 from types import TracebackType
 from typing import Self
 
-from xethru_protocol.driver import X4M300, Frame, RawConfig
-
 from slam.app.errors import AppError, RadarSilentError
 from slam.app.session import RadarInfo, Scan
 from slam.frames import RadarFrame
 from slam.geometry import Mount
+from xethru_protocol.driver import X4M300, Frame, RawConfig
 from xethru_protocol.errors import Disconnected, ResponseTimeout, XeThruError
 from xethru_protocol.x4 import MODULE_SPEED_MPS, frame_time_ns
 

@@ -1,0 +1,186 @@
+"""`uwb-slam demo` as a user runs it, on a short scene: files, numbers, and sameness of paths."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from PIL import Image
+from rerun.chunk import RrdReader
+from rosbags.highlevel import AnyReader
+
+from hil_tests.system.short_scene import write_short_scene
+from slam.app import ros_messages as ros
+from slam.app.emulated_rig import (
+    FRAME_RATE_HZ,
+    RAW_CONFIG,
+    end_counter,
+    open_loopback,
+    scene_and_config,
+)
+from slam.app.evaluate import evaluate
+from slam.app.rerun_view import count_rows
+from slam.app.session import Scan
+from slam.app.sweep import run_in_process, run_one
+from slam.app.tum import read_tum
+
+pytestmark = pytest.mark.slow
+
+SEED = 11
+RADARS = ("front_left", "rear_left", "front_right", "rear_right")
+
+
+@dataclass(frozen=True)
+class Finished:
+    scene: Path
+    out: Path
+    process: subprocess.CompletedProcess[str]
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    folder = tmp_path_factory.mktemp("demo")
+    scene = write_short_scene(folder)
+    out = folder / "out"
+    command = [sys.executable, "-m", "slam.app.cli", "demo", "--scene", str(scene)]
+    command += ["--seed", str(SEED), "--out", str(out)]
+    process = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert process.returncode == 0, process.stderr
+    return Finished(scene=scene, out=out, process=process)
+
+
+def test_stdout_is_one_table_of_simulated_numbers(demo: Finished) -> None:
+    lines = demo.process.stdout.splitlines()
+    assert lines[0] == f"short, preset paper, seed {SEED}: simulated numbers"
+    assert [line.split("  ")[0] for line in lines[2:-1]] == [
+        "odometry ATE",
+        "SLAM ATE",
+        "SLAM ATE, ICP",
+        "final error",
+        "landmarks",
+        "speed",
+    ]
+    assert "0 lost" in lines[-2]
+
+
+def test_progress_is_on_stderr_and_nothing_else(demo: Finished) -> None:
+    lines = demo.process.stderr.splitlines()
+    assert lines
+    assert all(line.startswith("scene time") for line in lines)
+
+
+def test_exactly_the_promised_files(demo: Finished) -> None:
+    assert {path.name for path in demo.out.iterdir()} == {
+        "session.mcap",
+        "session.rrd",
+        "map.png",
+        "summary.json",
+        "estimate.tum",
+        "truth.tum",
+        "odometry.tum",
+    }
+
+
+def test_summary_agrees_with_the_trajectory_files(demo: Finished) -> None:
+    summary = json.loads((demo.out / "summary.json").read_text())
+    assert summary["landmarks"]["true"] > 0
+    assert len(summary["nees_pose"]) == 10
+    truth = demo.out / "truth.tum"
+    for name, field in (("estimate", "ate_rmse_m"), ("odometry", "odometry_ate_rmse_m")):
+        result = evaluate(demo.out / f"{name}.tum", truth)
+        assert result["ate_rmse_m"] == pytest.approx(summary[field], rel=1e-9)
+        assert result["pairs"] == result["reference_poses"]
+
+
+def test_rosbags_reads_every_frame_without_a_gap(demo: Finished) -> None:
+    summary = json.loads((demo.out / "summary.json").read_text())
+    with AnyReader([demo.out / "session.mcap"]) as reader:
+        counts = {c.topic: c.msgcount for c in reader.connections}
+    frames = [counts[f"/radar/{name}/frame"] for name in RADARS]
+    assert sum(frames) == summary["frames"]
+    with (demo.out / "session.mcap").open("rb") as stream:
+        topic = f"/radar/{RADARS[0]}/frame"
+        counters = [m.sequence for _, _, m in make_reader(stream).iter_messages(topics=[topic])]
+    assert counters == list(range(frames[0]))
+
+
+def test_the_rrd_holds_every_frame_and_a_blueprint(demo: Finished) -> None:
+    summary = json.loads((demo.out / "summary.json").read_text())
+    rows = count_rows(demo.out / "session.rrd")
+    assert sum(rows[f"/radar/{name}/frame"] for name in RADARS) == summary["frames"]
+    assert rows["/link/front_left"] > 10
+    assert len(RrdReader(demo.out / "session.rrd").blueprints()) == 1
+
+
+def test_the_map_is_a_picture_with_all_its_colours(demo: Finished) -> None:
+    with Image.open(demo.out / "map.png") as picture:
+        assert min(picture.size) >= 800
+        colours = picture.convert("RGB").getcolors(maxcolors=1 << 24)
+    assert colours is not None
+    found = {colour for _, colour in colours}
+    for line_colour in ((31, 111, 208), (194, 37, 92)):  # estimate, landmarks
+        assert line_colour in found
+
+
+def test_the_link_log_tells_how_the_radars_were_set_up(demo: Finished) -> None:
+    with (demo.out / "session.mcap").open("rb") as stream:
+        lines = [
+            ros.deserialise(message.data, ros.LOG)
+            for _, _, message in make_reader(stream).iter_messages(topics=["/log"])
+        ]
+    for name in RADARS:
+        said = [line.msg for line in lines if line.name == name]
+        assert any("PING" in text.upper() for text in said)
+        assert any("FRAMEAREA" in text for text in said)
+
+
+def loopback_scans(scene: Path) -> Iterator[Scan]:
+    loaded, _ = scene_and_config(str(scene), "paper")
+    with open_loopback(loaded, SEED) as source:
+        source.start(RAW_CONFIG, FRAME_RATE_HZ)
+        yield from source.scans(end_counter(loaded.trajectory().duration_ns), lambda: None)
+
+
+def test_frames_through_ports_and_in_process_are_bit_identical(demo: Finished) -> None:
+    with (demo.out / "session.mcap").open("rb") as stream:
+        topics = [f"/radar/{name}/frame" for name in RADARS]
+        recorded = {
+            (channel.topic, message.sequence): (message.log_time, message.data)
+            for _, channel, message in make_reader(stream).iter_messages(topics=topics)
+        }
+    n_compared = 0
+    for scan in loopback_scans(demo.scene):
+        for frame in scan.frames:
+            t_ns, data = recorded[f"/radar/{RADARS[frame.radar]}/frame", frame.counter]
+            assert t_ns == frame.t_ns
+            samples = ros.deserialise(data, ros.FLOAT_ARRAY).data
+            assert samples.tobytes() == frame.samples.tobytes()
+            n_compared += 1
+    assert n_compared == len(recorded)
+
+
+def test_ports_and_in_process_give_the_same_belief_bit_for_bit(demo: Finished) -> None:
+    record = run_in_process(str(demo.scene), "paper", SEED)
+    estimate = read_tum(demo.out / "estimate.tum")
+    np.testing.assert_array_equal(estimate.stamps_ns, [row.t_ns for row in record.results])
+    positions = np.array([row.belief.pose[:2] for row in record.results])
+    assert estimate.poses[:, :2].tobytes() == positions.tobytes()
+    summary = json.loads((demo.out / "summary.json").read_text())
+    again = json.loads(run_one(str(demo.scene), "paper", SEED).to_json())
+    # covariances, landmarks and innovations all enter here
+    for numbers in (summary, again):
+        del numbers["realtime_factor"]
+    assert summary == again
+
+
+def test_seeds_differ(demo: Finished) -> None:
+    other = run_in_process(str(demo.scene), "paper", SEED + 1)
+    assert (
+        other.results[-1].belief.pose.tolist()
+        != read_tum(demo.out / "estimate.tum").poses[-1].tolist()
+    )

@@ -1,0 +1,162 @@
+"""How a demo ends when it does not end well: one line, the right code, nothing left behind."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from hil_tests.unit.slam.app.sessions import surviving_counters
+from slam.app.rerun_view import count_rows
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc (Linux)"),
+]
+
+WELL_UNDER_WAY_BYTES = 2_000_000
+
+
+@contextmanager
+def running_demo(
+    out: Path, temporary: Path, *, progressed: bool = True
+) -> Iterator[subprocess.Popen[str]]:
+    """Run a demo of the long lab scene; with `progressed`, yield when frames are on disk."""
+    temporary.mkdir()
+    demo = subprocess.Popen(
+        [sys.executable, "-m", "slam.app.cli", "demo", "--out", str(out)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"TMPDIR": str(temporary)},
+    )
+    try:
+        log = out / "session.mcap"
+        if progressed:
+            wait_until(lambda: log.exists() and log.stat().st_size > WELL_UNDER_WAY_BYTES, 30)
+        yield demo
+    finally:
+        demo.kill()
+        demo.communicate()
+
+
+def wait_until(condition: Callable[[], bool], limit_s: float) -> None:
+    give_up = time.monotonic() + limit_s
+    while not condition():
+        assert time.monotonic() < give_up, "waited in vain"
+        time.sleep(0.02)
+
+
+def children(pid: int) -> list[int]:
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def is_gone(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return True
+    return state == "Z"
+
+
+def leftovers(temporary: Path) -> list[Path]:
+    """Return links, sockets, files and port folders that nobody removed.
+
+    The folder by which emulators find each other may stay, and in it the card of one that was
+    killed: the next emulator removes it.
+    """
+    folder = f"xethru-{os.getuid()}"
+    found = [path for path in temporary.rglob("*") if path.name != folder]
+    return [path for path in found if path.parent.name != folder or path.suffix != ".json"]
+
+
+def finished_counters(log: Path) -> list[int]:
+    with log.open("rb") as stream:
+        reader = make_reader(stream)
+        assert reader.get_summary() is not None
+        topics = ["/radar/left_rear/frame"]
+        return [message.sequence for _, _, message in reader.iter_messages(topics=topics)]
+
+
+def test_ctrl_c_half_way(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with running_demo(out, tmp_path / "tmp") as demo:
+        (emulator,) = children(demo.pid)
+        demo.send_signal(signal.SIGINT)
+        stdout, stderr = demo.communicate(timeout=20)
+    assert demo.returncode == 130
+    assert stdout == ""
+    assert stderr.splitlines()[-1] == f"uwb-slam: stopped by SIGINT; what was recorded is in {out}"
+    assert "Traceback" not in stderr
+    assert is_gone(emulator)
+    assert leftovers(tmp_path / "tmp") == []
+    counters = finished_counters(out / "session.mcap")
+    assert counters == list(range(len(counters)))
+    assert abs(count_rows(out / "session.rrd")["/radar/left_rear/frame"] - len(counters)) <= 1
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "which", "code"), [(0.2, signal.SIGINT, 130), (1.2, signal.SIGTERM, 143)]
+)
+def test_a_signal_while_it_starts(
+    tmp_path: Path, delay_s: float, which: signal.Signals, code: int
+) -> None:
+    with running_demo(tmp_path / "out", tmp_path / "tmp", progressed=False) as demo:
+        time.sleep(delay_s)
+        started = children(demo.pid)
+        demo.send_signal(which)
+        _, stderr = demo.communicate(timeout=20)
+    assert demo.returncode == code
+    assert f"uwb-slam: stopped by {which.name}" in stderr
+    assert "Traceback" not in stderr
+    assert all(is_gone(child) for child in started)
+    assert leftovers(tmp_path / "tmp") == []
+
+
+def test_kill_9_leaves_a_readable_session_and_no_emulator(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with running_demo(out, tmp_path / "tmp") as demo:
+        (emulator,) = children(demo.pid)
+        demo.kill()
+        demo.wait()
+        wait_until(lambda: is_gone(emulator), 10)
+    assert leftovers(tmp_path / "tmp") == []
+    log = out / "session.mcap"
+    counters = surviving_counters(log, "/radar/left_rear/frame")
+    assert counters == list(range(len(counters)))
+    # 2 MB on disk hold well over 100 scans; all but the last chunk of 256 KiB must be there
+    assert len(counters) > 100
+
+
+def test_the_emulator_dies(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with running_demo(out, tmp_path / "tmp") as demo:
+        (emulator,) = children(demo.pid)
+        os.kill(emulator, signal.SIGKILL)
+        _, stderr = demo.communicate(timeout=30)
+    assert demo.returncode == 1
+    last = stderr.splitlines()[-1]
+    assert last == (f"uwb-slam: the emulator ended by SIGKILL; what was recorded is in {out}")
+    assert "Traceback" not in stderr
+    assert len(finished_counters(out / "session.mcap")) > 100
+    assert leftovers(tmp_path / "tmp") == []
+
+
+def test_the_emulator_freezes(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with running_demo(out, tmp_path / "tmp") as demo:
+        (emulator,) = children(demo.pid)
+        os.kill(emulator, signal.SIGSTOP)
+        _, stderr = demo.communicate(timeout=60)
+    assert demo.returncode == 1
+    last = stderr.splitlines()[-1]
+    assert last.startswith("uwb-slam: radar ")
+    assert "no frame for 5 s after frame" in last
+    assert is_gone(emulator)
+    assert len(finished_counters(out / "session.mcap")) > 100

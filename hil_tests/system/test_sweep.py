@@ -1,0 +1,61 @@
+"""`uwb-slam sweep`: same numbers on one process or two, groups that follow from the runs."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hil_tests.system.short_scene import write_short_scene
+
+pytestmark = pytest.mark.slow
+
+
+def sweep(tmp_path: Path, jobs: int) -> dict[str, Any]:
+    scene, out = write_short_scene(tmp_path), tmp_path / f"sweep{jobs}.json"
+    command = [sys.executable, "-m", "slam.app.cli", "sweep", "--scene", str(scene)]
+    command += ["--seeds", "3", "--jobs", str(jobs), "--json", str(out)]
+    run = subprocess.run(command, capture_output=True, text=True, check=True, timeout=100)
+    assert run.stdout.startswith("short, preset paper, 3 seeds (simulated): SLAM ATE median")
+    result: dict[str, Any] = json.loads(out.read_text())
+    return result
+
+
+def test_one_and_two_processes_give_the_same_numbers(tmp_path: Path) -> None:
+    alone, together = sweep(tmp_path, 1), sweep(tmp_path, 2)
+    for result in (alone, together):
+        for run in result["runs"]:
+            del run["realtime_factor"]
+        for group in result["groups"]:
+            del group["realtime_factor"]
+    assert alone == together
+    assert [run["seed"] for run in alone["runs"]] == [0, 1, 2]
+    (group,) = alone["groups"]
+    errors = [run["ate_rmse_m"] for run in alone["runs"]]
+    assert group["ate_rmse_m"]["median"] == sorted(errors)[1]
+    assert group["ate_rmse_m"]["p90"] == pytest.approx(np.quantile(errors, 0.9))
+    # chi-square with 9 degrees of freedom, 2.5 % and 97.5 % of tables, over 3 runs
+    assert group["anees_band_95"] == pytest.approx([2.700 / 3, 19.023 / 3], rel=1e-3)
+
+
+def test_ctrl_c_ends_a_sweep_and_its_workers(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "slam.app.cli", "sweep", "--seeds", "50"]
+    command += ["--jobs", "2", "--json", str(tmp_path / "o.json")]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, process_group=0
+    )
+    time.sleep(4)
+    started = time.monotonic()
+    # to the whole group, as a terminal does
+    os.killpg(process.pid, signal.SIGINT)
+    _, stderr = process.communicate(timeout=20)
+    assert time.monotonic() - started < 8
+    assert process.returncode == 130
+    assert stderr.splitlines()[-1].startswith("uwb-slam: stopped by SIGINT")
+    assert "Traceback" not in stderr
