@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from xethru_protocol.recordings import RecordingError, read_recording
-
 from emulator.chip import Chip
 from emulator.commands import Module
 from emulator.device import BootTiming, Device
@@ -14,6 +12,7 @@ from emulator.identity import Identity
 from emulator.outbox import LosslessOutbox
 from emulator.player import NOMINAL_PERIOD_NS, PlayStream, schedule
 from emulator.scene import empty_room
+from xethru_protocol.recordings import RecordingError, read_recording
 
 __all__ = ["RecordingError", "recording_device"]
 

@@ -1,9 +1,8 @@
 """Where running emulators leave word of themselves, so that other programs find their ports.
 
-``$XDG_RUNTIME_DIR/xethru`` (without that variable ``xethru-<uid>`` in the system's folder for
-temporary files) holds one ``<pid>.json`` per running emulator: its ready line with a ``pid``
-added, and the ports of those that were given no directory. What belongs to a process that is gone
-is stale, and removed by the next emulator that starts.
+The run directory (`xethru_protocol.ports.run_directory`) holds one ``<pid>.json`` per running
+emulator: its ready line with a ``pid`` added; and the ports of those that were given no directory.
+What belongs to a process that is gone is stale, and removed by the next emulator that starts.
 """
 
 from __future__ import annotations
@@ -17,17 +16,11 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Announcement", "fresh_port_folder", "run_directory"]
+from xethru_protocol.ports import run_directory
+
+__all__ = ["Announcement", "fresh_port_folder"]
 
 _PORTS = "ports-"
-
-
-def run_directory() -> Path:
-    """Return the folder, which may not exist yet."""
-    runtime = os.environ.get("XDG_RUNTIME_DIR")
-    if runtime and Path(runtime).is_dir():
-        return Path(runtime) / "xethru"
-    return Path(tempfile.gettempdir()) / f"xethru-{os.getuid()}"
 
 
 def fresh_port_folder() -> Path:

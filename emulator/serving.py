@@ -22,6 +22,7 @@ from emulator.link import LinkError, PtyLink
 from emulator.odometry import scene_odometry
 from emulator.odometry_feed import OdometryFeed
 from emulator.pace import Pace
+from emulator.playback import RecordingError, recording_device
 from emulator.port_watch import PortWatch
 from emulator.run_directory import Announcement, fresh_port_folder
 from emulator.scene import Scene, SceneError, empty_room, load_scene
@@ -109,8 +110,6 @@ def play(recording: Path, rate: float, loop: bool, link_dir: Path | None) -> Non
     CannotServeError
         When the recording cannot be read or the port not be had.
     """
-    from emulator.playback import RecordingError, recording_device
-
     with _stop_signals() as stop, contextlib.ExitStack() as cleanup:
         try:
             identity = Identity(serial=PLAYED_SERIAL)
