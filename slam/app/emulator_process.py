@@ -20,9 +20,9 @@ from typing import IO, Self
 
 from slam.app.errors import EmulatorError
 
-_READY_LIMIT_S = 30.0
+READY_LIMIT_S = 30.0
 _POLL_S = 0.2
-_END_LIMIT_S = 3.0
+END_LIMIT_S = 3.0
 _PR_SET_PDEATHSIG = 1
 
 
@@ -108,11 +108,11 @@ class EmulatorProcess:
         output = self._process.stdout
         assert output is not None
         line = b""
-        give_up = time.monotonic() + _READY_LIMIT_S
+        give_up = time.monotonic() + READY_LIMIT_S
         while not line.endswith(b"\n"):
             check()
             if time.monotonic() > give_up:
-                raise EmulatorError(f"the emulator was not ready after {_READY_LIMIT_S:g} s")
+                raise EmulatorError(f"the emulator was not ready after {READY_LIMIT_S:g} s")
             if select.select([output], [], [], _POLL_S)[0]:
                 part = os.read(output.fileno(), 65536)
                 if not part:
@@ -139,7 +139,7 @@ class EmulatorProcess:
             self._process.stdout.close()
         self._process.terminate()
         try:
-            self._process.wait(timeout=_END_LIMIT_S)
+            self._process.wait(timeout=END_LIMIT_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()

@@ -10,7 +10,10 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from types import TracebackType
-from typing import Self
+from typing import Self, cast
+
+import numpy as np
+from numpy.typing import NDArray
 
 from slam.app.errors import AppError, RadarSilentError
 from slam.app.session import RadarInfo, Scan
@@ -23,7 +26,7 @@ from xethru_protocol.x4 import MODULE_SPEED_MPS, frame_time_ns
 LIGHT_MPS = 299_792_458.0
 TRUE_PER_MODULE_METRE = LIGHT_MPS / MODULE_SPEED_MPS
 
-_SILENCE_S = 5.0
+SILENCE_S = 5.0
 _POLL_S = 0.25
 
 
@@ -53,7 +56,8 @@ def radar_frame(radar: int, frame: Frame, rate_hz: float) -> RadarFrame:
         radar=radar,
         t_ns=frame_time_ns(frame.counter, rate_hz),
         counter=frame.counter,
-        samples=frame.samples,
+        # raw RF was configured, so they are real; RadarFrame refuses anything else
+        samples=cast(NDArray[np.float32], frame.samples),
         range_start_m=frame.geometry.range_start_m * TRUE_PER_MODULE_METRE,
         bin_length_m=frame.geometry.bin_length_m * TRUE_PER_MODULE_METRE,
     )
@@ -166,7 +170,7 @@ class RigSource:
 
     def _next_frame(self, radar: int, expected: int, check: Callable[[], None]) -> Frame:
         link = self._links[radar]
-        give_up = time.monotonic() + _SILENCE_S
+        give_up = time.monotonic() + SILENCE_S
         while True:
             try:
                 return link.driver.read_frame(timeout_s=_POLL_S)
@@ -174,7 +178,7 @@ class RigSource:
                 check()
                 if time.monotonic() > give_up:
                     raise RadarSilentError(
-                        f"radar {link.mount.name} at {link.port}: no frame for {_SILENCE_S:g} s "
+                        f"radar {link.mount.name} at {link.port}: no frame for {SILENCE_S:g} s "
                         f"after frame {expected - 1}"
                     ) from None
             except Disconnected as error:

@@ -1,0 +1,83 @@
+"""Speed of a whole run in process, and of what logs and viewer cost per frame.
+
+Bars (design, quality bars): whole pipeline in process, four radars at 5 Hz, at least 100 times
+real time with synthesis and 200 times without. `extra_info` carries the factor.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import pytest
+from pytest_benchmark.fixture import BenchmarkFixture
+
+from hil_tests.system.short_scene import write_short_scene
+from hil_tests.unit.slam.app.sessions import scan, session_info
+from slam.app.emulated_rig import (
+    FRAME_RATE_HZ,
+    RAW_CONFIG,
+    end_counter,
+    open_loopback,
+    rig_of,
+    scene_and_config,
+)
+from slam.app.odometry import OdometryTrack
+from slam.app.rerun_view import RerunView
+from slam.app.runner import run_slam
+from slam.app.session_log import SessionLog
+from slam.app.sweep import run_in_process
+from slam.app.tum import TumSample
+from slam.pipeline import UwbRadarSlam
+
+N_SCANS = 512
+Result = TypeVar("Result")
+
+
+def repeat(benchmark: BenchmarkFixture, run: Callable[[], Result]) -> Result:
+    """Time three rounds after one that warms up; return the last result."""
+    result: Result = benchmark.pedantic(  # type: ignore[no-untyped-call]  # unannotated there
+        run, rounds=3, warmup_rounds=1
+    )
+    return result
+
+
+def test_whole_pipeline_with_synthesis(benchmark: BenchmarkFixture, tmp_path: Path) -> None:
+    scene = str(write_short_scene(tmp_path))
+    record = repeat(benchmark, lambda: run_in_process(scene, "paper", 0))
+    benchmark.extra_info["times_real_time"] = record.duration_ns / 1e9 / record.wall_s
+
+
+def test_whole_pipeline_without_synthesis(benchmark: BenchmarkFixture, tmp_path: Path) -> None:
+    scene, config = scene_and_config(str(write_short_scene(tmp_path)), "paper")
+    trajectory = scene.trajectory()
+    with open_loopback(scene, 0) as source:
+        source.start(RAW_CONFIG, FRAME_RATE_HZ)
+        scans = list(source.scans(end_counter(trajectory.duration_ns), lambda: None))
+    poses = trajectory.poses
+    # perfect odometry: only its length matters here
+    track = OdometryTrack(
+        TumSample(t_ns=s.t_ns, x_m=0.002 * 5 * s.counter, y_m=0.0, qz=0.0, qw=1.0) for s in scans
+    )
+
+    def run() -> float:
+        record = run_slam(scans, track, UwbRadarSlam(config, rig_of(scene)), poses)
+        return record.duration_ns / 1e9 / record.wall_s
+
+    benchmark.extra_info["times_real_time"] = repeat(benchmark, run)
+
+
+@pytest.mark.parametrize("kind", ["mcap", "rerun"])
+def test_logging_1024_frames(benchmark: BenchmarkFixture, tmp_path: Path, kind: str) -> None:
+    scans = [scan(counter) for counter in range(N_SCANS)]
+
+    def log() -> None:
+        observer = (
+            SessionLog(tmp_path / "s.mcap", session_info())
+            if kind == "mcap"
+            else RerunView(tmp_path / "s.rrd", session_info(), simulated=True)
+        )
+        for one in scans:
+            observer.on_scan(one)
+        observer.close()
+
+    repeat(benchmark, log)
