@@ -248,12 +248,14 @@ def config_from_tables(
         What to call the tables in an error message.
     """
     base = {key: value for key, value in tables.items() if key != "environment"}
-    overrides = tables.get("environment", {})
+    overrides = _table(tables.get("environment", {}), "environment", source)
     if environment != BASE_ENVIRONMENT and environment not in overrides:
         allowed = ", ".join([BASE_ENVIRONMENT, *sorted(overrides)])
         raise ConfigError(f"{source}: no environment {environment!r}; known: {allowed}")
-    for part, values in overrides.get(environment, {}).items():
-        base[part] = {**base.get(part, {}), **values}
+    key = f"environment.{environment}"
+    for part, values in _table(overrides.get(environment, {}), key, source).items():
+        general = _table(base.get(part, {}), part, source)
+        base[part] = {**general, **_table(values, f"{key}.{part}", source)}
     return _validated(base, source)
 
 
@@ -271,6 +273,12 @@ def override(config: SlamConfig, settings: Mapping[str, object]) -> SlamConfig:
             raise ConfigError(f"setting {key!r}: write it as part.key; parts: {_parts()}")
         tables[part] = {**tables[part], field: value}
     return _validated(tables, "setting")
+
+
+def _table(value: object, key: str, source: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ConfigError(f"{source}: {key}: must be a table (given: {value!r})")
+    return value
 
 
 def _validated(tables: Mapping[str, Any], source: str) -> SlamConfig:

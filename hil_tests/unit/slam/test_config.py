@@ -1,0 +1,118 @@
+"""Presets and overrides: Table I comes out, mistakes come out as one clear line."""
+
+import pytest
+
+from slam.config import (
+    Assignment,
+    ConfigError,
+    EndOfRun,
+    SlamConfig,
+    config_from_tables,
+    load_preset,
+    override,
+)
+
+
+def test_preset_paper_is_table_one() -> None:
+    config = load_preset("paper", "lab")
+    assert config.detection.smoothing_length_bins == 15
+    assert config.detection.smoothing_order == 5
+    assert config.detection.min_peak_height == 5.5e-3
+    assert config.detection.min_peak_prominence == 3e-3
+    assert config.detection.max_range_m == 1.5
+    assert config.trilateration.field_of_view_deg == 65.0
+    assert (config.window.min_distance_m, config.window.min_turn_rad) == (5e-3, 0.1)
+    assert config.window.size == 15
+    assert config.clustering.min_observations == 9
+    assert config.clustering.search_radius_m == 0.2
+    assert config.motion.sigma_heading_rad == 0.02
+    assert (config.observation.sigma_range_m, config.observation.sigma_bearing_rad) == (0.15, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("environment", "alpha", "sigma_xy_m"), [("lab", 0.6, 1e-4), ("classroom", 1.6, 1e-3)]
+)
+def test_environments_differ_where_the_paper_says(
+    environment: str, alpha: float, sigma_xy_m: float
+) -> None:
+    config = load_preset("paper", environment)
+    assert config.association.gate_threshold == alpha
+    assert config.motion.sigma_xy_m == sigma_xy_m
+    base = load_preset("paper")
+    assert config.clustering == base.clustering
+    assert config.motion.sigma_heading_rad == base.motion.sigma_heading_rad
+
+
+def test_defaults_are_the_preset_paper() -> None:
+    assert SlamConfig() == load_preset("paper")
+
+
+@pytest.mark.parametrize(
+    ("preset", "environment", "message"),
+    [
+        ("papier", "lab", "unknown preset 'papier'; known: paper"),
+        ("paper", "moon", "no environment 'moon'; known: lab, classroom"),
+    ],
+)
+def test_unknown_names_are_answered_with_the_known_ones(
+    preset: str, environment: str, message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load_preset(preset, environment)
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ({"window": {"sise": 3}}, "x.toml: unknown key window.sise; allowed: min_distance_m, "),
+        ({"radar": {}}, "x.toml: unknown key radar; allowed: detection, trilateration, window"),
+        ({"window": {"size": 0}}, r"x.toml: window.size: .* greater than or equal to 1 .*: 0\)"),
+        ({"window": 3}, r"x.toml: window: .* \(given: 3\)"),
+        ({"association": {"gate_rule": "x"}}, "association.gate_rule: .*'mahalanobis_sq'"),
+        ({"detection": {"smoothing_length_bins": 14}}, "smoothing_length_bins must be odd"),
+        ({"detection": {"smoothing_order": 15}}, "smoothing_order must be less than"),
+        ({"detection": {"min_range_m": 2.0}}, "min_range_m must be less than max_range_m"),
+        ({"association": {"gate_rule": "chi_square", "gate": 1.5}}, "probability below 1"),
+    ],
+)
+def test_mistake_in_a_file_is_one_line_naming_file_key_and_remedy(
+    tables: dict[str, object], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        config_from_tables(tables, source="x.toml")
+    assert "\n" not in str(caught.value)
+
+
+def test_environment_of_a_file_must_be_tables() -> None:
+    hall = {"environment": {"hall": {"window": 3}}}
+    with pytest.raises(ConfigError, match=r"x: environment.hall.window: must be a table"):
+        config_from_tables(hall, environment="hall", source="x")
+    with pytest.raises(ConfigError, match="x: environment: must be a table"):
+        config_from_tables({"environment": 3}, source="x")
+
+
+def test_override_reads_text_as_the_type_of_the_key() -> None:
+    config = override(
+        SlamConfig(),
+        {
+            "association.assignment": "one_to_one",
+            "window.size": "7",
+            "window.end_of_run": EndOfRun.FLUSH,
+        },
+    )
+    assert config.association.assignment is Assignment.ONE_TO_ONE
+    assert config.window.size == 7
+    assert config.window.end_of_run is EndOfRun.FLUSH
+
+
+@pytest.mark.parametrize(
+    ("key", "message"),
+    [
+        ("window", "write it as part.key; parts: detection, "),
+        ("nothing.gate", "unknown key nothing; allowed: detection, "),
+        ("association.gait", "unknown key association.gait; allowed: gate_rule, gate, assignment"),
+    ],
+)
+def test_override_of_an_unknown_key_names_the_known_ones(key: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        override(SlamConfig(), {key: 1})
