@@ -1,0 +1,101 @@
+"""Small stand-ins for the parts around the device: a source of known counters, a bare host."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.device import BootTiming, Device, radar_device
+from emulator.echo_source import CaptureSettings
+from emulator.identity import Identity
+from emulator.pace import Pace
+from xethru_protocol import messages as m
+from xethru_protocol.codes import SensorMode, X4Setting
+from xethru_protocol.connection import Connection, Role
+
+IDENTITY = Identity(serial="202611210001")
+
+
+class RampSource:
+    """Counters that tell frame, time and sample; remembers what it was asked."""
+
+    def __init__(self) -> None:
+        self.captures: list[CaptureSettings] = []
+        self.blocks: list[int] = []
+        self.scene_times_ns: dict[int, int] = {}
+
+    def rf_counters(
+        self,
+        capture: CaptureSettings,
+        frame_counters: NDArray[np.int64],
+        scene_times_ns: NDArray[np.int64],
+    ) -> NDArray[np.int64]:
+        self.captures.append(capture)
+        self.blocks.append(len(frame_counters))
+        times = zip(frame_counters.tolist(), scene_times_ns.tolist(), strict=True)
+        self.scene_times_ns.update(times)
+        samples = np.arange(capture.n_samples, dtype=np.int64)
+        return (frame_counters[:, np.newaxis] * 7 + samples) % 1000
+
+
+class FormulaSource:
+    """Counters from a formula over the sample's index counted from range label 0.18 m."""
+
+    def __init__(self, formula: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> None:
+        self._formula = formula
+
+    def rf_counters(
+        self,
+        capture: CaptureSettings,
+        frame_counters: NDArray[np.int64],
+        scene_times_ns: NDArray[np.int64],
+    ) -> NDArray[np.int64]:
+        first = round((capture.first_sample_m - 0.18) * 23.328e9 / 1.5e8)
+        index = np.arange(first, first + capture.n_samples, dtype=np.float64)
+        row = np.rint(self._formula(index)).astype(np.int64)
+        return np.tile(row, (len(frame_counters), 1))
+
+
+class BareHost:
+    """Speaks to a device directly; collects everything the device says."""
+
+    def __init__(self, device: Device, now_ns: int = 0) -> None:
+        self.device = device
+        self.now_ns = now_ns
+        self._line = Connection(Role.HOST)
+
+    def send(self, command: m.Command[m.Response]) -> None:
+        self.device.receive_data(self._line.send(command), self.now_ns)
+
+    def hear(self, most: int = 1000) -> list[m.Message]:
+        heard: list[m.Message] = []
+        while len(heard) < most and (packet := self.device.next_packet(self.now_ns)) is not None:
+            self._line.receive_data(packet)
+            event = self._line.next_event()
+            assert isinstance(event, m.Message), event
+            heard.append(event)
+        return heard
+
+    def ask(self, command: m.Command[m.Response]) -> m.Message:
+        self.send(command)
+        (reply,) = self.hear(1)
+        return reply
+
+    def set(self, setting: X4Setting, value: m.X4Value) -> None:
+        assert self.ask(m.X4DriverSet(setting=setting, value=value)) == m.Ack()
+
+    def enter_manual(self) -> None:
+        for mode in (SensorMode.XTID_SM_STOP, SensorMode.XTID_SM_MANUAL):
+            assert self.ask(m.SetMode(mode=mode)) == m.Ack()
+        assert self.ask(m.X4DriverInit()) == m.Ack()
+
+    def frames(self, count: int) -> list[m.DataFloat]:
+        heard = self.hear(count)
+        assert all(isinstance(message, m.DataFloat) for message in heard)
+        return [message for message in heard if isinstance(message, m.DataFloat)]
+
+
+def ramp_device(pace: Pace = Pace.ASAP, source: RampSource | None = None) -> Device:
+    return radar_device(IDENTITY, source or RampSource(), pace, boot=BootTiming())

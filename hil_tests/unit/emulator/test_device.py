@@ -1,0 +1,319 @@
+"""The module's answers, modes, reset and streaming, driven with a virtual clock."""
+
+from __future__ import annotations
+
+import pytest
+
+from emulator.device import BootTiming, radar_device
+from emulator.identity import Identity
+from emulator.pace import Pace
+from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource, ramp_device
+from xethru_protocol import messages as m
+from xethru_protocol.codes import SensorMode, X4Setting
+from xethru_protocol.connection import Connection, Role
+
+SECOND = 1_000_000_000
+PRESENCE_2 = 0x014D4AB8
+
+
+@pytest.fixture
+def host() -> BareHost:
+    return BareHost(ramp_device())
+
+
+def mode_of(host: BareHost) -> int:
+    reply = host.ask(m.GetMode())
+    assert isinstance(reply, m.ReplyByte)
+    return reply.values[0]
+
+
+def test_a_stock_module_powers_up_with_its_profile_running(host: BareHost) -> None:
+    """Protocol reference 8.2."""
+    assert host.ask(m.Ping(seed=0x12345678)) == m.Pong(value=0xAAEEAEEA)
+    assert mode_of(host) == 0x01
+    # REPLY INT is signed; the id is below 2**31
+    assert host.ask(m.GetProfileId()) == m.ReplyInt(values=(PRESENCE_2,))
+
+
+# Protocol reference 8.3: what SETMODE answers, from a module whose profile runs.
+MODES = [
+    (0x01, m.Ack(), 0x01),
+    (0x11, m.Ack(), 0x11),
+    (0x12, m.Ack(), 0x12),
+    (0x13, m.Ack(), 0x13),
+    (0x50, m.Ack(), 0x50),
+    (0x10, m.Error(code=1), 0x01),
+    (0x77, m.Error(code=1), 0x01),
+]
+
+
+@pytest.mark.parametrize(("mode", "reply", "then"), MODES)
+@pytest.mark.parametrize("param", [None, 0])
+def test_setmode(
+    host: BareHost, mode: int, reply: m.Response, then: int, param: int | None
+) -> None:
+    assert host.ask(m.SetMode(mode=mode, param=param)) == reply
+    assert mode_of(host) == then
+
+
+def test_run_needs_a_profile(host: BareHost) -> None:
+    stop, run = m.SetMode(mode=SensorMode.XTID_SM_STOP), m.SetMode(mode=SensorMode.XTID_SM_RUN)
+    assert host.ask(stop) == m.Ack()
+    assert host.ask(stop) == m.Ack()
+    assert host.ask(m.GetProfileId()) == m.ReplyInt(values=(0,))
+    assert host.ask(run) == m.Error(code=0x20)
+    assert host.ask(m.LoadApp(profile_id=0x064E57AD)) == m.Error(code=0x20)
+    assert host.ask(m.LoadApp(profile_id=PRESENCE_2)) == m.Ack()
+    assert mode_of(host) == 0x13
+    assert host.ask(run) == m.Ack()
+    assert host.ask(m.SetMode(mode=SensorMode.XTID_SM_IDLE)) == m.Ack()
+    assert host.ask(run) == m.Ack()
+
+
+@pytest.mark.parametrize("payload", ["EE", "A0", "51", "90 55", "90 59 00", "50 14", "20", "90 58"])
+def test_unknown_and_cut_commands_get_error_1(host: BareHost, payload: str) -> None:
+    data = bytes.fromhex(payload)
+    assert host.ask(m.UnknownMessage(code=data[0], payload=data)) == m.Error(code=1)
+    assert mode_of(host) == 0x01
+
+
+def test_info_items_of_the_sensor_firmware(host: BareHost) -> None:
+    """Protocol reference 4.10."""
+    texts = {}
+    for item in range(0x0A):
+        reply = host.ask(m.SystemGetInfo(item=item))
+        if item == 0x05:
+            assert reply == m.Error(code=1)
+            continue
+        assert isinstance(reply, m.ReplyString)
+        assert (reply.content_id, reply.info) == (0x58, item)
+        texts[item] = reply.text
+    assert texts[0x01] == "X4M300"
+    assert texts[0x06] == IDENTITY.serial
+    assert len(texts[0x06]) == 12
+    assert texts[0x04].startswith(texts[0x03] + "+")
+    assert len(texts[0x04].split(".sha.")[1]) == 40
+    assert host.ask(m.SystemGetInfo(item=0x0A)) == m.Error(code=1)
+
+
+@pytest.mark.parametrize("serial", ["12345678901", "1234567890123", "12345678901x", "1²3456789012"])
+def test_a_serial_number_has_12_digits(serial: str) -> None:
+    with pytest.raises(ValueError, match="12 digits"):
+        Identity(serial=serial)
+
+
+def test_getters_answer_in_the_documented_types(host: BareHost) -> None:
+    """Protocol reference 4.9, last column."""
+    byte_settings = {"DOWNCONVERSION", "DACSTEP", "TXCENTERFREQUENCY", "TXPOWER", "PRFDIV"}
+    float_settings = {"FPS": 1, "FRAMEAREA": 2, "FRAMEAREAOFFSET": 1}
+    int_settings = {"PULSESPERSTEP", "ITERATIONS", "DACMIN", "DACMAX", "FRAMEBINCOUNT"}
+    for setting in X4Setting:
+        address = 4 if setting.name.endswith("REGISTER") else None
+        reply = host.ask(m.X4DriverGet(setting=setting, address=address))
+        if setting.name == "ENABLE":
+            assert reply == m.Error(code=1)
+        elif setting.name in byte_settings or address is not None:
+            assert isinstance(reply, m.ReplyByte)
+            assert (reply.content_id, reply.info, len(reply.values)) == (setting, 0, 1)
+        elif setting.name in float_settings:
+            assert isinstance(reply, m.ReplyFloat)
+            assert len(reply.values) == float_settings[setting.name]
+            assert (reply.content_id, reply.info) == (setting, 0)
+        else:
+            assert setting.name in int_settings
+            assert isinstance(reply, m.ReplyInt)
+            assert (reply.content_id, reply.info, len(reply.values)) == (setting, 0, 1)
+
+
+def test_one_byte_pulses_and_dac_step_are_understood(host: BareHost) -> None:
+    """Protocol reference 11, rows 1 and 3: `7D 50 10 11 00 00 00 14 38 7E` and the host's form."""
+    for hexadecimal in ("7D 50 10 11 00 00 00 14 38 7E", "7D 50 10 15 00 00 00 00 28 7E"):
+        host.device.receive_data(bytes.fromhex(hexadecimal), 0)
+        assert host.hear() == [m.Ack()]
+    pulses = host.ask(m.X4DriverGet(setting=X4Setting.PULSESPERSTEP))
+    assert isinstance(pulses, m.ReplyInt)
+    assert pulses.values == (20,)
+
+
+def test_extra_bytes_are_ignored(host: BareHost) -> None:
+    assert host.ask(m.UnknownMessage(code=0x26, payload=b"\x26\x01\x02")) == m.ReplyByte(
+        values=b"\x01"
+    )
+
+
+def test_a_bad_checksum_is_not_answered(host: BareHost) -> None:
+    host.device.receive_data(bytes.fromhex("7D 26 00 7E"), 0)
+    assert host.hear() == []
+    assert mode_of(host) == 0x01
+    assert host.device.faults_seen == 1
+
+
+def test_block_register_access(host: BareHost) -> None:
+    assert host.ask(m.X4DriverWrite(address=0x13, values=b"\x01\x02\x03")) == m.Ack()
+    reply = host.ask(m.X4DriverRead(address=0x13, length=2))
+    assert isinstance(reply, m.ReplyByte)
+    assert (reply.content_id, len(reply.values)) == (0x22, 2)
+    assert host.ask(m.X4DriverRead(address=5, length=10**6)) == m.Error(code=1)
+
+
+def test_frames_flow_in_manual_mode_only(host: BareHost) -> None:
+    host.ask(m.SetMode(mode=SensorMode.XTID_SM_STOP))
+    host.set(X4Setting.FPS, 17.0)
+    assert host.hear() == []
+    assert host.ask(m.SetMode(mode=SensorMode.XTID_SM_MANUAL)) == m.Ack()
+    assert [frame.info for frame in host.frames(3)] == [0, 1, 2]
+    host.send(m.SetMode(mode=SensorMode.XTID_SM_STOP))
+    assert host.hear() == [m.Ack()]
+
+
+def test_a_reply_waits_behind_no_frame_and_no_frame_follows_a_stop(host: BareHost) -> None:
+    host.enter_manual()
+    host.set(X4Setting.FPS, 17.0)
+    assert len(host.frames(10)) == 10
+    assert host.ask(m.Ping()) == m.Pong(value=0xAAEEAEEA)
+    host.send(m.X4DriverSet(setting=X4Setting.FPS, value=0.0))
+    assert host.hear() == [m.Ack()]
+
+
+def test_a_pause_continues_the_counter_and_init_resets_it(host: BareHost) -> None:
+    host.enter_manual()
+    host.set(X4Setting.FPS, 17.0)
+    host.frames(5)
+    host.set(X4Setting.FPS, 0.0)
+    host.set(X4Setting.FPS, 17.0)
+    assert [frame.info for frame in host.frames(2)] == [5, 6]
+    host.ask(m.X4DriverInit())
+    assert host.hear() == [], "INIT stops the stream"
+    host.set(X4Setting.FPS, 17.0)
+    assert [frame.info for frame in host.frames(1)] == [0]
+
+
+def test_scene_time_continues_in_segments_over_a_rate_change() -> None:
+    source = RampSource()
+    host = BareHost(ramp_device(source=source))
+    host.enter_manual()
+    host.set(X4Setting.FPS, 100.0)
+    host.frames(50)
+    host.set(X4Setting.FPS, 40.0)
+    host.frames(2)
+    assert source.scene_times_ns[10] == SECOND // 10
+    assert source.scene_times_ns[50] == SECOND // 2
+    assert source.scene_times_ns[51] == SECOND // 2 + SECOND // 40
+
+
+def test_reset_acks_goes_deaf_and_comes_back_stopped(host: BareHost) -> None:
+    """Protocol reference 8.1 and 8.2: it was stopped, so it stays stopped."""
+    host.enter_manual()
+    host.set(X4Setting.FPS, 17.0)
+    assert host.ask(m.ModReset()) == m.Ack()
+    assert host.ask(m.Ping()) == m.Pong(value=0xAAEEAEEA), "half a second is left"
+    host.now_ns = SECOND // 2
+    host.device.advance(host.now_ns)
+    host.send(m.Ping())
+    assert host.hear() == []
+    assert host.device.wake_ns(host.now_ns) == SECOND // 2 + 2 * SECOND
+    host.now_ns = SECOND // 2 + 2 * SECOND
+    host.device.advance(host.now_ns)
+    assert host.hear() == [m.System(code=0x10), m.System(code=0x11)]
+    assert mode_of(host) == 0x13
+    count = host.ask(m.X4DriverGet(setting=X4Setting.FRAMEBINCOUNT))
+    assert isinstance(count, m.ReplyInt)
+    assert count.values == (1467,), "X4 settings are never saved"
+
+
+def test_reset_of_a_running_module_restores_its_profile(host: BareHost) -> None:
+    host.ask(m.ModReset())
+    host.now_ns = 10 * SECOND
+    host.device.advance(host.now_ns)
+    assert len(host.hear()) == 2
+    assert mode_of(host) == 0x01
+    assert host.ask(m.GetProfileId()) == m.ReplyInt(values=(PRESENCE_2,))
+
+
+def test_boot_timing_is_an_argument() -> None:
+    boot = BootTiming(ack_to_reset_ns=5, reset_to_ready_ns=7)
+    host = BareHost(radar_device(IDENTITY, RampSource(), Pace.ASAP, boot=boot))
+    host.ask(m.ModReset())
+    assert host.device.wake_ns(0) == 5
+    host.device.advance(5)
+    assert host.device.wake_ns(5) == 12
+
+
+def test_a_host_that_never_reads_is_held_back() -> None:
+    device = ramp_device()
+    ping = Connection(Role.HOST).send(m.Ping())
+    sent = 0
+    while device.wants_data:
+        device.receive_data(ping, 0)
+        sent += 1
+        assert sent < 1000
+    assert device.next_packet(0) is not None
+
+
+def test_realtime_frames_are_due_at_absolute_deadlines() -> None:
+    zero_ns, skew_ns = 7 * SECOND, 3_000_000
+    device = radar_device(
+        IDENTITY, RampSource(), Pace.REALTIME, scene_time_zero_ns=zero_ns, skew_ns=skew_ns
+    )
+    host = BareHost(device, now_ns=zero_ns)
+    host.enter_manual()
+    host.set(X4Setting.FPS, 50.0)
+    arrivals = {}
+    for _ in range(100):
+        due_ns = device.wake_ns(host.now_ns)
+        assert due_ns is not None
+        host.now_ns = due_ns + 100_000  # the loop wakes a little late, every time
+        device.advance(host.now_ns)
+        for frame in host.frames(10):
+            arrivals[frame.info] = host.now_ns
+    expected = {k: zero_ns + skew_ns + k * SECOND // 50 + 100_000 for k in range(100)}
+    assert arrivals == expected
+
+
+def test_a_late_start_in_realtime_skips_what_is_past() -> None:
+    source = RampSource()
+    device = radar_device(IDENTITY, source, Pace.REALTIME)
+    host = BareHost(device, now_ns=10 * SECOND + 1)
+    host.enter_manual()
+    host.set(X4Setting.FPS, 50.0)
+    host.now_ns += SECOND // 50
+    device.advance(host.now_ns)
+    (frame,) = host.frames(10)
+    assert frame.info == 501
+    assert source.scene_times_ns[501] == 501 * SECOND // 50
+
+
+def test_realtime_frames_equal_asap_frames() -> None:
+    asap, realtime = BareHost(ramp_device()), BareHost(ramp_device(Pace.REALTIME))
+    for host in (asap, realtime):
+        host.enter_manual()
+        host.set(X4Setting.FPS, 200.0)
+    wanted = {frame.info: frame for frame in asap.frames(400)}
+    got = []
+    for step in range(1, 60):  # an uneven loop
+        realtime.now_ns += step * 1_000_000
+        realtime.device.advance(realtime.now_ns)
+        got += realtime.frames(50)
+    assert len(got) > 200
+    assert all(frame == wanted[frame.info] for frame in got if frame.info in wanted)
+
+
+def test_realtime_overflow_shows_as_counter_gaps_and_commands_still_work() -> None:
+    device = ramp_device(Pace.REALTIME)
+    host = BareHost(device)
+    host.enter_manual()
+    host.set(X4Setting.FPS, 100.0)
+    for _ in range(500):  # five seconds nobody reads
+        host.now_ns += SECOND // 100
+        device.advance(host.now_ns)
+    host.send(m.Ping())
+    heard = host.hear()
+    counters = [message.info for message in heard if isinstance(message, m.DataFloat)]
+    assert m.Pong(value=0xAAEEAEEA) in heard
+    assert len(heard) <= 50
+    assert counters == sorted(set(counters))
+    assert counters[-1] > 490
+    host.now_ns += SECOND // 100
+    device.advance(host.now_ns)
+    (fresh,) = host.frames(5)
+    assert fresh.info == counters[-1] + 1

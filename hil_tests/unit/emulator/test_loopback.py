@@ -1,0 +1,99 @@
+"""The real driver on an emulated module in the same process."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from emulator.device import radar_device
+from emulator.echo import echo_source
+from emulator.loopback import LoopbackTransport
+from emulator.pace import Pace
+from emulator.scene import load_scene
+from hil_tests.unit.emulator.doubles import IDENTITY, ramp_device
+from xethru_protocol.codes import PongCode
+from xethru_protocol.driver import X4M300, RawConfig
+from xethru_protocol.errors import Disconnected, ResponseTimeout
+
+
+@pytest.mark.parametrize(("downconversion", "bins"), [(False, 1431), (True, 181)])
+def test_the_driver_gets_frames_of_the_documented_length(downconversion: bool, bins: int) -> None:
+    transport = LoopbackTransport(ramp_device())
+    with X4M300(transport, clock=transport.clock_ns) as radar:
+        geometry = radar.configure_raw(RawConfig(downconversion=downconversion))
+        rate = radar.start(17.0)
+        frames = list(radar.frames(50))
+        assert geometry.n_bins == bins
+        assert rate == pytest.approx(17.049379, abs=1e-6)
+        assert [frame.counter for frame in frames] == list(range(50))
+        assert {frame.samples.shape for frame in frames} == {(bins,)}
+        assert {frame.samples.dtype for frame in frames} == {
+            np.dtype(np.complex64 if downconversion else np.float32)
+        }
+        assert (radar.frames_lost, radar.frames_discarded, radar.fault_count) == (0, 0, 0)
+
+
+def test_virtual_time_makes_a_silent_module_time_out_at_once() -> None:
+    transport = LoopbackTransport(ramp_device())
+    with X4M300(transport, clock=transport.clock_ns) as radar:
+        began = time.monotonic()
+        with pytest.raises(ResponseTimeout):
+            radar.read_frame(timeout_s=3600.0)
+        assert transport.clock_ns() >= 3600 * 10**9
+        assert time.monotonic() - began < 5
+
+
+def test_a_reset_takes_no_wall_time() -> None:
+    transport = LoopbackTransport(ramp_device())
+    with X4M300(transport, clock=transport.clock_ns) as radar:
+        radar.configure_raw()
+        radar.reset()
+        with pytest.raises(ResponseTimeout):
+            radar.read_frame(5.0)
+        assert radar.reboots == 1
+        assert radar.ping() is PongCode.XTS_SPRP_READY
+        radar.configure_raw()
+
+
+def test_realtime_runs_on_the_virtual_clock() -> None:
+    transport = LoopbackTransport(ramp_device(Pace.REALTIME))
+    with X4M300(transport, clock=transport.clock_ns) as radar:
+        radar.configure_raw()
+        rate = radar.start(5.0)
+        arrivals = [radar.read_frame().arrival_ns for _ in range(20)]
+    steps = np.diff(arrivals)
+    np.testing.assert_allclose(steps, 1e9 / rate, atol=1)
+
+
+def test_content_depends_on_the_counter_alone() -> None:
+    """Same frames with a pause and a settings change in between as without."""
+    scene = load_scene("smoke")
+
+    def frames_of(pauses: bool) -> list[bytes]:
+        transport = LoopbackTransport(
+            radar_device(IDENTITY, echo_source(scene, 0, seed=3), Pace.ASAP)
+        )
+        with X4M300(transport, clock=transport.clock_ns) as radar:
+            radar.configure_raw()
+            radar.start(5.0)
+            frames = list(radar.frames(7))
+            if pauses:
+                radar.stop()
+                radar.start(5.0)
+            frames += radar.frames(40)
+            assert [frame.counter for frame in frames] == list(range(47))
+            return [frame.samples.tobytes() for frame in frames]
+
+    assert frames_of(pauses=True) == frames_of(pauses=False)
+
+
+def test_a_closed_transport_says_so() -> None:
+    transport = LoopbackTransport(ramp_device(), name="radar 3")
+    transport.close()
+    transport.close()
+    with pytest.raises(Disconnected, match="radar 3"):
+        transport.read(0.0)
+    with pytest.raises(Disconnected, match="radar 3"):
+        transport.write(b"x")
