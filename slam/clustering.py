@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
+from sklearn import config_context
 from sklearn.cluster import DBSCAN
 
 from slam.config import ClusterCount, ClusteringConfig, Emission, Evidence
@@ -93,7 +94,9 @@ def cluster_labels(points: Array, config: ClusteringConfig) -> NDArray[np.int64]
     model = DBSCAN(
         eps=config.search_radius_m, min_samples=config.min_observations, metric="precomputed"
     )
-    labels: NDArray[np.int64] = model.fit(cdist(points, points)).labels_.astype(np.int64)
+    # The parameters were checked once, with the configuration.
+    with config_context(skip_parameter_validation=True, assume_finite=True):
+        labels: NDArray[np.int64] = model.fit(cdist(points, points)).labels_.astype(np.int64)
     return labels
 
 

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from slam.config import MotionConfig, MotionNoise
 from slam.geometry import compose, wrap_angle, wrap_angles
@@ -241,9 +240,8 @@ def update(belief: Belief, row: int, observed: Array, Q: Array) -> Belief:
     HP = H @ np.concatenate([P[:POSE_SIZE], P[block]])
     S = HP[:, :POSE_SIZE] @ H_pose[0].T + HP[:, block] @ H_landmark[0].T + Q
     L = np.linalg.cholesky((S + S.T) / 2)
-    W = solve_triangular(L, HP, lower=True)
-    whitened = solve_triangular(L, innovation(observed, expected), lower=True)
-    mean = belief.mean + W.T @ whitened
+    W = whiten(L, HP)
+    mean = belief.mean + W.T @ whiten(L, innovation(observed, expected))
     mean[2] = wrap_angle(mean[2])
     return Belief(
         mean=mean,
@@ -251,6 +249,15 @@ def update(belief: Belief, row: int, observed: Array, Q: Array) -> Belief:
         landmark_ids=belief.landmark_ids,
         next_id=belief.next_id,
     )
+
+
+def whiten(L: NDArray[np.floating], rows: Array) -> Array:
+    """Return L^-1 rows for a lower triangular L of shape (2, 2) and two rows of any length.
+
+    Written out: a library call for two rows costs more than it computes, and wakes BLAS threads.
+    """
+    first = rows[0] / L[0, 0]
+    return np.array([first, (rows[1] - L[1, 0] * first) / L[1, 1]], dtype=np.float64)
 
 
 def augment(belief: Belief, observed: Array, Q: Array) -> Belief:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
-from slam.ekf_slam import LANDMARK_SIZE, Belief, landmark_slice
+from slam.ekf_slam import LANDMARK_SIZE, Belief, landmark_slice, whiten
 from slam.geometry import wrap_angle
 
 Array = NDArray[np.float64]
@@ -43,10 +42,10 @@ def merge(belief: Belief, keep: int, drop: int) -> Belief:
         raise ValueError(f"landmark row {keep} cannot be merged with itself")
     a, b = landmark_slice(keep), landmark_slice(drop)
     HP = belief.covariance[a] - belief.covariance[b]
-    S = HP[:, a] - HP[:, b] + MERGE_SIGMA_M**2 * np.eye(LANDMARK_SIZE)
+    S: Array = HP[:, a] - HP[:, b] + MERGE_SIGMA_M**2 * np.eye(LANDMARK_SIZE)
     L = np.linalg.cholesky((S + S.T) / 2)
-    W = solve_triangular(L, HP, lower=True)
-    mean = belief.mean + W.T @ solve_triangular(L, belief.mean[b] - belief.mean[a], lower=True)
+    W = whiten(L, HP)
+    mean = belief.mean + W.T @ whiten(L, belief.mean[b] - belief.mean[a])
     mean[2] = wrap_angle(mean[2])
     united = Belief(
         mean=mean,
