@@ -1,0 +1,121 @@
+"""How long the front end takes per frame, and one SLAM step against the size of the map."""
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pytest_benchmark.fixture import BenchmarkFixture
+from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # ships no stubs
+
+from slam.association import update_map
+from slam.clustering import filter_window
+from slam.config import AssociationConfig, ClusteringConfig, DetectionConfig, TrilaterationConfig
+from slam.detection import PaperDetector
+from slam.ekf_slam import Belief, predict, update
+from slam.frames import RadarFrame
+from slam.geometry import paper_rig
+from slam.trilateration import Fix, Trilaterator
+from slam.window import CollectedState
+
+Array = NDArray[np.float64]
+BIN_LENGTH_M = 299_792_458 / (2 * 23.328e9)
+Q = np.diag([0.15**2, 1.0])
+
+
+def frame(radar: int) -> RadarFrame:
+    """Return a frame of 1431 bins with four echoes, 30 dB for the strongest."""
+    labels = 0.2 + BIN_LENGTH_M * np.arange(1431)
+    samples = 5e-4 * np.random.default_rng(radar).standard_normal(1431)
+    for range_m in (0.6, 1.0, 2.0, 4.0):
+        envelope = 0.015 * np.exp(-0.5 * ((labels - range_m) / 0.0517) ** 2)
+        samples += envelope * np.cos(2 * math.pi * (labels - range_m) / 0.02056)
+    return RadarFrame(
+        radar=radar,
+        t_ns=0,
+        counter=0,
+        samples=samples.astype(np.float32),
+        range_start_m=0.2,
+        bin_length_m=BIN_LENGTH_M,
+    )
+
+
+def large_belief(n: int) -> Belief:
+    """Return n landmarks around the pose with a full covariance."""
+    rng = np.random.default_rng(n)
+    size = 3 + 2 * n
+    root = 0.1 * rng.standard_normal((size, 40)) / math.sqrt(40)
+    covariance = root @ root.T + 1e-3 * np.eye(size)
+    return Belief(
+        mean=np.concatenate([np.zeros(3), rng.uniform(-20, 20, 2 * n)]),
+        covariance=(covariance + covariance.T) / 2,
+        landmark_ids=tuple(range(n)),
+        next_id=n,
+    )
+
+
+@pytest.mark.benchmark(group="front end, one frame of 1431 bins")
+def test_front_end_per_frame(benchmark: BenchmarkFixture) -> None:
+    detector = PaperDetector(DetectionConfig())
+    one = frame(0)
+    detections = benchmark(detector.detect, one)
+    assert len(detections) >= 2
+
+
+@pytest.mark.benchmark(group="trilateration of one pose")
+def test_trilateration_per_pose(benchmark: BenchmarkFixture) -> None:
+    detector, trilaterator = (
+        PaperDetector(DetectionConfig()),
+        Trilaterator(TrilaterationConfig(), paper_rig()),
+    )
+    detections = [d for radar in range(4) for d in detector.detect(frame(radar))]
+    assert benchmark(trilaterator.locate, detections)
+
+
+@pytest.mark.benchmark(group="outlier filter, one window")
+def test_outlier_filter_per_window(benchmark: BenchmarkFixture) -> None:
+    rng = np.random.default_rng(0)
+    detection = PaperDetector(DetectionConfig()).detect(frame(0))[0]
+    window = [
+        CollectedState(
+            t_ns=k,
+            odometry_pose=np.array([0.01 * k, 0.0, 0.0]),
+            detections=(),
+            fixes=tuple(
+                Fix(pair=0, t_ns=k, x_m=x, y_m=y, detections=(detection, detection))
+                for x, y in ([0.0, 1.0], [0.3, -0.8]) + 0.03 * rng.standard_normal((2, 2))
+            ),
+        )
+        for k in range(15)
+    ]
+    filtered = benchmark(filter_window, window, ClusteringConfig())
+    assert len(filtered.observations) == 2
+
+
+@pytest.mark.parametrize("n", [100, 300, 1000])
+@pytest.mark.benchmark(group="SLAM step: predict and 4 updates")
+def test_slam_step(benchmark: BenchmarkFixture, n: int) -> None:
+    belief = large_belief(n)
+    u, R = np.array([0.01, 0.0, 0.01]), np.diag([1e-6, 1e-6, 4e-4])
+    seen = [np.array([math.hypot(*xy), math.atan2(xy[1], xy[0])]) for xy in belief.landmarks[:4]]
+
+    def step() -> Belief:
+        after = predict(belief, u, R)
+        for row, observed in enumerate(seen):
+            after = update(after, row, observed, Q)
+        return after
+
+    with threadpool_limits(1):
+        assert np.isfinite(benchmark(step).mean).all()
+
+
+@pytest.mark.parametrize("n", [14, 100, 1000])
+@pytest.mark.benchmark(group="association and update of one observation")
+def test_association(benchmark: BenchmarkFixture, n: int) -> None:
+    belief = large_belief(n)
+    config = AssociationConfig()
+    x, y = belief.landmarks[0]
+    seen = [np.array([math.hypot(x, y), math.atan2(y, x)])]
+    with threadpool_limits(1):
+        _, (association,) = benchmark(update_map, belief, seen, Q, config)
+    assert not association.is_new
