@@ -1,0 +1,80 @@
+"""Usage, exit codes and clear lines of xethru-emulator, without serving anything."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from emulator.cli import main
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["dance"],
+        ["serve"],
+        ["serve", "lab", "--bare"],
+        ["serve", "lab", "--count", "2"],
+        ["serve", "--bare", "--count", "0"],
+        ["serve", "--bare", "--count", "x"],
+        ["serve", "lab", "--pace", "slow"],
+        ["serve", "lab", "--seed", "-1"],
+        ["play"],
+        ["play", "x", "--rate", "-1"],
+        ["play", "x", "--rate", "nan"],
+    ],
+)
+def test_wrong_usage_exits_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        main(arguments)
+    assert exit_.value.code == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "usage: xethru-emulator" in captured.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["serve", "no_such_scene"], "no_such_scene: no such scene; known are"),
+        (["serve", "missing.toml"], "missing.toml: cannot read the scene file"),
+        (["play", "missing"], "there is no recording missing"),
+        (["serve", "--bare", "--link-dir", "FILE/links"], "cannot make the link directory"),
+        (["serve", "--bare", "--link-dir", "FILE"], "cannot make the link directory"),
+        (["play", "EMPTY"], "holds no recording this can read"),
+    ],
+)
+def test_what_cannot_be_served_is_one_line_and_exit_1(
+    arguments: list[str], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "empty").mkdir()
+    names = {"FILE": str(tmp_path / "file"), "EMPTY": str(tmp_path / "empty")}
+    given = arguments
+    for word, path in names.items():
+        given = [argument.replace(word, path) for argument in given]
+    assert main(given) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("xethru-emulator: ")
+    assert captured.err.count("\n") == 1
+    assert says in captured.err
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["serve", "--help"], ["play", "--help"]])
+def test_help_loads_nothing_heavy(arguments: list[str]) -> None:
+    code = (
+        "import sys; from emulator.cli import main\n"
+        "try: main(sys.argv[1:])\n"
+        "except SystemExit: pass\n"
+        "print(sorted({'numpy', 'scipy', 'pydantic', 'serial'} & set(sys.modules)))"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.endswith("\n[]\n")
+    assert "usage: xethru-emulator" in result.stdout
