@@ -122,11 +122,21 @@ def _draw_landmarks(axes: Axes, belief: Belief, place: NDArray[np.float64]) -> N
 
 def _write_title(axes: Axes, summary: Summary) -> None:
     axes.set_title(
-        f"{summary.scene}, preset {summary.preset}, seed {summary.seed}: "
+        f"{summary.scene}, preset {summary.preset}, seed {summary.seed} (simulated): "
         f"ATE {1e3 * summary.ate_rmse_m:.1f} mm, "
-        f"odometry {1e3 * summary.odometry_ate_rmse_m:.1f} mm (simulated)",
+        f"odometry {1e3 * summary.odometry_ate_rmse_m:.1f} mm",
         loc="left",
         fontsize=11,
         color="#20242a",
-        pad=10,
+        pad=24,
+    )
+    axes.annotate(
+        "drawn as estimated from the start pose; the ATE is after SE(2) alignment; "
+        f"final error unaligned {1e3 * summary.final_error_m:.0f} mm",
+        xy=(0.0, 1.0),
+        xytext=(0.0, 8.0),
+        xycoords="axes fraction",
+        textcoords="offset points",
+        fontsize=8.5,
+        color="#6a707a",
     )

@@ -20,6 +20,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
+from slam.app.bscan import bscan_picture
 from slam.app.ellipse import ellipse_95, rotate_covariances
 from slam.app.errors import AppError
 from slam.app.session import LogLine, Scan, SessionInfo, Snapshot
@@ -32,10 +33,6 @@ _BLOCK_SNAPSHOTS = 128
 _MAP_PERIOD_NS = NS_PER_S
 _PATH_PERIOD_NS = 2 * NS_PER_S
 
-# A B-scan shows what the paper's front end looks at and a little beyond, in decibels.
-_BSCAN_RANGE_M = 3.0
-_BSCAN_FLOOR_DB, _BSCAN_TOP_DB = -75.0, -30.0
-
 _MAP_MARGIN_M = 0.6
 _ARROW_M = 0.25
 
@@ -43,6 +40,13 @@ _TRUTH_RGB = (120, 120, 120)
 _ODOMETRY_RGB = (230, 130, 30)
 _ESTIMATE_RGB = (40, 120, 220)
 _LANDMARK_RGB = (200, 40, 90)
+
+# Name, colour, half line width, draw order: the truth lies below, wide enough to be seen.
+_PATHS = (
+    ("truth", _TRUTH_RGB, 0.02, 10.0),
+    ("odometry", _ODOMETRY_RGB, 0.006, 20.0),
+    ("estimate", _ESTIMATE_RGB, 0.006, 30.0),
+)
 
 ABOUT = """\
 # What you see
@@ -96,6 +100,9 @@ class RerunView:
         self._static("about", rr.TextDocument(about, media_type=rr.MediaType.MARKDOWN))
         settings = json.dumps([asdict(radar) for radar in info.radars], indent=1)
         self._static("radars", rr.TextDocument(settings))
+        for name, colour in (("truth", _TRUTH_RGB), ("estimate", _ESTIMATE_RGB)):
+            style = rr.Arrows2D.from_fields(colors=colour, radii=0.02, draw_order=40.0)
+            self._static(f"map/{name}/robot", style)
         if len(info.true_landmarks_m):
             self._static("map/landmarks/true", _crosses(info.true_landmarks_m))
 
@@ -173,7 +180,11 @@ class RerunView:
         self._sent[f"/{entity}"] += len(frames)
         # Stamped with its first frame, so that the cursor is inside the picture it shows.
         self._set_time(block.stamps_ns[0], block.counters[0])
-        self._open_stream().log(f"radar/{block.name}/bscan", _bscan(frames, block))
+        picture = bscan_picture(frames, block.range_start_m, block.bin_length_m)
+        self._open_stream().log(
+            f"radar/{block.name}/bscan",
+            rr.Tensor(picture, dim_names=("frame", "range_bin"), value_range=(0.0, 255.0)),
+        )
         block.clear()
 
     def _send_snapshots(self) -> None:
@@ -230,12 +241,13 @@ class RerunView:
 
     def _send_paths(self, snapshot: Snapshot) -> None:
         self._set_time(snapshot.t_ns, snapshot.counter)
-        colours = {"truth": _TRUTH_RGB, "odometry": _ODOMETRY_RGB, "estimate": _ESTIMATE_RGB}
-        for name, points in self._paths.items():
+        for name, colour, radius_m, draw_order in _PATHS:
+            points = self._paths[name]
             # One point per five states is 5 cm of path: no corner is lost.
             path = _screen(np.array([*points[::5], points[-1]]))
             self._open_stream().log(
-                f"map/{name}/path", rr.LineStrips2D([path], colors=colours[name], radii=0.008)
+                f"map/{name}/path",
+                rr.LineStrips2D([path], colors=colour, radii=radius_m, draw_order=draw_order),
             )
 
     def _set_time(self, t_ns: int, counter: int) -> None:
@@ -329,26 +341,6 @@ def _bar_charts(frames: NDArray[np.float32]) -> rr.ComponentColumn:
     )
     descriptor = template.component_descriptor()
     return rr.ComponentColumn(descriptor, _ArrowBatch(descriptor, column))
-
-
-def _bscan(frames: NDArray[np.float32], block: _FrameBlock) -> rr.Tensor:
-    """Draw echoes of shape (n_frames, n_bins) as bytes: constant part removed, envelope, decibels.
-
-    The quadrature of the pulse comes from the central difference of the samples, which for a
-    carrier of w radians per sample is the Hilbert partner times 2 sin w.
-    """
-    carrier_hz, light_mps = 7.29e9, 299_792_458.0
-    n_shown = min(
-        frames.shape[1], max(3, int((_BSCAN_RANGE_M - block.range_start_m) / block.bin_length_m))
-    )
-    echoes = frames[:, :n_shown] - frames[:, :n_shown].mean(axis=0)
-    phase_step_rad = 2.0 * np.pi * carrier_hz * 2.0 * block.bin_length_m / light_mps
-    quadrature = (echoes[:, 2:] - echoes[:, :-2]) / np.float32(2.0 * np.sin(phase_step_rad))
-    power = echoes[:, 1:-1] ** 2 + quadrature**2
-    level_db = 10.0 * np.log10(np.maximum(power, np.float32(1e-12)))
-    scaled = (level_db - _BSCAN_FLOOR_DB) / (_BSCAN_TOP_DB - _BSCAN_FLOOR_DB)
-    picture = (np.clip(scaled, 0.0, 1.0) * 255.0).astype(np.uint8)
-    return rr.Tensor(picture, dim_names=("frame", "range_bin"), value_range=(0.0, 255.0))
 
 
 def _crosses(points: NDArray[np.float64], arm_m: float = 0.04) -> rr.LineStrips2D:
