@@ -119,6 +119,11 @@ class Dialogue:
                 raise self.silence(f"answer to {summary(command)}", timeout_s)
             self.pump(left_ns * 1e-9)
 
+    def begin_anew(self) -> None:
+        """Forget half-read bytes and open answers, as after an interrupt in mid-work."""
+        self._connection = Connection(Role.HOST)
+        self._answers.clear()
+
     def pump(self, timeout_s: float) -> bool:
         """Read once and sort what came; False if nothing did in time."""
         data = self._transport.read(timeout_s)

@@ -127,10 +127,11 @@ class X4M300:
         try:
             if self._raw_mode:
                 self._raw_mode = False
+                self._dialogue.begin_anew()
                 self.stop()
                 self.request(SetMode(mode=SensorMode.XTID_SM_STOP))
         except XeThruError as error:
-            self._dialogue.tell("warning", f"the module was not stopped: {error}")
+            self._warn(f"the module was not stopped: {error}")
         finally:
             self._transport.close()
 

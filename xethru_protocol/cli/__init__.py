@@ -17,7 +17,11 @@ class Terminated(BaseException):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``xethru``; returns the exit code."""
-    previous = signal.signal(signal.SIGTERM, _terminate)
+    previous = {
+        signal.SIGTERM: signal.signal(signal.SIGTERM, _terminate),
+        # A script's background jobs start with SIGINT ignored; a stream must still be stoppable.
+        signal.SIGINT: signal.signal(signal.SIGINT, signal.default_int_handler),
+    }
     try:
         return _run(argv)
     except KeyboardInterrupt:
@@ -29,7 +33,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     finally:
-        signal.signal(signal.SIGTERM, previous)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 def _run(argv: Sequence[str] | None) -> int:

@@ -22,27 +22,28 @@ def stream(
     as_json: bool,
 ) -> int:
     """Print frames until ``count``, a signal, or the reader's end; the module is stopped then."""
-    with X4M300.open(port) as radar:
-        radar.configure_raw(config)
-        rate = radar.start(fps)
-        for text in radar.warnings:
-            warn(f"xethru stream: {text}")
-        timeout_s = max(2.0, 3.0 / rate)
-        live = None if as_json or with_samples or not sys.stdout.isatty() else _Live(radar)
-        try:
-            for frame in radar.frames(count, timeout_s):
+    radar = X4M300.open(port)
+    try:
+        with radar:
+            radar.configure_raw(config)
+            rate = radar.start(fps)
+            for text in radar.warnings:
+                warn(f"xethru stream: {text}")
+            radar.warnings.clear()
+            live = None if as_json or with_samples or not sys.stdout.isatty() else _Live(radar)
+            for frame in radar.frames(count, timeout_s=max(2.0, 3.0 / rate)):
                 if live is None:
                     print_json(_as_json(frame, with_samples))
                 else:
                     live.show(frame)
-        finally:
-            if live is not None:
-                live.end()
-            if radar.frames_lost or radar.fault_count:
-                warn(
-                    f"xethru stream: {radar.frames_lost} frames lost, "
-                    f"{radar.fault_count} damaged places on the line"
-                )
+    finally:  # also after a signal, once the module is stopped
+        if radar.frames_lost or radar.fault_count:
+            warn(
+                f"xethru stream: {radar.frames_lost} frames lost, "
+                f"{radar.fault_count} damaged places on the line"
+            )
+        for text in radar.warnings:
+            warn(f"xethru stream: {text}")
     return 0
 
 
@@ -85,9 +86,4 @@ class _Live:
             f"strongest at {geometry.range_start_m + strongest * geometry.bin_length_m:.3f} m, "
             f"{self._radar.frames_lost} lost \x1b[K"
         )
-        sys.stdout.flush()
-
-    def end(self) -> None:
-        """Leave the line as it is."""
-        sys.stdout.write("\n")
         sys.stdout.flush()
