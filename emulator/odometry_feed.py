@@ -97,7 +97,8 @@ class OdometryFeed:
         )
 
     def close(self) -> None:
-        """Close everything and remove the socket."""
+        """Close everything and remove the socket; the loop may be gone already."""
+        self._selector = None
         for client in list(self._clients):
             self._drop(client)
         with contextlib.suppress(OSError):

@@ -200,7 +200,7 @@ def test_a_hundred_all_zero_frames_switch_the_transmitter_off() -> None:
     chip.set(X4Setting.FPS, 17.0)
     for _ in range(99):
         chip.next_frame()
-    assert chip.running
+    assert chip.get(X4Setting.TXPOWER) == 2
     chip.next_frame()
     assert not chip.running
     assert chip.get(X4Setting.TXPOWER) == 0

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from emulator.chip import Chip
 from emulator.downconversion import CHANNELS, downconvert
 from hil_tests.unit.emulator.doubles import FormulaSource
 from xethru_protocol.codes import X4Setting
 
+Samples = NDArray[np.float64]
 CYCLES_PER_SAMPLE = {3: 5 / 16, 4: 3 / 8}
 
 
@@ -27,7 +29,7 @@ def test_taps_are_those_the_reference_describes(
 
 def baseband_of(
     setting: int, formula: FormulaSource, area: tuple[float, float] = (0.2, 9.4)
-) -> tuple[np.ndarray[tuple[int], np.dtype[np.complex128]], Chip]:
+) -> tuple[NDArray[np.complex128], Chip]:
     chip = Chip(formula)
     chip.set(X4Setting.DACMIN, 949)
     chip.set(X4Setting.DACMAX, 1100)
@@ -50,9 +52,7 @@ def test_tone_at_the_carrier_has_the_documented_gain_and_one_phase(
     amplitude, quantum = 0.05, 1 / (16 * 300 * 1024)
     cycles = CYCLES_PER_SAMPLE[setting]
 
-    def tone(
-        index: np.ndarray[tuple[int], np.dtype[np.float64]],
-    ) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    def tone(index: Samples) -> Samples:
         wave = amplitude * np.cos(2 * np.pi * cycles * index - phase_rad)
         return np.asarray((wave + 0.07421875) / quantum)
 
@@ -64,14 +64,15 @@ def test_tone_at_the_carrier_has_the_documented_gain_and_one_phase(
 
 def test_phase_falls_as_range_grows() -> None:
     """Protocol reference 9.8, phase convention with Q negated."""
-    mean_phases = []
-    for delay in (0.0, 0.25, 0.5):
-        iq, _ = baseband_of(
-            3,
-            FormulaSource(lambda n, d=delay: 3e5 + 1e5 * np.cos(2 * np.pi * 5 / 16 * (n - d))),
-        )
-        mean_phases.append(np.angle(iq.mean()))
-    steps = np.diff(np.unwrap(mean_phases))
+
+    def phase_of_delay(delay: float) -> float:
+        def tone(n: Samples) -> Samples:
+            return np.asarray(3e5 + 1e5 * np.cos(2 * np.pi * 5 / 16 * (n - delay)))
+
+        iq, _ = baseband_of(3, FormulaSource(tone))
+        return float(np.angle(iq.mean()))
+
+    steps = np.diff(np.unwrap([phase_of_delay(delay) for delay in (0.0, 0.25, 0.5)]))
     np.testing.assert_allclose(steps, -2 * np.pi * 5 / 16 * 0.25, atol=0.01)
 
 
@@ -80,9 +81,7 @@ def test_phase_falls_as_range_grows() -> None:
 def test_a_target_appears_at_its_labelled_range(line: int, setting: int) -> None:
     """A short pulse centred on RF sample 8 L (the label of line L) peaks in bin L."""
 
-    def pulse(
-        n: np.ndarray[tuple[int], np.dtype[np.float64]],
-    ) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    def pulse(n: Samples) -> Samples:
         centre = n - 8 * line
         carrier = np.cos(2 * np.pi * CYCLES_PER_SAMPLE[setting] * centre)
         return np.asarray(3e5 + 2e5 * np.exp(-((centre / 8) ** 2)) * carrier)

@@ -1,0 +1,64 @@
+"""`xethru-emulator` as a process of its own, for tests that go through real ports."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+END_LIMIT_S = 10
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Served:
+    """A running emulator and what its ready line says."""
+
+    process: subprocess.Popen[str]
+    names: tuple[str, ...]
+    paths: tuple[str, ...]
+    serials: tuple[str, ...]
+    odometry: str | None
+    scene_time_zero_ns: int
+
+    def end(self, number: signal.Signals = signal.SIGTERM) -> int:
+        """Send a signal; return the exit code."""
+        self.process.send_signal(number)
+        return self.process.wait(END_LIMIT_S)
+
+
+@contextmanager
+def emulator(
+    *arguments: str | Path, environment: Mapping[str, str] | None = None
+) -> Iterator[Served]:
+    """Run ``xethru-emulator`` until the block ends; stderr goes to the test's."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "emulator.cli", *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **(environment or {})},
+    )
+    assert process.stdout is not None
+    try:
+        line = process.stdout.readline()
+        assert line, f"no ready line; exit code {process.wait(END_LIMIT_S)}"
+        ready = json.loads(line)
+        assert ready["ready"] is True
+        devices = ready["devices"]
+        yield Served(
+            process=process,
+            names=tuple(device["name"] for device in devices),
+            paths=tuple(device["path"] for device in devices),
+            serials=tuple(device["serial"] for device in devices),
+            odometry=ready["odometry"],
+            scene_time_zero_ns=ready["scene_time_zero_ns"],
+        )
+    finally:
+        process.kill()
+        process.wait(END_LIMIT_S)
+        process.stdout.close()

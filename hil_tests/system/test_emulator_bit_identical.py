@@ -1,0 +1,86 @@
+"""Through pseudo-terminals and in process: the same frames, bit for bit."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from emulator.device import radar_device
+from emulator.echo import echo_source
+from emulator.identity import Identity
+from emulator.loopback import LoopbackTransport
+from emulator.pace import Pace
+from emulator.scene import load_scene
+from hil_tests.device.serving import Served, emulator
+from xethru_protocol.driver import X4M300, RawConfig
+
+pytestmark = pytest.mark.slow
+
+SCENE = "smoke"
+SEED = 5
+FRAMES = 150
+
+Content = dict[int, bytes]
+
+
+def read(driver: X4M300, config: RawConfig, count: int, fps: float) -> Content:
+    driver.configure_raw(config)
+    driver.start(fps)
+    return {frame.counter: frame.samples.tobytes() for frame in driver.frames(count)}
+
+
+def in_process(index: int, config: RawConfig, count: int, fps: float) -> Content:
+    scene = load_scene(SCENE)
+    device = radar_device(
+        Identity(serial=scene.radars[index].serial), echo_source(scene, index, SEED), Pace.ASAP
+    )
+    transport = LoopbackTransport(device)
+    with X4M300(transport, clock=transport.clock_ns) as driver:
+        return read(driver, config, count, fps)
+
+
+def through_ports(served: Served, config: RawConfig, count: int, fps: float) -> list[Content]:
+    """Read all radars at once, as a host with four modules does."""
+    contents: list[Content] = [{} for _ in served.paths]
+
+    def one(index: int, path: str) -> None:
+        with X4M300.open(path) as driver:
+            contents[index] = read(driver, config, count, fps)
+
+    threads = [
+        threading.Thread(target=one, args=(index, path)) for index, path in enumerate(served.paths)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return contents
+
+
+@pytest.fixture(scope="module")
+def served_asap() -> Iterator[Served]:
+    with emulator("serve", SCENE, "--seed", str(SEED), "--pace", "asap") as served:
+        yield served
+
+
+@pytest.mark.parametrize("downconversion", [False, True])
+def test_asap_all_frames_are_bit_identical(served_asap: Served, downconversion: bool) -> None:
+    config = RawConfig(downconversion=downconversion)
+    contents = through_ports(served_asap, config, FRAMES, 5.0)
+    assert len(contents) == 4
+    for index, content in enumerate(contents):
+        assert sorted(content) == list(range(FRAMES)), "nothing is lost"
+        assert content == in_process(index, config, FRAMES, 5.0)
+    assert len({content[10] for content in contents}) == 4, "each radar sees its own"
+
+
+def test_realtime_those_that_arrive_are_bit_identical() -> None:
+    config = RawConfig(iterations=16, pulses_per_step=10)
+    with emulator("serve", SCENE, "--seed", str(SEED), "--pace", "realtime") as served:
+        contents = through_ports(served, config, 60, 100.0)
+    for index, content in enumerate(contents):
+        assert len(content) == 60
+        whole = in_process(index, config, max(content) + 1, 100.0)
+        assert content == {counter: whole[counter] for counter in content}

@@ -1,0 +1,186 @@
+"""How serve and play start and end, whatever happens around them."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from hil_tests.device.serving import emulator
+from xethru_protocol.codes import PongCode
+from xethru_protocol.driver import X4M300, RawConfig
+
+pytestmark = pytest.mark.slow
+
+
+def environment(tmp_path: Path) -> dict[str, str]:
+    """Keep this test's announcements to itself."""
+    return {"XDG_RUNTIME_DIR": str(tmp_path)}
+
+
+def lines_of(path: str, most: int) -> list[str]:
+    with socket.socket(socket.AF_UNIX) as client:
+        client.settimeout(10)
+        client.connect(path)
+        data = b""
+        while data.count(b"\n") < most and (chunk := client.recv(65536)):
+            data += chunk
+    return data.decode().splitlines()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_it_with_0_and_nothing_is_left(
+    number: signal.Signals, tmp_path: Path
+) -> None:
+    links = tmp_path / "links"
+    with emulator(
+        "serve", "smoke", "--link-dir", links, environment=environment(tmp_path)
+    ) as served:
+        assert served.odometry is not None
+        assert sorted(path.name for path in links.iterdir()) == sorted(
+            [*served.names, "odometry.sock"]
+        )
+        (announced,) = (tmp_path / "xethru").glob("*.json")
+        assert json.loads(announced.read_text())["pid"] == served.process.pid
+        assert served.end(number) == 0
+    assert not links.exists()
+    assert list((tmp_path / "xethru").iterdir()) == []
+
+
+def test_a_signal_while_streaming_ends_it_too(tmp_path: Path) -> None:
+    with (
+        emulator("serve", "smoke", "--pace", "asap", environment=environment(tmp_path)) as served,
+        X4M300.open(served.paths[0]) as driver,
+    ):
+        driver.configure_raw()
+        driver.start(5.0)
+        driver.read_frame()
+        assert served.end() == 0
+        assert not Path(served.paths[0]).parent.exists()
+
+
+def test_a_killed_emulator_is_succeeded_by_the_next(tmp_path: Path) -> None:
+    links = tmp_path / "links"
+    arguments = ("serve", "smoke", "--link-dir", links)
+    with emulator(*arguments, environment=environment(tmp_path)) as first:
+        first.end(signal.SIGKILL)
+    assert len(list(links.iterdir())) == 5, "a killed process cleans nothing up"
+    with emulator(*arguments, environment=environment(tmp_path)) as second:
+        for path in second.paths:
+            with X4M300.open(path) as driver:
+                assert driver.ping() is PongCode.XTS_SPRP_READY
+        assert len(list((tmp_path / "xethru").glob("*.json"))) == 1
+        assert second.odometry is not None
+        assert lines_of(second.odometry, 1)
+        assert second.end() == 0
+    assert list(links.iterdir()) == [], "the folder was not ours to remove"
+
+
+def test_a_reader_of_stdout_that_left_ends_it_with_1(tmp_path: Path) -> None:
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    result = subprocess.run(
+        [sys.executable, "-m", "emulator.cli", "serve", "--bare", "--link-dir", tmp_path / "l"],
+        stdout=write_end,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+        env={**os.environ, **environment(tmp_path)},
+    )
+    os.close(write_end)
+    assert result.returncode == 1
+    assert result.stderr == "xethru-emulator: stdout: cannot write the ready line: Broken pipe\n"
+    assert not (tmp_path / "l").exists()
+
+
+def test_a_closed_stdout_does_not_matter(tmp_path: Path) -> None:
+    command = f"exec {sys.executable} -m emulator.cli serve --bare --link-dir {tmp_path}/l >&-"
+    with subprocess.Popen(
+        ["sh", "-c", command], env={**os.environ, **environment(tmp_path)}
+    ) as process:
+        deadline = time.monotonic() + 20
+        while not (tmp_path / "l" / "radar_1").is_symlink():
+            assert process.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        time.sleep(0.2)  # until the loop runs
+        process.terminate()
+        assert process.wait(10) == 0
+    assert not (tmp_path / "l").exists()
+
+
+@pytest.mark.parametrize("pace", ["asap", "realtime"])
+def test_a_host_killed_while_streaming_is_followed_by_another(pace: str, tmp_path: Path) -> None:
+    host = (
+        "import sys\n"
+        "from xethru_protocol.driver import X4M300\n"
+        "radar = X4M300.open(sys.argv[1])\n"
+        "radar.configure_raw()\n"
+        "radar.start(17.0)\n"
+        "radar.read_frame()\n"
+        "print('streaming', flush=True)\n"
+        "while True: radar.read_frame()\n"
+    )
+    with emulator("serve", "smoke", "--pace", pace, environment=environment(tmp_path)) as served:
+        with subprocess.Popen(
+            [sys.executable, "-c", host, served.paths[0]], stdout=subprocess.PIPE, text=True
+        ) as first:
+            assert first.stdout is not None
+            assert first.stdout.readline() == "streaming\n"
+            first.kill()
+        time.sleep(0.3)
+        with X4M300.open(served.paths[0]) as second:
+            second.configure_raw(RawConfig(downconversion=True))
+            second.start(17.0)
+            frames = list(second.frames(5))
+        assert {len(frame.samples) for frame in frames} == {181}
+        assert served.end() == 0
+
+
+def test_bare_serves_stock_modules_without_odometry(tmp_path: Path) -> None:
+    with emulator("serve", "--bare", "--count", "3", environment=environment(tmp_path)) as served:
+        assert served.odometry is None
+        assert len(set(served.serials)) == 3
+        for path, serial in zip(served.paths, served.serials, strict=True):
+            with X4M300.open(path) as driver:
+                info = driver.info()
+                assert (info.serial_number, info.mode) == (serial, "RUN")
+
+
+def test_odometry_comes_whole_under_asap_and_in_time_under_realtime(tmp_path: Path) -> None:
+    with emulator("serve", "smoke", "--pace", "asap", environment=environment(tmp_path)) as served:
+        assert served.odometry is not None
+        whole = lines_of(served.odometry, 10**9)
+    assert len(whole) > 1000
+    with emulator("serve", "smoke", environment=environment(tmp_path)) as served:
+        assert served.odometry is not None
+        with socket.socket(socket.AF_UNIX) as client:
+            client.connect(served.odometry)
+            client.setblocking(False)
+            data = b""
+            while data.count(b"\n") < 4:
+                assert select.select([client], [], [], 10)[0]
+                data += client.recv(65536)
+            elapsed_s = (time.monotonic_ns() - served.scene_time_zero_ns) / 1e9
+    first = data.decode().splitlines()
+    assert first == whole[: len(first)]
+    assert elapsed_s >= float(first[-1].split()[0])
+
+
+def test_a_long_link_directory_still_gets_a_socket(tmp_path: Path) -> None:
+    links = tmp_path / ("long" * 20)
+    with emulator(
+        "serve", "smoke", "--pace", "asap", "--link-dir", links, environment=environment(tmp_path)
+    ) as served:
+        assert served.odometry is not None
+        assert lines_of(served.odometry, 1)
+        assert served.end() == 0
+    assert not Path(served.odometry).parent.exists()
