@@ -15,7 +15,6 @@ from importlib import resources
 from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
-from scipy.special import chdtri
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -196,7 +195,8 @@ class AssociationConfig(_Model):
             return self.gate
         if self.gate_rule is GateRule.MAHALANOBIS:
             return self.gate**2
-        return float(chdtri(2, 1.0 - self.gate))
+        # With two degrees of freedom the chi-square quantile has a closed form.
+        return -2.0 * math.log1p(-self.gate)
 
 
 class SlamConfig(_Model):

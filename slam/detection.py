@@ -101,8 +101,8 @@ class SavitzkyGolay:
     """Least-squares polynomial smoothing of equally spaced samples, as one FIR filter.
 
     Equal to ``scipy.signal.savgol_filter`` with ``mode="interp"``: in the middle a fixed kernel,
-    at each end the polynomial fitted to the last ``length`` samples. Both are worked out once,
-    which is what makes it twenty times faster.
+    at each end the polynomial fitted to the last ``length`` samples. Both are worked out once
+    instead of once per frame.
 
     Parameters
     ----------
