@@ -32,7 +32,7 @@ MAX_TIMER_HZ = 65535.0
 """The firmware's frame rate is a 16-bit integer."""
 GUARD_FRAMES = 100
 """All-zero frames after which the module switches its transmitter off."""
-LARGEST_BLOCK = 32
+DEFAULT_LARGEST_BLOCK = 32
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,6 +61,13 @@ class _Block:
 class Chip:
     """An X4 with its driver, initialised as the sensor firmware leaves it.
 
+    Parameters
+    ----------
+    source
+        What its sampler sees.
+    largest_block
+        Most frames synthesised at once: many are cheap each, few disturb nobody's deadline.
+
     Attributes
     ----------
     settings
@@ -73,8 +80,9 @@ class Chip:
         False after ENABLE 0, until INIT.
     """
 
-    def __init__(self, source: EchoSource) -> None:
+    def __init__(self, source: EchoSource, largest_block: int = DEFAULT_LARGEST_BLOCK) -> None:
         self._source = source
+        self._largest_block = largest_block
         self._block: _Block | None = None
         self._block_frames = 1
         self.init()
@@ -131,7 +139,7 @@ class Chip:
         block = self._block
         if block is None or not 0 <= counter - block.first_counter < len(block.values):
             block = self._block = self._synthesise(counter, self._block_frames)
-            self._block_frames = min(2 * self._block_frames, LARGEST_BLOCK)
+            self._block_frames = min(2 * self._block_frames, self._largest_block)
         index = counter - block.first_counter
         self.timeline.next_counter = counter + 1
         self._guard_transmitter(bool(block.all_zero[index]))

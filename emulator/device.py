@@ -27,6 +27,10 @@ from xethru_protocol.packets import NeedData
 
 __all__ = ["BootTiming", "Device", "radar_device"]
 
+ASAP_BLOCK = 32
+# Radars in step refill at the same moment: four blocks of 8 cost 2 ms, four of 32 cost 7 ms.
+REALTIME_BLOCK = 8
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BootTiming:
@@ -166,7 +170,8 @@ def radar_device(
     boot
         Timing of a restart; the documented one if None.
     """
-    module = Module(identity, Chip(source))
+    largest_block = ASAP_BLOCK if pace is Pace.ASAP else REALTIME_BLOCK
+    module = Module(identity, Chip(source, largest_block))
     stream = ChipStream(module, pace=pace, scene_time_zero_ns=scene_time_zero_ns, skew_ns=skew_ns)
     outbox = LosslessOutbox() if pace is Pace.ASAP else FirmwareOutbox()
     return Device(module, stream, outbox, boot=boot or BootTiming())
