@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -97,18 +97,13 @@ class UwbRadarSlam:
         t_ns
             Session time.
         """
-        if not self._is_new_state(odometry_pose):
-            return ()
-        detections = self._detect(frames)
-        return self._collect(detections, odometry_pose, t_ns)
+        return self._take(lambda: self._detect(frames), odometry_pose, t_ns)
 
     def step_detections(
         self, detections: Sequence[Detection], odometry_pose: Array, t_ns: int
     ) -> tuple[StepResult, ...]:
         """Do what ``step`` does, from ranges that some other front end found."""
-        if not self._is_new_state(odometry_pose):
-            return ()
-        return self._collect(tuple(detections), odometry_pose, t_ns)
+        return self._take(lambda: tuple(detections), odometry_pose, t_ns)
 
     def flush(self) -> tuple[StepResult, ...]:
         """Return the states still in the window at the end of a run, if the preset wants them."""
@@ -116,30 +111,21 @@ class UwbRadarSlam:
             self._window.clear()
         return tuple(self._estimate() for _ in range(len(self._window)))
 
-    def _is_new_state(self, odometry_pose: Array) -> bool:
-        if self._collected_pose is None:  # Odom[0] <- origin
-            self._collected_pose = self._estimated_pose = odometry_pose
-            return False
-        return has_moved(self._collected_pose, odometry_pose, self.config.window)
-
-    def _detect(self, frames: Sequence[RadarFrame]) -> tuple[Detection, ...]:
-        return tuple(
-            detection
-            for frame in frames
-            for detection in self._detector.detect(
-                frame, self.rig.mounts[frame.radar].range_offset_m
-            )
-        )
-
-    def _collect(
-        self, detections: tuple[Detection, ...], odometry_pose: Array, t_ns: int
+    def _take(
+        self, detect: Callable[[], tuple[Detection, ...]], odometry_pose: Array, t_ns: int
     ) -> tuple[StepResult, ...]:
-        self._collected_pose = odometry_pose
+        """Collect a state where the robot has moved; estimate the oldest once w are there."""
+        pose = np.array(odometry_pose, dtype=np.float64)
+        if self._collected_pose is None:  # Odom[0] <- origin
+            self._collected_pose = self._estimated_pose = pose
+            return ()
+        if not has_moved(self._collected_pose, pose, self.config.window):
+            return ()
+        self._collected_pose = pose
+        detections = detect()
         fixes = self._trilaterator.locate(detections)
         self._window.append(
-            CollectedState(
-                t_ns=t_ns, odometry_pose=odometry_pose, detections=detections, fixes=fixes
-            )
+            CollectedState(t_ns=t_ns, odometry_pose=pose, detections=detections, fixes=fixes)
         )
         return (self._estimate(),) if len(self._window) == self.config.window.size else ()
 
@@ -171,3 +157,12 @@ class UwbRadarSlam:
 
     def _is_update_due(self) -> bool:
         return self._n_estimated % self.config.window.stride == 0
+
+    def _detect(self, frames: Sequence[RadarFrame]) -> tuple[Detection, ...]:
+        return tuple(
+            detection
+            for frame in frames
+            for detection in self._detector.detect(
+                frame, self.rig.mounts[frame.radar].range_offset_m
+            )
+        )
