@@ -13,6 +13,9 @@ from pathlib import Path
 from slam.app.errors import EXIT_FAILED, AppError
 from slam.app.stop import StopFlag, StopRequestedError
 
+_TYPICAL_SEED = 2
+"""Of seeds 0-19 in the lab, the one whose errors lie nearest the medians; see DECISIONS."""
+
 _Command = Callable[[argparse.Namespace, StopFlag], None]
 
 
@@ -57,7 +60,12 @@ def _parser() -> argparse.ArgumentParser:
         "while frames arrive, and writes session, map and numbers. All numbers are simulated.",
     )
     demo.add_argument("--out", type=Path, default=Path("out/demo"), help="folder for the results")
-    demo.add_argument("--seed", type=_seed, default=0, help="seed of noise and odometry drift")
+    demo.add_argument(
+        "--seed",
+        type=_seed,
+        default=_TYPICAL_SEED,
+        help="seed of noise and odometry drift (default: %(default)s, a typical run)",
+    )
     demo.add_argument("--scene", default="lab", help="name of a scene, or a scene file")
     demo.add_argument("--preset", default="paper", help="settings of SLAM")
     demo.set_defaults(command=_demo)
