@@ -220,7 +220,9 @@ def load_preset(name: str, environment: str = BASE_ENVIRONMENT) -> SlamConfig:
         Unknown preset or environment, unreadable file, unknown key or value out of range.
     """
     folder = resources.files("fixtures") / "presets"
-    known = sorted(file.name.removesuffix(".toml") for file in folder.iterdir())
+    known = sorted(
+        file.name.removesuffix(".toml") for file in folder.iterdir() if file.name.endswith(".toml")
+    )
     if name not in known:
         raise ConfigError(f"unknown preset {name!r}; known: {', '.join(known)}")
     file = folder / f"{name}.toml"

@@ -133,6 +133,19 @@ def test_lost_frame_of_one_radar_costs_only_the_fixes_of_its_pair() -> None:
     assert result.fixes[0].y_m < 0
 
 
+def test_stride_updates_only_every_nth_state_and_predicts_the_others() -> None:
+    config = SlamConfig(window=WindowConfig(size=10, stride=5))
+    slam = UwbRadarSlam(config, paper_rig())
+    seen = [Detection(radar=k, t_ns=0, range_m=0.8, amplitude=0.01) for k in (0, 1)]
+    results = [
+        result
+        for k, pose in enumerate(straight(30, step_m=0.006))
+        for result in slam.step_detections(seen, pose, k)
+    ]
+    assert [k for k, result in enumerate(results) if result.observations] == [0, 5, 10, 15]
+    assert all(result.belief.pose[0] > 0 for result in results)
+
+
 def test_without_noise_the_path_is_exact() -> None:
     """Drive one lap among well-spaced landmarks with perfect odometry and ranges."""
     room = Room(side_m=2.0, n_landmarks=5, min_spacing_m=1.5, scale_sigma=0.0, curvature_sigma=0.0)
