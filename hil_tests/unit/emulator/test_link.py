@@ -49,10 +49,11 @@ def test_the_line_stays_raw_over_reopening(tmp_path: Path) -> None:
 
 def test_a_full_line_takes_nothing_and_blocks_nobody(tmp_path: Path) -> None:
     with PtyLink(tmp_path / "radar") as link:
-        block = memoryview(bytes(65536))
-        while link.write(block):
-            pass
-        assert link.write(block) == 0
+        block, taken = memoryview(bytes(65536)), 0
+        # the kernel moves bytes on between its buffers: room may appear once more, not for ever
+        for _ in range(200):
+            taken += link.write(block)
+        assert 4096 <= taken < 65536
 
 
 def test_dangling_and_foreign_links_are_replaced_files_are_not(tmp_path: Path) -> None:
