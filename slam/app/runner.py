@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]  # ships no stubs
+from threadpoolctl import threadpool_limits
 
 from slam.app.odometry import OdometryTrack
 from slam.app.session import Scan, SessionObserver, Snapshot
