@@ -23,7 +23,6 @@ from collections import deque
 from typing import Final
 
 from xethru_protocol.packets import (
-    END,
     ESCAPE,
     MAX_NORMAL_BYTES,
     NEED_DATA,
@@ -123,7 +122,7 @@ class PacketReader:
         self._scan_from = -1  # Normal start whose terminator was looked for
         self._scan_at = -1  # how far; every special byte in between is escaped
         self._terminator = -1  # where it was found, else -1
-        self._next_end = -1  # next 7E at or after _scan_at, once looked up
+        self._ends = _Finder(b"\x7e")
         self._good_starts: frozenset[int] = frozenset()  # whose checksum fits ...
         self._good_for = -1  # ... at this terminator
 
@@ -286,23 +285,20 @@ class PacketReader:
         known_to = self._terminator if self._terminator >= 0 else self._scan_at
         if not self._scan_from <= first < known_to:
             self._scan_from, self._scan_at = first, first + 1
-            self._terminator = self._next_end = -1
+            self._terminator = -1
         if self._terminator >= 0:
             return
         buffer, base = self._buffer, self._base
-        at, end = self._scan_at - base, self._next_end - base
+        at = self._scan_at - base
         floor = max(self._scan_from + 1 - base, 0)
         limit = base + len(buffer)
         while True:
-            if end < at:
-                end = buffer.find(END, at)
-                if end < 0:
-                    end = len(buffer)
+            end = min(self._ends.next(buffer, base, base + at), limit) - base
             special = buffer.find(START, at, end)
             if special < 0:
                 special = end
             if special == len(buffer):
-                self._scan_at, self._next_end = limit, -1
+                self._scan_at = limit
                 return
             if buffer[special - 1] != ESCAPE or special == floor:
                 break
@@ -313,7 +309,6 @@ class PacketReader:
                 break
             at = special + 1
         self._scan_at = self._terminator = base + special
-        self._next_end = base + end
 
     def _need(self, missing: int, wanted: int = 0) -> NeedData:
         self._missing = missing

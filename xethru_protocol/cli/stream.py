@@ -31,17 +31,21 @@ def stream(
                 warn(f"xethru stream: {text}")
             radar.warnings.clear()
             live = None if as_json or with_samples or not sys.stdout.isatty() else _Live(radar)
-            for frame in radar.frames(count, timeout_s=max(2.0, 3.0 / rate)):
-                if live is None:
-                    print_json(_as_json(frame, with_samples))
-                else:
-                    live.show(frame)
-    finally:  # also after a signal, once the module is stopped
-        if radar.frames_lost or radar.fault_count:
-            warn(
-                f"xethru stream: {radar.frames_lost} frames lost, "
-                f"{radar.fault_count} damaged places on the line"
-            )
+            try:
+                for frame in radar.frames(count, timeout_s=max(2.0, 3.0 / rate)):
+                    if live is None:
+                        print_json(_as_json(frame, with_samples))
+                    else:
+                        live.show(frame)
+            finally:
+                if live is not None:
+                    warn("")  # leave the live line as it is
+                if radar.frames_lost or radar.fault_count:
+                    warn(
+                        f"xethru stream: {radar.frames_lost} frames lost, "
+                        f"{radar.fault_count} damaged places on the line"
+                    )
+    finally:  # also after a signal
         for text in radar.warnings:
             warn(f"xethru stream: {text}")
     return 0

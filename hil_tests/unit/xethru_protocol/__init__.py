@@ -1,1 +1,1 @@
-"""xethru_protocol tests."""
+"""Unit tests of xethru_protocol, one file per module."""

@@ -1,0 +1,201 @@
+"""Every byte string of the vendor's documents and parser, through codec and framing.
+
+The vectors were run through the vendor's own parser; where our receiver is stricter or more
+robust (Protocol reference 1.2, 1.4), the difference is asserted by name.
+"""
+
+from collections import Counter
+from typing import Any
+
+import pytest
+
+from hil_tests.golden.vectors import BUILDERS, WITHOUT_ROW, Vector, load, message_of
+from xethru_protocol.codec import decode_command, decode_response, describe
+from xethru_protocol.connection import Connection, Role
+from xethru_protocol.framing import (
+    NEED_DATA,
+    FaultKind,
+    Framing,
+    FramingFault,
+    Packet,
+    PacketReader,
+)
+from xethru_protocol.messages import Message, UnknownMessage, X4DriverSet
+from xethru_protocol.plausibility import FROM_HOST, FROM_MODULE
+
+VECTORS = load()
+BY_NAME = {vector.name: vector for vector in VECTORS}
+MESSAGES = [v for v in VECTORS if v.valid and not v.is_stream]
+KNOWN = [v for v in MESSAGES if v.message in BUILDERS]
+LATER = [v for v in MESSAGES if v.message in WITHOUT_ROW]
+ILLUSTRATIONS = [v for v in MESSAGES if v.name == "doc_noescape_example"]
+STREAMS = [v for v in VECTORS if v.valid and v.is_stream]
+INVALID = [v for v in VECTORS if not v.valid]
+# Entries of a vector that are not fields of its message.
+ABOUT = {
+    *("framing", "payload", "checksum", "checksum_printed", "checksum_computed", "message"),
+    *("note", "kind", "expect", "length_field", "reserved", "first", "last", "total_bytes", "rule"),
+}
+
+
+def packets_of(vector: Vector, chunk: int = 1 << 20) -> list[Packet | FramingFault]:
+    reader = PacketReader(FROM_HOST if vector.from_host else FROM_MODULE)
+    found: list[Packet | FramingFault] = []
+    for begin in range(0, len(vector.wire), chunk):
+        reader.receive_data(vector.wire[begin : begin + chunk])
+        while (item := reader.next_packet()) is not NEED_DATA:
+            assert isinstance(item, Packet | FramingFault)
+            found.append(item)
+    return found
+
+
+def received(vector: Vector) -> Message:
+    connection = Connection(Role.MODULE if vector.from_host else Role.HOST)
+    connection.receive_data(vector.wire)
+    event = connection.next_event()
+    assert isinstance(event, Message)
+    assert connection.next_event() is NEED_DATA
+    return event
+
+
+def test_every_vector_is_in_exactly_one_group() -> None:
+    groups = [KNOWN, LATER, ILLUSTRATIONS, STREAMS, INVALID]
+    assert Counter(v.name for group in groups for v in group) == Counter(v.name for v in VECTORS)
+    assert [len(group) for group in groups] == [175, 93, 1, 11, 5]
+
+
+def test_messages_left_for_later_are_those_without_a_row() -> None:
+    assert {v.message for v in LATER} == WITHOUT_ROW
+    assert not WITHOUT_ROW & BUILDERS.keys()
+
+
+@pytest.mark.parametrize("vector", KNOWN, ids=lambda v: v.name)
+def test_wire_decodes_to_the_described_message(vector: Vector) -> None:
+    assert received(vector) == message_of(vector)
+
+
+@pytest.mark.parametrize("vector", KNOWN, ids=lambda v: v.name)
+def test_described_message_encodes_to_the_wire(vector: Vector) -> None:
+    role = Role.HOST if vector.from_host else Role.MODULE
+    framing = Framing(vector.decoded["framing"])
+    assert Connection(role).send(message_of(vector), framing) == vector.wire
+
+
+@pytest.mark.parametrize(
+    "vector",
+    # the same message in the framing a module does not use for it
+    [v for v in KNOWN if v.name not in {"data_float_normal_framing", "data_byte_normal_framing"}],
+    ids=lambda v: v.name,
+)
+def test_default_framing_is_the_one_real_devices_use(vector: Vector) -> None:
+    role = Role.HOST if vector.from_host else Role.MODULE
+    assert Connection(role).send(message_of(vector)) == vector.wire
+
+
+@pytest.mark.parametrize("vector", KNOWN, ids=lambda v: v.name)
+def test_dump_has_the_vectors_names_and_fields(vector: Vector) -> None:
+    name, fields = describe(received(vector))
+    expected: dict[str, Any] = {k: v for k, v in vector.decoded.items() if k not in ABOUT}
+    if vector.name == "reply_system_test_x4_conn_pass":
+        assert expected.pop("values") == "see payload"
+        assert fields.pop("values") == [1, *[0] * 255]
+    if vector.name == "data_float_baseband_181bins":
+        assert fields.pop("data") == [(k - 90) / 1024 for k in range(362)]
+    assert name == vector.message
+    assert fields == expected
+
+
+@pytest.mark.parametrize("vector", LATER, ids=lambda v: v.name)
+def test_message_without_row_arrives_whole(vector: Vector) -> None:
+    message = received(vector)
+    assert vector.payload is not None
+    assert message == UnknownMessage(code=vector.payload[0], payload=vector.payload)
+
+
+@pytest.mark.parametrize("vector", [*MESSAGES, *STREAMS], ids=lambda v: v.name)
+@pytest.mark.parametrize("chunk", [1, 7, 1 << 20])
+def test_packets_are_those_of_the_vendors_parser(vector: Vector, chunk: int) -> None:
+    packets = [p.payload for p in packets_of(vector, chunk) if isinstance(p, Packet)]
+    if vector.name == "stream_missing_start_accepted":
+        # 1.2 recommends to drop what has no start byte
+        assert packets == [bytes.fromhex(vector.decoded["packets"][0])]
+    elif vector.decoded["framing"] == "stream":
+        assert packets == [bytes.fromhex(text) for text in vector.decoded["packets"]]
+    elif vector.payload is None:
+        assert len(packets[0]) == vector.decoded["length_field"]
+    else:
+        assert packets == [vector.payload]
+
+
+@pytest.mark.parametrize(
+    ("name", "faults"),
+    [
+        ("stream_bad_checksum_then_good", [(FaultKind.CHECKSUM, 0)]),
+        ("stream_garbage_between_packets", [(FaultKind.GARBAGE, 8)]),
+        ("stream_start_in_mid_packet", [(FaultKind.TRUNCATED, 0)]),
+        ("stream_double_start", []),
+        ("stream_lone_end", [(FaultKind.GARBAGE, 0)]),
+        ("stream_missing_start_accepted", [(FaultKind.GARBAGE, 8)]),
+        ("stream_empty_packet", [(FaultKind.EMPTY, 0)]),
+        ("stream_escape_before_ordinary_byte", []),
+        ("stream_noescape_then_normal", []),
+        ("stream_noescape_after_junk", [(FaultKind.GARBAGE, 0)]),
+        ("stream_ack_between_two_frames", []),
+    ],
+)
+def test_damage_is_reported_where_it_begins(name: str, faults: list[tuple[FaultKind, int]]) -> None:
+    found = [(f.kind, f.offset) for f in packets_of(BY_NAME[name]) if isinstance(f, FramingFault)]
+    assert found == faults
+
+
+def test_every_invalid_vector_has_its_own_test_below() -> None:
+    assert {v.name for v in INVALID} == {
+        "doc_escaping_example",
+        "doc_x4_set_pps_20_short",
+        "noisemap_delete_as_documented",
+        "x4_set_pps_20_as_float",
+        "stream_7c7c7c7c_inside_normal_packet",
+    }
+
+
+def test_wrongly_printed_checksum_is_dropped() -> None:
+    assert packets_of(BY_NAME["doc_escaping_example"]) == [
+        FramingFault(kind=FaultKind.CHECKSUM, offset=0)
+    ]
+
+
+def test_one_byte_pulses_per_step_are_accepted_and_never_sent() -> None:
+    message = received(BY_NAME["doc_x4_set_pps_20_short"])
+    assert isinstance(message, X4DriverSet)
+    assert message.value == 20
+    sent = Connection(Role.HOST).send(X4DriverSet(setting=message.setting, value=20))
+    assert sent == BY_NAME["x4_set_pps_20"].wire
+
+
+def test_pulses_per_step_sent_as_float_are_read_as_the_firmware_reads_them() -> None:
+    message = received(BY_NAME["x4_set_pps_20_as_float"])
+    assert isinstance(message, X4DriverSet)
+    assert message.value == BY_NAME["x4_set_pps_20_as_float"].decoded["value_as_uint32"]
+
+
+def test_delete_noise_map_as_printed_is_unknown() -> None:
+    assert received(BY_NAME["noisemap_delete_as_documented"]) == UnknownMessage(
+        code=0x10, payload=b"\x10\x15"
+    )
+
+
+@pytest.mark.parametrize("chunk", [1, 1 << 20])
+def test_noescape_start_inside_a_good_normal_packet_is_data(chunk: int) -> None:
+    vector = BY_NAME["stream_7c7c7c7c_inside_normal_packet"]
+    (packet,) = packets_of(vector, chunk)
+    assert isinstance(packet, Packet)
+    assert packet.payload == vector.payload
+    message = decode_command(packet.payload)
+    assert isinstance(message, X4DriverSet)
+    assert message.value == vector.decoded["value"]
+
+
+def test_noescape_example_of_the_document_is_a_packet_but_no_pong() -> None:
+    (packet,) = packets_of(BY_NAME["doc_noescape_example"])
+    assert isinstance(packet, Packet)
+    assert decode_response(packet.payload) == UnknownMessage(code=1, payload=b"\x01\x02\x03")
