@@ -1,0 +1,298 @@
+"""The driver on a scripted module."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from hil_tests.unit.xethru_protocol.scripted import (
+    READY,
+    Answer,
+    ScriptedTransport,
+    frame,
+    plain_module,
+)
+from xethru_protocol import messages as m
+from xethru_protocol.codes import PongCode, SensorMode, X4Setting
+from xethru_protocol.driver import X4M300, ProtocolRecord, RawConfig
+from xethru_protocol.errors import (
+    DeviceError,
+    LocalProtocolError,
+    RemoteProtocolError,
+    ResponseTimeout,
+)
+
+Said = Sequence[m.Message | bytes]
+
+
+def driver_on(answer: Answer = plain_module) -> tuple[X4M300, ScriptedTransport]:
+    transport = ScriptedTransport(answer)
+    return X4M300(transport, clock=transport.clock), transport
+
+
+def test_raw_mode_follows_the_recipe_of_the_reference() -> None:
+    radar, line = driver_on()
+    geometry = radar.configure_raw()
+    radar.start(17.0)
+    sets = [c for c in line.received if isinstance(c, m.X4DriverSet)]
+    assert [type(c) for c in line.received[:4]] == [m.Ping, m.SetMode, m.SetMode, m.X4DriverInit]
+    assert [c.mode for c in line.received if isinstance(c, m.SetMode)] == [
+        SensorMode.XTID_SM_STOP,
+        SensorMode.XTID_SM_MANUAL,
+    ]
+    assert [(c.setting.name, c.value) for c in sets] == [
+        ("DACMIN", 949),
+        ("DACMAX", 1100),
+        ("ITERATIONS", 16),
+        ("PULSESPERSTEP", 300),
+        ("TXCENTERFREQUENCY", 3),
+        ("TXPOWER", 2),
+        ("DOWNCONVERSION", 0),
+        ("FRAMEAREAOFFSET", float(np.float32(0.18))),
+        ("FRAMEAREA", (float(np.float32(0.2)), float(np.float32(9.4)))),
+        ("FPS", 17.0),
+    ]
+    assert (geometry.n_bins, geometry.range_start_m) == (1431, 0.19929012656211853)
+    assert geometry.bin_length_m == pytest.approx(0.006430041, abs=1e-8)
+    assert radar.warnings == []
+
+
+def test_firmware_without_modes_is_tolerated() -> None:
+    def xep(command: m.Message) -> Said:
+        return [m.Error(code=1)] if isinstance(command, m.SetMode) else plain_module(command)
+
+    radar, _ = driver_on(xep)
+    assert radar.configure_raw().n_bins == 1431
+
+
+def test_start_returns_the_real_rate_and_warns_above_the_possible() -> None:
+    radar, _ = driver_on()
+    radar.configure_raw()
+    assert radar.start(17.0) == 17.049379348754883
+    radar.start(25.0)
+    assert radar.warnings == [
+        "25 frames/s exceed the 19.8 that these settings allow; "
+        "lower the rate, iterations or pulses per step"
+    ]
+    with pytest.raises(LocalProtocolError, match="must be positive"):
+        radar.start(0.0)
+
+
+def test_frames_keep_their_samples_counters_and_arrival_times() -> None:
+    radar, line = driver_on()
+    radar.configure_raw()
+    line.say(frame(5), frame(6), frame(9))
+    frames = list(radar.frames(3))
+    assert [f.counter for f in frames] == [5, 6, 9]
+    assert [f.samples[0] for f in frames] == [5, 6, 9]
+    assert frames[0].samples.dtype == np.float32
+    assert frames[0].geometry is radar.geometry
+    assert frames[0].arrival_ns < frames[1].arrival_ns <= line.now_ns
+    assert radar.frames_lost == 2
+
+
+def test_counters_wrap_without_loss_and_restarts_are_no_loss() -> None:
+    radar, line = driver_on()
+    radar.configure_raw()
+    line.say(frame(0xFFFFFFFF), frame(0), frame(1), frame(0))
+    assert len(list(radar.frames(4))) == 4
+    assert radar.frames_lost == 0
+
+
+def test_baseband_frames_become_complex() -> None:
+    def module(command: m.Message) -> Said:
+        match command:
+            case m.X4DriverGet(setting=X4Setting.FRAMEAREA):
+                return [m.ReplyFloat(content_id=X4Setting.FRAMEAREA, values=(0.25, 0.375))]
+            case m.X4DriverGet(setting=X4Setting.FRAMEBINCOUNT):
+                return [m.ReplyInt(content_id=X4Setting.FRAMEBINCOUNT, values=(3,))]
+        return plain_module(command)
+
+    radar, line = driver_on(module)
+    geometry = radar.configure_raw(RawConfig(downconversion=True))
+    line.say(m.DataFloat(info=1, values=np.array([1, 2, 3, 4, 5, 6], np.float32)))
+    samples = radar.read_frame().samples
+    assert samples.dtype == np.complex64
+    assert samples.tolist() == [1 + 4j, 2 + 5j, 3 + 6j]
+    assert geometry.bin_length_m == 0.0625  # three bins: the area ends at the last one
+
+
+def test_profile_baseband_messages_are_frames_with_their_own_geometry() -> None:
+    radar, line = driver_on()
+    message = m.BasebandIq(
+        counter=7,
+        num_bins=2,
+        bin_length_m=0.5,
+        sampling_frequency_hz=2.0,
+        carrier_frequency_hz=3.0,
+        range_offset_m=0.25,
+        i=np.array([1, 2], np.float32),
+        q=np.array([3, 4], np.float32),
+    )
+    line.say(message)
+    got = radar.read_frame()
+    assert (got.counter, got.samples.tolist()) == (7, [1 + 3j, 2 + 4j])
+    assert (got.geometry.range_start_m, got.geometry.bin_length_m) == (0.25, 0.5)
+
+
+def test_frames_of_another_length_are_discarded_and_counted() -> None:
+    radar, line = driver_on()
+    radar.configure_raw()
+    line.say(frame(1, bins=99), frame(2))
+    assert radar.read_frame().counter == 2
+    assert radar.frames_discarded == 1
+
+
+def test_what_arrives_before_a_reply_is_sorted_and_nothing_is_lost() -> None:
+    def chatty(command: m.Message) -> Said:
+        if isinstance(command, m.X4DriverGet):
+            return [
+                frame(1),
+                m.System(code=0x11),
+                m.DataString(text="debug"),
+                b"\x01\x02",
+                frame(2),
+                m.ReplyFloat(content_id=X4Setting.FPS, values=(1.0,)),
+                frame(3),
+            ]
+        return plain_module(command)
+
+    radar, line = driver_on(plain_module)
+    radar.configure_raw()
+    line._answer = chatty
+    reply = radar.request(m.X4DriverGet(setting=X4Setting.FPS))
+    assert reply.values == (1.0,)
+    assert [f.counter for f in radar.frames(3)] == [1, 2, 3]
+    assert radar.fault_count == 1
+
+
+def test_replies_to_nothing_and_to_something_else_are_not_taken() -> None:
+    def confused(command: m.Message) -> Said:
+        return [
+            m.Ack(),
+            m.ReplyInt(content_id=X4Setting.DACMIN, values=(949,)),
+            m.ReplyInt(content_id=X4Setting.DACMAX, values=(1100,)),
+        ]
+
+    radar, line = driver_on(confused)
+    line.say(m.ReplyInt(content_id=X4Setting.DACMAX, values=(1,)))  # too late for its request
+    reply = radar.request(m.X4DriverGet(setting=X4Setting.DACMAX))
+    assert reply.values == (1100,)
+    assert radar.stray_count == 3
+
+
+def test_refusal_names_command_code_and_meaning() -> None:
+    radar, _ = driver_on(lambda command: [m.Error(code=17)])
+    with pytest.raises(DeviceError) as caught:
+        radar.request(m.X4DriverSet(setting=X4Setting.FRAMEAREA, value=(5.0, 0.4)))
+    assert caught.value.code == 17
+    assert str(caught.value) == (
+        "the module refused X4DRIVER_SET id=FRAMEAREA start=5.0 end=0.4: "
+        "error 17 (X4 FRAME_AREA_END_OUT_OF_SCOPE)"
+    )
+
+
+def test_silence_is_a_timeout_that_names_port_and_remedy() -> None:
+    radar, line = driver_on(lambda command: [])
+    with pytest.raises(
+        ResponseTimeout, match=r"no answer to PING .* from the port within 2 s; is it"
+    ):
+        radar.configure_raw()
+    assert 2_000_000_000 <= line.now_ns < 2_100_000_000
+    assert isinstance(ResponseTimeout(""), TimeoutError)
+
+
+def test_garbage_instead_of_an_answer_suggests_another_device() -> None:
+    radar, _ = driver_on(lambda command: [b"\x06\x1a login:"])
+    with pytest.raises(ResponseTimeout, match="no XeThru packets; is it another device"):
+        radar.ping()
+
+
+def test_strange_pong_is_no_xethru_module() -> None:
+    radar, _ = driver_on(lambda command: [m.Pong(value=1)])
+    with pytest.raises(RemoteProtocolError, match="0x00000001"):
+        radar.ping()
+
+
+def test_module_that_is_not_ready_is_waited_for() -> None:
+    answers = [m.Pong(value=PongCode.XTS_SPRP_NOTREADY)] * 3 + [READY]
+
+    def booting(command: m.Message) -> Said:
+        return [answers.pop(0)] if isinstance(command, m.Ping) else plain_module(command)
+
+    radar, line = driver_on(booting)
+    radar.configure_raw()
+    assert 0.3e9 <= line.now_ns < 0.5e9
+
+
+def test_module_that_stops_is_a_timeout_and_says_if_it_restarted() -> None:
+    radar, line = driver_on()
+    radar.configure_raw()
+    with pytest.raises(ResponseTimeout, match="no frame from the port within 1 s"):
+        radar.read_frame(timeout_s=1.0)
+    line.say(m.System(code=0x10))
+    with pytest.raises(ResponseTimeout, match="restarted"):
+        radar.read_frame()
+    assert radar.reboots == 1
+
+
+def test_info_has_what_the_module_tells() -> None:
+    radar, _ = driver_on()
+    info = radar.info()
+    assert (info.serial_number, info.mode, info.order_code) == ("123456789012", "MANUAL", None)
+    settings = radar.x4_settings()
+    assert settings[X4Setting.FRAMEBINCOUNT] == 1431
+    assert settings[X4Setting.DACMIN] is None
+    assert X4Setting.ENABLE not in settings
+
+
+def test_closing_stops_the_radar_also_in_the_middle_of_a_packet() -> None:
+    radar, line = driver_on()
+    with radar:
+        radar.configure_raw()
+        radar.start(17.0)
+        line.say(b"\x7c\x7c\x7c\x7c\x6a\x16\x00\x00\x00\xa0")
+        radar._dialogue.pump(0.0)
+        line.received.clear()
+    assert [type(c) for c in line.received] == [m.X4DriverSet, m.SetMode]
+    assert line.closed
+
+
+def test_closing_a_dead_module_tells_and_does_not_raise() -> None:
+    radar, line = driver_on()
+    with radar:
+        radar.configure_raw()
+        line._answer = lambda command: []
+    assert line.closed
+    assert radar.warnings[0].startswith("the module was not stopped: no answer")
+
+
+def test_observer_hears_everything_but_frames() -> None:
+    heard: list[ProtocolRecord] = []
+    line = ScriptedTransport(plain_module)
+    radar = X4M300(line, clock=line.clock, observer=heard.append)
+    radar.ping()
+    line.say(m.System(code=0x11), b"\x00", frame(1))
+    radar._dialogue.pump(0.0)
+    radar._dialogue.pump(0.0)
+    radar._dialogue.pump(0.0)
+    assert [(record.direction, record.summary) for record in heard] == [
+        ("tx", "PING seed=0xEEAAEAAE"),
+        ("rx", "PONG value=0xAAEEAEEA"),
+        ("rx", "SYSTEM code=17 code_name=READY"),
+        ("fault", "bytes between packets at byte 16"),
+    ]
+
+
+def test_reset_returns_at_the_ack() -> None:
+    radar, line = driver_on()
+    radar.reset()
+    radar.close()
+    assert [type(c) for c in line.received] == [m.ModReset]
+
+
+def test_impossible_area_is_refused_before_anything_is_sent() -> None:
+    radar, line = driver_on()
+    with pytest.raises(LocalProtocolError, match="swap"):
+        radar.configure_raw(RawConfig(frame_area_m=(5.0, 1.0)))
+    assert line.received == []
