@@ -1,0 +1,135 @@
+"""``xethru decode`` on the golden vectors and on bad input."""
+
+import io
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hil_tests.golden.test_protocol_vectors import ABOUT, KNOWN
+from hil_tests.golden.vectors import Vector, load
+from xethru_protocol.cli import main
+
+VECTORS = load()
+PING = "7D 01 AE EA AA EE 7C 7E"
+ACK = bytes.fromhex("7D 10 6D 7E")
+
+
+def decoded(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, lines: list[str], *options: str
+) -> list[dict[str, Any]]:
+    file = tmp_path / "bytes.txt"
+    file.write_text("\n".join(lines) + "\n")
+    assert main(["decode", "--hex", *options, str(file)]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    return [json.loads(line) for line in out.splitlines()]
+
+
+def fields_of(vector: Vector) -> dict[str, Any]:
+    fields = {key: value for key, value in vector.decoded.items() if key not in ABOUT}
+    if vector.name == "reply_system_test_x4_conn_pass":
+        fields["values"] = [1, *[0] * 255]
+    if vector.name == "data_float_baseband_181bins":
+        fields["data"] = [(k - 90) / 1024 for k in range(362)]
+    return fields
+
+
+@pytest.mark.parametrize("explicit", [False, True], ids=["auto", "from"])
+def test_every_known_vector_in_both_directions(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, explicit: bool
+) -> None:
+    for from_host in (True, False):
+        vectors = [v for v in KNOWN if v.from_host is from_host]
+        options = ["--from", "host" if from_host else "module"] if explicit else []
+        objects = decoded(capsys, tmp_path, [v.wire.hex(" ") for v in vectors], *options)
+        assert len(objects) == len(vectors)
+        for vector, found in zip(vectors, objects, strict=True):
+            assert found["message"] == vector.message, vector.name
+            assert found["fields"] == fields_of(vector), vector.name
+            assert found["framing"] == vector.decoded["framing"], vector.name
+            assert list(found) == ["framing", "payload_hex", "message", "fields"]
+            if vector.payload is not None:
+                assert bytes.fromhex(found["payload_hex"]) == vector.payload
+
+
+def test_all_other_vectors_give_packets_or_faults(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    for vector in VECTORS:
+        for found in decoded(capsys, tmp_path, [vector.wire.hex()]):
+            assert set(found) in (
+                {"framing", "payload_hex", "message", "fields"},
+                {"fault", "offset"},
+            )
+
+
+def test_corrupted_packet_is_a_fault(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    corrupted = PING.replace("EA", "EB", 1)
+    assert decoded(capsys, tmp_path, [corrupted]) == [{"fault": "wrong checksum", "offset": 0}]
+    assert decoded(capsys, tmp_path, [PING[:-3]]) == [
+        {"fault": "packet cut off by the end of the data", "offset": 0}
+    ]
+
+
+def test_lines_are_streams_of_their_own(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    found = decoded(capsys, tmp_path, ["7C 7C 7C 7C 1A 00 00 00 00 A0 12", "", PING])
+    assert [item.get("message", item.get("fault")) for item in found] == [
+        "packet cut off by the end of the data",
+        "PING",
+    ]
+
+
+def test_bad_hexadecimal_is_one_line_naming_file_and_line(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    file = tmp_path / "capture.txt"
+    file.write_text(f"{PING}\n7D 1\n")
+    assert main(["decode", "--hex", str(file)]) == 1
+    out, err = capsys.readouterr()
+    assert json.loads(out)["message"] == "PING"
+    assert err == (
+        f"xethru decode: {file} line 2 is not hexadecimal bytes: '7D 1'; "
+        "write them like 7D 10 6D 7E\n"
+    )
+
+
+@pytest.mark.parametrize("name", ["missing.bin", "."])
+def test_file_that_cannot_be_read_is_one_line(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, name: str
+) -> None:
+    assert main(["decode", str(tmp_path / name)]) == 1
+    err = capsys.readouterr().err
+    assert "cannot be read" in err
+    assert err.count("\n") == 1
+
+
+def test_bytes_from_standard_input(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stdin = io.TextIOWrapper(io.BytesIO(b"\x00" + ACK + ACK))
+    monkeypatch.setattr(sys, "stdin", stdin)
+    assert main(["decode"]) == 0
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [line.get("message") for line in lines] == [None, "ACK", "ACK"]
+
+
+def test_not_a_number_is_still_json(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    nan = "7C 7C 7C 7C 12 00 00 00 00 A0 12 00 00 00 00 01 00 00 00 01 00 00 00 00 00 C0 7F"
+    (found,) = decoded(capsys, tmp_path, [nan])
+    assert found["fields"]["data"] == [None]
+
+
+def test_packets_are_printed_as_they_come() -> None:
+    command = [sys.executable, "-m", "xethru_protocol.cli", "decode"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        process.stdin.write(ACK)
+        process.stdin.flush()
+        assert json.loads(process.stdout.readline())["message"] == "ACK"  # input is still open
+        process.stdin.close()
+        assert process.wait() == 0
