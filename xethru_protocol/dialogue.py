@@ -92,6 +92,7 @@ class Dialogue:
         self._take_frame = take_frame
         self._connection = Connection(Role.HOST)
         self._answers: deque[Response] = deque()
+        self._winding_down = False
 
     def request(self, command: Command[ReplyT], timeout_s: float) -> ReplyT:
         """Send a command, return its reply; see `X4M300.request`."""
@@ -119,8 +120,13 @@ class Dialogue:
                 raise self.silence(f"answer to {summary(command)}", timeout_s)
             self.pump(left_ns * 1e-9)
 
-    def begin_anew(self) -> None:
-        """Forget half-read bytes and open answers, as after an interrupt in mid-work."""
+    def wind_down(self) -> None:
+        """From now on care for answers only.
+
+        An interrupt may have come while bytes were taken in, so what is half-read is forgotten;
+        the rest of a packet that was cut so looks like damage and is not reported.
+        """
+        self._winding_down = True
         self._connection = Connection(Role.HOST)
         self._answers.clear()
 
@@ -135,8 +141,9 @@ class Dialogue:
             if isinstance(event, DataFloat | BasebandIq):
                 self._take_frame(event, arrival_ns)
             elif isinstance(event, FramingFault):
-                self.fault_count += 1
-                self.tell("fault", f"{event.kind.value} at byte {event.offset}")
+                if not self._winding_down:
+                    self.fault_count += 1
+                    self.tell("fault", f"{event.kind.value} at byte {event.offset}")
             elif isinstance(event, Message):
                 if isinstance(event, _ANSWERS):
                     self._answers.append(event)

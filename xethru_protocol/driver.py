@@ -127,7 +127,7 @@ class X4M300:
         try:
             if self._raw_mode:
                 self._raw_mode = False
-                self._dialogue.begin_anew()
+                self._dialogue.wind_down()
                 self.stop()
                 self.request(SetMode(mode=SensorMode.XTID_SM_STOP))
         except XeThruError as error:

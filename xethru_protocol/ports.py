@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from serial.tools import list_ports
+from xethru_protocol.transport import usb_serial_ports
 
 # Vendor and product ids; the vendor's sources disagree on which of the first two is the
 # application and which the bootloader (Protocol reference 10).
-_USB_IDS = {
+_USB_IDS: dict[tuple[int | None, int | None], str] = {
     (0x03EB, 0x6124): "XeThru module",
     (0x03EB, 0x2404): "XeThru module or its bootloader",
     (0x0403, 0x6001): "FTDI adapter (X2 module?)",
@@ -48,12 +48,10 @@ def run_directory() -> Path:
 
 
 def _usb_ports() -> Iterator[PortInfo]:
-    for port in sorted(list_ports.comports(), key=lambda found: found.device):
-        description = _USB_IDS.get((port.vid, port.pid))
+    for port in usb_serial_ports():
+        description = _USB_IDS.get((port.vendor_id, port.product_id))
         if description is not None:
-            yield PortInfo(
-                path=port.device, kind="usb", description=description, serial=port.serial_number
-            )
+            yield PortInfo(path=port.path, kind="usb", description=description, serial=port.serial)
 
 
 def _emulated_ports(folder: Path) -> Iterator[PortInfo]:

@@ -9,9 +9,11 @@ xethru_protocol.errors.PortUnavailable: there is no port /dev/no-such-port; 'xet
 import errno
 import os
 import select
+from dataclasses import dataclass
 from typing import Protocol
 
 import serial
+from serial.tools import list_ports
 
 from xethru_protocol.errors import Disconnected, PortUnavailable
 
@@ -105,6 +107,26 @@ class SerialTransport:
         if self._fd < 0:
             return f"{self.name} was closed"
         return f"{self.name} was disconnected; plug the module in again"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UsbSerialPort:
+    """A serial port and the USB ids behind it, None where it has none."""
+
+    path: str
+    vendor_id: int | None
+    product_id: int | None
+    serial: str | None
+
+
+def usb_serial_ports() -> tuple[UsbSerialPort, ...]:
+    """Return the serial ports the system lists, by path; pseudo-terminals are never among them."""
+    return tuple(
+        UsbSerialPort(
+            path=port.device, vendor_id=port.vid, product_id=port.pid, serial=port.serial_number
+        )
+        for port in sorted(list_ports.comports(), key=lambda found: found.device)
+    )
 
 
 def _why(path: str, error: Exception) -> str:
