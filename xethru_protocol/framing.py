@@ -23,6 +23,7 @@ from collections import deque
 from typing import Final
 
 from xethru_protocol.packets import (
+    END,
     ESCAPE,
     MAX_NORMAL_BYTES,
     NEED_DATA,
@@ -59,6 +60,7 @@ Span = tuple[Framing, bytes, int, int, int]
 
 MAX_NORMAL_WIRE_BYTES: Final = 2 * MAX_NORMAL_BYTES + 2  # all escaped, with start and end
 
+_JOIN_BYTES = 4096  # of the next chunk, to a Normal packet whose end is not known
 _LENGTH = struct.Struct("<I")
 # Magic and length, then code, type and element count of a DATA FLOAT.
 _FRAME_HEADER = struct.Struct("<4sIxBB8xI")
@@ -77,18 +79,23 @@ class _Finder:
         self._found = -1
         self._searched = 0
 
-    def next(self, buffer: bytes, base: int, here: int) -> int:
-        """Stream offset of the first pattern at or after ``here``; _NEVER if not in the buffer."""
-        if here <= self._found < _NEVER:
-            return self._found
+    def next(self, buffer: bytes, base: int, here: int, stop: int = _NEVER) -> int:
+        """Find the first pattern at or after ``here``; _NEVER if there is none before ``stop``.
+
+        ``buffer`` begins at ``base`` in the stream. No pattern may lie across ``stop``.
+        """
+        if here <= self._found:
+            return self._found if self._found < stop else _NEVER
         begin = max(here, self._searched)
-        at = buffer.find(self._pattern, begin - base)
+        if begin >= stop:
+            return _NEVER
+        limit = base + len(buffer)
+        at = buffer.find(self._pattern, begin - base, min(stop, limit) - base)
         if at >= 0:
             self._found = self._searched = base + at
-        else:
-            self._found = _NEVER
-            self._searched = max(begin, base + len(buffer) - len(self._pattern) + 1)
-        return self._found
+            return self._found
+        self._searched = stop if stop < limit else max(begin, limit - len(self._pattern) + 1)
+        return _NEVER
 
 
 class PacketReader:
@@ -122,7 +129,7 @@ class PacketReader:
         self._scan_from = -1  # Normal start whose terminator was looked for
         self._scan_at = -1  # how far; every special byte in between is escaped
         self._terminator = -1  # where it was found, else -1
-        self._ends = _Finder(b"\x7e")
+        self._next_end = 0  # no 7E lies between the last place looked at and this one
         self._good_starts: frozenset[int] = frozenset()  # whose checksum fits ...
         self._good_for = -1  # ... at this terminator
 
@@ -193,7 +200,7 @@ class PacketReader:
             here = self._base + self._pos
             limit = self._base + len(self._buffer)
             start = self._starts.next(self._buffer, self._base, here)
-            bulk = self._bulk_starts.next(self._buffer, self._base, here)
+            bulk = self._bulk_starts.next(self._buffer, self._base, here, start)
             first = min(start, bulk)
             junk_end = first if first < _NEVER else limit - self._trailing_7c()
             if junk_end > here:
@@ -255,7 +262,7 @@ class PacketReader:
         if (end if end >= 0 else self._scan_at) - first > MAX_NORMAL_WIRE_BYTES:
             return self._reject(FaultKind.OVERSIZE, first, first + MAX_NORMAL_WIRE_BYTES)
         if end < 0:
-            return self._need(1, len(self._buffer) - self._pos)
+            return self._need(1, max(len(self._buffer) - self._pos, _JOIN_BYTES))
         at, stop = first - self._base, end - self._base
         if self._buffer[stop] == START:
             if end == first + 1:  # doubled start: nothing is lost
@@ -291,14 +298,16 @@ class PacketReader:
         buffer, base = self._buffer, self._base
         at = self._scan_at - base
         floor = max(self._scan_from + 1 - base, 0)
-        limit = base + len(buffer)
+        size = len(buffer)
+        end = buffer.find(END, max(at, self._next_end - base))
         while True:
-            end = min(self._ends.next(buffer, base, base + at), limit) - base
+            if end < 0:
+                end = size
             special = buffer.find(START, at, end)
             if special < 0:
                 special = end
-            if special == len(buffer):
-                self._scan_at = limit
+            if special == size:
+                self._scan_at = self._next_end = base + size
                 return
             if buffer[special - 1] != ESCAPE or special == floor:
                 break
@@ -308,7 +317,10 @@ class PacketReader:
             if (special - before) & 1:  # an even number of escape bytes: they escape each other
                 break
             at = special + 1
+            if end < at:
+                end = buffer.find(END, at)
         self._scan_at = self._terminator = base + special
+        self._next_end = base + end
 
     def _need(self, missing: int, wanted: int = 0) -> NeedData:
         self._missing = missing

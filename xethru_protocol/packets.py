@@ -118,8 +118,13 @@ def unescape(body: bytes) -> bytes:
     """
     if ESCAPE not in body:
         return body
-    # 7F 7F pairs from the left are literal 7Fs; any other 7F only marks its successor.
-    return b"\x7f".join([part.replace(b"\x7f", b"") for part in body.split(b"\x7f\x7f")])
+    parts = body.split(b"\x7f")
+    if b"" not in parts:
+        return b"".join(parts)
+    # Each part stands behind a 7F; an empty one means that the next stands behind two.
+    rest = iter(parts[1:])
+    literal = [part or b"\x7f" + next(rest, b"") for part in rest]
+    return parts[0] + b"".join(literal)
 
 
 def xor(data: bytes) -> int:
