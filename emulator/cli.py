@@ -54,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     try:
         if arguments.command == "play":
-            play(arguments.recording, arguments.rate, arguments.loop, arguments.link_dir)
+            play(arguments.recording, arguments.rate, arguments.loop, arguments.link_dir, _warn)
         else:
             scene = arguments.count if arguments.bare else arguments.scene
             serve(scene, arguments.seed, arguments.pace, arguments.link_dir)
@@ -62,6 +62,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"xethru-emulator: {error}\n")
         return 1
     return 0
+
+
+def _warn(text: str) -> None:
+    sys.stderr.write(f"xethru-emulator: warning: {text}\n")
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from emulator.chip import Chip
@@ -12,12 +13,19 @@ from emulator.identity import Identity
 from emulator.outbox import LosslessOutbox
 from emulator.player import NOMINAL_PERIOD_NS, PlayStream, schedule
 from emulator.scene import empty_room
-from xethru_protocol.recordings import RecordingError, read_recording
+from xethru_protocol.recordings import RecordingError, RecordingFault, read_recording
 
 __all__ = ["RecordingError", "recording_device"]
 
 
-def recording_device(recording: Path, identity: Identity, *, rate: float, loop: bool) -> Device:
+def recording_device(
+    recording: Path,
+    identity: Identity,
+    *,
+    rate: float,
+    loop: bool,
+    on_fault: Callable[[RecordingFault], None],
+) -> Device:
     """Return a module that plays a recording to whoever opens its port.
 
     Parameters
@@ -30,13 +38,15 @@ def recording_device(recording: Path, identity: Identity, *, rate: float, loop: 
         Multiple of real time; 0 for as fast as the port takes it.
     loop
         Whether to begin again at the end.
+    on_fault
+        Called with what could not be read; the rest plays.
 
     Raises
     ------
     RecordingError
         When the recording cannot be read or is empty.
     """
-    records = list(read_recording(recording))
+    records = list(read_recording(recording, on_fault))
     if not records:
         raise RecordingError(f"{recording}: the recording holds no messages")
     messages = [message for message, _ in records]

@@ -10,7 +10,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -91,7 +91,13 @@ def serve(scene: str | int, seed: int, pace: Pace, link_dir: Path | None) -> Non
         _run(ports, services, ready, stop, cleanup)
 
 
-def play(recording: Path, rate: float, loop: bool, link_dir: Path | None) -> None:
+def play(
+    recording: Path,
+    rate: float,
+    loop: bool,
+    link_dir: Path | None,
+    warn: Callable[[str], None],
+) -> None:
     """Play a recording at the port of an emulated module until a signal asks for the end.
 
     Parameters
@@ -104,6 +110,8 @@ def play(recording: Path, rate: float, loop: bool, link_dir: Path | None) -> Non
         Whether to begin again at the end.
     link_dir
         Where the link appears; a fresh directory if None.
+    warn
+        Called with one line about a part of the recording that cannot be read; the rest plays.
 
     Raises
     ------
@@ -113,7 +121,13 @@ def play(recording: Path, rate: float, loop: bool, link_dir: Path | None) -> Non
     with _stop_signals() as stop, contextlib.ExitStack() as cleanup:
         try:
             identity = Identity(serial=PLAYED_SERIAL)
-            device = recording_device(recording, identity, rate=rate, loop=loop)
+            device = recording_device(
+                recording,
+                identity,
+                rate=rate,
+                loop=loop,
+                on_fault=lambda fault: warn(f"{fault.file}: {fault.reason}; the rest is played"),
+            )
             folder = cleanup.enter_context(_link_folder(link_dir))
             devices = [NamedDevice(name="player", serial=identity.serial, device=device)]
             ports = _open_ports(devices, folder, cleanup)

@@ -43,6 +43,25 @@ class X4DriverCode(IntEnum):
     XTS_SPCX_INIT = 0x20
 
 
+class NoiseMapCode(IntEnum):
+    """Second byte of MOD_NOISEMAP. Protocol reference 4.6."""
+
+    XTS_SPCN_SETCONTROL = 0x10
+
+
+class OutputCode(IntEnum):
+    """Second byte of OUTPUT. Protocol reference 4.7."""
+
+    XTS_SPCO_SETCONTROL = 0x10
+
+
+class IoPinCode(IntEnum):
+    """Second byte of IOPIN. Protocol reference 4.8."""
+
+    XTS_SPCIOP_SETCONTROL = 0x10
+    XTS_SPCIOP_SETVALUE = 0x20
+
+
 class DirCode(IntEnum):
     """Second byte of DIR_COMMAND. Protocol reference 4.10, 4.11."""
 

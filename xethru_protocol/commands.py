@@ -8,7 +8,16 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from xethru_protocol import wire
-from xethru_protocol.codes import CommandCode, DirCode, SensorMode, X4DriverCode, X4Setting
+from xethru_protocol.codes import (
+    CommandCode,
+    DirCode,
+    IoPinCode,
+    NoiseMapCode,
+    OutputCode,
+    SensorMode,
+    X4DriverCode,
+    X4Setting,
+)
 from xethru_protocol.responses import Ack, Pong, ReplyByte, ReplyFloat, ReplyInt, ReplyString
 from xethru_protocol.table import Command, command
 
@@ -58,6 +67,44 @@ class LoadApp(Command[Ack]):
     """Load a profile (`ProfileId`) without running it. 4.3."""
 
     profile_id: Annotated[int, wire.ID32]
+
+
+@command(
+    CommandCode.XTS_SPC_MOD_NOISEMAP, NoiseMapCode.XTS_SPCN_SETCONTROL, name="NOISEMAP_SETCONTROL"
+)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoiseMapSetControl(Command[Ack]):
+    """Choose where a profile's noise map comes from: three bits. 4.6."""
+
+    control: Annotated[int, wire.U32]
+
+
+@command(CommandCode.XTS_SPC_OUTPUT, OutputCode.XTS_SPCO_SETCONTROL, name="OUTPUT_SETCONTROL")
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutputSetControl(Command[Ack]):
+    """Switch one of a profile's messages on or off. 4.7."""
+
+    feature: Annotated[int, wire.ID32]
+    control: Annotated[int, wire.U32]
+
+
+@command(CommandCode.XTS_SPC_IOPIN, IoPinCode.XTS_SPCIOP_SETCONTROL, name="IOPIN_SETCONTROL")
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IoPinSetControl(Command[Ack]):
+    """Say what a pin does: setup bits and feature. 4.8."""
+
+    pin_id: Annotated[int, wire.U32]
+    pin_setup: Annotated[int, wire.U32]
+    pin_feature: Annotated[int, wire.U32]
+
+
+@command(CommandCode.XTS_SPC_IOPIN, IoPinCode.XTS_SPCIOP_SETVALUE, name="IOPIN_SETVALUE")
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IoPinSetValue(Command[Ack]):
+    """Drive an output pin high (1) or low (0). 4.8."""
+
+    pin_id: Annotated[int, wire.U32]
+    pin_value: Annotated[int, wire.U32]
 
 
 _DIR = CommandCode.XTS_SPC_DIR_COMMAND

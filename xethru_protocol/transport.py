@@ -7,6 +7,7 @@ xethru_protocol.errors.PortUnavailable: there is no port /dev/no-such-port; 'xet
 """
 
 import errno
+import math
 import os
 import select
 from dataclasses import dataclass
@@ -67,12 +68,13 @@ class SerialTransport:
         except (OSError, ValueError) as error:  # SerialException is an OSError
             raise PortUnavailable(_why(path, error)) from None
         self._fd: int = self._port.fileno()
+        self._poller = select.poll()  # select() cannot wait on descriptors above 1023
+        self._poller.register(self._fd, select.POLLIN)
 
     def read(self, timeout_s: float) -> bytes:
         """See `Transport.read`."""
         try:
-            ready, _, _ = select.select((self._fd,), (), (), max(timeout_s, 0.0))
-            if not ready:
+            if not self._poller.poll(math.ceil(max(timeout_s, 0.0) * 1000)):
                 return b""
             data = os.read(self._fd, _CHUNK_BYTES)
         except BlockingIOError:  # another reader was faster

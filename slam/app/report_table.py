@@ -26,7 +26,7 @@ def table_text(summary: Summary, *, wall_s: float, lost_frames: int) -> str:
         (
             "SLAM ATE, ICP",
             _mm(summary.ate_icp_rmse_m),
-            "the paper's number: nearest point of the path, no time",
+            "the paper's metric: nearest point of the path, no time",
         ),
         ("final error", _mm(summary.final_error_m), "at the end of the run, not aligned"),
         (

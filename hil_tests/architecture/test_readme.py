@@ -1,0 +1,16 @@
+"""The README's Python examples run and print what it says."""
+
+import doctest
+from pathlib import Path
+
+import pytest
+
+README = Path(__file__).parents[2] / "README.md"
+
+
+@pytest.mark.skipif(not README.exists(), reason="the README lives in the source tree")
+def test_the_examples_of_the_readme_are_true() -> None:
+    # A closing fence would be read as expected output; the examples end with a blank line.
+    results = doctest.testfile(str(README), module_relative=False)
+    assert results.attempted > 5
+    assert results.failed == 0
