@@ -35,7 +35,8 @@ def counters_played(recording: Path, faults: list[RecordingFault]) -> list[int]:
 
 def test_a_cut_last_record_costs_that_record_only(tmp_path: Path) -> None:
     recording = copy_of_the_vendors_recording(tmp_path)
-    whole = counters_played(recording, faults := [])
+    faults: list[RecordingFault] = []
+    whole = counters_played(recording, faults)
     assert faults == []
     data = next(recording.glob("*baseband_iq*.dat"))
     data.write_bytes(data.read_bytes()[:-1])
