@@ -59,7 +59,7 @@ def summarise(
     odometry = np.array([result.odometry_pose for result in record.results])
     last = record.results[-1]
     alignment = align_se2(estimate[:, :2], truth_xy)
-    counting = observable_landmarks(rig, record.truth, true_landmarks_m, config)
+    counting = observable_landmarks(rig, record.truth, true_landmarks_m)
     score = landmark_metrics(last.belief.landmarks, true_landmarks_m[counting], alignment)
     nis = _true_nis(record, true_landmarks_m)
     return Summary(

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slam.config import SlamConfig
 from slam.geometry import paper_rig
 from slam.visibility import observable_landmarks
 
@@ -33,19 +32,37 @@ def creeping(n: int) -> NDArray[np.float64]:
 )
 def test_joint_view_and_range_limits(landmark: tuple[float, float], findable: bool) -> None:
     poses = creeping(10) - np.array([0.05, 0.0, 0.0])
-    found = observable_landmarks(paper_rig(), poses, np.array([landmark]), SlamConfig())
+    found = observable_landmarks(paper_rig(), poses, np.array([landmark]))
     assert found.tolist() == [findable]
 
 
 @pytest.mark.parametrize(("n", "findable"), [(8, False), (9, True)])
 def test_nine_distinct_poses_are_needed(n: int, findable: bool) -> None:
     landmark = np.array([[0.04, 1.0]])
-    found = observable_landmarks(paper_rig(), creeping(n), landmark, SlamConfig())
+    found = observable_landmarks(paper_rig(), creeping(n), landmark)
     assert found.tolist() == [findable]
 
 
+@pytest.mark.parametrize(
+    ("step", "distinct"),
+    [
+        ((0.0051, 0.0, 0.0), True),
+        ((0.0049, 0.0, 0.0), False),
+        ((0.0, 0.0, 0.101), True),
+        ((0.0, 0.0, 0.099), False),
+    ],
+)
+def test_distinct_is_five_millimetres_or_a_tenth_of_a_radian(
+    step: tuple[float, float, float], distinct: bool
+) -> None:
+    # Nine poses to and fro, so that the way back does not add up to more than one step.
+    poses = np.array([np.array(step) * (k % 2) for k in range(9)])
+    found = observable_landmarks(paper_rig(), poses, np.array([[0.0, 1.0]]))
+    assert found.tolist() == [distinct]
+
+
 def test_standing_still_adds_no_pose() -> None:
-    found = observable_landmarks(paper_rig(), standing(100), np.array([[0.0, 1.0]]), SlamConfig())
+    found = observable_landmarks(paper_rig(), standing(100), np.array([[0.0, 1.0]]))
     assert found.tolist() == [False]
 
 
@@ -53,14 +70,12 @@ def test_poses_of_two_pairs_do_not_add_up() -> None:
     # Five looks with the left pair, then five with the right one after a half turn.
     poses = creeping(10)
     poses[5:, 2] = math.pi
-    found = observable_landmarks(paper_rig(), poses, np.array([[0.04, 1.0]]), SlamConfig())
+    found = observable_landmarks(paper_rig(), poses, np.array([[0.04, 1.0]]))
     assert found.tolist() == [False]
 
 
 def test_no_landmarks_and_no_poses() -> None:
     none = np.empty((0, 2))
-    assert observable_landmarks(paper_rig(), creeping(9), none, SlamConfig()).shape == (0,)
+    assert observable_landmarks(paper_rig(), creeping(9), none).shape == (0,)
     one = np.array([[0.0, 1.0]])
-    assert observable_landmarks(paper_rig(), np.empty((0, 3)), one, SlamConfig()).tolist() == [
-        False
-    ]
+    assert observable_landmarks(paper_rig(), np.empty((0, 3)), one).tolist() == [False]
