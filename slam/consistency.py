@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.association import Association
 from slam.geometry import transform
 from slam.metrics import LANDMARK_MATCH_M
 from slam.pipeline import StepResult
@@ -15,9 +18,17 @@ Array = NDArray[np.float64]
 class TrueAssociationNis:
     """Collects the NIS of every observation against the landmark it is truly of, before gating.
 
-    Ground truth decides what an observation is of: the true landmark nearest to where the true
-    pose puts it, within 0.15 m. The map's landmark for it is the one first born from it. What the
-    filter itself associated plays no part, so a tight gate cannot make the numbers look good.
+    Ground truth decides what an observation is of, its *origin*: the true landmark nearest to
+    where the true pose puts it, within 0.15 m, or clutter. A landmark of the map belongs to the
+    origin that more than half of its observations so far, its birth included, came from; so one
+    that wrong associations dragged from one true landmark to another changes its owner, and in
+    between has none. Of several that belong to one true landmark, the one with most observations
+    of it counts.
+
+    The observation itself is judged before it is counted and whatever the filter made of it, so a
+    tight gate cannot make the numbers look good. An observation of clutter, or of a true landmark
+    that no landmark of the map belongs to at that moment, is not counted: there is nothing it
+    could be compared with.
 
     Parameters
     ----------
@@ -27,26 +38,23 @@ class TrueAssociationNis:
 
     def __init__(self, true_xy: Array) -> None:
         self._true_xy = true_xy
-        self._landmark_of: dict[int, int] = {}
+        # By landmark id: how many of its observations came from each origin, None for clutter.
+        self._origins: dict[int, Counter[int | None]] = {}
 
     def add(self, result: StepResult, true_pose: Array) -> tuple[float, ...]:
         """Return the NIS (2 dof) of this state's observations of landmarks already in the map.
 
         ``true_pose`` has shape (3,), world frame, at ``result.t_ns``. Call it for every result, in
-        order: births are learned on the way.
+        order: who belongs to whom is learned on the way.
         """
         values = []
         for observation, association in zip(result.observations, result.associations, strict=True):
             origin = self._origin(true_pose, np.array([observation.x_m, observation.y_m]))
-            if origin is None:
-                continue
-            landmark_id = self._landmark_of.get(origin)
-            if landmark_id is None:
-                if association.is_new:
-                    self._landmark_of[origin] = association.landmark_id
-            elif landmark_id in association.candidate_ids:
-                row = association.candidate_ids.index(landmark_id)
-                values.append(float(association.mahalanobis_sq[row]))
+            if origin is not None:
+                row = self._row_of(origin, association)
+                if row is not None:
+                    values.append(float(association.mahalanobis_sq[row]))
+            self._origins.setdefault(association.landmark_id, Counter())[origin] += 1
         return tuple(values)
 
     def _origin(self, true_pose: Array, body_xy: Array) -> int | None:
@@ -55,3 +63,15 @@ class TrueAssociationNis:
         distances = np.linalg.norm(self._true_xy - transform(true_pose, body_xy), axis=1)
         nearest = int(np.argmin(distances))
         return nearest if distances[nearest] <= LANDMARK_MATCH_M else None
+
+    def _row_of(self, origin: int, association: Association) -> int | None:
+        """Return the candidate that is the true landmark's own, the older one of two equals."""
+        best, most = None, 0
+        for row, landmark_id in enumerate(association.candidate_ids):
+            origins = self._origins.get(landmark_id)
+            if origins is None:
+                continue
+            own = origins[origin]
+            if own > most and 2 * own > origins.total():
+                best, most = row, own
+        return best
