@@ -19,6 +19,8 @@ from slam.app.errors import AppError
 
 NS_PER_S = 1_000_000_000
 _FIELDS = 8
+_MAX_STAMP_S = Decimal(2**63) / NS_PER_S
+"""Where int64 nanoseconds end; a larger stamp was written in another unit."""
 
 
 class TumError(AppError):
@@ -67,7 +69,8 @@ def parse_tum_line(line: str) -> TumSample:
     Raises
     ------
     TumError
-        Fewer or more than eight numbers, a number that is not finite, a quaternion without length.
+        Fewer or more than eight numbers, a number that is not finite, a stamp that cannot be
+        seconds, a quaternion without length.
 
     Examples
     --------
@@ -81,15 +84,18 @@ def parse_tum_line(line: str) -> TumSample:
             f"found {len(fields)}: {line.strip()!r}"
         )
     try:
-        t_ns = round(Decimal(fields[0]) * NS_PER_S)
+        stamp_s = Decimal(fields[0])
         x, y, _z, _qx, _qy, qz, qw = (float(field) for field in fields[1:])
-    except (InvalidOperation, ValueError, OverflowError):
+    except (InvalidOperation, ValueError):
         raise TumError(f"not a number in TUM line {line.strip()!r}") from None
-    if not all(map(math.isfinite, (x, y, qz, qw))):
+    if not stamp_s.is_finite() or not all(map(math.isfinite, (x, y, qz, qw))):
         raise TumError(f"not a finite number in TUM line {line.strip()!r}")
+    # copy_abs, as abs would round to the context and overflow on a huge exponent
+    if stamp_s.copy_abs() >= _MAX_STAMP_S:
+        raise TumError(f"stamps must be seconds, found {fields[0]} in TUM line {line.strip()!r}")
     if qz == 0.0 and qw == 0.0:
         raise TumError(f"quaternion without a heading in TUM line {line.strip()!r}")
-    return TumSample(t_ns=t_ns, x_m=x, y_m=y, qz=qz, qw=qw)
+    return TumSample(t_ns=round(stamp_s * NS_PER_S), x_m=x, y_m=y, qz=qz, qw=qw)
 
 
 def format_tum_line(t_ns: int, pose: NDArray[np.float64]) -> str:

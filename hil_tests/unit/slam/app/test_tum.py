@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from slam.app.tum import (
@@ -49,6 +49,25 @@ def test_any_text_is_a_sample_or_a_tum_error(text: str) -> None:
         assert isinstance(parse_tum_line(text), TumSample)
 
 
+number_like = st.one_of(
+    st.floats().map(repr),
+    st.integers(-(2**80), 2**80).map(str),
+    st.decimals().map(str),
+    st.from_regex(r"[+-]?[0-9]{1,4}(\.[0-9]{0,12})?[eE][+-]?[0-9]{1,20}", fullmatch=True),
+)
+
+
+@given(st.lists(number_like, min_size=8, max_size=8))
+@example(["1e9999999", *"0000001"])
+@example(["-1e99999999999999999999", *"0000001"])
+@example(["1e-9999999", *"0000001"])
+def test_eight_number_like_fields_are_an_int64_stamp_or_a_tum_error(fields: list[str]) -> None:
+    with contextlib.suppress(TumError):
+        sample = parse_tum_line(" ".join(fields))
+        assert -(2**63) < sample.t_ns < 2**63
+        assert all(map(math.isfinite, (sample.x_m, sample.y_m, sample.heading_rad)))
+
+
 def test_files_round_trip_and_skip_comments(tmp_path: Path) -> None:
     path = tmp_path / "t.tum"
     poses = np.array([[0.1, 0.2, 0.3], [1 / 3, -2.0, -3.0]])
@@ -67,6 +86,9 @@ def test_files_round_trip_and_skip_comments(tmp_path: Path) -> None:
         ("1 2 3\n", "line 1: expected 8 numbers"),
         ("0 0 0 0 0 0 0 1\nx 0 0 0 0 0 0 1\n", "line 2: not a number"),
         ("0 nan 0 0 0 0 0 1\n", "line 1: not a finite number"),
+        ("0 0 0 0 0 0 0 1\n1732155000123456789 0 0 0 0 0 0 1\n", "line 2: stamps must be seconds"),
+        ("1e9999999 0 0 0 0 0 0 1\n", "line 1: stamps must be seconds"),
+        ("inf 0 0 0 0 0 0 1\n", "line 1: not a finite number"),
         ("0 0 0 0 0 0 0 0\n", "line 1: quaternion without a heading"),
         ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "line 2: its time is not after"),
     ],
