@@ -12,7 +12,10 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
+from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.sessions import surviving_counters
+from slam.app import demo as demo_module
+from slam.app.cli import main
 from slam.app.rerun_view import count_rows
 
 pytestmark = [
@@ -101,6 +104,27 @@ def test_ctrl_c_half_way(tmp_path: Path) -> None:
     assert abs(count_rows(out / "session.rrd")["/radar/left_rear/frame"] - len(counters)) <= 1
 
 
+@pytest.mark.parametrize("step", ["summarise", "_write_trajectories", "print_table"])
+def test_a_signal_after_the_last_scan(
+    tmp_path: Path,
+    step: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    real = getattr(demo_module, step)
+
+    def interrupted(*arguments: object, **options: object) -> object:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return real(*arguments, **options)
+
+    monkeypatch.setattr(demo_module, step, interrupted)
+    out = tmp_path / "out"
+    command = ["demo", "--scene", str(write_short_scene(tmp_path)), "--out", str(out)]
+    assert main(command) == 143
+    assert capsys.readouterr().err.splitlines()[-1].startswith("uwb-slam: stopped by SIGTERM")
+    assert (out / "map.png").exists() == (step == "print_table")
+
+
 @pytest.mark.parametrize(
     ("delay_s", "which", "code"), [(0.2, signal.SIGINT, 130), (1.2, signal.SIGTERM, 143)]
 )
@@ -153,10 +177,14 @@ def test_the_emulator_freezes(tmp_path: Path) -> None:
     with running_demo(out, tmp_path / "tmp") as demo:
         (emulator,) = children(demo.pid)
         os.kill(emulator, signal.SIGSTOP)
+        started = time.monotonic()
         _, stderr = demo.communicate(timeout=60)
+        waited_s = time.monotonic() - started
     assert demo.returncode == 1
     last = stderr.splitlines()[-1]
     assert last.startswith("uwb-slam: radar ")
     assert "no frame for 5 s after frame" in last
+    # 5 s of silence and 3 s for the emulator to end, but nothing for its four drivers
+    assert waited_s < 13
     assert is_gone(emulator)
     assert len(finished_counters(out / "session.mcap")) > 100

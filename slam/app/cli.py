@@ -27,6 +27,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with StopFlag() as stop:
             command(arguments, stop)
             sys.stdout.flush()
+        stop.check()  # a signal that came after the command's own last check
     except AppError as error:
         return _end(str(error), error.exit_code)
     except StopRequestedError as stopped:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,7 +63,7 @@ def run_demo(options: DemoOptions, stop: StopFlag) -> None:
     options
         Scene, seed, preset, folder.
     stop
-        Asked between two scans.
+        Asked between two scans, and between the steps after the last one.
 
     Raises
     ------
@@ -107,29 +108,44 @@ def run_demo(options: DemoOptions, stop: StopFlag) -> None:
         observers += [log, view, progress]
         link_log.attach(log, view, progress)
         slam = UwbRadarSlam(config, rig)
-        try:
-            with source:  # closed before the logs, which also want its last words
-                scans = source.scans(end_counter(trajectory.duration_ns), stop.check)
+        with _saying_what_is_left(kept), source:  # closed before the logs, for its last words
+            scans = source.scans(end_counter(trajectory.duration_ns), stop.check)
+            try:
                 record = run_slam(scans, odometry, slam, trajectory.poses, observers)
-        except StopRequestedError as stopped:
-            raise StopRequestedError(stopped.received, kept) from None
-        except RadarSilentError as silent:
-            raise EmulatorError(f"{emulator.ended() or silent}{kept}") from None
-    summary = summarise(
-        record,
-        scene=scene.name,
-        preset=options.preset,
-        seed=options.seed,
-        rig=rig,
-        config=config,
-        true_landmarks_m=landmarks_m,
-    )
-    if summary is None:
-        raise AppError(f"{options.scene}: too short for SLAM, no state was estimated{kept}")
-    _write_trajectories(options.out, record)
-    (options.out / "summary.json").write_text(summary.to_json() + "\n", encoding="ascii")
-    draw_map(options.out / "map.png", info, record, summary)
+            except RadarSilentError as silent:
+                cause = emulator.ended() or str(silent)
+                # Ended before the drivers close: they need not wait for answers then.
+                emulator.end()
+                raise EmulatorError(f"{cause}{kept}") from None
+    with _saying_what_is_left(kept):
+        stop.check()
+        summary = summarise(
+            record,
+            scene=scene.name,
+            preset=options.preset,
+            seed=options.seed,
+            rig=rig,
+            config=config,
+            true_landmarks_m=landmarks_m,
+        )
+        if summary is None:
+            raise AppError(f"{options.scene}: too short for SLAM, no state was estimated{kept}")
+        stop.check()
+        _write_trajectories(options.out, record)
+        (options.out / "summary.json").write_text(summary.to_json() + "\n", encoding="ascii")
+        stop.check()
+        draw_map(options.out / "map.png", info, record, summary)
+        stop.check()
     print_table(summary, wall_s=record.wall_s, lost_frames=source.lost_frames, stream=sys.stdout)
+
+
+@contextmanager
+def _saying_what_is_left(kept: str) -> Iterator[None]:
+    """Let a stop by a signal say what was recorded until then."""
+    try:
+        yield
+    except StopRequestedError as stopped:
+        raise StopRequestedError(stopped.received, kept) from None
 
 
 def _prepare(out: Path) -> None:

@@ -80,7 +80,11 @@ class EmulatorProcess:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """End the process, by force if it does not listen, and remove its links."""
+        """Do what `end` does."""
+        self.end()
+
+    def end(self) -> None:
+        """End the process, by force if it does not listen, and remove its links; only once."""
         self._cleanup.close()
 
     def ended(self) -> str | None:

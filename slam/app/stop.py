@@ -1,8 +1,8 @@
 """Stopping cleanly on SIGINT and SIGTERM.
 
 A signal only raises a flag; the program asks for it between two steps, so no file is left in the
-middle of a record. A second signal of the same kind gets Python's own handling, for a user who
-does not want to wait.
+middle of a record. A second signal of the same kind gets the system's default and ends the process
+where it stands, for a user who does not want to wait.
 """
 
 from __future__ import annotations
@@ -66,9 +66,10 @@ class StopFlag:
     @contextmanager
     def at_once(self) -> Iterator[None]:
         """Let a signal raise where it arrives: for waiting, where nothing is half-done."""
-        self.check()
-        self._at_once = True
         try:
+            # in this order: a signal is seen by the check, or raises where it arrives
+            self._at_once = True
+            self.check()
             yield
         finally:
             self._at_once = False

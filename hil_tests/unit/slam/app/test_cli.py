@@ -1,5 +1,7 @@
 """`uwb-slam` itself: help is light, wrong usage is 2, nobody sees a traceback."""
 
+import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -81,3 +83,15 @@ def test_a_folder_that_cannot_be_written_is_1(
     (tmp_path / "file").write_text("in the way")
     assert main(["demo", "--out", str(tmp_path / "file" / "o")]) == 1
     assert "cannot be written: Not a directory" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("which", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_after_a_commands_last_check_counts_too(
+    which: signal.Signals,
+    code: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("slam.app.cli._evaluate", lambda *_: os.kill(os.getpid(), which))
+    assert main(["evaluate", "one.tum", "two.tum"]) == code
+    assert capsys.readouterr().err == f"uwb-slam: stopped by {which.name}\n"

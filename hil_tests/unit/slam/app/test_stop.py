@@ -31,9 +31,33 @@ def test_while_waiting_a_signal_raises_where_it_arrives() -> None:
     assert time.monotonic() - started < 5
 
 
-def test_a_second_signal_is_pythons_own() -> None:
+def test_a_second_signal_gets_the_systems_default() -> None:
     before = signal.getsignal(signal.SIGINT)
     with StopFlag():
         os.kill(os.getpid(), signal.SIGINT)
         assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_signal_before_waiting_begins_is_not_lost() -> None:
+    with StopFlag() as stop:
+        os.kill(os.getpid(), signal.SIGINT)
+        with pytest.raises(StopRequestedError), stop.at_once():
+            pytest.fail("must not begin to wait")
+
+
+class StopFlagWithASlowCheck(StopFlag):
+    """A signal comes just after the check found nothing, where a lost one would go unseen."""
+
+    def check(self) -> None:
+        first = self._received is None
+        super().check()
+        if first:
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_a_signal_just_after_the_check_is_not_lost() -> None:
+    with StopFlagWithASlowCheck() as stop:
+        with pytest.raises(StopRequestedError), stop.at_once():
+            pytest.fail("must not begin to wait")
+        assert not stop._at_once
