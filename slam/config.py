@@ -41,6 +41,13 @@ class PeakPosition(StrEnum):
     PARABOLA = "parabola"  # vertex through the maximum and its neighbours
 
 
+class Pairing(StrEnum):
+    """Which detections of two radars are combined into fixes."""
+
+    ALL = "all"  # as printed: every one with every one, so K echoes give up to K^2 fixes
+    ONE_TO_ONE = "one_to_one"  # each used once: most pairs, then least amplitude mismatch
+
+
 class Evidence(StrEnum):
     """What a confirmed cluster sends to the filter."""
 
@@ -123,7 +130,10 @@ class TrilaterationConfig(_Model):
     """Which pairs of ranges become a fix (paper eq. 1 and 2)."""
 
     field_of_view_deg: Annotated[float, Field(gt=0, lt=180)] = 65.0
-    # As printed the stamps of a pair are not compared; infinity keeps that.
+    pairing: Pairing = Pairing.ALL
+    # As printed the stamps of a pair are not compared; infinity keeps that. Frames stamped by
+    # their counters carry equal stamps where the counters are equal, so a limit acts only where
+    # frames are stamped by their arrival.
     max_stamp_difference_s: Annotated[float, Field(ge=0, allow_inf_nan=True)] = math.inf
 
     @property

@@ -7,19 +7,24 @@ of the radars is kept. Everything follows from the mounts: the same formula serv
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
-from slam.config import TrilaterationConfig
+from slam.config import Pairing, TrilaterationConfig
 from slam.detection import Detection
 from slam.geometry import RadarPair, Rig
 
 Array = NDArray[np.float64]
 
 _NS_PER_S = 1_000_000_000
+# No range of this world; beyond it squares of lengths would not be numbers.
+_MAX_LENGTH_M = 1e150
+# Amplitudes are compared between these: a peak without a height counts as very faint.
+_AMPLITUDES = (1e-12, 1e12)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,11 +92,11 @@ def bilaterate(
         shape (n, 2) [m], body frame; NaN where the circles do not meet.
     accepted
         shape (n,), True where the circles meet inside both fields of view. Ranges that are
-        negative, zero or not finite are never accepted.
+        negative, zero, not finite or beyond 1e150 m are never accepted.
     """
     l1, l2 = np.asarray(first_m, dtype=np.float64), np.asarray(second_m, dtype=np.float64)
     d = pair.baseline_m
-    valid = np.isfinite(l1) & np.isfinite(l2) & (l1 > 0) & (l2 > 0)
+    valid = (l1 > 0) & (l2 > 0) & (l1 < _MAX_LENGTH_M) & (l2 < _MAX_LENGTH_M)
     l1, l2 = np.where(valid, l1, np.nan), np.where(valid, l2, np.nan)
     # Triangle inequality, written so that NaN fails it.
     meets = (np.abs(l1 - l2) <= d) & (l1 + l2 >= d)
@@ -127,15 +132,16 @@ def bilateration_jacobian(first_m: float, second_m: float, pair: RadarPair) -> A
 
 
 class Trilaterator:
-    """Pairs the detections of one pose, every one with every one of the other radar.
+    """Pairs the detections of one pose, those of one radar with those of the other.
 
-    K echoes seen by both radars give up to K^2 fixes. All that pass the geometry are kept, as in
-    the paper; the ghosts among them are left to the outlier filter.
+    K echoes seen by both radars give up to K^2 fixes. As printed, all that pass the geometry are
+    kept, and the ghosts among them are left to the outlier filter. With ``Pairing.ONE_TO_ONE``
+    each detection takes part in at most one fix of a pair of radars, see ``one_to_one``.
 
     Parameters
     ----------
     config
-        Field of view and stamp tolerance.
+        Field of view, stamp tolerance and pairing rule.
     rig
         The mounts; its pairs are worked out once.
     """
@@ -158,7 +164,9 @@ class Trilaterator:
                 if abs(a.t_ns - b.t_ns) <= self.config.max_stamp_difference_s * _NS_PER_S
             ]
             if combinations:
-                fixes.extend(self._fixes(index, combinations))
+                of_pair = self._fixes(index, combinations)
+                one_each = self.config.pairing is Pairing.ONE_TO_ONE
+                fixes.extend(one_to_one(of_pair) if one_each else of_pair)
         return tuple(fixes)
 
     def _fixes(self, index: int, combinations: Sequence[tuple[Detection, Detection]]) -> list[Fix]:
@@ -173,3 +181,35 @@ class Trilaterator:
             )
             if seen
         ]
+
+
+def one_to_one(fixes: Sequence[Fix]) -> list[Fix]:
+    """Return fixes of one pair of radars that share no detection.
+
+    As many as possible; among those choices the one whose amplitudes fit best: least sum of
+    ``|ln(a1 / a2)|``, because one target answers two radars side by side about equally loud. The
+    order of the fixes plays no part, in ties neither: detections are numbered by range first.
+    Equal detections of one radar are one.
+    """
+    firsts = _numbered(fix.detections[0] for fix in fixes)
+    seconds = _numbered(fix.detections[1] for fix in fixes)
+    table = {(firsts[fix.detections[0]], seconds[fix.detections[1]]): fix for fix in fixes}
+    mismatches = {cell: _mismatch(fix) for cell, fix in table.items()}
+    # One forbidden combination must cost more than any number of allowed ones.
+    cost = np.full((len(firsts), len(seconds)), 1.0 + sum(mismatches.values()))
+    for cell, mismatch in mismatches.items():
+        cost[cell] = mismatch
+    rows, columns = linear_sum_assignment(cost)
+    chosen = zip(rows.tolist(), columns.tolist(), strict=True)
+    return [table[cell] for cell in chosen if cell in table]
+
+
+def _numbered(detections: Iterable[Detection]) -> dict[Detection, int]:
+    """Return a number for each different detection, the same whatever order they come in."""
+    ordered = sorted(set(detections), key=lambda d: (d.range_m, d.t_ns, d.amplitude))
+    return {detection: number for number, detection in enumerate(ordered)}
+
+
+def _mismatch(fix: Fix) -> float:
+    a, b = np.clip(np.nan_to_num([d.amplitude for d in fix.detections]), *_AMPLITUDES)
+    return abs(math.log(a / b))
