@@ -136,7 +136,13 @@ def run_demo(options: DemoOptions, stop: StopFlag) -> None:
         stop.check()
         draw_map(options.out / "map.png", info, record, summary)
         stop.check()
-    print_table(summary, wall_s=record.wall_s, lost_frames=source.lost_frames, stream=sys.stdout)
+    print_table(
+        summary,
+        lag_states=config.window.size - 1,
+        wall_s=record.wall_s,
+        lost_frames=source.lost_frames,
+        stream=sys.stdout,
+    )
 
 
 @contextmanager

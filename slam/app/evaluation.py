@@ -87,7 +87,7 @@ def summarise(
 
 
 def _nees(record: RunRecord, truth_in_map: NDArray[np.float64]) -> tuple[tuple[float, float], ...]:
-    """Return (time [s], NEES) at the ten fixed times, from the last state at or before each."""
+    """Return (its time [s], its NEES) of the last state at or before each of the ten times."""
     stamps_ns = np.array([result.t_ns for result in record.results])
     values = []
     for part in NEES_AT:
@@ -95,7 +95,7 @@ def _nees(record: RunRecord, truth_in_map: NDArray[np.float64]) -> tuple[tuple[f
         row = max(int(np.searchsorted(stamps_ns, t_ns, side="right")) - 1, 0)
         belief = record.results[row].belief
         nees = nees_pose(belief.pose, belief.pose_covariance, truth_in_map[row])
-        values.append((t_ns / NS_PER_S, nees))
+        values.append((int(stamps_ns[row]) / NS_PER_S, nees))
     return tuple(values)
 
 

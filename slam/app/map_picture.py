@@ -124,7 +124,7 @@ def _write_title(axes: Axes, summary: Summary) -> None:
     axes.set_title(
         f"{summary.scene}, preset {summary.preset}, seed {summary.seed} (simulated): "
         f"ATE {1e3 * summary.ate_rmse_m:.1f} mm, "
-        f"odometry {1e3 * summary.odometry_ate_rmse_m:.1f} mm",
+        f"{summary.ate_ratio:.2f} of odometry's {1e3 * summary.odometry_ate_rmse_m:.1f} mm",
         loc="left",
         fontsize=11,
         color="#20242a",
@@ -132,7 +132,7 @@ def _write_title(axes: Axes, summary: Summary) -> None:
     )
     axes.annotate(
         "drawn as estimated from the start pose; the ATE is after SE(2) alignment; "
-        f"final error unaligned {1e3 * summary.final_error_m:.0f} mm",
+        f"at the last state it is off by {1e3 * summary.final_error_m:.0f} mm, unaligned",
         xy=(0.0, 1.0),
         xytext=(0.0, 8.0),
         xycoords="axes fraction",

@@ -4,36 +4,44 @@ from __future__ import annotations
 
 from typing import TextIO
 
-from slam.app.summary import Summary
+from slam.app.summary import Summary, ratio
 
 
-def print_table(summary: Summary, *, wall_s: float, lost_frames: int, stream: TextIO) -> None:
+def print_table(
+    summary: Summary, *, lag_states: int, wall_s: float, lost_frames: int, stream: TextIO
+) -> None:
     """Write the table of one simulated run."""
-    stream.write(table_text(summary, wall_s=wall_s, lost_frames=lost_frames))
+    text = table_text(summary, lag_states=lag_states, wall_s=wall_s, lost_frames=lost_frames)
+    stream.write(text)
     stream.flush()
 
 
-def table_text(summary: Summary, *, wall_s: float, lost_frames: int) -> str:
-    """Return the table: errors in mm with their ratio to odometry's, landmarks, speed."""
+def table_text(summary: Summary, *, lag_states: int, wall_s: float, lost_frames: int) -> str:
+    """Return the table: errors in mm with their ratio to odometry's, landmarks, speed.
+
+    `lag_states` is how many newer states had been seen when a state was estimated.
+    """
     landmarks = summary.landmarks
+    lag = f"filtered, {lag_states} states late" if lag_states else "causal"
+    icp_ratio = ratio(summary.ate_icp_rmse_m, summary.odometry_ate_rmse_m)
     rows = [
-        ("odometry ATE", _mm(summary.odometry_ate_rmse_m), "wheels alone, SE(2)-aligned"),
+        ("odometry ATE", mm_text(summary.odometry_ate_rmse_m), "wheels alone, SE(2)-aligned"),
         (
             "SLAM ATE",
-            _mm(summary.ate_rmse_m),
-            f"{summary.ate_ratio:.2f} of odometry's, SE(2)-aligned, causal",
+            mm_text(summary.ate_rmse_m),
+            f"{summary.ate_ratio:.2f} of odometry's, SE(2)-aligned, {lag}",
         ),
         (
             "SLAM ATE, ICP",
-            _mm(summary.ate_icp_rmse_m),
-            "the paper's metric: nearest point of the path, no time",
+            mm_text(summary.ate_icp_rmse_m),
+            f"{icp_ratio:.2f} of odometry's ATE; paper's metric: nearest point, no time",
         ),
-        ("final error", _mm(summary.final_error_m), "at the end of the run, not aligned"),
+        ("final error", mm_text(summary.final_error_m), "at the last state, not aligned"),
         (
             "landmarks",
             f"{landmarks.estimated} of {landmarks.true}",
-            f"precision {_share(landmarks.precision)}, recall {_share(landmarks.recall)}, "
-            f"{landmarks.duplicates} duplicates, rmse {_mm(landmarks.rmse_m)}",
+            f"precision {share_text(landmarks.precision)}, recall {share_text(landmarks.recall)}, "
+            f"{landmarks.duplicates} duplicates, rmse {mm_text(landmarks.rmse_m)}",
         ),
         (
             "speed",
@@ -48,9 +56,11 @@ def table_text(summary: Summary, *, wall_s: float, lost_frames: int) -> str:
     return "\n".join([title, rule, *lines, rule]) + "\n"
 
 
-def _mm(length_m: float | None) -> str:
+def mm_text(length_m: float | None) -> str:
+    """Return a length in millimetres, a dash where there is none."""
     return "-" if length_m is None else f"{1e3 * length_m:.1f} mm"
 
 
-def _share(value: float | None) -> str:
+def share_text(value: float | None) -> str:
+    """Return a share of one, a dash where there is none."""
     return "-" if value is None else f"{value:.2f}"

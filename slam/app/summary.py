@@ -3,7 +3,17 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import asdict, dataclass
+
+
+def ratio(error_m: float, odometry_error_m: float) -> float:
+    """Return an error in units of odometry's; infinite where odometry is perfect.
+
+    >>> ratio(0.5, 2.0), ratio(0.5, 0.0)
+    (0.25, inf)
+    """
+    return error_m / odometry_error_m if odometry_error_m else math.inf
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,9 +33,11 @@ class LandmarkSummary:
 class Summary:
     """The numbers of one run; field names are those of summary.json and a stable contract.
 
-    `ate_rmse_m` is time-associated and SE(2)-aligned, of the causal path; `ate_icp_rmse_m` is the
-    paper's number, without time, and flatters; `nees_pose` holds (time [s], NEES) pairs of the
-    unaligned pose in the start frame; `nis_mean` is divided by its degrees of freedom.
+    `ate_rmse_m` is time-associated and SE(2)-aligned, of the filtered path; `ate_icp_rmse_m` is the
+    paper's number, without time, and flatters; `final_error_m` is that of the last state, not
+    aligned; `nees_pose` holds (time of the state [s], NEES) pairs of the unaligned pose in the
+    start frame, of the last state at or before each of ten times; `nis_mean` is divided by its
+    degrees of freedom.
     """
 
     scene: str
@@ -46,7 +58,7 @@ class Summary:
     @property
     def ate_ratio(self) -> float:
         """SLAM's ATE in units of odometry's; below 1 is better than driving blind."""
-        return self.ate_rmse_m / self.odometry_ate_rmse_m
+        return ratio(self.ate_rmse_m, self.odometry_ate_rmse_m)
 
     def to_json(self) -> str:
         """Return the text of summary.json: exactly these fields, no NaN."""

@@ -61,10 +61,12 @@ def test_nan_is_refused() -> None:
 
 
 def test_the_table_says_simulated_and_gives_the_ratio() -> None:
-    text = table_text(SUMMARY, wall_s=9.9, lost_frames=0)
+    text = table_text(SUMMARY, lag_states=14, wall_s=9.9, lost_frames=0)
     assert "simulated" in text.splitlines()[0]
     assert "14.1 mm" in text
-    assert "0.25 of odometry's" in text
+    assert "0.25 of odometry's, SE(2)-aligned, filtered, 14 states late" in text
+    # 8.9 / 56.4
+    assert "0.16 of odometry's ATE" in text
     assert "70 x real time" in text
     assert "0 lost" in text
     assert max(map(len, text.splitlines())) <= 100
@@ -74,5 +76,8 @@ def test_a_map_without_a_match_has_dashes() -> None:
     nothing = LandmarkSummary(
         true=14, estimated=0, precision=None, recall=0.0, duplicates=0, rmse_m=None
     )
-    text = table_text(dataclasses.replace(SUMMARY, landmarks=nothing), wall_s=1.0, lost_frames=2)
+    text = table_text(
+        dataclasses.replace(SUMMARY, landmarks=nothing), lag_states=0, wall_s=1.0, lost_frames=2
+    )
+    assert "SE(2)-aligned, causal" in text
     assert "precision -, recall 0.00, 0 duplicates, rmse -" in text
