@@ -1,5 +1,6 @@
 """`uwb-slam sweep`: same numbers on one process or two, groups that follow from the runs."""
 
+import contextlib
 import json
 import os
 import signal
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 from hil_tests.system.short_scene import write_short_scene
+from slam.app.cli import main
 
 pytestmark = pytest.mark.slow
 
@@ -45,17 +47,63 @@ def test_one_and_two_processes_give_the_same_numbers(tmp_path: Path) -> None:
 
 
 def test_ctrl_c_ends_a_sweep_and_its_workers(tmp_path: Path) -> None:
+    scene = write_short_scene(tmp_path)
     command = [sys.executable, "-m", "slam.app.cli", "sweep", "--seeds", "50"]
+    command += ["--scene", str(scene)]
     command += ["--jobs", "2", "--json", str(tmp_path / "o.json")]
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, process_group=0
     )
-    time.sleep(4)
+    part = tmp_path / "o.json.part"
+    runs: list[Any] = []
+    give_up = time.monotonic() + 60
+    while not runs:
+        assert time.monotonic() < give_up, "no run was ever done"
+        assert process.poll() is None
+        time.sleep(0.05)
+        with contextlib.suppress(OSError, ValueError):  # not there yet, or being written
+            runs = json.loads(part.read_text())["runs"]
     started = time.monotonic()
     # to the whole group, as a terminal does
     os.killpg(process.pid, signal.SIGINT)
     _, stderr = process.communicate(timeout=20)
     assert time.monotonic() - started < 8
     assert process.returncode == 130
-    assert stderr.splitlines()[-1].startswith("uwb-slam: stopped by SIGINT")
-    assert "Traceback" not in stderr
+    done = len(json.loads(part.read_text())["runs"])
+    *progress, last = stderr.splitlines()
+    assert last == f"uwb-slam: stopped by SIGINT; {done} of 50 runs are in {part}"
+    assert len(progress) == done
+    assert all(f" of 50: {scene.stem}, paper, seed " in line for line in progress)
+    assert not (tmp_path / "o.json").exists()
+
+
+def test_ctrl_c_while_workers_start(tmp_path: Path) -> None:
+    script = tmp_path / "main.py"
+    script.write_text(
+        "import os, signal, joblib\n"
+        "from slam.app.cli import main\n"
+        "parallel = joblib.Parallel.__call__\n"
+        "def interrupted(*arguments):\n"
+        "    results = parallel(*arguments)\n"
+        "    os.killpg(0, signal.SIGINT)\n"
+        "    return results\n"
+        "joblib.Parallel.__call__ = interrupted\n"
+        f"out = {str(tmp_path / 'o.json')!r}\n"
+        "raise SystemExit(main(['sweep', '--jobs', '2', '--json', out]))\n"
+    )
+    process = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, process_group=0, timeout=30
+    )
+    assert (process.returncode, process.stdout) == (130, "")
+    assert process.stderr == "uwb-slam: stopped by SIGINT\n"
+    assert list(tmp_path.iterdir()) == [script]
+
+
+def test_an_out_that_cannot_be_written_fails_before_the_first_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for out, said in ((tmp_path, "is a folder"), (tmp_path / "no" / "o", "No such file")):
+        assert main(["sweep", "--seeds", "1000", "--json", str(out)]) == 1
+        text = capsys.readouterr()
+        assert said in text.err
+        assert (text.out, text.err.count("\n")) == ("", 1)

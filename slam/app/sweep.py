@@ -6,7 +6,9 @@ import json
 import signal
 import statistics
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
@@ -29,9 +31,10 @@ from slam.app.emulated_rig import (
 from slam.app.errors import AppError
 from slam.app.evaluation import summarise
 from slam.app.odometry import OdometryTrack
+from slam.app.report_table import mm_text, share_text
 from slam.app.runner import RunRecord, run_slam
-from slam.app.stop import StopFlag
-from slam.app.summary import Summary
+from slam.app.stop import StopFlag, StopRequestedError
+from slam.app.summary import Summary, ratio
 from slam.pipeline import UwbRadarSlam
 
 _POSE_DOF = 3
@@ -90,38 +93,80 @@ def run_one(scene: str, preset: str, seed: int, *, check: Callable[[], None] = _
 
 
 def run_sweep(options: SweepOptions, stop: StopFlag) -> None:
-    """Run all cells, write `{"runs": [...], "groups": [...]}`, print one line per group."""
+    """Run all cells, write `{"runs": [...], "groups": [...]}`, print one line per group.
+
+    OUT.part holds the same for the runs done so far, and becomes OUT at the end.
+
+    Raises
+    ------
+    AppError
+        A wrong name or a file that cannot be written, before the first run; a scene too short.
+    StopRequestedError
+        A signal arrived; OUT.part stays if it holds a run.
+    """
     for scene, preset in product(options.scenes, options.presets):
         scene_and_config(scene, preset)  # a wrong name ends the command before any run
-    if not options.out.parent.is_dir():
-        raise AppError(f"{options.out}: the folder {options.out.parent} does not exist")
+    part = options.out.with_name(f"{options.out.name}.part")
+    if options.out.is_dir():
+        raise AppError(f"{options.out}: is a folder, must be a file")
+    _write(part, [])  # what cannot be written ends the command before any run, too
     cells = list(product(options.scenes, options.presets, range(options.n_seeds)))
     runs: list[Summary] = []
-    for summary in _results(cells, options.jobs, stop):
-        runs.append(summary)
-        sys.stderr.write(
-            f"{len(runs)} of {len(cells)}: {summary.scene}, {summary.preset}, "
-            f"seed {summary.seed}: ATE {1e3 * summary.ate_rmse_m:.1f} mm, "
-            f"odometry {1e3 * summary.odometry_ate_rmse_m:.1f} mm\n"
-        )
-        stop.check()
+    try:
+        for summary in _results(cells, options.jobs, stop):
+            runs.append(summary)
+            groups = _write(part, runs)
+            sys.stderr.write(f"{len(runs)} of {len(cells)}: {_run_line(summary)}\n")
+            stop.check()
+    except StopRequestedError as stopped:
+        left = f"; {len(runs)} of {len(cells)} runs are in {part}" if runs else ""
+        raise StopRequestedError(stopped.received, left) from None
+    finally:
+        if not runs:
+            part.unlink()
+    part.replace(options.out)
+    for group in groups:
+        sys.stdout.write(f"{_group_line(group)}\n")
+
+
+def _write(path: Path, runs: Sequence[Summary]) -> list[dict[str, Any]]:
+    """Write runs and the statistics of their groups; return the latter."""
     groups = summarise_groups(runs)
     result = {"runs": [asdict(run) for run in runs], "groups": groups}
-    options.out.write_text(json.dumps(result, indent=2, allow_nan=False) + "\n", encoding="ascii")
-    for group in groups:
-        slam, wheels = group["ate_rmse_m"], group["odometry_ate_rmse_m"]
-        sys.stdout.write(
-            f"{group['scene']}, preset {group['preset']}, {group['runs']} seeds (simulated): "
-            f"SLAM ATE median {1e3 * slam['median']:.1f} mm, p90 {1e3 * slam['p90']:.1f} mm; "
-            f"odometry median {1e3 * wheels['median']:.1f} mm\n"
-        )
+    try:
+        path.write_text(json.dumps(result, indent=2, allow_nan=False) + "\n", encoding="ascii")
+    except OSError as error:
+        raise AppError(f"{path}: cannot be written: {error.strerror}") from None
+    return groups
+
+
+def _run_line(run: Summary) -> str:
+    return (
+        f"{run.scene}, {run.preset}, seed {run.seed}: ATE {1e3 * run.ate_rmse_m:.1f} mm "
+        f"({run.ate_ratio:.2f} of odometry's {1e3 * run.odometry_ate_rmse_m:.1f} mm)"
+    )
+
+
+def _group_line(group: dict[str, Any]) -> str:
+    slam, wheels, found = (
+        group[key] for key in ("ate_rmse_m", "odometry_ate_rmse_m", "landmark_medians")
+    )
+    return (
+        f"{group['scene']}, preset {group['preset']}, {group['runs']} seeds (simulated): "
+        f"SLAM ATE median {1e3 * slam['median']:.1f} mm "
+        f"({ratio(slam['median'], wheels['median']):.2f} of odometry's), "
+        f"p90 {1e3 * slam['p90']:.1f} mm; odometry median {1e3 * wheels['median']:.1f} mm; "
+        f"landmark medians: precision {share_text(found['precision'])}, "
+        f"recall {share_text(found['recall'])}, rmse {mm_text(found['rmse_m'])}"
+    )
 
 
 def summarise_groups(runs: Sequence[Summary]) -> list[dict[str, Any]]:
     """Return the statistics of each scene and preset, in the order they first appear.
 
     Every group has its number of runs, how many beat odometry, `median` and `p90` of the errors,
-    and the mean NEES over runs (ANEES) at each of the ten times with its 95 % band.
+    medians of the landmarks' scores, and the mean NEES over runs (ANEES) at each of the ten times
+    with its 95 % band.
     """
     keys = list(dict.fromkeys((run.scene, run.preset) for run in runs))
     return [_group([run for run in runs if (run.scene, run.preset) == key]) for key in keys]
@@ -144,6 +189,10 @@ def _group(runs: Sequence[Summary]) -> dict[str, Any]:
         "runs": len(runs),
         "runs_below_odometry": sum(run.ate_ratio < 1.0 for run in runs),
         **spread,
+        "landmark_medians": {
+            name: _median_of_known([getattr(run.landmarks, name) for run in runs])
+            for name in ("precision", "recall", "rmse_m")
+        },
         "realtime_factor": _spread([run.realtime_factor for run in runs]),
         "anees_pose": anees,
         "anees_band_95": band,
@@ -155,24 +204,46 @@ def _spread(values: Sequence[float]) -> dict[str, float]:
     return {"median": float(np.median(values)), "p90": float(np.quantile(values, 0.9))}
 
 
+def _median_of_known(values: Sequence[float | None]) -> float | None:
+    """Return the median of the runs that have the number; None where no run has it."""
+    known = [value for value in values if value is not None]
+    return statistics.median(known) if known else None
+
+
 def _results(cells: Iterable[tuple[str, str, int]], jobs: int, stop: StopFlag) -> Iterator[Summary]:
     """Run cells one after the other or on worker processes; results in the order of the cells."""
     if jobs == 1:
         for cell in cells:
             yield run_one(*cell, check=stop.check)
         return
-    tasks = (joblib.delayed(_run_in_worker)(*cell) for cell in cells)
-    results = iter(joblib.Parallel(n_jobs=jobs, return_as="generator")(tasks))
-    while True:
-        # Nothing is half-written while we wait, so a signal may end the waiting at once.
-        with stop.at_once():
-            summary = next(results, None)
-        if summary is None:
-            return
-        yield summary
+    tasks = (joblib.delayed(run_one)(*cell) for cell in cells)
+    with _without_sigint():
+        results = joblib.Parallel(n_jobs=jobs, return_as="generator")(tasks)
+    try:
+        while True:
+            # Nothing is half-written while we wait, so a signal may end the waiting at once.
+            with stop.at_once():
+                summary = next(results, None)
+            if summary is None:
+                return
+            yield summary
+    finally:
+        with warnings.catch_warnings():
+            # joblib regrets the work that an early end throws away
+            warnings.filterwarnings("ignore", "[0-9]+ tasks", UserWarning)
+            results.close()
 
 
-def _run_in_worker(scene: str, preset: str, seed: int) -> Summary:
-    # Ctrl-C reaches the whole process group; the parent answers it and ends its workers.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    return run_one(scene, preset, seed)
+@contextmanager
+def _without_sigint() -> Iterator[None]:
+    """Hold SIGINT back, for worker processes too, which inherit this when they start.
+
+    Ctrl-C reaches the whole process group; the parent answers it and ends its workers. Blocked and
+    not ignored, so that one that comes meanwhile reaches the parent afterwards. Threads started
+    here inherit it as well, so a worker that joblib replaces later is like the first ones.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
