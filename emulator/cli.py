@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from emulator.pace import Pace
+from emulator.stopping import Stop, stop_signals
 
 __all__ = ["main"]
 
@@ -48,16 +49,30 @@ who opens a port, a host's first command counts as opening it.)
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return its exit code."""
-    arguments = _parse(argv)
+    with stop_signals() as stop:  # the imports take most of a second: a signal may come in them
+        return _run(_parse(argv), stop)
+
+
+def _run(arguments: argparse.Namespace, stop: Stop) -> int:
     # heavy imports only now: --help and usage errors answer at once
     from emulator.serving import CannotServeError, play, serve
 
+    if stop.requested:
+        return 0
+    folder = arguments.link_dir
     try:
         if arguments.command == "play":
-            play(arguments.recording, arguments.rate, arguments.loop, arguments.link_dir, _warn)
+            play(
+                arguments.recording,
+                arguments.rate,
+                arguments.loop,
+                folder,
+                warn=_warn,
+                stop=stop,
+            )
         else:
             scene = arguments.count if arguments.bare else arguments.scene
-            serve(scene, arguments.seed, arguments.pace, arguments.link_dir)
+            serve(scene, arguments.seed, arguments.pace, folder, stop)
     except CannotServeError as error:
         sys.stderr.write(f"xethru-emulator: {error}\n")
         return 1

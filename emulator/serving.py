@@ -6,14 +6,12 @@ import contextlib
 import json
 import os
 import shutil
-import signal
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 
 from emulator.device import Device, radar_device
 from emulator.echo import echo_source
@@ -27,6 +25,7 @@ from emulator.port_watch import PortWatch
 from emulator.run_directory import Announcement, fresh_port_folder
 from emulator.scene import Scene, SceneError, empty_room, load_scene
 from emulator.server import Port, Server, Service
+from emulator.stopping import Stop
 
 __all__ = ["CannotServeError", "play", "serve"]
 
@@ -48,7 +47,7 @@ class NamedDevice:
     device: Device
 
 
-def serve(scene: str | int, seed: int, pace: Pace, link_dir: Path | None) -> None:
+def serve(scene: str | int, seed: int, pace: Pace, link_dir: Path | None, stop: Stop) -> None:
     """Emulate the radars of a scene until a signal asks for the end.
 
     Parameters
@@ -61,13 +60,15 @@ def serve(scene: str | int, seed: int, pace: Pace, link_dir: Path | None) -> Non
         Which clock drives the modules.
     link_dir
         Where the links appear; a fresh directory if None.
+    stop
+        Ends it, also before it has begun.
 
     Raises
     ------
     CannotServeError
         When scene or ports cannot be had.
     """
-    with _stop_signals() as stop, contextlib.ExitStack() as cleanup:
+    with contextlib.ExitStack() as cleanup:
         try:
             bare = isinstance(scene, int)
             loaded = empty_room(scene) if isinstance(scene, int) else load_scene(scene)
@@ -96,7 +97,9 @@ def play(
     rate: float,
     loop: bool,
     link_dir: Path | None,
+    *,
     warn: Callable[[str], None],
+    stop: Stop,
 ) -> None:
     """Play a recording at the port of an emulated module until a signal asks for the end.
 
@@ -112,13 +115,15 @@ def play(
         Where the link appears; a fresh directory if None.
     warn
         Called with one line about a part of the recording that cannot be read; the rest plays.
+    stop
+        Ends it, also before it has begun.
 
     Raises
     ------
     CannotServeError
         When the recording cannot be read or the port not be had.
     """
-    with _stop_signals() as stop, contextlib.ExitStack() as cleanup:
+    with contextlib.ExitStack() as cleanup:
         try:
             identity = Identity(serial=PLAYED_SERIAL)
             device = recording_device(
@@ -188,9 +193,11 @@ def _run(
     ports: Sequence[Port],
     services: Sequence[Service],
     ready: dict[str, object],
-    stop: _Stop,
+    stop: Stop,
     cleanup: contextlib.ExitStack,
 ) -> None:
+    if stop.requested:
+        return  # nobody shall learn of ports that go away at once
     server = Server(ports, services)
     cleanup.callback(server.close)
     stop.attach(server)
@@ -210,41 +217,6 @@ def _say_ready(ready: dict[str, object]) -> None:
         # nobody will ever learn our ports; and the interpreter must not try to flush again
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise CannotServeError(f"stdout: cannot write the ready line: {error.strerror}") from error
-
-
-class _Stop:
-    """A request to end that may come before there is a loop to end."""
-
-    def __init__(self) -> None:
-        self._server: Server | None = None
-        self._requested = False
-
-    def attach(self, server: Server) -> None:
-        self._server = server
-        if self._requested:
-            server.stop()
-
-    def request(self, number: int, frame: FrameType | None) -> None:
-        del number, frame
-        self._requested = True
-        if self._server is not None:
-            self._server.stop()
-
-    def detach(self) -> None:
-        self._server = None
-
-
-@contextlib.contextmanager
-def _stop_signals() -> Iterator[_Stop]:
-    """Turn SIGINT, SIGTERM and SIGHUP into an orderly end, from here to the last clean-up."""
-    stop = _Stop()
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {number: signal.signal(number, stop.request) for number in numbers}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextlib.contextmanager

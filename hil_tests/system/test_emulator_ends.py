@@ -55,6 +55,41 @@ def test_a_signal_ends_it_with_0_and_nothing_is_left(
     assert list((tmp_path / "xethru").iterdir()) == []
 
 
+def catches(pid: int, number: signal.Signals) -> bool:
+    """Tell whether a process has a handler of its own for a signal (Linux)."""
+    (line,) = (
+        line
+        for line in Path(f"/proc/{pid}/status").read_text().splitlines()
+        if line.startswith("SigCgt:")
+    )
+    return bool(int(line.split()[1], 16) >> (number - 1) & 1)
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="asks /proc who catches signals")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("delay_s", [0.0, 0.05, 0.2, 0.4, 0.8])
+def test_a_signal_during_the_start_ends_it_with_0(
+    delay_s: float, number: signal.Signals, tmp_path: Path
+) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-m", "emulator.cli", "serve", "smoke", "--link-dir", tmp_path / "l"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **environment(tmp_path)},
+    ) as process:
+        deadline = time.monotonic() + 20
+        # before that it is the interpreter that starts, and no program can answer
+        while not catches(process.pid, signal.SIGHUP):
+            assert time.monotonic() < deadline
+            time.sleep(0.001)
+        time.sleep(delay_s)
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=20)
+    assert (process.returncode, errors) == (0, "")
+    assert not (tmp_path / "l").exists()
+
+
 def test_a_signal_while_streaming_ends_it_too(tmp_path: Path) -> None:
     with (
         emulator("serve", "smoke", "--pace", "asap", environment=environment(tmp_path)) as served,
