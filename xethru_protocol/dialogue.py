@@ -93,6 +93,8 @@ class Dialogue:
         self._connection = Connection(Role.HOST)
         self._answers: deque[Response] = deque()
         self._winding_down = False
+        self._damaged_since = False  # since the last frame or answer
+        self._rebooted_since = False
 
     def request(self, command: Command[ReplyT], timeout_s: float) -> ReplyT:
         """Send a command, return its reply; see `X4M300.request`."""
@@ -139,26 +141,33 @@ class Dialogue:
         self._connection.receive_data(data)
         while (event := self._connection.next_event()) is not NEED_DATA:
             if isinstance(event, DataFloat | BasebandIq):
+                self._sign_of_life()
                 self._take_frame(event, arrival_ns)
             elif isinstance(event, FramingFault):
                 if not self._winding_down:
                     self.fault_count += 1
+                    self._damaged_since = True
                     self.tell("fault", f"{event.kind.value} at byte {event.offset}")
             elif isinstance(event, Message):
                 if isinstance(event, _ANSWERS):
+                    self._sign_of_life()
                     self._answers.append(event)
                 elif isinstance(event, System) and event.code == SystemCode.XTS_SPRS_BOOTING:
                     self.reboots += 1
+                    self._rebooted_since = True
                 if self._observer is not None:
                     self.tell("rx", summary(event))
         return True
 
     def silence(self, what: str, timeout_s: float) -> ResponseTimeout:
-        """Error for something that did not come, with the likeliest reason and remedy."""
+        """Error for something that did not come, with the likeliest reason and remedy.
+
+        Judged by what came since the last frame or answer: what was before that explains nothing.
+        """
         missing = f"no {what} from {self._transport.name} within {timeout_s:g} s"
-        if self.reboots:
+        if self._rebooted_since:
             return ResponseTimeout(f"{missing}: the module restarted meanwhile; start it again")
-        if self.fault_count:
+        if self._damaged_since:
             return ResponseTimeout(
                 f"{missing}, but bytes that are no XeThru packets; "
                 "is it another device, or another baud rate?"
@@ -169,6 +178,10 @@ class Dialogue:
         """Tell the observer."""
         if self._observer is not None:
             self._observer(ProtocolRecord(t_ns=self._clock(), direction=direction, summary=text))
+
+    def _sign_of_life(self) -> None:
+        self._damaged_since = False
+        self._rebooted_since = False
 
     def _take_stale_input(self) -> None:
         """Sort what arrived before a request: an answer among it belongs to no request."""

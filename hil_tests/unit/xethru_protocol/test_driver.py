@@ -236,6 +236,22 @@ def test_module_that_stops_is_a_timeout_and_says_if_it_restarted() -> None:
     assert radar.reboots == 1
 
 
+def test_trouble_before_the_last_answer_or_frame_explains_no_silence() -> None:
+    radar, line = driver_on()
+    line.say(b"\x00junk", m.System(code=0x10))
+    radar.configure_raw()
+    with pytest.raises(ResponseTimeout, match="is it an X4M300"):
+        radar.read_frame()
+    line.say(b"\x00junk", m.System(code=0x10), frame(1))
+    radar.read_frame()
+    with pytest.raises(ResponseTimeout, match="is it an X4M300"):
+        radar.read_frame()
+    line.say(b"\x00junk")
+    with pytest.raises(ResponseTimeout, match="is it another device"):
+        radar.read_frame()
+    assert (radar.fault_count, radar.reboots) == (3, 2)
+
+
 def test_info_has_what_the_module_tells() -> None:
     radar, _ = driver_on()
     info = radar.info()
