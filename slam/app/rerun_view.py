@@ -57,8 +57,10 @@ ABOUT = """\
 * **B-scan** (middle, top): echoes of one radar, range to the right, time downwards; each picture
   is {block} frames with the constant part removed. Landmarks are the curved lines.
 * **Frame** (middle): the newest raw frame of one radar, all its range bins.
-* **Pose error** compares with the truth, which SLAM never sees. **NIS** is the size of each
-  surprise in units of what the filter expected: about 1 when the filter is honest.
+* **Pose error** compares with the truth, which SLAM never sees. **NIS** is the mean surprise of
+  the observations that were associated with a landmark, in units of what the filter expected. The
+  gate let only small ones through, and the noise of the paper's Table I is larger than the real
+  one, so it lies far below 1: it shows outliers, and does not prove the filter honest.
 * **Link**: commands, answers and faults on the serial ports.
 
 Move the time cursor below; `device_time` is the radar's own time, `frame` its frame counter.
@@ -378,7 +380,7 @@ def _blueprint(info: SessionInfo) -> rrb.Blueprint:
     ]
     scalars = rrb.Tabs(
         rrb.TimeSeriesView(name="Pose error [m]", origin="/error"),
-        rrb.TimeSeriesView(name="NIS / dof", origin="/consistency"),
+        rrb.TimeSeriesView(name="NIS / dof, gated", origin="/consistency"),
         rrb.TimeSeriesView(name="Landmarks", origin="/landmarks"),
     )
     text = rrb.Tabs(
