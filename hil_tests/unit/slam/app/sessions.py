@@ -22,8 +22,8 @@ def session_info(n_radars: int = 2) -> SessionInfo:
             serial=f"00000000000{index}",
             port=f"port{index}",
             x_m=0.1,
-            y_m=0.2 * index,
-            yaw_rad=1.57,
+            y_m=0.2 + 0.3 * index,
+            yaw_rad=1.57 - index,
             range_offset_m=0.0,
             range_start_m=0.2,
             bin_length_m=0.0064,
@@ -60,13 +60,13 @@ def scan(counter: int, n_radars: int = 2) -> Scan:
 
 
 def snapshot(counter: int) -> Snapshot:
-    pose = np.array([0.01 * counter, 0.002 * counter, 0.1])
+    pose = np.array([0.01 * counter, 0.002 * counter, 0.1])  # three unequal headings
     return Snapshot(
         counter=counter,
         t_ns=counter * FRAME_NS,
         truth=pose,
-        odometry=pose + np.array([0.02, 0.0, 0.0]),
-        estimate=pose + np.array([0.0, 0.01, 0.0]),
+        odometry=pose + np.array([0.02, 0.0, -0.6]),
+        estimate=pose + np.array([0.0, 0.01, 0.3]),
         world_from_map=np.zeros(3),
         pose_covariance=np.diag([1e-4, 1e-4, 1e-5]),
         landmark_ids=np.array([3, 8]),

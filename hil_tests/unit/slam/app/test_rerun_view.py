@@ -59,8 +59,8 @@ def test_y_points_down_on_the_screen(finished: Path) -> None:
     assert frame == 0
     np.testing.assert_allclose(points, snapshot(0).landmarks_m * [1, -1], rtol=1e-6)
     _, (arrow,) = next(rows(finished, "/map/estimate/robot", "Arrows2D:vectors"))
-    # heading 0.1 rad to the left is upwards for us, so negative for Rerun
-    np.testing.assert_allclose(arrow, [0.25 * np.cos(0.1), -0.25 * np.sin(0.1)], rtol=1e-5)
+    # heading 0.4 rad to the left is upwards for us, so negative for Rerun
+    np.testing.assert_allclose(arrow, [0.25 * np.cos(0.4), -0.25 * np.sin(0.4)], rtol=1e-5)
 
 
 def test_ellipses_are_rotated_polygons(finished: Path) -> None:

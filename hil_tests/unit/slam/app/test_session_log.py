@@ -1,6 +1,9 @@
 """The session log: what goes in comes out, in rosbags and mcap, also after a crash."""
 
+import cmath
+import dataclasses
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -76,29 +79,78 @@ def test_states_landmarks_and_their_covariance_come_back(finished: Path) -> None
     assert points["id"].tolist() == sent.landmark_ids.tolist()
     np.testing.assert_allclose(points["x"], sent.landmarks_m[:, 0], rtol=1e-6)
     np.testing.assert_allclose(points["cov_xy"], sent.landmark_covariances_m2[:, 0, 1], rtol=1e-6)
-    _, _, estimate = messages(finished, "/estimate")[7]
-    assert estimate.pose.position.x == sent.estimate[0]
-    _, _, truth = messages(finished, "/truth")[7]
-    assert (truth.header.frame_id, truth.pose.position.y) == ("world", sent.truth[1])
+
+
+Planar = tuple[complex, float]
+"""Position as a complex number and heading [rad]: turning is multiplying, without our geometry."""
+
+
+def planar(position: ros.Message, orientation: ros.Message) -> Planar:
+    assert (position.z, orientation.x, orientation.y) == (0, 0, 0)
+    turned = complex(orientation.w, orientation.z) ** 2  # half the angle is in a quaternion
+    assert abs(turned) == pytest.approx(1.0)
+    return complex(position.x, position.y), cmath.phase(turned)
+
+
+def chained(first: Planar, second: Planar) -> Planar:
+    return first[0] + cmath.rect(1.0, first[1]) * second[0], first[1] + second[1]
+
+
+def assert_is(found: Planar, expected: Iterable[float]) -> None:
+    x, y, heading = map(float, expected)
+    assert found[0] == pytest.approx(complex(x, y))
+    assert found[1] == pytest.approx(heading)
+
+
+def links_of(message: ros.Message) -> dict[tuple[str, str], Planar]:
+    return {
+        (row.header.frame_id, row.child_frame_id): planar(
+            row.transform.translation, row.transform.rotation
+        )
+        for row in message.transforms
+    }
+
+
+def test_whole_poses_come_back(finished: Path) -> None:
+    sent = snapshot(7)
+    for topic, frame, pose in (("truth", "world", sent.truth), ("estimate", "map", sent.estimate)):
+        _, t_ns, message = messages(finished, f"/{topic}")[7]
+        stamp = message.header.stamp
+        assert (message.header.frame_id, t_ns) == (frame, sent.t_ns)
+        assert stamp.sec * 10**9 + stamp.nanosec == sent.t_ns
+        assert_is(planar(message.pose.position, message.pose.orientation), pose)
 
 
 def test_transforms_chain_to_the_estimate(finished: Path) -> None:
     _, _, message = messages(finished, "/tf")[9]
-    by_child = {row.child_frame_id: row for row in message.transforms}
-    assert by_child["odom"].header.frame_id == "map"
-    assert by_child["base_link"].header.frame_id == "odom"
-    # both headings are equal in the made-up session, so positions simply add
-    added = [
-        by_child["odom"].transform.translation.x + by_child["base_link"].transform.translation.x,
-        by_child["odom"].transform.translation.y + by_child["base_link"].transform.translation.y,
-    ]
-    np.testing.assert_allclose(added, snapshot(9).estimate[:2], atol=1e-12)
+    links = links_of(message)
+    assert set(links) == {("map", "odom"), ("odom", "base_link")}
+    assert_is(links["odom", "base_link"], snapshot(9).odometry)
+    both = chained(links["map", "odom"], links["odom", "base_link"])
+    assert_is(both, snapshot(9).estimate)
+
+
+def test_the_newest_static_message_holds_every_static_transform(tmp_path: Path) -> None:
+    path = tmp_path / "s.mcap"
+    log = SessionLog(path, session_info())
+    place = np.array([3.0, -2.0, 0.7])
+    for counter in range(3):
+        log.on_snapshot(dataclasses.replace(snapshot(counter), world_from_map=place))
+    log.close()
+    first, last = (links_of(row[2]) for row in messages(path, "/tf_static"))
+    for links in (first, last):
+        assert_is(links["base_link", "radar_radar0"], (0.1, 0.2, 1.57))
+        assert_is(links["base_link", "radar_radar1"], (0.1, 0.5, 0.57))
+    assert len(first) == 2
+    assert_is(last["world", "map"], place)
+    assert len(last) == 3
 
 
 def test_info_is_latched_and_tells_how_to_read_frames(finished: Path) -> None:
     ((_, _, message),) = messages(finished, "/radar/radar1/info")
     info = json.loads(message.data)
     assert info["serial"] == "000000000001"
+    assert info["length_unit"] == "module metres, c = 3.0e8 m/s"
     assert (info["n_bins"], info["range_start_m"], info["rate_hz"]) == (1431, 0.2, 5.018533)
     with finished.open("rb") as stream:
         summary = make_reader(stream).get_summary()
