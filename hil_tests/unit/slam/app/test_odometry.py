@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from slam.app.errors import OdometryError
 from slam.app.odometry import OdometryTrack, read_odometry_socket
-from slam.app.tum import format_tum_line
+from slam.app.tum import TumSample, format_tum_line
 
 
 def lines_of(rows: list[tuple[int, float, float, float]]) -> list[str]:
@@ -33,7 +33,13 @@ def test_between_two_samples_it_is_linear() -> None:
 @pytest.mark.parametrize("turn_rad", [0.4, -0.4])
 def test_heading_crosses_half_a_turn_the_short_way(turn_rad: float) -> None:
     start = math.copysign(math.pi - 0.1, turn_rad)
-    track = OdometryTrack.from_lines(lines_of([(0, 0, 0, start), (100, 0, 0, start + turn_rad)]))
+    end = math.remainder(start + turn_rad, math.tau)
+    assert abs(end - start) > math.pi  # as the text has it, the short way is not the direct one
+    samples = [
+        TumSample(t_ns=t_ns, x_m=0, y_m=0, qz=math.sin(h / 2), qw=math.cos(h / 2))
+        for t_ns, h in ((0, start), (100, end))
+    ]
+    track = OdometryTrack(samples)
     for part in (20, 50, 75):
         expected = math.remainder(start + turn_rad * part / 100, math.tau)
         heading_rad = float(track.pose_at(part)[2])
