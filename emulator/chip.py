@@ -267,4 +267,4 @@ _GETTERS: dict[X4Setting, Callable[[Chip], X4Value]] = {
 
 
 def _fps_read_back(fps: float) -> float:
-    return x4.real_frame_rate(fps) if fps > 0 else fps
+    return x4.frame_rate_read_back(fps)

@@ -281,7 +281,7 @@ class X4M300:
         rate = self._get(X4Setting.FPS)
         if not isinstance(rate, float):
             raise RemoteProtocolError(f"{self._transport.name} reads back frame rate {rate}")
-        return rate
+        return x4.real_frame_rate(rate)
 
     def stop(self) -> None:
         """Stop frames. One that was already on its way may still come."""

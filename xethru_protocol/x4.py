@@ -132,20 +132,33 @@ def frame_area(
 
 
 def real_frame_rate(requested_hz: float) -> float:
-    """Frame rate the chip runs at, and reads back, when asked for ``requested_hz``.
+    """Frame rate [Hz] the chip's timer runs at when asked for ``requested_hz``.
 
-    Returns the float32 value of GET FPS as a Python float [Hz], so that module and host
-    compute with the identical number. Not positive: the request itself, which stops the chip.
+    The same for a request and for its read-back, so that a host finds from GET FPS the identical
+    number the module computes with. Not positive: the request itself, which stops the chip.
     Protocol reference 9.6.
 
-    >>> round(real_frame_rate(17.0), 6), real_frame_rate(200.0), real_frame_rate(0.0)
+    >>> round(real_frame_rate(17.9), 6), real_frame_rate(200.5), real_frame_rate(0.0)
     (17.049379, 200.0, 0.0)
     """
     requested = _f32(requested_hz)
     if not requested > 0:
         return requested
     whole = max(int(min(requested, 65535.0)), 1)  # the firmware keeps 16 bits of the integer part
-    return _f32(_REAL_RATES_HZ[whole - 1]) if whole < 35 else requested
+    return _f32(_REAL_RATES_HZ[whole - 1]) if whole <= len(_REAL_RATES_HZ) else float(whole)
+
+
+def frame_rate_read_back(requested_hz: float) -> float:
+    """Answer to GET FPS [Hz], a float32 value, when ``requested_hz`` was set.
+
+    It is the real rate below 35, else the request with its fraction, which the timer does not
+    have. Protocol reference 9.6.
+
+    >>> round(frame_rate_read_back(17.9), 6), frame_rate_read_back(200.5)
+    (17.049379, 200.5)
+    """
+    requested = _f32(requested_hz)
+    return real_frame_rate(requested) if requested < len(_REAL_RATES_HZ) + 1 else requested
 
 
 def frame_time_ns(counter: int, rate_hz: float) -> int:

@@ -68,7 +68,7 @@ def test_firmware_without_modes_is_tolerated() -> None:
 def test_start_returns_the_real_rate_and_warns_above_the_possible() -> None:
     radar, _ = driver_on()
     radar.configure_raw()
-    assert radar.start(17.0) == 17.049379348754883
+    assert radar.start(17.0) == pytest.approx(17.049379, abs=1e-6)
     radar.start(25.0)
     assert radar.warnings == [
         "25 frames/s exceed the 19.8 that these settings allow; "
@@ -76,6 +76,16 @@ def test_start_returns_the_real_rate_and_warns_above_the_possible() -> None:
     ]
     with pytest.raises(LocalProtocolError, match="must be positive"):
         radar.start(0.0)
+
+
+def test_start_returns_the_timers_rate_where_the_read_back_has_a_fraction() -> None:
+    def module(command: m.Message) -> Said:
+        if command == m.X4DriverGet(setting=X4Setting.FPS):
+            return [m.ReplyFloat(content_id=X4Setting.FPS, values=(50.5,))]
+        return plain_module(command)
+
+    radar, _ = driver_on(module)
+    assert radar.start(50.5) == 50.0
 
 
 def test_frames_keep_their_samples_counters_and_arrival_times() -> None:

@@ -99,13 +99,46 @@ def test_quantised_area_covers_the_request_within_one_frame(
         (29, 29.107494),
         (34, 34.040967),
         (35, 35),
-        (200.5, 200.5),
+        (35.9, 35),
+        (50.5, 50),
+        (200.5, 200),
         (0, 0),
         (-2, -2),
     ],
 )
 def test_real_frame_rate_is_the_chip_timers(requested: float, real: float) -> None:
     assert x4.real_frame_rate(requested) == float(np.float32(real))
+
+
+@pytest.mark.parametrize(
+    ("requested", "answer"),
+    [
+        (0.5, 1.004108),
+        (17.9, 17.049379),
+        (34.99, 34.040967),
+        (35, 35),
+        (50.5, 50.5),
+        (0, 0),
+        (-2.5, -2.5),
+    ],
+)
+def test_frame_rate_reads_back_with_its_fraction_from_35_on(
+    requested: float, answer: float
+) -> None:
+    assert x4.frame_rate_read_back(requested) == float(np.float32(answer))
+
+
+@given(st.floats(0.0078125, 1000, width=32) | st.integers(1, 400))
+def test_host_finds_the_real_rate_from_the_read_back(requested: float) -> None:
+    real = x4.real_frame_rate(requested)
+    assert x4.real_frame_rate(x4.frame_rate_read_back(requested)) == real
+    assert int(real) == max(int(requested), 1)
+
+
+@pytest.mark.parametrize("requested", range(1, 40))
+def test_every_row_of_the_rate_table_survives_its_read_back(requested: int) -> None:
+    real = x4.real_frame_rate(requested)
+    assert x4.real_frame_rate(x4.frame_rate_read_back(requested)) == real
 
 
 @pytest.mark.parametrize(
