@@ -14,7 +14,15 @@ from enum import StrEnum
 from importlib import resources
 from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -84,10 +92,15 @@ class MotionNoise(StrEnum):
 
 
 class GateRule(StrEnum):
-    """What the number ``gate`` means."""
+    """What the number ``gate`` means.
 
-    MAHALANOBIS_SQ = "mahalanobis_sq"  # as printed: alpha bounds the squared distance
-    MAHALANOBIS = "mahalanobis"  # alpha read as a plain distance
+    The paper prints "Mahalanobis distance threshold" and no formula. The default compares the
+    squared distance: so does the authors' later code, and so does the algorithm with unknown
+    correspondences in Probabilistic Robotics (Thrun et al., table 10.2), which the paper follows.
+    """
+
+    MAHALANOBIS_SQ = "mahalanobis_sq"  # alpha bounds the squared distance
+    MAHALANOBIS = "mahalanobis"  # to the letter: alpha bounds the distance itself
     CHI_SQUARE = "chi_square"  # probability that a true match passes
 
 
@@ -98,8 +111,24 @@ class Assignment(StrEnum):
     ONE_TO_ONE = "one_to_one"  # all together, no landmark twice, least total distance
 
 
+# Validation context of settings that come as text, from a command line.
+_TEXT_ALLOWED = "text allowed"
+
+
 class _Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _as_written(cls, value: object, info: ValidationInfo) -> object:
+        """Refuse what Python would read as a number: true, false and, in a file, quoted text."""
+        if isinstance(value, bool):
+            raise ValueError("must be a number or a name, not true or false")
+        assert info.field_name is not None
+        is_number = cls.model_fields[info.field_name].annotation in (int, float)
+        if is_number and isinstance(value, str) and info.context != _TEXT_ALLOWED:
+            raise ValueError("must be a number, not text; write it without quotes")
+        return value
 
 
 class DetectionConfig(_Model):
@@ -255,7 +284,8 @@ def config_from_tables(
         The parsed file: one table per part of SlamConfig, and ``environment.<name>`` with the
         values that differ there.
     environment
-        "lab" is the top level itself; any other name must have its table.
+        "lab" is the top level itself; any other name must have its table. The tables of all
+        environments are checked, whichever is asked for.
     source
         What to call the tables in an error message.
     """
@@ -264,11 +294,15 @@ def config_from_tables(
     if environment != BASE_ENVIRONMENT and environment not in overrides:
         allowed = ", ".join([BASE_ENVIRONMENT, *sorted(overrides)])
         raise ConfigError(f"{source}: no environment {environment!r}; known: {allowed}")
-    key = f"environment.{environment}"
-    for part, values in _table(overrides.get(environment, {}), key, source).items():
-        general = _table(base.get(part, {}), part, source)
-        base[part] = {**general, **_table(values, f"{key}.{part}", source)}
-    return _validated(base, source)
+    configs = {BASE_ENVIRONMENT: _validated(base, source)}
+    for name, values in overrides.items():
+        key = f"environment.{name}"
+        merged = dict(base)
+        for part, changes in _table(values, key, source).items():
+            general = merged.get(part, {})
+            merged[part] = {**general, **_table(changes, f"{key}.{part}", source)}
+        configs[name] = _validated(merged, f"{source}: {key}")
+    return configs[environment]
 
 
 def override(config: SlamConfig, settings: Mapping[str, object]) -> SlamConfig:
@@ -284,7 +318,7 @@ def override(config: SlamConfig, settings: Mapping[str, object]) -> SlamConfig:
         if not isinstance(tables[part], dict) or not field:
             raise ConfigError(f"setting {key!r}: write it as part.key; parts: {_parts()}")
         tables[part] = {**tables[part], field: value}
-    return _validated(tables, "setting")
+    return _validated(tables, "setting", context=_TEXT_ALLOWED)
 
 
 def _table(value: object, key: str, source: str) -> dict[str, Any]:
@@ -293,9 +327,9 @@ def _table(value: object, key: str, source: str) -> dict[str, Any]:
     return value
 
 
-def _validated(tables: Mapping[str, Any], source: str) -> SlamConfig:
+def _validated(tables: Mapping[str, Any], source: str, context: str | None = None) -> SlamConfig:
     try:
-        return SlamConfig.model_validate(tables)
+        return SlamConfig.model_validate(tables, context=context)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         key = ".".join(str(part) for part in first["loc"])

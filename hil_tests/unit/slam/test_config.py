@@ -72,6 +72,10 @@ def test_unknown_names_are_answered_with_the_known_ones(
         ({"detection": {"smoothing_length_bins": 14}}, "smoothing_length_bins must be odd"),
         ({"detection": {"smoothing_order": 15}}, "smoothing_order must be less than"),
         ({"detection": {"min_range_m": 2.0}}, "min_range_m must be less than max_range_m"),
+        ({"association": {"gate": True}}, "association.gate: .*not true or false .*: True"),
+        ({"window": {"size": False}}, "window.size: must be a number .*: False"),
+        ({"association": {"gate": "0.6"}}, "association.gate: .*without quotes .*'0.6'"),
+        ({"window": {"size": "15"}}, "window.size: .*without quotes .*'15'"),
         ({"association": {"gate_rule": "chi_square", "gate": 1.5}}, "probability below 1"),
     ],
 )
@@ -89,6 +93,47 @@ def test_environment_of_a_file_must_be_tables() -> None:
         config_from_tables(hall, environment="hall", source="x")
     with pytest.raises(ConfigError, match="x: environment: must be a table"):
         config_from_tables({"environment": 3}, source="x")
+
+
+@pytest.mark.parametrize("environment", ["lab", "hall", "yard"])
+@pytest.mark.parametrize(
+    ("yard", "message"),
+    [
+        ({"window": {"sise": 3}}, "x: environment.yard: unknown key window.sise; allowed: "),
+        ({"windows": {"size": 3}}, "x: environment.yard: unknown key windows; allowed: "),
+        ({"window": {"size": 0}}, "x: environment.yard: window.size: .* greater than or equal"),
+        ({"association": {"gate": True}}, "x: environment.yard: association.gate: .*true"),
+        ({"detection": {"min_range_m": 1.0}}, "x: environment.yard: .*less than max_range_m"),
+        (3, "x: environment.yard: must be a table"),
+    ],
+)
+def test_mistake_in_any_environment_is_found_whichever_is_loaded(
+    environment: str, yard: object, message: str
+) -> None:
+    tables = {
+        "detection": {"max_range_m": 0.9},
+        "environment": {"hall": {"window": {"size": 3}}, "yard": yard},
+    }
+    with pytest.raises(ConfigError, match=message):
+        config_from_tables(tables, environment=environment, source="x")
+
+
+def test_environments_do_not_leak_into_each_other() -> None:
+    tables = {
+        "window": {"stride": 2},
+        "environment": {"hall": {"window": {"size": 3}}, "yard": {"window": {"stride": 4}}},
+    }
+
+    def window(environment: str) -> tuple[int, int]:
+        config = config_from_tables(tables, environment=environment, source="x")
+        return config.window.size, config.window.stride
+
+    assert [window(name) for name in ("lab", "hall", "yard")] == [(15, 2), (3, 2), (15, 4)]
+
+
+def test_override_refuses_a_switch() -> None:
+    with pytest.raises(ConfigError, match=r"setting: association\.gate: .*not true or false"):
+        override(SlamConfig(), {"association.gate": True})
 
 
 def test_override_reads_text_as_the_type_of_the_key() -> None:
