@@ -42,6 +42,10 @@ __all__ = [
 ]
 
 
+LONGEST_DRIVE_S = 24 * 3600
+MOST_ODOMETRY_LINES = 500_000
+"""A day at the default rate; all lines are computed before the ports open."""
+
 # Beside this package, in the repository and in the wheel alike. Not importlib.resources on the
 # name "fixtures": a folder of that name in the user's own project would come first.
 _SHIPPED_SCENES = Path(__file__).parent.parent / "fixtures" / "scenes"
@@ -59,8 +63,7 @@ def _finite(value: object) -> object:
 
 
 Metres = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-1000, le=1000)]
-NotNegative = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0)]
-Positive = Annotated[StrictFloat, BeforeValidator(_finite), Field(gt=0)]
+Sigma = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=1)]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
 
 
@@ -112,8 +115,10 @@ class PathSpec(_Table):
 
     waypoints_m: tuple[tuple[Metres, Metres], ...] = ((0.0, 0.0),)
     laps: tuple[Literal["forward", "backward"], ...] = ()
-    speed_mps: Positive = 0.05
-    turn_rate_deg_per_s: Positive = 28.125
+    speed_mps: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=1e-3, le=10)] = 0.05
+    turn_rate_deg_per_s: Annotated[
+        StrictFloat, BeforeValidator(_finite), Field(ge=0.1, le=3600)
+    ] = 28.125
 
     @field_validator("waypoints_m")
     @classmethod
@@ -141,20 +146,20 @@ class PathSpec(_Table):
 class OdometrySpec(_Table):
     """How the wheels drift: standard deviations of the model in ``emulator.odometry``."""
 
-    rate_hz: Annotated[StrictFloat, BeforeValidator(_finite), Field(gt=0, le=1000)] = 5.0
-    scale_sigma: NotNegative = 0.0
-    turn_scale_sigma: NotNegative = 0.0
-    curvature_sigma_rad_per_m: NotNegative = 0.0
-    along_sigma_m_per_sqrt_m: NotNegative = 0.0
-    across_sigma_m_per_sqrt_m: NotNegative = 0.0
-    heading_sigma_rad_per_sqrt_m: NotNegative = 0.0
-    heading_sigma_rad_per_rad: NotNegative = 0.0
+    rate_hz: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0.1, le=1000)] = 5.0
+    scale_sigma: Sigma = 0.0
+    turn_scale_sigma: Sigma = 0.0
+    curvature_sigma_rad_per_m: Sigma = 0.0
+    along_sigma_m_per_sqrt_m: Sigma = 0.0
+    across_sigma_m_per_sqrt_m: Sigma = 0.0
+    heading_sigma_rad_per_sqrt_m: Sigma = 0.0
+    heading_sigma_rad_per_rad: Sigma = 0.0
 
 
 class NoiseSpec(_Table):
     """White receiver noise: ``rf_sigma`` per RF sample at the named working point."""
 
-    rf_sigma: NotNegative = 5e-4
+    rf_sigma: Sigma = 5e-4
     iterations: Annotated[StrictInt, Field(ge=1, le=255)] = 16
     pulses_per_step: Annotated[StrictInt, Field(ge=1, le=65535)] = 300
 
@@ -162,7 +167,7 @@ class NoiseSpec(_Table):
 class LeakageSpec(_Table):
     """The direct pulse from transmitter to receiver, at TX power 2."""
 
-    amplitude: NotNegative = 0.06
+    amplitude: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=10)] = 0.06
     range_m: Metres = 0.05
 
 
@@ -189,6 +194,22 @@ class Scene(_Table):
             twice = sorted({value for value in values if values.count(value) > 1})
             if twice:
                 raise ValueError(f"{key}: each must be unique, {twice[0]!r} is used twice")
+        return self
+
+    @model_validator(mode="after")
+    def _ends_some_day(self) -> Scene:
+        duration_s = self.trajectory().duration_ns / 1e9
+        if duration_s > LONGEST_DRIVE_S:
+            raise ValueError(
+                f"path: the drive takes {duration_s / 3600:.1f} h, at most "
+                f"{LONGEST_DRIVE_S // 3600} h are allowed; drive faster or fewer laps"
+            )
+        lines = int(duration_s * self.odometry.rate_hz) + 1
+        if lines > MOST_ODOMETRY_LINES:
+            raise ValueError(
+                f"odometry.rate_hz: {lines} lines of odometry in the whole drive, at most "
+                f"{MOST_ODOMETRY_LINES} are allowed; lower the rate"
+            )
         return self
 
     def trajectory(self) -> Trajectory:
@@ -251,7 +272,7 @@ def load_scene(path_or_name: str | Path) -> Scene:
         raise SceneError(f"{text}: cannot read the scene file: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise SceneError(f"{text}: not UTF-8 text at byte {error.start}") from error
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:  # not TOML, or an integer of thousands of digits
         raise SceneError(f"{text}: not valid TOML: {error}") from error
     try:
         return Scene.model_validate(table)

@@ -73,7 +73,8 @@ def drive(
     """Return the trajectory of a robot that visits the stops in order, turning on the spot.
 
     It starts at the first stop with heading zero and takes the shorter way round at each turn;
-    a U-turn goes counter-clockwise. Leg and turn times are rounded to whole nanoseconds.
+    a U-turn goes counter-clockwise. Leg and turn times are rounded to whole nanoseconds,
+    at least one.
 
     Parameters
     ----------
@@ -104,11 +105,11 @@ def drive(
             turn += math.tau
         if abs(turn) > _ANGLE_TOLERANCE_RAD:
             heading += turn
-            time_ns += round(abs(turn) / turn_rate_rad_per_s * 1e9)
+            time_ns += max(round(abs(turn) / turn_rate_rad_per_s * 1e9), 1)
             times.append(time_ns)
             poses.append((x, y, heading))
         x, y = next_x, next_y
-        time_ns += round(length_m / speed_mps * 1e9)
+        time_ns += max(round(length_m / speed_mps * 1e9), 1)
         times.append(time_ns)
         poses.append((x, y, heading))
     return Trajectory(

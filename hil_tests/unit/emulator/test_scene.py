@@ -12,6 +12,22 @@ from emulator.scene import Scene, SceneError, empty_room, load_scene, scene_name
 RADAR = '[[radars]]\nname = "left"\nserial = "000000000001"\nx_m = 0.0\ny_m = 0.2\nyaw_deg = 90.0\n'
 HEAD = 'name = "mine"\nenvironment = "lab"\ndescription = "a scene"\n'
 GOOD = HEAD + RADAR
+FAR = '[path]\nwaypoints_m = [[0, 0], [1000, 0]]\nlaps = ["forward"]\n'
+OUT_OF_BOUNDS = [
+    ("path", "speed_mps", "0", "0.001"),
+    ("path", "speed_mps", "1e-12", "0.001"),
+    ("path", "speed_mps", "1e-310", "0.001"),
+    ("path", "speed_mps", "1e300", "10"),
+    ("path", "turn_rate_deg_per_s", "1e-310", "0.1"),
+    ("path", "turn_rate_deg_per_s", "1e300", "3600"),
+    ("odometry", "rate_hz", "1e-300", "0.1"),
+    ("odometry", "rate_hz", "1001", "1000"),
+    ("odometry", "scale_sigma", "1e300", "1"),
+    ("odometry", "heading_sigma_rad_per_rad", "1.1", "1"),
+    ("noise", "rf_sigma", "1e300", "1"),
+    ("leakage", "amplitude", "1e300", "10"),
+    ("leakage", "range_m", "-1e300", "-1000"),
+]
 
 
 def write(tmp_path: Path, text: str) -> Path:
@@ -70,7 +86,26 @@ def test_a_scene_is_frozen() -> None:
         (GOOD + RADAR, ["radars.name", "unique", "'left'"]),
         (GOOD + RADAR.replace("left", "right"), ["radars.serial", "unique", "'000000000001'"]),
         (HEAD + "radars = []\n", ["radars", "at least 1"]),
-        (GOOD + "[path]\nspeed_mps = 0\n", ["path.speed_mps", "greater than 0", "got 0"]),
+        *(
+            (
+                GOOD + f"[{table}]\n{key} = {value}\n",
+                [f"{table}.{key}", "than or equal to", limit],
+            )
+            for table, key, value, limit in OUT_OF_BOUNDS
+        ),
+        (GOOD + "[path]\nspeed_mps = 1e400\n", ["path.speed_mps", "must be a finite number"]),
+        (GOOD + f"[path]\nspeed_mps = 1{'0' * 400}\n", ["path.speed_mps"]),
+        (GOOD + f"[path]\nspeed_mps = 1{'0' * 5000}\n", ["not valid TOML"]),
+        # 2 km at 2 mm/s are 277.8 h
+        (
+            GOOD + FAR + "speed_mps = 0.002\n",
+            ["path: the drive takes 277.8 h", "at most 24 h", "drive faster"],
+        ),
+        # 2 km at 1 m/s and a U-turn of 1 s at the far end
+        (
+            GOOD + FAR + "speed_mps = 1\nturn_rate_deg_per_s = 180\n[odometry]\nrate_hz = 1000\n",
+            ["odometry.rate_hz: 2001001 lines", "at most 500000", "lower the rate"],
+        ),
         (GOOD + '[path]\nlaps = ["up"]\n', ["path.laps[0]", "'forward' or 'backward'", "'up'"]),
         (GOOD + "[path]\nwaypoints_m = [[1.0, 0.0]]\n", ["path.waypoints_m", "[0.0, 0.0]"]),
         (GOOD + "[path]\nwaypoints_m = [[0, 0], [0, 1]]\n", ["waypoints_m", "positive x axis"]),

@@ -102,3 +102,9 @@ def test_speed_and_turn_rate_are_never_exceeded() -> None:
     seconds = 7_000_003 / SECOND
     assert np.hypot(steps[:, 0], steps[:, 1]).max() <= 0.05 * seconds * (1 + 1e-9)
     assert np.abs(steps[:, 2]).max() <= math.radians(28.125) * seconds * (1 + 1e-9)
+
+
+def test_the_smallest_leg_still_takes_time() -> None:
+    path = drive([(0, 0), (1e-310, 0), (1, 0)], speed_mps=10, turn_rate_rad_per_s=60)
+    assert (np.diff(path.knot_times_ns) > 0).all()
+    assert np.isfinite(path.poses(np.arange(5, dtype=np.int64))).all()
