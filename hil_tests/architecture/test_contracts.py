@@ -29,6 +29,34 @@ def test_the_slam_core_contract_names_every_module_of_the_core() -> None:
     assert set(contract("slam-core")["source_modules"]) == modules
 
 
+# What may touch ports, files, sockets or clocks; everything else is pure.
+INPUT_AND_OUTPUT = {
+    "xethru_protocol": {"cli", "driver", "ports", "recordings", "transport"},
+    "emulator": {
+        "cli",
+        "link",
+        "odometry_feed",
+        "playback",
+        "port_watch",
+        "run_directory",
+        "scene",
+        "server",
+        "serving",
+        "stop",
+    },
+}
+
+
+def test_the_sans_io_contract_names_every_pure_module() -> None:
+    pure = {
+        f"{package}.{path.stem}"
+        for package, impure in INPUT_AND_OUTPUT.items()
+        for path in (REPOSITORY / package).glob("*.py")
+        if path.stem not in impure | {"__init__"}
+    }
+    assert set(contract("sans-io")["source_modules"]) == pure
+
+
 def loaded_heavy_modules(*python_arguments: str) -> set[str]:
     """Run Python and return which heavy packages it loaded."""
     script = "import sys, json\nprint(json.dumps(sorted({m.split('.')[0] for m in sys.modules})))"
