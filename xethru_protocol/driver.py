@@ -1,5 +1,6 @@
 """Driver of one X4M300: raw radar mode, frames, what the module tells. Pull-driven, no threads."""
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -279,8 +280,10 @@ class X4M300:
         self._raw_mode = True
         self.request(X4DriverSet(setting=X4Setting.FPS, value=fps))
         rate = self._get(X4Setting.FPS)
-        if not isinstance(rate, float):
-            raise RemoteProtocolError(f"{self._transport.name} reads back frame rate {rate}")
+        if not isinstance(rate, float) or not 0 < rate < math.inf:
+            raise RemoteProtocolError(
+                f"{self._transport.name} reads back frame rate {rate} after {fps:g} was set"
+            )
         return x4.real_frame_rate(rate)
 
     def stop(self) -> None:

@@ -88,6 +88,18 @@ def test_start_returns_the_timers_rate_where_the_read_back_has_a_fraction() -> N
     assert radar.start(50.5) == 50.0
 
 
+@pytest.mark.parametrize("values", [(0.0,), (-1.0,), (float("nan"),), (float("inf"),), ()])
+def test_rate_that_is_none_is_the_modules_fault(values: tuple[float, ...]) -> None:
+    def module(command: m.Message) -> Said:
+        if command == m.X4DriverGet(setting=X4Setting.FPS):
+            return [m.ReplyFloat(content_id=X4Setting.FPS, values=values)]
+        return plain_module(command)
+
+    radar, _ = driver_on(module)
+    with pytest.raises(RemoteProtocolError, match="the port reads back"):
+        radar.start(17.0)
+
+
 def test_frames_keep_their_samples_counters_and_arrival_times() -> None:
     radar, line = driver_on()
     radar.configure_raw()
