@@ -46,15 +46,21 @@ class Belief:
     next_id: int = 0
 
     def __post_init__(self) -> None:
-        """Check that the shapes belong together and freeze the arrays."""
+        """Check that the shapes belong together and make the fields read-only views.
+
+        The arrays are not copied, a dense map's covariance is large: who hands them over may
+        still write to them, and must not.
+        """
         size = POSE_SIZE + LANDMARK_SIZE * len(self.landmark_ids)
         if self.mean.shape != (size,) or self.covariance.shape != (size, size):
             raise ValueError(
                 f"{len(self.landmark_ids)} landmarks need mean ({size},) and covariance "
                 f"({size}, {size}), got {self.mean.shape} and {self.covariance.shape}"
             )
-        self.mean.setflags(write=False)
-        self.covariance.setflags(write=False)
+        for name, array in (("mean", self.mean), ("covariance", self.covariance)):
+            view = array.view()
+            view.setflags(write=False)
+            object.__setattr__(self, name, view)
 
     @property
     def pose(self) -> Array:

@@ -14,18 +14,16 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
-from slam.geometry import between, compose, transform, wrap_angle
+from slam.geometry import compose, transform, wrap_angle
 
 Array = NDArray[np.float64]
 
 LANDMARK_MATCH_M = 0.15
 _ICP_GATE_M = 0.5
 _ICP_ITERATIONS = 100
-
-
-def in_start_frame(poses: Array) -> Array:
-    """Return poses, shape (n, 3), seen from the first of them."""
-    return np.array([between(poses[0], pose) for pose in poses])
+# A share of a variance (of a unit one) that is rounding, and an error [m, rad] that is.
+_ROUNDING_VARIANCE = 1e-12
+_ROUNDING_ERROR = 1e-9
 
 
 def associate_times(
@@ -217,7 +215,7 @@ def landmark_metrics(estimated_xy: Array, true_xy: Array, alignment: Array) -> L
         matched=matched,
         precision=matched / n if n else None,
         recall=matched / m if m else None,
-        duplicates=int(close[np.ix_(others, columns)].any(axis=1).sum()),
+        duplicates=int(close[others][:, columns].any(axis=1).sum()),
         rmse_m=math.sqrt(float(np.mean(squared))) if matched else None,
     )
 
@@ -225,17 +223,34 @@ def landmark_metrics(estimated_xy: Array, true_xy: Array, alignment: Array) -> L
 def nees_pose(estimate: Array, covariance: Array, truth: Array) -> float:
     """Return the normalised estimation error squared of a pose (3 dof), not aligned.
 
+    ``e^T P^-1 e`` with the pseudo-inverse where P is singular, as it is after a turn on the spot
+    from a perfect start under proportional noise: a direction without variance adds nothing if
+    the error in it is rounding, and makes the result inf if not, the limit of a vanishing
+    variance. Then fewer than 3 degrees of freedom take part.
+
     Parameters
     ----------
     estimate, truth
         shape (3,) each, both in the start frame; the heading difference is wrapped.
     covariance
-        shape (3, 3), positive definite.
+        shape (3, 3), symmetric, positive semidefinite.
     """
     error = np.array(
         [estimate[0] - truth[0], estimate[1] - truth[1], wrap_angle(estimate[2] - truth[2])]
     )
-    return float(error @ np.linalg.solve(covariance, error))
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    varies = sigma > 0.0
+    if np.any(np.abs(error[~varies]) > _ROUNDING_ERROR):
+        return math.inf
+    # In units of sigma, so that metres and radians do not decide what is small.
+    sigma = sigma[varies]
+    correlation = covariance[varies][:, varies] / np.outer(sigma, sigma)
+    variances, axes = np.linalg.eigh(correlation)
+    squared = (axes.T @ (error[varies] / sigma)) ** 2
+    certain = variances <= _ROUNDING_VARIANCE
+    if np.any(squared[certain] > _ROUNDING_VARIANCE):
+        return math.inf
+    return float(np.sum(squared[~certain] / variances[~certain]))
 
 
 def _nearest(tree: KDTree, points: Array) -> tuple[Array, NDArray[np.intp]]:

@@ -15,7 +15,6 @@ from slam.metrics import (
     ate_rmse_m,
     icp_align_se2,
     icp_ate,
-    in_start_frame,
     landmark_metrics,
     nees_pose,
     rmse_m,
@@ -119,12 +118,36 @@ def test_two_points_have_a_closed_form() -> None:
     assert ate_rmse_m(estimate, reference) == pytest.approx(0.1, abs=1e-12)
 
 
-@given(poses, seeds)
-def test_start_frame_begins_at_the_origin(first: Array, seed: int) -> None:
-    later = np.column_stack([path(seed, 5), np.linspace(-3, 3, 5)])
-    seen = in_start_frame(np.vstack([first, later]))
-    assert seen[0] == pytest.approx(np.zeros(3), abs=1e-12)
-    assert transform(first, seen[1:, :2]) == pytest.approx(later[:, :2], abs=1e-9)
+def displaced_curve() -> tuple[Array, Array, Array]:
+    """Return a curve, the same curve moved rigidly, and the motion that brings it back."""
+    k = np.arange(120)
+    reference = np.column_stack([2 * np.cos(0.03 * k), 1.3 * np.sin(0.05 * k)])
+    back = np.array([0.03, -0.02, 0.05])
+    return reference, transform(invert(back), reference), back
+
+
+def test_icp_goes_on_until_a_displaced_curve_lies_on_itself() -> None:
+    reference, estimate, back = displaced_curve()
+    assert icp_align_se2(estimate, reference) == pytest.approx(back, abs=1e-9)
+    icp = icp_ate(estimate, reference)
+    assert icp.nearest_rmse_m <= 1e-9
+    assert icp.time_rmse_m <= 1e-9
+
+
+def test_per_axis_reading_takes_its_neighbours_before_the_alignment() -> None:
+    reference, estimate, _ = displaced_curve()
+    before = np.linalg.norm(estimate[:, None] - reference[None], axis=2).argmin(axis=1)
+    wanted = math.sqrt(float(np.mean((reference - reference[before]) ** 2)))
+    assert wanted > 0.005  # the neighbours are wrong ones
+    assert icp_ate(estimate, reference).per_axis_rmse_m == pytest.approx(wanted, abs=1e-9)
+
+
+@pytest.mark.parametrize(("off_m", "pulls"), [(0.52, False), (0.48, True)])
+def test_points_beyond_half_a_metre_do_not_pull(off_m: float, pulls: bool) -> None:
+    reference = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 3.0], [0.0, 3.0]])
+    stray = np.array([[3.0, 3.0 + off_m]])
+    aligned = icp_align_se2(np.vstack([reference, stray]), reference)
+    assert (np.abs(aligned).max() > 0.01) == pulls
 
 
 def test_mismatched_trajectories_are_refused_with_the_remedy() -> None:
@@ -184,6 +207,15 @@ def test_matching_is_joint_not_greedy() -> None:
     assert landmark_metrics(estimated, true, HERE).matched == 2
 
 
+@pytest.mark.parametrize(("off_m", "matched"), [(0.149, 1), (0.151, 0)])
+def test_fifteen_centimetres_are_a_match(off_m: float, matched: int) -> None:
+    estimated = TRUE[:1] + np.array([0.6, 0.8]) * off_m
+    assert landmark_metrics(estimated, TRUE, HERE).matched == matched
+    # A second estimate at that distance from a matched truth is a duplicate, or false.
+    both = np.vstack([TRUE[:1], estimated])
+    assert landmark_metrics(both, TRUE, HERE).duplicates == matched
+
+
 @pytest.mark.parametrize(("n", "m"), [(0, 3), (2, 0), (0, 0)])
 def test_empty_maps_have_no_ratio(n: int, m: int) -> None:
     score = landmark_metrics(np.zeros((n, 2)), np.zeros((m, 2)) + 9, HERE)
@@ -211,3 +243,36 @@ def test_nees_of_matched_errors_averages_its_degrees_of_freedom(seed: int) -> No
     errors = rng.multivariate_normal(np.zeros(3), covariance, 2000)
     mean = np.mean([nees_pose(error, covariance, np.zeros(3)) for error in errors])
     assert mean == pytest.approx(3.0, abs=5 * math.sqrt(6 / 2000))  # variance of chi2_3 is 6
+
+
+TURNED = np.diag([0.0, 0.0, 1e-6])  # a turn on the spot from a perfect start
+
+
+@pytest.mark.parametrize(
+    ("error", "covariance", "nees"),
+    [
+        ((0.0, 0.0, 2e-3), TURNED, 4.0),
+        ((1e-15, 0.0, 2e-3), TURNED, 4.0),
+        ((1e-4, 0.0, 2e-3), TURNED, math.inf),
+        ((0.0, 0.0, 0.0), np.zeros((3, 3)), 0.0),
+        ((0.0, 0.0, 1e-6), np.zeros((3, 3)), math.inf),
+        # x and y fully correlated: an error along the line x = y, and one across it.
+        ((0.01, 0.01, 0.0), np.array([[1e-4, 1e-4, 0], [1e-4, 1e-4, 0], [0, 0, 1e-6]]), 1.0),
+        ((0.01, -0.01, 0.0), np.array([[1e-4, 1e-4, 0], [1e-4, 1e-4, 0], [0, 0, 1e-6]]), math.inf),
+    ],
+)
+def test_nees_where_a_direction_has_no_variance(
+    error: tuple[float, float, float], covariance: Array, nees: float
+) -> None:
+    assert nees_pose(np.array(error), covariance, np.zeros(3)) == pytest.approx(nees)
+
+
+@given(seeds, st.floats(1e-6, 1e3))
+def test_nees_equals_the_quadratic_form_and_ignores_units(seed: int, metres: float) -> None:
+    rng = np.random.default_rng(seed)
+    root = rng.standard_normal((3, 3))
+    covariance, error = root @ root.T + 0.1 * np.eye(3), 0.1 * rng.standard_normal(3)
+    wanted = float(error @ np.linalg.inv(covariance) @ error)
+    scale = np.array([metres, metres, 1.0])
+    scaled = covariance * np.outer(scale, scale)
+    assert nees_pose(error * scale, scaled, np.zeros(3)) == pytest.approx(wanted, rel=1e-9)
