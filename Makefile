@@ -15,8 +15,8 @@ test: $(VENV)/installed-test
 	$(PYTEST) -n auto
 
 check: $(VENV)/installed-dev
-	$(BIN)/ruff format --check .
-	$(BIN)/ruff check .
+	$(BIN)/ruff format --no-cache --check .
+	$(BIN)/ruff check --no-cache .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(MAKE) test

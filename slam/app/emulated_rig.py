@@ -9,7 +9,6 @@ from platform import python_version
 
 import numpy as np
 from numpy.typing import NDArray
-from xethru_protocol.driver import X4M300, ProtocolRecord, RawConfig
 
 from emulator.device import radar_device
 from emulator.echo import echo_source
@@ -23,6 +22,7 @@ from slam.app.sources import RadarLink, RigSource
 from slam.app.tum import NS_PER_S
 from slam.config import ConfigError, SlamConfig, load_preset
 from slam.geometry import Mount, Rig
+from xethru_protocol.driver import X4M300, ProtocolRecord, RawConfig
 from xethru_protocol.errors import XeThruError
 from xethru_protocol.x4 import real_frame_rate
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from xethru_protocol.driver import ProtocolRecord
-
 from slam.app.session import LogLine, Scan, SessionObserver, Snapshot
+from xethru_protocol.driver import ProtocolRecord
 
 
 class LinkLog:
