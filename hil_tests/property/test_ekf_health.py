@@ -173,3 +173,30 @@ def test_merging_equals_observing_a_difference_of_zero(belief: Belief) -> None:
     assert relative_error(after.covariance, wanted[np.ix_(kept, kept)]) <= 1e-9
     assert turn_between(after.mean[2], mean[2]) <= 1e-9
     assert np.delete(after.mean, 2) == pytest.approx(np.delete(mean[kept], 2), abs=1e-9)
+
+
+@pytest.mark.parametrize("heading", [math.pi - 1e-6, -math.pi])
+def test_heading_stays_in_one_turn_when_a_merge_pushes_it_across_pi(heading: float) -> None:
+    crossed = 0
+    for seed in range(10):
+        belief = random_belief(np.random.default_rng(seed), 2, np.array([1.0, 2.0, heading]))
+        # The correction of the heading, K nu of the difference of the two landmarks.
+        P, a, b = belief.covariance, slice(3, 5), slice(5, 7)
+        S = P[a, a] - P[a, b] - P[b, a] + P[b, b]
+        nu = belief.landmarks[1] - belief.landmarks[0]
+        turned = heading + float((P[2, a] - P[2, b]) @ np.linalg.solve(S, nu))
+        after = merge(belief, 0, 1).mean[2]
+        assert -math.pi <= after < math.pi
+        assert turn_between(after, turned) <= 1e-5
+        crossed += not -math.pi <= turned < math.pi
+    assert 0 < crossed < 10
+
+
+def test_belief_leaves_its_callers_arrays_writable_and_is_itself_read_only() -> None:
+    mean, covariance = np.zeros(3), np.eye(3)
+    belief = Belief(mean=mean, covariance=covariance)
+    assert mean.flags.writeable
+    assert covariance.flags.writeable
+    for array in (belief.mean, belief.covariance, belief.pose, belief.pose_covariance):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0

@@ -105,6 +105,7 @@ def check_update(filter_: Filter, law: settings = thorough) -> None:
         assert relative_error(after.covariance, np.linalg.inv(information)) <= 1e-9
         mean = belief.mean + K @ np.array([dr, dphi])
         assert turn_between(after.mean[2], mean[2]) <= 1e-10
+        assert -math.pi <= after.mean[2] < math.pi
         assert np.delete(after.mean, 2) == pytest.approx(np.delete(mean, 2), abs=1e-10)
 
     corrects()
@@ -249,6 +250,13 @@ def unwrapped_update(belief: Belief, row: int, observed: Array, noise: Array) ->
         return ekf_slam.update(belief, row, observed, noise)
 
 
+def overflowing_update(belief: Belief, row: int, observed: Array, noise: Array) -> Belief:
+    """Leave the heading where the correction puts it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ekf_slam, "wrap_angle", lambda angle: angle)
+        return ekf_slam.update(belief, row, observed, noise)
+
+
 @pytest.mark.parametrize(
     ("mutant", "check"),
     [
@@ -258,6 +266,7 @@ def unwrapped_update(belief: Belief, row: int, observed: Array, noise: Array) ->
         (Filter(update=inverse_q_update), check_update),
         (Filter(predict=transposed_predict), check_predict),
         (Filter(update=unwrapped_update), check_update),
+        (Filter(update=overflowing_update), check_update),
     ],
 )
 def test_mutant_fails(mutant: Filter, check: Check) -> None:
