@@ -98,7 +98,7 @@ class Dialogue:
 
     def request(self, command: Command[ReplyT], timeout_s: float) -> ReplyT:
         """Send a command, return its reply; see `X4M300.request`."""
-        self._take_stale_input()
+        self.take_stale_input()
         row = ROWS[type(command)]
         content_id = row.content_id(command) if row.content_id else None
         self._transport.write(self._connection.send(command))
@@ -159,6 +159,14 @@ class Dialogue:
                     self.tell("rx", summary(event))
         return True
 
+    def take_stale_input(self) -> None:
+        """Sort what arrived before a request: an answer among it belongs to no request."""
+        for _ in range(_STALE_READS):
+            if not self.pump(0.0):
+                break
+        self.stray_count += len(self._answers)
+        self._answers.clear()
+
     def silence(self, what: str, timeout_s: float) -> ResponseTimeout:
         """Error for something that did not come, with the likeliest reason and remedy.
 
@@ -182,14 +190,6 @@ class Dialogue:
     def _sign_of_life(self) -> None:
         self._damaged_since = False
         self._rebooted_since = False
-
-    def _take_stale_input(self) -> None:
-        """Sort what arrived before a request: an answer among it belongs to no request."""
-        for _ in range(_STALE_READS):
-            if not self.pump(0.0):
-                break
-        self.stray_count += len(self._answers)
-        self._answers.clear()
 
 
 def summary(message: Message) -> str:

@@ -2,7 +2,6 @@
 
 import math
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import fields
 from types import TracebackType
@@ -10,7 +9,7 @@ from typing import Self, TypeVar
 
 from xethru_protocol import x4
 from xethru_protocol.codes import InfoItem, PongCode, SensorMode, X4Setting
-from xethru_protocol.dialogue import Dialogue, FrameMessage, Observer, ProtocolRecord
+from xethru_protocol.dialogue import Dialogue, Observer, ProtocolRecord
 from xethru_protocol.errors import (
     DeviceError,
     LocalProtocolError,
@@ -18,11 +17,10 @@ from xethru_protocol.errors import (
     ResponseTimeout,
     XeThruError,
 )
-from xethru_protocol.frames import Frame, FrameGeometry, Samples, baseband, rf_or_baseband
+from xethru_protocol.frame_queue import FrameQueue
+from xethru_protocol.frames import Frame, FrameGeometry
 from xethru_protocol.messages import (
-    BasebandIq,
     Command,
-    DataFloat,
     GetMode,
     ModReset,
     Ping,
@@ -50,7 +48,6 @@ __all__ = [
 
 _TIMEOUT_S = 2.0
 _SLOW_TIMEOUT_S = 10.0  # mode changes and chip restarts
-_COUNTER_WRAP = 1 << 32
 
 ReplyT = TypeVar("ReplyT", bound=Response)
 
@@ -69,12 +66,6 @@ class X4M300:
 
     Attributes
     ----------
-    geometry
-        Where the bins of the frames lie; None before `configure_raw`.
-    frames_lost
-        Frames missing by the counters of those that came.
-    frames_discarded
-        Frames of a length that does not fit the geometry (left over from older settings).
     warnings
         What was asked of the module although it is likely to fail.
     """
@@ -86,17 +77,12 @@ class X4M300:
         clock: Callable[[], int] = time.monotonic_ns,
         observer: Observer | None = None,
     ) -> None:
-        self.geometry: FrameGeometry | None = None
-        self.frames_lost = 0
-        self.frames_discarded = 0
         self.warnings: list[str] = []
         self._transport = transport
         self._clock = clock
-        self._dialogue = Dialogue(transport, clock, observer, self._take)
-        self._frames: deque[Frame] = deque()
+        self._frames = FrameQueue()
+        self._dialogue = Dialogue(transport, clock, observer, self._frames.take)
         self._config: RawConfig | None = None
-        self._last_counter: int | None = None
-        self._baseband_geometry: FrameGeometry | None = None
         self._raw_mode = False
 
     @classmethod
@@ -135,6 +121,25 @@ class X4M300:
             self._warn(f"the module was not stopped: {error}")
         finally:
             self._transport.close()
+
+    @property
+    def geometry(self) -> FrameGeometry | None:
+        """Where the bins of the radar frames lie; None before `configure_raw`."""
+        return self._frames.geometry
+
+    @geometry.setter
+    def geometry(self, geometry: FrameGeometry | None) -> None:
+        self._frames.geometry = geometry
+
+    @property
+    def frames_lost(self) -> int:
+        """Frames missing by the counters of those that came."""
+        return self._frames.lost
+
+    @property
+    def frames_discarded(self) -> int:
+        """Data that are no frame of the geometry, such as frames of older settings."""
+        return self._frames.discarded
 
     @property
     def fault_count(self) -> int:
@@ -256,15 +261,17 @@ class X4M300:
                 f"{self._transport.name} reads back frame area {area} with {n_bins} bins"
             )
         self._config = config
-        self.geometry = FrameGeometry.from_read_back(
+        geometry = FrameGeometry.from_read_back(
             area_m=(area[0], area[1]), n_bins=n_bins, downconversion=config.downconversion
         )
-        self._frames.clear()  # of older settings
-        self._last_counter = None
-        return self.geometry
+        self._frames.new_stream()  # those that wait are of older settings
+        self._frames.geometry = geometry
+        return geometry
 
     def start(self, fps: float) -> float:
         """Start frames at ``fps`` [Hz]; returns the rate the chip really runs at.
+
+        Frames of an earlier stream that were not read yet are dropped.
 
         A rate above what the settings allow is tried, with a warning: the firmware does not
         refuse it (Protocol reference 9.6).
@@ -276,7 +283,8 @@ class X4M300:
                 f"{fps:g} frames/s exceed the {self._config.fps_max:.1f} that these settings "
                 "allow; lower the rate, iterations or pulses per step"
             )
-        self._last_counter = None
+        self._dialogue.take_stale_input()
+        self._frames.new_stream()  # a late frame of the last stream would make a false gap
         self._raw_mode = True
         self.request(X4DriverSet(setting=X4Setting.FPS, value=fps))
         rate = self._get(X4Setting.FPS)
@@ -309,7 +317,7 @@ class X4M300:
                 if left_ns <= 0:
                     raise self._dialogue.silence("frame", timeout_s)
                 self._dialogue.pump(left_ns * 1e-9)
-        return self._frames.popleft()
+        return self._frames.pop()
 
     def frames(self, count: int | None = None, timeout_s: float = _TIMEOUT_S) -> Iterator[Frame]:
         """Iterate over frames; ``count`` of them, or without end."""
@@ -319,43 +327,6 @@ class X4M300:
                 count -= 1
 
     # --- inside ---------------------------------------------------------------------------------
-
-    def _take(self, message: FrameMessage, arrival_ns: int) -> None:
-        if isinstance(message, BasebandIq):
-            self._take_baseband(message, arrival_ns)
-        else:
-            self._take_radar_frame(message, arrival_ns)
-
-    def _take_radar_frame(self, message: DataFloat, arrival_ns: int) -> None:
-        geometry = self.geometry
-        samples = None if geometry is None else rf_or_baseband(message, geometry)
-        if geometry is None or samples is None:
-            self.frames_discarded += 1
-            return
-        self._queue_frame(message.info, samples, geometry, arrival_ns)
-
-    def _take_baseband(self, message: BasebandIq, arrival_ns: int) -> None:
-        geometry = FrameGeometry(
-            range_start_m=message.range_offset_m,
-            bin_length_m=message.bin_length_m,
-            n_bins=message.num_bins,
-            downconversion=True,
-        )
-        if geometry != self._baseband_geometry:
-            self._baseband_geometry = geometry
-        self._queue_frame(message.counter, baseband(message), self._baseband_geometry, arrival_ns)
-
-    def _queue_frame(
-        self, counter: int, samples: Samples, geometry: FrameGeometry, arrival_ns: int
-    ) -> None:
-        if self._last_counter is not None:
-            missing = (counter - self._last_counter - 1) % _COUNTER_WRAP
-            if missing < _COUNTER_WRAP // 2:  # else it went back: the chip was restarted
-                self.frames_lost += missing
-        self._last_counter = counter
-        self._frames.append(
-            Frame(counter=counter, samples=samples, geometry=geometry, arrival_ns=arrival_ns)
-        )
 
     def _wait_until_ready(self) -> None:
         deadline = self._clock() + round(_SLOW_TIMEOUT_S * 1e9)

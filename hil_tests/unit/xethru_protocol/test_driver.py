@@ -121,6 +121,20 @@ def test_counters_wrap_without_loss_and_restarts_are_no_loss() -> None:
     assert radar.frames_lost == 0
 
 
+def test_frames_of_the_last_stream_are_no_part_of_the_next() -> None:
+    radar, line = driver_on()
+    radar.configure_raw()
+    radar.start(17.0)
+    line.say(frame(4), frame(5))
+    assert radar.read_frame().counter == 4
+    radar.stop()  # frame 5 came with the answer and was not read
+    line.say(frame(6))  # it was on its way already
+    radar.start(17.0)
+    line.say(frame(40), frame(41))
+    assert [got.counter for got in radar.frames(2)] == [40, 41]
+    assert radar.frames_lost == 0
+
+
 def test_baseband_frames_become_complex() -> None:
     def module(command: m.Message) -> Said:
         match command:
