@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import selectors
 import socket
 from collections.abc import Iterator
@@ -10,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from emulator.link import LinkError
-from emulator.odometry_feed import OdometryFeed, stamp_ns
+from emulator.odometry_feed import MOST_CLIENTS, OdometryFeed, stamp_ns
 from emulator.pace import Pace
 
 LINES = tuple(f"{index}.500000000 0.1 0.2 0 0 0 0.0 1.0" for index in range(5))
@@ -99,6 +100,111 @@ def test_a_client_that_hangs_up_or_never_reads_disturbs_nobody(folder: Path) -> 
     stuck.close()
     loop.turn(0)
     feed.close()
+
+
+def test_a_client_that_only_stops_speaking_still_listens(folder: Path) -> None:
+    feed = OdometryFeed(folder / "o", LINES, Pace.REALTIME)
+    loop = Loop(feed)
+    with connect(feed) as client:
+        loop.turn(0)
+        client.shutdown(socket.SHUT_WR)
+        for _ in range(3):
+            loop.turn(0)
+        assert loop.selector.select(0) == [], "nothing keeps the loop busy"
+        loop.turn(60 * SECOND)
+        assert received(client).count(b"\n") == len(LINES)
+        assert received(client) == b""
+    feed.close()
+
+
+def test_a_client_that_is_gone_is_dropped_with_the_next_line(folder: Path) -> None:
+    feed = OdometryFeed(folder / "o", LINES, Pace.REALTIME)
+    loop = Loop(feed)
+    connect(feed).close()
+    for _ in range(3):
+        loop.turn(0)
+    loop.turn(SECOND)
+    assert feed.wake_ns(SECOND) is None
+    feed.close()
+
+
+def test_one_client_too_many_is_sent_away(folder: Path) -> None:
+    feed = OdometryFeed(folder / "o", LINES, Pace.REALTIME)
+    loop = Loop(feed)
+    clients = []
+    for _ in range(MOST_CLIENTS + 1):
+        clients.append(connect(feed))
+        loop.turn(0)
+    assert received(clients[-1]) == b""
+    assert {received(client) for client in clients[:-1]} == {b"(nothing)"}
+    for client in clients:
+        client.close()
+    loop.turn(SECOND)
+    with connect(feed) as later:
+        loop.turn(SECOND)
+        assert received(later).count(b"\n") == 1
+    feed.close()
+
+
+class OutOfDescriptors:
+    """A listener whose process has none left, until told otherwise."""
+
+    def __init__(self, listener: socket.socket) -> None:
+        self.listener = listener
+        self.exhausted = True
+
+    def fileno(self) -> int:
+        return self.listener.fileno()
+
+    def accept(self) -> tuple[socket.socket, object]:
+        if self.exhausted:
+            raise OSError(errno.EMFILE, "Too many open files")
+        return self.listener.accept()
+
+    def close(self) -> None:
+        self.listener.close()
+
+
+@pytest.mark.parametrize("after", ["a while", "a client left"])
+def test_without_descriptors_the_loop_rests(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, after: str
+) -> None:
+    feed = OdometryFeed(folder / "o", LINES, Pace.REALTIME)
+    listener = OutOfDescriptors(feed._listener)
+    monkeypatch.setattr(feed, "_listener", listener)
+    loop = Loop(feed)
+    listener.exhausted = False
+    with connect(feed) as early:
+        loop.turn(0)
+        listener.exhausted = True
+        with connect(feed) as late:
+            loop.turn(0)
+            assert loop.selector.select(0) == [], "nothing keeps the loop busy"
+            assert feed.wake_ns(0) is not None
+            loop.turn(1)
+            assert loop.selector.select(0) == []
+            listener.exhausted = False
+            if after == "a client left":
+                early.close()
+                now_ns = SECOND // 2  # a line falls due and finds it gone
+                loop.turn(2)
+            else:
+                now_ns = SECOND
+            for _ in range(3):
+                loop.turn(now_ns)
+            assert received(late) == f"{LINES[0]}\n".encode()
+    feed.close()
+
+
+def test_a_socket_somebody_replaced_is_not_removed(folder: Path) -> None:
+    first = OdometryFeed(folder / "o", LINES, Pace.ASAP)
+    second = OdometryFeed(folder / "o", LINES, Pace.ASAP)
+    first.close()
+    loop = Loop(second)
+    with connect(second) as client:
+        loop.turn(0)
+        assert received(client).count(b"\n") == len(LINES)
+    second.close()
 
 
 def test_a_stale_socket_is_replaced_and_a_file_is_not(tmp_path: Path) -> None:
