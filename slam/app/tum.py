@@ -105,9 +105,10 @@ def format_tum_line(t_ns: int, pose: NDArray[np.float64]) -> str:
     '1.000000001 0.5 -1.0 0 0 0 0.0 1.0'
     """
     x, y, heading = (float(value) for value in pose)
-    seconds, rest = divmod(int(t_ns), NS_PER_S)
+    sign = "-" if t_ns < 0 else ""
+    seconds, rest = divmod(abs(int(t_ns)), NS_PER_S)
     qz, qw = math.sin(heading / 2), math.cos(heading / 2)
-    return f"{seconds}.{rest:09d} {x!r} {y!r} 0 0 0 {qz!r} {qw!r}"
+    return f"{sign}{seconds}.{rest:09d} {x!r} {y!r} 0 0 0 {qz!r} {qw!r}"
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:

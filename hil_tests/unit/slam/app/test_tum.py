@@ -36,7 +36,7 @@ def test_heading_is_twice_the_quaternion_angle(qz: float, qw: float, heading_rad
     assert parse_tum_line(f"0 0 0 0 0 0 {qz!r} {qw!r}").heading_rad == pytest.approx(expected)
 
 
-@given(st.integers(0, 2**62), finite, finite, st.floats(-3.1, 3.1))
+@given(st.integers(-(2**62), 2**62), finite, finite, st.floats(-3.1, 3.1))
 def test_a_line_gives_back_what_was_written(t_ns: int, x: float, y: float, heading: float) -> None:
     sample = parse_tum_line(format_tum_line(t_ns, np.array([x, y, heading])))
     assert (sample.t_ns, sample.x_m, sample.y_m) == (t_ns, x, y)
