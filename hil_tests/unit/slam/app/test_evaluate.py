@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from slam.app.cli import main
+from slam.app.evaluate import evaluate
 from slam.app.tum import Trajectory, write_tum
 
 N = 200
@@ -48,6 +49,31 @@ def test_the_line_states_the_alignment(
 ) -> None:
     assert main(["evaluate", *map(str, files)]) == 0
     assert capsys.readouterr().out == "ATE 10.0 mm (RMS, SE(2), no scale, 197 of 197 poses)\n"
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_stamps_belong_together_within_10_ms(tmp_path: Path, sign: int) -> None:
+    reference, estimate = tmp_path / "ref.tum", tmp_path / "est.tum"
+    write_tum(reference, Trajectory(stamps_ns=STAMPS, poses=square_path()))
+    # 9 ms and 11 ms apart, in turns
+    apart_ns = np.where(np.arange(N) % 2, 11_000_000, 9_000_000)
+    write_tum(estimate, Trajectory(stamps_ns=STAMPS + sign * apart_ns, poses=square_path()))
+    assert evaluate(estimate, reference)["pairs"] == N // 2
+
+
+@pytest.mark.parametrize("huge", [1e160, 1e308])
+def test_an_error_beyond_all_floats_is_null(
+    files: tuple[Path, Path], tmp_path: Path, huge: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    far = square_path()
+    far[::2, 0] = huge
+    write_tum(tmp_path / "far.tum", Trajectory(stamps_ns=STAMPS, poses=far))
+    assert main(["evaluate", str(tmp_path / "far.tum"), str(files[1]), "--json"]) == 0
+    text = capsys.readouterr()
+    assert json.loads(text.out, parse_constant=pytest.fail)["ate_rmse_m"] is None
+    assert text.err == ""
+    assert main(["evaluate", str(tmp_path / "far.tum"), str(files[1])]) == 0
+    assert capsys.readouterr().out.startswith("ATE beyond floating point (RMS, ")
 
 
 def test_wrong_files_are_one_line_and_exit_1(
