@@ -1,11 +1,15 @@
 """Numbers of a run whose errors are known: perfect, offset, and without any landmark."""
 
+import cmath
+
 import numpy as np
 import pytest
 
 from slam.app.evaluation import NEES_AT, summarise
 from slam.app.runner import RunRecord
 from slam.app.summary import Summary
+from slam.association import Association
+from slam.clustering import Observation
 from slam.config import load_preset
 from slam.ekf_slam import Belief
 from slam.geometry import Mount, Rig
@@ -88,6 +92,113 @@ def test_landmarks_are_judged_after_the_trajectorys_alignment_and_only_if_seen()
     assert score.rmse_m == pytest.approx(0.0, abs=1e-9)
     # the path is right, the map is 30 mm off
     assert run(offset_m=0.0, drift=0.0, variance=0.01).landmarks.rmse_m == pytest.approx(0.03)
+
+
+PLACE = np.array([5.0, -3.0, 0.8])
+HEADING_RAD = 0.3
+"""Of the robot in the map frame, while it moves along the map's x axis."""
+
+
+def in_world(point: complex) -> complex:
+    return complex(*PLACE[:2]) + cmath.rect(1.0, PLACE[2]) * point
+
+
+def seen(landmark: complex, x_m: float) -> Observation:
+    """Observe a landmark of the map frame without error, from x on the path."""
+    body = (landmark - x_m) * cmath.rect(1.0, -HEADING_RAD)
+    return Observation(x_m=body.real, y_m=body.imag, n_fixes=4, n_poses=4, fixes=())
+
+
+def associated(landmark_id: int, *distances_sq: float, is_new: bool = False) -> Association:
+    return Association(
+        landmark_id=landmark_id,
+        is_new=is_new,
+        mahalanobis_sq=np.array(distances_sq),
+        candidate_ids=tuple(range(len(distances_sq))),
+    )
+
+
+@pytest.fixture(scope="module")
+def turned() -> Summary:
+    """Drive from somewhere in the world; path, map and filter have unequal headings.
+
+    The estimate is 50 mm to the side and 0.02 rad off; every second state of it also runs 60 mm
+    ahead or behind, always onto a place where the robot was at another time.
+    """
+    x_m = np.linspace(0, 3, N)  # 15 mm per state
+    places = [in_world(complex(x)) for x in x_m]
+    truth = np.array([(p.real, p.imag, PLACE[2] + HEADING_RAD) for p in places])
+    first, second = 1.0 + 1.0j, 2.0 + 1.1j
+    # What was seen truly, and what the filter made of it.
+    events = {
+        10: (first, associated(0, is_new=True)),
+        11: (first, associated(0, 3.0)),
+        12: (first, associated(1, 25.0, is_new=True)),  # refused by the gate
+        13: (second, associated(2, 70.0, 80.0, is_new=True)),
+        14: (first, associated(0, 8.0, 1.0, 90.0)),
+    }
+    ahead = np.zeros(N, dtype=int)
+    ahead[5:-5:4], ahead[7:-5:4] = 4, -4
+    results = []
+    for k in range(N):
+        observed = [(seen(what, x_m[k]), how) for at, (what, how) in events.items() if at == k]
+        results.append(
+            StepResult(
+                t_ns=k * PERIOD_NS,
+                odometry_pose=np.array([x_m[k], 0.1 * (k % 2), HEADING_RAD]),
+                belief=Belief(
+                    mean=np.array([x_m[k + ahead[k]], 0.05, HEADING_RAD + 0.02]),
+                    covariance=np.diag([0.04, 0.0025, 0.0004]),
+                    landmark_ids=(),
+                    next_id=0,
+                ),
+                detections=(),
+                fixes=(),
+                observations=tuple(observation for observation, _ in observed),
+                associations=tuple(association for _, association in observed),
+                rejected=(),
+            )
+        )
+    record = RunRecord(
+        results=tuple(results),
+        truth=truth,
+        world_from_map=PLACE,
+        n_frames=2 * N,
+        duration_ns=(N - 1) * PERIOD_NS + PERIOD_NS // 10,
+        wall_s=0.5,
+    )
+    summary = summarise(
+        record,
+        scene="turned",
+        preset="paper",
+        seed=0,
+        rig=RIG,
+        config=load_preset("paper", "lab"),
+        true_landmarks_m=np.array([(w.real, w.imag) for w in map(in_world, (first, second))]),
+    )
+    assert summary is not None
+    return summary
+
+
+def test_icp_forgets_time_and_the_ate_does_not(turned: Summary) -> None:
+    # 96 of 201 states are 60 mm along the path from where they belong
+    assert turned.ate_rmse_m == pytest.approx(0.06 * np.sqrt(96 / 201), rel=0.01)
+    assert turned.ate_icp_rmse_m == pytest.approx(0.0, abs=1e-9)
+
+
+def test_nees_is_of_the_map_frame_and_carries_its_states_time(turned: Summary) -> None:
+    times, values = np.array(turned.nees_pose).T
+    # the run ends a little after its last state, and each time lies a little after a state
+    np.testing.assert_allclose(times, [40.0 * part for part in NEES_AT])
+    # 0.05^2 / 0.0025 + 0.02^2 / 0.0004
+    np.testing.assert_allclose(values, 2.0)
+    assert turned.final_error_m == pytest.approx(0.05)
+
+
+def test_nis_is_of_true_associations_before_the_gate_per_degree_of_freedom(
+    turned: Summary,
+) -> None:
+    assert turned.nis_mean == pytest.approx((3.0 + 25.0 + 8.0) / 3 / 2)
 
 
 def test_a_run_without_a_state_has_no_summary() -> None:

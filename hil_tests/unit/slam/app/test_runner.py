@@ -1,0 +1,95 @@
+"""The runner hands every state on with its own counter, its truth and the place of the map."""
+
+from collections.abc import Sequence
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil_tests.unit.slam.app.sessions import FRAME_NS, scan
+from slam.app.odometry import OdometryTrack
+from slam.app.runner import run_slam
+from slam.app.session import LogLine, Scan, Snapshot
+from slam.app.tum import TumSample
+from slam.ekf_slam import Belief
+from slam.frames import RadarFrame
+from slam.pipeline import StepResult, UwbRadarSlam
+
+COUNTERS = (5, 6, 8, 11, 12)
+LAG = 2
+
+
+class LateSlam:
+    """Believes odometry, two scans late; what is left at the end comes from `flush`."""
+
+    def __init__(self) -> None:
+        self.waiting: list[StepResult] = []
+
+    def step(
+        self, frames: Sequence[RadarFrame], odometry_pose: NDArray[np.float64], t_ns: int
+    ) -> tuple[StepResult, ...]:
+        belief = Belief(mean=odometry_pose, covariance=np.eye(3), landmark_ids=(), next_id=0)
+        self.waiting.append(
+            StepResult(
+                t_ns=t_ns,
+                odometry_pose=odometry_pose,
+                belief=belief,
+                detections=(),
+                fixes=(),
+                observations=(),
+                associations=(),
+                rejected=(),
+            )
+        )
+        return (self.waiting.pop(0),) if len(self.waiting) > LAG else ()
+
+    def flush(self) -> tuple[StepResult, ...]:
+        return tuple(self.waiting)
+
+
+class Listener:
+    def __init__(self) -> None:
+        self.scans: list[int] = []
+        self.snapshots: list[Snapshot] = []
+
+    def on_scan(self, scan: Scan) -> None:
+        self.scans.append(scan.counter)
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        self.snapshots.append(snapshot)
+
+    def on_log(self, line: LogLine) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def truth_at(stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    counters = stamps_ns / FRAME_NS
+    return np.column_stack([counters, 100 - counters, 0.1 * counters])
+
+
+def test_every_state_comes_with_its_own_counter_truth_and_place() -> None:
+    ends = [
+        TumSample(t_ns=counter * FRAME_NS, x_m=2.0 * counter, y_m=0.0, qz=0.0, qw=1.0)
+        for counter in (0, 20)
+    ]
+    listener = Listener()
+    record = run_slam(
+        map(scan, COUNTERS),
+        OdometryTrack(ends),
+        cast(UwbRadarSlam, LateSlam()),
+        truth_at,
+        [listener],
+    )
+    assert tuple(listener.scans) == COUNTERS
+    assert tuple(snapshot.counter for snapshot in listener.snapshots) == COUNTERS
+    assert len(record.results) == len(COUNTERS)
+    np.testing.assert_allclose(record.world_from_map, [5.0, 95.0, 0.5])
+    for counter, snapshot, truth in zip(COUNTERS, listener.snapshots, record.truth, strict=True):
+        assert snapshot.t_ns == counter * FRAME_NS
+        np.testing.assert_allclose(snapshot.truth, [counter, 100 - counter, 0.1 * counter])
+        np.testing.assert_allclose(snapshot.estimate, [2.0 * counter, 0.0, 0.0])
+        np.testing.assert_array_equal(snapshot.world_from_map, record.world_from_map)
+        np.testing.assert_array_equal(truth, snapshot.truth)
+    assert record.n_frames == 2 * len(COUNTERS)
+    assert record.duration_ns == COUNTERS[-1] * FRAME_NS
