@@ -58,9 +58,7 @@ ABOUT = """\
   is {block} frames with the constant part removed. Landmarks are the curved lines.
 * **Frame** (middle): the newest raw frame of one radar, all its range bins.
 * **Pose error** compares with the truth, which SLAM never sees. **NIS** is the mean surprise of
-  the observations that were associated with a landmark, in units of what the filter expected. The
-  gate let only small ones through, and the noise of the paper's Table I is larger than the real
-  one, so it lies far below 1: it shows outliers, and does not prove the filter honest.
+  gated associations only, in units of what the filter expected; far below 1 with Table I's noise.
 * **Link**: commands, answers and faults on the serial ports.
 
 Move the time cursor below; `device_time` is the radar's own time, `frame` its frame counter.
