@@ -82,11 +82,11 @@ def test_content_depends_on_the_counter_alone() -> None:
             if pauses:  # frames of the first stream that were not read are dropped
                 radar.stop()
                 radar.start(5.0)
-            frames += radar.frames(40 if pauses else 140)
+            frames += radar.frames(40 if pauses else 240)
             return {frame.counter: frame.samples.tobytes() for frame in frames}
 
     paused, unpaused = frames_of(pauses=True), frames_of(pauses=False)
-    assert list(unpaused) == list(range(147))
+    assert list(unpaused) == list(range(247))
     later = list(paused)[7:]
     assert later == list(range(later[0], later[0] + 40))
     assert paused.items() <= unpaused.items()
