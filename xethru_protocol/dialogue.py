@@ -21,6 +21,7 @@ from xethru_protocol.messages import (
     DataFloat,
     Error,
     Message,
+    Ping,
     Pong,
     ReplyByte,
     ReplyFloat,
@@ -92,28 +93,42 @@ class Dialogue:
         self._take_frame = take_frame
         self._connection = Connection(Role.HOST)
         self._answers: deque[Response] = deque()
+        self._answer_owed = False
         self._winding_down = False
         self._damaged_since = False  # since the last frame or answer
         self._rebooted_since = False
 
     def request(self, command: Command[ReplyT], timeout_s: float) -> ReplyT:
-        """Send a command, return its reply; see `X4M300.request`."""
+        """Send a command, return its reply; see `X4M300.request`.
+
+        After a request that was given up its answer may still come. The module answers in
+        order, so a PING is sent first and all before its PONG dropped (Protocol reference 13).
+        """
+        data = self._connection.send(command)
+        if self._answer_owed and not isinstance(command, Ping):
+            self._exchange(Ping(), self._connection.send(Ping()), timeout_s)
+        return self._exchange(command, data, timeout_s)
+
+    def _exchange(self, command: Command[ReplyT], data: bytes, timeout_s: float) -> ReplyT:
         self.take_stale_input()
         row = ROWS[type(command)]
         content_id = row.content_id(command) if row.content_id else None
-        self._transport.write(self._connection.send(command))
+        self._answer_owed = True  # also if this is left by an interrupt
+        self._transport.write(data)
         if self._observer is not None:
             self.tell("tx", summary(command))
         deadline = self._clock() + round(timeout_s * 1e9)
         while True:
             while self._answers:
                 answer = self._answers.popleft()
-                if isinstance(answer, Error):
+                if isinstance(answer, Error) and not isinstance(command, Ping):
+                    self._answer_owed = False  # PING has no errors: that one is of another command
                     meaning = error_name(answer.code, x4_command=row.name.startswith("X4"))
                     raise DeviceError(answer.code, summary(command), meaning)
                 if isinstance(answer, row.replies) and (
                     content_id is None or getattr(answer, "content_id", None) == content_id
                 ):
+                    self._answer_owed = False
                     # isinstance checked it: the row's replies are what ReplyT stands for
                     return answer  # type: ignore[return-value]
                 self.stray_count += 1

@@ -217,6 +217,41 @@ def test_replies_to_nothing_and_to_something_else_are_not_taken() -> None:
     assert radar.stray_count == 3
 
 
+@pytest.mark.parametrize("late", [m.Ack(), m.Error(code=1)], ids=["ack", "error"])
+def test_late_answer_is_not_taken_for_the_next_commands(late: m.Message) -> None:
+    first = m.X4DriverSet(setting=X4Setting.DACMIN, value=949)
+    second = m.X4DriverSet(setting=X4Setting.TXPOWER, value=9)
+
+    def slow(command: m.Message) -> Said:
+        if command == first:
+            return []
+        if isinstance(command, m.Ping):
+            return [late, READY]  # the module answers in order, and is back
+        return [m.Error(code=21)] if command == second else plain_module(command)
+
+    radar, line = driver_on(slow)
+    with pytest.raises(ResponseTimeout):
+        radar.request(first)
+    with pytest.raises(DeviceError) as caught:
+        radar.request(second)
+    assert caught.value.code == 21
+    assert line.received == [first, m.Ping(), second]
+    radar.request(m.X4DriverInit())
+    assert line.received[3:] == [m.X4DriverInit()]  # in step again: no PING
+
+
+def test_module_that_stays_silent_is_pinged_before_each_command() -> None:
+    radar, line = driver_on(lambda command: [])
+    for _ in range(2):
+        with pytest.raises(ResponseTimeout):
+            radar.stop()
+    stop = m.X4DriverSet(setting=X4Setting.FPS, value=0.0)
+    assert line.received == [stop, m.Ping()]
+    line._answer = lambda command: [m.Error(code=1), READY]
+    assert radar.ping() is PongCode.XTS_SPRP_READY
+    assert line.received[2:] == [m.Ping()]
+
+
 def test_refusal_names_command_code_and_meaning() -> None:
     radar, _ = driver_on(lambda command: [m.Error(code=17)])
     with pytest.raises(DeviceError) as caught:
