@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from emulator.settings import ChipSettings
+from xethru_protocol import x4
 from xethru_protocol.codes import X4Setting
 
 __all__ = ["COUPLED", "Coupling", "Registers"]
@@ -56,6 +57,24 @@ def _with_low_3(value: int, byte: int) -> int:
     return value & 0x7F8 | byte & 7
 
 
+def _ignored(settings: ChipSettings, byte: int) -> ChipSettings:
+    """Leave alone what follows from other settings: bytes per counter, and the receive delay.
+
+    Assumed: the reference says what they hold, not what writing them does to the frames.
+    """
+    del byte
+    return settings
+
+
+def _area(settings: ChipSettings) -> x4.FrameArea:
+    return x4.frame_area(
+        settings.start_m,
+        settings.end_m,
+        settings.offset_m,
+        downconversion=settings.downconversion != 0,
+    )
+
+
 # fmt: off
 COUPLED: dict[int, Coupling] = {
     0x2C: Coupling(read=lambda s: s.prf_div,
@@ -82,6 +101,10 @@ COUPLED: dict[int, Coupling] = {
                    write=lambda s, b: replace(s, tx_power=b >> 5 & 3)),
     0x0F: Coupling(read=lambda s: int(s.downconversion != 0),
                    write=lambda s, b: replace(s, downconversion=b & 1)),
+    0x1B: Coupling(read=lambda s: 6 if s.downconversion else 3,
+                   write=_ignored),
+    0x42: Coupling(read=lambda s: _area(s).rx_wait,
+                   write=_ignored),
 }
 """PIF registers that are settings, by address."""
 # fmt: on

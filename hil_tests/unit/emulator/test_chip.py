@@ -234,10 +234,68 @@ def test_coupled_registers_are_the_settings() -> None:
     assert chip.get(X4Setting.FRAMEBINCOUNT) == 181
 
 
+# Protocol reference 4.9, table of X4 registers: address, byte written, and what it sets.
+REGISTER_WRITES: list[tuple[int, int, X4Setting, X4Value]] = [
+    (0x2C, 40, X4Setting.PRFDIV, 40),
+    (0x2E, 0x02, X4Setting.PULSESPERSTEP, 0x022C),  # 300 is 012Ch
+    (0x2F, 0x02, X4Setting.PULSESPERSTEP, 0x0102),
+    (0x30, 0x20, X4Setting.DACMAX, 0x104),  # 1100 is 89h * 8 + 4
+    (0x31, 0x03, X4Setting.DACMAX, 1099),
+    (0x32, 0x20, X4Setting.DACMIN, 0x105),  # 949 is 76h * 8 + 5
+    (0x33, 0x03, X4Setting.DACMIN, 947),
+    (0x34, 0x22, X4Setting.DACSTEP, 2),
+    (0x35, 24, X4Setting.ITERATIONS, 24),
+    (0x65, 0x40, X4Setting.TXCENTERFREQUENCY, 4),
+    (0x75, 0x70, X4Setting.TXPOWER, 3),
+    (0x75, 0x10, X4Setting.TXPOWER, 0),
+    (0x0F, 0x01, X4Setting.DOWNCONVERSION, 1),
+]
+
+
+@pytest.mark.parametrize(("address", "byte", "setting", "value"), REGISTER_WRITES)
+def test_writing_a_coupled_register_sets_its_setting_and_reads_back(
+    address: int, byte: int, setting: X4Setting, value: X4Value
+) -> None:
+    chip = Chip(RampSource())
+    working_point(chip)
+    chip.set(X4Setting.PIFREGISTER, (address, byte))
+    assert chip.get(setting) == value
+    assert chip.read_register(X4Setting.PIFREGISTER, address) == byte
+
+
+def test_registers_that_follow_from_settings() -> None:
+    """Protocol reference 4.9 and 9.4: bytes per counter, and rx wait = 1 + delay steps."""
+    chip = Chip(RampSource())
+    pif = X4Setting.PIFREGISTER
+    # (start - 0.18 m) / 0.6173 m: -0.3, 0.03 and 7.8 coarse steps
+    for start_m, rx_wait in ((0.0, 0), (0.2, 1), (5.0, 8)):
+        chip.set(X4Setting.FRAMEAREA, (start_m, 9.4))
+        assert chip.read_register(pif, 0x42) == rx_wait
+    assert chip.read_register(pif, 0x1B) == 3
+    chip.set(X4Setting.DOWNCONVERSION, 1)
+    assert chip.read_register(pif, 0x1B) == 6
+    chip.set(pif, (0x1B, 3))
+    assert chip.read_register(pif, 0x1B) == 6
+    assert chip.get(X4Setting.DOWNCONVERSION) == 1
+
+
 def test_registers_start_as_the_driver_leaves_them() -> None:
     """Protocol reference 4.9, last paragraph: after INIT."""
     chip = Chip(RampSource())
-    pif = {47: 10, 46: 0, 53: 8, 44: 16, 45: 16, 67: 1, 106: 96, 115: 16, 73: 8, 15: 0, 14: 128}
+    pif = {
+        47: 10,
+        46: 0,
+        53: 8,
+        44: 16,
+        45: 16,
+        67: 1,
+        106: 96,
+        115: 16,
+        73: 8,
+        15: 0,
+        14: 128,
+        66: 0,
+    }
     # 117 = 80 and 101 = 48 hold TX power 2 and centre frequency 3 of the board defaults
     pif |= {49: 7, 48: 255, 51: 0, 50: 0, 117: 80, 101: 48, 27: 3}
     for address, value in pif.items():
