@@ -166,8 +166,9 @@ def _x4_get(module: Module, command: m.X4DriverGet) -> m.Response:
 @answers(m.X4DriverWrite)
 def _x4_write(module: Module, command: m.X4DriverWrite) -> m.Response:
     _check_block_access(command.setting)
-    for byte in command.values:  # block access is a FIFO port: one address takes every byte
-        module.chip.write_register(command.setting, command.address, byte)
+    # Assumed: consecutive registers, wrapping at 256; the reference names only the first.
+    for address, byte in enumerate(command.values, start=command.address):
+        module.chip.write_register(command.setting, address, byte)
     return m.Ack()
 
 
@@ -176,8 +177,9 @@ def _x4_read(module: Module, command: m.X4DriverRead) -> m.Response:
     _check_block_access(command.setting)
     if command.length > LONGEST_READ:
         raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
-    byte = module.chip.read_register(command.setting, command.address)
-    return m.ReplyByte(content_id=command.setting, values=bytes([byte]) * command.length)
+    addresses = range(command.address, command.address + command.length)  # as in WRITE
+    values = bytes(module.chip.read_register(command.setting, address) for address in addresses)
+    return m.ReplyByte(content_id=command.setting, values=values)
 
 
 def _check_block_access(setting: X4Setting) -> None:

@@ -62,9 +62,6 @@ class Device:
         Damaged packets received so far; like the firmware, the module does not answer them.
     """
 
-    # A host that sends commands and never reads is held back here, not in memory.
-    REPLIES_BEFORE_PAUSE = FirmwareOutbox.SLOTS
-
     def __init__(
         self, module: Module, stream: MessageStream, outbox: Outbox, *, boot: BootTiming
     ) -> None:
@@ -84,8 +81,8 @@ class Device:
 
     @property
     def wants_data(self) -> bool:
-        """Whether more commands should be read now."""
-        return len(self._outbox) <= self.REPLIES_BEFORE_PAUSE
+        """Whether more commands should be read now; a host that never reads is held back."""
+        return self._outbox.takes_replies
 
     def receive_data(self, data: bytes, now_ns: int) -> None:
         """Take bytes from the host and carry out the commands they complete."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from xethru_protocol.codes import InfoItem
+
 __all__ = ["Identity"]
 
 
@@ -25,6 +27,8 @@ class Identity:
         Firmware version.
     xep_version
         Version of the base firmware inside it.
+    dsp_library
+        Last entry of the version list; name and version are assumed, the reference gives none.
     build
         Source revision, 40 hexadecimal digits.
 
@@ -42,6 +46,7 @@ class Identity:
     firmware_id: str = "Annapurna"
     version: str = "1.6.8"
     xep_version: str = "3.4.8"
+    dsp_library: str = "DSP:1.0.0"
     build: str = "0" * 40
 
     def __post_init__(self) -> None:
@@ -59,15 +64,19 @@ class Identity:
         >>> Identity(serial="202611210001").info(0x05) is None
         True
         """
-        return {
-            0x00: self.item_number,
-            0x01: self.order_code,
-            0x02: self.firmware_id,
-            0x03: self.version,
-            0x04: f"{self.version}+0.sha.{self.build}",
-            # 05, the application id list, is answered with an error by released firmware
-            0x06: self.serial,
-            0x07: f"{self.firmware_id}:{self.version};XEP:{self.xep_version};X4C51:2.1.0",
-            0x08: f"emulated-{self.serial}",
-            0x09: "unknown",
-        }.get(item)
+        texts: dict[int, str] = {
+            InfoItem.XTID_SSIC_ITEMNUMBER: self.item_number,
+            InfoItem.XTID_SSIC_ORDERCODE: self.order_code,
+            InfoItem.XTID_SSIC_FIRMWAREID: self.firmware_id,
+            InfoItem.XTID_SSIC_VERSION: self.version,
+            InfoItem.XTID_SSIC_BUILD: f"{self.version}+0.sha.{self.build}",
+            # the application id list is answered with an error by released firmware
+            InfoItem.XTID_SSIC_SERIALNUMBER: self.serial,
+            InfoItem.XTID_SSIC_VERSIONLIST: (
+                f"{self.firmware_id}:{self.version};XEP:{self.xep_version};X4C51:2.1.0"
+                f";{self.dsp_library}"
+            ),
+            InfoItem.XTID_SSIC_SYSTEMCOREID: f"emulated-{self.serial}",
+            InfoItem.XTID_SSIC_BOOTLOADER: "unknown",
+        }
+        return texts.get(item)

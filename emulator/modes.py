@@ -24,7 +24,7 @@ __all__ = ["ModeMachine"]
 
 X4M300_PROFILES = frozenset({ProfileId.XTS_ID_APP_PRESENCE_2})
 
-_NEEDS_PROFILE = {
+_NEEDS_PROFILE: dict[int, bool] = {
     SensorMode.XTID_SM_RUN: True,
     SensorMode.XTID_SM_IDLE: True,
     SensorMode.XTID_SM_MANUAL: False,
@@ -61,7 +61,7 @@ class ModeMachine:
 
     def set_mode(self, mode: int) -> None:
         """Change the mode, or raise `Refusal`."""
-        needs_profile = _NEEDS_PROFILE.get(SensorMode(mode)) if mode in _MODE_VALUES else None
+        needs_profile = _NEEDS_PROFILE.get(mode)
         if needs_profile is None:
             raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
         if needs_profile and self.profile_id == ProfileId.XTS_ID_APP_NONE:
@@ -81,6 +81,3 @@ class ModeMachine:
         self.profile_id = profile_id
         self.mode = SensorMode.XTID_SM_STOP
         self._was_running = False
-
-
-_MODE_VALUES = frozenset(int(mode) for mode in SensorMode)

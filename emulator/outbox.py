@@ -60,6 +60,11 @@ class MessageStream(Protocol):
 class Outbox(Protocol):
     """The queue between a module and its line."""
 
+    @property
+    def takes_replies(self) -> bool:
+        """Whether there is room for the reply to another command; if not, none should be read."""
+        ...
+
     def put(self, kind: MessageKind, message: Response, now_ns: int) -> None:
         """Queue one message, or lose one, as the queue's rule says."""
         ...
@@ -96,8 +101,15 @@ class LosslessOutbox:
     behind at most the one message the line is already sending.
     """
 
+    MOST_REPLIES = 50
+
     def __init__(self) -> None:
         self._messages: deque[Response] = deque()
+
+    @property
+    def takes_replies(self) -> bool:
+        """Whether few enough messages wait."""
+        return len(self._messages) < self.MOST_REPLIES
 
     def put(self, kind: MessageKind, message: Response, now_ns: int) -> None:
         """Queue one message; the owner stops reading commands while many wait."""
@@ -165,6 +177,13 @@ class FirmwareOutbox:
         self._queue: deque[_Queued] = deque()
         self._waiting_since_ns = 0
         self.frames_lost = 0
+
+    @property
+    def takes_replies(self) -> bool:
+        """Whether another reply displaces a frame at worst, and not a reply nobody has read."""
+        if len(self._queue) < self.SLOTS:
+            return True
+        return any(queued.kind is not MessageKind.REPLY for queued in self._queue)
 
     def put(self, kind: MessageKind, message: Response, now_ns: int) -> None:
         """Queue one message; see the class for what is lost when."""

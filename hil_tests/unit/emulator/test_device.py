@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from emulator.device import BootTiming, radar_device
@@ -93,6 +95,7 @@ def test_info_items_of_the_sensor_firmware(host: BareHost) -> None:
     assert len(texts[0x06]) == 12
     assert texts[0x04].startswith(texts[0x03] + "+")
     assert len(texts[0x04].split(".sha.")[1]) == 40
+    assert re.fullmatch(r"Annapurna:1\.6\.8;XEP:3\.4\.8;X4C51:[\d.]+[;:]\w+:[\d.]+", texts[0x07])
     assert host.ask(m.SystemGetInfo(item=0x0A)) == m.Error(code=1)
 
 
@@ -149,10 +152,12 @@ def test_a_bad_checksum_is_not_answered(host: BareHost) -> None:
 
 
 def test_block_register_access(host: BareHost) -> None:
-    assert host.ask(m.X4DriverWrite(address=0x13, values=b"\x01\x02\x03")) == m.Ack()
-    reply = host.ask(m.X4DriverRead(address=0x13, length=2))
-    assert isinstance(reply, m.ReplyByte)
-    assert (reply.content_id, len(reply.values)) == (0x22, 2)
+    assert host.ask(m.X4DriverWrite(address=0x14, values=b"\x01\x02\x03")) == m.Ack()
+    reply = host.ask(m.X4DriverRead(address=0x13, length=4))
+    assert reply == m.ReplyByte(content_id=0x22, values=b"\x00\x01\x02\x03")
+    # behind FFh comes 00h: the constants 00, FF and the chip ids 01, 02
+    reply = host.ask(m.X4DriverRead(address=0xFF, length=5))
+    assert reply == m.ReplyByte(content_id=0x22, values=b"\x00\x00\xff\x01\x02")
     assert host.ask(m.X4DriverRead(address=5, length=10**6)) == m.Error(code=1)
 
 
@@ -239,15 +244,54 @@ def test_boot_timing_is_an_argument() -> None:
     assert host.device.wake_ns(5) == 12
 
 
-def test_a_host_that_never_reads_is_held_back() -> None:
-    device = ramp_device()
+@pytest.mark.parametrize("pace", list(Pace))
+def test_a_host_that_never_reads_is_held_back(pace: Pace) -> None:
+    device = ramp_device(pace)
     ping = Connection(Role.HOST).send(m.Ping())
     sent = 0
     while device.wants_data:
         device.receive_data(ping, 0)
         sent += 1
         assert sent < 1000
-    assert device.next_packet(0) is not None
+    assert sent == 50
+    for _ in range(sent):
+        assert device.next_packet(0) is not None
+        assert device.wants_data
+    assert device.next_packet(0) is None
+
+
+def test_frames_that_wait_hold_no_command_back() -> None:
+    host = BareHost(ramp_device(Pace.REALTIME))
+    host.enter_manual()
+    host.set(X4Setting.FPS, 100.0)
+    for _ in range(90):
+        host.now_ns += SECOND // 100
+        host.device.advance(host.now_ns)
+    assert host.device.wants_data
+    host.send(m.Ping())
+    assert m.Pong(value=0xAAEEAEEA) in host.hear()
+
+
+def test_idle_needs_a_profile_too(host: BareHost) -> None:
+    """Protocol reference 8.3 is silent; assumed like RUN."""
+    assert host.ask(m.SetMode(mode=SensorMode.XTID_SM_STOP)) == m.Ack()
+    assert host.ask(m.SetMode(mode=SensorMode.XTID_SM_IDLE)) == m.Error(code=0x20)
+    assert mode_of(host) == SensorMode.XTID_SM_STOP
+
+
+def test_what_waits_is_lost_by_a_reset(host: BareHost) -> None:
+    host.send(m.ModReset())
+    host.send(m.Ping())
+    host.now_ns = 10 * SECOND
+    host.device.advance(host.now_ns)
+    assert host.hear() == [m.System(code=0x10), m.System(code=0x11)]
+
+
+def test_a_second_reset_does_not_postpone_the_first(host: BareHost) -> None:
+    assert host.ask(m.ModReset()) == m.Ack()
+    host.now_ns = SECOND // 4
+    assert host.ask(m.ModReset()) == m.Ack()
+    assert host.device.wake_ns(host.now_ns) == SECOND // 2
 
 
 def test_realtime_frames_are_due_at_absolute_deadlines() -> None:
