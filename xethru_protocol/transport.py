@@ -10,6 +10,7 @@ import errno
 import math
 import os
 import select
+import time
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -20,6 +21,7 @@ from xethru_protocol.errors import Disconnected, PortUnavailable
 
 _CHUNK_BYTES = 65536
 _WRITE_TIMEOUT_S = 5.0
+_LONGEST_WAIT_S = 86400.0  # poll() takes 31 bits of milliseconds; a caller waits again
 _BAUD = 115200  # what a UART module starts with; without meaning on USB and ptys
 
 
@@ -62,19 +64,19 @@ class SerialTransport:
     def __init__(self, path: str) -> None:
         self.name = path
         try:
-            self._port = serial.Serial(
-                path, _BAUD, timeout=0, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
-            )
+            self._port = serial.Serial(path, _BAUD, timeout=0, exclusive=True)
         except (OSError, ValueError) as error:  # SerialException is an OSError
             raise PortUnavailable(_why(path, error)) from None
         self._fd: int = self._port.fileno()
-        self._poller = select.poll()  # select() cannot wait on descriptors above 1023
-        self._poller.register(self._fd, select.POLLIN)
+        # select(), which pyserial's write uses, cannot wait on descriptors above 1023
+        self._readable, self._writable = select.poll(), select.poll()
+        self._readable.register(self._fd, select.POLLIN)
+        self._writable.register(self._fd, select.POLLOUT)
 
     def read(self, timeout_s: float) -> bytes:
         """See `Transport.read`."""
         try:
-            if not self._poller.poll(math.ceil(max(timeout_s, 0.0) * 1000)):
+            if not self._readable.poll(_whole_ms(timeout_s)):
                 return b""
             data = os.read(self._fd, _CHUNK_BYTES)
         except BlockingIOError:  # another reader was faster
@@ -87,14 +89,19 @@ class SerialTransport:
 
     def write(self, data: bytes) -> None:
         """See `Transport.write`."""
-        try:
-            self._port.write(data)
-        except serial.SerialTimeoutException:
-            raise Disconnected(
-                f"{self.name} takes no data any more; is the module hanging?"
-            ) from None
-        except (OSError, ValueError) as error:
-            raise Disconnected(self._lost()) from error
+        deadline = time.monotonic() + _WRITE_TIMEOUT_S
+        rest = memoryview(data)
+        while rest:
+            left_s = deadline - time.monotonic()
+            if left_s <= 0:
+                raise Disconnected(f"{self.name} takes no data any more; is the module hanging?")
+            try:
+                if self._writable.poll(_whole_ms(left_s)):
+                    rest = rest[os.write(self._fd, rest) :]
+            except BlockingIOError:  # room for less than the line takes at once
+                continue
+            except (OSError, ValueError) as error:
+                raise Disconnected(self._lost()) from error
 
     def close(self) -> None:
         """See `Transport.close`."""
@@ -109,6 +116,10 @@ class SerialTransport:
         if self._fd < 0:
             return f"{self.name} was closed"
         return f"{self.name} was disconnected; plug the module in again"
+
+
+def _whole_ms(timeout_s: float) -> int:
+    return math.ceil(min(max(timeout_s, 0.0), _LONGEST_WAIT_S) * 1000)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

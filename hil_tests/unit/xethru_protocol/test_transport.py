@@ -1,7 +1,11 @@
 """Serial transport on pseudo-terminals."""
 
+import math
 import os
 import pty
+import resource
+import threading
+import time
 import tty
 from collections.abc import Iterator
 from pathlib import Path
@@ -63,6 +67,62 @@ def test_unplugged_port_is_disconnected_and_can_be_closed(line: Line) -> None:
     port.close()
     with pytest.raises(Disconnected, match="was closed"):
         port.read(0.0)
+
+
+def test_read_waits_for_what_comes_in_time(line: Line) -> None:
+    port = SerialTransport(line.path)
+    timer = threading.Timer(0.1, os.write, (line.master, b"late"))
+    timer.start()
+    assert port.read(math.inf) == b"late"
+    timer.join()
+    port.close()
+
+
+def test_long_writes_wait_for_room(line: Line) -> None:
+    port = SerialTransport(line.path)
+    data = bytes(range(256)) * 400
+    got = bytearray()
+
+    def take_slowly() -> None:
+        time.sleep(0.1)  # the line is full by now
+        while len(got) < len(data):
+            got.extend(os.read(line.master, 4096))
+
+    reader = threading.Thread(target=take_slowly)
+    reader.start()
+    port.write(data)
+    reader.join()
+    assert bytes(got) == data
+    port.close()
+
+
+def test_line_that_takes_nothing_is_given_up(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("xethru_protocol.transport._WRITE_TIMEOUT_S", 0.1)
+    port = SerialTransport(line.path)
+    with pytest.raises(Disconnected, match="takes no data any more; is the module hanging"):
+        port.write(bytes(1 << 20))
+    port.close()
+
+
+def test_descriptors_above_1023_work(line: Line) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard != resource.RLIM_INFINITY and hard < 1200:
+        pytest.skip("this system allows no descriptor above 1023")
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, 1200), hard))
+    taken: list[int] = []
+    try:
+        while not taken or taken[-1] < 1023:
+            taken.append(os.dup(line.master))
+        port = SerialTransport(line.path)
+        port.write(b"\x7d\x10\x6d\x7e")
+        assert os.read(line.master, 99) == b"\x7d\x10\x6d\x7e"
+        os.write(line.master, b"answer")
+        assert port.read(1.0) == b"answer"
+        port.close()
+    finally:
+        for descriptor in taken:
+            os.close(descriptor)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 def test_missing_port_says_where_to_look(tmp_path: Path) -> None:
