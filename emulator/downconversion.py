@@ -23,9 +23,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from xethru_protocol.x4 import BASEBAND_DECIMATION
+
 __all__ = ["CHANNELS", "DECIMATION", "LEAD_SAMPLES", "TAP_COUNT", "ChannelTaps", "downconvert"]
 
-DECIMATION = 8
+DECIMATION = BASEBAND_DECIMATION
 TAP_COUNT = 32
 LEAD_SAMPLES = 16
 """RF samples that the window of line L reaches before sample 8 L."""

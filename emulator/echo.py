@@ -44,8 +44,9 @@ from numpy.typing import NDArray
 
 from emulator.echo_source import CaptureSettings, EchoSource
 from emulator.noise import UNITS_PER_SIGMA, frame_noise_units
-from emulator.pulse import SAMPLING_RATE_HZ, sum_of_pulses
+from emulator.pulse import sum_of_pulses
 from emulator.scene import RadarSpec, Scene, TargetSpec
+from xethru_protocol import x4
 
 __all__ = [
     "BEAM_EXPONENT",
@@ -59,9 +60,8 @@ __all__ = [
 ]
 
 SPEED_OF_LIGHT_MPS = 299_792_458.0
-_MODULE_SPEED_MPS = 3.0e8
-_SAMPLES_PER_M = 2 * SAMPLING_RATE_HZ / SPEED_OF_LIGHT_MPS
-_SAMPLES_PER_MODULE_M = 2 * SAMPLING_RATE_HZ / _MODULE_SPEED_MPS
+_SAMPLES_PER_M = 2 * x4.SAMPLING_RATE_HZ / SPEED_OF_LIGHT_MPS
+_SAMPLES_PER_MODULE_M = 2 * x4.SAMPLING_RATE_HZ / x4.MODULE_SPEED_MPS
 
 BEAM_EXPONENT = math.log(math.sqrt(0.5)) / math.log(math.cos(math.radians(65 / 2)))
 """n of the two-way amplitude pattern cos(angle)**n: 2.0354."""
@@ -195,8 +195,13 @@ class SceneEcho:
         scene_times_ns: NDArray[np.int64],
     ) -> NDArray[np.int64]:
         """Return raw RF chip counters, shape (n_frames, n_samples); see ``EchoSource``."""
-        count = _count(capture)
-        n_levels = capture.dac_max - capture.dac_min + 1
+        normalisation = x4.Normalisation.of(
+            iterations=capture.iterations,
+            pulses_per_step=capture.pulses_per_step,
+            dac_min=capture.dac_min,
+            dac_max=capture.dac_max,
+            dac_step=capture.dac_step,
+        )
         pulses = capture.iterations * capture.pulses_per_step
         noise = self._scene.noise
         sigma = noise.rf_sigma * math.sqrt(noise.iterations * noise.pulses_per_step / pulses)
@@ -206,15 +211,18 @@ class SceneEcho:
         )
         counts: NDArray[np.float64] = units * (sigma / UNITS_PER_SIGMA)
         counts += self.echo(capture, scene_times_ns)
-        counts += n_levels / 2048
-        counts *= 1 / count
+        counts += normalisation.dac_offset
+        counts *= 1 / _count(capture)
         np.rint(counts, out=counts)
-        np.clip(counts, 0, pulses * n_levels >> capture.dac_step, out=counts)
+        np.clip(counts, 0, normalisation.max_counter, out=counts)
         return counts.astype(np.int64)
 
 
 def _count(capture: CaptureSettings) -> float:
-    """Return one chip count in normalised units (protocol reference 9.7)."""
+    """Return one chip count in normalised units (protocol reference 9.7).
+
+    In float64: `xethru_protocol.x4.Normalisation` rounds it to float32, as the wire needs it.
+    """
     return 2.0**capture.dac_step / (capture.iterations * capture.pulses_per_step) / 1024
 
 

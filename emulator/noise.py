@@ -19,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from xethru_protocol.x4 import FRAME_SAMPLES
+
 __all__ = [
     "LARGEST_UNITS",
     "MAX_SAMPLES",
@@ -27,7 +29,7 @@ __all__ = [
     "standard_normals",
 ]
 
-MAX_SAMPLES = 1536
+MAX_SAMPLES = FRAME_SAMPLES
 """Samples of the longest frame the X4 can take (protocol reference 9.1)."""
 
 _TABLE_BITS = 16

@@ -11,25 +11,29 @@ Arithmetic is float64 additions and multiplications per sample; cosines are take
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
+
+from xethru_protocol.x4 import CARRIER_HZ, SAMPLING_RATE_HZ
 
 __all__ = [
     "BANDWIDTH_HZ",
     "CARRIER_CYCLES_PER_SAMPLE",
     "HALF_WINDOW",
-    "SAMPLING_RATE_HZ",
     "SIGMA_S",
     "sum_of_pulses",
 ]
 
-SAMPLING_RATE_HZ = 23.328e9
 BANDWIDTH_HZ = 1.4e9
 """Full width of the power spectrum at -10 dB."""
 SIGMA_S = math.sqrt(math.log(10)) / (math.pi * BANDWIDTH_HZ)
 """Envelope's standard deviation in time: the spectrum exp(-(2 pi f sigma)**2) is 0.1 at B/2."""
-CARRIER_CYCLES_PER_SAMPLE = {3: (5, 16), 4: (3, 8)}
+CARRIER_CYCLES_PER_SAMPLE = {
+    setting: (Fraction(carrier_hz) / Fraction(SAMPLING_RATE_HZ)).as_integer_ratio()
+    for setting, carrier_hz in CARRIER_HZ.items()
+}
 """TX centre frequency setting -> carrier / sampling rate as a fraction: 7.290 and 8.748 GHz."""
 
 _SIGMA_SAMPLES = SIGMA_S * SAMPLING_RATE_HZ

@@ -12,11 +12,11 @@ from emulator.pulse import (
     BANDWIDTH_HZ,
     CARRIER_CYCLES_PER_SAMPLE,
     HALF_WINDOW,
-    SAMPLING_RATE_HZ,
     SIGMA_S,
     sum_of_pulses,
 )
 
+SAMPLING_RATE_HZ = 23.328e9
 CARRIER_HZ = {3: 7.290e9, 4: 8.748e9}
 
 
