@@ -34,6 +34,7 @@ from xethru_protocol.packets import NEED_DATA, FramingFault
 from xethru_protocol.table import ROWS
 from xethru_protocol.transport import Transport
 
+_ENDLESS_S = 1e9
 _ANSWERS = (Ack, Error, Pong, ReplyByte, ReplyInt, ReplyFloat, ReplyString)
 _STALE_READS = 64  # more than any port buffers; a bound, since a fast module never pauses
 
@@ -117,7 +118,7 @@ class Dialogue:
         self._transport.write(data)
         if self._observer is not None:
             self.tell("tx", summary(command))
-        deadline = self._clock() + round(timeout_s * 1e9)
+        deadline = self.deadline_ns(timeout_s)
         while True:
             while self._answers:
                 answer = self._answers.popleft()
@@ -136,6 +137,10 @@ class Dialogue:
             if left_ns <= 0:
                 raise self.silence(f"answer to {summary(command)}", timeout_s)
             self.pump(left_ns * 1e-9)
+
+    def deadline_ns(self, timeout_s: float) -> int:
+        """Time of the clock [ns] at which a timeout is over; an infinite one takes 30 years."""
+        return self._clock() + round(min(timeout_s, _ENDLESS_S) * 1e9)
 
     def wind_down(self) -> None:
         """From now on care for answers only.

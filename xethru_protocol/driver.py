@@ -246,7 +246,7 @@ class X4M300:
             If the port is no radar.
         """
         config = config or RawConfig()
-        x4.frame_area(*config.frame_area_m, config.offset_m, config.downconversion)  # may raise
+        config.check_area()
         self._wait_until_ready()
         self._raw_mode = True
         self._set_mode_if_known(SensorMode.XTID_SM_STOP)
@@ -311,7 +311,7 @@ class X4M300:
             If the line is gone.
         """
         if not self._frames:
-            deadline = self._clock() + round(timeout_s * 1e9)
+            deadline = self._dialogue.deadline_ns(timeout_s)
             while not self._frames:
                 left_ns = deadline - self._clock()
                 if left_ns <= 0:

@@ -62,7 +62,12 @@ class Frame:
 
 
 def rf_or_baseband(message: DataFloat, geometry: FrameGeometry) -> Samples | None:
-    """Return the samples of a radar frame, or None if their number does not fit the geometry."""
+    """Return the samples of a radar frame, or None if the message is none of this geometry.
+
+    Radar frames have content id 0 (Protocol reference 6.1).
+    """
+    if message.content_id != 0:
+        return None
     values = message.values
     n = geometry.n_bins
     if not geometry.downconversion:

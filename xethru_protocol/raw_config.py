@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from xethru_protocol import x4
 from xethru_protocol.codes import X4Setting
+from xethru_protocol.errors import LocalProtocolError
 from xethru_protocol.messages import X4Value
 
 
@@ -11,7 +12,8 @@ from xethru_protocol.messages import X4Value
 class RawConfig:
     """Settings of raw radar mode; the defaults are the vendor's working point.
 
-    ``frame_area_m`` and ``offset_m`` are module metres. Protocol reference 4.9, 9.3.
+    ``frame_area_m`` and ``offset_m`` are module metres. Numbers the chip would cut to other
+    ones raise `LocalProtocolError`. Protocol reference 4.9, 9.3.
     """
 
     frame_area_m: tuple[float, float] = (0.2, 9.4)
@@ -23,6 +25,15 @@ class RawConfig:
     dac_max: int = 1100
     tx_power: int = 2
     tx_center_frequency: int = 3
+
+    def __post_init__(self) -> None:
+        """Check what the module does not: it keeps the low bits of any number."""
+        for name, value, largest in (
+            ("iterations", self.iterations, 255),
+            ("pulses_per_step", self.pulses_per_step, 65535),
+        ):
+            if not 1 <= value <= largest:
+                raise LocalProtocolError(f"{name} must be 1 ... {largest}, not {value}")
 
     def settings(self) -> tuple[tuple[X4Setting, X4Value], ...]:
         """X4 settings in the order in which the vendor's recipe sends them."""
@@ -37,6 +48,17 @@ class RawConfig:
             (X4Setting.FRAMEAREAOFFSET, self.offset_m),
             (X4Setting.FRAMEAREA, self.frame_area_m),
         )
+
+    def check_area(self) -> None:
+        """Raise `LocalProtocolError` if a module would make no bin of the frame area."""
+        area = x4.frame_area(*self.frame_area_m, self.offset_m, self.downconversion)
+        if area.n_bins <= 0:
+            begin = self.offset_m - x4.COARSE_STEP_M
+            raise LocalProtocolError(
+                f"frame area {self.frame_area_m[0]:g} ... {self.frame_area_m[1]:g} m has no bins; "
+                f"it must end at least {area.bin_length_m:.4f} m behind its start "
+                f"and behind {begin + area.bin_length_m:.4f} m"
+            )
 
     @property
     def fps_max(self) -> float:

@@ -87,8 +87,8 @@ class Member:
     label: str
 
     def pack(self, value: Any, before: Fields, bulk: bool) -> bytes:
-        """Pack the number behind the member."""
-        return struct.pack("<I", value)
+        """Pack the number behind the member; ``ValueError`` if it is none."""
+        return struct.pack("<I", self.enum(value))
 
     def unpack(self, data: bytes, start: int, before: Fields) -> tuple[Any, int]:
         """Unpack the member; ``ValueError`` if the number is none."""
@@ -97,7 +97,7 @@ class Member:
 
     def show(self, name: str, value: Any, before: Fields) -> dict[str, Any]:
         """Show the member's name."""
-        return {self.label: value.name}
+        return {self.label: self.enum(value).name}
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +109,9 @@ class OptionalByte:
     shown_if_absent: bool = False
 
     def pack(self, value: Any, before: Fields, bulk: bool) -> bytes:
-        """Pack the byte, or nothing."""
+        """Pack the byte, or nothing; ``ValueError`` if this message needs one."""
+        if value is None and self.required and self.wanted(before):
+            raise ValueError("the address is missing")
         return b"" if value is None else bytes((value,))
 
     def unpack(self, data: bytes, start: int, before: Fields) -> tuple[Any, int]:
@@ -146,7 +148,7 @@ class ByDiscriminator:
         """Pack in the layout of the discriminator."""
         key = before[self.field]
         if key not in self.layouts:
-            raise ValueError(f"{key.name} cannot be set")
+            raise ValueError("this setting cannot be set")
         codes, names = self.layouts[key]
         if before[self.width_field] == 1 and key in self.short:
             codes = "B"

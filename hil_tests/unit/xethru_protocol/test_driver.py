@@ -1,5 +1,6 @@
 """The driver on a scripted module."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -176,6 +177,14 @@ def test_frames_of_another_length_are_discarded_and_counted() -> None:
     radar.configure_raw()
     line.say(frame(1, bins=99), frame(2))
     assert radar.read_frame().counter == 2
+    assert radar.frames_discarded == 1
+
+
+def test_data_with_a_content_id_are_no_radar_frames() -> None:
+    radar, line = driver_on()
+    radar.configure_raw()
+    line.say(m.DataFloat(content_id=4, info=1, values=np.zeros(1431, np.float32)), frame(2))
+    assert radar.read_frame(math.inf).counter == 2  # without a limit
     assert radar.frames_discarded == 1
 
 
@@ -382,4 +391,37 @@ def test_impossible_area_is_refused_before_anything_is_sent() -> None:
     radar, line = driver_on()
     with pytest.raises(LocalProtocolError, match="swap"):
         radar.configure_raw(RawConfig(frame_area_m=(5.0, 1.0)))
+    assert line.received == []
+
+
+def test_area_without_bins_is_refused_before_anything_is_sent() -> None:
+    radar, line = driver_on()
+    with pytest.raises(LocalProtocolError, match=r"has no bins; it must end at least 0\.0064 m"):
+        radar.configure_raw(RawConfig(frame_area_m=(-3.0, -2.0)))
+    assert line.received == []
+
+
+@pytest.mark.parametrize(("name", "largest"), [("iterations", 255), ("pulses_per_step", 65535)])
+def test_numbers_the_chip_would_cut_are_refused(name: str, largest: int) -> None:
+    for value in (1, largest):
+        RawConfig(**{name: value})  # type: ignore[arg-type] # the two names are integer fields
+    for value in (0, largest + 1):
+        with pytest.raises(LocalProtocolError, match=rf"{name} must be 1 \.\.\. {largest}"):
+            RawConfig(**{name: value})  # type: ignore[arg-type] # as above
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        m.X4DriverGet(setting=X4Setting.PIFREGISTER),
+        m.X4DriverSet(setting=X4Setting.FRAMEBINCOUNT, value=1),
+        m.X4DriverSet(setting=0x99, value=1),  # type: ignore[arg-type] # that is the point
+        m.X4DriverGet(setting=0x99),  # type: ignore[arg-type] # that is the point
+    ],
+    ids=["register without address", "no setter", "set unknown", "get unknown"],
+)
+def test_what_no_module_understands_is_not_sent(command: m.Command[m.Ack]) -> None:
+    radar, line = driver_on()
+    with pytest.raises(LocalProtocolError, match=r"X4DRIVER_[SG]ET cannot carry"):
+        radar.request(command)
     assert line.received == []
