@@ -10,7 +10,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import hilbert
 
-from emulator.echo import BEAM_EXPONENT, SceneEcho, beam_gain, echo_source, reflection_phase_rad
+from emulator.echo import (
+    BEAM_EXPONENT,
+    SceneEcho,
+    beam_gain,
+    echo_source,
+    reflection_phase_rad,
+    target_reflections,
+)
 from emulator.echo_source import CaptureSettings
 from emulator.scene import (
     LeakageSpec,
@@ -263,3 +270,18 @@ def test_snr_of_a_rod_at_1_m_is_that_of_the_pulse_study() -> None:
     scene = load_scene("lab")
     ratio = scene.targets[0].amplitude_1m / scene.noise.rf_sigma
     assert 20 * math.log10(ratio) == pytest.approx(29.54, abs=0.01)
+
+
+@pytest.mark.parametrize(("kind", "exponent"), [("rod", 1.5), ("point", 2.0)])
+def test_the_amplitude_law_is_held_at_5_cm(kind: str, exponent: float) -> None:
+    here = np.zeros((1, 3))
+
+    def strength(range_m: float) -> float:
+        reflections = target_reflections((target(range_m, kind=kind),), FORWARD, here)
+        assert reflections.range_m[0, 0] == pytest.approx(range_m)
+        return float(reflections.amplitude[0, 0])
+
+    for range_m in (0.05, 0.06, 1.0):
+        assert strength(range_m) == pytest.approx(0.015 * range_m**-exponent)
+    for range_m in (0.0, 1e-9, 0.01, 0.049):
+        assert strength(range_m) <= strength(0.05)

@@ -118,6 +118,31 @@ def test_one_visit_makes_a_bounded_number_of_frames() -> None:
     assert ticker.taken == FirmwareOutbox.FRAMES_PER_REFILL
 
 
+def test_what_fell_due_more_than_a_second_ago_is_lost() -> None:
+    outbox, ticker = FirmwareOutbox(), Ticker(period_ns=SECOND // 100)
+    outbox.refill_on_time(ticker, 10 * SECOND)
+    assert outbox.frames_lost == 900, "those due before 9 s"
+    assert numbers(outbox, 10 * SECOND)[0] == 900
+
+
+def test_replies_that_nobody_reads_leave_no_room_for_more() -> None:
+    assert filled(50, FRAME).takes_replies, "a reply displaces a frame"
+    assert filled(49, REPLY).takes_replies
+    outbox = filled(50, REPLY)
+    assert not outbox.takes_replies
+    assert outbox.take(0) is not None
+    assert outbox.takes_replies
+
+
+def test_clearing_forgets_everything() -> None:
+    firmware, lossless = filled(3), LosslessOutbox()
+    lossless.put(REPLY, m.Pong(value=1), 0)
+    for outbox in (firmware, lossless):
+        outbox.clear()
+        assert len(outbox) == 0
+        assert outbox.take(0) is None
+
+
 def test_lossless_fetches_only_when_nothing_waits() -> None:
     outbox, ticker = LosslessOutbox(), Ticker(period_ns=SECOND)
     for _ in range(5):
