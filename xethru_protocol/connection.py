@@ -15,7 +15,7 @@ from xethru_protocol.packets import (
     encode_no_escape,
     encode_normal,
 )
-from xethru_protocol.plausibility import FROM_HOST, FROM_MODULE
+from xethru_protocol.plausibility import Direction
 from xethru_protocol.table import ROWS, Command, Message, Response, UnknownMessage
 
 
@@ -50,7 +50,7 @@ class Connection:
     def __init__(self, role: Role) -> None:
         self.role = role
         self._is_host = role is Role.HOST
-        self._reader = PacketReader(FROM_MODULE if self._is_host else FROM_HOST)
+        self._reader = PacketReader(Direction.FROM_MODULE if self._is_host else Direction.FROM_HOST)
         self._next_span = self._reader.next_span
 
     def receive_data(self, data: bytes) -> None:

@@ -40,7 +40,7 @@ from xethru_protocol.packets import (
     unescape,
     xor,
 )
-from xethru_protocol.plausibility import FROM_MODULE, HEAD_BYTES, MAX_LENGTH, plausible
+from xethru_protocol.plausibility import HEAD_BYTES, MAX_LENGTH, Direction, plausible
 
 __all__ = [
     "NEED_DATA",
@@ -103,8 +103,8 @@ class PacketReader:
 
     Parameters
     ----------
-    known_codes
-        First payload bytes that a NoEscape packet may have in this direction.
+    direction
+        Who sends the bytes: it tells which NoEscape headers can be true.
 
     >>> reader = PacketReader()
     >>> reader.receive_data(bytes.fromhex("7D 10 6D 7E"))
@@ -112,8 +112,8 @@ class PacketReader:
     ('10', <NeedData.NEED_DATA: 'need data'>)
     """
 
-    def __init__(self, known_codes: frozenset[int] = FROM_MODULE) -> None:
-        self._known = known_codes
+    def __init__(self, direction: Direction = Direction.FROM_MODULE) -> None:
+        self._direction = direction
         self._buffer = b""  # what is being parsed, from _pos on; never changed in place
         self._pos = 0
         self._base = 0  # stream offset of _buffer[0]; all other positions are stream offsets
@@ -239,7 +239,7 @@ class PacketReader:
             head = min(length, HEAD_BYTES)
             if have < NO_ESCAPE_HEADER_BYTES + head:
                 return self._need(NO_ESCAPE_HEADER_BYTES + head - have)
-            if plausible(length, self._buffer[begin : begin + head], self._known):
+            if plausible(length, self._buffer[begin : begin + head], self._direction):
                 if have < NO_ESCAPE_HEADER_BYTES + length:
                     return self._need(NO_ESCAPE_HEADER_BYTES + length - have)
                 self._pos = begin + length

@@ -6,6 +6,7 @@ same for every receiver, so that it depends on nothing but the bytes (Protocol r
 """
 
 import struct
+from enum import Enum
 
 from xethru_protocol.codes import AppDataId, CommandCode, ElementType, ResponseCode
 
@@ -14,8 +15,18 @@ MAX_LENGTH = 65535
 _VENDOR_LIMIT = 7995  # what the module's own parser can receive
 _COUNT = struct.Struct("<I")
 
-FROM_MODULE = frozenset(int(code) for code in ResponseCode)
-FROM_HOST = frozenset(int(code) for code in CommandCode)
+
+class Direction(Enum):
+    """Which way bytes travel; what a payload may be depends on it."""
+
+    FROM_HOST = "from host"
+    FROM_MODULE = "from module"
+
+
+_KNOWN = {
+    Direction.FROM_HOST: frozenset(int(code) for code in CommandCode),
+    Direction.FROM_MODULE: frozenset(int(code) for code in ResponseCode),
+}
 
 _ELEMENT_BYTES: dict[int, int] = {
     ElementType.XTS_SPRD_BYTE: 1,
@@ -37,7 +48,7 @@ _APPDATA: dict[int, tuple[int, int | None, int]] = {
 
 
 def plausible(  # noqa: PLR0911 - one return per kind of message
-    length: int, head: bytes, known: frozenset[int]
+    length: int, head: bytes, direction: Direction
 ) -> bool:
     """Whether a NoEscape packet may announce ``length`` payload bytes starting with ``head``.
 
@@ -47,24 +58,26 @@ def plausible(  # noqa: PLR0911 - one return per kind of message
         The header's length field.
     head
         The payload's first ``min(length, HEAD_BYTES)`` bytes.
-    known
-        First payload bytes that mean something in this direction.
+    direction
+        Who sent it.
 
-    >>> plausible(18, bytes.fromhex("A0 12 00 00 00 00 2A 00 00 00 01 00 00 00"), FROM_MODULE)
-    True
+    >>> head = bytes.fromhex("A0 12 00 00 00 00 2A 00 00 00 01 00 00 00")
+    >>> plausible(18, head, Direction.FROM_MODULE), plausible(19, head, Direction.FROM_MODULE)
+    (True, False)
     """
-    if not 1 <= length <= MAX_LENGTH or head[0] not in known:
+    if not 1 <= length <= MAX_LENGTH or head[0] not in _KNOWN[direction]:
         return False
     if length < HEAD_BYTES:
         return True
     code = head[0]
+    from_module = direction is Direction.FROM_MODULE
     if code == ResponseCode.XTS_SPR_DATA:
         size = _ELEMENT_BYTES.get(head[1])
         return size is not None and HEAD_BYTES + _count(head, 10) * size == length
-    if code == ResponseCode.XTS_SPR_REPLY and known is FROM_MODULE:
+    if code == ResponseCode.XTS_SPR_REPLY and from_module:
         size = _ELEMENT_BYTES.get(head[1])
-        trailer = head[1] != ElementType.XTS_SPRD_INT
-        return size is not None and HEAD_BYTES + _count(head, 10) * size + trailer == length
+        trailers = (0,) if head[1] == ElementType.XTS_SPRD_INT else (0, 1)  # may be left out
+        return size is not None and length - HEAD_BYTES - _count(head, 10) * size in trailers
     if code == ResponseCode.XTS_SPR_APPDATA:
         layout = _APPDATA.get(_count(head, 1))
         if layout is None:
@@ -74,7 +87,7 @@ def plausible(  # noqa: PLR0911 - one return per kind of message
             return length >= header and (length - header) % size == 0
         return header + _count(head, count_at) * size == length
     # The rest is a few bytes long and never sent this way by a real module or host.
-    return length <= (HEAD_BYTES if known is FROM_MODULE else _VENDOR_LIMIT)
+    return length <= (HEAD_BYTES if from_module else _VENDOR_LIMIT)
 
 
 def _count(head: bytes, offset: int) -> int:

@@ -21,7 +21,7 @@ from xethru_protocol.framing import (
     PacketReader,
 )
 from xethru_protocol.messages import Message, UnknownMessage, X4DriverSet
-from xethru_protocol.plausibility import FROM_HOST, FROM_MODULE
+from xethru_protocol.plausibility import Direction
 
 VECTORS = load()
 BY_NAME = {vector.name: vector for vector in VECTORS}
@@ -39,7 +39,7 @@ ABOUT = {
 
 
 def packets_of(vector: Vector, chunk: int = 1 << 20) -> list[Packet | FramingFault]:
-    reader = PacketReader(FROM_HOST if vector.from_host else FROM_MODULE)
+    reader = PacketReader(Direction.FROM_HOST if vector.from_host else Direction.FROM_MODULE)
     found: list[Packet | FramingFault] = []
     for begin in range(0, len(vector.wire), chunk):
         reader.receive_data(vector.wire[begin : begin + chunk])

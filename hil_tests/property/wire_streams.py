@@ -92,13 +92,17 @@ _NASTY = st.sampled_from([0x7C, 0x7D, 0x7E, 0x7F, 0x00, 0x01, 0x0E, 0x10, 0x12, 
 def packets(draw: st.DrawFn) -> bytes:
     """Draw an intact packet that a receiver on the host side accepts."""
     payload = bytes(draw(st.lists(_NASTY | _SCALARS["B"], min_size=1, max_size=24)))
-    kind = draw(st.sampled_from(["normal", "short", "frame"]))
+    kind = draw(st.sampled_from(["normal", "short", "reply", "frame"]))
     if kind == "normal":
         return encode_normal(payload)
     if kind == "short":
         return encode_no_escape(
             bytes([draw(st.sampled_from([0x01, 0x10, 0x20, 0x30]))]) + payload[:9]
         )
+    if kind == "reply":  # of bytes, with or without trailer
+        trailer = draw(st.sampled_from([b"", b"\x01"]))
+        header = b"\x11\x10" + bytes(8) + len(payload).to_bytes(4, "little")
+        return encode_no_escape(header + payload + trailer)
     samples = payload[: len(payload) & ~3]
     header = b"\xa0\x12" + bytes(8) + (len(samples) // 4).to_bytes(4, "little")
     return encode_no_escape(header + samples)
@@ -190,8 +194,12 @@ def _plausible(length: int, payload: bytes) -> bool:  # noqa: PLR0911 - one retu
     if payload[0] == 0xA0:
         return payload[1] in sizes and 14 + count * sizes[payload[1]] == length
     if payload[0] == 0x11:
-        trailer = payload[1] != 0x11
-        return payload[1] in sizes and 14 + count * sizes[payload[1]] + trailer == length
+        if payload[1] not in sizes:
+            return False
+        # Protocol reference 5.2: 14 bytes, the elements, a trailer byte unless the elements are
+        # INT; "accept with or without trailer"
+        elements_end = 14 + count * sizes[payload[1]]
+        return length == elements_end or (length == elements_end + 1 and payload[1] != 0x11)
     if payload[0] == 0x50:
         kind = int.from_bytes(payload[1:5], "little")
         bins = int.from_bytes(payload[9:13], "little")

@@ -13,7 +13,7 @@ from xethru_protocol.errors import LocalProtocolError, XeThruError
 from xethru_protocol.framing import PacketReader
 from xethru_protocol.messages import Message, Pong, UnknownMessage
 from xethru_protocol.packets import Framing, FramingFault, Packet
-from xethru_protocol.plausibility import FROM_HOST, FROM_MODULE
+from xethru_protocol.plausibility import Direction
 from xethru_protocol.wire import hex_bytes
 
 _CHUNK_BYTES = 65536
@@ -68,7 +68,7 @@ def _explains(message: Message, payload: bytes) -> bool:
 
 
 def _print_all(chunks: Iterator[bytes], sender: str) -> None:
-    reader = PacketReader(FROM_HOST if sender == "host" else FROM_MODULE)
+    reader = PacketReader(Direction.FROM_HOST if sender == "host" else Direction.FROM_MODULE)
     for chunk in chunks:
         reader.receive_data(chunk)
         _print_packets(reader, sender)
