@@ -65,7 +65,7 @@ def _emulated_ports(folder: Path) -> Iterator[PortInfo]:
             devices = [
                 (str(one["path"]), str(one["name"]), one["serial"]) for one in word["devices"]
             ]
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, OverflowError):
             continue  # not an emulator's word, or one that is just being written
         for path, name, serial in devices:
             if Path(path).exists():
@@ -75,6 +75,8 @@ def _emulated_ports(folder: Path) -> Iterator[PortInfo]:
 
 
 def _is_running(pid: int) -> bool:
+    if pid <= 0:  # kill() would mean groups of processes
+        return False
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

@@ -1,6 +1,7 @@
 """Arguments of ``xethru``. Importing this loads nothing that a command needs."""
 
 import argparse
+import math
 from collections.abc import Callable, Sequence
 
 _FROM = ("auto", "host", "module")
@@ -40,12 +41,12 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     one.add_argument(
         "--frame-area",
         nargs=2,
-        type=float,
+        type=_metres,
         default=(0.2, 9.4),
         metavar=("START", "END"),
         help="range to read, in module metres (default 0.2 9.4)",
     )
-    one.add_argument("--fps", type=_positive, default=17.0, help="frames per second (default 17)")
+    one.add_argument("--fps", type=_frame_rate, default=17.0, help="frames per second (default 17)")
     one.add_argument(
         "--baseband", action="store_true", help="complex baseband bins instead of RF bins"
     )
@@ -100,17 +101,34 @@ def _add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
-def _positive(text: str) -> float:
-    value = float(text)
+def _frame_rate(text: str) -> float:
+    value = _number(text)
     if not 0 < value < 65536:
-        raise argparse.ArgumentTypeError(f"{text} is not between 0 and 65536")
+        raise argparse.ArgumentTypeError(f"{text!r} must be a number between 0 and 65536")
     return value
 
 
+def _metres(text: str) -> float:
+    value = _number(text)
+    if not -1000 <= value <= 1000:
+        raise argparse.ArgumentTypeError(f"{text!r} must be metres between -1000 and 1000")
+    return value
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan  # in no range: the caller says what is allowed
+
+
 def _at_least_one(text: str) -> int:
-    value = int(text)
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
     if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is less than 1")
+        raise argparse.ArgumentTypeError(f"{text!r} must be a whole number from 1 on")
     return value
 
 

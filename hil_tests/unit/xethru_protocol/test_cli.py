@@ -130,6 +130,8 @@ def test_missing_port_is_one_clear_line(
         ["stream", "--port", "p", "--fps", "0"],
         ["stream", "--port", "p", "--count", "0"],
         ["stream", "--port", "p", "--frame-area", "5", "1"],
+        ["stream", "--port", "p", "--frame-area", "nan", "1"],
+        ["stream", "--port", "p", "--frame-area", "1", "inf"],
         ["decode", "--from", "nobody"],
     ],
 )
@@ -138,6 +140,28 @@ def test_wrong_usage_exits_with_2(arguments: list[str], capsys: pytest.CaptureFi
         main(arguments)
     assert caught.value.code == 2
     assert "usage: xethru" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("option", "values", "message"),
+    [
+        ("--fps", ["fast"], "argument --fps: 'fast' must be a number between 0 and 65536"),
+        ("--fps", ["nan"], "argument --fps: 'nan' must be a number between 0 and 65536"),
+        ("--count", ["2.5"], "argument --count: '2.5' must be a whole number from 1 on"),
+        ("--count", ["0"], "argument --count: '0' must be a whole number from 1 on"),
+        (
+            "--frame-area",
+            ["near", "1"],
+            "argument --frame-area: 'near' must be metres between -1000 and 1000",
+        ),
+    ],
+)
+def test_wrong_values_say_what_is_allowed(
+    option: str, values: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["stream", "--port", "p", option, *values])
+    assert capsys.readouterr().err.endswith(f"xethru stream: error: {message}\n")
 
 
 def test_list_shows_running_emulators_only(
@@ -154,6 +178,9 @@ def test_list_shows_running_emulators_only(
     (folder / "1.json").write_text(json.dumps(running))
     (folder / "2.json").write_text(json.dumps(running | {"pid": 1 << 22}))  # above any pid
     (folder / "3.json").write_text("{")
+    for number, pid in enumerate(["1e999", str(1 << 70), "-1", "0"], start=4):
+        word = json.dumps(running | {"pid": "PID"}).replace('"PID"', pid)
+        (folder / f"{number}.json").write_text(word)
     assert main(["list", "--json"]) == 0
     (found,) = lines_of(capsys)
     assert [port for port in found["ports"] if port["kind"] == "emulated"] == [
