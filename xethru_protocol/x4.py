@@ -22,7 +22,6 @@ BASEBAND_DISCARDED_LINES = 4  # filter fill at the start of a downconverted fram
 COMMON_PLL_HZ = 243e6
 DEFAULT_PRF_DIV = 16
 DEFAULT_OFFSET_M = 0.18  # frame area offset the firmware sets for the X4M300 board
-CARRIER_HZ = {3: 7.290e9, 4: 8.748e9}  # by TXCENTERFREQUENCY
 FULL_AREA_M = (0.0, 9.8765432)  # requested area after INIT
 
 _MAX_LENGTH_M = (float(np.float32(9.8765432)), float(np.float32(9.6707819)))
@@ -105,11 +104,11 @@ def frame_area(
     if end - start > longest:
         end = _f32(start + longest)
 
-    discarded, decimation = (
-        (BASEBAND_DISCARDED_LINES, BASEBAND_DECIMATION) if downconversion else (0, 1)
-    )
+    discarded, decimation, bin_m = 0, 1, RF_BIN_M
+    if downconversion:
+        discarded, decimation = BASEBAND_DISCARDED_LINES, BASEBAND_DECIMATION
+        bin_m = BASEBAND_BIN_M
     lines = FRAME_SAMPLES // decimation
-    bin_m = decimation * 1.5e8 / SAMPLING_RATE_HZ
     delay_steps = max(math.floor((start - offset) / COARSE_STEP_M), -1)
     base = delay_steps * COARSE_STEP_M + offset
     first_m = max(start, base)
@@ -162,12 +161,14 @@ def frame_rate_read_back(requested_hz: float) -> float:
 
 
 def frame_time_ns(counter: int, rate_hz: float) -> int:
-    """Time of frame ``counter`` after frame 0 at a constant rate, rounded to ns.
+    """Time of frame ``counter`` after frame 0 at a constant rate: the nearest ns, exactly.
 
     >>> frame_time_ns(5, 2.0)
     2500000000
     """
-    return round(counter * 1e9 / rate_hz)
+    frames, seconds = rate_hz.as_integer_ratio()
+    whole, rest = divmod(counter * 1_000_000_000 * seconds, frames)
+    return whole + (2 * rest + whole % 2 > frames)
 
 
 def fps_max(
