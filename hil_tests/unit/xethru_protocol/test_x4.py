@@ -1,6 +1,6 @@
 """X4 arithmetic against the tables of the Protocol reference, section 9."""
 
-import math
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -64,6 +64,21 @@ def test_read_back_has_the_float32_values_of_the_vectors(
 def test_equal_limits_give_the_bins_of_the_reference() -> None:
     assert x4.frame_area(1.0, 1.0).n_bins in (0, 1)
     assert x4.frame_area(1.0, 1.0, downconversion=True).n_bins in (1, 2)
+
+
+@pytest.mark.parametrize(("start", "steps"), [(160.0, 2), (0.2, 0), (-3.0, -1)])
+def test_receive_delay_is_one_byte(start: float, steps: int) -> None:
+    """9.4 step 4: (1 + max(floor((start - 0.18) / 0.6172839506), -1)) mod 256."""
+    assert x4.frame_area(start, start + 5).rx_wait == steps + 1
+
+
+def test_limit_that_is_a_bin_but_for_rounding_is_that_bin() -> None:
+    """9.4 steps 7 and 8: float32(3.325) lies 7e-6 of a bin behind a bin.
+
+    base is 0.2 + 0.6172839506; (0.94 - base) / 0.006430041 = 19.08, (3.325 - base) / 0.006430041
+    = 390.000007: 390 - 19 = 371 bins.
+    """
+    assert x4.frame_area(0.94, 3.325, 0.2).n_bins == 371
 
 
 def test_inverted_area_is_refused() -> None:
@@ -198,5 +213,4 @@ def test_bin_lengths_are_those_of_the_reference() -> None:
 
 @given(st.integers(0, 1 << 32), st.floats(1, 400))
 def test_frame_time_is_the_nearest_nanosecond(counter: int, rate: float) -> None:
-    exact = counter / rate * 1e9
-    assert math.isclose(x4.frame_time_ns(counter, rate), exact, rel_tol=1e-15, abs_tol=1)
+    assert x4.frame_time_ns(counter, rate) == round(Fraction(counter) * 10**9 / Fraction(rate))
