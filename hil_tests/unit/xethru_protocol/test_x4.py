@@ -214,3 +214,10 @@ def test_bin_lengths_are_those_of_the_reference() -> None:
 @given(st.integers(0, 1 << 32), st.floats(1, 400))
 def test_frame_time_is_the_nearest_nanosecond(counter: int, rate: float) -> None:
     assert x4.frame_time_ns(counter, rate) == round(Fraction(counter) * 10**9 / Fraction(rate))
+
+
+@pytest.mark.parametrize(("counter", "even"), [(1, 0), (3, 2), (5, 2), (7, 4)])
+def test_frame_time_in_the_middle_of_two_nanoseconds_is_the_even_one(
+    counter: int, even: int
+) -> None:
+    assert x4.frame_time_ns(counter, 2e9) == even
