@@ -72,7 +72,11 @@ def test_logging_1024_frames(benchmark: BenchmarkFixture, tmp_path: Path, kind: 
 
     def log() -> None:
         observer = (
-            SessionLog(tmp_path / "s.mcap", session_info())
+            SessionLog(
+                tmp_path / "s.mcap",
+                session_info(),
+                OdometryTrack((TumSample(t_ns=0, x_m=0.0, y_m=0.0, qz=0.0, qw=1.0),)),
+            )
             if kind == "mcap"
             else RerunView(tmp_path / "s.rrd", session_info(), simulated=True)
         )

@@ -177,14 +177,10 @@ def test_the_emulator_freezes(tmp_path: Path) -> None:
     with running_demo(out, tmp_path / "tmp") as demo:
         (emulator,) = children(demo.pid)
         os.kill(emulator, signal.SIGSTOP)
-        started = time.monotonic()
         _, stderr = demo.communicate(timeout=60)
-        waited_s = time.monotonic() - started
     assert demo.returncode == 1
     last = stderr.splitlines()[-1]
     assert last.startswith("uwb-slam: radar ")
     assert "no frame for 5 s after frame" in last
-    # 5 s of silence and 3 s for the emulator to end, but nothing for its four drivers
-    assert waited_s < 13
     assert is_gone(emulator)
     assert len(finished_counters(out / "session.mcap")) > 100

@@ -98,9 +98,8 @@ def run_demo(options: DemoOptions, stop: StopFlag) -> None:
             versions=versions(),
         )
         observers: list[SessionObserver] = [link_log]
-        log = SessionLog(options.out / "session.mcap", info)
+        log = SessionLog(options.out / "session.mcap", info, odometry)
         stack.callback(log.close)
-        log.write_odometry(odometry)
         view = RerunView(options.out / "session.rrd", info, simulated=True)
         stack.callback(view.close)
         progress = Progress(info, trajectory.duration_ns, lambda: source.lost_frames)

@@ -57,6 +57,7 @@ class SessionLog:
         self,
         path: Path,
         info: SessionInfo,
+        odometry: OdometryTrack,
         *,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
@@ -69,6 +70,8 @@ class SessionLog:
         self._writer.start(profile="ros2", library="xethru-hil")
         self._pending_bytes = 0
         self._chunk_started_ns = clock_ns()
+        self._samples = iter(odometry.samples)
+        self._odometry_ns = -1  # of the newest sample written
         self._schemas: dict[str, int] = {}
         self._frame_channels: list[int] = []
         self._writer.add_metadata(
@@ -103,13 +106,11 @@ class SessionLog:
         self._write(self._static_transforms, 0, ros.transforms(0, self._placements))
         self._cut_chunk()
 
-    def write_odometry(self, track: OdometryTrack) -> None:
-        """Write every sample of an odometry source."""
-        for sample in track.samples:
-            self._write(self._odometry, sample.t_ns, ros.odometry(sample))
-
     def on_scan(self, scan: Scan) -> None:
-        """Write the frames of one counter."""
+        """Write the frames of one counter, and the odometry that its pose is interpolated from."""
+        while self._odometry_ns < scan.t_ns and (sample := next(self._samples, None)) is not None:
+            self._write(self._odometry, sample.t_ns, ros.odometry(sample))
+            self._odometry_ns = sample.t_ns
         for frame in scan.frames:
             self._write(
                 self._frame_channels[frame.radar],

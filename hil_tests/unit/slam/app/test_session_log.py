@@ -30,8 +30,7 @@ N_SCANS = 300
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("log") / "session.mcap"
-    log = SessionLog(path, session_info())
-    log.write_odometry(odometry())
+    log = SessionLog(path, session_info(), odometry())
     feed(log, N_SCANS)
     log.close()
     return path
@@ -68,6 +67,17 @@ def test_counters_stamps_and_samples_come_back_identical(finished: Path) -> None
 def test_odometry_comes_back_as_the_same_floats(finished: Path) -> None:
     samples = tuple(ros.odometry_sample(row[2]) for row in messages(finished, "/odom"))
     assert samples == odometry().samples
+
+
+def test_odometry_is_written_as_far_as_the_scans_need_it(tmp_path: Path) -> None:
+    path = tmp_path / "session.mcap"
+    log = SessionLog(path, session_info(), odometry())
+    feed(log, 4)
+    log.close()
+    last_scan_ns = scan(3).t_ns
+    stamps = [t_ns for _, t_ns, _ in messages(path, "/odom")]
+    # up to the sample that closes the last interval, and nothing of the future beyond it
+    assert stamps[-2] < last_scan_ns <= stamps[-1]
 
 
 def test_states_landmarks_and_their_covariance_come_back(finished: Path) -> None:
@@ -132,7 +142,7 @@ def test_transforms_chain_to_the_estimate(finished: Path) -> None:
 
 def test_the_newest_static_message_holds_every_static_transform(tmp_path: Path) -> None:
     path = tmp_path / "s.mcap"
-    log = SessionLog(path, session_info())
+    log = SessionLog(path, session_info(), odometry())
     place = np.array([3.0, -2.0, 0.7])
     for counter in range(3):
         log.on_snapshot(dataclasses.replace(snapshot(counter), world_from_map=place))
@@ -199,7 +209,7 @@ def test_chunks_stay_below_the_limit(finished: Path) -> None:
 def test_a_chunk_is_cut_after_a_second_even_if_small(tmp_path: Path) -> None:
     now = [0]
     path = tmp_path / "s.mcap"
-    log = SessionLog(path, session_info(), clock_ns=lambda: now[0])
+    log = SessionLog(path, session_info(), odometry(), clock_ns=lambda: now[0])
     before = path.stat().st_size
     log.on_scan(scan(0))
     assert path.stat().st_size == before
@@ -211,7 +221,7 @@ def test_a_chunk_is_cut_after_a_second_even_if_small(tmp_path: Path) -> None:
 
 def test_a_file_that_was_never_finished_lacks_its_last_chunk_only(tmp_path: Path) -> None:
     path = tmp_path / "s.mcap"
-    log = SessionLog(path, session_info(), clock_ns=lambda: 0)
+    log = SessionLog(path, session_info(), odometry(), clock_ns=lambda: 0)
     feed(log, N_SCANS)
     survived = tmp_path / "survived.mcap"
     survived.write_bytes(path.read_bytes())
@@ -234,7 +244,7 @@ def test_a_file_cut_anywhere_is_readable_up_to_the_cut(
 
 
 def test_closing_twice_is_harmless(tmp_path: Path) -> None:
-    log = SessionLog(tmp_path / "s.mcap", session_info())
+    log = SessionLog(tmp_path / "s.mcap", session_info(), odometry())
     log.close()
     size = (tmp_path / "s.mcap").stat().st_size
     log.close()
