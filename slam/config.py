@@ -11,7 +11,7 @@ import math
 import tomllib
 from collections.abc import Mapping
 from enum import StrEnum
-from importlib import resources
+from pathlib import Path
 from typing import Annotated, Any, Self
 
 from pydantic import (
@@ -250,6 +250,11 @@ class SlamConfig(_Model):
     association: AssociationConfig = AssociationConfig()
 
 
+# Beside this package, in the repository and in the wheel alike; a folder named "fixtures" in the
+# user's own project must not come first, as it would by that name.
+_SHIPPED_PRESETS = Path(__file__).parent.parent / "fixtures" / "presets"
+
+
 def load_preset(name: str, environment: str = BASE_ENVIRONMENT) -> SlamConfig:
     """Return the preset ``fixtures/presets/<name>.toml`` for one environment.
 
@@ -258,13 +263,10 @@ def load_preset(name: str, environment: str = BASE_ENVIRONMENT) -> SlamConfig:
     ConfigError
         Unknown preset or environment, unreadable file, unknown key or value out of range.
     """
-    folder = resources.files("fixtures") / "presets"
-    known = sorted(
-        file.name.removesuffix(".toml") for file in folder.iterdir() if file.name.endswith(".toml")
-    )
+    known = sorted(file.stem for file in _SHIPPED_PRESETS.glob("*.toml"))
     if name not in known:
         raise ConfigError(f"unknown preset {name!r}; known: {', '.join(known)}")
-    file = folder / f"{name}.toml"
+    file = _SHIPPED_PRESETS / f"{name}.toml"
     source = f"preset {name}.toml"
     try:
         tables = tomllib.loads(file.read_text(encoding="utf-8"))

@@ -4,10 +4,10 @@ The tables here are written by hand from the vectors' own vocabulary; nothing in
 by the codec under test.
 """
 
-import importlib.resources
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,8 @@ from xethru_protocol import messages as m
 from xethru_protocol.codes import X4Setting
 
 Fields = dict[str, Any]
+
+FIXTURES = Path(__file__).parents[2] / "fixtures"
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +49,7 @@ class Vector:
 
 def load() -> tuple[Vector, ...]:
     """All vectors, in the file's order."""
-    text = (importlib.resources.files("fixtures") / "wire/protocol_vectors.json").read_text("utf-8")
+    text = (FIXTURES / "wire" / "protocol_vectors.json").read_text("utf-8")
     return tuple(
         Vector(
             entry["name"],

@@ -1,7 +1,6 @@
 """A recording whose last record is cut plays all the others, and says so."""
 
 import shutil
-from importlib.resources import as_file, files
 from pathlib import Path
 
 import pytest
@@ -9,6 +8,7 @@ import pytest
 from emulator.identity import Identity
 from emulator.loopback import LoopbackTransport
 from emulator.playback import RecordingError, recording_device
+from hil_tests.golden.vectors import FIXTURES
 from xethru_protocol.driver import X4M300
 from xethru_protocol.errors import ResponseTimeout
 from xethru_protocol.recordings import RecordingFault
@@ -17,8 +17,7 @@ IDENTITY = Identity(serial="123456789012")
 
 
 def copy_of_the_vendors_recording(folder: Path) -> Path:
-    with as_file(files("fixtures") / "recordings" / "iq") as source:
-        return Path(shutil.copytree(source, folder / "recording"))
+    return Path(shutil.copytree(FIXTURES / "recordings" / "iq", folder / "recording"))
 
 
 def counters_played(recording: Path, faults: list[RecordingFault]) -> list[int]:
