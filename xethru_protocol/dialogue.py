@@ -187,10 +187,16 @@ class Dialogue:
         self.stray_count += len(self._answers)
         self._answers.clear()
 
-    def silence(self, what: str, timeout_s: float) -> ResponseTimeout:
+    def silence(
+        self,
+        what: str,
+        timeout_s: float,
+        likely: str = "is it an X4M300, powered and not in its bootloader?",
+    ) -> ResponseTimeout:
         """Error for something that did not come, with the likeliest reason and remedy.
 
         Judged by what came since the last frame or answer: what was before that explains nothing.
+        ``likely`` is said when nothing came at all.
         """
         missing = f"no {what} from {self._transport.name} within {timeout_s:g} s"
         if self._rebooted_since:
@@ -200,7 +206,7 @@ class Dialogue:
                 f"{missing}, but bytes that are no XeThru packets; "
                 "is it another device, or another baud rate?"
             )
-        return ResponseTimeout(f"{missing}; is it an X4M300, powered and not in its bootloader?")
+        return ResponseTimeout(f"{missing}; {likely}")
 
     def tell(self, direction: Literal["tx", "rx", "fault", "warning"], text: str) -> None:
         """Tell the observer."""

@@ -280,8 +280,9 @@ class X4M300:
             raise LocalProtocolError(f"a frame rate must be positive, not {fps}; stop() stops")
         if self._config is not None and fps > self._config.fps_max:
             self._warn(
-                f"{fps:g} frames/s exceed the {self._config.fps_max:.1f} that these settings "
-                "allow; lower the rate, iterations or pulses per step"
+                f"{fps:g} frames/s are more than the {self._config.fps_max:.1f} that "
+                f"{self._config.iterations} iterations x {self._config.pulses_per_step} pulses "
+                "leave time for; a real module may not keep up"
             )
         self._dialogue.take_stale_input()
         self._frames.new_stream()  # a late frame of the last stream would make a false gap
@@ -315,7 +316,7 @@ class X4M300:
             while not self._frames:
                 left_ns = deadline - self._clock()
                 if left_ns <= 0:
-                    raise self._dialogue.silence("frame", timeout_s)
+                    raise self._no_frame(timeout_s)
                 self._dialogue.pump(left_ns * 1e-9)
         return self._frames.pop()
 
@@ -327,6 +328,14 @@ class X4M300:
                 count -= 1
 
     # --- inside ---------------------------------------------------------------------------------
+
+    def _no_frame(self, timeout_s: float) -> ResponseTimeout:
+        last = self._frames.last_counter
+        if last is None:
+            return self._dialogue.silence("frame", timeout_s)
+        return self._dialogue.silence(
+            f"frame after frame {last}", timeout_s, "did the module stop, or its recording end?"
+        )
 
     def _wait_until_ready(self) -> None:
         deadline = self._clock() + round(_SLOW_TIMEOUT_S * 1e9)

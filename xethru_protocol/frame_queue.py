@@ -20,6 +20,8 @@ class FrameQueue:
         Frames missing by the counters of those that came.
     discarded
         Data messages that are no frame of this geometry.
+    last_counter
+        Counter of the newest frame of this stream; None before the first.
     """
 
     def __init__(self) -> None:
@@ -27,7 +29,7 @@ class FrameQueue:
         self.lost = 0
         self.discarded = 0
         self._frames: deque[Frame] = deque()
-        self._last_counter: int | None = None
+        self.last_counter: int | None = None
         self._baseband_geometry: FrameGeometry | None = None
 
     def __len__(self) -> int:
@@ -41,7 +43,7 @@ class FrameQueue:
     def new_stream(self) -> None:
         """Forget the frames that wait and their counters: what comes now follows on nothing."""
         self._frames.clear()
-        self._last_counter = None
+        self.last_counter = None
 
     def take(self, message: FrameMessage, arrival_ns: int) -> None:
         """Queue a message's frame, or count the message as discarded."""
@@ -72,11 +74,11 @@ class FrameQueue:
     def _queue(
         self, counter: int, samples: Samples, geometry: FrameGeometry, arrival_ns: int
     ) -> None:
-        if self._last_counter is not None:
-            missing = (counter - self._last_counter - 1) % _COUNTER_WRAP
+        if self.last_counter is not None:
+            missing = (counter - self.last_counter - 1) % _COUNTER_WRAP
             if missing < _COUNTER_WRAP // 2:  # else it went back: the chip was restarted
                 self.lost += missing
-        self._last_counter = counter
+        self.last_counter = counter
         self._frames.append(
             Frame(counter=counter, samples=samples, geometry=geometry, arrival_ns=arrival_ns)
         )

@@ -23,7 +23,6 @@ COMMON_PLL_HZ = 243e6
 DEFAULT_PRF_DIV = 16
 DEFAULT_OFFSET_M = 0.18  # frame area offset the firmware sets for the X4M300 board
 CARRIER_HZ = {3: 7.290e9, 4: 8.748e9}  # by TXCENTERFREQUENCY
-CARRIER_HZ = {3: 7.290e9, 4: 8.748e9}  # by TXCENTERFREQUENCY
 FULL_AREA_M = (0.0, 9.8765432)  # requested area after INIT
 
 _MAX_LENGTH_M = (float(np.float32(9.8765432)), float(np.float32(9.6707819)))

@@ -39,7 +39,7 @@ def stream(
                         live.show(frame)
             finally:
                 if live is not None:
-                    warn("")  # leave the live line as it is
+                    live.finish()
                 if radar.frames_lost or radar.fault_count:
                     warn(
                         f"xethru stream: {radar.frames_lost} frames lost, "
@@ -73,15 +73,25 @@ class _Live:
         self._radar = radar
         self._shown_ns = 0
         self._frames = 0
+        self._newest: Frame | None = None
         self._began_ns = time.monotonic_ns()
 
     def show(self, frame: Frame) -> None:
         """Count a frame, and say so a few times a second."""
         self._frames += 1
+        self._newest = frame
         now_ns = time.monotonic_ns()
-        if now_ns - self._shown_ns < _REFRESH_NS:
-            return
-        self._shown_ns = now_ns
+        if now_ns - self._shown_ns >= _REFRESH_NS:
+            self._shown_ns = now_ns
+            self._write(frame, now_ns)
+
+    def finish(self) -> None:
+        """Bring the line up to date and leave it."""
+        if self._newest is not None:
+            self._write(self._newest, time.monotonic_ns())
+        warn("")
+
+    def _write(self, frame: Frame, now_ns: int) -> None:
         geometry = frame.geometry
         strongest = int(np.argmax(np.abs(frame.samples)))
         rate = self._frames / max((now_ns - self._began_ns) * 1e-9, 1e-3)

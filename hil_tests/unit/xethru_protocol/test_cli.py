@@ -57,7 +57,7 @@ def test_rate_above_the_possible_is_a_warning(
     module: PtyModule, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["stream", "--port", module.path, "--count", "1", "--fps", "30"]) == 0
-    assert "exceed the 19.8" in capsys.readouterr().err
+    assert "more than the 19.8" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
