@@ -39,7 +39,7 @@ def table_text(summary: Summary, *, lag_states: int, wall_s: float, lost_frames:
         ("final error", mm_text(summary.final_error_m), "at the last state, not aligned"),
         (
             "landmarks",
-            f"{landmarks.estimated} of {landmarks.true}",
+            f"{landmarks.estimated} for {landmarks.true} true",
             f"precision {share_text(landmarks.precision)}, recall {share_text(landmarks.recall)}, "
             f"{landmarks.duplicates} duplicates, rmse {mm_text(landmarks.rmse_m)}",
         ),
