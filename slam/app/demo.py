@@ -102,6 +102,7 @@ def run_demo(options: DemoOptions, stop: StopFlag) -> None:
         stack.callback(log.close)
         view = RerunView(options.out / "session.rrd", info, simulated=True)
         stack.callback(view.close)
+        stack.callback(log.close)  # first: the record must not wait for the view
         progress = Progress(info, trajectory.duration_ns, lambda: source.lost_frames)
         stack.callback(progress.close)
         observers += [log, view, progress]

@@ -60,7 +60,8 @@ class EmulatorProcess:
         """Start the process; its ports are there after `wait_until_ready`."""
         with self._cleanup:
             self._errors: IO[bytes] = self._cleanup.enter_context(tempfile.TemporaryFile())
-            command = [sys.executable, "-m", "emulator.cli", "serve", self._scene]
+            # -P: a folder "emulator" where the user happens to stand must not come first
+            command = [sys.executable, "-P", "-m", "emulator.cli", "serve", self._scene]
             command += ["--pace", "asap", "--seed", str(self._seed)]
             self._process = subprocess.Popen(
                 command,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 import time
 from collections.abc import Callable
@@ -92,7 +93,10 @@ class Progress:
 
     def _show(self) -> None:
         self._shown = self._clock()
-        self._write(self.line() + ("" if self._is_terminal else "\n"))
+        if self._is_terminal:  # erasing reaches one row only, so the line must not wrap
+            self._write(self.line()[: shutil.get_terminal_size().columns - 1])
+        else:
+            self._write(f"{self.line()}\n")
 
     def _write(self, text: str) -> None:
         # Carriage return and erase: the live line stays one line.

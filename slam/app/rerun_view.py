@@ -12,6 +12,7 @@ import json
 from collections import defaultdict
 from dataclasses import asdict
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pyarrow as pa
@@ -37,6 +38,7 @@ _MAP_MARGIN_M = 0.6
 _ARROW_M = 0.25
 
 _TRUTH_RGB = (120, 120, 120)
+_CLOSE_LIMIT_S = 20.0
 _ODOMETRY_RGB = (230, 130, 30)
 _ESTIMATE_RGB = (40, 120, 220)
 _LANDMARK_RGB = (200, 40, 90)
@@ -152,9 +154,17 @@ class RerunView:
             self._send_landmarks(last)
             self._send_paths(last)
             self._send_snapshots()
-        self._stream.disconnect()
-        self._stream = None
-        found = count_rows(self._path)
+        stream, self._stream = self._stream, None
+        # On a full disk Rerun's writer is gone and disconnect may wait for it without end.
+        closing = Thread(target=stream.disconnect, daemon=True)
+        closing.start()
+        closing.join(_CLOSE_LIMIT_S)
+        if closing.is_alive():
+            raise AppError(f"{self._path}: cannot be finished; is the disk full?")
+        try:
+            found = count_rows(self._path)
+        except RuntimeError:  # Rerun's own errors about a damaged file
+            raise AppError(f"{self._path}: is incomplete; is the disk full?") from None
         for entity, sent in self._sent.items():
             if found.get(entity, 0) != sent:
                 raise AppError(

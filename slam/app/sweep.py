@@ -7,7 +7,7 @@ import signal
 import statistics
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from itertools import product
@@ -28,7 +28,7 @@ from slam.app.emulated_rig import (
     scene_and_config,
     true_landmarks_m,
 )
-from slam.app.errors import AppError
+from slam.app.errors import AppError, UsageError
 from slam.app.evaluation import summarise
 from slam.app.odometry import OdometryTrack
 from slam.app.report_table import mm_text, share_text
@@ -104,8 +104,13 @@ def run_sweep(options: SweepOptions, stop: StopFlag) -> None:
     StopRequestedError
         A signal arrived; OUT.part stays if it holds a run.
     """
-    for scene, preset in product(options.scenes, options.presets):
-        scene_and_config(scene, preset)  # a wrong name ends the command before any run
+    names = {
+        # a wrong name ends the command before any run
+        scene_and_config(scene, preset)[0].name
+        for scene, preset in product(options.scenes, options.presets)
+    }
+    if len(names) < len(options.scenes):
+        raise UsageError("--scene: two of the scenes have the same name; give each its own")
     part = options.out.with_name(f"{options.out.name}.part")
     if options.out.is_dir():
         raise AppError(f"{options.out}: is a folder, must be a file")
@@ -210,7 +215,7 @@ def _median_of_known(values: Sequence[float | None]) -> float | None:
     return statistics.median(known) if known else None
 
 
-def _results(cells: Iterable[tuple[str, str, int]], jobs: int, stop: StopFlag) -> Iterator[Summary]:
+def _results(cells: Sequence[tuple[str, str, int]], jobs: int, stop: StopFlag) -> Iterator[Summary]:
     """Run cells one after the other or on worker processes; results in the order of the cells."""
     if jobs == 1:
         for cell in cells:
@@ -218,7 +223,7 @@ def _results(cells: Iterable[tuple[str, str, int]], jobs: int, stop: StopFlag) -
         return
     tasks = (joblib.delayed(run_one)(*cell) for cell in cells)
     with _without_sigint():
-        results = joblib.Parallel(n_jobs=jobs, return_as="generator")(tasks)
+        results = joblib.Parallel(n_jobs=min(jobs, len(cells)), return_as="generator")(tasks)
     try:
         while True:
             # Nothing is half-written while we wait, so a signal may end the waiting at once.

@@ -74,4 +74,4 @@ def test_the_arguments_are_those_of_the_emulators_command_line(
     fake_emulator.write_text(f'#!/bin/sh\necho "$@" > {said}\n')
     with EmulatorProcess("scene.toml", 42) as emulator, pytest.raises(EmulatorError):
         emulator.wait_until_ready(never)
-    assert said.read_text() == "-m emulator.cli serve scene.toml --pace asap --seed 42\n"
+    assert said.read_text() == "-P -m emulator.cli serve scene.toml --pace asap --seed 42\n"
