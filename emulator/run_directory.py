@@ -16,7 +16,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from xethru_protocol.ports import run_directory
+from xethru_protocol.ports import is_running, run_directory
 
 __all__ = ["Announcement", "fresh_port_folder"]
 
@@ -77,12 +77,5 @@ def _remove_stale(folder: Path) -> None:
 
 
 def _is_dead(pid: str) -> bool:
-    if not pid.isdigit():
-        return False  # not ours: leave it alone
-    try:
-        os.kill(int(pid), 0)
-    except ProcessLookupError:
-        return True
-    except (PermissionError, OverflowError):
-        return False
-    return False
+    # What bears no process number is not ours: leave it alone.
+    return pid.isdigit() and not is_running(int(pid))

@@ -60,7 +60,7 @@ def _emulated_ports(folder: Path) -> Iterator[PortInfo]:
     for entry in sorted(folder.glob("*.json")):
         try:
             word: dict[str, Any] = json.loads(entry.read_text())
-            if not _is_running(int(word["pid"])):
+            if not is_running(int(word["pid"])):
                 continue
             devices = [
                 (str(one["path"]), str(one["name"]), one["serial"]) for one in word["devices"]
@@ -74,12 +74,13 @@ def _emulated_ports(folder: Path) -> Iterator[PortInfo]:
                 )
 
 
-def _is_running(pid: int) -> bool:
+def is_running(pid: int) -> bool:
+    """Whether a process of this number exists; False for numbers no process can have."""
     if pid <= 0:  # kill() would mean groups of processes
         return False
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:
         return True

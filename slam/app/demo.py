@@ -125,7 +125,6 @@ def run_demo(options: DemoOptions, stop: StopFlag) -> None:
             preset=options.preset,
             seed=options.seed,
             rig=rig,
-            config=config,
             true_landmarks_m=landmarks_m,
         )
         if summary is None:

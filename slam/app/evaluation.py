@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from slam.app.runner import RunRecord
 from slam.app.summary import LandmarkSummary, Summary
 from slam.app.tum import NS_PER_S
-from slam.config import SlamConfig
 from slam.consistency import TrueAssociationNis
 from slam.geometry import Rig, between
 from slam.metrics import (
@@ -35,7 +34,6 @@ def summarise(
     preset: str,
     seed: int,
     rig: Rig,
-    config: SlamConfig,
     true_landmarks_m: NDArray[np.float64],
 ) -> Summary | None:
     """Compute summary.json's numbers; None where the run was too short for any state.
@@ -46,8 +44,8 @@ def summarise(
         The run.
     scene, preset, seed
         Its names.
-    rig, config
-        What SLAM was told; decides which true landmarks count.
+    rig
+        What SLAM was told of the mounts; decides which true landmarks count.
     true_landmarks_m
         Shape (n, 2), world frame.
     """

@@ -77,14 +77,13 @@ def run_one(scene: str, preset: str, seed: int, *, check: Callable[[], None] = _
     AppError
         The scene is too short for a single state.
     """
-    loaded, config = scene_and_config(scene, preset)
+    loaded, _ = scene_and_config(scene, preset)
     summary = summarise(
         run_in_process(scene, preset, seed, check=check),
         scene=loaded.name,
         preset=preset,
         seed=seed,
         rig=rig_of(loaded),
-        config=config,
         true_landmarks_m=true_landmarks_m(loaded),
     )
     if summary is None:

@@ -10,7 +10,6 @@ from slam.app.runner import RunRecord
 from slam.app.summary import Summary
 from slam.association import Association
 from slam.clustering import Observation
-from slam.config import load_preset
 from slam.ekf_slam import Belief
 from slam.geometry import Mount, Rig
 from slam.pipeline import StepResult
@@ -66,7 +65,6 @@ def run(offset_m: float, drift: float, variance: float) -> Summary:
         preset="paper",
         seed=0,
         rig=RIG,
-        config=load_preset("paper", "lab"),
         true_landmarks_m=LANDMARKS,
     )
     assert summary is not None
@@ -173,7 +171,6 @@ def turned() -> Summary:
         preset="paper",
         seed=0,
         rig=RIG,
-        config=load_preset("paper", "lab"),
         true_landmarks_m=np.array([(w.real, w.imag) for w in map(in_world, (first, second))]),
     )
     assert summary is not None
@@ -210,14 +207,12 @@ def test_a_run_without_a_state_has_no_summary() -> None:
         duration_ns=0,
         wall_s=1.0,
     )
-    config = load_preset("paper", "lab")
     nothing = summarise(
         record,
         scene="s",
         preset="paper",
         seed=0,
         rig=RIG,
-        config=config,
         true_landmarks_m=LANDMARKS,
     )
     assert nothing is None
