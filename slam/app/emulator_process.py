@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import json
 import os
 import select
@@ -19,11 +18,11 @@ from types import TracebackType
 from typing import IO, Self
 
 from slam.app.errors import EmulatorError
+from slam.app.parent_death import signal_at_parents_death
 
 READY_LIMIT_S = 30.0
 _POLL_S = 0.2
 END_LIMIT_S = 3.0
-_PR_SET_PDEATHSIG = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,7 +68,7 @@ class EmulatorProcess:
                 stdout=subprocess.PIPE,
                 stderr=self._errors,
                 process_group=0,
-                preexec_fn=_end_with_parent(),  # one system call
+                preexec_fn=signal_at_parents_death(signal.SIGTERM),
             )
             self._cleanup.callback(self._end)
             self._cleanup = self._cleanup.pop_all()
@@ -158,11 +157,3 @@ class EmulatorProcess:
         for folder in {path.parent for path in left}:
             with contextlib.suppress(OSError):  # gone already, or somebody else uses it
                 folder.rmdir()
-
-
-def _end_with_parent() -> Callable[[], None] | None:
-    """Make the child get SIGTERM when we die without a chance to end it (kill -9); Linux only."""
-    if sys.platform != "linux":
-        return None
-    libc = ctypes.CDLL(None)
-    return lambda: libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import json
-import signal
 import statistics
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from concurrent.futures import BrokenExecutor
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-import joblib
 import numpy as np
 from scipy.stats import chi2
 
@@ -35,6 +33,7 @@ from slam.app.report_table import mm_text, share_text
 from slam.app.runner import RunRecord, run_slam
 from slam.app.stop import StopFlag, StopRequestedError
 from slam.app.summary import Summary, ratio
+from slam.app.workers import results_from_workers
 from slam.pipeline import UwbRadarSlam
 
 _POSE_DOF = 3
@@ -99,7 +98,8 @@ def run_sweep(options: SweepOptions, stop: StopFlag) -> None:
     Raises
     ------
     AppError
-        A wrong name or a file that cannot be written, before the first run; a scene too short.
+        A wrong name or a file that cannot be written, before the first run; a scene too short; a
+        worker process that died.
     StopRequestedError
         A signal arrived; OUT.part stays if it holds a run.
     """
@@ -116,6 +116,10 @@ def run_sweep(options: SweepOptions, stop: StopFlag) -> None:
     _write(part, [])  # what cannot be written ends the command before any run, too
     cells = list(product(options.scenes, options.presets, range(options.n_seeds)))
     runs: list[Summary] = []
+
+    def left() -> str:
+        return f"; {len(runs)} of {len(cells)} runs are in {part}" if runs else ""
+
     try:
         for summary in _results(cells, options.jobs, stop):
             runs.append(summary)
@@ -123,8 +127,9 @@ def run_sweep(options: SweepOptions, stop: StopFlag) -> None:
             sys.stderr.write(f"{len(runs)} of {len(cells)}: {_run_line(summary)}\n")
             stop.check()
     except StopRequestedError as stopped:
-        left = f"; {len(runs)} of {len(cells)} runs are in {part}" if runs else ""
-        raise StopRequestedError(stopped.received, left) from None
+        raise StopRequestedError(stopped.received, left()) from None
+    except BrokenExecutor:
+        raise AppError(f"a worker process died; did memory run out?{left()}") from None
     finally:
         if not runs:
             part.unlink()
@@ -220,9 +225,7 @@ def _results(cells: Sequence[tuple[str, str, int]], jobs: int, stop: StopFlag) -
         for cell in cells:
             yield run_one(*cell, check=stop.check)
         return
-    tasks = (joblib.delayed(run_one)(*cell) for cell in cells)
-    with _without_sigint():
-        results = joblib.Parallel(n_jobs=min(jobs, len(cells)), return_as="generator")(tasks)
+    results = results_from_workers(run_one, cells, jobs)
     try:
         while True:
             # Nothing is half-written while we wait, so a signal may end the waiting at once.
@@ -236,18 +239,3 @@ def _results(cells: Sequence[tuple[str, str, int]], jobs: int, stop: StopFlag) -
             # joblib regrets the work that an early end throws away
             warnings.filterwarnings("ignore", "[0-9]+ tasks", UserWarning)
             results.close()
-
-
-@contextmanager
-def _without_sigint() -> Iterator[None]:
-    """Hold SIGINT back, for worker processes too, which inherit this when they start.
-
-    Ctrl-C reaches the whole process group; the parent answers it and ends its workers. Blocked and
-    not ignored, so that one that comes meanwhile reaches the parent afterwards. Threads started
-    here inherit it as well, so a worker that joblib replaces later is like the first ones.
-    """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)

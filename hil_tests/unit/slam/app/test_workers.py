@@ -1,0 +1,67 @@
+"""Worker processes: deaf to the signals of their group from the start, gone with their parent."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SCRIPT = """\
+import os, signal, sys, time
+from slam.app.workers import results_from_workers
+
+def work(task):
+    if task == "mask":
+        return sorted(signal.pthread_sigmask(signal.SIG_BLOCK, ()))
+    if task == "sleep":
+        time.sleep(60)
+    return os.getpid()
+
+if __name__ == "__main__":
+"""
+
+
+def started(tmp_path: Path, body: str) -> subprocess.Popen[str]:
+    """Start a fresh interpreter, where nothing of multiprocessing runs yet."""
+    script = tmp_path / "main.py"
+    script.write_text(SCRIPT + "".join(f"    {line}\n" for line in body.splitlines()))
+    return subprocess.Popen(
+        [sys.executable, str(script)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        process_group=0,
+    )
+
+
+def test_every_worker_begins_with_the_groups_signals_blocked(tmp_path: Path) -> None:
+    body = (
+        "for mask in results_from_workers(work, [('mask',)] * 4, 2):\n"
+        "    print(*(int(number) for number in mask))\n"
+        "print(*(int(one) for one in signal.pthread_sigmask(signal.SIG_BLOCK, ())))\n"
+    )
+    with started(tmp_path, body) as process:
+        output, errors = process.communicate(timeout=15)
+    assert (process.returncode, errors) == (0, "")
+    blocked = sorted((signal.SIGINT, signal.SIGTERM, signal.SIGHUP))
+    *workers, parent = output.split("\n")[:-1]
+    assert workers == [" ".join(str(int(number)) for number in blocked)] * 4
+    assert parent == "", "the parent itself hears signals again"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the parent's death is a signal on Linux only")
+def test_no_worker_survives_a_killed_parent(tmp_path: Path) -> None:
+    body = (
+        "results = results_from_workers(work, [('pid',), ('sleep',), ('sleep',)], 2)\n"
+        "print(next(results), flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    with started(tmp_path, body) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().strip().isdigit()
+        process.kill()
+        # every worker holds these pipes: they end when the last of them has, or this times out
+        process.communicate(timeout=15)

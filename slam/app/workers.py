@@ -1,0 +1,74 @@
+"""Worker processes that leave signals to their parent and never outlive it.
+
+Ctrl-C and a closing terminal reach the whole process group. Only the parent answers; it ends its
+workers itself. So every worker begins with these signals blocked, before its interpreter runs a
+first line: a handler of its own would come too late for one that is caught while it starts.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
+from typing import TypeVar, cast
+
+import joblib
+
+from slam.app.parent_death import signal_at_parents_death
+
+_LEFT_TO_THE_PARENT = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+
+_Result = TypeVar("_Result")
+
+
+def results_from_workers(
+    function: Callable[..., _Result], tasks: Sequence[tuple[object, ...]], n_workers: int
+) -> Generator[_Result, None, None]:
+    """Start worker processes and yield the results in the order of the tasks.
+
+    Closing the generator early kills the workers.
+
+    Parameters
+    ----------
+    function
+        Called with the members of each task; importable by name, as it runs elsewhere.
+    tasks
+        At least one.
+    n_workers
+        Processes; never more than there are tasks.
+    """
+    calls = (joblib.delayed(function)(*task) for task in tasks)
+    with (
+        _signals_left_to_the_parent(),
+        joblib.parallel_config("loky", initializer=_belong_to, initargs=(os.getpid(),)),
+    ):
+        parallel = joblib.Parallel(n_jobs=min(n_workers, len(tasks)), return_as="generator")
+        return cast("Generator[_Result, None, None]", parallel(calls))
+
+
+@contextmanager
+def _signals_left_to_the_parent() -> Iterator[None]:
+    """Block signals for this thread, and for processes and threads that it starts, which inherit.
+
+    Blocked and not ignored, so that one that comes meanwhile reaches the parent afterwards. The
+    thread in which joblib replaces workers later inherits it, too.
+    """
+    # Python 3.11's tracker unblocks SIGINT and SIGTERM when it is first needed, that is, when the
+    # first worker is about to start. Running already, it does so no more.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _LEFT_TO_THE_PARENT)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _belong_to(parent: int) -> None:
+    """Make this worker die with its parent, also when that is killed; Linux only."""
+    end_with_parent = signal_at_parents_death(signal.SIGKILL)
+    if end_with_parent is not None:
+        end_with_parent()
+    if os.getppid() != parent:  # it died before we asked
+        os._exit(1)
