@@ -1,0 +1,119 @@
+"""One door for every kind of recording: which it is, its messages, its summary."""
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from xethru_protocol.recordings.errors import (
+    FaultHandler,
+    RecordingFault,
+    unreadable,
+)
+from xethru_protocol.recordings.records import RecordingFacts, Timed
+from xethru_protocol.recordings.vendor_meta import PARAMETER_FILE_NAME
+from xethru_protocol.recordings.vendor_reader import is_vendor_file, read_vendor, vendor_facts
+from xethru_protocol.table import ROWS, Response, UnknownMessage
+
+
+def message_name(message: Response) -> str:
+    """Name of a message as in dumps, for example ``"DATA FLOAT"``."""
+    return "UNKNOWN" if isinstance(message, UnknownMessage) else ROWS[type(message)].name
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordingSummary:
+    """What a recording holds.
+
+    Attributes
+    ----------
+    path, format
+        Where, and ``"vendor"``, ``"wire"``, ``"mcap"`` or ``"npz"``.
+    start_ns, duration_ns
+        Time of the first message [ns since 1970] and from there to the last; None without times.
+    messages
+        How many of each kind, by name.
+    size_bytes
+        Of all its files.
+    parameter_file
+        Name of the stored parameter file; None if there is none.
+    faults
+        What could not be read.
+    """
+
+    path: Path
+    format: str
+    start_ns: int | None
+    duration_ns: int | None
+    messages: dict[str, int]
+    size_bytes: int
+    session_id: str
+    profile_id: int | None
+    parameter_file: str | None
+    faults: tuple[RecordingFault, ...]
+
+
+def read_recording(path: Path | str, on_fault: FaultHandler | None = None) -> Iterator[Timed]:
+    """Messages of a recording with their times, whatever its format.
+
+    Parameters
+    ----------
+    path
+        A directory of ModuleConnector, its meta file or one data file in it.
+    on_fault
+        Called with what could not be read; the rest is read all the same. None: what costs
+        messages raises, what costs only times passes.
+
+    Yields
+    ------
+    The message, and its time [ns since 1970]; None where the recording has none. In vendor
+    directories the resolution is 1 ms.
+
+    Raises
+    ------
+    RecordingError
+        If there is nothing to read, or messages are lost and ``on_fault`` is None.
+    """
+    path = Path(path)
+    yield from read_vendor(path, on_fault)
+
+
+def recording_facts(path: Path | str) -> RecordingFacts:
+    """Return what a recording says about itself; RecordingError if it cannot be read."""
+    return vendor_facts(Path(path))[0]
+
+
+def describe_recording(path: Path | str) -> RecordingSummary:
+    """Read a whole recording and say what it holds; RecordingError if it holds nothing."""
+    path = Path(path)
+    faults: list[RecordingFault] = []
+    counts: Counter[str] = Counter()
+    first_ns = last_ns = None
+    for message, t_ns in read_recording(path, faults.append):
+        counts[message_name(message)] += 1
+        if t_ns is not None:
+            first_ns = t_ns if first_ns is None else min(first_ns, t_ns)
+            last_ns = t_ns if last_ns is None else max(last_ns, t_ns)
+    facts = recording_facts(path)
+    return RecordingSummary(
+        path=path,
+        format="vendor",
+        start_ns=first_ns,
+        duration_ns=None if first_ns is None or last_ns is None else last_ns - first_ns,
+        messages=dict(counts),
+        size_bytes=_size(path),
+        session_id=facts.session_id,
+        profile_id=facts.profile_id,
+        parameter_file=None if facts.parameter_file is None else PARAMETER_FILE_NAME,
+        faults=tuple(faults),
+    )
+
+
+def _size(path: Path) -> int:
+    try:
+        if path.is_file() and not is_vendor_file(path):
+            return path.stat().st_size
+        directory = path if path.is_dir() else path.parent
+        return sum(file.stat().st_size for file in directory.rglob("xethru_*") if file.is_file())
+    except OSError as error:
+        raise unreadable(path, error) from None

@@ -1,0 +1,37 @@
+"""What every kind of recording holds: messages with their times, and facts about the whole."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from xethru_protocol.table import Response
+
+MS_NS = 1_000_000
+Timed = tuple[Response, int | None]
+"""A message and its time [ns since 1970]; None where the recording has none."""
+TimedMessages = Iterator[Timed]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordingFacts:
+    """What a recording says about itself besides its messages.
+
+    Attributes
+    ----------
+    session_id
+        The recorder's name for the session; empty if it gave none.
+    profile_id
+        Profile that ran (Protocol reference 4.3); None where unknown.
+    parameter_file
+        Content of the module's parameter file; None if none was stored.
+    user_header
+        Bytes that the recorder put before the records of each data file.
+    stopped_ns, closed_ns
+        When the last data file and the recording were closed [ns since 1970]; None: unknown.
+    """
+
+    session_id: str = ""
+    profile_id: int | None = None
+    parameter_file: bytes | None = None
+    user_header: bytes = b""
+    stopped_ns: int | None = None
+    closed_ns: int | None = None
