@@ -10,10 +10,9 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from xethru_protocol import commands, responses  # noqa: F401 - entering their rows is the point
 from xethru_protocol.codes import ElementType, ResponseCode
 from xethru_protocol.errors import LocalProtocolError
-from xethru_protocol.responses import DataFloat
+from xethru_protocol.messages import DataFloat  # importing messages enters all rows
 from xethru_protocol.table import (
     COMMANDS,
     RESPONSES,
@@ -21,6 +20,7 @@ from xethru_protocol.table import (
     Command,
     Message,
     Response,
+    Row,
     UnknownMessage,
 )
 from xethru_protocol.wire import FLOAT32, hex_bytes
@@ -51,15 +51,14 @@ def encode(message: Message, *, bulk: bool | None = None) -> bytes:
     if isinstance(message, UnknownMessage):
         return message.payload
     row = ROWS[type(message)]
-    fields: dict[str, Any] = {}
+    fields = _fields(message, row)
     parts = [row.prefix]
     for name, kind in row.kinds:
-        value = getattr(message, name)
         try:
-            parts.append(kind.pack(value, fields, row.bulk if bulk is None else bulk))
+            parts.append(kind.pack(fields.get(name), fields, row.bulk if bulk is None else bulk))
         except (struct.error, ValueError, TypeError, OverflowError) as error:
-            raise LocalProtocolError(f"{row.name} cannot carry {name}={value!r}: {error}") from None
-        fields[name] = value
+            what = f"{name}={fields[name]!r}" if name in fields else name
+            raise LocalProtocolError(f"{row.name} cannot carry {what}: {error}") from None
     return b"".join(parts)
 
 
@@ -69,11 +68,8 @@ def decode_command(payload: bytes) -> Command[Response]:
     >>> decode_command(bytes.fromhex("50 10 10 00 00 00 00 00 A0 41"))
     X4DriverSet(setting=<X4Setting.FPS: 16>, value_width=None, value=20.0)
     """
-    for length in (2, 1):
-        cls = COMMANDS.get(payload[:length])
-        if cls is not None:
-            return cast(Command[Response], _build(cls, payload))
-    return _unknown(payload)
+    cls = COMMANDS.find(payload)
+    return _unknown(payload) if cls is None else cast(Command[Response], _build(cls, payload))
 
 
 def decode_response(payload: bytes) -> Response:
@@ -82,11 +78,8 @@ def decode_response(payload: bytes) -> Response:
     >>> decode_response(bytes.fromhex("20 01 00 00 00"))
     Error(code=1)
     """
-    for length in (2, 1, 5):
-        cls = RESPONSES.get(payload[:length])
-        if cls is not None:
-            return cast(Response, _build(cls, payload))
-    return _unknown(payload)
+    cls = RESPONSES.find(payload)
+    return _unknown(payload) if cls is None else cast(Response, _build(cls, payload))
 
 
 _FRAME_HEADER = struct.Struct("<III")  # content id, info, count: from payload byte 2
@@ -125,11 +118,10 @@ def describe(message: Message) -> tuple[str, dict[str, Any]]:
     if isinstance(message, UnknownMessage):
         return "UNKNOWN", {"code": message.code, "payload": hex_bytes(message.payload)}
     row = ROWS[type(message)]
-    fields: dict[str, Any] = {}
+    fields = _fields(message, row)
     shown: dict[str, Any] = {}
     for name, kind in row.kinds:
-        fields[name] = getattr(message, name)
-        shown |= kind.show(name, fields[name], fields)
+        shown |= kind.show(name, fields.get(name), fields)
     for name, derive in row.derived.items():
         shown[name] = derive(message)
     return row.name, shown
@@ -144,7 +136,13 @@ def _build(cls: type[BuiltT], payload: bytes) -> BuiltT | UnknownMessage:
             fields[name], position = kind.unpack(payload, position, fields)
     except (struct.error, ValueError, KeyError):
         return _unknown(payload)
+    for name in row.wire_only:
+        del fields[name]
     return cls(**fields)
+
+
+def _fields(message: Message, row: Row) -> dict[str, Any]:
+    return {name: getattr(message, name) for name, _ in row.kinds if name not in row.wire_only}
 
 
 def _unknown(payload: bytes) -> UnknownMessage:

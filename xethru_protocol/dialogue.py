@@ -124,7 +124,7 @@ class Dialogue:
                 answer = self._answers.popleft()
                 if isinstance(answer, Error) and not isinstance(command, Ping):
                     self._answer_owed = False  # PING has no errors: that one is of another command
-                    meaning = error_name(answer.code, x4_command=row.name.startswith("X4"))
+                    meaning = error_name(answer.code, row.errors)
                     raise DeviceError(answer.code, summary(command), meaning)
                 if isinstance(answer, row.replies) and (
                     content_id is None or getattr(answer, "content_id", None) == content_id

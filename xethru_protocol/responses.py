@@ -1,4 +1,4 @@
-"""Rows of the message table: what the module sends.
+"""Rows of the message table: answers, DATA and HIL; what the module sends but APPDATA.
 
 Names in dumps are those of the golden vectors. Section numbers refer to the Protocol reference.
 """
@@ -9,15 +9,11 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 
-from xethru_protocol import wire
-from xethru_protocol.codes import AppDataId, ElementType, ResponseCode, SystemCode, error_name
-from xethru_protocol.table import ROWS, Response, response
+from xethru_protocol import wire, wire_lists
+from xethru_protocol.codes import ElementType, ResponseCode, SystemCode, error_name
+from xethru_protocol.table import Response, response
 
 FloatArray = npt.NDArray[np.float32]
-
-
-def _appdata(content: AppDataId) -> tuple[int, ...]:
-    return ResponseCode.XTS_SPR_APPDATA, *content.to_bytes(4, "little")
 
 
 @response(ResponseCode.XTS_SPR_ACK, name="ACK")
@@ -68,6 +64,16 @@ _DATA = ResponseCode.XTS_SPR_DATA
 _CONTENT_ID = wire.Number("I", shown=wire.short_hexadecimal)
 
 
+@response(_REPLY, ElementType.XTS_SPRD_NONE, name="REPLY NONE")
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReplyNone(Response):
+    """Answer without elements; no firmware is known to send it. 5.2."""
+
+    content_id: Annotated[int, _CONTENT_ID] = 0
+    info: Annotated[int, wire.U32] = 0
+    trailer: Annotated[int | None, wire.OptionalByte(shown_if_absent=True)] = None
+
+
 @response(_REPLY, ElementType.XTS_SPRD_BYTE, name="REPLY BYTE")
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReplyByte(Response):
@@ -108,6 +114,16 @@ class ReplyString(Response):
     content_id: Annotated[int, _CONTENT_ID] = 0
     info: Annotated[int, wire.U32] = 0
     text: Annotated[str, wire.Elements("s", 1, "value", trailer=1, trailer_shown=True)]
+
+
+@response(_REPLY, ElementType.XTS_SPRD_USER, name="REPLY USER")
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReplyUser(Response):
+    """Answer of a user structure, as bytes. 5.2."""
+
+    content_id: Annotated[int, _CONTENT_ID] = 0
+    info: Annotated[int, wire.U32] = 0
+    values: Annotated[bytes, wire.Elements("c", 1, "values", trailer=1, trailer_shown=True)]
 
 
 @response(_DATA, ElementType.XTS_SPRD_FLOAT, name="DATA FLOAT", bulk=True)
@@ -169,61 +185,33 @@ class DataUser(Response):
     values: Annotated[bytes, wire.Elements("c", 1, "data", count_label="length")]
 
 
-class _Baseband(Response):
-    """What both baseband messages share: equality of every bit, and the header's names."""
-
-    __slots__ = ()
-
-    def __eq__(self, other: object) -> bool:
-        """Equal if every bit of every field is."""
-        if not isinstance(other, _Baseband) or type(other) is not type(self):
-            return NotImplemented
-        return self._identity() == other._identity()
-
-    def __hash__(self) -> int:
-        """Hash of all bits."""
-        return hash(self._identity())
-
-    def _identity(self) -> tuple[bytes, ...]:
-        values = (getattr(self, field) for field, _ in ROWS[type(self)].kinds)
-        return tuple(np.asarray(value).tobytes() for value in values)
+def _type_name(code: int) -> str:
+    name = next((kind.name for kind in ElementType if kind == code), f"{code:02X}")
+    return name.removeprefix("XTS_SPRD_").lower()
 
 
-_BIN_LENGTH = wire.Number("f", "bin_length")
-_SAMPLING = wire.Number("f", "sampling_frequency")
-_CARRIER = wire.Number("f", "carrier_frequency")
-_OFFSET = wire.Number("f", "range_offset")
+@response(ResponseCode.XTS_SPR_HIL, name="HIL")
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HilReply(Response):
+    """Hardware-in-the-loop traffic, not used by an X4M300: a `HilCommand` and elements. 5.4.
 
-
-@response(*_appdata(AppDataId.XTS_ID_BASEBAND_IQ), name="BASEBAND_IQ", bulk=True)
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BasebandIq(_Baseband):
-    """Complex baseband of the running profile. 7.1.
-
-    ``i`` and ``q``: shape (num_bins,), float32, read-only. Ranges in module metres;
-    ``range_offset_m`` is the range of bin 0.
+    ``values`` are bytes, text, or a tuple of numbers, as ``datatype`` (`ElementType`) says.
     """
 
-    counter: Annotated[int, wire.U32]
-    num_bins: Annotated[int, wire.U32]
-    bin_length_m: Annotated[float, _BIN_LENGTH]
-    sampling_frequency_hz: Annotated[float, _SAMPLING]
-    carrier_frequency_hz: Annotated[float, _CARRIER]
-    range_offset_m: Annotated[float, _OFFSET]
-    i: Annotated[FloatArray, wire.Bins("num_bins")]
-    q: Annotated[FloatArray, wire.Bins("num_bins")]
-
-
-@response(*_appdata(AppDataId.XTS_ID_BASEBAND_AMPLITUDE_PHASE), name="BASEBAND_AP", bulk=True)
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BasebandAp(_Baseband):
-    """Baseband as amplitude and phase [rad]. 7.1; fields as in `BasebandIq`."""
-
-    counter: Annotated[int, wire.U32]
-    num_bins: Annotated[int, wire.U32]
-    bin_length_m: Annotated[float, _BIN_LENGTH]
-    sampling_frequency_hz: Annotated[float, _SAMPLING]
-    carrier_frequency_hz: Annotated[float, _CARRIER]
-    range_offset_m: Annotated[float, _OFFSET]
-    amplitude: Annotated[FloatArray, wire.Bins("num_bins")]
-    phase: Annotated[FloatArray, wire.Bins("num_bins")]
+    datatype: Annotated[int, wire.Number("B", shown=_type_name)]
+    hil_command: Annotated[int, wire.U32]
+    info: Annotated[int, wire.U32] = 0
+    values: Annotated[
+        bytes | str | tuple[int, ...] | tuple[float, ...],
+        wire_lists.TypedElements(
+            "datatype",
+            {
+                ElementType.XTS_SPRD_NONE: wire.Elements("c", 1, "data", count_label="length"),
+                ElementType.XTS_SPRD_BYTE: wire.Elements("c", 1, "data", count_label="length"),
+                ElementType.XTS_SPRD_INT: wire.Elements("i", 4, "data", count_label="length"),
+                ElementType.XTS_SPRD_FLOAT: wire.Elements("f", 4, "data", count_label="length"),
+                ElementType.XTS_SPRD_STRING: wire.Elements("s", 1, "data", count_label="length"),
+                ElementType.XTS_SPRD_USER: wire.Elements("c", 1, "data", count_label="length"),
+            },
+        ),
+    ] = b""

@@ -1,9 +1,10 @@
 """Kinds of wire fields: what ``Annotated[type, KIND]`` in a message may say.
 
 A kind knows how one field is packed, unpacked and shown. The codec walks a message's fields in
-order; the layouts themselves stand in ``messages``. All numbers are little-endian, unpadded
-(Protocol reference, head). A kind raises ``struct.error`` or ``ValueError`` when the bytes do
-not fit; the codec turns that into `UnknownMessage`.
+order; the layouts themselves stand in the rows. All numbers are little-endian, unpadded
+(Protocol reference, head). Lists with a count of their own stand in ``wire_lists``. A kind raises
+``struct.error`` or ``ValueError`` when the bytes do not fit; the codec turns that into
+`UnknownMessage`.
 """
 # ruff: noqa: ANN401 - a kind handles whatever type its field has
 
@@ -16,19 +17,20 @@ import numpy as np
 import numpy.typing as npt
 
 FLOAT32 = np.dtype("<f4")
-Fields = Mapping[str, Any]  # the fields before this one, by name
+# A message's fields by name; while unpacking, those before this one.
+Fields = Mapping[str, Any]
 
 
 class Kind(Protocol):
     """One way to put a field on the wire."""
 
-    def pack(self, value: Any, before: Fields, bulk: bool) -> bytes:
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
         """Bytes of ``value``; ``bulk`` says that the packet travels in NoEscape framing."""
 
-    def unpack(self, data: bytes, start: int, before: Fields) -> tuple[Any, int]:
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
         """Value at ``start`` and the offset behind it."""
 
-    def show(self, name: str, value: Any, before: Fields) -> dict[str, Any]:
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
         """JSON-able entries of a dump."""
 
 
@@ -58,17 +60,18 @@ class Number:
     code: str
     label: str = ""
     shown: Callable[[Any], Any] = _plain
+    order: str = "<"
 
-    def pack(self, value: Any, before: Fields, bulk: bool) -> bytes:
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
         """Pack the scalar."""
-        return struct.pack("<" + self.code, value)
+        return struct.pack(self.order + self.code, value)
 
-    def unpack(self, data: bytes, start: int, before: Fields) -> tuple[Any, int]:
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
         """Unpack the scalar."""
-        (value,) = struct.unpack_from("<" + self.code, data, start)
-        return value, start + struct.calcsize("<" + self.code)
+        (value,) = struct.unpack_from(self.order + self.code, data, start)
+        return value, start + struct.calcsize(self.order + self.code)
 
-    def show(self, name: str, value: Any, before: Fields) -> dict[str, Any]:
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
         """Show it under its label, as the golden vectors name it."""
         return {self.label or name: self.shown(value)}
 
@@ -86,37 +89,62 @@ class Member:
     enum: Callable[[int], Any]
     label: str
 
-    def pack(self, value: Any, before: Fields, bulk: bool) -> bytes:
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
         """Pack the number behind the member; ``ValueError`` if it is none."""
         return struct.pack("<I", self.enum(value))
 
-    def unpack(self, data: bytes, start: int, before: Fields) -> tuple[Any, int]:
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
         """Unpack the member; ``ValueError`` if the number is none."""
         (value,) = struct.unpack_from("<I", data, start)
         return self.enum(value), start + 4
 
-    def show(self, name: str, value: Any, before: Fields) -> dict[str, Any]:
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
         """Show the member's name."""
         return {self.label: self.enum(value).name}
+
+
+@dataclass(frozen=True, slots=True)
+class Spelling:
+    """A code that belongs to the prefix and has several values for one and the same message.
+
+    Must be a row's first field: the row is entered once per value. The first value is the
+    usual one and not shown.
+    """
+
+    codes: tuple[int, ...]
+
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
+        """Pack the code; ``ValueError`` if it is not one of this message's."""
+        if value not in self.codes:
+            raise ValueError("this code is another message's")
+        return bytes((value,))
+
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
+        """Unpack the code."""
+        return data[start], start + 1
+
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
+        """Show which code was used, unless it is the usual one."""
+        return {} if value == self.codes[0] else {name: short_hexadecimal(value)}
 
 
 @dataclass(frozen=True, slots=True)
 class OptionalByte:
     """A trailing u8 that may be absent (None)."""
 
-    wanted: Callable[[Fields], bool] = lambda before: True
+    wanted: Callable[[Fields], bool] = lambda fields: True
     required: bool = False
     shown_if_absent: bool = False
 
-    def pack(self, value: Any, before: Fields, bulk: bool) -> bytes:
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
         """Pack the byte, or nothing; ``ValueError`` if this message needs one."""
-        if value is None and self.required and self.wanted(before):
+        if value is None and self.required and self.wanted(fields):
             raise ValueError("the address is missing")
         return b"" if value is None else bytes((value,))
 
-    def unpack(self, data: bytes, start: int, before: Fields) -> tuple[Any, int]:
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
         """Unpack the byte where this message has one."""
-        if not self.wanted(before):
+        if not self.wanted(fields):
             return None, start
         if start < len(data):
             return data[start], start + 1
@@ -124,7 +152,7 @@ class OptionalByte:
             raise ValueError("the address is missing")
         return None, start
 
-    def show(self, name: str, value: Any, before: Fields) -> dict[str, Any]:
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
         """Show the byte; an absent one only where the vectors list it as null."""
         return {} if value is None and not self.shown_if_absent else {name: value}
 
@@ -141,30 +169,31 @@ class ByDiscriminator:
 
     field: str
     layouts: Mapping[int, tuple[str, tuple[str, ...]]]
-    short: frozenset[int]
-    width_field: str
+    short: frozenset[int] = frozenset()
+    width_field: str = ""
 
-    def pack(self, value: Any, before: Fields, bulk: bool) -> bytes:
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
         """Pack in the layout of the discriminator."""
-        key = before[self.field]
+        key = fields[self.field]
         if key not in self.layouts:
             raise ValueError("this setting cannot be set")
         codes, names = self.layouts[key]
-        if before[self.width_field] == 1 and key in self.short:
+        if key in self.short and fields[self.width_field] == 1:
             codes = "B"
         return struct.pack("<" + codes, *(value if len(names) > 1 else (value,)))
 
-    def unpack(self, data: bytes, start: int, before: Fields) -> tuple[Any, int]:
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
         """Unpack in the layout of the discriminator."""
-        codes, names = self.layouts[before[self.field]]
-        if before[self.width_field] == 1:
+        key = fields[self.field]
+        codes, names = self.layouts[key]
+        if key in self.short and fields[self.width_field] == 1:
             codes = "B"
         values = struct.unpack_from("<" + codes, data, start)
         return (values if len(names) > 1 else values[0]), start + struct.calcsize("<" + codes)
 
-    def show(self, name: str, value: Any, before: Fields) -> dict[str, Any]:
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
         """Show each scalar under its own name."""
-        names = self.layouts[before[self.field]][1]
+        names = self.layouts[fields[self.field]][1]
         return dict(zip(names, value if len(names) > 1 else (value,), strict=True))
 
 
@@ -175,17 +204,17 @@ class ShortForm:
     field: str
     short: frozenset[int]
 
-    def pack(self, value: Any, before: Fields, bulk: bool) -> bytes:
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
         """Nothing."""
         if value not in (None, 1):
             raise ValueError("a value is one byte wide or as the firmware parses it (None)")
         return b""
 
-    def unpack(self, data: bytes, start: int, before: Fields) -> tuple[Any, int]:
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
         """Tell the form by the bytes that are left."""
-        return (1 if before[self.field] in self.short and len(data) - start == 1 else None), start
+        return (1 if fields[self.field] in self.short and len(data) - start == 1 else None), start
 
-    def show(self, name: str, value: Any, before: Fields) -> dict[str, Any]:
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
         """Nothing: the value itself is shown."""
         return {}
 
@@ -205,13 +234,13 @@ class Elements:
     count_label: str = ""  # the name under which a dump shows the count
     trailer_shown: bool = False
 
-    def pack(self, value: Any, before: Fields, bulk: bool) -> bytes:
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
         """Pack count, elements and trailer."""
         body = self._bytes(value)
         count = b"" if not body and not bulk else struct.pack("<I", len(body) // self.size)
         return count + body + (b"" if self.trailer is None else bytes((self.trailer,)))
 
-    def unpack(self, data: bytes, start: int, before: Fields) -> tuple[Any, int]:
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
         """Unpack the elements; a missing count or trailer is accepted."""
         rest = len(data) - start
         if rest <= (0 if self.trailer is None else 1):
@@ -223,7 +252,7 @@ class Elements:
             raise ValueError(f"{count} elements announced, fewer present")
         return self._value(data[begin:end]), end
 
-    def show(self, name: str, value: Any, before: Fields) -> dict[str, Any]:
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
         """Show count, elements and trailer as the golden vectors do."""
         shown: dict[str, Any] = {}
         if self.count_label:
@@ -262,24 +291,25 @@ class Bins:
     """A float32 array with one value per bin; the bin count is the field ``count_field``."""
 
     count_field: str
+    label: str = ""
 
-    def pack(self, value: Any, before: Fields, bulk: bool) -> bytes:
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
         """Pack the array."""
         array: npt.NDArray[np.float32] = np.ascontiguousarray(value, dtype=FLOAT32)
-        if array.shape != (before[self.count_field],):
-            raise ValueError(f"{array.shape} values for {before[self.count_field]} bins")
+        if array.shape != (fields[self.count_field],):
+            raise ValueError(f"{array.shape} values for {fields[self.count_field]} bins")
         return array.tobytes()
 
-    def unpack(self, data: bytes, start: int, before: Fields) -> tuple[Any, int]:
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
         """Unpack the array, as a view on its own copy of the bytes."""
-        end = start + 4 * before[self.count_field]
+        end = start + 4 * fields[self.count_field]
         if end > len(data):
             raise ValueError("fewer bins than announced")
         return np.frombuffer(data[start:end], dtype=FLOAT32), end
 
-    def show(self, name: str, value: Any, before: Fields) -> dict[str, Any]:
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
         """Show the values."""
-        return {name: value.tolist()}
+        return {self.label or name: value.tolist()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,15 +317,17 @@ class RestBytes:
     """All bytes that are left."""
 
     shown: Callable[[bytes], Any] = hex_bytes
+    label: str = ""
+    empty_shown: bool = True
 
-    def pack(self, value: Any, before: Fields, bulk: bool) -> bytes:
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
         """Pack the bytes."""
         return bytes(value)
 
-    def unpack(self, data: bytes, start: int, before: Fields) -> tuple[Any, int]:
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
         """Take everything."""
         return data[start:], len(data)
 
-    def show(self, name: str, value: Any, before: Fields) -> dict[str, Any]:
-        """Show the bytes."""
-        return {name: self.shown(value)}
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
+        """Show the bytes, none of them only where the vectors do."""
+        return {self.label or name: self.shown(value)} if value or self.empty_shown else {}
