@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil_tests.property.wire_streams import messages
+from hil_tests.property.message_strategies import messages
 from xethru_protocol import wire
 from xethru_protocol.codec import (
     decode_command,

@@ -5,7 +5,8 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hil_tests.property.wire_streams import STREAMS, messages
+from hil_tests.property.message_strategies import messages
+from hil_tests.property.wire_streams import STREAMS
 from xethru_protocol.connection import Connection, Role
 from xethru_protocol.framing import NEED_DATA, FramingFault
 from xethru_protocol.table import Command, Message, Response
