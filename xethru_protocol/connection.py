@@ -16,6 +16,7 @@ from xethru_protocol.packets import (
     encode_normal,
 )
 from xethru_protocol.plausibility import Direction
+from xethru_protocol.statistics import LinkStatistics
 from xethru_protocol.table import ROWS, Command, Message, Response, UnknownMessage
 
 
@@ -36,6 +37,9 @@ class Connection:
     ----------
     role
         HOST sends commands and receives responses, MODULE the reverse.
+    statistics
+        Where to count what is received, for example on from an earlier connection; None: in
+        new ones.
 
     >>> from xethru_protocol.messages import Ping, Pong
     >>> host, module = Connection(Role.HOST), Connection(Role.MODULE)
@@ -47,10 +51,12 @@ class Connection:
     Pong(value=2867769066)
     """
 
-    def __init__(self, role: Role) -> None:
+    def __init__(self, role: Role, statistics: LinkStatistics | None = None) -> None:
         self.role = role
         self._is_host = role is Role.HOST
-        self._reader = PacketReader(Direction.FROM_MODULE if self._is_host else Direction.FROM_HOST)
+        direction = Direction.FROM_MODULE if self._is_host else Direction.FROM_HOST
+        self._reader = PacketReader(direction, statistics)
+        self.statistics = self._reader.statistics
         self._next_span = self._reader.next_span
 
     def receive_data(self, data: bytes) -> None:
@@ -66,9 +72,14 @@ class Connection:
         span = self._next_span()
         if isinstance(span, tuple):
             _, buffer, start, end, _ = span
-            if self._is_host:
-                return decode_response_at(buffer, start, end)
-            return decode_command(buffer[start:end])
+            message = (
+                decode_response_at(buffer, start, end)
+                if self._is_host
+                else decode_command(buffer[start:end])
+            )
+            if type(message) is UnknownMessage:
+                self.statistics.unknown += 1
+            return message
         return span
 
     @property

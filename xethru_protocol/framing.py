@@ -22,9 +22,8 @@ import struct
 from collections import deque
 from typing import Final
 
+from xethru_protocol.finders import NEVER, PatternFinder, TerminatorFinder
 from xethru_protocol.packets import (
-    END,
-    ESCAPE,
     MAX_NORMAL_BYTES,
     NEED_DATA,
     NO_ESCAPE_HEADER_BYTES,
@@ -41,6 +40,7 @@ from xethru_protocol.packets import (
     xor,
 )
 from xethru_protocol.plausibility import HEAD_BYTES, MAX_LENGTH, Direction, plausible
+from xethru_protocol.statistics import LinkStatistics
 
 __all__ = [
     "NEED_DATA",
@@ -66,36 +66,6 @@ _LENGTH = struct.Struct("<I")
 _FRAME_HEADER = struct.Struct("<4sIxBB8xI")
 _ESCAPED = re.compile(rb"\x7f(.)", re.DOTALL)
 _RUN_OF_7C = re.compile(rb"\x7c{9,}")
-_NEVER: Final = 1 << 62  # a stream offset that is not reached
-
-
-class _Finder:
-    """Where a pattern comes next, remembering what was searched: no byte is searched twice."""
-
-    __slots__ = ("_found", "_pattern", "_searched")
-
-    def __init__(self, pattern: bytes) -> None:
-        self._pattern = pattern
-        self._found = -1
-        self._searched = 0
-
-    def next(self, buffer: bytes, base: int, here: int, stop: int = _NEVER) -> int:
-        """Find the first pattern at or after ``here``; _NEVER if there is none before ``stop``.
-
-        ``buffer`` begins at ``base`` in the stream. No pattern may lie across ``stop``.
-        """
-        if here <= self._found:
-            return self._found if self._found < stop else _NEVER
-        begin = max(here, self._searched)
-        if begin >= stop:
-            return _NEVER
-        limit = base + len(buffer)
-        at = buffer.find(self._pattern, begin - base, min(stop, limit) - base)
-        if at >= 0:
-            self._found = self._searched = base + at
-            return self._found
-        self._searched = stop if stop < limit else max(begin, limit - len(self._pattern) + 1)
-        return _NEVER
 
 
 class PacketReader:
@@ -105,6 +75,8 @@ class PacketReader:
     ----------
     direction
         Who sends the bytes: it tells which NoEscape headers can be true.
+    statistics
+        Where to count; None: in new ones.
 
     >>> reader = PacketReader()
     >>> reader.receive_data(bytes.fromhex("7D 10 6D 7E"))
@@ -112,8 +84,13 @@ class PacketReader:
     ('10', <NeedData.NEED_DATA: 'need data'>)
     """
 
-    def __init__(self, direction: Direction = Direction.FROM_MODULE) -> None:
+    def __init__(
+        self,
+        direction: Direction = Direction.FROM_MODULE,
+        statistics: LinkStatistics | None = None,
+    ) -> None:
         self._direction = direction
+        self.statistics = LinkStatistics() if statistics is None else statistics
         self._buffer = b""  # what is being parsed, from _pos on; never changed in place
         self._pos = 0
         self._base = 0  # stream offset of _buffer[0]; all other positions are stream offsets
@@ -124,14 +101,11 @@ class PacketReader:
         self._wanted = 1  # bytes worth joining to the buffer at once
         self._ended = False
         self._damage_end = -1  # end of the bytes a fault was reported for; -1: none since a packet
-        self._starts = _Finder(b"\x7d")
-        self._bulk_starts = _Finder(NO_ESCAPE_START)
-        self._scan_from = -1  # Normal start whose terminator was looked for
-        self._scan_at = -1  # how far; every special byte in between is escaped
-        self._terminator = -1  # where it was found, else -1
-        self._next_end = 0  # no 7E lies between the last place looked at and this one
-        self._good_starts: frozenset[int] = frozenset()  # whose checksum fits ...
-        self._good_for = -1  # ... at this terminator
+        self._starts = PatternFinder(b"\x7d")
+        self._bulk_starts = PatternFinder(NO_ESCAPE_START)
+        self._terminators = TerminatorFinder()
+        self._judged = -1  # the last terminator for which a Normal start was judged
+        self._good_starts: frozenset[int] | None = None  # that share it and have a fitting checksum
 
     def receive_data(self, data: bytes) -> None:
         """Take bytes as they come from the port, in chunks of any size.
@@ -141,6 +115,7 @@ class PacketReader:
         if data:
             self._queue.append(bytes(data))
             self._queued += len(data)
+            self.statistics.bytes += len(data)
 
     def end_data(self) -> None:
         """Tell that no more bytes will come: what is incomplete now will be a fault."""
@@ -178,6 +153,7 @@ class PacketReader:
                 ):
                     self._pos = end
                     self._damage_end = -1
+                    self.statistics.packets += 1
                     return Framing.NO_ESCAPE, buffer, pos + 9, end, self._base + pos
             found = self._parse()
             if found is not NEED_DATA:
@@ -199,17 +175,20 @@ class PacketReader:
         while True:
             here = self._base + self._pos
             limit = self._base + len(self._buffer)
-            start = self._starts.next(self._buffer, self._base, here)
-            bulk = self._bulk_starts.next(self._buffer, self._base, here, start)
+            if self._buffer.startswith(b"\x7d", self._pos):  # nothing to search for
+                start, bulk = here, NEVER
+            else:
+                start = self._starts.next(self._buffer, self._base, here)
+                bulk = self._bulk_starts.next(self._buffer, self._base, here, start)
             first = min(start, bulk)
-            junk_end = first if first < _NEVER else limit - self._trailing_7c()
+            junk_end = first if first < NEVER else limit - self._trailing_7c()
             if junk_end > here:
-                self._pos = junk_end - self._base
+                self._skip_to(junk_end)
                 clean = self._damage_end < 0
                 self._damage_end = max(self._damage_end, junk_end)
                 if clean:
-                    return FramingFault(kind=FaultKind.GARBAGE, offset=here)
-            if first == _NEVER:
+                    return self._fault(FaultKind.GARBAGE, here)
+            if first == NEVER:
                 return self._need(1, HEAD_BYTES)
             found = self._normal(first) if first == start else self._no_escape(first)
             if found is not None:
@@ -222,10 +201,20 @@ class PacketReader:
 
     def _reject(self, kind: FaultKind, first: int, covered_end: int) -> FramingFault | None:
         """Give up a start and go on behind it; a fault unless these bytes had theirs."""
-        self._pos = first + 1 - self._base
+        self._skip_to(first + 1)
+        self.statistics.resyncs += 1
         reported = first < self._damage_end
         self._damage_end = max(self._damage_end, covered_end)
-        return None if reported else FramingFault(kind=kind, offset=first)
+        return None if reported else self._fault(kind, first)
+
+    def _fault(self, kind: FaultKind, offset: int) -> FramingFault:
+        self.statistics.faults[kind] += 1
+        return FramingFault(kind=kind, offset=offset)
+
+    def _skip_to(self, offset: int) -> None:
+        """Go on at ``offset``; the bytes before it belong to no packet."""
+        self.statistics.junk_bytes += offset - self._base - self._pos
+        self._pos = offset - self._base
 
     def _no_escape(self, first: int) -> Span | FramingFault | NeedData | None:
         """Judge the NoEscape packet at ``first``; None if it was rejected without a report."""
@@ -244,12 +233,13 @@ class PacketReader:
                     return self._need(NO_ESCAPE_HEADER_BYTES + length - have)
                 self._pos = begin + length
                 self._damage_end = -1
+                self.statistics.packets += 1
                 return Framing.NO_ESCAPE, self._buffer, begin, begin + length, first
         fault = self._reject(FaultKind.HEADER, first, first + len(NO_ESCAPE_START))
         run = _RUN_OF_7C.match(self._buffer, at)
         if run:  # a start whose length would be 7C7C7C7C: all but the last 7 of the run
-            self._pos = run.end() - 7
-            last_rejected = self._base + self._pos - 1
+            last_rejected = self._base + run.end() - 8
+            self._skip_to(last_rejected + 1)
             self._damage_end = max(self._damage_end, last_rejected + len(NO_ESCAPE_START))
         return fault
 
@@ -257,25 +247,24 @@ class PacketReader:
         self, first: int
     ) -> Span | FramingFault | NeedData | None:
         """Judge the Normal packet at ``first``; None if it was rejected without a report."""
-        self._scan(first)
-        end = self._terminator
-        if (end if end >= 0 else self._scan_at) - first > MAX_NORMAL_WIRE_BYTES:
+        end = self._terminators.after(self._buffer, self._base, first, MAX_NORMAL_WIRE_BYTES)
+        if (end if end >= 0 else self._terminators.searched) - first > MAX_NORMAL_WIRE_BYTES:
             return self._reject(FaultKind.OVERSIZE, first, first + MAX_NORMAL_WIRE_BYTES)
         if end < 0:
             return self._need(1, max(len(self._buffer) - self._pos, _JOIN_BYTES))
         at, stop = first - self._base, end - self._base
         if self._buffer[stop] == START:
             if end == first + 1:  # doubled start: nothing is lost
-                self._pos = at + 1
+                self._skip_to(end)
                 return None
             return self._reject(FaultKind.TRUNCATED, first, end)
-        if first == self._scan_from:
-            content = unescape(self._buffer[at + 1 : stop])
+        if end != self._judged:
+            self._judged, self._good_starts = end, None
+            content = self._terminators.content(self._buffer, self._base, first)
             good = xor(content) == START
         else:
-            if self._good_for != end:
+            if self._good_starts is None:
                 self._good_starts = _good_starts(self._buffer[at:stop], first)
-                self._good_for = end
             good = first in self._good_starts
             content = unescape(self._buffer[at + 1 : stop]) if good else b""
         if good and len(content) > MAX_NORMAL_BYTES:
@@ -283,44 +272,10 @@ class PacketReader:
         if good and len(content) > 1:
             self._pos = stop + 1
             self._damage_end = -1
+            self.statistics.packets += 1
             return Framing.NORMAL, content, 0, len(content) - 1, first
         kind = FaultKind.EMPTY if good or not content else FaultKind.CHECKSUM
         return self._reject(kind, first, end + 1)
-
-    def _scan(self, first: int) -> None:
-        """Find the terminator of the Normal start ``first``: the next 7D or 7E not escaped."""
-        known_to = self._terminator if self._terminator >= 0 else self._scan_at
-        if not self._scan_from <= first < known_to:
-            self._scan_from, self._scan_at = first, first + 1
-            self._terminator = -1
-        if self._terminator >= 0:
-            return
-        buffer, base = self._buffer, self._base
-        at = self._scan_at - base
-        floor = max(self._scan_from + 1 - base, 0)
-        size = len(buffer)
-        end = buffer.find(END, max(at, self._next_end - base))
-        while True:
-            if end < 0:
-                end = size
-            special = buffer.find(START, at, end)
-            if special < 0:
-                special = end
-            if special == size:
-                self._scan_at = self._next_end = base + size
-                return
-            if buffer[special - 1] != ESCAPE or special == floor:
-                break
-            before = special - 1
-            while before >= floor and buffer[before] == ESCAPE:
-                before -= 1
-            if (special - before) & 1:  # an even number of escape bytes: they escape each other
-                break
-            at = special + 1
-            if end < at:
-                end = buffer.find(END, at)
-        self._scan_at = self._terminator = base + special
-        self._next_end = base + end
 
     def _need(self, missing: int, wanted: int = 0) -> NeedData:
         self._missing = missing
@@ -336,11 +291,12 @@ class PacketReader:
         if self._queued < self._missing:
             return False
         self._base += self._pos
-        if self._pos == len(self._buffer):
+        rest = len(self._buffer) - self._pos
+        if rest <= self._taken:  # all of it was copied from the chunk that goes on: parse it there
             self._buffer = self._queue.popleft()
-            self._pos, self._taken = self._taken, 0
+            self._queued -= len(self._buffer) - self._taken
+            self._pos, self._taken = self._taken - rest, 0
             self._base -= self._pos
-            self._queued -= len(self._buffer) - self._pos
             return True
         parts = [memoryview(self._buffer)[self._pos :]]
         wanted = min(self._wanted, self._queued)
