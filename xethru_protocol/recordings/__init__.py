@@ -1,27 +1,40 @@
 """Recordings of everything a module sent: read, written, converted.
 
 `read_recording` takes any of them; `RecordingWriter` writes what the vendor's ModuleConnector
-does.
+does; `WireCapture` keeps the bytes of a port; `convert` goes from any to any. The rest is in the
+modules of this package: layouts and meta file of the vendor's format first.
 """
 
+from xethru_protocol.recordings.convert import Conversion, convert
 from xethru_protocol.recordings.detect import (
+    RecordingFormat,
     RecordingSummary,
     describe_recording,
     read_recording,
     recording_facts,
+    recording_format,
 )
 from xethru_protocol.recordings.errors import RecordingError, RecordingFault
 from xethru_protocol.recordings.records import RecordingFacts
 from xethru_protocol.recordings.vendor_writer import RecordingWriter, Split
+from xethru_protocol.recordings.wire_capture import Chunk, WireCapture, read_chunks, read_note
 
 __all__ = [
+    "Chunk",
+    "Conversion",
     "RecordingError",
     "RecordingFacts",
     "RecordingFault",
+    "RecordingFormat",
     "RecordingSummary",
     "RecordingWriter",
     "Split",
+    "WireCapture",
+    "convert",
     "describe_recording",
+    "read_chunks",
+    "read_note",
     "read_recording",
     "recording_facts",
+    "recording_format",
 ]

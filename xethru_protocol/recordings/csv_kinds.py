@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from xethru_protocol import responses
+from xethru_protocol import responses, responses_profile
 from xethru_protocol.recordings.records import MS_NS
 from xethru_protocol.table import Response
 
@@ -131,17 +131,137 @@ def _time_ns(stamp: str) -> int:
     return (datetime.fromisoformat(stamp) - _UNIX) // timedelta(milliseconds=1) * MS_NS
 
 
-_TEXT_KIND = CsvKind(  # bit [HDR], name and columns [INF]
-    "xethru_string_",
-    1 << 5,
-    responses.DataString,
-    (
-        Column("ContentId", "content_id"),
-        Column("Info", "info"),
-        Column("Text", "text", _escaped, _unescaped),
-    ),
+_COUNTER = Column("Counter", "counter")
+_STATE = Column("State", "state")
+_RATE = _real("RPM", "rpm")
+_DISTANCE = _real("ObjectDistance", "distance_m")
+_QUALITY = Column("SignalQuality", "signal_quality")
+_MOVEMENT = (
+    _counted("MovementIntervalCount", "movement_slow"),
+    _listed("MovementSlowItem", "movement_slow"),
+    _listed("MovementFastItem", "movement_fast"),
+)
+_DETECTION_COUNT = _counted("DetectionCount", "detection_distance_m")
+_DETECTION = (
+    _listed("DetectionDistance", "detection_distance_m"),
+    _listed("DetectionRadarCrossSection", "detection_rcs"),
+    _listed("DetectionVelocity", "detection_velocity"),
 )
 
-
-CSV_KINDS: tuple[CsvKind, ...] = (_TEXT_KIND,)
+CSV_KINDS: tuple[CsvKind, ...] = (
+    CsvKind(  # bit, name and columns [OBS]
+        "xethru_presence_single_",
+        1 << 12,
+        responses_profile.PresenceSingle,
+        (
+            _COUNTER,
+            Column("PresenceState", "state"),
+            _real("Distance", "distance_m"),
+            Column("Direction", "direction"),
+            _QUALITY,
+        ),
+    ),
+    CsvKind(  # bit [OBS]; name, columns and brackets as others report them [INF]
+        "xethru_presence_movinglist_",
+        1 << 13,
+        responses_profile.PresenceMovingList,
+        (
+            _COUNTER,
+            Column("PresenceState", "state"),
+            _MOVEMENT[0],
+            _DETECTION_COUNT,
+            *_MOVEMENT[1:],
+            *_DETECTION,
+        ),
+    ),
+    CsvKind(  # bit [HDR]; name and columns as others report them, the last two [INF]
+        "xethru_sleep_",
+        1 << 2,
+        responses_profile.SleepStatus,
+        (
+            Column("FrameCounter", "counter"),
+            _STATE,
+            _RATE,
+            _DISTANCE,
+            _QUALITY,
+            _real("MovementSlow", "movement_slow"),
+            _real("MovementFast", "movement_fast"),
+        ),
+    ),
+    CsvKind(  # bit [HDR]; name as others report it, columns [INF]
+        "xethru_respiration_",
+        1 << 3,
+        responses_profile.RespStatus,
+        (
+            Column("FrameCounter", "counter"),
+            _STATE,
+            Column("RPM", "rpm"),
+            _DISTANCE,
+            _real("ObjectMovement", "movement_mm"),
+            _QUALITY,
+        ),
+    ),
+    CsvKind(  # bit [HDR], name and columns [INF]
+        "xethru_string_",
+        1 << 5,
+        responses.DataString,
+        (
+            Column("ContentId", "content_id"),
+            Column("Info", "info"),
+            Column("Text", "text", _escaped, _unescaped),
+        ),
+    ),
+    CsvKind(  # bit [HDR], name and columns [INF]
+        "xethru_respiration_detectionlist_",
+        1 << 14,
+        responses_profile.RespirationDetectionList,
+        (_COUNTER, _DETECTION_COUNT, *_DETECTION),
+    ),
+    CsvKind(  # bit [HDR], name and columns [INF]
+        "xethru_respiration_movinglist_",
+        1 << 15,
+        responses_profile.RespirationMovingList,
+        (_COUNTER, *_MOVEMENT),
+    ),
+    CsvKind(  # bit [HDR], name and columns [INF]
+        "xethru_vitalsigns_",
+        1 << 16,
+        responses_profile.VitalSigns,
+        (
+            _COUNTER,
+            _STATE,
+            _real("RespirationRate", "respiration_rate"),
+            _real("RespirationDistance", "respiration_distance_m"),
+            _real("RespirationConfidence", "respiration_confidence"),
+            _real("HeartRate", "heart_rate"),
+            _real("HeartDistance", "heart_distance_m"),
+            _real("HeartConfidence", "heart_confidence"),
+            _real("NormalizedMovementSlow", "normalized_movement_slow"),
+            _real("NormalizedMovementFast", "normalized_movement_fast"),
+            _real("NormalizedMovementStart", "normalized_movement_start_m"),
+            _real("NormalizedMovementEnd", "normalized_movement_end_m"),
+        ),
+    ),
+    CsvKind(  # bit [HDR], name and columns [INF]
+        "xethru_sleepstage_",
+        1 << 17,
+        responses_profile.SleepStage,
+        (_COUNTER, Column("SleepStage", "stage")),
+    ),
+    CsvKind(  # bit [HDR], name and columns [INF]
+        "xethru_respiration_normalizedmovementlist_",
+        1 << 18,
+        responses_profile.RespirationNormalizedMovementList,
+        (
+            _COUNTER,
+            _real("Start", "start_m"),
+            _real("BinLength", "bin_length_m"),
+            _counted("Count", "movement_slow"),
+            _listed("MovementSlow", "movement_slow"),
+            _listed("MovementFast", "movement_fast"),
+        ),
+    ),
+)
+"""All kinds. Bits 1 << 4 (performance status) and 1 << 19 ... 22 (frames of newer firmware) of [HDR]
+have no row: their layout is not known (Protocol reference 7.5)."""
 BY_MESSAGE: dict[type[Response], CsvKind] = {kind.message: kind for kind in CSV_KINDS}

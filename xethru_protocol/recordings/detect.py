@@ -4,16 +4,23 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
+from xethru_protocol.recordings import wire_capture
 from xethru_protocol.recordings.errors import (
     FaultHandler,
+    RecordingError,
     RecordingFault,
     unreadable,
 )
+from xethru_protocol.recordings.npz import npz_facts, read_npz
 from xethru_protocol.recordings.records import RecordingFacts, Timed
 from xethru_protocol.recordings.vendor_meta import PARAMETER_FILE_NAME
 from xethru_protocol.recordings.vendor_reader import is_vendor_file, read_vendor, vendor_facts
+from xethru_protocol.recordings.wire_capture import read_wire, wire_facts
 from xethru_protocol.table import ROWS, Response, UnknownMessage
+
+RecordingFormat = Literal["vendor", "wire", "mcap", "npz"]
 
 
 def message_name(message: Response) -> str:
@@ -42,7 +49,7 @@ class RecordingSummary:
     """
 
     path: Path
-    format: str
+    format: RecordingFormat
     start_ns: int | None
     duration_ns: int | None
     messages: dict[str, int]
@@ -53,13 +60,48 @@ class RecordingSummary:
     faults: tuple[RecordingFault, ...]
 
 
+_MAGICS: dict[bytes, RecordingFormat] = {
+    wire_capture.MAGIC: "wire",
+    b"\x89MCAP0\r\n": "mcap",
+    b"PK\x03\x04": "npz",
+}
+
+
+def recording_format(path: Path | str) -> RecordingFormat:
+    """Return the format of a recording, told by what it begins with.
+
+    Raises
+    ------
+    RecordingError
+        If there is nothing, or nothing that this can read.
+    """
+    path = Path(path)
+    try:
+        if not path.exists():
+            raise RecordingError(f"there is no recording {path}")
+        if path.is_dir() or is_vendor_file(path):
+            return "vendor"
+        with path.open("rb") as stream:
+            start = stream.read(8)
+    except OSError as error:
+        raise unreadable(path, error) from None
+    for magic, found in _MAGICS.items():
+        if start.startswith(magic):
+            return found
+    raise RecordingError(
+        f"{path} is no recording this can read: a directory or data file of ModuleConnector,"
+        " a wire capture (.xtwire), MCAP or .npz"
+    )
+
+
 def read_recording(path: Path | str, on_fault: FaultHandler | None = None) -> Iterator[Timed]:
     """Messages of a recording with their times, whatever its format.
 
     Parameters
     ----------
     path
-        A directory of ModuleConnector, its meta file or one data file in it.
+        A directory of ModuleConnector, its meta file or one data file in it; a wire capture
+        (`WireCapture`), an MCAP file or a numpy archive that `convert` wrote.
     on_fault
         Called with what could not be read; the rest is read all the same. None: what costs
         messages raises, what costs only times passes.
@@ -75,12 +117,33 @@ def read_recording(path: Path | str, on_fault: FaultHandler | None = None) -> It
         If there is nothing to read, or messages are lost and ``on_fault`` is None.
     """
     path = Path(path)
-    yield from read_vendor(path, on_fault)
+    match recording_format(path):
+        case "wire":
+            yield from read_wire(path, on_fault)
+        case "npz":
+            yield from read_npz(path)
+        case "mcap":
+            from xethru_protocol.recordings.mcap_file import read_mcap
+
+            yield from read_mcap(path, on_fault)
+        case "vendor":
+            yield from read_vendor(path, on_fault)
 
 
 def recording_facts(path: Path | str) -> RecordingFacts:
     """Return what a recording says about itself; RecordingError if it cannot be read."""
-    return vendor_facts(Path(path))[0]
+    path = Path(path)
+    match recording_format(path):
+        case "wire":
+            return wire_facts(path)
+        case "npz":
+            return npz_facts(path)
+        case "mcap":
+            from xethru_protocol.recordings.mcap_file import mcap_facts
+
+            return mcap_facts(path)
+        case "vendor":
+            return vendor_facts(path)
 
 
 def describe_recording(path: Path | str) -> RecordingSummary:
@@ -97,7 +160,7 @@ def describe_recording(path: Path | str) -> RecordingSummary:
     facts = recording_facts(path)
     return RecordingSummary(
         path=path,
-        format="vendor",
+        format=recording_format(path),
         start_ns=first_ns,
         duration_ns=None if first_ns is None or last_ns is None else last_ns - first_ns,
         messages=dict(counts),

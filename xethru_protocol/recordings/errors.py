@@ -14,13 +14,13 @@ class RecordingError(XeThruError):
 class RecordingFault:
     """A damaged part: what could not be read of ``file`` at byte ``offset``, and why.
 
-    ``times_only`` says that no message is lost, only its time or the order among several files.
+    ``minor`` says that no message is lost, only its time or the order among several files.
     """
 
     file: str
     offset: int
     reason: str
-    times_only: bool = False
+    minor: bool = False
 
 
 FaultHandler = Callable[[RecordingFault], None]
@@ -30,7 +30,7 @@ def report(fault: RecordingFault, on_fault: FaultHandler | None) -> None:
     """Hand a fault over; without a handler, one that costs messages raises `RecordingError`."""
     if on_fault is not None:
         on_fault(fault)
-    elif not fault.times_only:
+    elif not fault.minor:
         raise RecordingError(f"{fault.file}: {fault.reason} (at byte {fault.offset})")
 
 

@@ -1,7 +1,8 @@
 """What every kind of recording holds: messages with their times, and facts about the whole."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Self
 
 from xethru_protocol.table import Response
 
@@ -35,3 +36,25 @@ class RecordingFacts:
     user_header: bytes = b""
     stopped_ns: int | None = None
     closed_ns: int | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """JSON-able form: bytes in hexadecimal."""
+        return asdict(self) | {
+            "parameter_file": None if self.parameter_file is None else self.parameter_file.hex(),
+            "user_header": self.user_header.hex(),
+        }
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Self:
+        """Read `as_json` back; unknown keys are left out.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If a value is not of its kind.
+        """
+        known = {name: values[name] for name in cls.__slots__ if name in values}
+        for name in ("parameter_file", "user_header"):
+            if known.get(name) is not None:
+                known[name] = bytes.fromhex(known[name])
+        return cls(**known)

@@ -46,8 +46,8 @@ def read_vendor(path: Path, on_fault: FaultHandler | None) -> TimedMessages:
         yield from _Part(directory, files, on_fault, whole=path.is_dir()).messages()
 
 
-def vendor_facts(path: Path) -> tuple[RecordingFacts, int | None]:
-    """Return what a recording says about itself, and its format version; None without a meta.
+def vendor_facts(path: Path) -> RecordingFacts:
+    """Return what a recording says about itself; next to nothing without a meta file.
 
     Raises
     ------
@@ -65,19 +65,16 @@ def vendor_facts(path: Path) -> tuple[RecordingFacts, int | None]:
     except OSError as error:
         raise unreadable(parameters, error) from None
     if meta is None:
-        return RecordingFacts(parameter_file=parameter_file), None
+        return RecordingFacts(parameter_file=parameter_file)
     stops = [entry.since_start_ms for entry in meta.entries if entry.closed]
     at_once = not rest and meta.complete
-    return (
-        RecordingFacts(
-            session_id=meta.head.session_id.decode("utf-8", "replace"),
-            profile_id=meta.head.profile_id,
-            parameter_file=parameter_file,
-            user_header=_user_header(directory, meta),
-            stopped_ns=_time_ns(meta, max(stops)) if stops and at_once else None,
-            closed_ns=_time_ns(meta, meta.head.duration_ms) if at_once else None,
-        ),
-        13,
+    return RecordingFacts(
+        session_id=meta.head.session_id.decode("utf-8", "replace"),
+        profile_id=meta.head.profile_id,
+        parameter_file=parameter_file,
+        user_header=_user_header(directory, meta),
+        stopped_ns=_time_ns(meta, max(stops)) if stops and at_once else None,
+        closed_ns=_time_ns(meta, meta.head.duration_ms) if at_once else None,
     )
 
 
@@ -273,11 +270,11 @@ class _Part:
         report(RecordingFault(file=name, offset=0, reason=reason), self._on_fault)
 
     def _report_meta(self, reason: str) -> None:
-        fault = RecordingFault(file=META_NAME, offset=0, reason=reason, times_only=True)
+        fault = RecordingFault(file=META_NAME, offset=0, reason=reason, minor=True)
         report(fault, self._on_fault)
 
     def _disagree(self, reading: _Reading, offset: int, reason: str) -> None:
         reading.times_hold = False
         name = reading.file.path.name
-        fault = RecordingFault(file=name, offset=offset, reason=reason, times_only=True)
+        fault = RecordingFault(file=name, offset=offset, reason=reason, minor=True)
         report(fault, self._on_fault)

@@ -1,0 +1,232 @@
+"""Recordings as MCAP, which ROS 2, Foxglove and PlotJuggler open; the only user of mcap here.
+
+Topics, as in the sessions of this project: ``/radar/<name>/frame`` holds radar frames (DATA FLOAT
+of content 0) as Float32MultiArray with the counter in the record's sequence number,
+``/radar/<name>/info`` once what is known of them. Every other message is on
+``/radar/<name>/payload``, its payload as UInt8MultiArray, and for reading, if it is a short one, on
+``/radar/<name>/message`` as JSON. Messages without a time have one of 0 and a channel that says so.
+A cut file loses its last chunk of at most 256 KiB.
+"""
+
+import json
+import re
+import struct
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import zstandard
+from mcap.exceptions import McapError
+from mcap.records import Channel, Message, Metadata
+from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.writer import CompressionType, Writer
+
+from xethru_protocol.codec import decode_response, describe, encode
+from xethru_protocol.messages import BasebandAp, BasebandIq, DataFloat
+from xethru_protocol.recordings.cdr import (
+    BYTE_ARRAY,
+    FLOAT_ARRAY,
+    SCHEMAS,
+    STRING,
+    pack_array,
+    pack_string,
+    unpack_array,
+)
+from xethru_protocol.recordings.errors import (
+    FaultHandler,
+    RecordingError,
+    RecordingFault,
+    report,
+    unreadable,
+    unwritable,
+)
+from xethru_protocol.recordings.records import RecordingFacts, Timed, TimedMessages
+from xethru_protocol.table import ROWS, Response, UnknownMessage
+
+_FACTS = "xethru-hil recording"
+_LENGTH_UNIT = "module metres, c = 3.0e8 m/s"
+_CHUNK_BYTES = 256 * 1024
+_UNTIMED = {"xethru-hil": "time unknown"}
+_DAMAGED = (
+    McapError,
+    CRCValidationError,
+    EOFError,
+    struct.error,
+    ValueError,
+    OverflowError,
+    zstandard.ZstdError,
+)
+
+
+class _McapWriter:
+    """The channels of one radar in a file being written."""
+
+    def __init__(self, stream: BinaryIO, radar: str, facts: RecordingFacts) -> None:
+        self._radar = radar
+        self._writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer.start(profile="ros2", library="xethru-hil")
+        self._writer.add_metadata(_FACTS, {"facts": json.dumps(facts.as_json())})
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[tuple[str, bool], int] = {}
+        self._others = 0
+        self._has_info = False
+
+    def write(self, message: Response, t_ns: int | None) -> None:
+        """Add a message."""
+        if isinstance(message, DataFloat) and message.content_id == 0:
+            self._info(message, t_ns)
+            data = pack_array(FLOAT_ARRAY, np.ascontiguousarray(message.values, "<f4"))
+            self._add("frame", FLOAT_ARRAY, data, t_ns, message.info)
+            return
+        bulk = not isinstance(message, UnknownMessage) and ROWS[type(message)].bulk
+        if isinstance(message, BasebandIq | BasebandAp):
+            self._info(message, t_ns)
+        payload = np.frombuffer(encode(message), np.uint8)
+        self._add("payload", BYTE_ARRAY, pack_array(BYTE_ARRAY, payload), t_ns, self._others)
+        if not bulk:
+            name, fields = describe(message)
+            text = json.dumps({"message": name, "fields": fields})
+            self._add("message", STRING, pack_string(text), t_ns, self._others)
+        self._others = (self._others + 1) & 0xFFFFFFFF
+
+    def finish(self) -> None:
+        """Write the index."""
+        self._writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
+
+    def _info(self, frame: DataFloat | BasebandIq | BasebandAp, t_ns: int | None) -> None:
+        """Say once what is known of the frames; what is not is null."""
+        if self._has_info:
+            return
+        self._has_info = True
+        baseband = None if isinstance(frame, DataFloat) else frame
+        info: dict[str, object] = {
+            "name": self._radar,
+            "serial": "",
+            "port": "",
+            "x_m": None,
+            "y_m": None,
+            "yaw_rad": None,
+            "range_offset_m": None,
+            "range_start_m": None if baseband is None else baseband.range_offset_m,
+            "bin_length_m": None if baseband is None else baseband.bin_length_m,
+            "n_bins": len(frame.values) if isinstance(frame, DataFloat) else frame.num_bins,
+            "rate_hz": None,
+            "settings": {},
+            "length_unit": _LENGTH_UNIT,
+        }
+        self._add("info", STRING, pack_string(json.dumps(info)), t_ns, 0)
+
+    def _add(self, topic: str, schema: str, data: bytes, t_ns: int | None, sequence: int) -> None:
+        channel = self._channel(topic, schema, timed=t_ns is not None)
+        stamp_ns = t_ns or 0
+        if stamp_ns < 0:
+            raise RecordingError("MCAP has no place for times before 1970")
+        self._writer.add_message(
+            channel_id=channel,
+            log_time=stamp_ns,
+            publish_time=stamp_ns,
+            sequence=sequence,
+            data=data,
+        )
+
+    def _channel(self, topic: str, schema: str, *, timed: bool) -> int:
+        key = topic, timed
+        if key not in self._channels:
+            if schema not in self._schemas:
+                text = SCHEMAS[schema].encode()
+                self._schemas[schema] = self._writer.register_schema(schema, "ros2msg", text)
+            self._channels[key] = self._writer.register_channel(
+                f"/radar/{self._radar}/{topic}",
+                "cdr",
+                self._schemas[schema],
+                {} if timed else _UNTIMED,
+            )
+        return self._channels[key]
+
+
+def write_mcap(
+    path: Path, messages: Iterable[Timed], facts: RecordingFacts, radar: str = "module"
+) -> None:
+    """Write messages to a new file; ``radar`` is the name in its topics.
+
+    Raises
+    ------
+    RecordingError
+        If the file exists or cannot be written. What was written before stays.
+    """
+    try:
+        with path.open("xb") as stream:
+            writer = _McapWriter(stream, radar, facts)
+            for message, t_ns in messages:
+                writer.write(message, t_ns)
+            writer.finish()
+    except OSError as error:
+        raise unwritable(path, error) from None
+
+
+def read_mcap(path: Path, on_fault: FaultHandler | None) -> TimedMessages:
+    """Messages of an MCAP file of this program: a recording, or a session of one radar.
+
+    Raises
+    ------
+    RecordingError
+        If it holds no radar or several, or is damaged and ``on_fault`` is None.
+    """
+    topics: dict[int, tuple[str, bool]] = {}
+    radars: set[str] = set()
+    for record in _records(path, on_fault):
+        if isinstance(record, Channel):
+            radar, topic = _radar_topic(record.topic)
+            if radar and topic in {"frame", "payload"}:
+                topics[record.id] = topic, record.metadata.get("xethru-hil") is None
+                radars.add(radar)
+                if len(radars) > 1:
+                    names = ", ".join(sorted(radars))
+                    raise RecordingError(f"{path} holds several radars ({names}), not one")
+        elif isinstance(record, Message) and record.channel_id in topics:
+            topic, timed = topics[record.channel_id]
+            try:
+                message = _message(topic, record)
+            except (ValueError, struct.error) as error:
+                raise RecordingError(f"{path}: a message is damaged: {error}") from None
+            yield message, record.log_time if timed else None
+    if not radars:
+        raise RecordingError(f"{path} holds no topic /radar/<name>/frame or .../payload")
+
+
+def mcap_facts(path: Path) -> RecordingFacts:
+    """Return what a file says about itself; defaults where it says nothing."""
+    for record in _records(path, lambda fault: None):
+        if isinstance(record, Metadata) and record.name == _FACTS:
+            try:
+                return RecordingFacts.from_json(json.loads(record.metadata["facts"]))
+            except (KeyError, ValueError, TypeError) as error:
+                raise RecordingError(f"{path}: what it says about itself: {error}") from None
+        if isinstance(record, Message):
+            break
+    return RecordingFacts()
+
+
+def _message(topic: str, record: Message) -> Response:
+    if topic == "frame":
+        return DataFloat(info=record.sequence, values=unpack_array(record.data, "<f4"))
+    return decode_response(unpack_array(record.data, "u1").tobytes())
+
+
+def _radar_topic(topic: str) -> tuple[str, str]:
+    found = re.fullmatch(r"/radar/([^/]+)/([^/]+)", topic)
+    return (found[1], found[2]) if found else ("", "")
+
+
+def _records(path: Path, on_fault: FaultHandler | None) -> Iterator[object]:
+    try:
+        with path.open("rb") as stream:
+            try:
+                yield from StreamReader(stream, validate_crcs=True).records
+            except _DAMAGED as error:
+                reason = f"nothing more can be read: {error or type(error).__name__}"
+                fault = RecordingFault(file=path.name, offset=stream.tell(), reason=reason)
+                report(fault, on_fault)
+    except OSError as error:
+        raise unreadable(path, error) from None

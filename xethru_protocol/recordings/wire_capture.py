@@ -1,0 +1,245 @@
+"""Raw wire captures: every byte of one port, both ways, with nanosecond stamps.
+
+Our own format, made to be read by a few lines in any language; numbers are little-endian.
+
+Head::
+
+    8 bytes  89 58 54 57 49 52 45 0A  (0x89 "XTWIRE" LF)
+    u32      1, the version
+    u32      length of the note that follows
+    note     JSON object, UTF-8: what the writer knows, such as the port
+
+Then chunks until the end of the file::
+
+    u8   3C "<" from the module, 3E ">" from the host
+    i64  time [ns since 1970] at which the chunk was complete; -2**63 where unknown
+    u32  length of the bytes that follow
+    the bytes, as the port gave or took them: packets may begin and end anywhere in them
+
+A file may end anywhere: whole chunks before the cut are good. Suffix ``.xtwire``.
+"""
+
+import json
+import os
+import struct
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from io import FileIO
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO, Literal, Self
+
+from xethru_protocol.codec import decode_response
+from xethru_protocol.framing import PacketReader
+from xethru_protocol.packets import FramingFault, NeedData
+from xethru_protocol.plausibility import Direction
+from xethru_protocol.recordings.errors import (
+    FaultHandler,
+    RecordingError,
+    RecordingFault,
+    report,
+    unreadable,
+    unwritable,
+)
+from xethru_protocol.recordings.records import RecordingFacts, TimedMessages
+
+MAGIC = b"\x89XTWIRE\n"
+VERSION = 1
+SUFFIX = ".xtwire"
+
+Way = Literal["rx", "tx"]
+"""``rx``: from the module; ``tx``: from the host."""
+
+_HEAD = struct.Struct("<8sII")
+_CHUNK = struct.Struct("<BqI")
+_MARKS: dict[Way, int] = {"rx": ord("<"), "tx": ord(">")}
+_WAYS: dict[int, Way] = {mark: way for way, mark in _MARKS.items()}
+_NO_TIME = -(2**63)
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """Bytes that passed the port together; ``t_ns`` since 1970, None where unknown."""
+
+    way: Way
+    data: bytes
+    t_ns: int | None
+
+
+class WireCapture:
+    """Writes a wire capture; each chunk is handed to the operating system at once.
+
+    Parameters
+    ----------
+    path
+        A new file.
+    note
+        What to say about the capture, as JSON-able values.
+
+    Raises
+    ------
+    RecordingError
+        If the file exists or cannot be made.
+    """
+
+    def __init__(self, path: Path | str, note: Mapping[str, Any] | None = None) -> None:
+        self.path = Path(path)
+        text = json.dumps(dict(note or {})).encode()
+        try:
+            self._stream = FileIO(self.path, "x")
+        except OSError as error:
+            raise unwritable(self.path, error) from None
+        self._size = 0
+        self._append(_HEAD.pack(MAGIC, VERSION, len(text)) + text)
+
+    def __enter__(self) -> Self:
+        """Return the capture itself."""
+        return self
+
+    def __exit__(
+        self,
+        exception: type[BaseException] | None,
+        value: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Close the file."""
+        self.close()
+
+    def write(self, direction: Way, data: bytes, t_ns: int | None) -> None:
+        """Append a chunk; ``t_ns`` since 1970, None if unknown.
+
+        Raises
+        ------
+        RecordingError
+            If the disk is full or the file went away. What was written before stays.
+        """
+        if not data:
+            return
+        stamp_ns = _NO_TIME if t_ns is None else t_ns
+        self._append(_CHUNK.pack(_MARKS[direction], stamp_ns, len(data)) + data)
+
+    def close(self) -> None:
+        """Close the file; calling it again does nothing."""
+        self._stream.close()
+
+    def _append(self, data: bytes) -> None:
+        if self._stream.closed:
+            raise RecordingError(f"{self.path}: the capture is closed")
+        view = memoryview(data)
+        try:
+            while view:
+                view = view[self._stream.write(view) :]
+        except OSError as error:
+            with suppress(OSError):  # the disk itself may be gone
+                os.ftruncate(self._stream.fileno(), self._size)  # no half chunk stays behind
+                self._stream.seek(self._size)
+            raise unwritable(self.path, error) from None
+        self._size += len(data)
+
+
+def read_chunks(path: Path | str, on_fault: FaultHandler | None = None) -> Iterator[Chunk]:
+    """Chunks of a wire capture in the order in which they passed.
+
+    A cut last chunk is yielded as far as it is there, then reported.
+
+    Raises
+    ------
+    RecordingError
+        If the file is no wire capture, or is cut and ``on_fault`` is None.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as stream:
+            size = os.fstat(stream.fileno()).st_size
+            _read_note(path, stream)
+            while head := stream.read(_CHUNK.size):
+                begin = stream.tell() - len(head)
+                if len(head) < _CHUNK.size:
+                    _report(path, begin, f"the last chunk is cut: {len(head)} bytes", on_fault)
+                    return
+                mark, stamp_ns, length = _CHUNK.unpack(head)
+                way = _WAYS.get(mark)
+                if way is None:
+                    _report(path, begin, f"no chunk begins with byte {mark:02X}", on_fault)
+                    return
+                data = stream.read(min(length, size - stream.tell()))
+                yield Chunk(way, data, None if stamp_ns == _NO_TIME else stamp_ns)
+                if len(data) < length:
+                    reason = f"the last chunk is cut: {len(data)} of its {length} bytes are there"
+                    _report(path, begin, reason, on_fault)
+                    return
+    except OSError as error:
+        raise unreadable(path, error) from None
+
+
+def read_note(path: Path | str) -> dict[str, Any]:
+    """Return the note of a wire capture; RecordingError if it is none."""
+    path = Path(path)
+    try:
+        with path.open("rb") as stream:
+            return _read_note(path, stream)
+    except OSError as error:
+        raise unreadable(path, error) from None
+
+
+def wire_facts(path: Path) -> RecordingFacts:
+    """Return what the note says of the recording; defaults where it says nothing."""
+    try:
+        return RecordingFacts.from_json(read_note(path).get("facts", {}))
+    except (ValueError, TypeError, AttributeError) as error:
+        raise RecordingError(f"{path}: what it says about itself is damaged: {error}") from None
+
+
+def read_wire(path: Path, on_fault: FaultHandler | None) -> TimedMessages:
+    """Messages from the module in a wire capture, each with the time its last byte came.
+
+    Damage on the line is reported as a fault whose offset counts the bytes from the module.
+    """
+    reader = PacketReader(Direction.FROM_MODULE)
+    cuts: list[RecordingFault] = []
+    t_ns: int | None = None
+    for chunk in read_chunks(path, cuts.append):
+        if chunk.way == "rx":
+            t_ns = chunk.t_ns
+            reader.receive_data(chunk.data)
+            yield from _packets(path, reader, t_ns, on_fault)
+    if not cuts:
+        reader.end_data()
+        yield from _packets(path, reader, t_ns, on_fault)
+    for cut in cuts:
+        report(cut, on_fault)
+
+
+def _packets(
+    path: Path, reader: PacketReader, t_ns: int | None, on_fault: FaultHandler | None
+) -> TimedMessages:
+    while not isinstance(found := reader.next_packet(), NeedData):
+        if isinstance(found, FramingFault):
+            reason = f"on the line: {found.kind.value}"
+            report(RecordingFault(file=path.name, offset=found.offset, reason=reason), on_fault)
+        else:
+            yield decode_response(found.payload), t_ns
+
+
+def _read_note(path: Path, stream: BinaryIO) -> dict[str, Any]:
+    head = stream.read(_HEAD.size)
+    if len(head) < _HEAD.size:
+        raise RecordingError(f"{path} is cut: {len(head)} of {_HEAD.size} bytes of its head")
+    magic, version, length = _HEAD.unpack(head)
+    if magic != MAGIC:
+        raise RecordingError(f"{path} is no wire capture")
+    if version != VERSION:
+        raise RecordingError(f"{path} is a wire capture of version {version}, known is {VERSION}")
+    text = stream.read(min(length, os.fstat(stream.fileno()).st_size))
+    try:
+        note = json.loads(text)
+    except ValueError:
+        note = None
+    if len(text) < length or not isinstance(note, dict):
+        raise RecordingError(f"{path}: the head of the capture is cut or damaged")
+    return note
+
+
+def _report(path: Path, offset: int, reason: str, on_fault: FaultHandler | None) -> None:
+    report(RecordingFault(file=path.name, offset=offset, reason=reason), on_fault)
