@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import statistics
 import sys
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor
 from dataclasses import asdict, dataclass
@@ -33,7 +32,7 @@ from slam.app.report_table import mm_text, share_text
 from slam.app.runner import RunRecord, run_slam
 from slam.app.stop import StopFlag, StopRequestedError
 from slam.app.summary import Summary, ratio
-from slam.app.workers import results_from_workers
+from slam.app.workers import worker_results
 from slam.pipeline import UwbRadarSlam
 
 _POSE_DOF = 3
@@ -225,8 +224,7 @@ def _results(cells: Sequence[tuple[str, str, int]], jobs: int, stop: StopFlag) -
         for cell in cells:
             yield run_one(*cell, check=stop.check)
         return
-    results = results_from_workers(run_one, cells, jobs)
-    try:
+    with worker_results(run_one, cells, jobs) as results:
         while True:
             # Nothing is half-written while we wait, so a signal may end the waiting at once.
             with stop.at_once():
@@ -234,8 +232,3 @@ def _results(cells: Sequence[tuple[str, str, int]], jobs: int, stop: StopFlag) -
             if summary is None:
                 return
             yield summary
-    finally:
-        with warnings.catch_warnings():
-            # joblib regrets the work that an early end throws away
-            warnings.filterwarnings("ignore", "[0-9]+ tasks", UserWarning)
-            results.close()

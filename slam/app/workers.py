@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
+import warnings
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
@@ -23,12 +25,13 @@ _LEFT_TO_THE_PARENT = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 _Result = TypeVar("_Result")
 
 
-def results_from_workers(
+@contextmanager
+def worker_results(
     function: Callable[..., _Result], tasks: Sequence[tuple[object, ...]], n_workers: int
-) -> Generator[_Result, None, None]:
-    """Start worker processes and yield the results in the order of the tasks.
+) -> Iterator[Iterator[_Result]]:
+    """Start worker processes and hand out the results in the order of the tasks.
 
-    Closing the generator early kills the workers.
+    Leaving the block kills workers that are still at it.
 
     Parameters
     ----------
@@ -45,7 +48,31 @@ def results_from_workers(
         joblib.parallel_config("loky", initializer=_belong_to, initargs=(os.getpid(),)),
     ):
         parallel = joblib.Parallel(n_jobs=min(n_workers, len(tasks)), return_as="generator")
-        return cast("Generator[_Result, None, None]", parallel(calls))
+        results = cast("Generator[_Result, None, None]", parallel(calls))
+    try:
+        yield results
+    finally:
+        _throw_away(results)
+
+
+def _throw_away(results: Generator[_Result, None, None]) -> None:
+    """End the workers, without joblib's regrets about the work that is lost."""
+    before = threading.excepthook
+
+    def silent_about_lost_work(crash: threading.ExceptHookArgs) -> None:
+        # loky's manager forgets all tasks, kills the workers, and may then look for a task that
+        # it had not yet handed out; nothing is left for it to do but to end, which it does.
+        thread = crash.thread.name if crash.thread else ""
+        if not (crash.exc_type is KeyError and thread == "ExecutorManagerThread"):
+            before(crash)
+
+    threading.excepthook = silent_about_lost_work
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "[0-9]+ tasks", UserWarning)
+            results.close()
+    finally:
+        threading.excepthook = before
 
 
 @contextmanager

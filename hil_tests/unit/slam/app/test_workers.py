@@ -5,13 +5,17 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+import threading
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
 
+from slam.app.workers import _throw_away
+
 SCRIPT = """\
 import os, signal, sys, time
-from slam.app.workers import results_from_workers
+from slam.app.workers import worker_results
 
 def work(task):
     if task == "mask":
@@ -39,8 +43,9 @@ def started(tmp_path: Path, body: str) -> subprocess.Popen[str]:
 
 def test_every_worker_begins_with_the_groups_signals_blocked(tmp_path: Path) -> None:
     body = (
-        "for mask in results_from_workers(work, [('mask',)] * 4, 2):\n"
-        "    print(*(int(number) for number in mask))\n"
+        "with worker_results(work, [('mask',)] * 4, 2) as masks:\n"
+        "    for mask in masks:\n"
+        "        print(*(int(number) for number in mask))\n"
         "print(*(int(one) for one in signal.pthread_sigmask(signal.SIG_BLOCK, ())))\n"
     )
     with started(tmp_path, body) as process:
@@ -55,9 +60,9 @@ def test_every_worker_begins_with_the_groups_signals_blocked(tmp_path: Path) -> 
 @pytest.mark.skipif(sys.platform != "linux", reason="the parent's death is a signal on Linux only")
 def test_no_worker_survives_a_killed_parent(tmp_path: Path) -> None:
     body = (
-        "results = results_from_workers(work, [('pid',), ('sleep',), ('sleep',)], 2)\n"
-        "print(next(results), flush=True)\n"
-        "time.sleep(60)\n"
+        "with worker_results(work, [('pid',), ('sleep',), ('sleep',)], 2) as results:\n"
+        "    print(next(results), flush=True)\n"
+        "    time.sleep(60)\n"
     )
     with started(tmp_path, body) as process:
         assert process.stdout is not None
@@ -65,3 +70,47 @@ def test_no_worker_survives_a_killed_parent(tmp_path: Path) -> None:
         process.kill()
         # every worker holds these pipes: they end when the last of them has, or this times out
         process.communicate(timeout=15)
+
+
+def test_work_that_is_thrown_away_ends_at_once_and_without_a_word(tmp_path: Path) -> None:
+    body = (
+        "with worker_results(work, [('sleep',)] * 20, 2) as results:\n"
+        "    pass\n"
+        "with worker_results(work, [('pid',)] + [('sleep',)] * 20, 2) as results:\n"
+        "    next(results)\n"
+    )
+    with started(tmp_path, body) as process:
+        output, errors = process.communicate(timeout=15)
+    assert (process.returncode, output, errors) == (0, "", "")
+
+
+@pytest.mark.parametrize(
+    ("thread", "error", "is_told"),
+    [
+        ("ExecutorManagerThread", KeyError(3), False),
+        ("ExecutorManagerThread", ValueError(3), True),
+        ("somebody else", KeyError(3), True),
+    ],
+)
+def test_only_the_managers_search_for_lost_work_is_silent(
+    thread: str, error: Exception, is_told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[threading.ExceptHookArgs] = []
+    monkeypatch.setattr(threading, "excepthook", told.append)
+
+    def crash() -> None:
+        raise error
+
+    def results() -> Generator[int, None, None]:
+        try:
+            yield 1
+        finally:  # as joblib: the thread is joined before close returns
+            manager = threading.Thread(target=crash, name=thread)
+            manager.start()
+            manager.join()
+
+    begun = results()
+    next(begun)
+    _throw_away(begun)
+    assert bool(told) == is_told
+    assert threading.excepthook == told.append
