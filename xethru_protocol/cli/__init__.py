@@ -6,7 +6,6 @@ Results go to stdout, everything else to stderr. Exit 0 done, 1 failed, 2 wrong 
 
 import os
 import signal
-import sys
 from collections.abc import Sequence
 from types import FrameType
 
@@ -17,6 +16,9 @@ class Terminated(BaseException):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``xethru``; returns the exit code."""
+    from xethru_protocol.cli.output import end_output, warn
+
+    _occupy_closed_descriptors()
     previous = {
         signal.SIGTERM: signal.signal(signal.SIGTERM, _terminate),
         # A script's background jobs start with SIGINT ignored; a stream must still be stoppable.
@@ -28,27 +30,40 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
     except Terminated:
         return 143
-    except BrokenPipeError:
-        # Whoever read our output has enough. Python flushes stdout once more at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except SystemExit:  # after --help or wrong usage
+        if end_output():
+            raise
+        warn("xethru: standard output cannot be written")
+        return 1
+    except BrokenPipeError:  # whoever read our output has enough
         return 0
     finally:
+        end_output()  # what fails here was told already, or nobody is there to hear it
         for number, handler in previous.items():
             signal.signal(number, handler)
 
 
 def _run(argv: Sequence[str] | None) -> int:
     from xethru_protocol.cli.arguments import parse
+    from xethru_protocol.cli.output import one_line, warn
     from xethru_protocol.errors import XeThruError
 
     arguments = parse(argv)
     try:
         code: int = arguments.run(arguments)
     except XeThruError as error:
-        sys.stderr.write(f"xethru {arguments.command}: {error}\n")
+        warn(f"xethru {arguments.command}: {one_line(str(error))}")
         return 1
-    sys.stdout.flush()
     return code
+
+
+def _occupy_closed_descriptors() -> None:
+    """Give closed standard descriptors to /dev/null: a port opened there would get our messages."""
+    for descriptor in range(3):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
 
 
 def _terminate(signum: int, frame: FrameType | None) -> None:

@@ -3,8 +3,11 @@
 import argparse
 import math
 from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 _FROM = ("auto", "host", "module")
+_LONGEST_S = 1e9  # 30 years
+_Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -17,8 +20,53 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
 
+    for add in (
+        _add_list,
+        _add_doctor,
+        _add_questions,
+        _add_stream,
+        _add_record,
+        _add_dump,
+        _add_convert,
+        _add_decode,
+    ):
+        add(commands)
+    arguments = parser.parse_args(argv)
+    area = getattr(arguments, "frame_area", None)
+    if area is not None and area[0] >= area[1]:
+        parser.error("argument --frame-area: START must be smaller than END")
+    if arguments.command == "record" and arguments.out is None and arguments.wire is None:
+        parser.error("record needs --out DIR, or --wire FILE, or both")
+    return arguments
+
+
+# --- the commands ---------------------------------------------------------------------------
+
+
+def _add_list(commands: _Commands) -> None:
     one = _command(commands, "list", "find modules: USB and running emulators", _list)
     _add_json(one)
+
+
+def _add_doctor(commands: _Commands) -> None:
+    one = _command(
+        commands,
+        "doctor",
+        "find out what is wrong, and what to do about it",
+        _doctor,
+        "Examines every port that 'xethru list' shows, or those named by --port. A port that "
+        "another program has open is left alone. Exit 0 if all is well, 1 if there is a fault.",
+    )
+    one.add_argument(
+        "--port",
+        action="append",
+        default=[],
+        help="examine this port; may be given several times (default: all that are found)",
+    )
+    _add_json(one)
+
+
+def _add_questions(commands: _Commands) -> None:
     for name, text, run in (
         ("ping", "ask a module for a sign of life", _ping),
         ("info", "print what a module tells about itself", _info),
@@ -28,6 +76,8 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         _add_port(one)
         _add_json(one)
 
+
+def _add_stream(commands: _Commands) -> None:
     one = _command(
         commands,
         "stream",
@@ -38,21 +88,78 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     _add_port(one)
     _add_json(one)
-    one.add_argument(
-        "--frame-area",
-        nargs=2,
-        type=_metres,
-        default=(0.2, 9.4),
-        metavar=("START", "END"),
-        help="range to read, in module metres (default 0.2 9.4)",
-    )
-    one.add_argument("--fps", type=_frame_rate, default=17.0, help="frames per second (default 17)")
-    one.add_argument(
-        "--baseband", action="store_true", help="complex baseband bins instead of RF bins"
-    )
+    _add_raw_settings(one)
     one.add_argument("--count", type=_at_least_one, help="stop after COUNT frames")
     one.add_argument("--samples", action="store_true", help="print the samples, too")
 
+
+def _add_record(commands: _Commands) -> None:
+    one = _command(
+        commands,
+        "record",
+        "write what a module sends to files",
+        _record,
+        "Ends at --count or --duration, by Ctrl-C, or when the module is unplugged or the disk "
+        "is full; what came until then is kept and complete. Progress goes to stderr, a summary "
+        "to stdout.",
+    )
+    _add_port(one)
+    one.add_argument(
+        "--out",
+        metavar="DIR",
+        help="directory for a recording in the vendor's format (ModuleConnector)",
+    )
+    one.add_argument(
+        "--wire", metavar="FILE", help="also, or only, write all bytes of both directions here"
+    )
+    one.add_argument(
+        "--profile",
+        choices=("raw", "presence", "none"),
+        default="raw",
+        help="raw: radar frames (default); presence: the X4M300's own profile; none: only listen "
+        "to what the module is sending, and send it nothing",
+    )
+    _add_raw_settings(one)
+    one.add_argument("--count", type=_at_least_one, help="stop after COUNT messages")
+    one.add_argument(
+        "--duration", type=_seconds, metavar="S", help="stop after S seconds of recording"
+    )
+    one.add_argument("--session-id", default="", metavar="TEXT", help="name kept in the recording")
+    _add_force(one, "replace a recording that is there already")
+    _add_json(one)
+
+
+def _add_dump(commands: _Commands) -> None:
+    one = _command(
+        commands,
+        "dump",
+        "print a recording",
+        _dump,
+        "Reads the vendor's recordings (the directory, or one of its files), wire captures, "
+        ".mcap and .npz. Prints a summary and one line per message; with --json one object per "
+        "message, as decode does, with its time t_ns. Exit 1 if a part could not be read.",
+    )
+    one.add_argument("file", metavar="FILE", help="file or directory of a recording")
+    one.add_argument("--samples", action="store_true", help="print arrays whole")
+    _add_json(one)
+
+
+def _add_convert(commands: _Commands) -> None:
+    one = _command(
+        commands,
+        "convert",
+        "turn a recording into another format",
+        _convert,
+        "The name of TARGET says which: .mcap, .npz, .xtwire (a wire capture); a name without "
+        "suffix is a directory in the vendor's format.",
+    )
+    one.add_argument("source", metavar="SOURCE", help="any recording that 'xethru dump' reads")
+    one.add_argument("target", metavar="TARGET", help="file or directory to write")
+    _add_force(one, "replace TARGET if it exists")
+    _add_json(one)
+
+
+def _add_decode(commands: _Commands) -> None:
     one = _command(
         commands,
         "decode",
@@ -73,14 +180,12 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "--from", dest="sender", choices=_FROM, default="auto", help="who sent the bytes"
     )
 
-    arguments = parser.parse_args(argv)
-    if arguments.command == "stream" and arguments.frame_area[0] >= arguments.frame_area[1]:
-        parser.error("argument --frame-area: START must be smaller than END")
-    return arguments
+
+# --- their parts ------------------------------------------------------------------------------
 
 
 def _command(
-    commands: "argparse._SubParsersAction[argparse.ArgumentParser]",
+    commands: _Commands,
     name: str,
     text: str,
     run: Callable[[argparse.Namespace], int],
@@ -95,6 +200,34 @@ def _command(
 
 def _add_port(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--port", required=True, help="serial port, for example /dev/ttyACM0")
+    parser.add_argument(
+        "--baudrate",
+        type=_at_least_one,
+        default=115200,
+        metavar="RATE",
+        help="of a module on a UART (default 115200); without meaning on USB and for emulators",
+    )
+
+
+def _add_raw_settings(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--frame-area",
+        nargs=2,
+        type=_metres,
+        default=(0.2, 9.4),
+        metavar=("START", "END"),
+        help="range to read, in module metres (default 0.2 9.4)",
+    )
+    parser.add_argument(
+        "--fps", type=_frame_rate, default=17.0, help="frames per second (default 17)"
+    )
+    parser.add_argument(
+        "--baseband", action="store_true", help="complex baseband bins instead of RF bins"
+    )
+
+
+def _add_force(parser: argparse.ArgumentParser, text: str) -> None:
+    parser.add_argument("--force", action="store_true", help=text)
 
 
 def _add_json(parser: argparse.ArgumentParser) -> None:
@@ -105,6 +238,13 @@ def _frame_rate(text: str) -> float:
     value = _number(text)
     if not 0 < value < 65536:
         raise argparse.ArgumentTypeError(f"{text!r} must be a number between 0 and 65536")
+    return value
+
+
+def _seconds(text: str) -> float:
+    value = _number(text)
+    if not 0 < value <= _LONGEST_S:
+        raise argparse.ArgumentTypeError(f"{text!r} must be seconds, more than 0")
     return value
 
 
@@ -141,22 +281,28 @@ def _list(arguments: argparse.Namespace) -> int:
     return list_modules(as_json=arguments.json)
 
 
+def _doctor(arguments: argparse.Namespace) -> int:
+    from xethru_protocol.cli.doctor import doctor
+
+    return doctor(arguments.port, as_json=arguments.json)
+
+
 def _ping(arguments: argparse.Namespace) -> int:
     from xethru_protocol.cli.module import ping
 
-    return ping(arguments.port, as_json=arguments.json)
+    return ping(arguments.port, arguments.baudrate, as_json=arguments.json)
 
 
 def _info(arguments: argparse.Namespace) -> int:
     from xethru_protocol.cli.module import info
 
-    return info(arguments.port, as_json=arguments.json)
+    return info(arguments.port, arguments.baudrate, as_json=arguments.json)
 
 
 def _reset(arguments: argparse.Namespace) -> int:
     from xethru_protocol.cli.module import reset
 
-    return reset(arguments.port, as_json=arguments.json)
+    return reset(arguments.port, arguments.baudrate, as_json=arguments.json)
 
 
 def _stream(arguments: argparse.Namespace) -> int:
@@ -165,11 +311,52 @@ def _stream(arguments: argparse.Namespace) -> int:
 
     return stream(
         arguments.port,
+        arguments.baudrate,
         RawConfig(frame_area_m=tuple(arguments.frame_area), downconversion=arguments.baseband),
         fps=arguments.fps,
         count=arguments.count,
         with_samples=arguments.samples,
         as_json=arguments.json,
+    )
+
+
+def _record(arguments: argparse.Namespace) -> int:
+    from pathlib import Path
+
+    from xethru_protocol.cli.record import record
+    from xethru_protocol.cli.recorder import Targets
+    from xethru_protocol.cli.recording_modes import recording_mode
+    from xethru_protocol.raw_config import RawConfig
+
+    config = RawConfig(frame_area_m=tuple(arguments.frame_area), downconversion=arguments.baseband)
+    targets = Targets(
+        directory=Path(arguments.out) if arguments.out else None,
+        wire=Path(arguments.wire) if arguments.wire else None,
+        session_id=arguments.session_id,
+    )
+    return record(
+        arguments.port,
+        arguments.baudrate,
+        recording_mode(arguments.profile, config, arguments.fps),
+        targets,
+        count=arguments.count,
+        duration_s=arguments.duration,
+        replace=arguments.force,
+        as_json=arguments.json,
+    )
+
+
+def _dump(arguments: argparse.Namespace) -> int:
+    from xethru_protocol.cli.dump import dump
+
+    return dump(arguments.file, with_samples=arguments.samples, as_json=arguments.json)
+
+
+def _convert(arguments: argparse.Namespace) -> int:
+    from xethru_protocol.cli.convert import convert
+
+    return convert(
+        arguments.source, arguments.target, replace=arguments.force, as_json=arguments.json
     )
 
 

@@ -4,8 +4,8 @@ import time
 from dataclasses import asdict
 
 from xethru_protocol.cli.output import print_json, print_line
+from xethru_protocol.cli.session import module_at
 from xethru_protocol.codes import PongCode
-from xethru_protocol.driver import X4M300
 from xethru_protocol.ports import find_ports
 
 _STATE = {
@@ -30,9 +30,9 @@ def list_modules(*, as_json: bool) -> int:
     return 0
 
 
-def ping(port: str, *, as_json: bool) -> int:
+def ping(port: str, baudrate: int, *, as_json: bool) -> int:
     """Print whether a module answers, and how fast."""
-    with X4M300.open(port) as module:
+    with module_at(port, baudrate) as module:
         began_ns = time.monotonic_ns()
         state = _STATE[module.ping()]
         round_trip_ms = (time.monotonic_ns() - began_ns) * 1e-6
@@ -43,9 +43,9 @@ def ping(port: str, *, as_json: bool) -> int:
     return 0
 
 
-def info(port: str, *, as_json: bool) -> int:
+def info(port: str, baudrate: int, *, as_json: bool) -> int:
     """Print what a module tells about itself and its radar chip."""
-    with X4M300.open(port) as module:
+    with module_at(port, baudrate) as module:
         state = _STATE[module.ping()]
         about = {"port": port, "state": state, **asdict(module.info())}
         chip = {setting.name: value for setting, value in module.x4_settings().items()}
@@ -60,9 +60,9 @@ def info(port: str, *, as_json: bool) -> int:
     return 0
 
 
-def reset(port: str, *, as_json: bool) -> int:
+def reset(port: str, baudrate: int, *, as_json: bool) -> int:
     """Restart a module; returns when it has agreed to."""
-    with X4M300.open(port) as module:
+    with module_at(port, baudrate) as module:
         module.reset()
     if as_json:
         print_json({"port": port, "reset": True})

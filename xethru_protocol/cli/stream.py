@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from xethru_protocol.cli.output import print_json, warn
+from xethru_protocol.cli.output import is_terminal, print_json, print_text, warn
+from xethru_protocol.cli.session import module_at, say_warnings
 from xethru_protocol.driver import X4M300, Frame, RawConfig
 
 _REFRESH_NS = 200_000_000
@@ -14,6 +15,7 @@ _REFRESH_NS = 200_000_000
 
 def stream(
     port: str,
+    baudrate: int,
     config: RawConfig,
     *,
     fps: float,
@@ -22,32 +24,20 @@ def stream(
     as_json: bool,
 ) -> int:
     """Print frames until ``count``, a signal, or the reader's end; the module is stopped then."""
-    radar = X4M300.open(port)
-    try:
-        with radar:
-            radar.configure_raw(config)
-            rate = radar.start(fps)
-            for text in radar.warnings:
-                warn(f"xethru stream: {text}")
-            radar.warnings.clear()
-            live = None if as_json or with_samples or not sys.stdout.isatty() else _Live(radar)
-            try:
-                for frame in radar.frames(count, timeout_s=max(2.0, 3.0 / rate)):
-                    if live is None:
-                        print_json(_as_json(frame, with_samples))
-                    else:
-                        live.show(frame)
-            finally:
-                if live is not None:
-                    live.finish()
-                if radar.frames_lost or radar.fault_count:
-                    warn(
-                        f"xethru stream: {radar.frames_lost} frames lost, "
-                        f"{radar.fault_count} damaged places on the line"
-                    )
-    finally:  # also after a signal
-        for text in radar.warnings:
-            warn(f"xethru stream: {text}")
+    with module_at(port, baudrate) as radar:
+        radar.configure_raw(config)
+        rate = radar.start(fps)
+        say_warnings(radar)
+        live = None if as_json or with_samples or not is_terminal(sys.stdout) else _Live(radar)
+        try:
+            for frame in radar.frames(count, timeout_s=max(2.0, 3.0 / rate)):
+                if live is None:
+                    print_json(_as_json(frame, with_samples))
+                else:
+                    live.show(frame)
+        finally:
+            if live is not None:
+                live.finish()
     return 0
 
 
@@ -95,9 +85,8 @@ class _Live:
         geometry = frame.geometry
         strongest = int(np.argmax(np.abs(frame.samples)))
         rate = self._frames / max((now_ns - self._began_ns) * 1e-9, 1e-3)
-        sys.stdout.write(
+        print_text(
             f"\r{self._frames} frames, {rate:.1f}/s, {geometry.n_bins} bins, "
             f"strongest at {geometry.range_start_m + strongest * geometry.bin_length_m:.3f} m, "
             f"{self._radar.frames_lost} lost \x1b[K"
         )
-        sys.stdout.flush()

@@ -1,0 +1,240 @@
+"""What `doctor` finds out about one port, each fact when it is first asked for.
+
+The order in which the checks ask matters: a port that another program has open is never opened.
+"""
+
+import getpass
+import grp
+import os
+import re
+import stat
+import time
+from dataclasses import dataclass
+from functools import cached_property
+
+from xethru_protocol.cli.port_users import PortUser, port_users
+from xethru_protocol.codes import X4Setting
+from xethru_protocol.connection import Connection, Role
+from xethru_protocol.driver import X4M300, ModuleInfo
+from xethru_protocol.errors import DeviceError, Disconnected, PortUnavailable
+from xethru_protocol.messages import (
+    BootloaderGetDeviceInfo,
+    Command,
+    GetProfileId,
+    Message,
+    Ping,
+    Pong,
+    Response,
+    X4DriverGet,
+)
+from xethru_protocol.packets import NEED_DATA, FramingFault
+from xethru_protocol.transport import SerialTransport, Transport
+
+USUAL_BAUDRATE = 115200
+# Protocol reference 10, the likeliest first
+_OTHER_BAUDRATES = (
+    *(921600, 460800, 230400, 1000000, 2000000, 3000000, 4000000),
+    *(500000, 576000, 38400, 19200, 9600),
+)
+_PATIENCE_S = 1.0
+_GLANCE_S = 0.25  # enough for the 18 bytes of PING and PONG at 9600 baud
+# A pseudo-terminal and a USB device of the class CDC ACM have no rate.
+_WITHOUT_RATE = re.compile(r"/dev/(pts/|ttyACM|ttyGS|ptmx)")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contact:
+    """What came back over an opened port.
+
+    Attributes
+    ----------
+    pong
+        Answer to PING; None: there was none.
+    baudrate
+        Rate at which that came, or the usual one.
+    talks
+        Whether other messages came.
+    damaged
+        Whether bytes came that are no packets.
+    bootloader
+        Whether a bootloader answered.
+    gone
+        Whether the port went away meanwhile.
+    """
+
+    pong: int | None = None
+    baudrate: int = USUAL_BAUDRATE
+    talks: bool = False
+    damaged: bool = False
+    bootloader: bool = False
+    gone: bool = False
+
+
+class Patient:
+    """One port under examination."""
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        self.refusal: str | None = None
+        self._transport: Transport | None = None
+
+    def close(self) -> None:
+        """Release the port, if it was opened."""
+        if self._transport is not None:
+            self._transport.close()
+
+    # --- without opening it ---------------------------------------------------------------------
+
+    @property
+    def target(self) -> str:
+        """The device behind a link, or the path itself."""
+        return os.path.realpath(self.path)
+
+    @property
+    def is_stale_link(self) -> bool:
+        """Whether the path is a link to something that is gone."""
+        return os.path.islink(self.path) and not os.path.exists(self.path)
+
+    @property
+    def exists(self) -> bool:
+        """Whether there is anything of that name."""
+        return os.path.exists(self.path)
+
+    @property
+    def is_device(self) -> bool:
+        """Whether it could be a serial port at all."""
+        return stat.S_ISCHR(os.stat(self.path).st_mode)
+
+    @property
+    def may_be_opened(self) -> bool:
+        """Whether this user may read and write it."""
+        return os.access(self.path, os.R_OK | os.W_OK)
+
+    @property
+    def group(self) -> str:
+        """Group the device belongs to."""
+        number = os.stat(self.path).st_gid
+        try:
+            return grp.getgrgid(number).gr_name
+        except KeyError:
+            return str(number)
+
+    @property
+    def group_may_open(self) -> bool:
+        """Whether joining the group would help."""
+        return os.stat(self.path).st_mode & 0o060 == 0o060
+
+    @property
+    def user(self) -> str:
+        """Who examines."""
+        try:
+            return getpass.getuser()
+        except (KeyError, OSError):
+            return str(os.getuid())
+
+    @cached_property
+    def users(self) -> tuple[PortUser, ...]:
+        """Programs that have the port open."""
+        return port_users(self.path)
+
+    # --- having opened it -----------------------------------------------------------------------
+
+    @cached_property
+    def opens(self) -> bool:
+        """Open the port; if that fails, `refusal` says why."""
+        try:
+            self._transport = SerialTransport(self.path)
+        except PortUnavailable as error:
+            self.refusal = str(error)
+            return False
+        return True
+
+    @cached_property
+    def contact(self) -> Contact:
+        """Ask for a sign of life, at other rates too, and whether it is the bootloader."""
+        first = self._ask(Ping(), _PATIENCE_S)
+        if first.pong is not None or first.gone:
+            return first
+        if self._ask(BootloaderGetDeviceInfo(), _GLANCE_S).talks and not first.talks:
+            return Contact(bootloader=True)
+        if _WITHOUT_RATE.match(self.target) is None:
+            for baudrate in _OTHER_BAUDRATES:
+                if self._reopen(baudrate):
+                    contact = self._ask(Ping(), _GLANCE_S, baudrate)
+                    if contact.pong is not None:
+                        return contact
+            self._reopen(USUAL_BAUDRATE)
+        return first
+
+    @cached_property
+    def module(self) -> X4M300:
+        """The driver of a module that answers."""
+        assert self._transport is not None, "the checks open the port first"
+        return X4M300(self._transport)
+
+    @cached_property
+    def info(self) -> ModuleInfo:
+        """What the module tells about itself."""
+        return self.module.info()
+
+    @property
+    def is_bare_xep(self) -> bool:
+        """Whether the firmware has no profile layer."""
+        return self.info.order_code is None
+
+    @property
+    def version(self) -> tuple[int, ...] | None:
+        """Firmware version; None if it is no three numbers."""
+        found = re.match(r"(\d+)\.(\d+)\.(\d+)", self.info.version or "")
+        return None if found is None else tuple(map(int, found.groups()))
+
+    @cached_property
+    def profile_id(self) -> int | None:
+        """Loaded profile, 0 for none; None where the module does not say."""
+        try:
+            values = self.module.request(GetProfileId()).values
+        except DeviceError:
+            return None
+        return values[0] if values else None
+
+    @cached_property
+    def tx_power(self) -> int | None:
+        """Transmitter power, 0 for off; None where the module does not say."""
+        try:
+            values = self.module.request(X4DriverGet(setting=X4Setting.TXPOWER)).values
+        except DeviceError:
+            return None
+        return int(values[0]) if values else None
+
+    # --- inside ---------------------------------------------------------------------------------
+
+    def _reopen(self, baudrate: int) -> bool:
+        """Open the port at another rate; False where the adapter does not know that."""
+        assert self._transport is not None
+        self._transport.close()
+        try:
+            self._transport = SerialTransport(self.path, baudrate=baudrate)
+        except PortUnavailable:
+            return False
+        return True
+
+    def _ask(
+        self, command: Command[Response], timeout_s: float, baudrate: int = USUAL_BAUDRATE
+    ) -> Contact:
+        """Send a command; return what came until its answer, or until the time was over."""
+        assert self._transport is not None
+        connection = Connection(Role.HOST)
+        talks = damaged = False
+        try:
+            self._transport.write(connection.send(command))
+            deadline_s = time.monotonic() + timeout_s
+            while (left_s := deadline_s - time.monotonic()) > 0:
+                connection.receive_data(self._transport.read(left_s))
+                while (event := connection.next_event()) is not NEED_DATA:
+                    if isinstance(event, Pong):
+                        return Contact(pong=event.value, baudrate=baudrate)
+                    damaged |= isinstance(event, FramingFault)
+                    talks |= isinstance(event, Message)
+        except Disconnected:
+            return Contact(gone=True)
+        return Contact(talks=talks, damaged=damaged)

@@ -1,0 +1,61 @@
+"""Progress for people, on stderr: one line rewritten on a terminal, else a line now and then."""
+
+import sys
+import time
+from collections.abc import Callable
+
+from xethru_protocol.cli.output import is_terminal, show
+
+_REWRITE_S = 0.2
+_LINE_S = 10.0
+
+
+class Progress:
+    """Shows the newest of many states, not too often.
+
+    Parameters
+    ----------
+    name
+        What to begin lines of a log with, for example ``"xethru record"``.
+    clock
+        Monotonic time [s].
+    """
+
+    def __init__(self, name: str, clock: Callable[[], float] = time.monotonic) -> None:
+        self._name = name
+        self._clock = clock
+        self._rewrites = is_terminal(sys.stderr)
+        self._shown_s = clock()
+        self._is_open = False  # a line is there that ends in no line end
+
+    def show(self, state: Callable[[], str]) -> None:
+        """Show ``state()`` if it is time to."""
+        now_s = self._clock()
+        if now_s - self._shown_s < (_REWRITE_S if self._rewrites else _LINE_S):
+            return
+        self._shown_s = now_s
+        if self._rewrites:
+            show(f"\r{state()}\x1b[K")
+            self._is_open = True
+        else:
+            show(f"{self._name}: {state()}\n")
+
+    def finish(self, state: Callable[[], str]) -> None:
+        """Bring a rewritten line up to date and end it."""
+        if self._is_open:
+            show(f"\r{state()}\x1b[K\n")
+            self._is_open = False
+
+
+def bytes_text(count: int) -> str:
+    """Amount of data, for people.
+
+    >>> bytes_text(999), bytes_text(5_747_000)
+    ('999 B', '5.7 MB')
+    """
+    value, unit = float(count), "B"
+    for larger in ("kB", "MB", "GB", "TB"):
+        if value < 1000:
+            break
+        value, unit = value / 1000, larger
+    return f"{value:.0f} B" if unit == "B" else f"{value:.1f} {unit}"
