@@ -22,6 +22,17 @@ class FrameGeometry:
     n_bins: int
     downconversion: bool
 
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of one radar frame on the wire. Protocol reference 1.3, 6.1.
+
+        >>> FrameGeometry(
+        ...     range_start_m=0.2, bin_length_m=0.0064, n_bins=1431, downconversion=False
+        ... ).frame_bytes
+        5747
+        """
+        return 9 + 14 + 4 * self.n_bins * (2 if self.downconversion else 1)
+
     @classmethod
     def from_read_back(
         cls, *, area_m: tuple[float, float], n_bins: int, downconversion: bool

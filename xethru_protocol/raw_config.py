@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from xethru_protocol import x4
 from xethru_protocol.codes import X4Setting
 from xethru_protocol.errors import LocalProtocolError
+from xethru_protocol.lattice import Lattice
 from xethru_protocol.messages import X4Value
 
 
@@ -12,8 +13,10 @@ from xethru_protocol.messages import X4Value
 class RawConfig:
     """Settings of raw radar mode; the defaults are the vendor's working point.
 
-    ``frame_area_m`` and ``offset_m`` are module metres. Numbers the chip would cut to other
-    ones raise `LocalProtocolError`. Protocol reference 4.9, 9.3.
+    ``frame_area_m`` and ``offset_m`` are module metres. ``dac_step`` 0 ... 3 means steps of
+    1, 2, 4, 8 levels; ``prf_div`` divides the 243 MHz clock (16: the one regulators allow).
+    Numbers the chip would cut to other ones raise `LocalProtocolError`. Protocol reference 4.9,
+    9.3.
     """
 
     frame_area_m: tuple[float, float] = (0.2, 9.4)
@@ -23,25 +26,31 @@ class RawConfig:
     pulses_per_step: int = 300
     dac_min: int = 949
     dac_max: int = 1100
+    dac_step: int = 0
+    prf_div: int = x4.DEFAULT_PRF_DIV
     tx_power: int = 2
     tx_center_frequency: int = 3
 
     def __post_init__(self) -> None:
         """Check what the module does not: it keeps the low bits of any number."""
-        for name, value, largest in (
-            ("iterations", self.iterations, 255),
-            ("pulses_per_step", self.pulses_per_step, 65535),
+        for name, value, smallest, largest in (
+            ("iterations", self.iterations, 1, 255),
+            ("pulses_per_step", self.pulses_per_step, 1, 65535),
+            ("dac_step", self.dac_step, 0, 3),
+            ("prf_div", self.prf_div, 4, 255),
         ):
-            if not 1 <= value <= largest:
-                raise LocalProtocolError(f"{name} must be 1 ... {largest}, not {value}")
+            if not smallest <= value <= largest:
+                raise LocalProtocolError(f"{name} must be {smallest} ... {largest}, not {value}")
 
     def settings(self) -> tuple[tuple[X4Setting, X4Value], ...]:
-        """X4 settings in the order in which the vendor's recipe sends them."""
+        """X4 settings in the order in which the vendor's recipe sends them, and two more."""
         return (
             (X4Setting.DACMIN, self.dac_min),
             (X4Setting.DACMAX, self.dac_max),
+            (X4Setting.DACSTEP, self.dac_step),
             (X4Setting.ITERATIONS, self.iterations),
             (X4Setting.PULSESPERSTEP, self.pulses_per_step),
+            (X4Setting.PRFDIV, self.prf_div),
             (X4Setting.TXCENTERFREQUENCY, self.tx_center_frequency),
             (X4Setting.TXPOWER, self.tx_power),
             (X4Setting.DOWNCONVERSION, int(self.downconversion)),
@@ -68,7 +77,25 @@ class RawConfig:
             pulses_per_step=self.pulses_per_step,
             dac_min=self.dac_min,
             dac_max=self.dac_max,
+            dac_step=self.dac_step,
+            prf_div=self.prf_div,
         )
+
+    @property
+    def lattice(self) -> Lattice | None:
+        """Samples these settings can give; None where that is not known."""
+        try:
+            return Lattice.of(
+                iterations=self.iterations,
+                pulses_per_step=self.pulses_per_step,
+                dac_min=self.dac_min,
+                dac_max=self.dac_max,
+                dac_step=self.dac_step,
+                downconversion=self.downconversion,
+                tx_center_frequency=self.tx_center_frequency,
+            )
+        except LocalProtocolError:
+            return None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -23,6 +23,9 @@ _CHUNK_BYTES = 65536
 _WRITE_TIMEOUT_S = 5.0
 _LONGEST_WAIT_S = 86400.0  # poll() takes 31 bits of milliseconds; a caller waits again
 _BAUD = 115200  # what a UART module starts with; without meaning on USB and ptys
+_BITS_PER_BYTE = 10  # start and stop bit
+# Names of ports without a rate of their own: USB CDC and pseudo-terminals.
+_UNLIMITED = ("/dev/ttyACM", "/dev/pts/", "/dev/cu.usbmodem", "/dev/tty.usbmodem", "/dev/ttys")
 
 
 class Transport(Protocol):
@@ -54,6 +57,8 @@ class SerialTransport:
     ----------
     path
         For example ``/dev/ttyACM0`` or a link made by ``xethru-emulator``.
+    baudrate
+        Rate of a UART; without meaning on USB and ptys.
 
     Raises
     ------
@@ -61,10 +66,10 @@ class SerialTransport:
         If the port does not exist, is no serial port, is in use, or may not be opened.
     """
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str, baudrate: int = _BAUD) -> None:
         self.name = path
         try:
-            self._port = serial.Serial(path, _BAUD, timeout=0, exclusive=True)
+            self._port = serial.Serial(path, baudrate, timeout=0, exclusive=True)
         except (OSError, ValueError) as error:  # SerialException is an OSError
             raise PortUnavailable(_why(path, error)) from None
         self._fd: int = self._port.fileno()
@@ -96,12 +101,39 @@ class SerialTransport:
             if left_s <= 0:
                 raise Disconnected(f"{self.name} takes no data any more; is the module hanging?")
             try:
-                if self._writable.poll(_whole_ms(left_s)):
-                    rest = rest[os.write(self._fd, rest) :]
-            except BlockingIOError:  # room for less than the line takes at once
-                continue
+                self._writable.poll(_whole_ms(left_s))
             except (OSError, ValueError) as error:
                 raise Disconnected(self._lost()) from error
+            rest = rest[self.write_some(rest) :]
+
+    def write_some(self, data: bytes | memoryview) -> int:
+        """Send what the line takes now and return how many bytes that were."""
+        try:
+            return os.write(self._fd, data)
+        except BlockingIOError:  # no room
+            return 0
+        except (OSError, ValueError) as error:
+            raise Disconnected(self._lost()) from error
+
+    def fileno(self) -> int:
+        """Descriptor to wait for with other means; raises `Disconnected` after `close`."""
+        if self._fd < 0:
+            raise Disconnected(self._lost())
+        return self._fd
+
+    @property
+    def bytes_per_s(self) -> float:
+        """What the line carries at most: 10 bits per byte on a UART, infinite elsewhere."""
+        if os.path.realpath(self.name).startswith(_UNLIMITED):
+            return math.inf
+        return self._port.baudrate / _BITS_PER_BYTE
+
+    def set_baudrate(self, baudrate: int) -> None:
+        """Change this side's rate, keeping the port open."""
+        try:
+            self._port.baudrate = baudrate
+        except (OSError, ValueError) as error:  # SerialException is an OSError
+            raise Disconnected(f"{self.name} cannot be set to {baudrate} baud: {error}") from error
 
     def close(self) -> None:
         """See `Transport.close`."""
@@ -116,6 +148,18 @@ class SerialTransport:
         if self._fd < 0:
             return f"{self.name} was closed"
         return f"{self.name} was disconnected; plug the module in again"
+
+
+def capacity_bytes_per_s(line: object) -> float:
+    """Return what a line says that it carries at most; infinite if it says nothing."""
+    return float(getattr(line, "bytes_per_s", math.inf))
+
+
+def set_rate(line: object, baudrate: int) -> None:
+    """Change a line's baud rate, if it has one."""
+    change = getattr(line, "set_baudrate", None)
+    if change is not None:
+        change(baudrate)
 
 
 def _whole_ms(timeout_s: float) -> int:

@@ -31,11 +31,20 @@ def test_the_slam_core_contract_names_every_module_of_the_core() -> None:
 
 # What may touch ports, files, sockets or clocks; everything else is pure.
 INPUT_AND_OUTPUT = {
-    "xethru_protocol": {"cli", "driver", "ports", "recordings", "transport"},
+    "xethru_protocol": {
+        "async_driver",
+        "async_transport",
+        "cli",
+        "driver",
+        "ports",
+        "recordings",
+        "transport",
+    },
     "emulator": {
         "cli",
         "link",
         "odometry_feed",
+        "path_lock",
         "playback",
         "port_watch",
         "run_directory",

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from types import TracebackType
 from typing import Self
 
-from hil_tests.unit.xethru_protocol.scripted import frame, plain_module
+from hil_tests.unit.xethru_protocol.scripted import PlainModule, frame
 from xethru_protocol import messages as m
 from xethru_protocol.codes import X4Setting
 from xethru_protocol.connection import Connection, Role
@@ -17,11 +17,12 @@ from xethru_protocol.packets import NEED_DATA
 
 
 class PtyModule:
-    """Answers like `plain_module`; streams frames 0, 1, 2 ... while FPS is positive."""
+    """Answers like `PlainModule`; streams frames 0, 1, 2 ... while FPS is positive."""
 
     def __init__(self) -> None:
         self.received: list[m.Message] = []
         self.fps = 0.0
+        self._plain = PlainModule()
         self._master, self._slave = pty.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
@@ -70,4 +71,4 @@ class PtyModule:
         if isinstance(command, m.X4DriverSet) and command.setting is X4Setting.FPS:
             assert isinstance(command.value, float)
             self.fps = command.value
-        return [answer for answer in plain_module(command) if isinstance(answer, m.Message)]
+        return [answer for answer in self._plain(command) if isinstance(answer, m.Message)]

@@ -15,14 +15,19 @@ READY = m.Pong(value=PongCode.XTS_SPRP_READY)
 
 
 class ScriptedTransport:
-    """Answers each command with what ``answer(command)`` returns; raw bytes go out as they are."""
+    """Answers each command with what ``answer(command)`` returns; raw bytes go out as they are.
 
-    def __init__(self, answer: Answer) -> None:
-        self.name = "the port"
+    ``gone`` makes the line one whose module was unplugged.
+    """
+
+    def __init__(self, answer: Answer, name: str = "the port") -> None:
+        self.name = name
         self.now_ns = 0
         self.received: list[m.Message] = []
         self.closed = False
+        self.gone = False
         self.pending: list[bytes] = []
+        self.timed: list[tuple[int, bytes]] = []
         self._answer = answer
         self._module = Connection(Role.MODULE)
 
@@ -32,22 +37,33 @@ class ScriptedTransport:
 
     def say(self, *said: m.Message | bytes) -> None:
         """Put something on the line, as one read each."""
-        self.pending += [
-            item if isinstance(item, bytes) else self._module.send(item) for item in said
-        ]
+        self.pending += [self._bytes(item) for item in said]
+
+    def say_later(self, delay_s: float, *said: m.Message | bytes) -> None:
+        """Put something on the line when the time has come."""
+        due_ns = self.now_ns + round(delay_s * 1e9)
+        self.timed = sorted([*self.timed, *((due_ns, self._bytes(item)) for item in said)])
+
+    def _bytes(self, item: m.Message | bytes) -> bytes:
+        return item if isinstance(item, bytes) else self._module.send(item)
 
     def read(self, timeout_s: float) -> bytes:
         """Next piece, or nothing after the virtual timeout."""
+        self._check_open()
+        end_ns = self.now_ns + round(min(timeout_s, 1e9) * 1e9)
+        if not self.pending and self.timed and self.timed[0][0] <= end_ns:
+            due_ns, data = self.timed.pop(0)
+            self.now_ns = max(self.now_ns, due_ns)
+            self.pending.append(data)
         if self.pending:
             self.now_ns += 1_000
             return self.pending.pop(0)
-        self.now_ns += round(timeout_s * 1e9)
+        self.now_ns = end_ns
         return b""
 
     def write(self, data: bytes) -> None:
         """Take a command."""
-        if self.closed:
-            raise Disconnected("the port was closed")
+        self._check_open()
         self._module.receive_data(data)
         while (event := self._module.next_event()) is not NEED_DATA:
             assert isinstance(event, m.Message)
@@ -58,30 +74,70 @@ class ScriptedTransport:
         """Note it."""
         self.closed = True
 
+    def _check_open(self) -> None:
+        if self.closed or self.gone:
+            raise Disconnected(f"{self.name} was disconnected")
+
 
 def frame(counter: int, bins: int = 1431) -> m.DataFloat:
     """Make a frame whose samples all equal its counter."""
     return m.DataFloat(info=counter, values=np.full(bins, counter, np.float32))
 
 
-def plain_module(  # noqa: PLR0911 - one return per command
-    command: m.Message,
-) -> Sequence[m.Message | bytes]:
-    """Answers of a module with the read-backs of the golden vectors for 0.2 ... 9.4 m."""
-    match command:
-        case m.Ping():
-            return [READY]
-        case m.X4DriverGet(setting=X4Setting.FRAMEAREA):
-            area = (0.19929012656211853, 9.400678634643555)
-            return [m.ReplyFloat(content_id=X4Setting.FRAMEAREA, values=area)]
-        case m.X4DriverGet(setting=X4Setting.FRAMEBINCOUNT):
-            return [m.ReplyInt(content_id=X4Setting.FRAMEBINCOUNT, values=(1431,))]
-        case m.X4DriverGet(setting=X4Setting.FPS):
-            return [m.ReplyFloat(content_id=X4Setting.FPS, values=(17.049379348754883,))]
-        case m.SystemGetInfo(item=6):
-            return [m.ReplyString(content_id=0x58, info=6, text="123456789012")]
-        case m.SystemGetInfo() | m.X4DriverGet():
-            return [m.Error(code=1)]
-        case m.GetMode():
-            return [m.ReplyByte(values=b"\x12")]
-    return [m.Ack()]
+BYTE_SETTINGS = frozenset(  # Protocol reference 4.9, column "GET reply"
+    {
+        X4Setting.DOWNCONVERSION,
+        X4Setting.DACSTEP,
+        X4Setting.TXCENTERFREQUENCY,
+        X4Setting.TXPOWER,
+        X4Setting.PRFDIV,
+    }
+)
+INT_SETTINGS = frozenset(
+    {X4Setting.PULSESPERSTEP, X4Setting.ITERATIONS, X4Setting.DACMIN, X4Setting.DACMAX}
+)
+
+
+class PlainModule:
+    """A module with the read-backs of the golden vectors for 0.2 ... 9.4 m; it keeps settings."""
+
+    def __init__(self, serial: str = "123456789012") -> None:
+        self.serial = serial
+        self.settings: dict[X4Setting, m.X4Value] = {}
+
+    def __call__(  # noqa: PLR0911 - one return per command
+        self, command: m.Message
+    ) -> Sequence[m.Message | bytes]:
+        """Answer a command."""
+        match command:
+            case m.Ping():
+                return [READY]
+            case m.X4DriverSet(setting=setting, value=value):
+                self.settings[setting] = value
+                return [m.Ack()]
+            case m.X4DriverGet(setting=X4Setting.FRAMEAREA):
+                area = (0.19929012656211853, 9.400678634643555)
+                return [m.ReplyFloat(content_id=X4Setting.FRAMEAREA, values=area)]
+            case m.X4DriverGet(setting=X4Setting.FRAMEBINCOUNT):
+                return [m.ReplyInt(content_id=X4Setting.FRAMEBINCOUNT, values=(1431,))]
+            case m.X4DriverGet(setting=X4Setting.FPS):
+                return [m.ReplyFloat(content_id=X4Setting.FPS, values=(17.049379348754883,))]
+            case m.X4DriverGet(setting=setting):
+                return [self._kept(setting)]
+            case m.SystemGetInfo(item=6):
+                return [m.ReplyString(content_id=0x58, info=6, text=self.serial)]
+            case m.SystemGetInfo():
+                return [m.Error(code=1)]
+            case m.GetMode():
+                return [m.ReplyByte(values=b"\x12")]
+        return [m.Ack()]
+
+    def _kept(self, setting: X4Setting) -> m.Response:
+        value = self.settings.get(setting)
+        if isinstance(value, float):
+            return m.ReplyFloat(content_id=setting, values=(value,))
+        if isinstance(value, int) and setting in BYTE_SETTINGS:
+            return m.ReplyByte(content_id=setting, values=bytes([value]))
+        if isinstance(value, int) and setting in INT_SETTINGS:
+            return m.ReplyInt(content_id=setting, values=(value,))
+        return m.Error(code=1)

@@ -1,4 +1,4 @@
-"""The driver on a scripted module."""
+"""The drivers, sync and async, on a scripted module."""
 
 import math
 from collections.abc import Sequence
@@ -6,16 +6,11 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from hil_tests.unit.xethru_protocol.scripted import (
-    READY,
-    Answer,
-    ScriptedTransport,
-    frame,
-    plain_module,
-)
+from hil_tests.unit.xethru_protocol.both_drivers import DriverOn
+from hil_tests.unit.xethru_protocol.scripted import READY, PlainModule, frame
 from xethru_protocol import messages as m
 from xethru_protocol.codes import PongCode, SensorMode, X4Setting
-from xethru_protocol.driver import X4M300, ProtocolRecord, RawConfig
+from xethru_protocol.driver import ProtocolRecord, RawConfig
 from xethru_protocol.errors import (
     DeviceError,
     LocalProtocolError,
@@ -26,12 +21,7 @@ from xethru_protocol.errors import (
 Said = Sequence[m.Message | bytes]
 
 
-def driver_on(answer: Answer = plain_module) -> tuple[X4M300, ScriptedTransport]:
-    transport = ScriptedTransport(answer)
-    return X4M300(transport, clock=transport.clock), transport
-
-
-def test_raw_mode_follows_the_recipe_of_the_reference() -> None:
+def test_raw_mode_follows_the_recipe_of_the_reference(driver_on: DriverOn) -> None:
     radar, line = driver_on()
     geometry = radar.configure_raw()
     radar.start(17.0)
@@ -44,8 +34,10 @@ def test_raw_mode_follows_the_recipe_of_the_reference() -> None:
     assert [(c.setting.name, c.value) for c in sets] == [
         ("DACMIN", 949),
         ("DACMAX", 1100),
+        ("DACSTEP", 0),  # this one and PRFDIV are not in the recipe, but settings of ours
         ("ITERATIONS", 16),
         ("PULSESPERSTEP", 300),
+        ("PRFDIV", 16),
         ("TXCENTERFREQUENCY", 3),
         ("TXPOWER", 2),
         ("DOWNCONVERSION", 0),
@@ -58,15 +50,17 @@ def test_raw_mode_follows_the_recipe_of_the_reference() -> None:
     assert radar.warnings == []
 
 
-def test_firmware_without_modes_is_tolerated() -> None:
+def test_firmware_without_modes_is_tolerated(driver_on: DriverOn) -> None:
+    plain = PlainModule()
+
     def xep(command: m.Message) -> Said:
-        return [m.Error(code=1)] if isinstance(command, m.SetMode) else plain_module(command)
+        return [m.Error(code=1)] if isinstance(command, m.SetMode) else plain(command)
 
     radar, _ = driver_on(xep)
     assert radar.configure_raw().n_bins == 1431
 
 
-def test_start_returns_the_real_rate_and_warns_above_the_possible() -> None:
+def test_start_returns_the_real_rate_and_warns_above_the_possible(driver_on: DriverOn) -> None:
     radar, _ = driver_on()
     radar.configure_raw()
     assert radar.start(17.0) == pytest.approx(17.049379, abs=1e-6)
@@ -79,29 +73,37 @@ def test_start_returns_the_real_rate_and_warns_above_the_possible() -> None:
         radar.start(0.0)
 
 
-def test_start_returns_the_timers_rate_where_the_read_back_has_a_fraction() -> None:
+def test_start_returns_the_timers_rate_where_the_read_back_has_a_fraction(
+    driver_on: DriverOn,
+) -> None:
+    plain = PlainModule()
+
     def module(command: m.Message) -> Said:
         if command == m.X4DriverGet(setting=X4Setting.FPS):
             return [m.ReplyFloat(content_id=X4Setting.FPS, values=(50.5,))]
-        return plain_module(command)
+        return plain(command)
 
     radar, _ = driver_on(module)
     assert radar.start(50.5) == 50.0
 
 
 @pytest.mark.parametrize("values", [(0.0,), (-1.0,), (float("nan"),), (float("inf"),), ()])
-def test_rate_that_is_none_is_the_modules_fault(values: tuple[float, ...]) -> None:
+def test_rate_that_is_none_is_the_modules_fault(
+    driver_on: DriverOn, values: tuple[float, ...]
+) -> None:
+    plain = PlainModule()
+
     def module(command: m.Message) -> Said:
         if command == m.X4DriverGet(setting=X4Setting.FPS):
             return [m.ReplyFloat(content_id=X4Setting.FPS, values=values)]
-        return plain_module(command)
+        return plain(command)
 
     radar, _ = driver_on(module)
     with pytest.raises(RemoteProtocolError, match="the port reads back"):
         radar.start(17.0)
 
 
-def test_frames_keep_their_samples_counters_and_arrival_times() -> None:
+def test_frames_keep_their_samples_counters_and_arrival_times(driver_on: DriverOn) -> None:
     radar, line = driver_on()
     radar.configure_raw()
     line.say(frame(5), frame(6), frame(9))
@@ -114,7 +116,7 @@ def test_frames_keep_their_samples_counters_and_arrival_times() -> None:
     assert radar.frames_lost == 2
 
 
-def test_counters_wrap_without_loss_and_restarts_are_no_loss() -> None:
+def test_counters_wrap_without_loss_and_restarts_are_no_loss(driver_on: DriverOn) -> None:
     radar, line = driver_on()
     radar.configure_raw()
     line.say(frame(0xFFFFFFFF), frame(0), frame(1), frame(0))
@@ -122,7 +124,7 @@ def test_counters_wrap_without_loss_and_restarts_are_no_loss() -> None:
     assert radar.frames_lost == 0
 
 
-def test_frames_of_the_last_stream_are_no_part_of_the_next() -> None:
+def test_frames_of_the_last_stream_are_no_part_of_the_next(driver_on: DriverOn) -> None:
     radar, line = driver_on()
     radar.configure_raw()
     radar.start(17.0)
@@ -136,14 +138,16 @@ def test_frames_of_the_last_stream_are_no_part_of_the_next() -> None:
     assert radar.frames_lost == 0
 
 
-def test_baseband_frames_become_complex() -> None:
+def test_baseband_frames_become_complex(driver_on: DriverOn) -> None:
+    plain = PlainModule()
+
     def module(command: m.Message) -> Said:
         match command:
             case m.X4DriverGet(setting=X4Setting.FRAMEAREA):
                 return [m.ReplyFloat(content_id=X4Setting.FRAMEAREA, values=(0.25, 0.375))]
             case m.X4DriverGet(setting=X4Setting.FRAMEBINCOUNT):
                 return [m.ReplyInt(content_id=X4Setting.FRAMEBINCOUNT, values=(3,))]
-        return plain_module(command)
+        return plain(command)
 
     radar, line = driver_on(module)
     geometry = radar.configure_raw(RawConfig(downconversion=True))
@@ -154,7 +158,7 @@ def test_baseband_frames_become_complex() -> None:
     assert geometry.bin_length_m == 0.0625  # three bins: the area ends at the last one
 
 
-def test_profile_baseband_messages_are_frames_with_their_own_geometry() -> None:
+def test_profile_baseband_messages_are_frames_with_their_own_geometry(driver_on: DriverOn) -> None:
     radar, line = driver_on()
     message = m.BasebandIq(
         counter=7,
@@ -172,7 +176,7 @@ def test_profile_baseband_messages_are_frames_with_their_own_geometry() -> None:
     assert (got.geometry.range_start_m, got.geometry.bin_length_m) == (0.25, 0.5)
 
 
-def test_frames_of_another_length_are_discarded_and_counted() -> None:
+def test_frames_of_another_length_are_discarded_and_counted(driver_on: DriverOn) -> None:
     radar, line = driver_on()
     radar.configure_raw()
     line.say(frame(1, bins=99), frame(2))
@@ -180,7 +184,7 @@ def test_frames_of_another_length_are_discarded_and_counted() -> None:
     assert radar.frames_discarded == 1
 
 
-def test_data_with_a_content_id_are_no_radar_frames() -> None:
+def test_data_with_a_content_id_are_no_radar_frames(driver_on: DriverOn) -> None:
     radar, line = driver_on()
     radar.configure_raw()
     line.say(m.DataFloat(content_id=4, info=1, values=np.zeros(1431, np.float32)), frame(2))
@@ -188,7 +192,9 @@ def test_data_with_a_content_id_are_no_radar_frames() -> None:
     assert radar.frames_discarded == 1
 
 
-def test_what_arrives_before_a_reply_is_sorted_and_nothing_is_lost() -> None:
+def test_what_arrives_before_a_reply_is_sorted_and_nothing_is_lost(driver_on: DriverOn) -> None:
+    plain = PlainModule()
+
     def chatty(command: m.Message) -> Said:
         if isinstance(command, m.X4DriverGet):
             return [
@@ -200,9 +206,9 @@ def test_what_arrives_before_a_reply_is_sorted_and_nothing_is_lost() -> None:
                 m.ReplyFloat(content_id=X4Setting.FPS, values=(1.0,)),
                 frame(3),
             ]
-        return plain_module(command)
+        return plain(command)
 
-    radar, line = driver_on(plain_module)
+    radar, line = driver_on(plain)
     radar.configure_raw()
     line._answer = chatty
     reply = radar.request(m.X4DriverGet(setting=X4Setting.FPS))
@@ -211,7 +217,7 @@ def test_what_arrives_before_a_reply_is_sorted_and_nothing_is_lost() -> None:
     assert radar.fault_count == 1
 
 
-def test_replies_to_nothing_and_to_something_else_are_not_taken() -> None:
+def test_replies_to_nothing_and_to_something_else_are_not_taken(driver_on: DriverOn) -> None:
     def confused(command: m.Message) -> Said:
         return [
             m.Ack(),
@@ -227,7 +233,10 @@ def test_replies_to_nothing_and_to_something_else_are_not_taken() -> None:
 
 
 @pytest.mark.parametrize("late", [m.Ack(), m.Error(code=1)], ids=["ack", "error"])
-def test_late_answer_is_not_taken_for_the_next_commands(late: m.Message) -> None:
+def test_late_answer_is_not_taken_for_the_next_commands(
+    driver_on: DriverOn, late: m.Message
+) -> None:
+    plain = PlainModule()
     first = m.X4DriverSet(setting=X4Setting.DACMIN, value=949)
     second = m.X4DriverSet(setting=X4Setting.TXPOWER, value=9)
 
@@ -236,7 +245,7 @@ def test_late_answer_is_not_taken_for_the_next_commands(late: m.Message) -> None
             return []
         if isinstance(command, m.Ping):
             return [late, READY]  # the module answers in order, and is back
-        return [m.Error(code=21)] if command == second else plain_module(command)
+        return [m.Error(code=21)] if command == second else plain(command)
 
     radar, line = driver_on(slow)
     with pytest.raises(ResponseTimeout):
@@ -249,7 +258,7 @@ def test_late_answer_is_not_taken_for_the_next_commands(late: m.Message) -> None
     assert line.received[3:] == [m.X4DriverInit()]  # in step again: no PING
 
 
-def test_module_that_stays_silent_is_pinged_before_each_command() -> None:
+def test_module_that_stays_silent_is_pinged_before_each_command(driver_on: DriverOn) -> None:
     radar, line = driver_on(lambda command: [])
     for _ in range(2):
         with pytest.raises(ResponseTimeout):
@@ -261,7 +270,7 @@ def test_module_that_stays_silent_is_pinged_before_each_command() -> None:
     assert line.received[2:] == [m.Ping()]
 
 
-def test_refusal_names_command_code_and_meaning() -> None:
+def test_refusal_names_command_code_and_meaning(driver_on: DriverOn) -> None:
     radar, _ = driver_on(lambda command: [m.Error(code=17)])
     with pytest.raises(DeviceError) as caught:
         radar.request(m.X4DriverSet(setting=X4Setting.FRAMEAREA, value=(5.0, 0.4)))
@@ -272,7 +281,7 @@ def test_refusal_names_command_code_and_meaning() -> None:
     )
 
 
-def test_silence_is_a_timeout_that_names_port_and_remedy() -> None:
+def test_silence_is_a_timeout_that_names_port_and_remedy(driver_on: DriverOn) -> None:
     radar, line = driver_on(lambda command: [])
     with pytest.raises(
         ResponseTimeout, match=r"no answer to PING .* from the port within 2 s; is it"
@@ -282,30 +291,31 @@ def test_silence_is_a_timeout_that_names_port_and_remedy() -> None:
     assert isinstance(ResponseTimeout(""), TimeoutError)
 
 
-def test_garbage_instead_of_an_answer_suggests_another_device() -> None:
+def test_garbage_instead_of_an_answer_suggests_another_device(driver_on: DriverOn) -> None:
     radar, _ = driver_on(lambda command: [b"\x06\x1a login:"])
     with pytest.raises(ResponseTimeout, match="no XeThru packets; is it another device"):
         radar.ping()
 
 
-def test_strange_pong_is_no_xethru_module() -> None:
+def test_strange_pong_is_no_xethru_module(driver_on: DriverOn) -> None:
     radar, _ = driver_on(lambda command: [m.Pong(value=1)])
     with pytest.raises(RemoteProtocolError, match="0x00000001"):
         radar.ping()
 
 
-def test_module_that_is_not_ready_is_waited_for() -> None:
+def test_module_that_is_not_ready_is_waited_for(driver_on: DriverOn) -> None:
+    plain = PlainModule()
     answers = [m.Pong(value=PongCode.XTS_SPRP_NOTREADY)] * 3 + [READY]
 
     def booting(command: m.Message) -> Said:
-        return [answers.pop(0)] if isinstance(command, m.Ping) else plain_module(command)
+        return [answers.pop(0)] if isinstance(command, m.Ping) else plain(command)
 
     radar, line = driver_on(booting)
     radar.configure_raw()
     assert 0.3e9 <= line.now_ns < 0.5e9
 
 
-def test_module_that_stops_is_a_timeout_and_says_if_it_restarted() -> None:
+def test_module_that_stops_is_a_timeout_and_says_if_it_restarted(driver_on: DriverOn) -> None:
     radar, line = driver_on()
     radar.configure_raw()
     with pytest.raises(ResponseTimeout, match="no frame from the port within 1 s"):
@@ -316,7 +326,7 @@ def test_module_that_stops_is_a_timeout_and_says_if_it_restarted() -> None:
     assert radar.reboots == 1
 
 
-def test_trouble_before_the_last_answer_or_frame_explains_no_silence() -> None:
+def test_trouble_before_the_last_answer_or_frame_explains_no_silence(driver_on: DriverOn) -> None:
     radar, line = driver_on()
     line.say(b"\x00junk", m.System(code=0x10))
     radar.configure_raw()
@@ -332,7 +342,7 @@ def test_trouble_before_the_last_answer_or_frame_explains_no_silence() -> None:
     assert (radar.fault_count, radar.reboots) == (3, 2)
 
 
-def test_info_has_what_the_module_tells() -> None:
+def test_info_has_what_the_module_tells(driver_on: DriverOn) -> None:
     radar, _ = driver_on()
     info = radar.info()
     assert (info.serial_number, info.mode, info.order_code) == ("123456789012", "MANUAL", None)
@@ -342,19 +352,19 @@ def test_info_has_what_the_module_tells() -> None:
     assert X4Setting.ENABLE not in settings
 
 
-def test_closing_stops_the_radar_also_in_the_middle_of_a_packet() -> None:
+def test_closing_stops_the_radar_also_in_the_middle_of_a_packet(driver_on: DriverOn) -> None:
     radar, line = driver_on()
     with radar:
         radar.configure_raw()
         radar.start(17.0)
         line.say(b"\x7c\x7c\x7c\x7c\x6a\x16\x00\x00\x00\xa0")
-        radar._dialogue.pump(0.0)
+        radar._pump(0.0)
         line.received.clear()
     assert [type(c) for c in line.received] == [m.X4DriverSet, m.SetMode]
     assert line.closed
 
 
-def test_closing_a_dead_module_tells_and_does_not_raise() -> None:
+def test_closing_a_dead_module_tells_and_does_not_raise(driver_on: DriverOn) -> None:
     radar, line = driver_on()
     with radar:
         radar.configure_raw()
@@ -363,15 +373,14 @@ def test_closing_a_dead_module_tells_and_does_not_raise() -> None:
     assert radar.warnings[0].startswith("the module was not stopped: no answer")
 
 
-def test_observer_hears_everything_but_frames() -> None:
+def test_observer_hears_everything_but_frames(driver_on: DriverOn) -> None:
     heard: list[ProtocolRecord] = []
-    line = ScriptedTransport(plain_module)
-    radar = X4M300(line, clock=line.clock, observer=heard.append)
+    radar, line = driver_on(observer=heard.append)
     radar.ping()
     line.say(m.System(code=0x11), b"\x00", frame(1))
-    radar._dialogue.pump(0.0)
-    radar._dialogue.pump(0.0)
-    radar._dialogue.pump(0.0)
+    radar._pump(0.0)
+    radar._pump(0.0)
+    radar._pump(0.0)
     assert [(record.direction, record.summary) for record in heard] == [
         ("tx", "PING seed=0xEEAAEAAE"),
         ("rx", "PONG value=0xAAEEAEEA"),
@@ -380,21 +389,21 @@ def test_observer_hears_everything_but_frames() -> None:
     ]
 
 
-def test_reset_returns_at_the_ack() -> None:
+def test_reset_returns_at_the_ack(driver_on: DriverOn) -> None:
     radar, line = driver_on()
     radar.reset()
     radar.close()
     assert [type(c) for c in line.received] == [m.ModReset]
 
 
-def test_impossible_area_is_refused_before_anything_is_sent() -> None:
+def test_impossible_area_is_refused_before_anything_is_sent(driver_on: DriverOn) -> None:
     radar, line = driver_on()
     with pytest.raises(LocalProtocolError, match="swap"):
         radar.configure_raw(RawConfig(frame_area_m=(5.0, 1.0)))
     assert line.received == []
 
 
-def test_area_without_bins_is_refused_before_anything_is_sent() -> None:
+def test_area_without_bins_is_refused_before_anything_is_sent(driver_on: DriverOn) -> None:
     radar, line = driver_on()
     with pytest.raises(LocalProtocolError, match=r"has no bins; it must end at least 0\.0064 m"):
         radar.configure_raw(RawConfig(frame_area_m=(-3.0, -2.0)))
@@ -420,7 +429,9 @@ def test_numbers_the_chip_would_cut_are_refused(name: str, largest: int) -> None
     ],
     ids=["register without address", "no setter", "set unknown", "get unknown"],
 )
-def test_what_no_module_understands_is_not_sent(command: m.Command[m.Ack]) -> None:
+def test_what_no_module_understands_is_not_sent(
+    driver_on: DriverOn, command: m.Command[m.Ack]
+) -> None:
     radar, line = driver_on()
     with pytest.raises(LocalProtocolError, match=r"X4DRIVER_[SG]ET cannot carry"):
         radar.request(command)

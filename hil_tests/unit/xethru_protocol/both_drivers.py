@@ -1,0 +1,144 @@
+"""The same tests on both drivers: `AsyncX4M300` with an event loop around each call."""
+
+import asyncio
+import inspect
+from collections.abc import Callable, Iterator
+from types import TracebackType
+from typing import Any, Protocol, Self, cast
+
+from hil_tests.unit.xethru_protocol.scripted import Answer, PlainModule, ScriptedTransport
+from xethru_protocol.async_driver import AsyncX4M300
+from xethru_protocol.driver import X4M300
+
+
+class AsyncScripted:
+    """A `ScriptedTransport` whose reads and writes are awaited."""
+
+    def __init__(self, line: ScriptedTransport) -> None:
+        self.line = line
+        self.name = line.name
+
+    async def read(self, timeout_s: float) -> bytes:
+        """See `ScriptedTransport.read`."""
+        await asyncio.sleep(0)
+        return self.line.read(timeout_s)
+
+    async def write(self, data: bytes) -> None:
+        """See `ScriptedTransport.write`."""
+        self.line.write(data)
+
+    def close(self) -> None:
+        """See `ScriptedTransport.close`."""
+        self.line.close()
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - what only some lines have
+        """Whatever else the line knows, such as its rate."""
+        if name == "line":
+            raise AttributeError(name)
+        return getattr(self.line, name)
+
+
+class Blocking:
+    """Anything with coroutines, as if it had none."""
+
+    def __init__(self, target: object, runner: asyncio.Runner) -> None:
+        self.__dict__.update(target=target, runner=runner)
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - anything
+        """Member of the target, awaited if it must be."""
+        value = getattr(self.target, name)
+        if inspect.iscoroutinefunction(value):
+            return lambda *args, **kwargs: self.runner.run(value(*args, **kwargs))
+        if inspect.isasyncgenfunction(value):
+            return lambda *args, **kwargs: self._iterate(value(*args, **kwargs))
+        if name in {"presence", "files"}:
+            return Blocking(value, self.runner)
+        return value
+
+    def __setattr__(self, name: str, value: object) -> None:
+        """Pass it on."""
+        setattr(self.target, name, value)
+
+    def __enter__(self) -> Self:
+        """Enter the target."""
+        self.runner.run(self.target.__aenter__())
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Leave the target."""
+        self.runner.run(self.target.__aexit__(kind, error, trace))
+
+    def _iterate(self, items: Any) -> Iterator[Any]:  # noqa: ANN401 - an asynchronous generator
+        async def take() -> Any:  # noqa: ANN401 - as above
+            return await anext(items)
+
+        while True:
+            try:
+                item = self.runner.run(take())
+            except StopAsyncIteration:
+                return
+            yield item
+
+
+class DriverOn(Protocol):
+    """Makes a driver and the scripted line it is on."""
+
+    def __call__(
+        self,
+        answer: Answer | None = None,
+        *,
+        ports: dict[str, Callable[[], ScriptedTransport]] | None = None,
+        name: str = "the port",
+        **options: Any,  # noqa: ANN401 - those of the drivers
+    ) -> tuple[X4M300, ScriptedTransport]:
+        """Return both; ``ports`` are those at which a reconnect may open a line."""
+
+
+def driver_factory(kind: str, runner: asyncio.Runner) -> DriverOn:
+    """Return the maker of one kind of driver."""
+
+    def driver_on(
+        answer: Answer | None = None,
+        *,
+        ports: dict[str, Callable[[], ScriptedTransport]] | None = None,
+        name: str = "the port",
+        **options: Any,  # noqa: ANN401 - those of the drivers
+    ) -> tuple[X4M300, ScriptedTransport]:
+        line = ScriptedTransport(answer or PlainModule(), name)
+        known = ports or {}
+
+        def open_line(path: str, baudrate: int) -> ScriptedTransport:
+            return known[path]()
+
+        def pass_time(seconds: float) -> None:
+            line.now_ns += round(seconds * 1e9)
+
+        async def let_time_pass(seconds: float) -> None:
+            pass_time(seconds)
+
+        if kind == "sync":
+            radar = X4M300(
+                line,
+                clock=line.clock,
+                open_port=open_line,
+                candidates=lambda: list(known),
+                sleep=pass_time,
+                **options,
+            )
+            return radar, line
+        awaited = AsyncX4M300(
+            AsyncScripted(line),
+            clock=line.clock,
+            open_port=lambda path, baudrate: AsyncScripted(open_line(path, baudrate)),
+            candidates=lambda: list(known),
+            sleep=let_time_pass,
+            **options,
+        )
+        return cast(X4M300, Blocking(awaited, runner)), line
+
+    return driver_on

@@ -1,0 +1,121 @@
+"""Bytes to and from a port for asyncio, without threads."""
+
+import asyncio
+from collections.abc import Callable
+from typing import Protocol
+
+from xethru_protocol.errors import Disconnected
+from xethru_protocol.transport import SerialTransport
+
+_WRITE_TIMEOUT_S = 5.0
+_LONGEST_WAIT_S = 86400.0
+
+
+class AsyncTransport(Protocol):
+    """What `AsyncX4M300` needs of a line to a module."""
+
+    @property
+    def name(self) -> str:
+        """What to call this line in messages to people."""
+
+    async def read(self, timeout_s: float) -> bytes:
+        """Whatever has arrived, waiting up to ``timeout_s`` for the first byte; b"" if none.
+
+        Raises `Disconnected` if the line is gone.
+        """
+
+    async def write(self, data: bytes) -> None:
+        """Send all of ``data``; raises `Disconnected` if the line is gone."""
+
+    def close(self) -> None:
+        """Release the line; who reads from it gets `Disconnected`. May be called twice."""
+
+
+class AsyncSerialTransport:
+    """A serial port whose descriptor the running event loop watches; see `SerialTransport`."""
+
+    def __init__(self, path: str, baudrate: int = 115200) -> None:
+        self._port = SerialTransport(path, baudrate)
+        self._waiting: set[_Waiting] = set()
+
+    @property
+    def name(self) -> str:
+        """See `AsyncTransport.name`."""
+        return self._port.name
+
+    @property
+    def bytes_per_s(self) -> float:
+        """See `SerialTransport.bytes_per_s`."""
+        return self._port.bytes_per_s
+
+    def set_baudrate(self, baudrate: int) -> None:
+        """See `SerialTransport.set_baudrate`."""
+        self._port.set_baudrate(baudrate)
+
+    async def read(self, timeout_s: float) -> bytes:
+        """See `AsyncTransport.read`."""
+        data = self._port.read(0.0)
+        if data or timeout_s <= 0:
+            await asyncio.sleep(0)  # a stream that never pauses must not stop the other tasks
+            return data
+        loop = asyncio.get_running_loop()
+        if not await self._wait(loop.add_reader, loop.remove_reader, timeout_s):
+            return b""
+        return self._port.read(0.0)
+
+    async def write(self, data: bytes) -> None:
+        """See `AsyncTransport.write`."""
+        loop = asyncio.get_running_loop()
+        rest = memoryview(data)
+        deadline_s = loop.time() + _WRITE_TIMEOUT_S
+        while rest := rest[self._port.write_some(rest) :]:
+            left_s = deadline_s - loop.time()
+            if not await self._wait(loop.add_writer, loop.remove_writer, left_s):
+                raise Disconnected(f"{self.name} takes no data any more; is the module hanging?")
+
+    def close(self) -> None:
+        """See `AsyncTransport.close`."""
+        for waiting in tuple(self._waiting):
+            waiting.unwatch()
+            if not waiting.ready.done():
+                waiting.ready.set_exception(Disconnected(f"{self.name} was closed"))
+        self._port.close()
+
+    async def _wait(
+        self,
+        watch: Callable[..., object],
+        unwatch: Callable[[int], object],
+        timeout_s: float,
+    ) -> bool:
+        """Wait until the descriptor is ready; False if it is not in time."""
+        waiting = _Waiting(self._waiting, self._port.fileno(), unwatch)
+        watch(waiting.descriptor, waiting.wake)
+        try:
+            await asyncio.wait_for(waiting.ready, min(max(timeout_s, 0.0), _LONGEST_WAIT_S))
+        except TimeoutError:
+            return False
+        finally:
+            waiting.unwatch()
+        return True
+
+
+class _Waiting:
+    """A task that waits for a descriptor, which must not be watched once it is closed."""
+
+    def __init__(
+        self, others: "set[_Waiting]", descriptor: int, unwatch: Callable[[int], object]
+    ) -> None:
+        self.descriptor = descriptor
+        self.ready: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._others = others
+        self._unwatch = unwatch
+        others.add(self)
+
+    def wake(self) -> None:
+        if not self.ready.done():
+            self.ready.set_result(None)
+
+    def unwatch(self) -> None:
+        if self in self._others:
+            self._others.discard(self)
+            self._unwatch(self.descriptor)

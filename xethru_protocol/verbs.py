@@ -1,0 +1,59 @@
+"""Procedures as methods: of a driver that blocks, and of one whose methods are awaited."""
+
+import functools
+from collections.abc import Awaitable, Callable
+from typing import Any, Concatenate, ParamSpec, TypeVar
+
+from xethru_protocol.core import RadarCore
+from xethru_protocol.reconnection import resilient
+from xethru_protocol.steps import Procedure
+
+P = ParamSpec("P")
+T = TypeVar("T")
+_Written = Callable[Concatenate[RadarCore, P], Procedure[T]]
+
+
+def blocking(procedure: _Written[P, T]) -> Callable[Concatenate[Any, P], T]:
+    """Make a method that returns the procedure's result; repeated after a reconnect, if on."""
+
+    @functools.wraps(procedure)
+    def method(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:  # noqa: ANN401 - any part of a driver
+        core: RadarCore = self._core
+        result: T = self._run(resilient(core, lambda: procedure(core, *args, **kwargs)))
+        return result
+
+    return method
+
+
+def blocking_once(procedure: _Written[P, T]) -> Callable[Concatenate[Any, P], T]:
+    """Do the same, but never repeat: a broken line is the caller's business."""
+
+    @functools.wraps(procedure)
+    def method(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:  # noqa: ANN401 - as above
+        result: T = self._run(procedure(self._core, *args, **kwargs))
+        return result
+
+    return method
+
+
+def awaited(procedure: _Written[P, T]) -> Callable[Concatenate[Any, P], Awaitable[T]]:
+    """Make a coroutine method; repeated after a reconnect, if that is on."""
+
+    @functools.wraps(procedure)
+    async def method(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:  # noqa: ANN401 - as above
+        core: RadarCore = self._core
+        result: T = await self._run(resilient(core, lambda: procedure(core, *args, **kwargs)))
+        return result
+
+    return method
+
+
+def awaited_once(procedure: _Written[P, T]) -> Callable[Concatenate[Any, P], Awaitable[T]]:
+    """Do the same, but never repeat."""
+
+    @functools.wraps(procedure)
+    async def method(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:  # noqa: ANN401 - as above
+        result: T = await self._run(procedure(self._core, *args, **kwargs))
+        return result
+
+    return method
