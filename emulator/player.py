@@ -50,6 +50,11 @@ def schedule(
     -------
     Times that never decrease: a stamp that runs backwards plays at once.
 
+    Raises
+    ------
+    OverflowError
+        When a rate near 0 puts a message beyond all time.
+
     Examples
     --------
     >>> from xethru_protocol.messages import Ack

@@ -262,6 +262,6 @@ CSV_KINDS: tuple[CsvKind, ...] = (
         ),
     ),
 )
-"""All kinds. Bits 1 << 4 (performance status) and 1 << 19 ... 22 (frames of newer firmware) of [HDR]
-have no row: their layout is not known (Protocol reference 7.5)."""
+"""All kinds. Bits 1 << 4 (performance status) and 1 << 19 ... 22 (frames of newer firmware) of the
+vendor's header have no row: their layout is not known (Protocol reference 7.5)."""
 BY_MESSAGE: dict[type[Response], CsvKind] = {kind.message: kind for kind in CSV_KINDS}
