@@ -240,6 +240,7 @@ class PacketReader:
         if run:  # a start whose length would be 7C7C7C7C: all but the last 7 of the run
             last_rejected = self._base + run.end() - 8
             self._skip_to(last_rejected + 1)
+            self.statistics.resyncs += last_rejected - first
             self._damage_end = max(self._damage_end, last_rejected + len(NO_ESCAPE_START))
         return fault
 
