@@ -136,7 +136,8 @@ class DeleteNoiseMap(Command[Ack]):
             (
                 AppCommandCode.XTS_SPCA_DELETE_NOISEMAP,
                 AppCommandCode.XTS_SPCA_GET_PARAMETER_FILE,
-            )
+            ),
+            usual=AppCommandCode.XTS_SPCA_DELETE_NOISEMAP,
         ),
     ] = AppCommandCode.XTS_SPCA_DELETE_NOISEMAP
 
@@ -146,4 +147,4 @@ class DeleteNoiseMap(Command[Ack]):
 class AppPoll(Command[Ack]):
     """A command that is defined but never parsed: ERROR 1. 4.4."""
 
-    data: Annotated[bytes, wire.RestBytes(empty_shown=False)] = b""
+    data: Annotated[bytes, wire.RestBytes()] = b""

@@ -93,7 +93,7 @@ class DebugLevel(Command[Ack]):
 class SetCom(Command[Ack]):
     """A command that is defined but handled by no firmware: ERROR 1. 2."""
 
-    data: Annotated[bytes, wire.RestBytes(empty_shown=False)] = b""
+    data: Annotated[bytes, wire.RestBytes()] = b""
 
 
 @command(CommandCode.XTS_SPC_HIL, name="HIL")

@@ -34,10 +34,10 @@ class NoiseMapGetControl(Command[ReplyInt]):
 @command(_NOISEMAP, NoiseMapCode.SET_PERIODIC_STORE, name="NOISEMAP_SET_PERIODIC_STORE")
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NoiseMapSetPeriodicStore(Command[Ack]):
-    """Store the noise map every ``interval_min`` minutes; ``reserved`` is sent as 0. 16."""
+    """Store the noise map every ``interval_min`` minutes; ``padding`` is sent as 0. 16."""
 
     interval_min: Annotated[int, wire.U32]
-    reserved: Annotated[int, wire.U32] = 0
+    padding: Annotated[int, wire.U32] = 0
 
 
 @command(_NOISEMAP, NoiseMapCode.GET_PERIODIC_STORE, name="NOISEMAP_GET_PERIODIC_STORE")

@@ -114,7 +114,7 @@ class LegacyDirCommand(Command[Response]):
     """Any other X2 command, kept whole; an X4 answers ERROR 1. 4.10."""
 
     sub_code: Annotated[int, wire.Spelling(tuple(sorted(LEGACY_DIR_CODES)))]
-    data: Annotated[bytes, wire.RestBytes(empty_shown=False)] = b""
+    data: Annotated[bytes, wire.RestBytes()] = b""
 
 
 _BOOTLOADER = CommandCode.XTS_SPC_BOOTLOADER

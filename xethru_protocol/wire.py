@@ -11,6 +11,7 @@ order; the layouts themselves stand in the rows. All numbers are little-endian, 
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Any, Protocol
 
 import numpy as np
@@ -86,7 +87,7 @@ ID32 = Number("I", shown=hexadecimal)
 class Member:
     """A u32 that must be a member of ``enum``; shown by its name."""
 
-    enum: Callable[[int], Any]
+    enum: type[IntEnum]
     label: str
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
@@ -107,11 +108,12 @@ class Member:
 class Spelling:
     """A code that belongs to the prefix and has several values for one and the same message.
 
-    Must be a row's first field: the row is entered once per value. The first value is the
-    usual one and not shown.
+    Must be a row's first field: the row is entered once per value. The value ``usual`` is not
+    shown.
     """
 
     codes: tuple[int, ...]
+    usual: int | None = None
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
         """Pack the code; ``ValueError`` if it is not one of this message's."""
@@ -125,7 +127,7 @@ class Spelling:
 
     def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
         """Show which code was used, unless it is the usual one."""
-        return {} if value == self.codes[0] else {name: short_hexadecimal(value)}
+        return {} if value == self.usual else {name: short_hexadecimal(value)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -318,7 +320,6 @@ class RestBytes:
 
     shown: Callable[[bytes], Any] = hex_bytes
     label: str = ""
-    empty_shown: bool = True
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
         """Pack the bytes."""
@@ -329,5 +330,5 @@ class RestBytes:
         return data[start:], len(data)
 
     def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
-        """Show the bytes, none of them only where the vectors do."""
-        return {self.label or name: self.shown(value)} if value or self.empty_shown else {}
+        """Show the bytes."""
+        return {self.label or name: self.shown(value)}

@@ -63,7 +63,7 @@ def _field(  # noqa: PLR0911, PLR0912 - one case per kind of field
     match kind:
         case wire.Number():
             return SCALARS[kind.code]
-        case wire.Member(enum=type() as enum):
+        case wire.Member(enum=enum):
             return st.sampled_from(list(enum))
         case wire.Spelling(codes=codes):
             return st.sampled_from(codes)

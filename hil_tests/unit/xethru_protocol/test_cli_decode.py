@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from hil_tests.golden.test_protocol_vectors import ABOUT, KNOWN
-from hil_tests.golden.vectors import Vector, load
+from hil_tests.golden.test_protocol_vectors import KNOWN
+from hil_tests.golden.vectors import ABOUT, Vector, load
 from xethru_protocol.cli import main
 
 VECTORS = load()
