@@ -140,6 +140,11 @@ class MatrixControl(IntFlag):
     FAST_AS_DOCUMENTED = 4
     DEBUG_ROUTING = 1 << 31
 
+    @property
+    def fast(self) -> bool:
+        """Whether the fast matrix is on, by either numbering."""
+        return bool(self & (MatrixControl.FAST | MatrixControl.FAST_AS_DOCUMENTED))
+
 
 class IoPinSetup(IntFlag):
     """Setup bits of an IO pin. Protocol reference 4.8."""

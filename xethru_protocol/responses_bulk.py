@@ -124,10 +124,10 @@ class _MatrixByte(_Bulk):
 
     @property
     def power(self) -> npt.NDArray[np.float64]:
-        """Power per frequency, shape (F,); inf where the steps announce more than a float can."""
+        """Power per frequency, linear, shape (F,); a damaged header may give infinities."""
         levels = np.frombuffer(self.levels, dtype=np.uint8)
-        decibels = self.byte_step_start_db + levels * self.byte_step_size_db
-        with np.errstate(over="ignore", invalid="ignore"):
+        with np.errstate(all="ignore"):
+            decibels = self.byte_step_start_db + levels * self.byte_step_size_db
             return np.asarray(10.0 ** (decibels / 10.0), dtype=np.float64)
 
 

@@ -150,9 +150,9 @@ def _row(  # noqa: PLR0917 - the two decorators above are its only callers
 
 
 def _enter(prefixes: Prefixes, cls: type[MessageT], row: Row) -> type[MessageT]:
-    ROWS[cls] = row
     first = row.kinds[0][1] if row.kinds else None
     codes = [bytes((code,)) for code in first.codes] if isinstance(first, wire.Spelling) else [b""]
     for code in codes:
         prefixes.enter(row.prefix + code, cls)
+    ROWS[cls] = row
     return cls
