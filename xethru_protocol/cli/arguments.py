@@ -59,6 +59,7 @@ def _add_doctor(commands: _Commands) -> None:
     )
     one.add_argument(
         "--port",
+        type=_not_empty,
         action="append",
         default=[],
         help="examine this port; may be given several times (default: all that are found)",
@@ -106,11 +107,15 @@ def _add_record(commands: _Commands) -> None:
     _add_port(one)
     one.add_argument(
         "--out",
+        type=_not_empty,
         metavar="DIR",
         help="directory for a recording in the vendor's format (ModuleConnector)",
     )
     one.add_argument(
-        "--wire", metavar="FILE", help="also, or only, write all bytes of both directions here"
+        "--wire",
+        type=_not_empty,
+        metavar="FILE",
+        help="also, or only, write all bytes of both directions here",
     )
     one.add_argument(
         "--profile",
@@ -139,7 +144,9 @@ def _add_dump(commands: _Commands) -> None:
         ".mcap and .npz. Prints a summary and one line per message; with --json one object per "
         "message, as decode does, with its time t_ns. Exit 1 if a part could not be read.",
     )
-    one.add_argument("file", metavar="FILE", help="file or directory of a recording")
+    one.add_argument(
+        "file", type=_not_empty, metavar="FILE", help="file or directory of a recording"
+    )
     one.add_argument("--samples", action="store_true", help="print arrays whole")
     _add_json(one)
 
@@ -153,8 +160,10 @@ def _add_convert(commands: _Commands) -> None:
         "The name of TARGET says which: .mcap, .npz, .xtwire (a wire capture); a name without "
         "suffix is a directory in the vendor's format.",
     )
-    one.add_argument("source", metavar="SOURCE", help="any recording that 'xethru dump' reads")
-    one.add_argument("target", metavar="TARGET", help="file or directory to write")
+    one.add_argument(
+        "source", type=_not_empty, metavar="SOURCE", help="any recording that 'xethru dump' reads"
+    )
+    one.add_argument("target", type=_not_empty, metavar="TARGET", help="file or directory to write")
     _add_force(one, "replace TARGET if it exists")
     _add_json(one)
 
@@ -170,7 +179,9 @@ def _add_decode(commands: _Commands) -> None:
         "the structure decides: NoEscape packets are the module's; otherwise the reading that "
         "explains every byte wins; 01 with a value that modules answer is PONG, else PING.",
     )
-    one.add_argument("file", nargs="?", metavar="FILE", help="default: standard input")
+    one.add_argument(
+        "file", type=_not_empty, nargs="?", metavar="FILE", help="default: standard input"
+    )
     one.add_argument(
         "--hex",
         action="store_true",
@@ -178,6 +189,11 @@ def _add_decode(commands: _Commands) -> None:
     )
     one.add_argument(
         "--from", dest="sender", choices=_FROM, default="auto", help="who sent the bytes"
+    )
+    one.add_argument(
+        "--statistics",
+        action="store_true",
+        help="at the end, write totals to standard error as one JSON object",
     )
 
 
@@ -199,7 +215,12 @@ def _command(
 
 
 def _add_port(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--port", required=True, help="serial port, for example /dev/ttyACM0")
+    parser.add_argument(
+        "--port",
+        type=_not_empty,
+        required=True,
+        help="serial port, for example /dev/ttyACM0",
+    )
     parser.add_argument(
         "--baudrate",
         type=_at_least_one,
@@ -253,6 +274,12 @@ def _metres(text: str) -> float:
     if not -1000 <= value <= 1000:
         raise argparse.ArgumentTypeError(f"{text!r} must be metres between -1000 and 1000")
     return value
+
+
+def _not_empty(text: str) -> str:
+    if not text:
+        raise argparse.ArgumentTypeError("an empty name is none")
+    return text
 
 
 def _number(text: str) -> float:
@@ -363,4 +390,9 @@ def _convert(arguments: argparse.Namespace) -> int:
 def _decode(arguments: argparse.Namespace) -> int:
     from xethru_protocol.cli.decode import decode
 
-    return decode(arguments.file, is_hex=arguments.hex, sender=arguments.sender)
+    return decode(
+        arguments.file,
+        is_hex=arguments.hex,
+        sender=arguments.sender,
+        with_statistics=arguments.statistics,
+    )

@@ -1,19 +1,21 @@
 """``xethru decode``: captured bytes to messages, packet by packet as they come."""
 
+import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
 from typing import BinaryIO
 
-from xethru_protocol.cli.output import print_json
+from xethru_protocol.cli.output import print_json, warn
 from xethru_protocol.codec import decode_command, decode_response, describe, encode
 from xethru_protocol.codes import PongCode
 from xethru_protocol.errors import LocalProtocolError, XeThruError
 from xethru_protocol.framing import PacketReader
-from xethru_protocol.messages import Message, Pong, UnknownMessage
+from xethru_protocol.messages import Ack, Message, Pong, UnknownMessage
 from xethru_protocol.packets import Framing, FramingFault, Packet
 from xethru_protocol.plausibility import Direction
+from xethru_protocol.statistics import LinkStatistics
 from xethru_protocol.wire import hex_bytes
 
 _CHUNK_BYTES = 65536
@@ -23,28 +25,48 @@ class DecodeError(XeThruError):
     """The input cannot be read as what it was said to be."""
 
 
-def decode(file: str | None, *, is_hex: bool, sender: str) -> int:
-    """Print one JSON object per packet and per fault."""
+def decode(file: str | None, *, is_hex: bool, sender: str, with_statistics: bool = False) -> int:
+    """Print one JSON object per packet and per fault; totals at the end, on stderr, if wanted."""
     name = file or "standard input"
+    statistics = LinkStatistics()
     try:
         with Path(file).open("rb") if file else nullcontext(sys.stdin.buffer) as source:
             if is_hex:
                 for number, line in enumerate(source, start=1):
-                    _print_all(iter((_from_hex(line, name, number),)), sender)
+                    _print_all(iter((_from_hex(line, name, number),)), sender, statistics)
             else:
-                _print_all(_chunks(source), sender)
+                _print_all(_chunks(source), sender, statistics)
     except BrokenPipeError:  # of stdout
         raise
     except OSError as error:
         raise DecodeError(f"{name} cannot be read: {error.strerror}") from None
+    finally:
+        if with_statistics:
+            warn(json.dumps(statistics.summary()))
     return 0
+
+
+def found_in(
+    chunks: Iterable[bytes], sender: str, statistics: LinkStatistics
+) -> Iterator[Packet | FramingFault]:
+    """Packets and faults of a stream that comes in chunks, each as soon as it can be told."""
+    direction = Direction.FROM_HOST if sender == "host" else Direction.FROM_MODULE
+    reader = PacketReader(direction, statistics)
+    for chunk in chunks:
+        reader.receive_data(chunk)
+        while isinstance(found := reader.next_packet(), Packet | FramingFault):
+            yield found
+    reader.end_data()
+    while isinstance(found := reader.next_packet(), Packet | FramingFault):
+        yield found
 
 
 def message_of(packet: Packet, sender: str) -> Message:
     """Message of a packet from ``sender``: "host", "module", or "auto" to judge by structure.
 
     Of two readings the one that explains every byte wins. PING and PONG look alike: a value
-    that modules answer with is a PONG.
+    that modules answer with is a PONG. An ACK is its code alone: with more behind it the code
+    is APPCOMMAND's, also if its content is not known.
     """
     payload = packet.payload
     if sender == "host":
@@ -53,8 +75,10 @@ def message_of(packet: Packet, sender: str) -> Message:
     if sender == "module" or packet.framing is Framing.NO_ESCAPE:
         return response
     command = decode_command(payload)
+    if isinstance(response, Ack) and len(payload) == 1:
+        return response
     if not _explains(command, payload):
-        return command if isinstance(response, UnknownMessage) else response
+        return command if isinstance(response, UnknownMessage | Ack) else response
     if isinstance(response, Pong):
         return response if response.value in set(PongCode) else command
     return response if _explains(response, payload) else command
@@ -67,21 +91,14 @@ def _explains(message: Message, payload: bytes) -> bool:
         return False
 
 
-def _print_all(chunks: Iterator[bytes], sender: str) -> None:
-    reader = PacketReader(Direction.FROM_HOST if sender == "host" else Direction.FROM_MODULE)
-    for chunk in chunks:
-        reader.receive_data(chunk)
-        _print_packets(reader, sender)
-    reader.end_data()
-    _print_packets(reader, sender)
-
-
-def _print_packets(reader: PacketReader, sender: str) -> None:
-    while isinstance(found := reader.next_packet(), Packet | FramingFault):
+def _print_all(chunks: Iterable[bytes], sender: str, statistics: LinkStatistics) -> None:
+    for found in found_in(chunks, sender, statistics):
         if isinstance(found, FramingFault):
             print_json({"fault": found.kind.value, "offset": found.offset})
             continue
-        name, shown = describe(message_of(found, sender))
+        message = message_of(found, sender)
+        statistics.unknown += isinstance(message, UnknownMessage)
+        name, shown = describe(message)
         print_json(
             {
                 "framing": found.framing.value,

@@ -100,7 +100,7 @@ def _lines(report: Report) -> Iterator[str]:
     yield f"{one_line(report.subject)}{': ' if report.about else ''}{report.about}"
     well = sum(finding.level is Level.OK for finding in report.findings)
     if well:
-        yield f"  ok     {well} checks"
+        yield f"  ok     {well} check{'s' if well > 1 else ''}"
     for finding in report.findings:
         if finding.level is not Level.OK:
             yield from _wrapped(f"  {finding.level.value:<6} ", one_line(finding.found))

@@ -11,6 +11,7 @@ import stat
 import time
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 from xethru_protocol.cli.port_users import PortUser, port_users
 from xethru_protocol.codes import X4Setting
@@ -38,8 +39,7 @@ _OTHER_BAUDRATES = (
 )
 _PATIENCE_S = 1.0
 _GLANCE_S = 0.25  # enough for the 18 bytes of PING and PONG at 9600 baud
-# A pseudo-terminal and a USB device of the class CDC ACM have no rate.
-_WITHOUT_RATE = re.compile(r"/dev/(pts/|ttyACM|ttyGS|ptmx)")
+_WITHOUT_RATE = ("/dev/pts/", "/dev/ttyACM")  # pseudo-terminals, and USB of class CDC ACM
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,9 +101,16 @@ class Patient:
         return os.path.exists(self.path)
 
     @property
-    def is_device(self) -> bool:
-        """Whether it could be a serial port at all."""
-        return stat.S_ISCHR(os.stat(self.path).st_mode)
+    def is_serial_port(self) -> bool:
+        """Whether it is a device, and, where the system tells (Linux), one of a serial driver."""
+        status = os.stat(self.path)
+        if not stat.S_ISCHR(status.st_mode):
+            return False
+        drivers = _serial_drivers()
+        return not drivers or any(
+            os.major(status.st_rdev) == major and os.minor(status.st_rdev) in minors
+            for major, minors in drivers
+        )
 
     @property
     def may_be_opened(self) -> bool:
@@ -157,7 +164,7 @@ class Patient:
             return first
         if self._ask(BootloaderGetDeviceInfo(), _GLANCE_S).talks and not first.talks:
             return Contact(bootloader=True)
-        if _WITHOUT_RATE.match(self.target) is None:
+        if not ignores_baudrate(self.target):
             for baudrate in _OTHER_BAUDRATES:
                 if self._reopen(baudrate):
                     contact = self._ask(Ping(), _GLANCE_S, baudrate)
@@ -238,3 +245,23 @@ class Patient:
         except Disconnected:
             return Contact(gone=True)
         return Contact(talks=talks, damaged=damaged)
+
+
+def ignores_baudrate(target: str) -> bool:
+    """Whether a device talks alike at every rate."""
+    return target.startswith(_WITHOUT_RATE)
+
+
+def _serial_drivers() -> list[tuple[int, range]]:
+    """Major and minor numbers of serial ports and pseudo-terminals; empty where unknown."""
+    try:
+        lines = Path("/proc/tty/drivers").read_text().splitlines()
+    except OSError:
+        return []
+    found = []
+    for line in lines:
+        words = line.split()  # driver, path, major, minors, kind
+        if len(words) >= 5 and words[4].partition(":")[0] in ("serial", "pty"):
+            first, _, last = words[3].partition("-")
+            found.append((int(words[2]), range(int(first), int(last or first) + 1)))
+    return found

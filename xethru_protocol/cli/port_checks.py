@@ -11,6 +11,7 @@ from xethru_protocol.codes import PongCode, ProfileId, SensorMode
 from xethru_protocol.messages import Ping
 
 _OLDEST_SOUND_FIRMWARE = (1, 6, 8)  # Protocol reference 15, item 10
+_FEW = 4
 _POWER_CYCLE = "take the module's power away for some seconds"
 
 
@@ -27,8 +28,8 @@ def _missing(patient: Patient) -> str | None:
     return None if patient.exists else "there is no such port"
 
 
-def _no_device(patient: Patient) -> str | None:
-    return None if patient.is_device else "it is a file or a folder, no serial port"
+def _no_port(patient: Patient) -> str | None:
+    return None if patient.is_serial_port else "it is no serial port"
 
 
 def _no_rights(patient: Patient) -> str | None:
@@ -44,7 +45,9 @@ def _no_rights_for_the_group(patient: Patient) -> str | None:
 def _shared(patient: Patient) -> str | None:
     if len(patient.users) < 2:
         return None
-    names = " and ".join(map(str, patient.users))
+    names = " and ".join(map(str, patient.users[:_FEW]))
+    if len(patient.users) > _FEW:
+        names += f" and {len(patient.users) - _FEW} more"
     return f"{names} have it open at once: each gets only a part of what the module sends"
 
 
@@ -190,9 +193,9 @@ PORT_CHECKS = (
         ends=True,
     ),
     Check(
-        name="is a device",
-        looks_at="what kind of file the path is",
-        find=_no_device,
+        name="is a serial port",
+        looks_at="what kind of file the path is, and its driver",
+        find=_no_port,
         remedy="name the module's port, such as /dev/ttyACM0; 'xethru list' shows them",
         ends=True,
     ),

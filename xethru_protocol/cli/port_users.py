@@ -109,7 +109,7 @@ def _name(pid: int) -> str:
     if not words:
         return _read(f"/proc/{pid}/comm").strip() or "unknown"
     if len(words) > 1 and Path(words[0]).name.startswith("python"):
-        del words[0]
+        del words[: 2 if words[1] == "-m" and len(words) > 2 else 1]
     words[0] = Path(words[0]).name
     text = " ".join(words)
     return text if len(text) <= _LONGEST_NAME else text[: _LONGEST_NAME - 3] + "..."
