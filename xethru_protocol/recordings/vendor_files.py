@@ -20,8 +20,9 @@ from xethru_protocol.table import Response
 _KINDS: tuple[Layout | CsvKind, ...] = (*LAYOUTS, *CSV_KINDS)
 _BY_TYPE: dict[int, Layout | CsvKind] = {kind.data_type: kind for kind in _KINDS}
 _BY_LENGTH = sorted(_KINDS, key=lambda kind: -len(kind.file_prefix))
-_LONGEST_USER_HEADER = 4096  # bytes to look through where no index tells how long it is
-_LARGEST_PLAUSIBLE_RECORD = 1 << 20
+_LONGEST_USER_HEADER = 4096  # bytes; looked for where no index tells how long it is
+_LARGEST_PLAUSIBLE_RECORD = 1 << 16
+_LAST_CONTENT_ID = 14  # Protocol reference 6.1
 
 
 def kind_of(file_or_type: str | int) -> Layout | CsvKind | None:
@@ -78,7 +79,8 @@ class DataFile:
             self._stream: BinaryIO = path.open("rb")
             self._size = os.fstat(self._stream.fileno()).st_size
             if not indexed and isinstance(kind, Layout):
-                self.skip(_user_header_bytes(self._stream.read(_LONGEST_USER_HEADER), kind))
+                start = self._stream.read(_LONGEST_USER_HEADER + 2 * _LARGEST_PLAUSIBLE_RECORD)
+                self.skip(_user_header_bytes(start, self._size, kind))
         except OSError as error:
             raise unreadable(path, error) from None
 
@@ -156,24 +158,28 @@ class DataFile:
         report(fault, self._on_fault)
 
 
-def _user_header_bytes(start: bytes, layout: Layout) -> int:
+def _user_header_bytes(start: bytes, size: int, layout: Layout) -> int:
     """Length of what stands before the first record, as far as the records themselves tell.
 
-    0 where records begin at once, and where no place is better.
+    ``start`` is the beginning of the file of ``size`` bytes. 0 where records begin at once, and
+    where no place is better.
     """
-    return next((at for at in range(len(start)) if _chain_fits(start, at, layout)), 0)
+    places = range(min(len(start), _LONGEST_USER_HEADER))
+    return next((at for at in places if _records_follow(start, at, size, layout)), 0)
 
 
-def _chain_fits(start: bytes, position: int, layout: Layout) -> bool:
-    """Whether plausible records follow each other from ``position`` on."""
-    records = 0
-    while position + layout.header.itemsize <= len(start):
+def _records_follow(start: bytes, position: int, size: int, layout: Layout) -> bool:
+    """Whether plausible records stand from ``position`` on: two of them, or one and the end."""
+    for _ in range(2):
         header = start[position : position + layout.header.itemsize]
-        size = layout.record_size(header)
-        if size == layout.header.itemsize or size > _LARGEST_PLAUSIBLE_RECORD:
+        if len(header) < layout.header.itemsize:
             return False
-        if layout.count == "length" and int.from_bytes(header[:4], "little") > 0xFF:
-            return False  # content ids are small numbers (Protocol reference 6.1)
-        position += size
-        records += 1
-    return records > 0
+        record = layout.record_size(header)
+        if record == layout.header.itemsize or record > _LARGEST_PLAUSIBLE_RECORD:
+            return False
+        if layout.count == "length" and int.from_bytes(header[:4], "little") > _LAST_CONTENT_ID:
+            return False
+        position += record
+        if position == size:
+            return True
+    return True
