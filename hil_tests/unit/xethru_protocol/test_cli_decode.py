@@ -87,6 +87,55 @@ def test_corrupted_packet_is_a_fault(capsys: pytest.CaptureFixture[str], tmp_pat
     ]
 
 
+@pytest.mark.parametrize(
+    ("payload", "sender", "message"),
+    [
+        ("10", "auto", "ACK"),
+        ("10", "host", "UNKNOWN"),
+        ("10 10 1C 0A A1 96 CD CC CC 3E 00 00 A0 40", "auto", "APP_SET DETECTION_ZONE"),
+        ("10 10 99 99 99 99 01", "auto", "UNKNOWN"),
+        ("10 10 99 99 99 99 01", "module", "ACK"),
+    ],
+)
+def test_an_ack_is_its_code_alone(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, payload: str, sender: str, message: str
+) -> None:
+    wire = framed(bytes.fromhex(payload))
+    (found,) = decoded(capsys, tmp_path, [wire.hex()], "--from", sender)
+    assert found["message"] == message
+
+
+def framed(payload: bytes) -> bytes:
+    """Frame a payload without special bytes in it."""
+    checksum = 0x7D
+    for byte in payload:
+        checksum ^= byte
+    assert not {0x7D, 0x7E, 0x7F} & {*payload, checksum}
+    return b"\x7d" + payload + bytes((checksum,)) + b"\x7e"
+
+
+def test_statistics_are_one_json_object_on_standard_error(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    file = tmp_path / "bytes"
+    unknown = framed(b"\x99\x01")
+    file.write_bytes(ACK + b"\x00\x01" + bytes.fromhex("7D 10 6C 7E") + unknown + ACK)
+    assert main(["decode", "--statistics", str(file)]) == 0
+    out, err = capsys.readouterr()
+    assert len(out.splitlines()) == 5  # two ACK, one unknown; two faults
+    assert json.loads(err) == {
+        "bytes": 19,
+        "packets": 3,
+        "junk_bytes": 6,
+        "resyncs": 1,
+        "checksum_failures": 1,
+        "unknown": 1,
+        "frames_lost": 0,
+        "off_lattice_samples": 0,
+        "faults": {"bytes between packets": 1, "wrong checksum": 1},
+    }
+
+
 def test_lines_are_streams_of_their_own(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     found = decoded(capsys, tmp_path, ["7C 7C 7C 7C 1A 00 00 00 00 A0 12", "", PING])
     assert [item.get("message", item.get("fault")) for item in found] == [
