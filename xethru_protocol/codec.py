@@ -51,11 +51,12 @@ def encode(message: Message, *, bulk: bool | None = None) -> bytes:
     if isinstance(message, UnknownMessage):
         return message.payload
     row = ROWS[type(message)]
+    framed_in_bulk = row.bulk if bulk is None else bulk
     fields = _fields(message, row)
     parts = [row.prefix]
     for name, kind in row.kinds:
         try:
-            parts.append(kind.pack(fields.get(name), fields, row.bulk if bulk is None else bulk))
+            parts.append(kind.pack(fields.get(name), fields, framed_in_bulk))
         except (struct.error, ValueError, TypeError, OverflowError) as error:
             what = f"{name}={fields[name]!r}" if name in fields else name
             raise LocalProtocolError(f"{row.name} cannot carry {what}: {error}") from None
@@ -142,7 +143,7 @@ def _build(cls: type[BuiltT], payload: bytes) -> BuiltT | UnknownMessage:
 
 
 def _fields(message: Message, row: Row) -> dict[str, Any]:
-    return {name: getattr(message, name) for name, _ in row.kinds if name not in row.wire_only}
+    return {name: getattr(message, name) for name in row.fields}
 
 
 def _unknown(payload: bytes) -> UnknownMessage:

@@ -55,7 +55,8 @@ class Row:
     name: str
     prefix: bytes
     kinds: tuple[tuple[str, wire.Kind], ...]  # in the order of the wire
-    wire_only: frozenset[str]  # those of them that are no fields of the message
+    fields: tuple[str, ...]  # those of them that are fields of the message
+    wire_only: frozenset[str]  # the others
     bulk: bool  # a real module sends it in NoEscape framing
     replies: tuple[type[Response], ...]
     content_id: Callable[[Any], int] | None  # content id the reply must carry
@@ -146,7 +147,10 @@ def _row(  # noqa: PLR0917 - the two decorators above are its only callers
         (field, get_args(get_args(hint)[0] if field in wire_only else hint)[1])
         for field, hint in hints.items()
     )
-    return Row(name, prefix, kinds, wire_only, bulk, replies, content_id, errors, derived or {})
+    fields = tuple(field for field in hints if field not in wire_only)
+    return Row(
+        name, prefix, kinds, fields, wire_only, bulk, replies, content_id, errors, derived or {}
+    )
 
 
 def _enter(prefixes: Prefixes, cls: type[MessageT], row: Row) -> type[MessageT]:

@@ -13,7 +13,7 @@ import pytest
 
 from hil_tests.golden.vectors import FIXTURES, load, load_hand_made
 from xethru_protocol import codes
-from xethru_protocol.codec import decode_command
+from xethru_protocol.codec import decode_command, decode_response
 from xethru_protocol.messages import Hil, LegacyDirCommand, SetCom, UnknownMessage
 
 TABLES: list[dict[str, Any]] = tomllib.loads(
@@ -88,7 +88,16 @@ def test_commands_that_no_firmware_handles_have_a_class() -> None:
     assert decode_command(b"\xa0") == Hil()
 
 
+@pytest.mark.parametrize(
+    "payload",
+    ["51 00", "02", "50 BB 95 36 A5 00", "11 99 00 00 00 00 00 00 00 00", "A0 11" + " 00" * 12, ""],
+)
+def test_responses_that_the_reference_does_not_name_are_unknown(payload: str) -> None:
+    data = bytes.fromhex(payload)
+    assert decode_response(data) == UnknownMessage(code=data[0] if data else -1, payload=data)
+
+
 @pytest.mark.parametrize("payload", ["51 00", "10 10 BB 95 36 A5", "10 17", "90 77", "50 16", "EE"])
-def test_what_the_reference_does_not_name_is_unknown(payload: str) -> None:
+def test_commands_that_the_reference_does_not_name_are_unknown(payload: str) -> None:
     data = bytes.fromhex(payload)
     assert decode_command(data) == UnknownMessage(code=data[0], payload=data)
