@@ -20,7 +20,7 @@ _RULE = "=" * 80
 _ARRAY_PARTS = f"""\
 {_RULE}
 MSG: std_msgs/MultiArrayLayout
-MultiArrayDimension[] dim
+std_msgs/MultiArrayDimension[] dim
 uint32 data_offset
 {_RULE}
 MSG: std_msgs/MultiArrayDimension
@@ -29,8 +29,8 @@ uint32 size
 uint32 stride
 """
 SCHEMAS = {
-    FLOAT_ARRAY: f"MultiArrayLayout layout\nfloat32[] data\n{_ARRAY_PARTS}",
-    BYTE_ARRAY: f"MultiArrayLayout layout\nuint8[] data\n{_ARRAY_PARTS}",
+    FLOAT_ARRAY: f"std_msgs/MultiArrayLayout layout\nfloat32[] data\n{_ARRAY_PARTS}",
+    BYTE_ARRAY: f"std_msgs/MultiArrayLayout layout\nuint8[] data\n{_ARRAY_PARTS}",
     STRING: "string data\n",
 }
 """Definition of each message with all it refers to, as ``ros2msg`` text."""

@@ -175,7 +175,13 @@ def read_mcap(path: Path, on_fault: FaultHandler | None) -> TimedMessages:
     """
     topics: dict[int, tuple[str, bool]] = {}
     radars: set[str] = set()
-    for record in _records(path, on_fault):
+    faults: list[RecordingFault] = []
+
+    def note(fault: RecordingFault) -> None:
+        faults.append(fault)
+        report(fault, on_fault)
+
+    for record in _records(path, note):
         if isinstance(record, Channel):
             radar, topic = _radar_topic(record.topic)
             if radar and topic in {"frame", "payload"}:
@@ -191,7 +197,7 @@ def read_mcap(path: Path, on_fault: FaultHandler | None) -> TimedMessages:
             except (ValueError, struct.error) as error:
                 raise RecordingError(f"{path}: a message is damaged: {error}") from None
             yield message, record.log_time if timed else None
-    if not radars:
+    if not radars and not faults:
         raise RecordingError(f"{path} holds no topic /radar/<name>/frame or .../payload")
 
 
@@ -225,7 +231,7 @@ def _records(path: Path, on_fault: FaultHandler | None) -> Iterator[object]:
             try:
                 yield from StreamReader(stream, validate_crcs=True).records
             except _DAMAGED as error:
-                reason = f"nothing more can be read: {error or type(error).__name__}"
+                reason = f"it is cut or damaged: {str(error) or type(error).__name__}"
                 fault = RecordingFault(file=path.name, offset=stream.tell(), reason=reason)
                 report(fault, on_fault)
     except OSError as error:

@@ -160,7 +160,7 @@ def parse_meta(data: bytes) -> Meta:
         session_id=data[_HEAD.size : index].rstrip(b"\0"),
     )
     entries, position = _parse_entries(data, index, index_end)
-    names = _parse_files(data, index_end) if index_end else None
+    names = _parse_files(data, index_end) if 0 < index_end <= len(data) else None
     complete = position == index_end and names is not None
     return Meta(head=head, entries=entries, files=names or (), complete=complete)
 
