@@ -1,7 +1,8 @@
 """Every byte string of the vendor's documents and parser, through codec and framing.
 
-Rows that those do not show have vectors put together by hand. The former were run through the vendor's own parser; where our receiver is stricter or more
-robust (Protocol reference 1.2, 1.4), the difference is asserted by name.
+Rows that those do not show have vectors put together by hand. The former were run through the
+vendor's own parser; where our receiver is stricter or more robust (Protocol reference 1.2, 1.4),
+the difference is asserted by name.
 """
 
 from collections import Counter
