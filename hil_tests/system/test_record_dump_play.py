@@ -1,0 +1,185 @@
+"""A recording made by `xethru record`, printed by `xethru dump`, played by `xethru-emulator play`.
+
+The messages are the same everywhere, byte for byte.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hil_tests.device.serving import emulator
+from xethru_protocol.cli import main
+
+pytestmark = pytest.mark.slow
+
+XETHRU = [sys.executable, "-m", "xethru_protocol.cli"]
+FRAMES = 30
+SERVED = ("serve", "smoke", "--pace", "asap")
+
+
+@pytest.fixture
+def environment(tmp_path: Path) -> dict[str, str]:
+    return {"XDG_RUNTIME_DIR": str(tmp_path)}
+
+
+class Xethru:
+    """Runs commands in this process; each must succeed and warn of nothing."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
+        self._capsys = capsys
+
+    def __call__(self, *arguments: str | Path) -> str:
+        """Return what a command printed."""
+        assert main([str(argument) for argument in arguments]) == 0
+        printed, errors = self._capsys.readouterr()
+        assert errors == ""
+        return printed
+
+    def dumped(self, recording: Path) -> list[dict[str, Any]]:
+        return [json.loads(line) for line in self("dump", recording, "--json").splitlines()]
+
+
+@pytest.fixture
+def xethru(capsys: pytest.CaptureFixture[str]) -> Xethru:
+    return Xethru(capsys)
+
+
+def payloads(messages: Sequence[dict[str, Any]]) -> list[str]:
+    return [message["payload_hex"] for message in messages]
+
+
+@pytest.mark.parametrize("kind", [[], ["--baseband"]], ids=["rf", "baseband"])
+def test_identical_messages(
+    kind: list[str], xethru: Xethru, tmp_path: Path, environment: dict[str, str]
+) -> None:
+    first, listened, again = (tmp_path / name for name in ("first", "listened", "again"))
+    count = ("--count", str(FRAMES))
+    with emulator(*SERVED, environment=environment) as served:
+        xethru("record", "--port", served.paths[0], "--out", first, *count, *kind)
+    messages = xethru.dumped(first)
+    assert len(messages) == FRAMES
+    assert [message["fields"]["info"] for message in messages] == list(range(FRAMES))
+    assert len(set(payloads(messages))) == FRAMES
+
+    with emulator("play", first, "--rate", "0", environment=environment) as played:
+        port = played.paths[0]
+        xethru("record", "--port", port, "--out", listened, *count, "--profile", "none")
+        xethru("record", "--port", port, "--out", again, *count, *kind)
+        lines = xethru("stream", "--port", port, *count, *kind, "--samples").splitlines()
+    for copy in (listened, again):
+        assert payloads(xethru.dumped(copy)) == payloads(messages)
+    for frame, message in zip(map(json.loads, lines), messages, strict=True):
+        assert frame["counter"] == message["fields"]["info"]
+        samples = frame["i"] + frame["q"] if kind else frame["samples"]
+        assert samples == message["fields"]["data"]
+
+
+def test_wire_capture_and_conversions_hold_the_same_messages(
+    xethru: Xethru, tmp_path: Path, environment: dict[str, str]
+) -> None:
+    vendor, wire = tmp_path / "vendor", tmp_path / "port.xtwire"
+    with emulator(*SERVED, environment=environment) as served:
+        port = served.paths[0]
+        xethru("record", "--port", port, "--out", vendor, "--wire", wire, "--count", str(FRAMES))
+    messages = xethru.dumped(vendor)
+    heard = [message for message in xethru.dumped(wire) if message["message"] == "DATA FLOAT"]
+    assert payloads(heard)[:FRAMES] == payloads(messages)
+    assert all(
+        abs(one["t_ns"] - other["t_ns"]) < 10**9
+        for one, other in zip(heard[:FRAMES], messages, strict=True)
+    )
+    for name in ("copy.npz", "copy.mcap", "copy.xtwire", "copy"):
+        xethru("convert", vendor, tmp_path / name)
+        copied = xethru.dumped(tmp_path / name)
+        assert payloads(copied) == payloads(messages)
+        assert [message["t_ns"] for message in copied] == [message["t_ns"] for message in messages]
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["SIGINT", "SIGTERM"]
+)
+def test_a_signal_leaves_a_complete_recording_and_a_stopped_module(
+    number: signal.Signals,
+    code: int,
+    xethru: Xethru,
+    tmp_path: Path,
+    environment: dict[str, str],
+) -> None:
+    out = tmp_path / "recording"
+    with emulator(*SERVED, environment=environment) as served:
+        command = [*XETHRU, "record", "--port", served.paths[0], "--out", str(out), "--json"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            wait_for_records(out, process)
+            process.send_signal(number)
+            printed, _ = process.communicate(timeout=10)
+        assert process.returncode == code
+        info = json.loads(xethru("info", "--port", served.paths[0], "--json"))
+    summary = json.loads(printed)
+    assert info["mode"] == "STOP"
+    assert summary["ended_by"] == "signal"
+    assert summary["link"]["frames_lost"] == 0
+    counters = [message["fields"]["info"] for message in xethru.dumped(out)]
+    assert counters == list(range(summary["messages"]))
+
+
+def test_unplugging_keeps_what_came(
+    xethru: Xethru, tmp_path: Path, environment: dict[str, str]
+) -> None:
+    out = tmp_path / "recording"
+    with emulator(*SERVED, environment=environment) as served:
+        command = [*XETHRU, "record", "--port", served.paths[0], "--out", str(out)]
+        with subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as process:
+            wait_for_records(out, process)
+            served.process.kill()
+            printed, errors = process.communicate(timeout=10)
+    assert (process.returncode, printed) == (1, "")
+    (line,) = errors.splitlines()
+    assert line.startswith(f"xethru record: {served.paths[0]} was disconnected")
+    kept = re.search(rf"; kept (\d+) messages in {out}$", line)
+    assert kept
+    counters = [message["fields"]["info"] for message in xethru.dumped(out)]
+    assert counters == list(range(int(kept[1])))
+
+
+def wait_for_records(out: Path, process: subprocess.Popen[str]) -> None:
+    """Wait until some frames are on disk."""
+    deadline = time.monotonic() + 20
+    while not any(path.stat().st_size > 50_000 for path in out.glob("xethru_datafloat_*")):
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+def test_what_cannot_be_printed_is_one_line(tmp_path: Path, environment: dict[str, str]) -> None:
+    with (
+        emulator("serve", "--bare", environment=environment) as served,
+        open("/dev/full", "w") as full,
+    ):
+        for command in ("list", "info", "ping", "stream", "doctor"):
+            port = [] if command == "list" else ["--port", served.paths[0]]
+            result = subprocess.run(
+                [*XETHRU, command, *port],
+                stdout=full,
+                stderr=subprocess.PIPE,
+                text=True,
+                check=False,
+                env={**os.environ, **environment},
+            )
+            assert result.returncode == 1
+            assert result.stderr == (
+                f"xethru {command}: standard output cannot be written: No space left on device\n"
+            )
