@@ -204,9 +204,9 @@ class AsyncX4M300(DriverFacts):
             return result
 
     async def _carry_out(self, step: Step) -> bool:
+        if isinstance(step, Read):  # the most frequent one, so without a match
+            return await self._pump(step.timeout_s)
         match step:
-            case Read(timeout_s):
-                return await self._pump(timeout_s)
             case Write(data):
                 if self.raw_listener is not None:
                     self.raw_listener("tx", data, self._core.clock())

@@ -34,6 +34,7 @@ from xethru_protocol.packets import NEED_DATA, FramingFault
 from xethru_protocol.statistics import LinkStatistics
 from xethru_protocol.table import ROWS, Row
 
+FRAMES = (DataFloat, BasebandIq)  # a tuple is the faster argument of isinstance
 _ENDLESS_S = 1e9
 _ANSWERS = (Ack, Error, Pong, ReplyByte, ReplyInt, ReplyFloat, ReplyString)
 # The module answers PINGs that waited for it one right after the other; a PONG that stays out
@@ -250,8 +251,8 @@ class Conversation:
     def _sort(self, message: Response, arrival_ns: int) -> None:
         if self.listener is not None:
             self.listener(message, arrival_ns)
-        if isinstance(message, DataFloat | BasebandIq):
-            self._sign_of_life()
+        if isinstance(message, FRAMES):
+            self._damaged_since = self._rebooted_since = False
             self._take_data(message, arrival_ns)
             return
         if self._is_answer(message):

@@ -5,9 +5,9 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from xethru_protocol.conversation import Conversation, Observer
+from xethru_protocol.conversation import FRAMES, Conversation, Observer
 from xethru_protocol.frame_queue import FrameQueue
-from xethru_protocol.messages import BasebandIq, Command, DataFloat, Response
+from xethru_protocol.messages import Command, Response
 from xethru_protocol.raw_config import RawConfig
 
 POWER_UP_BAUD = 115200  # a UART module's rate after every restart (Protocol reference 10)
@@ -122,7 +122,7 @@ class RadarCore:
         return math.isinf(self.bytes_per_s)
 
     def _take(self, message: Response, arrival_ns: int) -> None:
-        if isinstance(message, DataFloat | BasebandIq):
+        if isinstance(message, FRAMES):
             self.frames.take(message, arrival_ns)
         elif self.messages is not None:
             if len(self.messages) >= _MESSAGES:

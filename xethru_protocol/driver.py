@@ -230,9 +230,9 @@ class X4M300(DriverFacts):
             return result
 
     def _carry_out(self, step: Step) -> bool:
+        if isinstance(step, Read):  # the most frequent one, so without a match
+            return self._pump(step.timeout_s)
         match step:
-            case Read(timeout_s):
-                return self._pump(timeout_s)
             case Write(data):
                 if self.raw_listener is not None:
                     self.raw_listener("tx", data, self._core.clock())

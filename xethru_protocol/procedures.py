@@ -261,9 +261,11 @@ def wait_for_frame(core: RadarCore, timeout_s: float) -> Procedure[None]:
     frames = core.frames
     conversation = core.conversation
     deadline_ns = conversation.deadline_ns(timeout_s)
+    left_s = timeout_s
     while not frames:
+        yield Read(left_s)
         left_s = core.left_s(deadline_ns)
-        if left_s <= 0:
+        if left_s <= 0 and not frames:
             if frames.last_counter is None:
                 raise conversation.silence("frame", timeout_s)
             raise conversation.silence(
@@ -271,7 +273,6 @@ def wait_for_frame(core: RadarCore, timeout_s: float) -> Procedure[None]:
                 timeout_s,
                 "did the module stop, or its recording end?",
             )
-        yield Read(left_s)
 
 
 def stop(core: RadarCore) -> Procedure[None]:

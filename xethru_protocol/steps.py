@@ -6,11 +6,10 @@ a line that blocks, `AsyncX4M300` on one that does not; the procedures are the s
 
 from collections.abc import Generator
 from dataclasses import dataclass
-from typing import TypeAlias, TypeVar
+from typing import NamedTuple, TypeAlias, TypeVar
 
 
-@dataclass(frozen=True, slots=True)
-class Read:
+class Read(NamedTuple):  # several per frame: twice as fast to make as a frozen dataclass
     """Hear what comes, waiting up to ``timeout_s`` for its first byte; answered by whether any."""
 
     timeout_s: float

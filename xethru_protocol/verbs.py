@@ -19,7 +19,11 @@ def blocking(procedure: _Written[P, T]) -> Callable[Concatenate[Any, P], T]:
     @functools.wraps(procedure)
     def method(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:  # noqa: ANN401 - any part of a driver
         core: RadarCore = self._core
-        result: T = self._run(resilient(core, lambda: procedure(core, *args, **kwargs)))
+        if core.reconnect_s > 0:
+            whole = resilient(core, lambda: procedure(core, *args, **kwargs))
+        else:
+            whole = procedure(core, *args, **kwargs)
+        result: T = self._run(whole)
         return result
 
     return method
