@@ -1,23 +1,57 @@
-"""A recording whose last record is cut plays all the others, and says so."""
+"""What a module that plays a recording sends, and what it says of itself meanwhile."""
 
 import shutil
+import struct
+from datetime import UTC
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from emulator.device import Device
 from emulator.identity import Identity
 from emulator.loopback import LoopbackTransport
 from emulator.playback import RecordingError, recording_device
 from hil_tests.golden.vectors import FIXTURES
-from xethru_protocol.driver import X4M300
+from hil_tests.unit.emulator.doubles import BareHost
+from xethru_protocol import messages as m
+from xethru_protocol.codes import X4Setting
+from xethru_protocol.driver import X4M300, RawConfig
 from xethru_protocol.errors import ResponseTimeout
-from xethru_protocol.recordings import RecordingFault
+from xethru_protocol.recordings import (
+    RecordingFault,
+    RecordingWriter,
+    WireCapture,
+    convert,
+    read_recording,
+)
 
 IDENTITY = Identity(serial="123456789012")
+RECORDINGS = FIXTURES / "recordings"
+SECOND = 1_000_000_000
+
+
+def device_of(recording: Path, rate: float = 0, warnings: list[str] | None = None) -> Device:
+    return recording_device(
+        recording,
+        IDENTITY,
+        rate=rate,
+        loop=False,
+        on_fault=lambda fault: pytest.fail(fault.reason),
+        warn=lambda line: None if warnings is None else warnings.append(line),
+    )
+
+
+def wire_bytes(device: Device) -> bytes:
+    """Everything a host that only listens gets."""
+    device.port_opened(0)
+    device.advance(SECOND)
+    packets = iter(lambda: device.next_packet(SECOND), None)
+    return b"".join(packets)
 
 
 def copy_of_the_vendors_recording(folder: Path) -> Path:
-    return Path(shutil.copytree(FIXTURES / "recordings" / "iq", folder / "recording"))
+    return Path(shutil.copytree(RECORDINGS / "iq", folder / "recording"))
 
 
 def counters_played(recording: Path, faults: list[RecordingFault]) -> list[int]:
@@ -48,3 +82,141 @@ def test_a_recording_of_nothing_is_refused(tmp_path: Path) -> None:
     next(recording.glob("*baseband_iq*.dat")).write_bytes(b"")
     with pytest.raises(RecordingError):
         recording_device(recording, IDENTITY, rate=0, loop=False, on_fault=lambda fault: None)
+
+
+def test_radar_frames_come_byte_for_byte_without_escapes() -> None:
+    data = (RECORDINGS / "float" / "xethru_datafloat_20261121_003602.dat").read_bytes()[4:]
+    expected = b"".join(
+        b"\x7c" * 4 + struct.pack("<I", 390) + b"\0\xa0\x12" + data[at : at + 388]
+        for at in range(0, len(data), 388)
+    )
+    assert wire_bytes(device_of(RECORDINGS / "float")) == expected
+
+
+def test_presence_comes_byte_for_byte_in_normal_framing() -> None:
+    """The first line of the recording: 164;2;21.75;2;10."""
+    payload = bytes.fromhex(
+        "50 1E FA 3B 72  A4 00 00 00  02 00 00 00  00 00 AE 41  02  0A 00 00 00"
+    )
+    checksum = 0x7D
+    for byte in payload:
+        checksum ^= byte
+    expected = b"\x7d" + payload + bytes((checksum, 0x7E))
+    played = wire_bytes(device_of(RECORDINGS / "single"))
+    assert played.startswith(expected)
+    assert len(played) == 40 * len(expected)
+
+
+@pytest.mark.parametrize("target", ["x.mcap", "x.npz", "x.xtwire"])
+@pytest.mark.parametrize("name", ["iq", "float", "single"])
+def test_every_format_plays_the_same_bytes(name: str, target: str, tmp_path: Path) -> None:
+    convert(RECORDINGS / name, tmp_path / target)
+    assert wire_bytes(device_of(tmp_path / target)) == wire_bytes(device_of(RECORDINGS / name))
+
+
+def test_messages_of_several_kinds_come_in_the_order_of_time(tmp_path: Path) -> None:
+    frame = m.DataFloat(info=1, values=np.zeros(2, np.float32))
+    presence = m.PresenceSingle(counter=9, state=1, distance_m=1.0, direction=0, signal_quality=3)
+    written: list[m.Message] = [frame, presence, frame, presence]
+    with RecordingWriter(tmp_path / "r", timezone=UTC) as writer:
+        for number, message in enumerate(written):
+            assert isinstance(message, m.Response)
+            writer.write(message, number * SECOND)
+    host = BareHost(device_of(tmp_path / "r", rate=1.0))
+    host.device.port_opened(0)
+    heard = []
+    for number in range(4):
+        host.now_ns = SECOND // 2 + number * SECOND
+        host.device.advance(host.now_ns)
+        heard.append(host.hear())
+    assert heard == [[message] for message in written]
+
+
+def frames_read(recording: Path, config: RawConfig) -> tuple[list[np.ndarray], list[float]]:
+    line = LoopbackTransport(device_of(recording))
+    with X4M300(line, clock=line.clock_ns) as radar:
+        geometry = radar.configure_raw(config)
+        radar.start(20.0)
+        frames = list(radar.frames(40, timeout_s=5.0))
+    assert [frame.counter for frame in frames] == list(range(124, 164))
+    return [frame.samples for frame in frames], [geometry.range_start_m, geometry.bin_length_m]
+
+
+def test_a_host_that_configures_reads_the_recorded_frames() -> None:
+    samples, (start_m, bin_m) = frames_read(RECORDINGS / "float", RawConfig())
+    recorded = [message for message, _ in read_recording(RECORDINGS / "float")]
+    for played, message in zip(samples, recorded, strict=True):
+        assert isinstance(message, m.DataFloat)
+        assert played.tobytes() == message.values.tobytes()
+    assert start_m == pytest.approx(0.2, abs=0.004), "the recording does not tell: as requested"
+    assert bin_m == pytest.approx(1.5e8 / 23.328e9, rel=1e-5)
+
+
+def test_a_host_that_wants_baseband_gets_half_as_many_bins() -> None:
+    samples, (_, bin_m) = frames_read(RECORDINGS / "float", RawConfig(downconversion=True))
+    assert {len(played) for played in samples} == {47}
+    assert samples[0].dtype == np.complex64
+    assert bin_m == pytest.approx(8 * 1.5e8 / 23.328e9, rel=1e-5)
+
+
+def test_it_says_when_nobody_knows_where_the_frames_lie() -> None:
+    warnings: list[str] = []
+    device_of(RECORDINGS / "float", warnings=warnings)
+    assert len(warnings) == 1
+    assert "does not say where its radar frames lie" in warnings[0]
+    device_of(RECORDINGS / "iq", warnings=warnings)
+    assert len(warnings) == 1, "baseband messages say it themselves"
+
+
+@pytest.fixture
+def raw_capture(tmp_path: Path) -> Path:
+    """Commands, their answers (FRAMEAREA 0.5 ... 0.75 among them), and two frames of 39 bins."""
+    path = tmp_path / "raw.xtwire"
+    area = struct.pack("<IIIff", X4Setting.FRAMEAREA, 0, 2, 0.5, 0.75)
+    payload = b"\x11\x12" + area + b"\4"
+    checksum = 0x7D
+    for byte in payload:
+        checksum ^= byte
+    with WireCapture(path) as capture:
+        capture.write("tx", bytes.fromhex("7D 01 AE EA AA EE 90 7E"), 0)
+        capture.write("rx", bytes.fromhex("7D 10 6D 7E"), 1)
+        capture.write("rx", b"\x7d" + payload + bytes((checksum, 0x7E)), 2)
+        for counter in range(2):
+            body = b"\xa0\x12" + struct.pack("<III", 0, counter, 39) + bytes(4 * 39)
+            capture.write("rx", b"\x7c" * 4 + struct.pack("<I", len(body)) + b"\0" + body, 3)
+    return path
+
+
+def test_recorded_answers_are_not_played_but_their_area_is_told(raw_capture: Path) -> None:
+    warnings: list[str] = []
+    host = BareHost(device_of(raw_capture, warnings=warnings))
+    assert warnings == []
+    host.device.port_opened(0)
+    area = host.ask(m.X4DriverGet(setting=X4Setting.FRAMEAREA))
+    assert isinstance(area, m.ReplyFloat)
+    assert area.values == (0.5, 0.75)
+    assert host.ask(m.X4DriverGet(setting=X4Setting.FRAMEBINCOUNT)) == m.ReplyInt(
+        content_id=X4Setting.FRAMEBINCOUNT, values=(39,)
+    )
+    host.now_ns = SECOND
+    host.device.advance(SECOND)
+    assert [type(message) for message in host.hear()] == [m.DataFloat, m.DataFloat]
+
+
+def test_a_recording_of_answers_only_is_refused(tmp_path: Path) -> None:
+    with WireCapture(tmp_path / "x.xtwire") as capture:
+        capture.write("rx", bytes.fromhex("7D 10 6D 7E"), 1)
+    with pytest.raises(RecordingError, match="holds answers only"):
+        device_of(tmp_path / "x.xtwire")
+
+
+@pytest.mark.parametrize("rate", [1e-300, 1e-9, 5e-324])
+def test_a_rate_that_takes_for_ever_is_refused_in_one_line(rate: float) -> None:
+    with pytest.raises(RecordingError, match="would play for more than 20 days"):
+        device_of(RECORDINGS / "iq", rate=rate)
+
+
+def test_any_high_rate_plays() -> None:
+    assert wire_bytes(device_of(RECORDINGS / "iq", rate=1e300)) == wire_bytes(
+        device_of(RECORDINGS / "iq")
+    )
