@@ -65,10 +65,10 @@ def _emulated_ports(folder: Path) -> Iterator[PortInfo]:
             devices = [
                 (str(one["path"]), str(one["name"]), one["serial"]) for one in word["devices"]
             ]
-        except (OSError, ValueError, KeyError, TypeError, OverflowError):
+        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
             continue  # not an emulator's word, or one that is just being written
         for path, name, serial in devices:
-            if Path(path).exists():
+            if os.path.exists(path):  # False, too, for what can be no path
                 yield PortInfo(
                     path=path, kind="emulated", description=f"emulated {name}", serial=serial
                 )

@@ -197,3 +197,20 @@ def test_help_and_import_load_nothing_heavy() -> None:
         "sys.exit(f'loaded {heavy}' if heavy else 0)"
     )
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+
+
+@pytest.mark.parametrize(
+    "path", ["x" * 5000, "\0", "\ud800", "a\nb"], ids=["long", "NUL", "surrogate", "line end"]
+)
+def test_list_passes_over_what_can_be_no_path(
+    path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    folder = tmp_path / "xethru"
+    folder.mkdir()
+    device = {"path": path, "name": "left", "serial": "42"}
+    (folder / "1.json").write_text(json.dumps({"pid": 1, "devices": [device]}))
+    (folder / "2.json").write_text("[" * 100_000)
+    assert main(["list", "--json"]) == 0
+    (found,) = lines_of(capsys)
+    assert [port for port in found["ports"] if port["kind"] == "emulated"] == []

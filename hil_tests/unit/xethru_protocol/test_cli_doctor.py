@@ -323,7 +323,7 @@ def test_what_dead_emulators_left(
     stale[0].write_text("{}")
     stale[1].mkdir()
     (folder / "notes.txt").touch()  # not an emulator's
-    (folder / f"{os.getpid()}.json").write_text("{" * 100_000)
+    (folder / f"{os.getpid()}.json").write_text("[" * 100_000)
     code, reports = examined(capsys)
     findings = {check["check"]: check for check in not_well(reports[-1])}
     assert code == 1
