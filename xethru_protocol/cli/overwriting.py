@@ -18,6 +18,9 @@ def make_room(targets: Iterable[Path], *, replace: bool) -> None:
         If something is there and must stay, or cannot be removed.
     """
     old = [path for target in targets for path in _recording_files(target)]
+    for path in old:
+        if not path.is_file():  # --force is no reason to remove a device
+            raise RecordingError(f"{path} is no file; name a new one")
     if old and not replace:
         raise RecordingError(f"there is a recording already: {old[0]}; --force replaces it")
     for path in old:
@@ -31,7 +34,8 @@ def remove_unfinished(target: Path, *, was_there: bool) -> None:
     """Remove what a conversion that failed has written so far."""
     with suppress(OSError):
         for path in _recording_files(target):
-            path.unlink()
+            if path.is_file():
+                path.unlink()
         if target.is_dir() and not was_there:
             target.rmdir()
 

@@ -36,7 +36,7 @@ def module_at(port: str, baudrate: int) -> Iterator[X4M300]:
         raise
     except XeThruError as error:
         if radar.warnings:
-            raise CommandFailed(f"{error}; it could not be stopped either") from error
+            raise CommandFailed(f"{error} (and it could not be stopped)") from error
         raise
     except BaseException:
         _say_end(radar, losses)
