@@ -1,0 +1,319 @@
+"""What ``xethru decode`` finds when some of all bytes are damaged.
+
+``python -m hil_tests.bench.corrupted_traffic --megabytes 100 --rate 1e-3`` makes mixed traffic of
+a module, replaces that share of all bytes by other values, decodes what is left through the
+command's own code path and tells how many of the packets that no damage touched were found.
+Each that was not is explained by what stands in its place; ``unexplained`` must be 0.
+``--short`` sends answers of a few bytes only; ``--cli`` also runs the command itself and tells
+its time and memory. Everything follows from ``--seed``.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import IO
+
+import numpy as np
+
+from xethru_protocol import messages as m
+from xethru_protocol.cli.decode import found_in, message_of
+from xethru_protocol.codes import SystemCode
+from xethru_protocol.connection import Connection, Role
+from xethru_protocol.framing import Framing, FramingFault, Packet
+from xethru_protocol.packets import encode_normal
+from xethru_protocol.statistics import LinkStatistics
+
+CHUNK_BYTES = 65536  # as the command reads
+BLOCK_BYTES = 1_000_000  # made at once
+
+SWALLOWED_NORMAL = "inside a longer Normal packet whose checksum fits by chance"
+SWALLOWED_MERGED = "behind a packet whose end became an escape: both checksums cancel"
+SWALLOWED_BULK = "inside a damaged NoEscape packet whose lengths fit"
+UNEXPLAINED = "unexplained"
+
+
+@dataclass(slots=True, kw_only=True)
+class Outcome:
+    """What became of the packets of one run."""
+
+    bytes: int = 0
+    damaged_bytes: int = 0
+    packets: int = 0
+    untouched: int = 0
+    found: int = 0
+    missed: Counter[str] = field(default_factory=Counter)
+    invented: int = 0  # packets found where none was sent
+    seconds: float = 0.0
+    statistics: LinkStatistics = field(default_factory=LinkStatistics)
+
+
+def packet_pool(rng: np.random.Generator, *, short: bool) -> list[bytes]:
+    """Return packets of all kinds a module sends, escapes among their bytes."""
+    module = Connection(Role.MODULE)
+
+    def number() -> int:
+        return int(rng.integers(1 << 32))
+
+    def floats(count: int) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
+        counters = rng.integers(0, 729_600, count).astype(np.float32)
+        return counters * np.float32(2.0345053e-07) - np.float32(0.07421875)
+
+    pool = []
+    for _ in range(200):
+        pool += [
+            module.send(m.Ack()),
+            module.send(m.Error(code=number() & 0x1F)),
+            module.send(m.Pong(value=0xAAEEAEEA)),
+            module.send(m.System(code=SystemCode.XTS_SPRS_READY)),
+            module.send(m.ReplyInt(content_id=number(), info=0, values=(number() >> 1,))),
+            module.send(m.ReplyString(content_id=5, info=0, text=rng.bytes(20).decode("latin-1"))),
+            module.send(m.ReplyByte(content_id=number(), info=0, values=rng.bytes(9))),
+        ]
+    if short:
+        return pool
+    for _ in range(40):
+        pool += [module.send(m.DataFloat(info=number(), values=floats(1431))) for _ in range(20)]
+        pool += [
+            module.send(m.DataFloat(info=number(), values=floats(362))),
+            module.send(m.DataFloat(info=number(), values=floats(1431)), Framing.NORMAL),
+            module.send(m.DataFloat(info=number(), values=floats(54)), Framing.NORMAL),
+            module.send(
+                m.BasebandIq(
+                    counter=number(),
+                    num_bins=180,
+                    bin_length_m=0.0514,
+                    sampling_frequency_hz=2.916e9,
+                    carrier_frequency_hz=7.29e9,
+                    range_offset_m=0.18,
+                    i=floats(180),
+                    q=floats(180),
+                )
+            ),
+        ]
+    return pool
+
+
+def blocks(pool: list[bytes], size: int, rng: np.random.Generator) -> Iterator[list[bytes]]:
+    """Packets of at least ``size`` bytes in all, a block at a time."""
+    sent = 0
+    mean = sum(map(len, pool)) / len(pool)
+    while sent < size:
+        count = max(1, int(min(BLOCK_BYTES, size - sent) / mean))
+        block = [pool[index] for index in rng.integers(0, len(pool), count).tolist()]
+        sent += sum(map(len, block))
+        yield block
+
+
+class Corruption:
+    """Makes the damaged stream chunk by chunk and remembers what was sent untouched."""
+
+    def __init__(self, size: int, rate: float, seed: int, *, short: bool) -> None:
+        self._rng = np.random.default_rng(seed)
+        self._pool = packet_pool(self._rng, short=short)
+        self._size = size
+        self._rate = rate
+        self.outcome = Outcome()
+        self.untouched: dict[int, bytes] = {}  # by offset: sent, not found yet
+        self.merged: set[int] = set()  # offsets of packets whose predecessor's end became 7F
+
+    def chunks(self) -> Iterator[bytes]:
+        """Yield the damaged stream as the command reads it."""
+        base = 0
+        rest = b""
+        for packets in blocks(self._pool, self._size, self._rng):
+            stream = rest + self._damage(packets, base)
+            base += len(stream) - len(rest)
+            whole = len(stream) - len(stream) % CHUNK_BYTES
+            for begin in range(0, whole, CHUNK_BYTES):
+                yield stream[begin : begin + CHUNK_BYTES]
+            rest = stream[whole:]
+        yield rest
+
+    def _damage(self, packets: list[bytes], base: int) -> bytes:
+        lengths = np.array([len(packet) for packet in packets])
+        ends = np.cumsum(lengths)
+        stream = np.frombuffer(b"".join(packets), np.uint8).copy()
+        at = np.flatnonzero(self._rng.random(stream.size) < self._rate)
+        stream[at] ^= self._rng.integers(1, 256, at.size).astype(np.uint8)
+        touched = np.zeros(len(packets), np.bool_)
+        hit = np.searchsorted(ends, at, side="right")
+        touched[hit] = True
+        begins = ends - lengths + base
+        self.merged.update((base + at[(stream[at] == 0x7F) & (at + 1 == ends[hit])] + 1).tolist())
+        for index in np.flatnonzero(~touched).tolist():
+            self.untouched[int(begins[index])] = packets[index]
+        outcome = self.outcome
+        outcome.bytes += stream.size
+        outcome.damaged_bytes += at.size
+        outcome.packets += len(packets)
+        outcome.untouched += len(packets) - int(touched.sum())
+        return stream.tobytes()
+
+
+def run(size: int, rate: float, seed: int, *, short: bool) -> Outcome:
+    """Send, damage, decode and compare.
+
+    Parameters
+    ----------
+    size
+        Bytes to send.
+    rate
+        Share of them that is replaced.
+    seed
+        Of all randomness.
+    short
+        Answers of a few bytes only, instead of mixed traffic.
+    """
+    line = Corruption(size, rate, seed, short=short)
+    outcome = line.outcome
+    swallowing: list[tuple[int, Packet]] = []
+    began = time.perf_counter()
+    for found in found_in(line.chunks(), "module", outcome.statistics):
+        if isinstance(found, FramingFault):
+            continue
+        message = message_of(found, "module")
+        outcome.statistics.unknown += isinstance(message, m.UnknownMessage)
+        sent = line.untouched.get(found.offset)
+        if sent is not None and _carries(sent, found):
+            del line.untouched[found.offset]
+            outcome.found += 1
+        else:
+            swallowing.append((found.offset, found))
+    outcome.seconds = time.perf_counter() - began
+    outcome.invented = outcome.statistics.packets - outcome.found
+    offsets = np.array([offset for offset, _ in swallowing] or [-1])
+    for offset in line.untouched:
+        index = int(np.searchsorted(offsets, offset, side="right")) - 1
+        before = swallowing[index][1] if index >= 0 and swallowing else None
+        outcome.missed[_why(before, offset, line.merged)] += 1
+    return outcome
+
+
+def _carries(sent: bytes, found: Packet) -> bool:
+    if found.framing is Framing.NO_ESCAPE:
+        return sent[:4] == b"\x7c" * 4 and sent[9:] == found.payload
+    return sent == encode_normal(found.payload)
+
+
+def _why(before: Packet | None, offset: int, merged: set[int]) -> str:
+    """Explain why the packet at ``offset`` was not found, by the packet found before it."""
+    if before is None:
+        return UNEXPLAINED
+    if before.framing is Framing.NO_ESCAPE:
+        covers = before.offset + 9 + len(before.payload) > offset
+        return SWALLOWED_BULK if covers else UNEXPLAINED
+    if before.offset + len(encode_normal(before.payload)) <= offset:
+        return UNEXPLAINED
+    return SWALLOWED_MERGED if offset in merged else SWALLOWED_NORMAL
+
+
+@dataclass(slots=True, kw_only=True)
+class CommandRun:
+    """What the command itself did with the same stream."""
+
+    seconds: float
+    cpu_seconds: float
+    peak_megabytes: float
+    output_megabytes: float
+    lines: int
+    faults: int
+    exit_code: int
+    statistics: dict[str, object]
+
+
+def run_command(size: int, rate: float, seed: int, *, short: bool) -> CommandRun:
+    """Decode the same stream by ``xethru decode``, fed through a pipe."""
+    command = [sys.executable, "-m", "xethru_protocol.cli", "decode", "--from", "module"]
+    line = Corruption(size, rate, seed, short=short)
+    began = time.perf_counter()
+    with subprocess.Popen(
+        [*command, "--statistics"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        assert process.stderr is not None
+        counted = _Counted(process.stdout)
+        for chunk in line.chunks():
+            process.stdin.write(chunk)
+            line.untouched.clear()
+            line.merged.clear()
+        process.stdin.close()
+        counted.thread.join()
+        messages = process.stderr.read()
+        _, status, usage = os.wait4(process.pid, 0)  # its own memory, not that of all children
+        process.returncode = os.waitstatus_to_exitcode(status)
+    return CommandRun(
+        seconds=time.perf_counter() - began,
+        cpu_seconds=usage.ru_utime + usage.ru_stime,
+        peak_megabytes=usage.ru_maxrss / 1024,
+        output_megabytes=counted.bytes / 1e6,
+        lines=counted.lines,
+        faults=counted.faults,
+        exit_code=process.returncode,
+        statistics=json.loads(messages),
+    )
+
+
+class _Counted:
+    """Counts the lines of a pipe, in a thread."""
+
+    def __init__(self, source: IO[bytes]) -> None:
+        self._source = source
+        self.bytes = self.lines = self.faults = 0
+        self.thread = threading.Thread(target=self._count)
+        self.thread.start()
+
+    def _count(self) -> None:
+        for text in self._source:
+            self.bytes += len(text)
+            self.lines += 1
+            self.faults += text.startswith(b'{"fault"')
+
+
+def report(outcome: Outcome) -> dict[str, object]:
+    """JSON-able form of an outcome."""
+    return {
+        "bytes": outcome.bytes,
+        "damaged_bytes": outcome.damaged_bytes,
+        "packets": outcome.packets,
+        "untouched": outcome.untouched,
+        "found": outcome.found,
+        "missed": dict(outcome.missed),
+        "found_besides": outcome.invented,
+        "seconds": round(outcome.seconds, 1),
+        "statistics": outcome.statistics.summary(),
+    }
+
+
+def main() -> None:
+    """Run one case and print what came out as JSON."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
+    parser.add_argument("--megabytes", type=float, default=100)
+    parser.add_argument("--rate", type=float, default=1e-3, help="share of bytes to damage")
+    parser.add_argument("--short", action="store_true", help="answers of a few bytes only")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--cli", action="store_true", help="also run the command itself")
+    arguments = parser.parse_args()
+    size = int(arguments.megabytes * 1e6)
+    outcome = run(size, arguments.rate, arguments.seed, short=arguments.short)
+    shown = report(outcome)
+    if arguments.cli:
+        command = run_command(size, arguments.rate, arguments.seed, short=arguments.short)
+        shown["command"] = {
+            name: getattr(command, name) for name in CommandRun.__dataclass_fields__
+        }
+    sys.stdout.write(json.dumps(shown, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
