@@ -69,12 +69,9 @@ class Floats:
         return struct.pack(f"<{len(value)}f", *value)
 
     def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
-        """Unpack the values; ``ValueError`` if there are fewer than announced."""
+        """Unpack the values; ``struct.error`` if there are fewer than announced."""
         size = fields[self.count] * self.per
-        end = start + 4 * size
-        if end > len(data):
-            raise ValueError("fewer values than announced")
-        return struct.unpack_from(f"<{size}f", data, start), end
+        return struct.unpack_from(f"<{size}f", data, start), start + 4 * size
 
     def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
         """Show the values; an empty list is not shown."""

@@ -12,7 +12,7 @@ from xethru_protocol import wire
 from xethru_protocol.codec import decode_command, decode_response, describe, encode
 from xethru_protocol.codes import ErrorSpace, MatrixControl, error_name
 from xethru_protocol.errors import LocalProtocolError
-from xethru_protocol.table import ROWS, Command, command
+from xethru_protocol.table import ROWS, Command, Prefixes, command
 
 # Every row of 5.1 as (code, name by space); "" where the reference has no meaning.
 X4, FILES, PINS = ErrorSpace.X4_DRIVER, ErrorSpace.FILES, ErrorSpace.IO_PINS
@@ -169,3 +169,27 @@ def test_no_two_rows_share_a_prefix() -> None:
         @dataclass(frozen=True, slots=True, kw_only=True)
         class _AnotherReset(Command[m.Ack]):
             seed: Annotated[int, wire.U8]
+
+
+def test_the_longest_prefix_wins() -> None:
+    prefixes = Prefixes()
+    prefixes.enter(b"\x10", m.Ack)
+    prefixes.enter(b"\x10\x01\x02", m.Pong)
+    prefixes.enter(b"\x10\x01", m.System)
+    found = [prefixes.find(data) for data in (b"\x10\x01\x02\x03", b"\x10\x01", b"\x10\x02", b"")]
+    assert found == [m.Pong, m.System, m.Ack, None]
+
+
+def test_the_bin_count_cannot_be_set() -> None:
+    """4.9: the firmware answers ERROR 1, as to what it does not know."""
+    payload = bytes.fromhex("50 10 26 00 00 00 01 00 00 00")
+    assert decode_command(payload) == m.UnknownMessage(code=0x50, payload=payload)
+
+
+@pytest.mark.parametrize("count", ["FF FF FF FF", "00 00 00 40", "03 00 00 00"])
+def test_counts_beyond_the_payload_are_not_believed(count: str) -> None:
+    """A damaged count must neither raise nor take memory."""
+    for head in ("50 00 3B 0A 61 01 00 00 00", "90 75 01 00 00 00", "50 02 3B 0A 61 01 00 00 00"):
+        payload = bytes.fromhex(f"{head} {count} 00 00 80 3F 00 00")
+        decode = decode_command if head.startswith("90") else decode_response
+        assert decode(payload) == m.UnknownMessage(code=payload[0], payload=payload)
