@@ -1,9 +1,9 @@
 """From any kind of recording to any other.
 
-What is lost, and nothing else: vendor directories round times to 1 ms, give times that run
-backwards before the first message up, and have no place for answers, system messages and the like;
-text files of theirs lose the payload bits of a NaN. Only wire captures hold what the host sent and
-how messages lay in packets.
+What is lost, and nothing else: vendor directories cut times to 1 ms, know none before the first
+message's, give a message without a time that of the one before, and have no place for answers,
+system messages and the like; text files of theirs lose the payload bits of a NaN. Only wire
+captures hold what the host sent and how messages lay in packets.
 """
 
 from collections import Counter

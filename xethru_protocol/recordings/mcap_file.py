@@ -2,7 +2,8 @@
 
 Topics, as in the sessions of this project: ``/radar/<name>/frame`` holds radar frames (DATA FLOAT
 of content 0) as Float32MultiArray with the counter in the record's sequence number,
-``/radar/<name>/info`` once what is known of them. Every other message is on
+``/radar/<name>/info`` once what is known of them, where the recorded module answered for its
+settings. Every other message is on
 ``/radar/<name>/payload``, its payload as UInt8MultiArray, and for reading, if it is a short one, on
 ``/radar/<name>/message`` as JSON. Messages without a time have one of 0 and a channel that says so.
 A cut file loses its last chunk of at most 256 KiB.
@@ -23,7 +24,16 @@ from mcap.stream_reader import CRCValidationError, StreamReader
 from mcap.writer import CompressionType, Writer
 
 from xethru_protocol.codec import decode_response, describe, encode
-from xethru_protocol.messages import BasebandAp, BasebandIq, DataFloat
+from xethru_protocol.codes import X4Setting
+from xethru_protocol.frames import FrameGeometry
+from xethru_protocol.messages import (
+    BasebandAp,
+    BasebandIq,
+    DataFloat,
+    ReplyFloat,
+    ReplyInt,
+    X4Value,
+)
 from xethru_protocol.recordings.cdr import (
     BYTE_ARRAY,
     FLOAT_ARRAY,
@@ -71,6 +81,7 @@ class _McapWriter:
         self._channels: dict[tuple[str, bool], int] = {}
         self._others = 0
         self._has_info = False
+        self._settings: dict[str, X4Value] = {}  # as the recorded module read them back
 
     def write(self, message: Response, t_ns: int | None) -> None:
         """Add a message."""
@@ -79,6 +90,8 @@ class _McapWriter:
             data = pack_array(FLOAT_ARRAY, np.ascontiguousarray(message.values, "<f4"))
             self._add("frame", FLOAT_ARRAY, data, t_ns, message.info)
             return
+        if isinstance(message, ReplyInt | ReplyFloat):
+            self._note_setting(message)
         bulk = not isinstance(message, UnknownMessage) and ROWS[type(message)].bulk
         if isinstance(message, BasebandIq | BasebandAp):
             self._info(message, t_ns)
@@ -99,7 +112,7 @@ class _McapWriter:
         if self._has_info:
             return
         self._has_info = True
-        baseband = None if isinstance(frame, DataFloat) else frame
+        geometry = self._geometry(frame)
         info: dict[str, object] = {
             "name": self._radar,
             "serial": "",
@@ -108,14 +121,43 @@ class _McapWriter:
             "y_m": None,
             "yaw_rad": None,
             "range_offset_m": None,
-            "range_start_m": None if baseband is None else baseband.range_offset_m,
-            "bin_length_m": None if baseband is None else baseband.bin_length_m,
-            "n_bins": len(frame.values) if isinstance(frame, DataFloat) else frame.num_bins,
+            "range_start_m": None if geometry is None else geometry.range_start_m,
+            "bin_length_m": None if geometry is None else geometry.bin_length_m,
+            "n_bins": None if geometry is None else geometry.n_bins,
             "rate_hz": None,
-            "settings": {},
+            "settings": self._settings,
             "length_unit": _LENGTH_UNIT,
         }
         self._add("info", STRING, pack_string(json.dumps(info)), t_ns, 0)
+
+    def _geometry(self, frame: DataFloat | BasebandIq | BasebandAp) -> FrameGeometry | None:
+        """Where the bins lie: as the message says, or as the module answered before it."""
+        if not isinstance(frame, DataFloat):
+            return FrameGeometry(
+                range_start_m=frame.range_offset_m,
+                bin_length_m=frame.bin_length_m,
+                n_bins=frame.num_bins,
+                downconversion=True,
+            )
+        area_m = self._settings.get(X4Setting.FRAMEAREA.name)
+        n_bins = self._settings.get(X4Setting.FRAMEBINCOUNT.name)
+        if not isinstance(area_m, tuple) or not isinstance(n_bins, int):
+            return None
+        if len(frame.values) not in {n_bins, 2 * n_bins}:
+            return None  # of another time
+        return FrameGeometry.from_read_back(
+            area_m=(float(area_m[0]), float(area_m[1])),
+            n_bins=n_bins,
+            downconversion=len(frame.values) == 2 * n_bins,
+        )
+
+    def _note_setting(self, answer: ReplyInt | ReplyFloat) -> None:
+        """Remember what the module answered of its frame area: the content id is the setting's."""
+        match answer:
+            case ReplyFloat(content_id=X4Setting.FRAMEAREA, values=(start_m, end_m)):
+                self._settings[X4Setting.FRAMEAREA.name] = start_m, end_m
+            case ReplyInt(content_id=X4Setting.FRAMEBINCOUNT, values=(n_bins,)):
+                self._settings[X4Setting.FRAMEBINCOUNT.name] = n_bins
 
     def _add(self, topic: str, schema: str, data: bytes, t_ns: int | None, sequence: int) -> None:
         channel = self._channel(topic, schema, timed=t_ns is not None)

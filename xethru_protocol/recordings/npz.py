@@ -122,13 +122,13 @@ def _bulk_arrays(layout: Layout, gathered: _Gathered) -> _Arrays:
     } | {_field_name(layout, part): headers[part] for part in layout.header.names or ()}
 
 
-def _save(path: Path, arrays: _Arrays) -> None:
+def _save(path: Path, arrays: dict[str, Any]) -> None:
     if path.exists():
         raise RecordingError(f"{path} exists already")
     partial = path.with_name(path.name + ".part")
     try:
         with partial.open("wb") as stream:
-            np.savez_compressed(stream, allow_pickle=False, **arrays)
+            np.savez_compressed(stream, **arrays)
         os.replace(partial, path)
     except OSError as error:
         partial.unlink(missing_ok=True)

@@ -70,7 +70,7 @@ def vendor_facts(path: Path) -> RecordingFacts:
     at_once = not rest and meta.complete
     return RecordingFacts(
         session_id=meta.head.session_id.decode("utf-8", "replace"),
-        profile_id=meta.head.profile_id,
+        profile_id=meta.head.profile_id or None,
         parameter_file=parameter_file,
         user_header=_user_header(directory, meta),
         stopped_ns=_time_ns(meta, max(stops)) if stops and at_once else None,

@@ -42,6 +42,12 @@ class Split:
     bytes: int | None = None
     seconds: float | None = None
 
+    def __post_init__(self) -> None:
+        """Check that every limit leaves room for a record."""
+        for limit in (self.records, self.bytes, self.seconds):
+            if limit is not None and not limit > 0:
+                raise RecordingError(f"a limit of a data file must be positive, not {limit}")
+
 
 class _DataFile:
     """One data file being written."""

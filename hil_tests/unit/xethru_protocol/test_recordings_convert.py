@@ -17,6 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from hil_tests.golden.vectors import FIXTURES
 from xethru_protocol import messages as m
+from xethru_protocol.codes import X4Setting
 from xethru_protocol.connection import Connection, Role
 from xethru_protocol.recordings import (
     RecordingError,
@@ -239,7 +240,27 @@ def test_an_independent_ros_reader_reads_the_frames(tmp_path: Path) -> None:
     infos = [record for record in records if record[1].topic == "/radar/module/info"]
     assert len(infos) == 1
     facts = json.loads(ros.deserialize_cdr(infos[0][2].data, "std_msgs/msg/String").data)
-    assert (facts["n_bins"], facts["range_start_m"]) == (94, None)
+    # 94 bins of RF or 47 of baseband, and where: this recording does not tell
+    assert (facts["n_bins"], facts["range_start_m"]) == (None, None)
+
+
+def test_the_module_s_own_answers_say_where_the_bins_lie(tmp_path: Path) -> None:
+    module = Connection(Role.MODULE)
+    answers = [
+        m.ReplyFloat(content_id=X4Setting.FRAMEAREA, values=(0.5, 0.75)),
+        m.ReplyInt(content_id=X4Setting.FRAMEBINCOUNT, values=(10,)),
+    ]
+    with WireCapture(tmp_path / "x.xtwire") as capture:
+        for message in (*answers, frame(1, 10)):
+            capture.write("rx", module.send(message), 1)
+    convert(tmp_path / "x.xtwire", tmp_path / "x.mcap")
+    ros: Any = get_typestore(Stores.ROS2_HUMBLE)
+    with (tmp_path / "x.mcap").open("rb") as stream:
+        found = list(make_reader(stream).iter_messages(["/radar/module/info"]))
+    facts = json.loads(ros.deserialize_cdr(found[0][2].data, "std_msgs/msg/String").data)
+    assert (facts["range_start_m"], facts["n_bins"]) == (0.5, 10)
+    assert facts["bin_length_m"] == pytest.approx(0.025)
+    assert facts["settings"] == {"FRAMEAREA": [0.5, 0.75], "FRAMEBINCOUNT": 10}
 
 
 def test_the_definitions_in_the_file_are_those_of_ros(tmp_path: Path) -> None:

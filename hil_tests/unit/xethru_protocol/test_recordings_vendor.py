@@ -238,6 +238,13 @@ def test_a_directory_with_a_recording_is_not_written_into(tmp_path: Path) -> Non
         RecordingWriter(tmp_path / "old")
 
 
+def test_a_limit_that_leaves_no_room_is_refused() -> None:
+    with pytest.raises(RecordingError, match="must be positive, not 0"):
+        Split(records=0)
+    with pytest.raises(RecordingError, match="must be positive, not nan"):
+        Split(seconds=float("nan"))
+
+
 def test_a_closed_recording_takes_nothing_more(tmp_path: Path) -> None:
     writer = RecordingWriter(tmp_path / "closed")
     writer.write(frame(1), 0)
