@@ -20,6 +20,7 @@ from xethru_protocol.codes_values import (
     HilCommand,
     InfoItem,
     InjectMode,
+    IoPin,
     IoPinFeature,
     IoPinSetup,
     LedMode,
@@ -39,6 +40,8 @@ from xethru_protocol.codes_values import (
     SystemCode,
     TestCode,
     TraceLevel,
+    TxCenterFrequency,
+    TxPower,
 )
 from xethru_protocol.codes_wire import (
     I2C_REGISTER,
@@ -82,6 +85,7 @@ __all__ = [
     "HilCommand",
     "InfoItem",
     "InjectMode",
+    "IoPin",
     "IoPinCode",
     "IoPinError",
     "IoPinFeature",
@@ -106,6 +110,8 @@ __all__ = [
     "SystemCode",
     "TestCode",
     "TraceLevel",
+    "TxCenterFrequency",
+    "TxPower",
     "X4DriverCode",
     "X4Error",
     "X4Setting",

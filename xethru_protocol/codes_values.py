@@ -146,6 +146,36 @@ class MatrixControl(IntFlag):
         return bool(self & (MatrixControl.FAST | MatrixControl.FAST_AS_DOCUMENTED))
 
 
+class IoPin(IntEnum):
+    """Id of a pin; those from 7 on are known to the base firmware only. 4.8."""
+
+    ALL = 0
+    IO1 = 1
+    IO2 = 2
+    IO3 = 3
+    IO4 = 4
+    IO5 = 5
+    IO6 = 6
+    PIN_7 = 7
+    PIN_8 = 8
+    PIN_9 = 9
+    X4_IO1 = 41
+    X4_IO2 = 42
+    X4_IO3 = 43
+    X4_IO4 = 44
+    X4_ENABLE = 49
+    MODE_SELECT_70 = 70
+    MODE_SELECT_71 = 71
+    SERIAL_80 = 80
+    SERIAL_81 = 81
+    SERIAL_82 = 82
+    SERIAL_83 = 83
+    SERIAL_84 = 84
+    SERIAL_85 = 85
+    SERIAL_86 = 86
+    VBUS = 90
+
+
 class IoPinSetup(IntFlag):
     """Setup bits of an IO pin. Protocol reference 4.8."""
 
@@ -165,6 +195,22 @@ class IoPinFeature(IntEnum):
     MOVEMENT = 4
     BREATHING = 5
     NO_PRESENCE = 6
+
+
+class TxCenterFrequency(IntEnum):
+    """Value of X4 setting TXCENTERFREQUENCY and of a profile's band. Protocol reference 9.2."""
+
+    LOW_BAND = 3  # 7.290 GHz
+    HIGH_BAND = 4  # 8.748 GHz
+
+
+class TxPower(IntEnum):
+    """Value of X4 setting TXPOWER. Protocol reference 4.9."""
+
+    OFF = 0
+    LOW = 1
+    MEDIUM = 2
+    HIGH = 3
 
 
 class InfoItem(IntEnum):

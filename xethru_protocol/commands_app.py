@@ -61,7 +61,7 @@ class GetSensitivity(Command[ReplyInt]):
 @command(*_set(AppObject.TX_CENTER_FREQ), name="APP_SET TX_CENTER_FREQ")
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetTxCenterFrequency(Command[Ack]):
-    """Choose the profile's band: 3 is 7.29 GHz, 4 is 8.748 GHz. 4.4, 9.2."""
+    """Choose the profile's band, a `TxCenterFrequency`. 4.4, 9.2."""
 
     tx_center_frequency: Annotated[int, wire.Number("I", "band")]
 

@@ -93,7 +93,7 @@ class DebugOutputGetControl(Command[ReplyInt]):
 class IoPinSetControl(Command[Ack]):
     """Say what a pin does: `IoPinSetup` bits and an `IoPinFeature`. 4.8.
 
-    ``pin_id`` 1 ... 6 is IO1 ... IO6, 0 is all of them.
+    ``pin_id``: an `IoPin`.
     """
 
     pin_id: Annotated[int, wire.U32]
