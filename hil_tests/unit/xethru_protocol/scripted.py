@@ -26,6 +26,7 @@ class ScriptedTransport:
         self.received: list[m.Message] = []
         self.closed = False
         self.gone = False
+        self.vanishes_ns: int | None = None
         self.pending: list[bytes] = []
         self.timed: list[tuple[int, bytes]] = []
         self._answer = answer
@@ -44,6 +45,10 @@ class ScriptedTransport:
         due_ns = self.now_ns + round(delay_s * 1e9)
         self.timed = sorted([*self.timed, *((due_ns, self._bytes(item)) for item in said)])
 
+    def vanish_later(self, delay_s: float) -> None:
+        """Unplug the module when the time has come."""
+        self.vanishes_ns = self.now_ns + round(delay_s * 1e9)
+
     def _bytes(self, item: m.Message | bytes) -> bytes:
         return item if isinstance(item, bytes) else self._module.send(item)
 
@@ -58,6 +63,10 @@ class ScriptedTransport:
         if self.pending:
             self.now_ns += 1_000
             return self.pending.pop(0)
+        if self.vanishes_ns is not None and self.vanishes_ns <= end_ns:
+            self.now_ns = max(self.now_ns, self.vanishes_ns)
+            self.gone = True
+            self._check_open()
         self.now_ns = end_ns
         return b""
 
@@ -99,10 +108,15 @@ INT_SETTINGS = frozenset(
 
 
 class PlainModule:
-    """A module with the read-backs of the golden vectors for 0.2 ... 9.4 m; it keeps settings."""
+    """A module with the read-backs of the golden vectors for 0.2 ... 9.4 m; it keeps settings.
 
-    def __init__(self, serial: str = "123456789012") -> None:
+    ``stream`` is what it sends behind the read-back of the frame rate; a ``serial`` of None is
+    one it refuses to tell.
+    """
+
+    def __init__(self, serial: str | None = "123456789012") -> None:
         self.serial = serial
+        self.stream: tuple[m.Message, ...] = ()
         self.settings: dict[X4Setting, m.X4Value] = {}
 
     def __call__(  # noqa: PLR0911 - one return per command
@@ -121,10 +135,11 @@ class PlainModule:
             case m.X4DriverGet(setting=X4Setting.FRAMEBINCOUNT):
                 return [m.ReplyInt(content_id=X4Setting.FRAMEBINCOUNT, values=(1431,))]
             case m.X4DriverGet(setting=X4Setting.FPS):
-                return [m.ReplyFloat(content_id=X4Setting.FPS, values=(17.049379348754883,))]
+                rate = m.ReplyFloat(content_id=X4Setting.FPS, values=(17.049379348754883,))
+                return [rate, *self.stream]
             case m.X4DriverGet(setting=setting):
                 return [self._kept(setting)]
-            case m.SystemGetInfo(item=6):
+            case m.SystemGetInfo(item=6) if self.serial is not None:
                 return [m.ReplyString(content_id=0x58, info=6, text=self.serial)]
             case m.SystemGetInfo():
                 return [m.Error(code=1)]
