@@ -89,7 +89,7 @@ def test_every_stored_kind_is_a_response_of_the_table() -> None:
         max_size=6,
     )
 )
-def test_archives_and_mcap_give_back_what_was_written(
+def test_archives_mcap_and_captures_give_back_what_was_written(
     timed: list[tuple[m.Response, int | None]],
 ) -> None:
     facts = RecordingFacts(session_id="s", user_header=b"\xff")
@@ -99,6 +99,11 @@ def test_archives_and_mcap_give_back_what_was_written(
         write_mcap(Path(folder) / "x.mcap", timed, facts)
         if timed:
             assert payloads(list(read_mcap(Path(folder) / "x.mcap", None))) == payloads(timed)
+        module = Connection(Role.MODULE)
+        with WireCapture(Path(folder) / "x.xtwire") as capture:
+            for message, t_ns in timed:
+                capture.write("rx", module.send(message), t_ns)
+        assert payloads(list(read_recording(Path(folder) / "x.xtwire"))) == payloads(timed)
 
 
 @cache

@@ -42,8 +42,9 @@ def read_vendor(path: Path, on_fault: FaultHandler | None) -> TimedMessages:
     RecordingError
         If there is nothing to read, or messages are lost and ``on_fault`` is None.
     """
+    whole = path.is_dir() or path.name == META_NAME
     for directory, files in _parts(path):
-        yield from _Part(directory, files, on_fault, whole=path.is_dir()).messages()
+        yield from _Part(directory, files, on_fault, whole=whole).messages()
 
 
 def vendor_facts(path: Path) -> RecordingFacts:
@@ -239,10 +240,7 @@ class _Part:
         """Tell which open file an entry means: by the list of files, else by type and order."""
         by_name = {reading.file.path.name: reading for reading in readings}
         by_number: dict[tuple[int, int], _Reading | None] = {}
-        by_type: dict[int, Iterator[_Reading]] = {
-            data_type: iter([r for r in readings if r.file.kind.data_type == data_type])
-            for data_type in {reading.file.kind.data_type for reading in readings}
-        }
+        unlisted = [path.name for path in _data_files(self._directory)]
 
         def find(entry: Entry) -> _Reading | None:
             kind = kind_of(entry.data_type) or kind_of(entry.data_type ^ ALL_BITS)
@@ -252,8 +250,12 @@ class _Part:
                     name = Path(meta.files[entry.file]).name
                     by_number[key] = by_name.get(name)
                 elif kind is not None:
+                    numbered = sum(data_type == kind.data_type for data_type, _ in by_number)
+                    names = [name for name in unlisted if kind_of(name) is kind]
                     name = f"{kind.file_prefix}*"
-                    by_number[key] = next(by_type.get(kind.data_type, iter(())), None)
+                    if numbered < len(names):
+                        name = names[numbered]
+                    by_number[key] = by_name.get(name)
                 else:
                     name = f"of data type {entry.data_type}"
                     by_number[key] = None

@@ -221,6 +221,26 @@ def test_a_split_closes_each_file_in_the_index_as_others_report_it(tmp_path: Pat
     )
 
 
+def test_one_of_several_files_has_its_own_times_without_a_list_of_files(tmp_path: Path) -> None:
+    """A recorder that was killed leaves an index without the names of the files."""
+    writer = RecordingWriter(tmp_path / "split", split=Split(records=1), timezone=UTC)
+    for counter in range(3):
+        writer.write(frame(counter), counter * 10 * MS)
+    last = tmp_path / "split" / "xethru_datafloat_19700101_000000_002.dat"
+    assert list(read_recording(last)) == [(frame(2), 20 * MS)]
+    assert [t_ns for _, t_ns in read_recording(tmp_path / "split")] == [0, 10 * MS, 20 * MS]
+    writer.close()
+    assert list(read_recording(last)) == [(frame(2), 20 * MS)]
+
+
+def test_the_meta_file_names_the_recording(tmp_path: Path) -> None:
+    assert len(list(read_recording(RECORDINGS / "float" / META))) == 40
+    copy = copy_of("single", tmp_path)
+    next(copy.glob("*.csv")).rename(copy / "elsewhere.csv")
+    with pytest.raises(RecordingError, match="holds no recording"):
+        list(read_recording(copy / META))
+
+
 def test_a_recording_split_by_directory_is_read_as_one(tmp_path: Path) -> None:
     for part in range(2):
         with RecordingWriter(tmp_path / f"xethru_recording_{part}_s", session_id="s") as writer:
