@@ -87,7 +87,10 @@ def test_importing_the_protocol_loads_no_heavy_library() -> None:
     ("module", "command"),
     [
         ("xethru_protocol.cli", ""),
-        ("xethru_protocol.cli", "stream"),
+        *(
+            ("xethru_protocol.cli", command)
+            for command in ("stream", "doctor", "record", "dump", "convert")
+        ),
         ("emulator.cli", ""),
         ("emulator.cli", "serve"),
         ("emulator.cli", "play"),
