@@ -4,7 +4,6 @@ Normal framing escapes 7D, 7E, 7F and ends with an XOR checksum; NoEscape framin
 length and has neither (Protocol reference 1.1, 1.3).
 """
 
-import re
 from dataclasses import dataclass
 from enum import Enum
 from typing import Final
@@ -20,8 +19,6 @@ ESCAPE: Final = 0x7F
 NO_ESCAPE_START: Final = b"\x7c\x7c\x7c\x7c"
 NO_ESCAPE_HEADER_BYTES: Final = 9
 MAX_NORMAL_BYTES: Final = 7999  # payload and checksum, unescaped: the vendor's parser buffer
-
-_SPECIAL = re.compile(rb"[\x7d\x7e\x7f]")
 
 
 class Framing(Enum):
@@ -89,7 +86,9 @@ def encode_normal(payload: bytes) -> bytes:
             f"a Normal packet carries 1 to {MAX_NORMAL_BYTES - 1} bytes, not {len(payload)}"
         )
     body = payload + bytes((START ^ xor(payload),))
-    return b"\x7d" + _SPECIAL.sub(b"\x7f\\g<0>", body) + b"\x7e"
+    escaped = body.replace(b"\x7f", b"\x7f\x7f")  # first: the others bring new 7F
+    escaped = escaped.replace(b"\x7d", b"\x7f\x7d").replace(b"\x7e", b"\x7f\x7e")
+    return b"\x7d" + escaped + b"\x7e"
 
 
 def encode_no_escape(payload: bytes) -> bytes:

@@ -10,6 +10,7 @@ its time and memory. Everything follows from ``--seed``.
 
 import argparse
 import json
+import math
 import os
 import subprocess
 import sys
@@ -18,6 +19,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import IO
 
 import numpy as np
@@ -247,21 +249,32 @@ def run_command(size: int, rate: float, seed: int, *, short: bool) -> CommandRun
             process.stdin.write(chunk)
             line.untouched.clear()
             line.merged.clear()
+        process.stdin.flush()
+        peak = _peak_megabytes(process.pid)
         process.stdin.close()
         counted.thread.join()
         messages = process.stderr.read()
-        _, status, usage = os.wait4(process.pid, 0)  # its own memory, not that of all children
+        _, status, usage = os.wait4(process.pid, 0)  # its own time, not that of all children
         process.returncode = os.waitstatus_to_exitcode(status)
     return CommandRun(
         seconds=time.perf_counter() - began,
         cpu_seconds=usage.ru_utime + usage.ru_stime,
-        peak_megabytes=usage.ru_maxrss / 1024,
+        peak_megabytes=peak,
         output_megabytes=counted.bytes / 1e6,
         lines=counted.lines,
         faults=counted.faults,
         exit_code=process.returncode,
         statistics=json.loads(messages),
     )
+
+
+def _peak_megabytes(pid: int) -> float:
+    """Most memory a process held so far; Linux only (ru_maxrss would count its parent's)."""
+    status = Path(f"/proc/{pid}/status")
+    if not status.exists():
+        return math.nan
+    (line,) = [text for text in status.read_text().splitlines() if text.startswith("VmHWM")]
+    return int(line.split()[1]) / 1024
 
 
 class _Counted:

@@ -13,26 +13,38 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from xethru_protocol import messages as m
 from xethru_protocol.codes import X4Setting
 from xethru_protocol.connection import Connection, Role
 from xethru_protocol.driver import X4M300
 from xethru_protocol.frames import FrameGeometry
+from xethru_protocol.lattice import Lattice
 from xethru_protocol.packets import NEED_DATA, Framing
 
 FRAMES = 2000
 CHUNK = 65536
 
 
-def _stream(framing: Framing) -> bytes:
-    """Frames of 1431 quantised noise samples at the vendor's working point."""
+def _samples() -> NDArray[np.float32]:
+    """Quantised noise at the vendor's working point, shape (200, 1431)."""
     counters = np.random.default_rng(0).integers(0, 729_600, (200, 1431))
-    samples = counters.astype(np.float32) * np.float32(2.03450526e-07) - np.float32(0.07421875)
+    return counters.astype(np.float32) * np.float32(2.03450526e-07) - np.float32(0.07421875)
+
+
+def _stream(framing: Framing) -> bytes:
+    """Frames of 1431 samples."""
+    samples = _samples()
     module = Connection(Role.MODULE)
     return b"".join(
         module.send(m.DataFloat(info=k, values=samples[k]), framing) for k in range(200)
     ) * (FRAMES // 200)
+
+
+def _note_rate(benchmark: Any, frames: int) -> None:  # noqa: ANN401 - the plugin has no types
+    if benchmark.stats is not None:  # absent under --benchmark-disable
+        benchmark.extra_info["frames_per_s"] = frames / benchmark.stats["min"]
 
 
 @pytest.mark.parametrize("framing", Framing)
@@ -51,7 +63,7 @@ def test_decode_1431_float_frames(benchmark: Any, framing: Framing) -> None:  # 
         return events
 
     assert benchmark(decode) == FRAMES
-    benchmark.extra_info["frames_per_s"] = FRAMES / benchmark.stats["min"]
+    _note_rate(benchmark, FRAMES)
 
 
 _WRITER = """
@@ -78,10 +90,39 @@ def test_driver_frames_from_one_pty(benchmark: Any, tmp_path: Path) -> None:  # 
         radar.read_frame(timeout_s=10.0)
         assert benchmark(lambda: sum(1 for _ in radar.frames(FRAMES))) == FRAMES
         writer.kill()
-    benchmark.extra_info["frames_per_s"] = FRAMES / benchmark.stats["min"]
+    _note_rate(benchmark, FRAMES)
     radar.close()
     os.close(master)
     os.close(slave)
+
+
+@pytest.mark.parametrize("framing", Framing)
+def test_encode_1431_float_frames(benchmark: Any, framing: Framing) -> None:  # noqa: ANN401 - the plugin has no types
+    """What an emulated module does with each frame."""
+    module = Connection(Role.MODULE)
+    frames = [m.DataFloat(info=k, values=values) for k, values in enumerate(_samples())]
+
+    def encode() -> int:
+        return sum(len(module.send(frame, framing)) for frame in frames)
+
+    assert benchmark(encode) >= 200 * 5747
+    _note_rate(benchmark, 200)
+
+
+def test_lattice_of_1431_float_frames(benchmark: Any) -> None:  # noqa: ANN401 - the plugin has no types
+    """What a driver may spend on each frame to see that no sample was damaged."""
+    lattice = Lattice.of(
+        iterations=16,
+        pulses_per_step=300,
+        dac_min=949,
+        dac_max=1100,
+        dac_step=0,
+        downconversion=False,
+        tx_center_frequency=3,
+    )
+    samples = _samples()
+    assert benchmark(lambda: sum(lattice.off_lattice(values) for values in samples)) == 0
+    _note_rate(benchmark, 200)
 
 
 def test_encode_commands(benchmark: Any) -> None:  # noqa: ANN401 - the plugin has no types
