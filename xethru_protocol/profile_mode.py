@@ -13,7 +13,12 @@ from xethru_protocol.codes import (
     SensorMode,
 )
 from xethru_protocol.core import ProfilePlan, RadarCore
-from xethru_protocol.errors import DeviceError, LocalProtocolError, RemoteProtocolError
+from xethru_protocol.errors import (
+    DeviceError,
+    LocalProtocolError,
+    RemoteProtocolError,
+    ResponseTimeout,
+)
 from xethru_protocol.procedures import SLOW_TIMEOUT_S, listen, request, wait_until_ready
 from xethru_protocol.steps import Procedure
 
@@ -46,7 +51,7 @@ def load(core: RadarCore, profile_id: int = ProfileId.XTS_ID_APP_PRESENCE_2) -> 
     yield from wait_until_ready(core)
     yield from _load(core, profile_id)
     core.plan = ProfilePlan(profile_id=profile_id, loaded=True)
-    hear_messages(core)
+    hear_messages(core).clear()  # those that wait are of what ran before
 
 
 def _load(core: RadarCore, profile_id: int) -> Procedure[None]:
@@ -238,9 +243,7 @@ def wait_for_message(core: RadarCore, timeout_s: float) -> Procedure[m.Response]
     """
     waiting = hear_messages(core)
     if not waiting and not (yield from listen(core, lambda: bool(waiting), timeout_s)):
-        raise core.conversation.silence(
-            "message of the profile", timeout_s, "does it run, and is an output switched on?"
-        )
+        raise _no_message(core, timeout_s)
     return waiting.popleft()
 
 
@@ -263,18 +266,21 @@ def wait_until_initialized(
     """
     limit_s = _starting_time_s(core) if timeout_s is None else timeout_s
     deadline_ns = core.conversation.deadline_ns(limit_s)
-    while True:
-        left_s = max(core.left_s(deadline_ns), 0.0)
-        message = yield from wait_for_message(core, min(left_s, MESSAGE_TIMEOUT_S))
-        state = getattr(message, "state", None)
+    waiting = hear_messages(core)
+    while (left_s := core.left_s(deadline_ns)) > 0:
+        wait_s = min(left_s, MESSAGE_TIMEOUT_S)
+        if not waiting and not (yield from listen(core, lambda: bool(waiting), wait_s)):
+            if wait_s == MESSAGE_TIMEOUT_S:
+                raise _no_message(core, wait_s)
+            break
+        message = waiting.popleft()
         if isinstance(message, m.PresenceSingle | m.PresenceMovingList) and (
-            state != PresenceState.INITIALIZING
+            message.state != PresenceState.INITIALIZING
         ):
             return message
-        if left_s <= 0:
-            raise core.conversation.silence(
-                "end of the profile's start", limit_s, "does the room keep it from settling?"
-            )
+    raise core.conversation.silence(
+        "end of the profile's start", limit_s, "does the room keep it from settling?"
+    )
 
 
 def hear_messages(core: RadarCore) -> deque[m.Response]:
@@ -294,6 +300,12 @@ def _starting_time_s(core: RadarCore) -> float:
         chosen.control & NoiseMapControl.NO_DEFAULT
     )
     return (_NEW_MAP_S if makes_map else _START_S) + _RESERVE_S
+
+
+def _no_message(core: RadarCore, timeout_s: float) -> ResponseTimeout:
+    return core.conversation.silence(
+        "message of the profile", timeout_s, "does it run, and is an output switched on?"
+    )
 
 
 def _set_mode(core: RadarCore, mode: SensorMode) -> Procedure[None]:

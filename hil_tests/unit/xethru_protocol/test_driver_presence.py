@@ -1,0 +1,275 @@
+"""The presence profile, by both drivers. Protocol reference 4.4-4.7, 7.3, 8.2, 8.3, 13."""
+
+import numpy as np
+import pytest
+
+from hil_tests.unit.xethru_protocol.both_drivers import DriverOn
+from hil_tests.unit.xethru_protocol.scripted import frame
+from hil_tests.unit.xethru_protocol.scripted_profile import (
+    IDLE,
+    RUN,
+    STEP_M,
+    STOP,
+    ProfileModule,
+    presence,
+)
+from xethru_protocol import messages as m
+from xethru_protocol.codes import LedMode, NoiseMapControl, OutputFeature
+from xethru_protocol.errors import DeviceError, LocalProtocolError, ResponseTimeout
+
+NO_PRESENCE, PRESENCE, INITIALIZING = 0, 1, 2
+
+
+def test_profile_is_set_up_and_run_by_the_recipe(driver_on: DriverOn) -> None:
+    module = ProfileModule()
+    radar, _ = driver_on(module)
+    radar.presence.load()
+    radar.presence.set_sensitivity(8)
+    radar.presence.set_noise_map(NoiseMapControl.NO_DEFAULT | NoiseMapControl.ADAPTIVE)
+    radar.presence.set_led(LedMode.OFF)
+    radar.presence.set_output(OutputFeature.PRESENCE_SINGLE)
+    radar.presence.run()
+    assert module.received == [
+        m.Ping(),
+        m.SetMode(mode=STOP),
+        m.LoadApp(profile_id=0x014D4AB8),
+        m.SetSensitivity(sensitivity=8),
+        m.NoiseMapSetControl(control=3),
+        m.AppSetLedControl(mode=0, intensity=0),
+        m.OutputSetControl(feature=0x723BFA1E, control=1),
+        m.SetMode(mode=RUN),
+    ]
+
+
+def test_settings_are_read_as_they_were_set(driver_on: DriverOn) -> None:
+    radar, _ = driver_on(ProfileModule())
+    radar.presence.load()
+    radar.presence.set_sensitivity(2)
+    radar.presence.set_band(4)
+    radar.presence.set_led(LedMode.SIMPLE)
+    radar.presence.set_noise_map(NoiseMapControl.ADAPTIVE)
+    radar.presence.set_output(OutputFeature.PULSEDOPPLER_FLOAT, 3)
+    assert radar.presence.sensitivity() == 2
+    assert radar.presence.band() == 4
+    assert radar.presence.led() is LedMode.SIMPLE
+    assert radar.presence.noise_map() == NoiseMapControl.ADAPTIVE
+    assert radar.presence.output(OutputFeature.PULSEDOPPLER_FLOAT) == 3
+    assert radar.presence.output(OutputFeature.PULSEDOPPLER_BYTE) == 0
+    assert radar.presence.profile_id() == 0x014D4AB8
+
+
+def test_zone_is_checked_against_the_modules_limits_and_read_back_snapped(
+    driver_on: DriverOn,
+) -> None:
+    module = ProfileModule()
+    radar, _ = driver_on(module)
+    radar.presence.load()
+    limits = radar.presence.zone_limits()
+    assert (limits.min_m, limits.max_m) == pytest.approx((0.4, 9.4))
+    assert limits.step_m == pytest.approx(STEP_M)
+    start_m, end_m = radar.presence.set_zone(1.0, 5.0)
+    assert 1.0 - STEP_M < start_m <= 1.0
+    assert 5.0 <= end_m < 5.0 + STEP_M
+    radar.presence.set_zone(0.4, 9.4)  # the limits themselves
+    module.received.clear()
+    for start, end, why in [
+        (0.3, 5.0, "does not lie within 0.4 ... 9.4 m"),
+        (1.0, 9.5, "does not lie within 0.4 ... 9.4 m"),
+        (5.0, 1.0, "does not lie within"),
+        (1.0, 1.1, "is smaller than 0.2 m"),
+    ]:
+        with pytest.raises(LocalProtocolError, match=why):
+            radar.presence.set_zone(start, end)
+    assert not any(isinstance(c, m.SetDetectionZone) for c in module.received)
+
+
+@pytest.mark.parametrize(
+    ("verb", "value"), [("set_sensitivity", 10), ("set_sensitivity", -1), ("set_band", 5)]
+)
+def test_values_no_module_has_are_not_sent(driver_on: DriverOn, verb: str, value: int) -> None:
+    module = ProfileModule()
+    radar, _ = driver_on(module)
+    radar.presence.load()
+    sent = len(module.received)
+    with pytest.raises(LocalProtocolError, match="must be"):
+        getattr(radar.presence, verb)(value)
+    assert len(module.received) == sent
+
+
+def test_without_a_profile_nothing_is_asked_that_gets_no_answer(driver_on: DriverOn) -> None:
+    module = ProfileModule()
+    radar, line = driver_on(module)
+    for verb in ("zone", "zone_limits", "sensitivity", "led", "noise_map", "run", "idle"):
+        with pytest.raises(LocalProtocolError, match=r"no profile is loaded; load\(\) one first"):
+            getattr(radar.presence, verb)()
+    assert line.now_ns < 1e9  # no timeout among them
+
+
+def test_profile_that_was_found_running_is_used_as_it_is(driver_on: DriverOn) -> None:
+    module = ProfileModule()
+    module.profile, module.mode = 0x014D4AB8, RUN  # as a stock module powers up
+    radar, line = driver_on(module)
+    assert radar.presence.sensitivity() == 5
+    line.say(presence(1, NO_PRESENCE))
+    radar.ping()
+    line.say(presence(2, PRESENCE))
+    assert list(radar.presence.messages(1)) == [presence(2, PRESENCE)]  # heard since asked for
+    assert not any(isinstance(c, m.LoadApp | m.SetMode) for c in module.received)
+
+
+def test_refusals_are_the_modules_own(driver_on: DriverOn) -> None:
+    radar, _ = driver_on(ProfileModule())
+    with pytest.raises(DeviceError, match="APP_INVALID"):
+        radar.presence.load(0x064E57AD)
+    radar.presence.load()
+    radar.presence.run()
+    with pytest.raises(DeviceError, match="COMMAND_FAILED"):
+        radar.presence.set_sensitivity(1)
+
+
+def test_messages_come_typed_and_in_order_and_frames_stay_frames(driver_on: DriverOn) -> None:
+    module = ProfileModule()
+    radar, line = driver_on(module)
+    radar.presence.load()
+    radar.presence.run()
+    moving = m.PresenceMovingList(
+        counter=3,
+        state=PRESENCE,
+        movement_slow=(1.0, 2.0),
+        movement_fast=(3.0, 4.0),
+        detection_distance_m=(1.5,),
+        detection_rcs=(0.0,),
+        detection_velocity=(0.0,),
+    )
+    baseband = m.BasebandIq(
+        counter=9,
+        num_bins=2,
+        bin_length_m=0.0514403,
+        sampling_frequency_hz=2.916e9,
+        carrier_frequency_hz=7.29e9,
+        range_offset_m=0.25,
+        i=np.array([1, 2], np.float32),
+        q=np.array([3, 4], np.float32),
+    )
+    line.say(presence(2, PRESENCE), baseband, moving)
+    assert list(radar.presence.messages(2)) == [presence(2, PRESENCE), moving]
+    assert radar.read_frame().counter == 9
+    with pytest.raises(ResponseTimeout, match="no message of the profile from the port within 3 s"):
+        next(radar.presence.messages())
+
+
+def test_messages_nobody_asked_for_are_not_kept(driver_on: DriverOn) -> None:
+    radar, line = driver_on()
+    radar.configure_raw()
+    line.say(*(presence(k, PRESENCE) for k in range(9)), frame(1))
+    radar.read_frame()
+    assert radar._core.messages is None
+
+
+def test_messages_that_pile_up_are_dropped_and_told_of(driver_on: DriverOn) -> None:
+    radar, line = driver_on(ProfileModule())
+    radar.presence.load()
+    said = presence(1, PRESENCE)
+    for _ in range(4100):
+        radar._core._take(said, 0)
+    radar._core._take(presence(2, PRESENCE), 0)
+    assert radar.messages_dropped == 5
+    assert radar.warnings == ["4096 messages wait unread, so the oldest are dropped"]
+    assert line.pending == []
+
+
+@pytest.mark.parametrize(("control", "limit_s"), [(2, 25.0), (6, 25.0), (3, 125.0), (7, 125.0)])
+def test_start_is_waited_for_as_long_as_it_may_take(
+    driver_on: DriverOn, control: int, limit_s: float
+) -> None:
+    radar, line = driver_on(ProfileModule())
+    radar.presence.load()
+    radar.presence.set_noise_map(NoiseMapControl(control))
+    radar.presence.run()
+    for second in range(1, 200):
+        line.say_later(second, presence(second, INITIALIZING))
+    with pytest.raises(ResponseTimeout, match=rf"no end of the profile's start .* {limit_s:g} s"):
+        radar.presence.wait_until_initialized()
+    assert limit_s <= line.now_ns * 1e-9 < limit_s + 2
+
+
+def test_end_of_the_start_is_the_first_message_of_another_state(driver_on: DriverOn) -> None:
+    radar, line = driver_on(ProfileModule())
+    radar.presence.load()
+    radar.presence.run()
+    for second in range(1, 19):
+        line.say_later(second, presence(second, INITIALIZING))
+    line.say_later(19, presence(19, NO_PRESENCE), presence(20, PRESENCE))
+    assert radar.presence.wait_until_initialized() == presence(19, NO_PRESENCE)
+    assert list(radar.presence.messages(1)) == [presence(20, PRESENCE)]
+
+
+def test_module_that_falls_silent_while_it_starts_is_not_waited_for_all_the_time(
+    driver_on: DriverOn,
+) -> None:
+    radar, line = driver_on(ProfileModule())
+    radar.presence.load()
+    radar.presence.run()
+    with pytest.raises(ResponseTimeout, match="does it run, and is an output switched on"):
+        radar.presence.wait_until_initialized()
+    assert line.now_ns < 4e9
+
+
+def test_module_that_restarts_to_change_its_profile_is_waited_for(driver_on: DriverOn) -> None:
+    module = ProfileModule()
+    module.run_errors = [0x22]
+    radar, line = driver_on(module)
+    radar.presence.load()
+    radar.presence.set_sensitivity(1)
+    line.say_later(2.5, m.System(code=0x10), m.System(code=0x11))
+    module.received.clear()
+    radar.presence.run()
+    assert module.received == [
+        m.SetMode(mode=RUN),
+        m.SetMode(mode=STOP),
+        m.LoadApp(profile_id=0x014D4AB8),
+        m.SetSensitivity(sensitivity=1),
+        m.SetMode(mode=RUN),
+    ]
+    assert line.now_ns >= 2.5e9
+    assert radar.warnings == ["the module restarts to change its profile"]
+
+
+def test_profile_pauses_goes_on_and_stops(driver_on: DriverOn) -> None:
+    module = ProfileModule()
+    radar, _ = driver_on(module)
+    radar.presence.load()
+    radar.presence.run()
+    radar.presence.idle()
+    radar.presence.run()
+    radar.presence.stop()
+    modes = [c.mode for c in module.received if isinstance(c, m.SetMode)]
+    assert modes == [STOP, RUN, IDLE, RUN, STOP]
+    with pytest.raises(LocalProtocolError, match="no profile is loaded"):
+        radar.presence.run()
+
+
+def test_running_profile_is_left_running_at_the_end(driver_on: DriverOn) -> None:
+    module = ProfileModule()
+    radar, line = driver_on(module)
+    with radar:
+        radar.presence.load()
+        radar.presence.run()
+    assert module.mode == RUN
+    assert line.closed
+
+
+def test_noise_map_and_factory_preset(driver_on: DriverOn) -> None:
+    module = ProfileModule()
+    radar, _ = driver_on(module)
+    radar.presence.load()
+    radar.presence.store_noise_map()
+    radar.presence.load_noise_map()
+    radar.presence.delete_noise_map()
+    radar.presence.factory_preset()
+    assert module.received[3:] == [
+        m.StoreNoiseMap(),
+        m.LoadNoiseMap(),
+        m.DeleteNoiseMap(),
+        m.FactoryPreset(),
+    ]
