@@ -37,7 +37,7 @@ class _Bulk(Response):
         return hash(self._identity())
 
     def _identity(self) -> tuple[bytes, ...]:
-        values = (getattr(self, field) for field, _ in ROWS[type(self)].kinds)
+        values = (getattr(self, field) for field in ROWS[type(self)].fields)
         return tuple(np.asarray(value).tobytes() for value in values)
 
 

@@ -34,7 +34,7 @@ class PresenceMovingList(Response):
 
     ``movement_slow`` and ``movement_fast``, 0 ... 100, are equally long; the first entry is the
     average of the list. The three ``detection`` lists are equally long: distance [m], radar cross
-    section [dB(m^2)] and velocity [m/s], of which released firmware computes the first only.
+    section [dB(m^2)] and velocity, of which released firmware computes the first only.
     """
 
     counter: Annotated[int, wire.U32]
