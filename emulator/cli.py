@@ -35,14 +35,15 @@ real module. pace asap: as fast as the host reads, nothing is lost.
 """
 
 _PLAY_HELP = """\
-Plays a directory of recorded baseband_iq messages (ModuleConnector's format) at the port of an
-emulated X4M300, byte-exact. Same ready line as serve.
+Plays a recording at the port of an emulated X4M300, every message byte-exact: a directory of
+ModuleConnector, a wire capture (.xtwire), MCAP or .npz. Same ready line as serve.
 
 Playing begins anew for every host that opens the port: at once when the host starts the radar
 (FPS above 0, or SETMODE RUN), else half a second after it opened the port or sent its last
 command. It ends when the last host closes the port. Nothing is dropped: a host that reads slowly
 makes the recording wait. Meanwhile the module answers every command; FPS, mode and geometry
-settings are acknowledged and change nothing about what is played. (Where the system cannot tell
+settings are acknowledged and change nothing about what is played; the number of bins reads back as
+recorded. Recorded answers are left out. (Where the system cannot tell
 who opens a port, a host's first command counts as opening it.)
 """
 
@@ -74,13 +75,19 @@ def _run(arguments: argparse.Namespace, stop: Stop) -> int:
             scene = arguments.count if arguments.bare else arguments.scene
             serve(scene, arguments.seed, arguments.pace, folder, stop)
     except CannotServeError as error:
-        sys.stderr.write(f"xethru-emulator: {error}\n")
-        return 1
+        _say(str(error))
+        return error.exit_code
     return 0
 
 
 def _warn(text: str) -> None:
-    sys.stderr.write(f"xethru-emulator: warning: {text}\n")
+    _say(f"warning: {text}")
+
+
+def _say(text: str) -> None:
+    if sys.stderr is not None:  # started with stderr closed: nobody wants to know
+        line = " ".join(text.split())
+        sys.stderr.write(f"xethru-emulator: {line}\n")
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -119,7 +126,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         description=_PLAY_HELP,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    play.add_argument("recording", type=Path, metavar="RECORDING", help="directory to play")
+    play.add_argument("recording", type=Path, metavar="RECORDING", help="recording to play")
     play.add_argument(
         "--rate",
         type=_rate,

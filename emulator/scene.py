@@ -36,6 +36,7 @@ __all__ = [
     "Scene",
     "SceneError",
     "TargetSpec",
+    "UnknownSceneError",
     "empty_room",
     "load_scene",
     "scene_names",
@@ -53,6 +54,10 @@ _SHIPPED_SCENES = Path(__file__).parent.parent / "fixtures" / "scenes"
 
 class SceneError(ValueError):
     """A scene that cannot be used; the message is one line naming file, key and the remedy."""
+
+
+class UnknownSceneError(SceneError):
+    """A name that is none of the shipped scenes: wrong usage, while a bad file is a failure."""
 
 
 def _finite(value: object) -> object:
@@ -255,13 +260,15 @@ def load_scene(path_or_name: str | Path) -> Scene:
 
     Raises
     ------
+    UnknownSceneError
+        No scene of this name ships with the package.
     SceneError
         File missing or unreadable, TOML broken, key unknown, or value refused.
     """
     text = str(path_or_name)
     is_name = isinstance(path_or_name, str) and not text.endswith(".toml") and "/" not in text
     if is_name and text not in scene_names():
-        raise SceneError(
+        raise UnknownSceneError(
             f"{text}: no such scene; known are {', '.join(scene_names())}, "
             "or give the path of a .toml file"
         )
@@ -274,6 +281,8 @@ def load_scene(path_or_name: str | Path) -> Scene:
         raise SceneError(f"{text}: not UTF-8 text at byte {error.start}") from error
     except ValueError as error:  # not TOML, or an integer of thousands of digits
         raise SceneError(f"{text}: not valid TOML: {error}") from error
+    except RecursionError as error:
+        raise SceneError(f"{text}: brackets are nested too deep for a scene") from error
     try:
         return Scene.model_validate(table)
     except ValidationError as error:

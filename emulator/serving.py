@@ -20,22 +20,34 @@ from emulator.link import LinkError, PtyLink
 from emulator.odometry import scene_odometry
 from emulator.odometry_feed import OdometryFeed
 from emulator.pace import Pace
+from emulator.path_lock import PathInUseError, locked
 from emulator.playback import RecordingError, recording_device
 from emulator.port_watch import PortWatch
 from emulator.run_directory import Announcement, fresh_port_folder
-from emulator.scene import Scene, SceneError, empty_room, load_scene
+from emulator.scene import Scene, SceneError, UnknownSceneError, empty_room, load_scene
 from emulator.server import Port, Server, Service
 from emulator.stopping import Stop
 
 __all__ = ["CannotServeError", "play", "serve"]
 
 NS_PER_MS = 1_000_000
-LONGEST_SOCKET_PATH = 100  # bytes; the kernel takes 107
+LONGEST_SOCKET_PATH = 100  # bytes; Linux takes 107, macOS 103
+SOCKET_NAME = "odometry.sock"
 PLAYED_SERIAL = "000000000000"
 
 
 class CannotServeError(Exception):
-    """The emulator could not start; the message is one line with the remedy."""
+    """The emulator could not start; the message is one line with the remedy.
+
+    Attributes
+    ----------
+    exit_code
+        1 when the thing failed, 2 when it was called wrongly.
+    """
+
+    def __init__(self, message: str, *, exit_code: int = 1) -> None:
+        super().__init__(message)
+        self.exit_code = exit_code
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,6 +97,8 @@ def serve(scene: str | int, seed: int, pace: Pace, link_dir: Path | None, stop: 
                 )
                 cleanup.callback(feed.close)
             ports = _open_ports(devices, folder, cleanup)
+        except UnknownSceneError as error:
+            raise CannotServeError(str(error), exit_code=2) from error
         except (SceneError, LinkError) as error:
             raise CannotServeError(str(error)) from error
         services: list[Service] = [] if feed is None else [feed]
@@ -106,7 +120,7 @@ def play(
     Parameters
     ----------
     recording
-        Directory of recorded messages.
+        Anything that `read_recording` takes.
     rate
         Multiple of real time; 0 for as fast as the port takes it.
     loop
@@ -132,6 +146,7 @@ def play(
                 rate=rate,
                 loop=loop,
                 on_fault=lambda fault: warn(f"{fault.file}: {fault.reason}; the rest is played"),
+                warn=warn,
             )
             folder = cleanup.enter_context(_link_folder(link_dir))
             devices = [NamedDevice(name="player", serial=identity.serial, device=device)]
@@ -221,7 +236,10 @@ def _say_ready(ready: dict[str, object]) -> None:
 
 @contextlib.contextmanager
 def _link_folder(wanted: Path | None) -> Iterator[Path]:
-    """Provide the directory of the links; remove it afterwards if we made it and it is empty."""
+    """Provide the directory of the links; remove it afterwards if we made it and it is empty.
+
+    A given directory serves one running emulator: a second one would take its names over.
+    """
     if wanted is None:
         folder = fresh_port_folder()
         try:
@@ -230,23 +248,42 @@ def _link_folder(wanted: Path | None) -> Iterator[Path]:
             shutil.rmtree(folder, ignore_errors=True)
         return
     existed = wanted.exists()
-    try:
-        wanted.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise LinkError(f"{wanted}: cannot make the link directory: {error.strerror}") from error
-    try:
-        yield wanted.absolute()
-    finally:
-        if not existed:
-            with contextlib.suppress(OSError):  # somebody else uses it too
-                wanted.rmdir()
+    with contextlib.ExitStack() as held:
+        try:
+            wanted.mkdir(parents=True, exist_ok=True)
+            held.enter_context(locked(wanted))
+        except OSError as error:
+            raise LinkError(
+                f"{wanted}: cannot make the link directory: {error.strerror}"
+            ) from error
+        except PathInUseError as error:
+            raise LinkError(
+                f"{wanted}: a running emulator has its links there; choose another --link-dir"
+            ) from error
+        try:
+            yield wanted.absolute()
+        finally:
+            if not existed:
+                with contextlib.suppress(OSError):  # somebody else uses it too
+                    wanted.rmdir()
 
 
 def _socket_path(folder: Path, cleanup: contextlib.ExitStack) -> Path:
     """Return where the odometry socket goes: among the links, if the kernel takes such a path."""
-    path = folder / "odometry.sock"
-    if len(os.fsencode(path)) <= LONGEST_SOCKET_PATH:
+    path = folder / SOCKET_NAME
+    if _fits(path):
         return path
-    short = Path(tempfile.mkdtemp(prefix="xethru-"))
-    cleanup.callback(shutil.rmtree, short, ignore_errors=True)
-    return short / "odometry.sock"
+    for parent in (tempfile.gettempdir(), "/tmp"):  # the former may be as long
+        if _fits(Path(parent) / "xethru-12345678" / SOCKET_NAME):
+            with contextlib.suppress(OSError):
+                short = Path(tempfile.mkdtemp(prefix="xethru-", dir=parent))
+                cleanup.callback(shutil.rmtree, short, ignore_errors=True)
+                return short / SOCKET_NAME
+    raise LinkError(
+        f"{path}: too long for the odometry socket, {LONGEST_SOCKET_PATH} bytes at most; "
+        "choose a shorter --link-dir or TMPDIR"
+    )
+
+
+def _fits(path: Path) -> bool:
+    return len(os.fsencode(path)) <= LONGEST_SOCKET_PATH

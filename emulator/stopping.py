@@ -55,9 +55,14 @@ class Stop:
 
 @contextlib.contextmanager
 def stop_signals() -> Iterator[Stop]:
-    """Turn SIGINT, SIGTERM and SIGHUP into an orderly end, from here to the last clean-up."""
+    """Turn SIGINT, SIGTERM and SIGHUP into an orderly end, from here to the last clean-up.
+
+    A SIGHUP that is ignored already stays so, as whoever says `nohup` wants.
+    """
     stop = Stop()
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
     before = {number: signal.signal(number, stop.request) for number in numbers}
     try:
         yield stop

@@ -69,7 +69,7 @@ def test_ctrl_c_ends_a_sweep_and_its_workers(tmp_path: Path) -> None:
     assert process.returncode == 130
     done = len(json.loads(part.read_text())["runs"])
     *progress, last = stderr.splitlines()
-    assert last == f"uwb-slam: stopped by SIGINT; {done} of 50 runs are in {part}"
+    assert last == f"uwb-slam: stopped by SIGINT; {done} of 50 runs are in {part}", stderr
     assert len(progress) == done
     assert all(f" of 50: {scene.stem}, paper, seed " in line for line in progress)
     assert not (tmp_path / "o.json").exists()

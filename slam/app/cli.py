@@ -6,11 +6,13 @@ Nothing heavy is imported before a command runs, so `--help` answers at once.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from slam.app.errors import EXIT_FAILED, AppError
+from slam.app.standard_streams import drop_what_cannot_be_said, open_closed_streams
 from slam.app.stop import StopFlag, StopRequestedError
 
 _TYPICAL_SEED = 2
@@ -20,22 +22,32 @@ _Command = Callable[[argparse.Namespace, StopFlag], None]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; return 0, 1 (failed), 2 (wrong usage), 130 or 143 (stopped by a signal)."""
-    arguments = _parser().parse_args(argv)
-    command: _Command = arguments.command
+    """Run a command; return 0, 1 (failed), 2 (wrong usage), or 128 + n (stopped by signal n)."""
+    open_closed_streams()
     try:
-        with StopFlag() as stop:
-            command(arguments, stop)
-            sys.stdout.flush()
+        return _run(_parser().parse_args(argv))
+    finally:
+        drop_what_cannot_be_said()
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    command: _Command = arguments.command
+    stop = StopFlag()
+    try:
+        try:
+            with stop:
+                command(arguments, stop)
+                sys.stdout.flush()
+        except OSError:
+            stop.check()  # a terminal that closes sends SIGHUP and refuses what we say
+            raise
         stop.check()  # a signal that came after the command's own last check
     except AppError as error:
         return _end(str(error), error.exit_code)
     except StopRequestedError as stopped:
         return _end(str(stopped), stopped.exit_code)
     except BrokenPipeError:
-        # Whoever read our output has gone; Python would complain once more while it exits.
-        sys.stderr.close()
-        return EXIT_FAILED
+        return EXIT_FAILED  # whoever read our output has gone
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         return _end(f"{where}{error.strerror or error}", EXIT_FAILED)
@@ -44,7 +56,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _end(message: str, exit_code: int) -> int:
     line = " ".join(message.split())
-    print(f"uwb-slam: {line}", file=sys.stderr)  # noqa: T201 - a command line speaks
+    with contextlib.suppress(OSError):  # the terminal is gone, which may be why we end
+        print(f"uwb-slam: {line}", file=sys.stderr)  # noqa: T201 - a command line speaks
     return exit_code
 
 
@@ -60,7 +73,9 @@ def _parser() -> argparse.ArgumentParser:
         description="Starts the emulator, opens its four radars through serial ports, runs SLAM "
         "while frames arrive, and writes session, map and numbers. All numbers are simulated.",
     )
-    demo.add_argument("--out", type=Path, default=Path("out/demo"), help="folder for the results")
+    demo.add_argument(
+        "--out", type=_folder, default=Path("out/demo"), help="folder for the results"
+    )
     demo.add_argument(
         "--seed",
         type=_seed,
@@ -95,6 +110,14 @@ def _parser() -> argparse.ArgumentParser:
     sweep.add_argument("--json", type=Path, required=True, metavar="OUT", help="result file")
     sweep.set_defaults(command=_sweep)
     return parser
+
+
+def _folder(text: str) -> Path:
+    try:
+        text.encode()
+    except UnicodeEncodeError:  # Rerun's writer takes no other
+        raise argparse.ArgumentTypeError(f"must be a UTF-8 name, not {text!r}") from None
+    return Path(text)
 
 
 def _seed(text: str) -> int:

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from emulator.path_lock import PathInUseError, locked
+from emulator.scene import Scene
 from slam.app.emulated_rig import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
@@ -21,7 +23,7 @@ from slam.app.emulated_rig import (
     versions,
 )
 from slam.app.emulator_process import EmulatorProcess
-from slam.app.errors import AppError, EmulatorError, RadarSilentError
+from slam.app.errors import AppError, EmulatorError, RadarSilentError, naming
 from slam.app.evaluation import summarise
 from slam.app.link_log import LinkLog
 from slam.app.odometry import read_odometry_socket
@@ -32,6 +34,7 @@ from slam.app.session import SessionInfo, SessionObserver
 from slam.app.session_log import SessionLog
 from slam.app.stop import StopFlag, StopRequestedError
 from slam.app.tum import Trajectory, write_tum
+from slam.config import SlamConfig
 from slam.pipeline import UwbRadarSlam
 
 OUTPUTS = (
@@ -58,6 +61,8 @@ class DemoOptions:
 def run_demo(options: DemoOptions, stop: StopFlag) -> None:
     """Run the emulated robot through its scene and write everything into one folder.
 
+    The folder is this run's alone until it ends.
+
     Parameters
     ----------
     options
@@ -73,10 +78,15 @@ def run_demo(options: DemoOptions, stop: StopFlag) -> None:
         A signal arrived; the same holds.
     """
     scene, config = scene_and_config(options.scene, options.preset)
+    with ExitStack() as held:
+        _prepare(options.out, held)
+        _run(options, scene, config, stop)
+
+
+def _run(options: DemoOptions, scene: Scene, config: SlamConfig, stop: StopFlag) -> None:
     rig = rig_of(scene)
     landmarks_m = true_landmarks_m(scene)
     trajectory = scene.trajectory()
-    _prepare(options.out)
     kept = f"; what was recorded is in {options.out}"
     with ExitStack() as stack:
         emulator = stack.enter_context(EmulatorProcess(options.scene, options.seed))
@@ -131,9 +141,11 @@ def run_demo(options: DemoOptions, stop: StopFlag) -> None:
             raise AppError(f"{options.scene}: too short for SLAM, no state was estimated{kept}")
         stop.check()
         _write_trajectories(options.out, record)
-        (options.out / "summary.json").write_text(summary.to_json() + "\n", encoding="ascii")
+        with naming(path := options.out / "summary.json"):
+            path.write_text(summary.to_json() + "\n", encoding="ascii")
         stop.check()
-        draw_map(options.out / "map.png", info, record, summary)
+        with naming(path := options.out / "map.png"):
+            draw_map(path, info, record, summary)
         stop.check()
     print_table(
         summary,
@@ -153,14 +165,18 @@ def _saying_what_is_left(kept: str) -> Iterator[None]:
         raise StopRequestedError(stopped.received, kept) from None
 
 
-def _prepare(out: Path) -> None:
-    """Make the folder, and remove an earlier run's files so that no two runs mix."""
-    try:
+def _prepare(out: Path, held: ExitStack) -> None:
+    """Make the folder, hold it, and remove an earlier run's files so that no two runs mix."""
+    with naming(out):
         out.mkdir(parents=True, exist_ok=True)
+        try:
+            held.enter_context(locked(out))
+        except PathInUseError:
+            raise AppError(
+                f"{out}: another run is writing there; wait for its end or choose another --out"
+            ) from None
         for name in OUTPUTS:
             (out / name).unlink(missing_ok=True)
-    except OSError as error:
-        raise AppError(f"{out}: cannot be written: {error.strerror}") from None
 
 
 def _write_trajectories(out: Path, record: RunRecord) -> None:
@@ -171,4 +187,5 @@ def _write_trajectories(out: Path, record: RunRecord) -> None:
         ("truth", record.truth),
         ("odometry", np.array([result.odometry_pose for result in record.results])),
     ):
-        write_tum(out / f"{name}.tum", Trajectory(stamps_ns=stamps_ns, poses=poses))
+        with naming(path := out / f"{name}.tum"):
+            write_tum(path, Trajectory(stamps_ns=stamps_ns, poses=poses))

@@ -15,7 +15,7 @@ from emulator.echo import echo_source
 from emulator.identity import Identity
 from emulator.loopback import LoopbackTransport
 from emulator.pace import Pace
-from emulator.scene import Scene, SceneError, load_scene
+from emulator.scene import Scene, SceneError, UnknownSceneError, load_scene
 from slam.app.emulator_process import EmulatedDevice
 from slam.app.errors import AppError, UsageError
 from slam.app.sources import RadarLink, RigSource
@@ -42,13 +42,17 @@ def scene_and_config(scene: str, preset: str) -> tuple[Scene, SlamConfig]:
     Raises
     ------
     UsageError
-        One of them does not exist or is refused; one line with file, key and remedy.
+        One of the names is not known; one line with those that are.
+    AppError
+        The scene file cannot be read or is refused; one line with file, key and remedy.
     """
     try:
         loaded = load_scene(scene)
         return loaded, load_preset(preset, loaded.environment)
-    except (SceneError, ConfigError) as error:
+    except (UnknownSceneError, ConfigError) as error:
         raise UsageError(str(error)) from None
+    except SceneError as error:
+        raise AppError(str(error)) from None
 
 
 def rig_of(scene: Scene) -> Rig:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
 EXIT_FAILED = 1
 EXIT_USAGE = 2
 
@@ -13,9 +17,18 @@ class AppError(Exception):
 
 
 class UsageError(AppError):
-    """The command was called wrongly, for example with a scene that does not exist."""
+    """The command was called wrongly, for example with the name of a scene that does not exist."""
 
     exit_code = EXIT_USAGE
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Let a failing write say which file it is about; the system's own error does not always."""
+    try:
+        yield
+    except OSError as error:
+        raise AppError(f"{path}: cannot be written: {error.strerror or error}") from None
 
 
 class RadarSilentError(AppError):

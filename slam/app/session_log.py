@@ -6,11 +6,14 @@ process leaves everything but its last chunk. Times in the file are session time
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from collections.abc import Callable
 from dataclasses import asdict
+from io import BufferedWriter, FileIO
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
@@ -19,6 +22,9 @@ from slam.app import ros_messages as ros
 from slam.app.odometry import OdometryTrack
 from slam.app.session import LogLine, Scan, SessionInfo, Snapshot
 from slam.geometry import between, compose
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
 
 _CHUNK_BYTES = 256 * 1024
 _CHUNK_NS = 1_000_000_000
@@ -45,6 +51,17 @@ _LATCHED_QOS = """\
 """
 
 
+class _NamedFile(FileIO):
+    """Says its name when it cannot be written; all failures of the log pass here."""
+
+    def write(self, data: ReadableBuffer, /) -> int:
+        try:
+            return super().write(data)
+        except OSError as error:
+            error.filename = self.name
+            raise
+
+
 class SessionLog:
     """Writes a session as it happens.
 
@@ -62,18 +79,26 @@ class SessionLog:
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._clock_ns = clock_ns
-        self._stream = path.open("wb")
+        self._stream = BufferedWriter(_NamedFile(path, "wb"))
         # Chunks are cut here, by size and by time; the writer itself knows size only.
         self._writer = Writer(
             self._stream, chunk_size=2 * _CHUNK_BYTES, compression=CompressionType.ZSTD
         )
-        self._writer.start(profile="ros2", library="xethru-hil")
         self._pending_bytes = 0
         self._chunk_started_ns = clock_ns()
         self._samples = iter(odometry.samples)
         self._odometry_ns = -1  # of the newest sample written
         self._schemas: dict[str, int] = {}
         self._frame_channels: list[int] = []
+        try:
+            self._begin(info)
+        except BaseException:
+            with contextlib.suppress(OSError):  # what is in its buffer cannot be written either
+                self._stream.close()
+            raise
+
+    def _begin(self, info: SessionInfo) -> None:
+        self._writer.start(profile="ros2", library="xethru-hil")
         self._writer.add_metadata(
             METADATA_NAME,
             {

@@ -1,8 +1,9 @@
-"""Stopping cleanly on SIGINT and SIGTERM.
+"""Stopping cleanly on SIGINT, SIGTERM and SIGHUP.
 
 A signal only raises a flag; the program asks for it between two steps, so no file is left in the
 middle of a record. A second signal of the same kind gets the system's default and ends the process
-where it stands, for a user who does not want to wait.
+where it stands, for a user who does not want to wait; except SIGHUP, of which a closing terminal
+sends two.
 """
 
 from __future__ import annotations
@@ -13,11 +14,11 @@ from contextlib import contextmanager
 from types import FrameType, TracebackType
 from typing import Any, Self
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopRequestedError(Exception):
-    """SIGINT or SIGTERM arrived; carries the signal, and says what is left behind."""
+    """SIGINT, SIGTERM or SIGHUP arrived; carries the signal, and says what is left behind."""
 
     def __init__(self, received: signal.Signals, left_behind: str = "") -> None:
         super().__init__(f"stopped by {received.name}{left_behind}")
@@ -25,12 +26,14 @@ class StopRequestedError(Exception):
 
     @property
     def exit_code(self) -> int:
-        """What a shell expects of a program ended by this signal: 130 or 143."""
+        """What a shell expects of a program ended by this signal: 130, 143 or 129."""
         return 128 + int(self.received)
 
 
 class StopFlag:
-    """Catches SIGINT and SIGTERM while it is entered; `check` raises once one arrived.
+    """Catches SIGINT, SIGTERM and SIGHUP while it is entered; `check` raises once one arrived.
+
+    A SIGHUP that is ignored already stays so, as whoever says `nohup` wants.
 
     Examples
     --------
@@ -45,7 +48,9 @@ class StopFlag:
 
     def __enter__(self) -> Self:
         """Install the handlers. Main thread only, as Python demands."""
-        self._previous = {which: signal.signal(which, self._on_signal) for which in _SIGNALS}
+        for which in _SIGNALS:
+            if which is not signal.SIGHUP or signal.getsignal(which) is not signal.SIG_IGN:
+                self._previous[which] = signal.signal(which, self._on_signal)
         return self
 
     def __exit__(
@@ -76,6 +81,6 @@ class StopFlag:
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self._received = signal.Signals(number)
-        signal.signal(number, signal.SIG_DFL)
+        signal.signal(number, signal.SIG_IGN if number == signal.SIGHUP else signal.SIG_DFL)
         if self._at_once:
             self.check()

@@ -7,6 +7,7 @@ import statistics
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
@@ -16,6 +17,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from emulator.odometry import scene_odometry
+from emulator.path_lock import PathInUseError, locked
 from slam.app.emulated_rig import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
@@ -25,7 +27,7 @@ from slam.app.emulated_rig import (
     scene_and_config,
     true_landmarks_m,
 )
-from slam.app.errors import AppError, UsageError
+from slam.app.errors import AppError, UsageError, naming
 from slam.app.evaluation import summarise
 from slam.app.odometry import OdometryTrack
 from slam.app.report_table import mm_text, share_text
@@ -112,7 +114,19 @@ def run_sweep(options: SweepOptions, stop: StopFlag) -> None:
     part = options.out.with_name(f"{options.out.name}.part")
     if options.out.is_dir():
         raise AppError(f"{options.out}: is a folder, must be a file")
-    _write(part, [])  # what cannot be written ends the command before any run, too
+    with ExitStack() as held:
+        with naming(part):  # what cannot be written ends the command before any run, too
+            part.touch()
+            try:
+                held.enter_context(locked(part))
+            except PathInUseError:
+                raise AppError(
+                    f"{part}: another sweep is writing there; choose another --json"
+                ) from None
+        _run(options, part, stop)
+
+
+def _run(options: SweepOptions, part: Path, stop: StopFlag) -> None:
     cells = list(product(options.scenes, options.presets, range(options.n_seeds)))
     runs: list[Summary] = []
 
@@ -120,6 +134,7 @@ def run_sweep(options: SweepOptions, stop: StopFlag) -> None:
         return f"; {len(runs)} of {len(cells)} runs are in {part}" if runs else ""
 
     try:
+        _write(part, [])
         for summary in _results(cells, options.jobs, stop):
             runs.append(summary)
             groups = _write(part, runs)
@@ -141,10 +156,8 @@ def _write(path: Path, runs: Sequence[Summary]) -> list[dict[str, Any]]:
     """Write runs and the statistics of their groups; return the latter."""
     groups = summarise_groups(runs)
     result = {"runs": [asdict(run) for run in runs], "groups": groups}
-    try:
+    with naming(path):
         path.write_text(json.dumps(result, indent=2, allow_nan=False) + "\n", encoding="ascii")
-    except OSError as error:
-        raise AppError(f"{path}: cannot be written: {error.strerror}") from None
     return groups
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from emulator.cli import main
+from emulator.path_lock import locked
 
 
 @pytest.mark.parametrize(
@@ -40,7 +41,6 @@ def test_wrong_usage_exits_2(arguments: list[str], capsys: pytest.CaptureFixture
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["serve", "no_such_scene"], "no_such_scene: no such scene; known are"),
         (["serve", "missing.toml"], "missing.toml: cannot read the scene file"),
         (["play", "missing"], "there is no recording missing"),
         (["serve", "--bare", "--link-dir", "FILE/links"], "cannot make the link directory"),
@@ -63,6 +63,33 @@ def test_what_cannot_be_served_is_one_line_and_exit_1(
     assert captured.err.startswith("xethru-emulator: ")
     assert captured.err.count("\n") == 1
     assert says in captured.err
+
+
+def test_an_unknown_name_is_wrong_usage_while_a_missing_file_is_a_failure(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["serve", "no_such_scene"]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.startswith("xethru-emulator: no_such_scene: no such scene; known are")
+    assert (captured.out, captured.err.count("\n")) == ("", 1)
+
+
+def test_the_link_directory_of_a_running_emulator_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with locked(tmp_path):  # as the running one does
+        assert main(["serve", "--bare", "--link-dir", str(tmp_path)]) == 1
+    assert capsys.readouterr().err == (
+        f"xethru-emulator: {tmp_path}: a running emulator has its links there; "
+        "choose another --link-dir\n"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_closed_stderr_leaves_the_exit_code() -> None:
+    command = f"exec {sys.executable} -m emulator.cli serve no_such_scene 2>&-"
+    run = subprocess.run(["sh", "-c", command], stdout=subprocess.PIPE, check=False)
+    assert (run.returncode, run.stdout) == (2, b"")
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["serve", "--help"], ["play", "--help"]])

@@ -115,6 +115,7 @@ def test_a_scene_is_frozen() -> None:
         (GOOD + "[noise]\niterations = 1.5\n", ["noise.iterations", "integer", "1.5"]),
         (GOOD + '[[targets]]\nname = "Bad Name"\n', ["targets[0].name", "pattern", "(and 3 more)"]),
         (GOOD + "[path\n", ["not valid TOML", "line"]),
+        ("a = " + "[" * 100_000, ["brackets are nested too deep"]),
         ("radars = 3\n" + HEAD, ["radars", "tuple", "got 3"]),
         ("", ["missing", "(and 3 more)"]),
     ],

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from emulator.path_lock import locked
 from slam.app.cli import main
 
 HEAVY = {
@@ -51,6 +52,7 @@ def test_help_loads_nothing_heavy(arguments: list[str]) -> None:
         ["fly"],
         ["demo", "--seed", "-1"],
         ["demo", "--seed", "x"],
+        ["demo", "--out", os.fsdecode(b"\xff")],
         ["sweep", "--json", "o.json", "--seeds", "0"],
         ["evaluate", "one.tum"],
     ],
@@ -63,13 +65,14 @@ def test_wrong_usage_is_2(arguments: list[str], capsys: pytest.CaptureFixture[st
 
 
 @pytest.mark.parametrize(
-    ("option", "value"), [("--scene", "mars"), ("--scene", "no/such.toml"), ("--preset", "magic")]
+    ("wrong", "code"), [("--scene mars", 2), ("--scene no/such.toml", 1), ("--preset magic", 2)]
 )
 @pytest.mark.parametrize("command", ["demo --out", "sweep --json"])
-def test_an_unknown_scene_or_preset_is_2_and_one_line(
-    command: str, option: str, value: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_an_unknown_name_is_2_a_missing_file_1_both_one_line(
+    command: str, wrong: str, code: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([*command.split(), str(tmp_path / "out"), option, value]) == 2
+    option, value = wrong.split()
+    assert main([*command.split(), str(tmp_path / "out"), option, value]) == code
     text = capsys.readouterr()
     assert text.out == ""
     assert value in text.err
@@ -83,6 +86,59 @@ def test_a_folder_that_cannot_be_written_is_1(
     (tmp_path / "file").write_text("in the way")
     assert main(["demo", "--out", str(tmp_path / "file" / "o")]) == 1
     assert "cannot be written: Not a directory" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "said"),
+    [
+        ("demo", "--out", "another run is writing there"),
+        ("sweep", "--json", "another sweep is writing there"),
+    ],
+)
+def test_two_runs_into_one_place_are_refused_and_the_first_goes_on(
+    command: str, option: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    first = out / "summary.json" if command == "demo" else tmp_path / "out.part"
+    first.parent.mkdir(exist_ok=True)
+    first.write_text("of the first run")
+    with locked(out if command == "demo" else first):
+        assert main([command, option, str(out)]) == 1
+    text = capsys.readouterr()
+    assert said in text.err
+    assert (text.out, text.err.count("\n")) == ("", 1)
+    assert first.read_text() == "of the first run"
+
+
+def trajectory(folder: Path) -> str:
+    path = folder / "path.tum"
+    path.write_text("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n3 1 1 0 0 0 0 1\n")
+    return str(path)
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
+@pytest.mark.parametrize(("scene", "code"), [("", 0), ("mars", 2)])
+def test_a_closed_standard_stream_changes_nothing(
+    closed: str, scene: str, code: int, tmp_path: Path
+) -> None:
+    path = trajectory(tmp_path)
+    arguments = f"sweep --json o --scene {scene}" if scene else f"evaluate {path} {path}"
+    run = subprocess.run(
+        ["sh", "-c", f"exec {sys.executable} -m slam.app.cli {arguments} {closed}"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == code
+    assert "Traceback" not in run.stderr
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full (Linux)")
+def test_output_that_takes_no_more_is_1_and_one_line(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "slam.app.cli", "evaluate", *2 * [trajectory(tmp_path)]]
+    with Path("/dev/full").open("w") as full:
+        run = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert (run.returncode, run.stderr) == (1, "uwb-slam: No space left on device\n")
 
 
 @pytest.mark.parametrize(("which", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

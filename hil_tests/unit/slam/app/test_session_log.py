@@ -249,3 +249,10 @@ def test_closing_twice_is_harmless(tmp_path: Path) -> None:
     size = (tmp_path / "s.mcap").stat().st_size
     log.close()
     assert (tmp_path / "s.mcap").stat().st_size == size
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full (Linux)")
+def test_a_full_disk_names_the_file() -> None:
+    with pytest.raises(OSError, match="No space left") as caught:
+        feed(SessionLog(Path("/dev/full"), session_info(), odometry()), 1)
+    assert caught.value.filename == Path("/dev/full")

@@ -10,7 +10,9 @@ import pytest
 from slam.app.stop import StopFlag, StopRequestedError
 
 
-@pytest.mark.parametrize(("which", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("which", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+)
 def test_a_signal_raises_at_the_next_check_only(which: signal.Signals, code: int) -> None:
     with StopFlag() as stop:
         stop.check()
@@ -37,6 +39,27 @@ def test_a_second_signal_gets_the_systems_default() -> None:
         os.kill(os.getpid(), signal.SIGINT)
         assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_closing_terminals_second_hang_up_does_not_end_the_clean_stop() -> None:
+    before = signal.getsignal(signal.SIGHUP)
+    with StopFlag() as stop:
+        os.kill(os.getpid(), signal.SIGHUP)
+        os.kill(os.getpid(), signal.SIGHUP)
+        with pytest.raises(StopRequestedError):
+            stop.check()
+    assert signal.getsignal(signal.SIGHUP) is before
+
+
+def test_nohup_is_respected() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with StopFlag() as stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            stop.check()
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_a_signal_before_waiting_begins_is_not_lost() -> None:

@@ -1,11 +1,14 @@
 """Sweeps that would mix up two scenes are refused before the first run."""
 
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
 from hil_tests.system.short_scene import write_short_scene
-from slam.app.errors import UsageError
+from slam.app import sweep
+from slam.app.errors import AppError, UsageError
 from slam.app.stop import StopFlag
 from slam.app.sweep import SweepOptions, run_sweep
 
@@ -22,3 +25,18 @@ def test_two_scenes_of_one_name_are_refused(tmp_path: Path) -> None:
     with StopFlag() as stop, pytest.raises(UsageError, match="same name"):
         run_sweep(options, stop)
     assert not (tmp_path / "out.json").exists()
+
+
+def test_a_worker_that_dies_is_one_line_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def dying(*_: object) -> NoReturn:
+        raise BrokenExecutor
+
+    monkeypatch.setattr(sweep, "worker_results", dying)
+    options = SweepOptions(
+        scenes=("lab",), presets=("paper",), n_seeds=2, jobs=2, out=tmp_path / "out.json"
+    )
+    with StopFlag() as stop, pytest.raises(AppError, match=r"^a worker process died; did memory"):
+        run_sweep(options, stop)
+    assert list(tmp_path.iterdir()) == []

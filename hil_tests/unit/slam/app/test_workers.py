@@ -20,6 +20,8 @@ from slam.app.workers import worker_results
 def work(task):
     if task == "mask":
         return sorted(signal.pthread_sigmask(signal.SIG_BLOCK, ()))
+    if task == "die":
+        os.kill(os.getpid(), signal.SIGKILL)
     if task == "sleep":
         time.sleep(60)
     return os.getpid()
@@ -82,6 +84,20 @@ def test_work_that_is_thrown_away_ends_at_once_and_without_a_word(tmp_path: Path
     with started(tmp_path, body) as process:
         output, errors = process.communicate(timeout=15)
     assert (process.returncode, output, errors) == (0, "", "")
+
+
+def test_a_worker_that_dies_breaks_the_results(tmp_path: Path) -> None:
+    body = (
+        "from concurrent.futures import BrokenExecutor\n"
+        "try:\n"
+        "    with worker_results(work, [('die',), ('sleep',)], 2) as results:\n"
+        "        next(results)\n"
+        "except BrokenExecutor:\n"
+        "    print('broken')\n"
+    )
+    with started(tmp_path, body) as process:
+        output, errors = process.communicate(timeout=15)
+    assert (process.returncode, output, errors) == (0, "broken\n", "")
 
 
 @pytest.mark.parametrize(
