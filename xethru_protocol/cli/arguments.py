@@ -1,12 +1,12 @@
 """Arguments of ``xethru``. Importing this loads nothing that a command needs."""
 
 import argparse
-import math
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
+from xethru_protocol.cli import values
+
 _FROM = ("auto", "host", "module")
-_LONGEST_S = 1e9  # 30 years
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
@@ -59,7 +59,7 @@ def _add_doctor(commands: _Commands) -> None:
     )
     one.add_argument(
         "--port",
-        type=_not_empty,
+        type=values.not_empty,
         action="append",
         default=[],
         help="examine this port; may be given several times (default: all that are found)",
@@ -90,7 +90,7 @@ def _add_stream(commands: _Commands) -> None:
     _add_port(one)
     _add_json(one)
     _add_raw_settings(one)
-    one.add_argument("--count", type=_at_least_one, help="stop after COUNT frames")
+    one.add_argument("--count", type=values.at_least_one, help="stop after COUNT frames")
     one.add_argument("--samples", action="store_true", help="print the samples, too")
 
 
@@ -107,13 +107,13 @@ def _add_record(commands: _Commands) -> None:
     _add_port(one)
     one.add_argument(
         "--out",
-        type=_not_empty,
+        type=values.not_empty,
         metavar="DIR",
         help="directory for a recording in the vendor's format (ModuleConnector)",
     )
     one.add_argument(
         "--wire",
-        type=_not_empty,
+        type=values.not_empty,
         metavar="FILE",
         help="also, or only, write all bytes of both directions here",
     )
@@ -125,9 +125,9 @@ def _add_record(commands: _Commands) -> None:
         "to what the module is sending, and send it nothing",
     )
     _add_raw_settings(one)
-    one.add_argument("--count", type=_at_least_one, help="stop after COUNT messages")
+    one.add_argument("--count", type=values.at_least_one, help="stop after COUNT messages")
     one.add_argument(
-        "--duration", type=_seconds, metavar="S", help="stop after S seconds of recording"
+        "--duration", type=values.seconds, metavar="S", help="stop after S seconds of recording"
     )
     one.add_argument("--session-id", default="", metavar="TEXT", help="name kept in the recording")
     _add_force(one, "replace a recording that is there already")
@@ -145,7 +145,7 @@ def _add_dump(commands: _Commands) -> None:
         "message, as decode does, with its time t_ns. Exit 1 if a part could not be read.",
     )
     one.add_argument(
-        "file", type=_not_empty, metavar="FILE", help="file or directory of a recording"
+        "file", type=values.not_empty, metavar="FILE", help="file or directory of a recording"
     )
     one.add_argument("--samples", action="store_true", help="print arrays whole")
     _add_json(one)
@@ -161,9 +161,14 @@ def _add_convert(commands: _Commands) -> None:
         "suffix is a directory in the vendor's format.",
     )
     one.add_argument(
-        "source", type=_not_empty, metavar="SOURCE", help="any recording that 'xethru dump' reads"
+        "source",
+        type=values.not_empty,
+        metavar="SOURCE",
+        help="any recording that 'xethru dump' reads",
     )
-    one.add_argument("target", type=_not_empty, metavar="TARGET", help="file or directory to write")
+    one.add_argument(
+        "target", type=values.not_empty, metavar="TARGET", help="file or directory to write"
+    )
     _add_force(one, "replace TARGET if it exists")
     _add_json(one)
 
@@ -180,7 +185,7 @@ def _add_decode(commands: _Commands) -> None:
         "explains every byte wins; 01 with a value that modules answer is PONG, else PING.",
     )
     one.add_argument(
-        "file", type=_not_empty, nargs="?", metavar="FILE", help="default: standard input"
+        "file", type=values.not_empty, nargs="?", metavar="FILE", help="default: standard input"
     )
     one.add_argument(
         "--hex",
@@ -217,13 +222,13 @@ def _command(
 def _add_port(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--port",
-        type=_not_empty,
+        type=values.not_empty,
         required=True,
         help="serial port, for example /dev/ttyACM0",
     )
     parser.add_argument(
         "--baudrate",
-        type=_at_least_one,
+        type=values.at_least_one,
         default=115200,
         metavar="RATE",
         help="of a module on a UART (default 115200); without meaning on USB and for emulators",
@@ -231,18 +236,19 @@ def _add_port(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_raw_settings(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
+    group = parser.add_argument_group("raw radar frames")
+    group.add_argument(
         "--frame-area",
         nargs=2,
-        type=_metres,
+        type=values.metres,
         default=(0.2, 9.4),
         metavar=("START", "END"),
         help="range to read, in module metres (default 0.2 9.4)",
     )
-    parser.add_argument(
-        "--fps", type=_frame_rate, default=17.0, help="frames per second (default 17)"
+    group.add_argument(
+        "--fps", type=values.frame_rate, default=17.0, help="frames per second (default 17)"
     )
-    parser.add_argument(
+    group.add_argument(
         "--baseband", action="store_true", help="complex baseband bins instead of RF bins"
     )
 
@@ -253,50 +259,6 @@ def _add_force(parser: argparse.ArgumentParser, text: str) -> None:
 
 def _add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
-
-
-def _frame_rate(text: str) -> float:
-    value = _number(text)
-    if not 0 < value < 65536:
-        raise argparse.ArgumentTypeError(f"{text!r} must be a number between 0 and 65536")
-    return value
-
-
-def _seconds(text: str) -> float:
-    value = _number(text)
-    if not 0 < value <= _LONGEST_S:
-        raise argparse.ArgumentTypeError(f"{text!r} must be seconds, more than 0")
-    return value
-
-
-def _metres(text: str) -> float:
-    value = _number(text)
-    if not -1000 <= value <= 1000:
-        raise argparse.ArgumentTypeError(f"{text!r} must be metres between -1000 and 1000")
-    return value
-
-
-def _not_empty(text: str) -> str:
-    if not text:
-        raise argparse.ArgumentTypeError("an empty name is none")
-    return text
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan  # in no range: the caller says what is allowed
-
-
-def _at_least_one(text: str) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} must be a whole number from 1 on")
-    return value
 
 
 # Each command imports its own module: --help and the other commands stay fast.

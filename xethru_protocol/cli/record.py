@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from xethru_protocol.cli.output import print_json, print_line
+from xethru_protocol.cli.output import one_line, print_json, print_line, warn
 from xethru_protocol.cli.overwriting import make_room
 from xethru_protocol.cli.progress import Progress
 from xethru_protocol.cli.recorder import Recorder, Targets
@@ -51,8 +51,11 @@ def record(
         print_line(f"{targets.text}: {recorder.numbers()}")
     if recorder.failure is not None:
         text = str(recorder.failure)
-        kept = f"; kept {recorder.messages} messages in {targets.text}"
-        raise CommandFailed(text + kept if recorder.messages else text)
+        if recorder.messages:
+            text += f"; kept {recorder.messages} messages in {targets.text}"
+        if not signals:
+            raise CommandFailed(text)
+        warn(f"xethru record: {one_line(text)}")
     return 128 + signals[0] if signals else 0
 
 
