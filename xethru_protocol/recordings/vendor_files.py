@@ -78,7 +78,7 @@ class DataFile:
         try:
             self._stream: BinaryIO = path.open("rb")
             self._size = os.fstat(self._stream.fileno()).st_size
-            if not indexed and isinstance(kind, Layout):
+            if not indexed:
                 start = self._stream.read(_LONGEST_USER_HEADER + 2 * _LARGEST_PLAUSIBLE_RECORD)
                 self.skip(_user_header_bytes(start, self._size, kind))
         except OSError as error:
@@ -158,14 +158,16 @@ class DataFile:
         report(fault, self._on_fault)
 
 
-def _user_header_bytes(start: bytes, size: int, layout: Layout) -> int:
+def _user_header_bytes(start: bytes, size: int, kind: Layout | CsvKind) -> int:
     """Length of what stands before the first record, as far as the records themselves tell.
 
     ``start`` is the beginning of the file of ``size`` bytes. 0 where records begin at once, and
     where no place is better.
     """
+    if isinstance(kind, CsvKind):
+        return max(start.find(kind.header.encode()), 0)
     places = range(min(len(start), _LONGEST_USER_HEADER))
-    return next((at for at in places if _records_follow(start, at, size, layout)), 0)
+    return next((at for at in places if _records_follow(start, at, size, kind)), 0)
 
 
 def _records_follow(start: bytes, position: int, size: int, layout: Layout) -> bool:

@@ -299,6 +299,19 @@ def test_a_user_header_is_found_without_an_index(tmp_path: Path) -> None:
     assert "missing" in faults[0].reason
 
 
+@pytest.mark.parametrize("header", [b"hello", b"two\nlines\n", bytes(range(256)) * 3])
+@pytest.mark.parametrize("message", [frame(7, 50), presence(7)])
+def test_any_user_header_is_found_without_an_index(
+    header: bytes, message: m.Response, tmp_path: Path
+) -> None:
+    with RecordingWriter(tmp_path / "r", user_header=header) as writer:
+        for number in range(3):
+            writer.write(message, number * MS)
+    assert recording_facts(tmp_path / "r").user_header == header
+    (tmp_path / "r" / META).unlink()
+    assert [found for found, _ in read_recording(tmp_path / "r")] == [message] * 3
+
+
 def test_text_files_have_times_of_their_own(tmp_path: Path) -> None:
     copy = copy_of("single", tmp_path)
     (copy / META).unlink()
