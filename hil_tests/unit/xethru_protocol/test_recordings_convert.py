@@ -16,6 +16,10 @@ from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from hil_tests.golden.vectors import FIXTURES
+from hil_tests.unit.slam.app.sessions import scan, session_info
+from slam.app.odometry import OdometryTrack
+from slam.app.session_log import SessionLog
+from slam.app.tum import format_tum_line
 from xethru_protocol import messages as m
 from xethru_protocol.codes import X4Setting
 from xethru_protocol.connection import Connection, Role
@@ -276,6 +280,24 @@ def test_the_definitions_in_the_file_are_those_of_ros(tmp_path: Path) -> None:
                 assert json.loads(data)["message"] == "PRESENCE_SINGLE"
             else:
                 assert (channel.topic, data[0]) == ("/radar/module/payload", 0x50)
+
+
+@pytest.mark.parametrize("n_radars", [1, 2])
+def test_a_session_of_one_radar_is_a_recording(n_radars: int, tmp_path: Path) -> None:
+    poses = [format_tum_line(k * 200_000_000, np.zeros(3)) for k in range(2)]
+    track = OdometryTrack.from_lines(poses)
+    log = SessionLog(tmp_path / "s.mcap", session_info(n_radars), track)
+    for counter in range(3):
+        log.on_scan(scan(counter, n_radars))
+    log.close()
+    if n_radars == 2:
+        with pytest.raises(RecordingError, match=r"several radars \(radar0, radar1\)"):
+            describe_recording(tmp_path / "s.mcap")
+        return
+    sent = [scan(counter, 1).frames[0] for counter in range(3)]
+    assert list(read_recording(tmp_path / "s.mcap")) == [
+        (m.DataFloat(info=frame.counter, values=frame.samples), frame.t_ns) for frame in sent
+    ]
 
 
 def test_a_file_of_several_radars_is_refused(tmp_path: Path) -> None:
