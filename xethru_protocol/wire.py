@@ -263,6 +263,8 @@ class Elements:
             shown[self.label] = list(value) if self.trailer_shown else hex_bytes(value)
         elif isinstance(value, str):
             shown[self.label] = value
+        elif isinstance(value, np.ndarray):
+            shown[self.label] = value.tolist()
         else:
             shown[self.label] = [item.item() if hasattr(item, "item") else item for item in value]
         if self.trailer_shown:
