@@ -1,7 +1,7 @@
 """Procedures as methods: of a driver that blocks, and of one whose methods are awaited."""
 
 import functools
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable, Coroutine
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from xethru_protocol.core import RadarCore
@@ -40,7 +40,7 @@ def blocking_once(procedure: _Written[P, T]) -> Callable[Concatenate[Any, P], T]
     return method
 
 
-def awaited(procedure: _Written[P, T]) -> Callable[Concatenate[Any, P], Awaitable[T]]:
+def awaited(procedure: _Written[P, T]) -> Callable[Concatenate[Any, P], Coroutine[Any, Any, T]]:
     """Make a coroutine method; repeated after a reconnect, if that is on."""
 
     @functools.wraps(procedure)
@@ -52,7 +52,9 @@ def awaited(procedure: _Written[P, T]) -> Callable[Concatenate[Any, P], Awaitabl
     return method
 
 
-def awaited_once(procedure: _Written[P, T]) -> Callable[Concatenate[Any, P], Awaitable[T]]:
+def awaited_once(
+    procedure: _Written[P, T],
+) -> Callable[Concatenate[Any, P], Coroutine[Any, Any, T]]:
     """Do the same, but never repeat."""
 
     @functools.wraps(procedure)

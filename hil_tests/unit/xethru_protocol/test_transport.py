@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import serial
 
 from xethru_protocol.errors import Disconnected, PortUnavailable
 from xethru_protocol.transport import SerialTransport
@@ -101,6 +102,74 @@ def test_line_that_takes_nothing_is_given_up(line: Line, monkeypatch: pytest.Mon
     port = SerialTransport(line.path)
     with pytest.raises(Disconnected, match="takes no data any more; is the module hanging"):
         port.write(bytes(1 << 20))
+    port.close()
+
+
+def test_frame_is_read_in_few_pieces_never_byte_by_byte(line: Line) -> None:
+    """Field measurement: pyserial's read(1) carries 49 frames/s, reads of all there is 43 900."""
+    port = SerialTransport(line.path)
+    os.write(line.master, bytes(5747))  # a radar frame; one read of a tty gives at most 4095
+    sizes: list[int] = []
+    while sum(sizes) < 5747:
+        sizes.append(len(port.read(1.0)))
+    assert len(sizes) == 2
+    port.close()
+
+
+def test_every_byte_passes_unchanged_although_the_line_was_not_raw() -> None:
+    """A fresh pty echoes, edits lines and swallows control bytes, 11h and 13h among them."""
+    master, slave = pty.openpty()
+    port = SerialTransport(os.ttyname(slave))
+    port.write(bytes(range(256)))
+    assert os.read(master, 999) == bytes(range(256))
+    os.write(master, bytes(range(256)))
+    assert port.read(1.0) == bytes(range(256))
+    port.write(b"!")
+    assert os.read(master, 999) == b"!"  # nothing was echoed
+    port.close()
+    os.close(master)
+    os.close(slave)
+
+
+def test_what_waited_from_before_the_opening_is_not_read(line: Line) -> None:
+    os.write(line.master, b"stale")
+    port = SerialTransport(line.path)
+    assert port.read(0.05) == b""
+    port.close()
+
+
+def test_port_without_modem_lines_is_opened_and_closed(line: Line) -> None:
+    with pytest.raises(OSError, match="Inappropriate ioctl"):  # what setting them would say
+        serial.Serial(line.path, timeout=0).dtr = False
+    port = SerialTransport(line.path)
+    port.set_baudrate(921600)
+    port.close()
+
+
+def test_line_is_pending_data_first_then_disconnected(line: Line) -> None:
+    port = SerialTransport(line.path)
+    os.write(line.master, b"last words")
+    assert port.read(0.5) == b"last words"
+    line.unplug()
+    with pytest.raises(Disconnected, match="was disconnected"):
+        port.read(0.0)
+    with pytest.raises(Disconnected, match="cannot be set to 9600 baud"):
+        port.set_baudrate(9600)
+    port.close()
+    with pytest.raises(Disconnected, match="was closed"):
+        port.fileno()
+
+
+def test_only_a_uart_has_a_limit(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
+    port = SerialTransport(line.path)
+    assert port.bytes_per_s == math.inf
+    for real, limit in [
+        ("/dev/ttyUSB0", 11520.0),
+        ("/dev/ttyS1", 11520.0),
+        ("/dev/ttyACM3", math.inf),
+    ]:
+        monkeypatch.setattr("os.path.realpath", lambda path, real=real: real)
+        assert port.bytes_per_s == limit
     port.close()
 
 
