@@ -228,7 +228,7 @@ def _add_port(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--baudrate",
-        type=values.at_least_one,
+        type=values.baud_rate,
         default=115200,
         metavar="RATE",
         help="of a module on a UART (default 115200); without meaning on USB and for emulators",

@@ -71,7 +71,7 @@ def _no_module(machine: Machine) -> str | None:
 def _stale_entries(machine: Machine) -> str | None:
     if not machine.stale:
         return None
-    return f"emulators that have died left {len(machine.stale)} things in {machine.run_directory}"
+    return f"{machine.run_directory} still holds what emulators left that have died"
 
 
 def _damaged_entries(machine: Machine) -> str | None:

@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from types import FrameType
 
 from xethru_protocol.cli.output import one_line, print_json, print_line, warn
-from xethru_protocol.cli.overwriting import make_room
 from xethru_protocol.cli.progress import Progress
 from xethru_protocol.cli.recorder import Recorder, Targets
 from xethru_protocol.cli.recording_modes import RecordingMode
@@ -33,7 +32,7 @@ def record(
     as_json: bool,
 ) -> int:
     """Record until ``count`` messages, ``duration_s``, a signal, unplugging or a full disk."""
-    make_room(targets.paths, replace=replace)
+    targets.make_room(replace=replace)
     signals: list[int] = []
     with Recorder(targets, count) as recorder:
         try:

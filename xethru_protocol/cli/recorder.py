@@ -9,6 +9,7 @@ from types import TracebackType
 from typing import Any, Literal, Self
 
 from xethru_protocol.cli.output import one_line
+from xethru_protocol.cli.overwriting import make_room
 from xethru_protocol.cli.progress import bytes_text
 from xethru_protocol.driver import X4M300
 from xethru_protocol.errors import XeThruError
@@ -61,6 +62,14 @@ class Targets:
     def paths(self) -> tuple[Path, ...]:
         """What there is of both."""
         return tuple(path for path in (self.directory, self.wire) if path is not None)
+
+    def make_room(self, *, replace: bool) -> None:
+        """Remove what an earlier recording left, if that is allowed; see `make_room`."""
+        if self.directory is not None and self.directory.exists() and not self.directory.is_dir():
+            raise RecordingError(f"{self.directory} is no directory; name a new one")
+        if self.wire is not None and self.wire.is_dir():
+            raise RecordingError(f"{self.wire} is a directory; name a file in it")
+        make_room(self.paths, replace=replace)
 
 
 class Recorder:

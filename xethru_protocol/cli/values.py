@@ -53,3 +53,14 @@ def at_least_one(text: str) -> int:
     if value < 1:
         raise ArgumentTypeError(f"{text!r} must be a whole number from 1 on")
     return value
+
+
+def baud_rate(text: str) -> int:
+    """Read a rate that a module could be set to (Protocol reference 4.10)."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
+    if not 600 <= value <= 10_000_000:
+        raise ArgumentTypeError(f"{text!r} must be a whole number from 600 to 10000000")
+    return value

@@ -3,6 +3,7 @@
 import io
 import json
 import resource
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -14,7 +15,7 @@ from hil_tests.unit.xethru_protocol.pty_module import PtyModule
 from hil_tests.unit.xethru_protocol.scripted import frame
 from hil_tests.unit.xethru_protocol.sick_module import Said, SickModule, silent
 from xethru_protocol import messages as m
-from xethru_protocol.cli import main
+from xethru_protocol.cli import main, record
 from xethru_protocol.cli.progress import Progress
 from xethru_protocol.codes import ProfileId, SensorMode, X4Setting
 from xethru_protocol.recordings import read_recording
@@ -91,6 +92,18 @@ def test_force_removes_no_device(module: PtyModule, capsys: Capture) -> None:
     assert main(arguments) == 1
     assert capsys.readouterr().err == ("xethru record: /dev/null is no file; name a new one\n")
     assert Path("/dev/null").exists()
+
+
+def test_force_takes_a_file_for_no_directory_and_back(tmp_path: Path, capsys: Capture) -> None:
+    file, directory = tmp_path / "thesis", tmp_path / "recording"
+    file.write_text("years of work")
+    directory.mkdir()
+    (directory / "xethru_recording_meta.dat").touch()
+    for option, path in (("--out", file), ("--wire", directory)):
+        assert main(["record", "--port", "p", option, str(path), "--force"]) == 1
+        assert f"xethru record: {path} is " in capsys.readouterr().err
+    assert file.read_text() == "years of work"
+    assert len(list(directory.iterdir())) == 1
 
 
 def test_the_wire_alone(module: PtyModule, tmp_path: Path) -> None:
@@ -189,6 +202,8 @@ def test_a_full_disk_keeps_what_is_there(module: PtyModule, tmp_path: Path) -> N
         ["--out", "o", "--profile", "sleep"],
         ["--out", "o", "--frame-area", "3", "2"],
         ["--out", "o", "--baudrate", "fast"],
+        ["--out", "o", "--baudrate", "300"],
+        ["--out", "o", "--baudrate", "99999999999"],
     ],
 )
 def test_wrong_usage(arguments: list[str], capsys: Capture) -> None:
@@ -196,6 +211,24 @@ def test_wrong_usage(arguments: list[str], capsys: Capture) -> None:
         main(["record", "--port", "p", *arguments])
     assert caught.value.code == 2
     assert "usage: xethru" in capsys.readouterr().err
+
+
+def test_the_second_signal_insists() -> None:
+    noted: list[int] = []
+
+    def twice() -> None:
+        with record._noted(noted):
+            signal.raise_signal(signal.SIGINT)
+            assert noted == [signal.SIGINT]
+            signal.raise_signal(signal.SIGINT)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            twice()
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 # --- progress -------------------------------------------------------------------------------------
