@@ -318,15 +318,18 @@ def _record(arguments: argparse.Namespace) -> int:
     from xethru_protocol.raw_config import RawConfig
 
     config = RawConfig(frame_area_m=tuple(arguments.frame_area), downconversion=arguments.baseband)
+    mode = recording_mode(arguments.profile, config, arguments.fps)
     targets = Targets(
         directory=Path(arguments.out) if arguments.out else None,
         wire=Path(arguments.wire) if arguments.wire else None,
         session_id=arguments.session_id,
+        profile_id=mode.profile_id,
+        port=arguments.port,
     )
     return record(
         arguments.port,
         arguments.baudrate,
-        recording_mode(arguments.profile, config, arguments.fps),
+        mode,
         targets,
         count=arguments.count,
         duration_s=arguments.duration,

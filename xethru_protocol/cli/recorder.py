@@ -47,11 +47,17 @@ class Targets:
         File for all bytes of both directions; None: not wanted.
     session_id
         Name kept in the vendor's format.
+    profile_id
+        Profile that runs, kept in the vendor's format; None: none, or not known.
+    port
+        Where the module is, kept in the wire capture.
     """
 
     directory: Path | None
     wire: Path | None
     session_id: str = ""
+    profile_id: int | None = None
+    port: str = ""
 
     @property
     def text(self) -> str:
@@ -110,9 +116,13 @@ class Recorder:
         self._wire: WireCapture | None = None
         try:
             if targets.directory is not None:
-                self._writer = RecordingWriter(targets.directory, session_id=targets.session_id)
+                self._writer = RecordingWriter(
+                    targets.directory,
+                    session_id=targets.session_id,
+                    profile_id=targets.profile_id,
+                )
             if targets.wire is not None:
-                self._wire = WireCapture(targets.wire)
+                self._wire = WireCapture(targets.wire, {"port": targets.port})
         except RecordingError:
             self._remove_empty()
             raise

@@ -4,6 +4,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol
 
+from xethru_protocol.codes import ProfileId
 from xethru_protocol.driver import X4M300, RawConfig
 from xethru_protocol.errors import ResponseTimeout
 
@@ -12,6 +13,10 @@ _FRAMES_AT_ONCE = 100
 
 class RecordingMode(Protocol):
     """How to get a module to send what shall be recorded."""
+
+    @property
+    def profile_id(self) -> int | None:
+        """Profile that runs then; None if that is none, or not known."""
 
     def prepare(self, radar: X4M300) -> None:
         """Bring the module to where it sends nothing yet; what comes meanwhile is old."""
@@ -29,6 +34,7 @@ class RawFrames:
 
     config: RawConfig
     fps: float
+    profile_id: int | None = None
 
     def prepare(self, radar: X4M300) -> None:
         """Configure the chip."""
@@ -46,6 +52,8 @@ class RawFrames:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Presence:
     """Messages of the X4M300's own profile, about one a second."""
+
+    profile_id: int | None = ProfileId.XTS_ID_APP_PRESENCE_2
 
     def prepare(self, radar: X4M300) -> None:
         """Load the profile."""
@@ -68,6 +76,8 @@ class Presence:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Listen:
     """Whatever the module sends by itself."""
+
+    profile_id: int | None = None
 
     def prepare(self, radar: X4M300) -> None:
         """Send nothing."""

@@ -18,7 +18,7 @@ from xethru_protocol import messages as m
 from xethru_protocol.cli import main, record
 from xethru_protocol.cli.progress import Progress
 from xethru_protocol.codes import ProfileId, SensorMode, X4Setting
-from xethru_protocol.recordings import read_recording
+from xethru_protocol.recordings import describe_recording, read_note, read_recording
 
 Capture = pytest.CaptureFixture[str]
 PRESENCE = m.PresenceSingle(counter=3, state=1, distance_m=1.5, direction=0, signal_quality=7)
@@ -110,6 +110,7 @@ def test_the_wire_alone(module: PtyModule, tmp_path: Path) -> None:
     wire = tmp_path / "port.xtwire"
     assert main(["record", "--port", module.path, "--wire", str(wire), "--count", "3"]) == 0
     assert counters(wire)[:3] == [0, 1, 2]
+    assert read_note(wire) == {"port": module.path}
     # what the host sent is there, too: PING comes first (reference 4.1)
     assert bytes.fromhex("7D 01 AE EA AA EE") in wire.read_bytes()
 
@@ -142,6 +143,7 @@ def test_presence_is_loaded_run_and_recorded(tmp_path: Path, capsys: Capture) ->
     ]
     messages = [message for message, _ in read_recording(out)]
     assert messages == [PRESENCE, PRESENCE]
+    assert describe_recording(out).profile_id == 0x014D4AB8
 
 
 def test_nothing_to_record_leaves_nothing(tmp_path: Path, capsys: Capture) -> None:
