@@ -108,11 +108,12 @@ class _Window:
     window that is not escaped by it.
     """
 
-    __slots__ = ("_bytes", "_drop", "_places", "_unescaped", "end", "found")
+    __slots__ = ("_bounds", "_bytes", "_drop", "_places", "_unescaped", "end", "found")
 
     def __init__(self, buffer: bytes, base: int, begin: int) -> None:
-        size = min(_WINDOW, len(buffer) - begin)
-        self._bytes = np.frombuffer(buffer, np.uint8, size, begin)
+        piece = buffer[begin : begin + _WINDOW]  # a copy: the buffer may be large, and done with
+        size = len(piece)
+        self._bytes = np.frombuffer(piece, np.uint8)
         special = np.flatnonzero(self._bytes - np.uint8(START) < 3)  # 7D to 7F; less wraps around
         is_escape = self._bytes[special] == ESCAPE
         # A special byte is free if an even number of 7F stands right before it.
@@ -122,16 +123,17 @@ class _Window:
         free = (order - np.maximum.accumulate(np.where(behind_escape, 0, order))) & 1 == 0
         self._places = special[free & ~is_escape]  # of the terminators
         self._drop = special[free & is_escape]  # bytes that escape the next
-        self._unescaped = b""  # made when the first packet asks
+        self._unescaped = b""  # the window without those, made when the first packet asks
+        self._bounds: list[int] = []  # where the terminators lie in that
         self.found: list[int] = (self._places + (base + begin)).tolist()
         splits = self._drop.size and self._drop[-1] == size - 1
         self.end = base + begin + size - (1 if splits else 0)
 
     def content(self, index: int) -> bytes:
-        """Unescaped bytes between the terminator before the ``index``-th and that one."""
+        """Unescape what lies between the terminator before the ``index``-th and that one."""
         if not self._unescaped:
             keep = np.ones(self._bytes.size, np.bool_)
             keep[self._drop] = False
             self._unescaped = self._bytes[keep].tobytes()
-            self._places -= np.searchsorted(self._drop, self._places)
-        return self._unescaped[self._places[index - 1] + 1 : self._places[index]]
+            self._bounds = (self._places - np.searchsorted(self._drop, self._places)).tolist()
+        return self._unescaped[self._bounds[index - 1] + 1 : self._bounds[index]]

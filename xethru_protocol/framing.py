@@ -3,13 +3,16 @@
 What it guarantees, for any bytes in any chunks:
 
 - The packets and faults depend on the bytes only, not on how they were cut into chunks.
-- It never raises, and once it asks for data it holds less than one packet (65 544 bytes).
+- It never raises, and once it asks for data it holds less than one packet (65 544 bytes) that
+  is not judged, in whatever chunks these came.
 - Starts are tried in the order of their position and the first that holds wins. So an intact
   packet is found unless an earlier start makes a valid packet out of its bytes: a Normal packet
-  whose checksum happens to fit (1 in 256 for random bytes) or a NoEscape header that happens to
-  be consistent. Junk without a start cannot hide anything; a stray 7D delays what follows until
+  whose checksum happens to fit (1 in 256 for random bytes; always when the end of an intact
+  packet became 7F, since the two checksums cancel) or a NoEscape header that happens to be
+  consistent. Junk without a start cannot hide anything; a stray 7D delays what follows until
   it is refuted, by the next unescaped 7D or 7E or at the longest possible packet.
 - Every byte is searched and parsed a bounded number of times, also in input made to hurt.
+- `LinkStatistics` counts every byte: in a packet, junk, or not judged yet.
 
 The last point rests on one fact. Let a Normal packet started at s be parsed up to its
 terminator t. A 7D between the two was not a terminator, so it was escaped, so the parse is in
