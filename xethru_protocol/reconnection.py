@@ -228,7 +228,7 @@ def _find_again(
                 why = str(error)
         yield CloseLine()
         left_s = core.left_s(deadline_ns)
-        if left_s <= 0:
+        if left_s <= 0 or core.closed:
             raise Disconnected(
                 f"the module of {lost} did not come back within {timeout_s:g} s: {why}"
             )
