@@ -1,5 +1,6 @@
 """The receiver at single points: what damage it sees, what it keeps, what it costs."""
 
+import re
 import sys
 from types import FrameType
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from xethru_protocol import finders
 from xethru_protocol.errors import LocalProtocolError
 from xethru_protocol.framing import (
     MAX_NORMAL_WIRE_BYTES,
@@ -230,3 +232,42 @@ def test_bytes_are_searched_a_bounded_number_of_times(name: str) -> None:
     while reader.next_packet() is not NEED_DATA:
         pass
     assert _CountingBytes.searched < 8 * size
+
+
+class _CountingContent:
+    """A regular expression that counts the bytes it goes over."""
+
+    def __init__(self, pattern: re.Pattern[bytes]) -> None:
+        self._pattern = pattern
+        self.searched = 0
+
+    def match(self, buffer: bytes, begin: int, stop: int) -> re.Match[bytes] | None:
+        found = self._pattern.match(buffer, begin, stop)
+        assert found is not None
+        self.searched += found.end() - begin
+        return found
+
+
+@pytest.mark.parametrize("chunk", [100, 3000, 1 << 20])
+@pytest.mark.parametrize("name", HOSTILE)
+def test_terminators_are_looked_for_once_in_every_byte(
+    name: str, chunk: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    size = 50_000
+    pattern = HOSTILE[name]
+    data = (pattern * (size // len(pattern) + 1))[:size]
+    content = _CountingContent(finders._CONTENT)
+    marked = []
+
+    class CountingWindow(finders._Window):
+        def __init__(self, buffer: bytes, base: int, begin: int) -> None:
+            super().__init__(buffer, base, begin)
+            marked.append(self.end - base - begin)
+
+    monkeypatch.setattr(finders, "_CONTENT", content)
+    monkeypatch.setattr(finders, "_Window", CountingWindow)
+    reader = PacketReader()
+    for begin in range(0, size, chunk):
+        reader.receive_data(data[begin : begin + chunk])
+        drain(reader)
+    assert content.searched + sum(marked) <= size
