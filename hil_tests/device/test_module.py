@@ -35,6 +35,7 @@ def test_raw_frames(radar: X4M300, downconversion: bool, bins: int) -> None:
     assert {frame.samples.shape for frame in frames} == {(bins,)}
     assert all(np.isfinite(frame.samples).all() for frame in frames)
     assert (radar.frames_lost, radar.fault_count) == (0, 0)
+    assert radar.statistics.off_lattice_samples == 0
 
 
 def test_samples_lie_on_the_quantisation_grid(radar: X4M300) -> None:
@@ -55,7 +56,18 @@ def test_settings_read_back(radar: X4M300) -> None:
     assert settings[X4Setting.DACMAX] == 1100
     assert settings[X4Setting.ITERATIONS] == 16
     assert settings[X4Setting.PULSESPERSTEP] == 300
+    assert settings[X4Setting.DACSTEP] == 0
+    assert settings[X4Setting.PRFDIV] == 16
     assert settings[X4Setting.FRAMEAREA] == pytest.approx((0.199290, 9.400679), abs=1e-6)
+
+
+def test_it_is_ready_again_after_a_reset(radar: X4M300) -> None:
+    """Protocol reference 8.1: ready again after 2 ... 9 s, X4 settings gone."""
+    radar.configure_raw(RawConfig(iterations=8))
+    radar.reset(wait=True)
+    assert radar.ping() is PongCode.XTS_SPRP_READY
+    radar.configure_raw()
+    assert radar.x4_settings()[X4Setting.ITERATIONS] == 16
 
 
 @pytest.mark.parametrize(
