@@ -76,8 +76,9 @@ def _record_from(
                     raise ResponseTimeout(f"the module sent nothing to record in {duration_s:g} s")
                 break
             if recorder.silent_s > silence_s:
+                likely = "it has restarted meanwhile" if radar.reboots else "did it stop?"
                 raise ResponseTimeout(
-                    f"the module sent nothing to record for {silence_s:g} s; did it stop?"
+                    f"the module sent nothing to record for {silence_s:g} s; {likely}"
                 )
             left_s = _GLANCE_S if duration_s is None else duration_s - recorder.elapsed_s
             mode.wait(radar, min(_GLANCE_S, left_s))  # the recorder hears what comes

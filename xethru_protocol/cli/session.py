@@ -30,12 +30,13 @@ def module_at(port: str, baudrate: int) -> Iterator[X4M300]:
         with radar:
             try:
                 yield radar
-            finally:  # what the driver skips to stop the module is no loss
-                losses = _losses(radar)
+            finally:
+                losses = _losses(radar)  # what is skipped to stop the module is no loss
+                say_warnings(radar)
     except Disconnected:  # that it could not be stopped goes without saying
         raise
     except XeThruError as error:
-        if radar.warnings:
+        if radar.warnings:  # of closing
             raise CommandFailed(f"{error} (and it could not be stopped)") from error
         raise
     except BaseException:

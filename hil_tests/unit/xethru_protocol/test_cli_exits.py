@@ -103,11 +103,18 @@ class Hanging:
         self.warnings.append("the module was not stopped: no answer")
 
 
+class Stoppable(Hanging):
+    """A driver whose module is stopped at the end."""
+
+    def __exit__(self, *reason: object) -> None:
+        """Stop it."""
+
+
 @contextmanager
-def hanging(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(X4M300, "open", lambda port, baudrate: Hanging())
+def opened(driver: Hanging, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hanging]:
+    monkeypatch.setattr(X4M300, "open", lambda port, baudrate: driver)
     with session.module_at("port", 115200):
-        yield
+        yield driver
 
 
 def test_the_cause_comes_first_and_in_one_line(
@@ -115,7 +122,7 @@ def test_the_cause_comes_first_and_in_one_line(
 ) -> None:
     with (
         pytest.raises(session.CommandFailed, match=r"^no frame came \(and it could not be stopp"),
-        hanging(monkeypatch),
+        opened(Hanging(), monkeypatch),
     ):
         raise ResponseTimeout("no frame came")
     assert capsys.readouterr().err == ""
@@ -124,15 +131,27 @@ def test_the_cause_comes_first_and_in_one_line(
 def test_of_a_port_that_went_only_that_is_said(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(Disconnected, match=r"^unplugged$"), hanging(monkeypatch):
+    with pytest.raises(Disconnected, match=r"^unplugged$"), opened(Hanging(), monkeypatch):
         raise Disconnected("unplugged")
     assert capsys.readouterr().err == ""
+
+
+def test_a_warning_of_before_is_no_failure_to_stop(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with (
+        pytest.raises(ResponseTimeout, match=r"^no frame came$"),
+        opened(Stoppable(), monkeypatch) as radar,
+    ):
+        radar.warnings.append("30 frames/s are many")
+        raise ResponseTimeout("no frame came")
+    assert capsys.readouterr().err == "xethru: 30 frames/s are many\n"
 
 
 def test_after_a_signal_it_is_a_warning(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(KeyboardInterrupt), hanging(monkeypatch):
+    with pytest.raises(KeyboardInterrupt), opened(Hanging(), monkeypatch):
         raise KeyboardInterrupt
     assert capsys.readouterr().err == (
         "xethru: the module was not stopped: no answer\n"
