@@ -1,0 +1,84 @@
+"""Speed of both drivers on a pty, as `configure_raw` leaves them: ``make bench``.
+
+Numbers are reported, never asserted: a timed test fails for the wrong reasons.
+"""
+
+import asyncio
+import os
+import pty
+import subprocess
+import sys
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from xethru_protocol import messages as m
+from xethru_protocol.async_driver import AsyncX4M300
+from xethru_protocol.connection import Connection, Role
+from xethru_protocol.driver import X4M300, FrameGeometry, RawConfig
+
+FRAMES = 2000
+GEOMETRY = FrameGeometry(range_start_m=0.2, bin_length_m=0.0064, n_bins=1431, downconversion=False)
+_WRITER = """
+import os, sys
+stream = memoryview(open(sys.argv[2], "rb").read())
+while True:
+    rest = stream
+    while rest:
+        rest = rest[os.write(int(sys.argv[1]), rest[:65536]):]
+"""
+
+
+@pytest.fixture
+def port(tmp_path: Path) -> Iterator[str]:
+    """Pty into which another process writes quantised frames without end."""
+    counters = np.random.default_rng(0).integers(0, 729_600, (200, 1431))
+    samples = counters.astype(np.float32) * np.float32(2.03450526e-07) - np.float32(0.07421875)
+    module = Connection(Role.MODULE)
+    frames = (module.send(m.DataFloat(info=k, values=samples[k])) for k in range(200))
+    (tmp_path / "stream").write_bytes(b"".join(frames) * 10)
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    command = [sys.executable, "-c", _WRITER, str(master), str(tmp_path / "stream")]
+    with subprocess.Popen(command, pass_fds=[master]) as writer:
+        yield os.ttyname(slave)
+        writer.kill()
+    os.close(master)
+    os.close(slave)
+
+
+@pytest.mark.parametrize("checked", [True, False], ids=["lattice checked", "not checked"])
+def test_blocking_driver(benchmark: Any, port: str, checked: bool) -> None:  # noqa: ANN401 - the plugin has no types
+    """Bar: 20 000 frames/s."""
+    radar = X4M300.open(port)
+    radar.geometry = GEOMETRY
+    radar._core.frames.lattice = RawConfig().lattice if checked else None
+    radar.read_frame(timeout_s=10.0)
+    assert benchmark(lambda: sum(1 for _ in radar.frames(FRAMES))) == FRAMES
+    assert radar.statistics.off_lattice_samples == 0
+    benchmark.extra_info["frames_per_s"] = FRAMES / benchmark.stats["min"]
+    radar.close()
+
+
+def test_asynchronous_driver(benchmark: Any, port: str) -> None:  # noqa: ANN401 - the plugin has no types
+    with asyncio.Runner() as runner:
+
+        async def begin() -> AsyncX4M300:
+            radar = AsyncX4M300.open(port)
+            radar.geometry = GEOMETRY
+            radar._core.frames.lattice = RawConfig().lattice
+            await radar.read_frame(timeout_s=10.0)
+            return radar
+
+        radar = runner.run(begin())
+
+        async def read() -> int:
+            return len([None async for _ in radar.frames(FRAMES)])
+
+        assert benchmark(lambda: runner.run(read())) == FRAMES
+        benchmark.extra_info["frames_per_s"] = FRAMES / benchmark.stats["min"]
+        runner.run(radar.close())
