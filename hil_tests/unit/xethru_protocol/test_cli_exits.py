@@ -111,10 +111,10 @@ class Stoppable(Hanging):
 
 
 @contextmanager
-def opened(driver: Hanging, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hanging]:
+def opened(driver: Hanging, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(X4M300, "open", lambda port, baudrate: driver)
     with session.module_at("port", 115200):
-        yield driver
+        yield
 
 
 def test_the_cause_comes_first_and_in_one_line(
@@ -139,11 +139,12 @@ def test_of_a_port_that_went_only_that_is_said(
 def test_a_warning_of_before_is_no_failure_to_stop(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    radar = Stoppable()
+    radar.warnings.append("30 frames/s are many")
     with (
         pytest.raises(ResponseTimeout, match=r"^no frame came$"),
-        opened(Stoppable(), monkeypatch) as radar,
+        opened(radar, monkeypatch),
     ):
-        radar.warnings.append("30 frames/s are many")
         raise ResponseTimeout("no frame came")
     assert capsys.readouterr().err == "xethru: 30 frames/s are many\n"
 
