@@ -6,6 +6,7 @@ from dataclasses import asdict
 from xethru_protocol.cli.output import print_json, print_line
 from xethru_protocol.cli.session import module_at
 from xethru_protocol.codes import PongCode
+from xethru_protocol.messages import X4Value
 from xethru_protocol.ports import find_ports
 
 _STATE = {
@@ -54,10 +55,17 @@ def info(port: str, baudrate: int, *, as_json: bool) -> int:
         return 0
     for name, value in about.items():
         print_line(f"{name.replace('_', ' '):<20} {'-' if value is None else value}")
-    for name, value in chip.items():
-        text = " ... ".join(map(str, value)) if isinstance(value, tuple) else value
-        print_line(f"X4 {name:<17} {'-' if value is None else text}")
+    for setting, number in chip.items():
+        print_line(f"X4 {setting:<17} {_number(number)}")
     return 0
+
+
+def _number(value: X4Value | None) -> str:
+    if isinstance(value, tuple):
+        return " ... ".join(map(_number, value))
+    if isinstance(value, float):
+        return f"{value:.7g}"  # as far as float32 is exact
+    return "-" if value is None else str(value)
 
 
 def reset(port: str, baudrate: int, *, as_json: bool) -> int:

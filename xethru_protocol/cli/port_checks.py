@@ -266,7 +266,8 @@ PORT_CHECKS = (
         name="answers",
         looks_at="the answer to PING, at all rates on a UART",
         find=_silent,
-        remedy=f"is a module there, and powered? If so, {_POWER_CYCLE}",
+        remedy="is a module there, and powered? One that has just restarted needs ten seconds; "
+        f"if it stays silent, {_POWER_CYCLE}",
         ends=True,
     ),
     Check(

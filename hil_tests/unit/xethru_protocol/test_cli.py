@@ -99,7 +99,9 @@ def test_ping_and_info(module: PtyModule, capsys: pytest.CaptureFixture[str]) ->
     assert info["mode"] == "MANUAL"
     assert info["x4"]["FRAMEBINCOUNT"] == 1431
     assert main(["info", "--port", module.path]) == 0
-    assert "serial number        123456789012\n" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert "serial number        123456789012\n" in text
+    assert "X4 FRAMEAREA         0.1992901 ... 9.400679\n" in text
 
 
 def test_reset(module: PtyModule, capsys: pytest.CaptureFixture[str]) -> None:
