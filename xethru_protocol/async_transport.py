@@ -9,6 +9,7 @@ from xethru_protocol.transport import SerialTransport
 
 _WRITE_TIMEOUT_S = 5.0
 _LONGEST_WAIT_S = 86400.0
+_TURN_S = 0.005  # how long one task may read on while data never end
 
 
 class AsyncTransport(Protocol):
@@ -37,6 +38,7 @@ class AsyncSerialTransport:
     def __init__(self, path: str, baudrate: int = 115200) -> None:
         self._port = SerialTransport(path, baudrate)
         self._waiting: set[_Waiting] = set()
+        self._turn_ends_s = 0.0
 
     @property
     def name(self) -> str:
@@ -55,10 +57,13 @@ class AsyncSerialTransport:
     async def read(self, timeout_s: float) -> bytes:
         """See `AsyncTransport.read`."""
         data = self._port.read(0.0)
-        if data or timeout_s <= 0:
-            await asyncio.sleep(0)  # a stream that never pauses must not stop the other tasks
-            return data
         loop = asyncio.get_running_loop()
+        if data or timeout_s <= 0:
+            if loop.time() > self._turn_ends_s:  # a line that never pauses: now the other tasks
+                await asyncio.sleep(0)
+                self._turn_ends_s = loop.time() + _TURN_S
+            return data
+        self._turn_ends_s = loop.time() + _TURN_S
         if not await self._wait(loop.add_reader, loop.remove_reader, timeout_s):
             return b""
         return self._port.read(0.0)
@@ -89,14 +94,15 @@ class AsyncSerialTransport:
     ) -> bool:
         """Wait until the descriptor is ready; False if it is not in time."""
         waiting = _Waiting(self._waiting, self._port.fileno(), unwatch)
-        watch(waiting.descriptor, waiting.wake)
+        watch(waiting.descriptor, waiting.end, True)
+        limit_s = min(max(timeout_s, 0.0), _LONGEST_WAIT_S)
+        # half the cost of wait_for(), which a stream of frames would feel
+        timer = asyncio.get_running_loop().call_later(limit_s, waiting.end, False)
         try:
-            await asyncio.wait_for(waiting.ready, min(max(timeout_s, 0.0), _LONGEST_WAIT_S))
-        except TimeoutError:
-            return False
+            return await waiting.ready
         finally:
+            timer.cancel()
             waiting.unwatch()
-        return True
 
 
 class _Waiting:
@@ -106,14 +112,14 @@ class _Waiting:
         self, others: "set[_Waiting]", descriptor: int, unwatch: Callable[[int], object]
     ) -> None:
         self.descriptor = descriptor
-        self.ready: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self.ready: asyncio.Future[bool] = asyncio.get_running_loop().create_future()
         self._others = others
         self._unwatch = unwatch
         others.add(self)
 
-    def wake(self) -> None:
+    def end(self, ready: bool) -> None:
         if not self.ready.done():
-            self.ready.set_result(None)
+            self.ready.set_result(ready)
 
     def unwatch(self) -> None:
         if self in self._others:
