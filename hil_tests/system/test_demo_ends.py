@@ -1,6 +1,7 @@
 """How a demo ends when it does not end well: one line, the right code, nothing left behind."""
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -102,6 +103,38 @@ def test_ctrl_c_half_way(tmp_path: Path) -> None:
     counters = finished_counters(out / "session.mcap")
     assert counters == list(range(len(counters)))
     assert abs(count_rows(out / "session.rrd")["/radar/left_rear/frame"] - len(counters)) <= 1
+
+
+def test_a_closed_terminal_half_way(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with running_demo(out, tmp_path / "tmp") as demo:
+        (emulator,) = children(demo.pid)
+        for _ in range(2):  # the kernel's and the shell's
+            demo.send_signal(signal.SIGHUP)
+        _, stderr = demo.communicate(timeout=20)
+    assert demo.returncode == 129
+    assert stderr.splitlines()[-1] == f"uwb-slam: stopped by SIGHUP; what was recorded is in {out}"
+    assert is_gone(emulator)
+    counters = finished_counters(out / "session.mcap")
+    assert counters == list(range(len(counters)))
+
+
+def test_a_file_that_may_not_grow_is_one_line(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "slam.app.cli", "demo"]
+    command += ["--scene", str(write_short_scene(tmp_path)), "--out", str(tmp_path / "out")]
+    limit = 1_000_000  # bytes, of which the session takes several times as many
+    run = subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+    )
+    assert (run.returncode, run.stdout) == (1, "")
+    *progress, last = run.stderr.splitlines()
+    assert last.startswith(f"uwb-slam: {tmp_path / 'out'}/session.")
+    assert all(line.startswith("scene time") for line in progress), run.stderr
 
 
 @pytest.mark.parametrize("step", ["summarise", "_write_trajectories", "print_table"])

@@ -166,6 +166,7 @@ class RerunView:
         closing.start()
         closing.join(_CLOSE_LIMIT_S)
         if closing.is_alive():
+            rr.unregister_shutdown()  # or it waits once more when the interpreter ends
             raise AppError(f"{self._path}: cannot be finished; is the disk full?")
         try:
             found = count_rows(self._path)

@@ -17,6 +17,7 @@ from multiprocessing import resource_tracker
 from typing import TypeVar, cast
 
 import joblib
+from joblib.externals.loky.backend import resource_tracker as loky_tracker
 
 from slam.app.parent_death import signal_at_parents_death
 
@@ -84,12 +85,29 @@ def _signals_left_to_the_parent() -> Iterator[None]:
     """
     # Python 3.11's tracker unblocks SIGINT and SIGTERM when it is first needed, that is, when the
     # first worker is about to start. Running already, it does so no more.
-    resource_tracker.ensure_running()
+    _start_trackers()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _LEFT_TO_THE_PARENT)
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _start_trackers() -> None:
+    """Start the processes that remove what killed workers leave behind, and let them do it quietly.
+
+    They warn on our stderr about each semaphore that somebody left, or removed before them.
+    """
+    before = os.environ.get("PYTHONWARNINGS")
+    os.environ["PYTHONWARNINGS"] = ",".join(filter(None, (before, "ignore:resource_tracker")))
+    try:
+        resource_tracker.ensure_running()
+        loky_tracker.ensure_running()
+    finally:
+        if before is None:
+            del os.environ["PYTHONWARNINGS"]
+        else:
+            os.environ["PYTHONWARNINGS"] = before
 
 
 def _belong_to(parent: int) -> None:

@@ -86,6 +86,19 @@ def test_work_that_is_thrown_away_ends_at_once_and_without_a_word(tmp_path: Path
     assert (process.returncode, output, errors) == (0, "", "")
 
 
+def test_what_killed_workers_leave_is_removed_without_a_word(tmp_path: Path) -> None:
+    body = (
+        "from joblib.externals.loky.backend import resource_tracker\n"
+        "with worker_results(work, [('pid',)] * 2, 2) as results:\n"
+        "    list(results)\n"
+        "resource_tracker.register('/gone', 'semlock')\n"
+        "print('PYTHONWARNINGS' in os.environ)\n"
+    )
+    with started(tmp_path, body) as process:
+        output, errors = process.communicate(timeout=15)
+    assert (process.returncode, output, errors) == (0, "False\n", "")
+
+
 def test_a_worker_that_dies_breaks_the_results(tmp_path: Path) -> None:
     body = (
         "from concurrent.futures import BrokenExecutor\n"
