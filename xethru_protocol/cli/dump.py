@@ -48,7 +48,7 @@ def message_line(message: Response, *, with_samples: bool) -> str:
     >>> import numpy as np
     >>> message = DataFloat(info=7, values=np.arange(5, dtype=np.float32) / 3)
     >>> message_line(message, with_samples=False)
-    'DATA_FLOAT content_id=0 info=7 values=[0, 0.333333, 0.666667, ... 5 in all]'
+    'DATA FLOAT content_id=0 info=7 length=5 data=[0, 0.333333, 0.666667, ... 5 in all]'
     """
     name, shown = describe(message)
     parts = (f"{key}={_text(value, with_samples)}" for key, value in shown.items())
