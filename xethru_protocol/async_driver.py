@@ -182,12 +182,13 @@ class AsyncX4M300(DriverFacts):
         core = self._core
         if core.reconnect_s > 0 and core.identity is None:
             await self._run(reconnection.identify_quietly(core))
-        while True:
+        for _ in range(reconnection.RECONNECTS_PER_CALL):
             generation = core.generation
             try:
                 return await self._carry(procedure())
             except Disconnected as error:
                 await self._run(reconnection.recover(core, generation, error))
+        return await self._carry(procedure())
 
     async def _carry(self, procedure: Procedure[T]) -> T:
         try:

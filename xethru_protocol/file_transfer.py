@@ -121,6 +121,8 @@ def write(
     body = _write_chunks(core, file_type, identifier, data, on_progress)
     try:
         yield from _then_close(core, file_type, identifier, body)
+    except GeneratorExit:
+        raise
     except BaseException:
         yield from _quietly(core, delete(core, file_type, identifier))
         raise
@@ -212,6 +214,8 @@ def _then_close(
     close = request(core, m.CloseFile(file_type=file_type, identifier=identifier))
     try:
         result = yield from body
+    except GeneratorExit:  # nobody carries steps out any more
+        raise
     except BaseException:  # also an interrupt: the module has room for ten open files
         yield from _quietly(core, close)
         raise

@@ -28,7 +28,7 @@ _BOOT_S = 3.0  # a module that keeps its port says READY by then
 _ASK_S = 0.5  # one PING to a port that may be deaf yet
 _LOOK_AGAIN_S = 0.2
 _FOREIGN_NS = 3_000_000_000  # how long a port is left alone that was another module's
-_RECONNECTS_PER_CALL = 3  # then the module is in a restart loop, and the user should know
+RECONNECTS_PER_CALL = 3  # then the module is in a restart loop, and the user should know
 
 T = TypeVar("T")
 
@@ -148,7 +148,7 @@ def resilient(core: RadarCore, procedure: Callable[[], Procedure[T]]) -> Procedu
     """Run a procedure; if the line breaks meanwhile and the user wants so, reconnect and repeat."""
     if core.reconnect_s > 0:
         yield from identify_quietly(core)
-    for _ in range(_RECONNECTS_PER_CALL):
+    for _ in range(RECONNECTS_PER_CALL):
         generation = core.generation
         try:
             return (yield from procedure())

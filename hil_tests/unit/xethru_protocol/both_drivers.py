@@ -92,7 +92,7 @@ class DriverOn(Protocol):
         self,
         answer: Answer | None = None,
         *,
-        ports: dict[str, Callable[[], ScriptedTransport]] | None = None,
+        ports: dict[str, Callable[[int], ScriptedTransport]] | None = None,
         name: str = "the port",
         **options: Any,  # noqa: ANN401 - those of the drivers
     ) -> tuple[X4M300, ScriptedTransport]:
@@ -105,7 +105,7 @@ def driver_factory(kind: str, runner: asyncio.Runner) -> DriverOn:
     def driver_on(
         answer: Answer | None = None,
         *,
-        ports: dict[str, Callable[[], ScriptedTransport]] | None = None,
+        ports: dict[str, Callable[[int], ScriptedTransport]] | None = None,
         name: str = "the port",
         **options: Any,  # noqa: ANN401 - those of the drivers
     ) -> tuple[X4M300, ScriptedTransport]:
@@ -113,7 +113,7 @@ def driver_factory(kind: str, runner: asyncio.Runner) -> DriverOn:
         known = ports or {}
 
         def open_line(path: str, baudrate: int) -> ScriptedTransport:
-            return known[path]()
+            return known[path](baudrate)
 
         def pass_time(seconds: float) -> None:
             line.now_ns += round(seconds * 1e9)

@@ -1,8 +1,10 @@
 """A machine with ports at which scripted modules appear, on one virtual clock."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 
-from hil_tests.unit.xethru_protocol.scripted import Answer, ScriptedTransport
+from hil_tests.unit.xethru_protocol.scripted import Answer, PlainModule, ScriptedTransport
+from xethru_protocol import messages as m
 from xethru_protocol.errors import PortUnavailable
 
 
@@ -30,22 +32,53 @@ class Machine:
         self._first = first
 
     @property
-    def ports(self) -> dict[str, Callable[[], ScriptedTransport]]:
-        """How to open each port."""
-        return {path: lambda path=path: self._open(path) for path in self._paths}  # type: ignore[misc] # a default binds it
+    def ports(self) -> dict[str, Callable[[int], ScriptedTransport]]:
+        """How to open each port at a baud rate."""
+        return {path: partial(self._open, path) for path in self._paths}
 
     def asked(self, path: str) -> list[object]:
         """Everything the module behind a port was asked."""
         return [command for line in self.lines if line.name == path for command in line.received]
 
-    def _open(self, path: str) -> ScriptedTransport:
+    def _open(self, path: str, baudrate: int) -> ScriptedTransport:
         assert self._first is not None
         module, from_ns = self._behind.get(path, (None, 0))
         if module is None or self._first.now_ns < from_ns:
             raise PortUnavailable(f"there is no port {path}")
         line = _SameClock(module, path, self._first)
+        if isinstance(module, UartModule):
+            module.connect(line, baudrate)
         self.lines.append(line)
         return line
+
+
+class UartModule(PlainModule):
+    """A module that hears and is heard only at its own baud rate."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.baudrate = 115200
+        self._line_rate = 115200
+
+    def connect(self, line: ScriptedTransport, baudrate: int) -> None:
+        """Be at the other end of a line."""
+        self._line_rate = baudrate
+        line.bytes_per_s = 11520.0
+        line.set_baudrate = self._set_line_rate
+
+    def _set_line_rate(self, baudrate: int) -> None:
+        self._line_rate = baudrate
+
+    def __call__(self, command: m.Message) -> Sequence[m.Message | bytes]:
+        """Answer, if the rates are the same."""
+        if self._line_rate != self.baudrate:
+            return []
+        answer = super().__call__(command)
+        if isinstance(command, m.SetBaudRate):
+            self.baudrate = command.baudrate  # behind the answer, which goes out at the old rate
+        if isinstance(command, m.ModReset):
+            self.baudrate = 115200
+        return answer
 
 
 class _SameClock(ScriptedTransport):

@@ -1,5 +1,6 @@
 """A line to a module that says what a test wrote down, on a virtual clock."""
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -27,6 +28,8 @@ class ScriptedTransport:
         self.closed = False
         self.gone = False
         self.vanishes_ns: int | None = None
+        self.bytes_per_s = math.inf
+        self.set_baudrate: Callable[[int], object] = lambda baudrate: None
         self.pending: list[bytes] = []
         self.timed: list[tuple[int, bytes]] = []
         self._answer = answer

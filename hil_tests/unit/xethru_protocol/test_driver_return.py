@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import pytest
 
 from hil_tests.unit.xethru_protocol.both_drivers import DriverOn
-from hil_tests.unit.xethru_protocol.machine import Machine
+from hil_tests.unit.xethru_protocol.machine import Machine, UartModule
 from hil_tests.unit.xethru_protocol.scripted import PlainModule, ScriptedTransport, frame
 from xethru_protocol import messages as m
 from xethru_protocol.codes import OutputFeature, PongCode, SensorMode, X4Setting
@@ -315,6 +315,36 @@ def test_profile_is_set_up_again_after_a_return(driver_on: DriverOn, machine: Ma
         m.SetMode(mode=SensorMode.XTID_SM_RUN),
         m.Ping(),
     ]
+
+
+def test_uart_is_talked_to_at_its_own_rate_again_after_a_reset(driver_on: DriverOn) -> None:
+    """It starts at 115200 whatever it was set to. Protocol reference 10."""
+    uart = UartModule()
+    radar, line = driver_on(uart)
+    uart.connect(line, 115200)
+    radar.set_baud_rate(921600)
+    assert (uart.baudrate, radar.ping()) == (921600, PongCode.XTS_SPRP_READY)
+    radar.reset(wait=True)
+    assert (uart.baudrate, radar.ping()) == (921600, PongCode.XTS_SPRP_READY)
+
+
+@pytest.mark.parametrize("rate", [115200, 921600], ids=["restarted", "kept its power"])
+def test_uart_is_found_again_at_either_rate(
+    driver_on: DriverOn, machine: Machine, rate: int
+) -> None:
+    uart, back = UartModule(), UartModule()
+    back.baudrate = rate
+    machine.plug(HOME, back)
+    radar, line = driver_on(uart, ports=machine.ports, name=HOME, reconnect_s=9.0)
+    machine.runs_on(line)
+    uart.connect(line, 115200)
+    radar._core.bytes_per_s = line.bytes_per_s
+    radar.set_baud_rate(921600)
+    radar.ping()
+    unplug(line)
+    assert radar.ping() is PongCode.XTS_SPRP_READY
+    assert back.baudrate == 921600
+    assert radar.reconnects == 1
 
 
 def test_closing_after_the_module_vanished_does_not_look_for_it(

@@ -194,7 +194,7 @@ def test_baud_rate_changes_on_both_sides_with_the_vendors_pauses(driver_on: Driv
         return plain(command)
 
     radar, line = driver_on(module)
-    line.set_baudrate = lambda rate: changes.append((rate, line.now_ns))  # type: ignore[attr-defined] # UARTs have it
+    line.set_baudrate = lambda rate: changes.append((rate, line.now_ns))
     radar.set_baud_rate(921600)
     assert line.received[0] == m.SetBaudRate(baudrate=921600)
     (rate, changed_ns), (last, pinged_ns) = changes[0], asked[-1]
@@ -209,7 +209,7 @@ def test_module_that_is_silent_at_the_new_rate_is_talked_to_at_the_old_one(
 ) -> None:
     changes: list[int] = []
     radar, line = driver_on(lambda c: [m.Ack()] if isinstance(c, m.SetBaudRate) else [])
-    line.set_baudrate = changes.append  # type: ignore[attr-defined] # UARTs have it
+    line.set_baudrate = changes.append
     with pytest.raises(ResponseTimeout, match="not answer at 38400 baud; this side is back at 115"):
         radar.set_baud_rate(38400)
     assert changes == [38400, 115200]
