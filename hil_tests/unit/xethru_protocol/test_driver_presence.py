@@ -158,6 +158,15 @@ def test_messages_come_typed_and_in_order_and_frames_stay_frames(driver_on: Driv
         next(radar.presence.messages())
 
 
+def test_messages_of_what_ran_before_are_not_the_loaded_profiles(driver_on: DriverOn) -> None:
+    radar, line = driver_on(ProfileModule())
+    radar.presence.load()
+    line.say(presence(1, PRESENCE))
+    radar.presence.load()
+    line.say(presence(2, PRESENCE))
+    assert next(radar.presence.messages()) == presence(2, PRESENCE)
+
+
 def test_messages_nobody_asked_for_are_not_kept(driver_on: DriverOn) -> None:
     radar, line = driver_on()
     radar.configure_raw()
