@@ -35,6 +35,11 @@ _ELEMENT_BYTES: dict[int, int] = {
     ElementType.XTS_SPRD_STRING: 1,
     ElementType.XTS_SPRD_USER: 1,
 }
+# Messages that end with their elements: bytes per element, by type.
+_LISTS: dict[int, dict[int, int]] = {
+    ResponseCode.XTS_SPR_DATA: _ELEMENT_BYTES,
+    ResponseCode.XTS_SPR_HIL: _ELEMENT_BYTES | {ElementType.XTS_SPRD_NONE: 1},
+}
 # APPDATA with bulk content: (header bytes, offset of the bin count if within the head, bytes
 # per bin). Pulse-Doppler and noise maps count their bins behind the head.
 _APPDATA: dict[int, tuple[int, int | None, int]] = {
@@ -71,14 +76,14 @@ def plausible(  # noqa: PLR0911 - one return per kind of message
         return True
     code = head[0]
     from_module = direction is Direction.FROM_MODULE
-    if code == ResponseCode.XTS_SPR_DATA:
-        size = _ELEMENT_BYTES.get(head[1])
+    if code in _LISTS and from_module:
+        size = _LISTS[code].get(head[1])
         return size is not None and HEAD_BYTES + _count(head, 10) * size == length
     if code == ResponseCode.XTS_SPR_REPLY and from_module:
         size = _ELEMENT_BYTES.get(head[1])
         trailers = (0,) if head[1] == ElementType.XTS_SPRD_INT else (0, 1)  # may be left out
         return size is not None and length - HEAD_BYTES - _count(head, 10) * size in trailers
-    if code == ResponseCode.XTS_SPR_APPDATA:
+    if code == ResponseCode.XTS_SPR_APPDATA and from_module:
         layout = _APPDATA.get(_count(head, 1))
         if layout is None:
             return length <= _VENDOR_LIMIT

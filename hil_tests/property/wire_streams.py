@@ -110,7 +110,9 @@ def _plausible(length: int, payload: bytes) -> bool:  # noqa: PLR0911 - one retu
         return True
     sizes = {0x10: 1, 0x11: 4, 0x12: 4, 0x13: 1, 0x50: 1}
     count = int.from_bytes(payload[10:14], "little")
-    if payload[0] == 0xA0:
+    if payload[0] == 0x12:
+        sizes[0x00] = 1
+    if payload[0] in (0xA0, 0x12):
         return payload[1] in sizes and 14 + count * sizes[payload[1]] == length
     if payload[0] == 0x11:
         if payload[1] not in sizes:

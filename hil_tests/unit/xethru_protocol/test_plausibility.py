@@ -46,6 +46,22 @@ def test_data_have_their_elements_and_nothing_else(kind: int, expected: list[int
 
 
 @pytest.mark.parametrize(
+    ("kind", "expected"),
+    [(NONE, [17]), (BYTE, [17]), (INT, [26]), (FLOAT, [26]), (STRING, [17]), (USER, [17])],
+)
+def test_hil_has_its_elements_and_nothing_else(kind: int, expected: list[int]) -> None:
+    """5.4, and 1.3: a host accepts both framings for the same message."""
+    assert lengths(elements(0x12, kind, 3)) == expected
+
+
+def test_what_a_host_sends_is_not_judged_by_what_a_module_sends() -> None:
+    """2: A0 and 50 are HIL and X4DRIVER then, not DATA and APPDATA."""
+    everything = list(range(14, 100))
+    assert lengths(elements(0xA0, FLOAT, 3), FROM_HOST) == everything
+    assert lengths(b"\x50\x0c" + bytes(12), FROM_HOST) == everything
+
+
+@pytest.mark.parametrize(
     ("message_id", "expected"),
     [
         (0x0C, [45]),  # 29 + 8 N at two bins
