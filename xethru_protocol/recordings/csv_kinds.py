@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from xethru_protocol import responses, responses_profile
-from xethru_protocol.recordings.records import MS_NS
+from xethru_protocol.codec import encode
+from xethru_protocol.recordings.records import EARLIEST_MS, LATEST_MS, MS_NS
 from xethru_protocol.table import Response
 
 _EPOCH_DIGITS = "milliseconds"
@@ -105,7 +106,13 @@ class CsvKind:
         return ";".join((_stamp(time_ms, zone), *cells)) + "\n"
 
     def parse(self, line: str) -> tuple[Response, int]:
-        """Message of a line and its time [ns since 1970], or ValueError."""
+        """Message of a line and its time [ns since 1970].
+
+        Raises
+        ------
+        ValueError, OverflowError, LocalProtocolError
+            If the line is none of this kind.
+        """
         cells = line.rstrip("\r\n").split(";")
         if len(cells) != len(self.columns) + 1:
             raise ValueError(f"{len(self.columns) + 1} columns were expected, not {len(cells)}")
@@ -116,7 +123,9 @@ class CsvKind:
         for field, count in counts.items():
             if len(fields[field]) != count:
                 raise ValueError(f"{field} has {len(fields[field])} values, not {count}")
-        return self.message(**fields), _time_ns(cells[0])
+        message = self.message(**fields)
+        encode(message)  # it must fit the wire, or nothing can be done with it
+        return message, _time_ns(cells[0])
 
 
 _UNIX = datetime.fromisoformat("1970-01-01T00:00:00+00:00")
@@ -128,7 +137,13 @@ def _stamp(time_ms: int, zone: tzinfo | None) -> str:
 
 
 def _time_ns(stamp: str) -> int:
-    return (datetime.fromisoformat(stamp) - _UNIX) // timedelta(milliseconds=1) * MS_NS
+    time = datetime.fromisoformat(stamp)
+    if time.tzinfo is None:
+        time = time.astimezone()  # the zone it was written in is not told: this machine's
+    time_ms = (time - _UNIX) // timedelta(milliseconds=1)
+    if not EARLIEST_MS <= time_ms <= LATEST_MS:
+        raise ValueError(f"{stamp} is beyond what 64 bits of nanoseconds hold")
+    return time_ms * MS_NS
 
 
 _COUNTER = Column("Counter", "counter")

@@ -249,7 +249,7 @@ def mcap_facts(path: Path) -> RecordingFacts:
         if isinstance(record, Metadata) and record.name == _FACTS:
             try:
                 return RecordingFacts.from_json(json.loads(record.metadata["facts"]))
-            except (KeyError, ValueError, TypeError) as error:
+            except (KeyError, ValueError, TypeError, RecursionError) as error:
                 raise RecordingError(f"{path}: what it says about itself: {error}") from None
         if isinstance(record, Message):
             break

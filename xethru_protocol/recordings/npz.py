@@ -160,7 +160,7 @@ def npz_facts(path: Path) -> RecordingFacts:
     """Return what an archive says about itself; RecordingError if it cannot be read."""
     try:
         return RecordingFacts.from_json(json.loads(str(_load(path, only="facts")["facts"])))
-    except (KeyError, ValueError, TypeError) as error:
+    except (KeyError, ValueError, TypeError, RecursionError) as error:
         raise RecordingError(f"{path}: what it says about itself is damaged: {error}") from None
 
 

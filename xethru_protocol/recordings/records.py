@@ -2,11 +2,16 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
+from types import NoneType
 from typing import Any, Self
 
 from xethru_protocol.table import Response
 
 MS_NS = 1_000_000
+LATEST_MS = 2**63 // MS_NS - 2**32
+"""Latest time at which a recording may begin [ms since 1970]: each of its times [ns], at most
+2**32 ms later, fits 64 bits."""
+EARLIEST_MS = -LATEST_MS
 Timed = tuple[Response, int | None]
 """A message and its time [ns since 1970]; None where the recording has none."""
 TimedMessages = Iterator[Timed]
@@ -54,7 +59,20 @@ class RecordingFacts:
             If a value is not of its kind.
         """
         known = {name: values[name] for name in cls.__slots__ if name in values}
+        for name, value in known.items():
+            if not isinstance(value, _JSON_TYPES[name]):
+                raise TypeError(f"{name} cannot be {value!r}")
         for name in ("parameter_file", "user_header"):
             if known.get(name) is not None:
                 known[name] = bytes.fromhex(known[name])
         return cls(**known)
+
+
+_JSON_TYPES: dict[str, tuple[type, ...]] = {
+    "session_id": (str,),
+    "profile_id": (int, NoneType),
+    "parameter_file": (str, NoneType),
+    "user_header": (str,),
+    "stopped_ns": (int, NoneType),
+    "closed_ns": (int, NoneType),
+}

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from xethru_protocol.codec import decode_response
+from xethru_protocol.errors import LocalProtocolError
 from xethru_protocol.recordings.csv_kinds import CSV_KINDS, CsvKind
 from xethru_protocol.recordings.errors import (
     FaultHandler,
@@ -48,8 +49,6 @@ class DataFile:
         The file; its name tells its kind.
     on_fault
         Called with what could not be read; None: that raises.
-    indexed
-        Whether an index will tell of a user header; else one is looked for.
 
     Attributes
     ----------
@@ -66,7 +65,7 @@ class DataFile:
         If the file cannot be read.
     """
 
-    def __init__(self, path: Path, on_fault: FaultHandler | None, indexed: bool) -> None:
+    def __init__(self, path: Path, on_fault: FaultHandler | None) -> None:
         kind = kind_of(path.name)
         assert kind is not None, path
         self.path = path
@@ -78,9 +77,6 @@ class DataFile:
         try:
             self._stream: BinaryIO = path.open("rb")
             self._size = os.fstat(self._stream.fileno()).st_size
-            if not indexed:
-                start = self._stream.read(_LONGEST_USER_HEADER + 2 * _LARGEST_PLAUSIBLE_RECORD)
-                self.skip(_user_header_bytes(start, self._size, kind))
         except OSError as error:
             raise unreadable(path, error) from None
 
@@ -88,8 +84,22 @@ class DataFile:
         """Close the file."""
         self._stream.close()
 
+    def skip_user_header(self) -> None:
+        """Leave out a user header whose length nobody tells.
+
+        Raises
+        ------
+        RecordingError
+            If the file cannot be read.
+        """
+        try:
+            start = self._stream.read(_LONGEST_USER_HEADER + 2 * _LARGEST_PLAUSIBLE_RECORD)
+        except OSError as error:
+            raise unreadable(self.path, error) from None
+        self.skip(_user_header_bytes(start, self._size, self.kind))
+
     def skip(self, size: int) -> None:
-        """Leave out a user header."""
+        """Leave out a user header of ``size`` bytes."""
         self.position = min(self.position + size, self._size)
         self._stream.seek(self.position)
 
@@ -140,7 +150,7 @@ class DataFile:
             return None, None
         try:
             found = kind.parse(line.decode("latin-1"))
-        except (ValueError, OverflowError) as error:
+        except (ValueError, OverflowError, LocalProtocolError) as error:
             self._fault(f"a line cannot be read: {error}")
             self.position += len(line)
             return None, None

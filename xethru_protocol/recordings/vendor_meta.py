@@ -37,9 +37,14 @@ which have one file each; they are what others report of split recordings in the
 """
 
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
+import numpy.typing as npt
+
 from xethru_protocol.recordings.errors import RecordingError
+from xethru_protocol.recordings.records import EARLIEST_MS, LATEST_MS
 
 META_NAME = "xethru_recording_meta.dat"
 PARAMETER_FILE_NAME = "xethru_parameter_file.par"
@@ -49,6 +54,18 @@ ALL_BITS = 0xFFFFFFFF
 _MAGIC = 0xA0B1C2D3
 _HEAD = struct.Struct("<IIqBIQQI8sII28sI")
 _ENTRY = struct.Struct("<IBIIIQQ")
+_ROW = np.dtype(
+    [
+        ("since_ms", "<u4"),
+        ("kind", "u1"),
+        ("data_type", "<u4"),
+        ("size", "<u4"),
+        ("file", "<u4"),
+        ("begin", "<u8"),
+        ("end", "<u8"),
+    ]
+)
+_AT_ONCE = 4096  # entries unpacked together
 _FILES = struct.Struct("<IBI")
 _LENGTH = struct.Struct("<I")
 _RECORD, _CLOSED, _FILE_LIST = 1, 2, 3
@@ -75,6 +92,38 @@ class Entry:
         return _ENTRY.pack(
             self.since_start_ms, kind, self.data_type, self.size, self.file, self.begin, self.end
         )
+
+
+class Index:
+    """The entries of a meta file, one after the other; they stay packed, 33 bytes each."""
+
+    def __init__(self, rows: npt.NDArray[np.void]) -> None:
+        self._rows = rows
+
+    def __len__(self) -> int:
+        """Return the number of entries."""
+        return len(self._rows)
+
+    def __iter__(self) -> Iterator[Entry]:
+        """Return the entries in order."""
+        for begin in range(0, len(self), _AT_ONCE):
+            for since_ms, kind, data_type, size, file, start, end in self._rows[
+                begin : begin + _AT_ONCE
+            ].tolist():
+                yield Entry(
+                    since_start_ms=since_ms,
+                    closed=kind == _CLOSED,
+                    data_type=data_type,
+                    size=size,
+                    file=file,
+                    begin=start,
+                    end=end,
+                )
+
+    def stops_ms(self) -> list[int]:
+        """Return when data files were closed [ms since start]."""
+        found: list[int] = self._rows["since_ms"][self._rows["kind"] == _CLOSED].tolist()
+        return found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,7 +167,7 @@ class Meta:
     """A meta file as read; ``complete`` says that it was closed and nothing is missing."""
 
     head: MetaHead
-    entries: tuple[Entry, ...]
+    entries: Index
     files: tuple[str, ...]
     complete: bool
 
@@ -148,6 +197,8 @@ def parse_meta(data: bytes) -> Meta:
         raise RecordingError("it does not begin like a meta file of a recording")
     if version != VERSION:
         raise RecordingError(f"its format version is {version}, known is {VERSION}")
+    if not EARLIEST_MS <= start_ms <= LATEST_MS:
+        raise RecordingError(f"its start is no time: {start_ms} ms since 1970")
     index = _HEAD.size + length
     head = MetaHead(
         start_ms=start_ms,
@@ -165,27 +216,15 @@ def parse_meta(data: bytes) -> Meta:
     return Meta(head=head, entries=entries, files=names or (), complete=complete)
 
 
-def _parse_entries(data: bytes, index: int, index_end: int) -> tuple[tuple[Entry, ...], int]:
-    entries: list[Entry] = []
-    position = index
+def _parse_entries(data: bytes, index: int, index_end: int) -> tuple[Index, int]:
+    """Return the entries from ``index`` on and where they end."""
     stop = min(index_end, len(data)) if index_end else len(data)
-    while position + _ENTRY.size <= stop:
-        since_ms, kind, data_type, size, file, begin, end = _ENTRY.unpack_from(data, position)
-        if kind not in (_RECORD, _CLOSED):
-            break  # the list of files of a recording whose head was never completed
-        entries.append(
-            Entry(
-                since_start_ms=since_ms,
-                closed=kind == _CLOSED,
-                data_type=data_type,
-                size=size,
-                file=file,
-                begin=begin,
-                end=end,
-            )
-        )
-        position += _ENTRY.size
-    return tuple(entries), position
+    count = max(stop - index, 0) // _ENTRY.size
+    rows = np.frombuffer(data, _ROW, count, index) if count else np.empty(0, _ROW)
+    # The list of files of a recording whose head was never completed is no entry.
+    strange = np.flatnonzero((rows["kind"] != _RECORD) & (rows["kind"] != _CLOSED))
+    rows = rows[: strange[0]] if len(strange) else rows
+    return Index(rows), index + len(rows) * _ENTRY.size
 
 
 def _parse_files(data: bytes, position: int) -> tuple[str, ...] | None:

@@ -67,7 +67,7 @@ def vendor_facts(path: Path) -> RecordingFacts:
         raise unreadable(parameters, error) from None
     if meta is None:
         return RecordingFacts(parameter_file=parameter_file)
-    stops = [entry.since_start_ms for entry in meta.entries if entry.closed]
+    stops = meta.entries.stops_ms()
     at_once = not rest and meta.complete
     return RecordingFacts(
         session_id=meta.head.session_id.decode("utf-8", "replace"),
@@ -186,8 +186,7 @@ class _Part:
                 self._report_meta("it is missing, so no message has a time")
         except RecordingError as error:
             self._report_meta(f"it is of no use, so no message has a time: {error}")
-        indexed = self._meta is not None
-        readings = [_Reading(DataFile(path, self._on_fault, indexed)) for path in self._paths]
+        readings = [_Reading(DataFile(path, self._on_fault)) for path in self._paths]
         try:
             if self._meta is not None:
                 yield from self._along_index(self._meta, readings)
@@ -229,6 +228,8 @@ class _Part:
 
     def _rest(self, reading: _Reading) -> Iterator[Timed]:
         """Read what lies behind the index: recorded last, or with no index at all."""
+        if reading.file.position == 0:  # no index told of a user header
+            reading.file.skip_user_header()
         while (found := reading.file.take()) is not None:
             message, stamp_ns = found
             if message is not None:

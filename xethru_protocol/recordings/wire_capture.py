@@ -56,6 +56,7 @@ _CHUNK = struct.Struct("<BqI")
 _MARKS: dict[Way, int] = {"rx": ord("<"), "tx": ord(">")}
 _WAYS: dict[int, Way] = {mark: way for way, mark in _MARKS.items()}
 _NO_TIME = -(2**63)
+_LARGEST_PIECE = 1 << 20  # bytes: what a reader holds does not depend on what a chunk claims
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +142,8 @@ class WireCapture:
 def read_chunks(path: Path | str, on_fault: FaultHandler | None = None) -> Iterator[Chunk]:
     """Chunks of a wire capture in the order in which they passed.
 
-    A cut last chunk is yielded as far as it is there, then reported.
+    A cut last chunk is yielded as far as it is there, then reported. A chunk of more than 1 MiB,
+    which a damaged length makes, comes in pieces of that size.
 
     Raises
     ------
@@ -163,10 +165,14 @@ def read_chunks(path: Path | str, on_fault: FaultHandler | None = None) -> Itera
                 if way is None:
                     _report(path, begin, f"no chunk begins with byte {mark:02X}", on_fault)
                     return
-                data = stream.read(min(length, size - stream.tell()))
-                yield Chunk(way, data, None if stamp_ns == _NO_TIME else stamp_ns)
-                if len(data) < length:
-                    reason = f"the last chunk is cut: {len(data)} of its {length} bytes are there"
+                t_ns = None if stamp_ns == _NO_TIME else stamp_ns
+                there = min(length, size - stream.tell())
+                left = there
+                while left and (data := stream.read(min(left, _LARGEST_PIECE))):
+                    left -= len(data)
+                    yield Chunk(way, data, t_ns)
+                if there < length:
+                    reason = f"the last chunk is cut: {there} of its {length} bytes are there"
                     _report(path, begin, reason, on_fault)
                     return
     except OSError as error:
@@ -234,7 +240,7 @@ def _read_note(path: Path, stream: BinaryIO) -> dict[str, Any]:
     text = stream.read(min(length, os.fstat(stream.fileno()).st_size))
     try:
         note = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         note = None
     if len(text) < length or not isinstance(note, dict):
         raise RecordingError(f"{path}: the head of the capture is cut or damaged")

@@ -123,6 +123,35 @@ def test_a_damaged_head_of_a_capture_is_named(tmp_path: Path, content: bytes, re
         list(read_recording(tmp_path / "x.xtwire"))
 
 
+@pytest.mark.parametrize(
+    "note",
+    [
+        b"[" * 100_000,
+        b'{"facts": 5}',
+        b'{"facts": {"session_id": 7}}',
+        b'{"facts": {"stopped_ns": "late"}}',
+        b'{"facts": {"user_header": "no hex"}}',
+    ],
+    ids=["deep", "number", "session id", "time", "bytes"],
+)
+def test_a_note_that_makes_no_sense_is_named(note: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "a.xtwire"
+    path.write_bytes(b"\x89XTWIRE\n" + struct.pack("<II", 1, len(note)) + note)
+    with pytest.raises(RecordingError, match="damaged"):
+        convert(path, tmp_path / "copy")
+
+
+def test_a_chunk_that_claims_much_comes_in_pieces(tmp_path: Path) -> None:
+    """A damaged length must not make the reader take the rest of a large file at once."""
+    path = tmp_path / "a.xtwire"
+    with WireCapture(path) as capture:
+        capture.write("rx", bytes(3_000_000), 7)
+    chunks = list(read_chunks(path))
+    assert {(chunk.way, chunk.t_ns) for chunk in chunks} == {("rx", 7)}
+    assert max(len(chunk.data) for chunk in chunks) == 1 << 20
+    assert sum(len(chunk.data) for chunk in chunks) == 3_000_000
+
+
 def test_a_chunk_that_is_none_ends_the_reading(capture: Path) -> None:
     whole = len(list(read_recording(capture)))
     capture.write_bytes(capture.read_bytes() + b"\x00" * 20)

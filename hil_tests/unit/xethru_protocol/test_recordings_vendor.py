@@ -10,7 +10,8 @@ import signal
 import struct
 import subprocess
 import sys
-from datetime import UTC
+import tracemalloc
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -340,6 +341,78 @@ def test_a_line_that_makes_no_sense_costs_itself_only(tmp_path: Path) -> None:
     assert [fault.file for fault in faults] == [file.name, file.name]
     assert "a line cannot be read" in faults[0].reason
     assert "the index gives this record 43 bytes, it has 45" in faults[1].reason
+
+
+@pytest.mark.parametrize(
+    ("column", "cell", "reason"),
+    [
+        (0, "9999-12-31T23:59:59+00:00", "64 bits"),
+        (0, "0001-01-01T00:00:00+23:59", "64 bits"),
+        (1, "-1", "counter=-1"),
+        (1, "4294967296", "counter=4294967296"),
+        (4, "256", "direction=256"),
+    ],
+)
+def test_a_line_that_fits_no_message_costs_itself_only(
+    column: int, cell: str, reason: str, tmp_path: Path
+) -> None:
+    copy = copy_of("single", tmp_path)
+    file = next(copy.glob("*.csv"))
+    lines = file.read_text().splitlines(keepends=True)
+    cells = lines[1].split(";")
+    lines[1] = ";".join([*cells[:column], cell, *cells[column + 1 :]])
+    file.write_text("".join(lines))
+    found, faults = read_with_faults(copy)
+    whole = [message for message, _ in read_recording(RECORDINGS / "single")]
+    assert [message for message, _ in found] == whole[1:]
+    assert [reason in fault.reason for fault in faults if not fault.minor] == [True]
+
+
+def test_a_stamp_without_zone_is_in_that_of_this_machine(tmp_path: Path) -> None:
+    line = "2026-07-21T12:00:00.500;1;2;1.5;0;7\n"
+    file = tmp_path / "xethru_presence_single_20260721_120000.csv"
+    file.write_text("TimeStamp;Counter;PresenceState;Distance;Direction;SignalQuality\n" + line)
+    ((_, t_ns),) = read_recording(file)
+    assert t_ns == round(datetime(2026, 7, 21, 12).timestamp()) * 1000 * MS + 500 * MS
+
+
+@pytest.mark.parametrize(
+    ("offset", "damage"),
+    [
+        (0x55, b"\xff\xff\xff\xff"),  # length of the session id
+        (0x1D, b"\x01" + bytes(7)),  # where the index ends
+        (0x08, b"\xff" * 7 + b"\x7f"),  # start
+        (0x08, bytes(7) + b"\x80"),
+    ],
+)
+def test_a_damaged_head_of_the_meta_file_costs_no_message(
+    offset: int, damage: bytes, tmp_path: Path
+) -> None:
+    """The recording has a user header, whose length only the index tells."""
+    copy = copy_of("float", tmp_path)
+    meta = bytearray((copy / META).read_bytes())
+    meta[offset : offset + len(damage)] = damage
+    (copy / META).write_bytes(meta)
+    found, faults = read_with_faults(copy)
+    whole = [message for message, _ in read_recording(RECORDINGS / "float")]
+    assert found == [(message, None) for message in whole]
+    assert [(fault.file, fault.minor) for fault in faults] == [(META, True)]
+
+
+def test_a_long_index_stays_packed_in_memory(tmp_path: Path) -> None:
+    n_messages = 20_000
+    with RecordingWriter(tmp_path / "long") as writer:
+        for counter in range(n_messages):
+            writer.write(frame(counter, 1), counter * MS)
+    tracemalloc.start()
+    try:
+        counters = [message.info for message, _ in read_recording(tmp_path / "long")]  # type: ignore[attr-defined]  # frames only
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert counters == list(range(n_messages))
+    # 33 bytes in the file, 40 of the list above, and a block of entries at work
+    assert peak < n_messages * 100 + 2_000_000
 
 
 def test_other_columns_are_reported_and_not_guessed_at(tmp_path: Path) -> None:
