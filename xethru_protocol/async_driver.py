@@ -1,5 +1,13 @@
 """Driver of one X4M300 for asyncio: the same as `X4M300`, with methods that are awaited.
 
+::
+
+    async with AsyncX4M300.open(port, reconnect_s=20.0) as radar:
+        await radar.configure_raw()
+        await radar.start(17.0)
+        async for frame in radar.frames():
+            ...
+
 No threads: the port's descriptor is watched by the event loop while somebody waits for it.
 
 Several tasks may use one driver, for example one that reads frames and one that asks: commands
