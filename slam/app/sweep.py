@@ -111,9 +111,12 @@ def run_sweep(options: SweepOptions, stop: StopFlag) -> None:
     }
     if len(names) < len(options.scenes):
         raise UsageError("--scene: two of the scenes have the same name; give each its own")
-    part = options.out.with_name(f"{options.out.name}.part")
     if options.out.is_dir():
         raise AppError(f"{options.out}: is a folder, must be a file")
+    if options.out.exists() and not options.out.is_file():
+        # it would be replaced: as root, even a device for everybody
+        raise AppError(f"{options.out}: is no regular file, must be one")
+    part = options.out.with_name(f"{options.out.name}.part")
     with ExitStack() as held:
         with naming(part):  # what cannot be written ends the command before any run, too
             part.touch()

@@ -36,6 +36,7 @@ def test_wrong_usage_exits_2(arguments: list[str], capsys: pytest.CaptureFixture
     captured = capsys.readouterr()
     assert captured.out == ""
     assert "usage: xethru-emulator" in captured.err
+    assert " _" not in captured.err, "names of ours say nothing to a user"
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Sweeps that would mix up two scenes are refused before the first run."""
 
+import os
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
 from typing import NoReturn
@@ -40,3 +41,13 @@ def test_a_worker_that_dies_is_one_line_and_leaves_nothing(
     with StopFlag() as stop, pytest.raises(AppError, match=r"^a worker process died; did memory"):
         run_sweep(options, stop)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_no_regular_file_is_never_replaced(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    options = SweepOptions(scenes=("lab",), presets=("paper",), n_seeds=1, jobs=1, out=pipe)
+    with StopFlag() as stop, pytest.raises(AppError, match="no regular file"):
+        run_sweep(options, stop)
+    assert pipe.is_fifo()
+    assert list(tmp_path.iterdir()) == [pipe]
