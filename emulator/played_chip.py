@@ -7,7 +7,6 @@ size. While a recording plays, its frames are what they are, so the read-back mu
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +18,7 @@ from xethru_protocol import x4
 from xethru_protocol.codes import X4Setting
 from xethru_protocol.messages import DataFloat, ReplyFloat, Response, X4Value
 
-__all__ = ["PlayedChip", "PlayedFrames"]
+__all__ = ["FrameSurvey", "PlayedChip", "PlayedFrames"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,26 +36,33 @@ class PlayedFrames:
     n_values: int
     area_m: tuple[float, float] | None
 
-    @classmethod
-    def of(cls, messages: Iterable[Response]) -> PlayedFrames | None:
-        """Look for radar frames; of several sizes the most frequent counts. None: there are none.
+
+class FrameSurvey:
+    """Looks for radar frames among the messages of a recording."""
+
+    def __init__(self) -> None:
+        self._sizes: Counter[int] = Counter()
+        self._area_m: tuple[float, float] | None = None
+
+    def look_at(self, message: Response) -> None:
+        """Look at the next message."""
+        if isinstance(message, DataFloat) and message.content_id == 0:
+            self._sizes[message.values.size] += 1
+        elif (
+            isinstance(message, ReplyFloat)
+            and message.content_id == X4Setting.FRAMEAREA
+            and len(message.values) == 2
+        ):
+            self._area_m = message.values[0], message.values[1]
+
+    def found(self) -> PlayedFrames | None:
+        """Return what was found; of several sizes the most frequent counts. None: no frames.
 
         The area is the last one the host of the recording asked for.
         """
-        sizes: Counter[int] = Counter()
-        area_m = None
-        for message in messages:
-            if isinstance(message, DataFloat) and message.content_id == 0:
-                sizes[message.values.size] += 1
-            elif (
-                isinstance(message, ReplyFloat)
-                and message.content_id == X4Setting.FRAMEAREA
-                and len(message.values) == 2
-            ):
-                area_m = message.values[0], message.values[1]
-        if not sizes:
+        if not self._sizes:
             return None
-        return cls(n_values=sizes.most_common(1)[0][0], area_m=area_m)
+        return PlayedFrames(n_values=self._sizes.most_common(1)[0][0], area_m=self._area_m)
 
 
 class PlayedChip(Chip):

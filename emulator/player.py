@@ -10,7 +10,7 @@ wait. A host that only asks something and leaves within half a second hears none
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from xethru_protocol.codes import SensorMode, X4Setting
@@ -33,21 +33,20 @@ class TimedMessage:
 
 
 def schedule(
-    messages: Sequence[Response], stamps_ns: Sequence[int | None], rate: float
-) -> tuple[TimedMessage, ...]:
-    """Return when each message of a recording is played.
+    messages: Iterable[tuple[Response, int | None]], rate: float
+) -> Iterator[TimedMessage]:
+    """Tell when each message of a recording is played.
 
     Parameters
     ----------
     messages
-        The messages in order.
-    stamps_ns
-        The recording's own time of each, ns; None where it has none.
+        The messages in order, each with the recording's own time of it, ns; None where it has
+        none.
     rate
         Multiple of real time; 0 for as fast as the port takes them.
 
-    Returns
-    -------
+    Yields
+    ------
     Times that never decrease: a stamp that runs backwards plays at once.
 
     Raises
@@ -58,23 +57,19 @@ def schedule(
     Examples
     --------
     >>> from xethru_protocol.messages import Ack
-    >>> [item.time_ns for item in schedule([Ack()] * 3, [5, 1005, 905], rate=2.0)]
+    >>> [item.time_ns for item in schedule([(Ack(), 5), (Ack(), 1005), (Ack(), 905)], rate=2.0)]
     [0, 500, 500]
     """
-    if rate == 0:
-        return tuple(TimedMessage(time_ns=0, message=message) for message in messages)
-    timed: list[TimedMessage] = []
     elapsed_ns = 0
     previous_ns: int | None = None
-    for message, stamp_ns in zip(messages, stamps_ns, strict=True):
-        if timed:
+    for index, (message, stamp_ns) in enumerate(messages):
+        if index:
             if stamp_ns is None or previous_ns is None:
                 elapsed_ns += NOMINAL_PERIOD_NS
             else:
                 elapsed_ns += max(stamp_ns - previous_ns, 0)
         previous_ns = stamp_ns
-        timed.append(TimedMessage(time_ns=round(elapsed_ns / rate), message=message))
-    return tuple(timed)
+        yield TimedMessage(time_ns=round(elapsed_ns / rate) if rate else 0, message=message)
 
 
 class PlayStream:
@@ -85,32 +80,37 @@ class PlayStream:
     Parameters
     ----------
     timed
-        What to play, from `schedule`; not empty.
+        What to play, as from `schedule`; gone through anew for every host and round, one message
+        ahead, so that it need not lie in memory.
     loop_gap_ns
         Pause between the last message and the first when playing in a loop; None to play once.
     """
 
-    def __init__(self, timed: Sequence[TimedMessage], *, loop_gap_ns: int | None = None) -> None:
+    def __init__(self, timed: Iterable[TimedMessage], *, loop_gap_ns: int | None = None) -> None:
         self._timed = timed
         self._loop_gap_ns = loop_gap_ns
-        self._next = 0
+        self._coming: Iterator[TimedMessage] = iter(())
+        self._next: TimedMessage | None = None
+        self._begun = False
         self._start_ns: int | None = None
 
     def next_due_ns(self) -> int | None:
         """Return when the next message is due; None with no host or at the end."""
-        if self._start_ns is None or self._next >= len(self._timed):
+        if self._start_ns is None or self._next is None:
             return None
-        return self._start_ns + self._timed[self._next].time_ns
+        return self._start_ns + self._next.time_ns
 
     def take(self) -> Response:
-        """Return the next message."""
-        message = self._timed[self._next].message
-        self._next += 1
-        if self._next == len(self._timed) and self._loop_gap_ns is not None:
+        """Return the next message; there must be one."""
+        taken = self._next
+        assert taken is not None
+        self._begun = True
+        self._next = next(self._coming, None)
+        if self._next is None and self._loop_gap_ns is not None:
             if self._start_ns is not None:
-                self._start_ns += self._timed[-1].time_ns + self._loop_gap_ns
-            self._next = 0
-        return message
+                self._start_ns += taken.time_ns + self._loop_gap_ns
+            self._rewind()
+        return taken.message
 
     def skip_due_before(self, time_ns: int) -> int:
         """Skip nothing: a recording is played whole."""
@@ -119,8 +119,10 @@ class PlayStream:
 
     def command_done(self, command: Command[Response], now_ns: int) -> None:
         """Begin when the host starts the radar; wait on while it asks and configures."""
-        if self._next > 0:
+        if self._begun:
             return
+        if self._start_ns is None:
+            self._rewind()
         if _starts_radar(command):
             self._start_ns = now_ns
         elif self._start_ns is None or self._start_ns > now_ns:
@@ -128,14 +130,21 @@ class PlayStream:
 
     def port_opened(self, now_ns: int) -> None:
         """Play from the beginning, soon."""
-        self._next = 0
+        self._begun = False
+        self._rewind()
         self._start_ns = now_ns + QUIET_NS
 
     def port_closed(self, now_ns: int) -> None:
         """Stop playing."""
         del now_ns
+        self._begun = False
         self._start_ns = None
-        self._next = 0
+        self._coming = iter(())
+        self._next = None
+
+    def _rewind(self) -> None:
+        self._coming = iter(self._timed)
+        self._next = next(self._coming, None)
 
 
 def _starts_radar(command: Command[Response]) -> bool:

@@ -2,6 +2,7 @@
 
 import shutil
 import struct
+import tracemalloc
 from datetime import UTC
 from pathlib import Path
 
@@ -214,6 +215,35 @@ def test_a_recording_of_answers_only_is_refused(tmp_path: Path) -> None:
 def test_a_rate_that_takes_for_ever_is_refused_in_one_line(rate: float) -> None:
     with pytest.raises(RecordingError, match="would play for more than 20 days"):
         device_of(RECORDINGS / "iq", rate=rate)
+
+
+def test_a_recording_is_not_held_in_memory(tmp_path: Path) -> None:
+    n_frames, n_bins = 2000, 1000
+    with RecordingWriter(tmp_path / "long") as writer:
+        for counter in range(n_frames):
+            writer.write(m.DataFloat(info=counter, values=np.ones(n_bins, np.float32)), 0)
+    tracemalloc.start()
+    try:
+        device = device_of(tmp_path / "long")
+        device.port_opened(0)
+        device.advance(SECOND)
+        played = sum(len(packet) for packet in iter(lambda: device.next_packet(SECOND), None))
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert played == n_frames * (9 + 14 + 4 * n_bins)
+    assert peak < played / 4
+
+
+def test_a_recording_that_is_gone_is_told_and_the_module_answers_on(tmp_path: Path) -> None:
+    recording = copy_of_the_vendors_recording(tmp_path)
+    warnings: list[str] = []
+    device = device_of(recording, warnings=warnings)
+    shutil.rmtree(recording)
+    assert wire_bytes(device) == b""
+    assert [str(recording) in line for line in warnings] == [True]
+    host = BareHost(device)
+    assert host.ask(m.Ping()) == m.Pong(value=0xAAEEAEEA)
 
 
 def test_any_high_rate_plays() -> None:

@@ -19,7 +19,9 @@ RECORDS = [m.Pong(value=value) for value in range(5)]
 
 def player(rate: float = 1.0, gap_ns: int | None = None) -> BareHost:
     stamps = [10 * SECOND + index * SECOND for index in range(5)]
-    stream = PlayStream(schedule(RECORDS, stamps, rate), loop_gap_ns=gap_ns)
+    stream = PlayStream(
+        tuple(schedule(zip(RECORDS, stamps, strict=True), rate)), loop_gap_ns=gap_ns
+    )
     module = Module(IDENTITY, Chip(RampSource()))
     return BareHost(Device(module, stream, LosslessOutbox(), boot=BootTiming()))
 
@@ -107,10 +109,11 @@ def test_a_loop_goes_on() -> None:
 
 
 def test_records_without_time_come_at_the_nominal_rate() -> None:
-    times = [item.time_ns for item in schedule(RECORDS, [None] * 5, 2.0)]
+    times = [item.time_ns for item in schedule([(record, None) for record in RECORDS], 2.0)]
     assert times == pytest.approx([index * SECOND / 34 for index in range(5)], abs=2)
 
 
 def test_time_that_runs_backwards_is_not_waited_for() -> None:
-    times = [item.time_ns for item in schedule(RECORDS, [5, 9, 3, 4, None], 1.0)]
+    stamps = [5, 9, 3, 4, None]
+    times = [item.time_ns for item in schedule(zip(RECORDS, stamps, strict=True), 1.0)]
     assert times == [0, 4, 4, 5, 5 + SECOND // 17]
