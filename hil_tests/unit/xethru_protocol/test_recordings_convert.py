@@ -6,6 +6,7 @@ import json
 import struct
 import subprocess
 import sys
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -242,6 +243,39 @@ def test_an_archive_is_plain_numpy(tmp_path: Path, capture: Path) -> None:
         assert arrays["baseband_iq_samples"].tolist() == [[[1.0, 2.0], [3.0, 4.0]]]
         assert arrays["message_name"].tolist() == ["PONG"]
         assert json.loads(arrays["message_fields"][0]) == {"value": "0xAAEEAEEA"}
+
+
+def test_samples_are_not_held_in_memory(tmp_path: Path) -> None:
+    n_frames, n_bins = 2000, 1000
+    with RecordingWriter(tmp_path / "long") as writer:
+        for counter in range(n_frames):
+            writer.write(frame(counter, n_bins), counter * 1_000_000)
+    for source, target in [("long", "x.npz"), ("x.npz", "y.xtwire")]:
+        tracemalloc.start()
+        try:
+            convert(tmp_path / source, tmp_path / target)
+            _, peak = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+        assert peak < 4 * n_frames * n_bins / 2
+    expected = list(read_recording(tmp_path / "long"))
+    assert list(read_recording(tmp_path / "y.xtwire")) == expected
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["long", "x.npz", "y.xtwire"]
+
+
+def test_a_damaged_archive_gives_no_message(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)  # so that the samples cannot be compressed
+    with RecordingWriter(tmp_path / "long") as writer:
+        for counter in range(300):
+            values = rng.random(1000, np.float32)
+            writer.write(m.DataFloat(info=counter, values=values), counter * 1_000_000)
+    convert(tmp_path / "long", tmp_path / "x.npz")
+    data = bytearray((tmp_path / "x.npz").read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 1000] = bytes(1000)
+    (tmp_path / "x.npz").write_bytes(data)
+    with pytest.raises(RecordingError, match="is cut or damaged"):
+        next(read_recording(tmp_path / "x.npz"))
 
 
 def test_other_archives_are_refused(tmp_path: Path) -> None:
