@@ -32,11 +32,14 @@ from slam.app.ellipse import ellipse_95, rotate_covariances
 from slam.app.errors import AppError
 from slam.app.session import LogLine, Scan, SessionInfo, Snapshot
 from slam.app.tum import NS_PER_S
+from slam.app.view_guide import ABOUT
 from slam.geometry import transform
 
 _BLOCK_FRAMES = 128
 """Frames sent at once, and rows of one B-scan picture."""
 _BLOCK_SNAPSHOTS = 128
+_CLOSE_LIMIT_S = 20.0
+"""Longest wait for Rerun to finish the file."""
 _MAP_PERIOD_NS = NS_PER_S
 _PATH_PERIOD_NS = 2 * NS_PER_S
 
@@ -44,7 +47,6 @@ _MAP_MARGIN_M = 0.6
 _ARROW_M = 0.25
 
 _TRUTH_RGB = (120, 120, 120)
-_CLOSE_LIMIT_S = 20.0
 _ODOMETRY_RGB = (230, 130, 30)
 _ESTIMATE_RGB = (40, 120, 220)
 _LANDMARK_RGB = (200, 40, 90)
@@ -55,23 +57,6 @@ _PATHS = (
     ("odometry", _ODOMETRY_RGB, 0.006, 20.0),
     ("estimate", _ESTIMATE_RGB, 0.006, 30.0),
 )
-
-ABOUT = """\
-# What you see
-
-* **Map** (left, metres, y up): the robot's *true* path in grey, *wheel odometry* in orange, the
-  path *estimated* by radar SLAM in blue. Grey crosses are the true landmarks; red dots are the
-  estimated ones, each with the ellipse that should hold the truth in 95 % of cases.
-* **B-scan** (middle, top): echoes of one radar, range to the right, time downwards; each picture
-  is {block} frames with the constant part removed. Landmarks are the curved lines.
-* **Frame** (middle): the newest raw frame of one radar, all its range bins.
-* **Pose error** compares with the truth, which SLAM never sees. **NIS** is the mean surprise of
-  gated associations only, in units of what the filter expected; far below 1 with Table I's noise.
-* **Link**: commands, answers and faults on the serial ports.
-
-Move the time cursor below; `device_time` is the radar's own time, `frame` its frame counter.
-All data of this file are {origin}.
-"""
 
 
 class RerunView:

@@ -19,6 +19,8 @@ from slam.app.errors import AppError
 
 NS_PER_S = 1_000_000_000
 _FIELDS = 8
+_MAX_BYTES = 1 << 28
+"""Weeks of poses; what is longer, or endless, is no trajectory."""
 _MAX_STAMP_S = Decimal(2**63) / NS_PER_S
 """Where int64 nanoseconds end; a larger stamp was written in another unit."""
 
@@ -126,10 +128,14 @@ def read_tum(path: Path) -> Trajectory:
         The file cannot be read, holds no pose, goes back in time, or has a malformed line.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        with path.open("rb") as file:
+            content = file.read(_MAX_BYTES + 1)
+        text = content.decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not a text file"
         raise TumError(f"{path}: cannot read: {reason}") from None
+    if len(content) > _MAX_BYTES:
+        raise TumError(f"{path}: longer than {_MAX_BYTES >> 20} MiB, so it is no trajectory")
     samples = []
     for number, line in enumerate(text.splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):

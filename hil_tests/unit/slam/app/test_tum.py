@@ -110,3 +110,9 @@ def test_a_missing_file_and_a_binary_file_are_named(tmp_path: Path) -> None:
     (tmp_path / "b.tum").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(TumError, match="not a text file"):
         read_tum(tmp_path / "b.tum")
+
+
+def test_endless_input_is_no_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("slam.app.tum._MAX_BYTES", 1000)
+    with pytest.raises(TumError, match="it is no trajectory"):
+        read_tum(Path("/dev/zero"))
