@@ -103,34 +103,44 @@ class DataFile:
         self.position = min(self.position + size, self._size)
         self._stream.seek(self.position)
 
-    def take(self) -> tuple[Response | None, int | None] | None:
+    def take(self, listed: int | None = None) -> tuple[Response | None, int | None] | None:
         """Next record.
+
+        Parameters
+        ----------
+        listed
+            Its size by the index; None if the index lists no more. A binary record that claims
+            more than the file holds is given up and this much skipped.
 
         Returns
         -------
         None at the end, or when nothing more can be read, which is reported once. Else the
-        message, None for the header line of a text file, and the record's own time [ns since
-        1970], None in binary files.
+        message, None for a damaged record and the header line of a text file, and the record's
+        own time [ns since 1970], None in binary files.
         """
         if self.ended:
             return None
         try:
             if isinstance(self.kind, Layout):
-                record = self._binary(self.kind)
+                record = self._binary(self.kind, listed)
                 if record is None:
-                    return None
+                    return None if self.ended else (None, None)
                 return decode_response(self.kind.prefix + record), None
             return self._line(self.kind)
         except OSError as error:
             raise unreadable(self.path, error) from None
 
-    def _binary(self, layout: Layout) -> bytes | None:
+    def _binary(self, layout: Layout, listed: int | None) -> bytes | None:
         left = self._size - self.position
         header = self._stream.read(layout.header.itemsize)
         whole = len(header) == layout.header.itemsize
         size = layout.record_size(header) if whole else layout.header.itemsize
         if size > left:
-            self._cut(left)
+            if listed is not None and layout.header.itemsize <= listed <= left:
+                self._fault(f"a record is damaged: it claims {size} bytes, the index {listed}")
+                self.skip(listed)
+            else:
+                self._cut(left)
             return None
         self.position += size
         return header + self._stream.read(size - len(header))

@@ -210,7 +210,7 @@ class _Part:
             if reading.file.ended:
                 continue
             begin = reading.file.position
-            found = reading.file.take()
+            found = reading.file.take(entry.size if reading.times_hold else None)
             if found is None:
                 if not reading.file.faulty and reading.times_hold:
                     self._disagree(reading, begin, "the index lists more records than it holds")

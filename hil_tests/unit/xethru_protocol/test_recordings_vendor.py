@@ -449,6 +449,24 @@ def test_a_meta_that_is_wrong_costs_times_only(
     assert found[-1][1] is None
 
 
+@pytest.mark.parametrize("damaged", [0, 7, 39])
+def test_a_damaged_count_costs_its_record_where_the_index_tells_the_size(
+    damaged: int, tmp_path: Path
+) -> None:
+    whole = list(read_recording(RECORDINGS / "iq"))
+    copy = copy_of("iq", tmp_path)
+    file = next(copy.glob("xethru_baseband_iq_*"))
+    data = bytearray(file.read_bytes())
+    begin = len(data) // 40 * damaged  # 40 records of one size
+    data[begin + 4 : begin + 8] = b"\xff\xff\xff\x7f"
+    file.write_bytes(data)
+    found, faults = read_with_faults(copy)
+    assert found == whole[:damaged] + whole[damaged + 1 :]
+    assert [(fault.file, fault.offset) for fault in faults] == [(file.name, begin)]
+    with pytest.raises(RecordingError, match="a record is damaged"):
+        list(read_recording(copy))
+
+
 def test_an_index_that_is_too_short_or_too_long_is_reported(tmp_path: Path) -> None:
     copy = copy_of("iq", tmp_path)
     file = next(copy.glob("*iq*.dat"))
