@@ -10,6 +10,7 @@ A cut file loses its last chunk of at most 256 KiB.
 """
 
 import json
+import os
 import re
 import struct
 from collections.abc import Iterable, Iterator
@@ -66,6 +67,7 @@ _DAMAGED = (
     ValueError,
     OverflowError,
     zstandard.ZstdError,
+    MemoryError,  # a damaged size
 )
 
 
@@ -271,7 +273,9 @@ def _records(path: Path, on_fault: FaultHandler | None) -> Iterator[object]:
     try:
         with path.open("rb") as stream:
             try:
-                yield from StreamReader(stream, validate_crcs=True).records
+                size = os.fstat(stream.fileno()).st_size  # no record is larger, whatever it claims
+                reader = StreamReader(stream, validate_crcs=True, record_size_limit=size)
+                yield from reader.records
             except _DAMAGED as error:
                 reason = f"it is cut or damaged: {str(error) or type(error).__name__}"
                 fault = RecordingFault(file=path.name, offset=stream.tell(), reason=reason)

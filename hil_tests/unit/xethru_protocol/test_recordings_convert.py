@@ -124,24 +124,6 @@ def test_a_damaged_head_of_a_capture_is_named(tmp_path: Path, content: bytes, re
         list(read_recording(tmp_path / "x.xtwire"))
 
 
-@pytest.mark.parametrize(
-    "note",
-    [
-        b"[" * 100_000,
-        b'{"facts": 5}',
-        b'{"facts": {"session_id": 7}}',
-        b'{"facts": {"stopped_ns": "late"}}',
-        b'{"facts": {"user_header": "no hex"}}',
-    ],
-    ids=["deep", "number", "session id", "time", "bytes"],
-)
-def test_a_note_that_makes_no_sense_is_named(note: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "a.xtwire"
-    path.write_bytes(b"\x89XTWIRE\n" + struct.pack("<II", 1, len(note)) + note)
-    with pytest.raises(RecordingError, match="damaged"):
-        convert(path, tmp_path / "copy")
-
-
 def test_a_chunk_that_claims_much_comes_in_pieces(tmp_path: Path) -> None:
     """A damaged length must not make the reader take the rest of a large file at once."""
     path = tmp_path / "a.xtwire"
@@ -261,21 +243,6 @@ def test_samples_are_not_held_in_memory(tmp_path: Path) -> None:
     expected = list(read_recording(tmp_path / "long"))
     assert list(read_recording(tmp_path / "y.xtwire")) == expected
     assert sorted(path.name for path in tmp_path.iterdir()) == ["long", "x.npz", "y.xtwire"]
-
-
-def test_a_damaged_archive_gives_no_message(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)  # so that the samples cannot be compressed
-    with RecordingWriter(tmp_path / "long") as writer:
-        for counter in range(300):
-            values = rng.random(1000, np.float32)
-            writer.write(m.DataFloat(info=counter, values=values), counter * 1_000_000)
-    convert(tmp_path / "long", tmp_path / "x.npz")
-    data = bytearray((tmp_path / "x.npz").read_bytes())
-    middle = len(data) // 2
-    data[middle : middle + 1000] = bytes(1000)
-    (tmp_path / "x.npz").write_bytes(data)
-    with pytest.raises(RecordingError, match="is cut or damaged"):
-        next(read_recording(tmp_path / "x.npz"))
 
 
 def test_other_archives_are_refused(tmp_path: Path) -> None:

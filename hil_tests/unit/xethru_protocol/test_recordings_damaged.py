@@ -1,4 +1,4 @@
-"""Recording directories of the vendor that are damaged, incomplete, refused or cut off."""
+"""Recordings that are damaged, incomplete, refused or cut off: those of the vendor first."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from xethru_protocol.recordings import (
     RecordingError,
     RecordingFault,
     RecordingWriter,
+    convert,
     read_recording,
     recording_facts,
 )
@@ -349,3 +350,43 @@ def test_a_killed_recorder_leaves_every_message_and_every_time(tmp_path: Path) -
     facts = recording_facts(tmp_path / "r")
     assert facts.session_id == "killed"
     assert facts.closed_ns is None
+
+
+@pytest.mark.parametrize(
+    "note",
+    [
+        b"[" * 100_000,
+        b'{"facts": 5}',
+        b'{"facts": {"session_id": 7}}',
+        b'{"facts": {"stopped_ns": "late"}}',
+        b'{"facts": {"user_header": "no hex"}}',
+    ],
+    ids=["deep", "number", "session id", "time", "bytes"],
+)
+def test_a_note_that_makes_no_sense_is_named(note: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "a.xtwire"
+    path.write_bytes(b"\x89XTWIRE\n" + struct.pack("<II", 1, len(note)) + note)
+    with pytest.raises(RecordingError, match="damaged"):
+        convert(path, tmp_path / "copy")
+
+
+def test_a_damaged_archive_gives_no_message(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)  # so that the samples cannot be compressed
+    with RecordingWriter(tmp_path / "long") as writer:
+        for counter in range(300):
+            values = rng.random(1000, np.float32)
+            writer.write(m.DataFloat(info=counter, values=values), counter * 1_000_000)
+    convert(tmp_path / "long", tmp_path / "x.npz")
+    data = bytearray((tmp_path / "x.npz").read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 1000] = bytes(1000)
+    (tmp_path / "x.npz").write_bytes(data)
+    with pytest.raises(RecordingError, match="is cut or damaged"):
+        next(read_recording(tmp_path / "x.npz"))
+
+
+def test_a_record_of_mcap_that_claims_more_than_the_file_is_not_waited_for(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(b"\x89MCAP0\r\n\x06" + struct.pack("<Q", 3_000_000_000))
+    with pytest.raises(RecordingError, match="exceeds limit 17"):
+        list(read_recording(path))
