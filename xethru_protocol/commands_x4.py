@@ -61,8 +61,9 @@ class X4DriverInit(Command[Ack]):
 class X4DriverSet(Command[Ack]):
     """Set one X4 setting. 4.9.
 
-    ``value`` is a number; for FRAMEAREA (start, end) in module metres; for a register
-    (address, value). ``value_width`` 1 marks the one-byte form that two settings tolerate.
+    ``value`` is a number, of FPS [1/s], of FRAMEAREAOFFSET [m]; for FRAMEAREA (start, end) in
+    module metres; for a register (address, value). ``value_width`` 1 marks the one-byte form that
+    two settings tolerate.
     """
 
     setting: Annotated[X4Setting, _SETTING]

@@ -62,7 +62,7 @@ class PresenceMovingList(Response):
 @response(*appdata(AppDataId.XTS_ID_RESP_STATUS), name="RESP_STATUS")
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RespStatus(Response):
-    """Breathing: `RespirationState`, breaths per minute, movement [mm], quality 0 ... 10. 7.4."""
+    """Breathing: `RespirationState`, breaths per minute, movement [mm], quality. 7.4."""
 
     counter: Annotated[int, wire.U32]
     state: Annotated[int, wire.U32]
@@ -75,7 +75,7 @@ class RespStatus(Response):
 @response(*appdata(AppDataId.XTS_ID_SLEEP_STATUS), name="SLEEP_STATUS")
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SleepStatus(Response):
-    """Sleep: `RespirationState`, breaths per minute, quality, movement 0 ... 100. 7.4."""
+    """Sleep: `RespirationState`, breaths per minute, quality, slow and fast movement. 7.4."""
 
     counter: Annotated[int, wire.U32]
     state: Annotated[int, wire.U32]
@@ -89,7 +89,7 @@ class SleepStatus(Response):
 @response(*appdata(AppDataId.XTS_ID_VITAL_SIGNS), name="VITAL_SIGNS")
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VitalSigns(Response):
-    """Breaths and heartbeats per minute, with distances [m] and confidences. 7.4."""
+    """Rates of breath and heartbeat, with distances [m] and confidences. 7.4."""
 
     counter: Annotated[int, wire.U32]
     state: Annotated[int, wire.U32]
@@ -117,7 +117,7 @@ class SleepStage(Response):
 @response(*appdata(AppDataId.XTS_ID_RESPIRATION_MOVINGLIST), name="RESPIRATION_MOVINGLIST")
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RespirationMovingList(Response):
-    """Movement by range; lists as in `PresenceMovingList`. 7.4."""
+    """Movement by range, slow and fast; the two lists are equally long. 7.4."""
 
     counter: Annotated[int, wire.U32]
     interval_count: ClassVar[
@@ -130,7 +130,7 @@ class RespirationMovingList(Response):
 @response(*appdata(AppDataId.XTS_ID_RESPIRATION_DETECTIONLIST), name="RESPIRATION_DETECTIONLIST")
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RespirationDetectionList(Response):
-    """Detections; lists as in `PresenceMovingList`. 7.4."""
+    """Detections: distances [m], cross sections, velocities; equally long lists. 7.4."""
 
     counter: Annotated[int, wire.U32]
     detection_count: ClassVar[
@@ -154,7 +154,7 @@ class RespirationDetectionList(Response):
 )
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RespirationNormalizedMovementList(Response):
-    """Normalised movement per bin from ``start_m`` on. 7.4."""
+    """Normalised movement per bin from ``start_m`` on, slow and fast, equally long. 7.4."""
 
     counter: Annotated[int, wire.U32]
     start_m: Annotated[float, wire.Number("f", "start")]
