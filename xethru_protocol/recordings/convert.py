@@ -3,7 +3,9 @@
 What is lost, and nothing else: vendor directories cut times to 1 ms, know none before the first
 message's, give a message without a time that of the one before, and have no place for answers,
 system messages and the like; text files of theirs lose the payload bits of a NaN. Only wire
-captures hold what the host sent and how messages lay in packets.
+captures hold what the host sent and how messages lay in packets. Messages are written as the
+message table encodes them: with a trailer or NUL that was left out, without what lies behind the
+last field.
 """
 
 from collections import Counter

@@ -130,7 +130,8 @@ def _data_files(directory: Path) -> list[Path]:
 def _split_directories(path: Path) -> list[tuple[Path, list[Path]]]:
     names = sorted(child for child in path.iterdir() if child.name.startswith(_DIRECTORY_PREFIX))
     parts = [(child, files) for child in names if child.is_dir() and (files := _data_files(child))]
-    sessions = {vendor_session(directory) for directory, _ in parts}
+    # Without a session id, nothing says that two directories are of one radar.
+    sessions = {vendor_session(directory) or directory for directory, _ in parts}
     if len(sessions) > 1:
         raise RecordingError(
             f"{path} holds {len(parts)} recordings of {len(sessions)} sessions; name one of them"

@@ -239,6 +239,21 @@ def test_a_recording_split_by_directory_is_read_as_one(tmp_path: Path) -> None:
         list(read_recording(tmp_path))
 
 
+@pytest.mark.parametrize("meta", [True, False])
+def test_directories_without_session_id_are_not_taken_for_one_recording(
+    meta: bool, tmp_path: Path
+) -> None:
+    for radar in range(2):
+        with RecordingWriter(tmp_path / f"xethru_recording_{radar}") as writer:
+            writer.write(frame(radar), 0)
+        if not meta:
+            (tmp_path / f"xethru_recording_{radar}" / META).unlink()
+    with pytest.raises(RecordingError, match="holds 2 recordings of 2 sessions; name one"):
+        list(read_recording(tmp_path))
+    ((found, _),) = read_recording(tmp_path / "xethru_recording_1")
+    assert found == frame(1)
+
+
 def test_a_directory_with_a_recording_is_not_written_into(tmp_path: Path) -> None:
     shutil.copytree(RECORDINGS / "iq", tmp_path / "old")
     with pytest.raises(RecordingError, match="already holds a recording"):
