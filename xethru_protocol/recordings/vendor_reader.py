@@ -131,7 +131,7 @@ def _split_directories(path: Path) -> list[tuple[Path, list[Path]]]:
     names = sorted(child for child in path.iterdir() if child.name.startswith(_DIRECTORY_PREFIX))
     parts = [(child, files) for child in names if child.is_dir() and (files := _data_files(child))]
     # Without a session id, nothing says that two directories are of one radar.
-    sessions = {vendor_session(directory) or directory for directory, _ in parts}
+    sessions = {_session(directory) or directory for directory, _ in parts}
     if len(sessions) > 1:
         raise RecordingError(
             f"{path} holds {len(parts)} recordings of {len(sessions)} sessions; name one of them"
@@ -139,7 +139,7 @@ def _split_directories(path: Path) -> list[tuple[Path, list[Path]]]:
     return parts
 
 
-def vendor_session(directory: Path) -> bytes | None:
+def _session(directory: Path) -> bytes | None:
     """Session id of a directory; None without a usable meta file."""
     try:
         meta = _read_meta(directory)
