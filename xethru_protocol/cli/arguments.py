@@ -34,9 +34,12 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     arguments = parser.parse_args(argv)
     area = getattr(arguments, "frame_area", None)
     if area is not None and area[0] >= area[1]:
-        parser.error("argument --frame-area: START must be smaller than END")
-    if arguments.command == "record" and arguments.out is None and arguments.wire is None:
-        parser.error("record needs --out DIR, or --wire FILE, or both")
+        arguments.refuse("argument --frame-area: START must be smaller than END")
+    if arguments.command == "record":
+        if arguments.out is None and arguments.wire is None:
+            arguments.refuse("--out DIR is missing, or --wire FILE, or both")
+        if arguments.out == arguments.wire:
+            arguments.refuse("--out and --wire must not be the same")
     return arguments
 
 
@@ -129,7 +132,13 @@ def _add_record(commands: _Commands) -> None:
     one.add_argument(
         "--duration", type=values.seconds, metavar="S", help="stop after S seconds of recording"
     )
-    one.add_argument("--session-id", default="", metavar="TEXT", help="name kept in the recording")
+    one.add_argument(
+        "--session-id",
+        type=values.text,
+        default="",
+        metavar="TEXT",
+        help="name kept in the recording",
+    )
     _add_force(one, "replace a recording that is there already")
     _add_json(one)
 
@@ -185,7 +194,7 @@ def _add_decode(commands: _Commands) -> None:
         "explains every byte wins; 01 with a value that modules answer is PONG, else PING.",
     )
     one.add_argument(
-        "file", type=values.not_empty, nargs="?", metavar="FILE", help="default: standard input"
+        "file", type=values.not_empty, nargs="?", metavar="FILE", help="- or none: standard input"
     )
     one.add_argument(
         "--hex",
@@ -215,7 +224,7 @@ def _command(
     parser = commands.add_parser(
         name, help=text, description=f"{text[0].upper()}{text[1:]}. {details}"
     )
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, refuse=parser.error)
     return parser
 
 
@@ -356,7 +365,7 @@ def _decode(arguments: argparse.Namespace) -> int:
     from xethru_protocol.cli.decode import decode
 
     return decode(
-        arguments.file,
+        None if arguments.file == "-" else arguments.file,
         is_hex=arguments.hex,
         sender=arguments.sender,
         with_statistics=arguments.statistics,

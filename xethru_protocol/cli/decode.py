@@ -29,6 +29,8 @@ def decode(file: str | None, *, is_hex: bool, sender: str, with_statistics: bool
     """Print one JSON object per packet and per fault; totals at the end, on stderr, if wanted."""
     name = file or "standard input"
     statistics = LinkStatistics()
+    if file is None and sys.stdin is None:
+        raise DecodeError("standard input is closed; there is nothing to decode")
     try:
         with Path(file).open("rb") if file else nullcontext(sys.stdin.buffer) as source:
             if is_hex:

@@ -4,7 +4,8 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import Any
 
-from xethru_protocol.cli.output import one_line, print_json, print_line, warn
+from xethru_protocol.cli.faults import warn_of
+from xethru_protocol.cli.output import one_line, print_json, print_line
 from xethru_protocol.cli.profiles import profile_name
 from xethru_protocol.cli.progress import bytes_text
 from xethru_protocol.codec import describe, encode
@@ -36,8 +37,7 @@ def dump(file: str, *, with_samples: bool, as_json: bool) -> int:
         for message, t_ns in read_recording(file, faults.append):
             time = _since(t_ns, summary.start_ns)
             print_line(f"{time}  {message_line(message, with_samples=with_samples)}")
-    for fault in faults:
-        warn(f"xethru dump: {one_line(fault.file)}: {fault.reason} (at byte {fault.offset})")
+    warn_of("dump", faults)
     return 1 if faults else 0
 
 

@@ -1,5 +1,6 @@
 """How `doctor` works: a table of checks, carried out in order on whatever is examined."""
 
+import shlex
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -31,7 +32,8 @@ class Check(Generic[PatientT]):
     find
         Returns what is wrong, None if nothing is.
     remedy
-        What to do about it; ``{...}`` may name any attribute of the patient.
+        What to do about it; ``{...}`` may name any attribute of the patient, which is quoted as
+        a shell needs it.
     level
         NOTE for what is a fault only to some users.
     ends
@@ -63,12 +65,12 @@ def examine(patient: PatientT, checks: Sequence[Check[PatientT]]) -> Iterator[Fi
     for check in checks:
         try:
             found = check.find(patient)
-        except XeThruError as error:  # a module that answered before
+        except (XeThruError, OSError) as error:  # a module that answered, a port that was there
             yield Finding(
                 check=check.name,
                 looks_at=check.looks_at,
                 level=Level.FAULT,
-                found=f"this could not be found out: {error}",
+                found=f"this could not be found out: {getattr(error, 'strerror', None) or error}",
                 remedy="try again; if this stays, take the module's power away for some seconds",
             )
             return
@@ -87,11 +89,14 @@ def examine(patient: PatientT, checks: Sequence[Check[PatientT]]) -> Iterator[Fi
 
 
 class _Attributes(dict[str, object]):
-    """The attributes of an object as a mapping; each is asked for only when named."""
+    """The attributes of an object, quoted for a shell; each is asked for only when named."""
 
     def __init__(self, named: object) -> None:
         super().__init__()
         self._named = named
 
     def __missing__(self, name: str) -> object:
-        return getattr(self._named, name)
+        value = getattr(self._named, name)
+        if isinstance(value, tuple):
+            return shlex.join(map(str, value))
+        return shlex.quote(value) if isinstance(value, str) else value

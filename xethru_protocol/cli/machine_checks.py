@@ -33,16 +33,6 @@ class Machine:
             if entry not in self.stale and not _is_readable(entry)
         )
 
-    @property
-    def stale_names(self) -> str:
-        """The stale entries, for a command line."""
-        return " ".join(str(entry) for entry in self.stale)
-
-    @property
-    def damaged_names(self) -> str:
-        """The damaged entries, for a command line."""
-        return " ".join(str(entry) for entry in self.damaged)
-
 
 def _process_id(entry: Path) -> int | None:
     """Process an entry belongs to: ``<pid>.json`` or ``ports-<pid>-...``; None if it is neither."""
@@ -91,12 +81,12 @@ MACHINE_CHECKS = (
         name="no dead emulators",
         looks_at="processes named in the run directory",
         find=_stale_entries,
-        remedy="start an emulator, which tidies up, or run: rm -r {stale_names}",
+        remedy="start an emulator, which tidies up, or run: rm -r {stale}",
     ),
     Check(
         name="emulators' word readable",
         looks_at="entries of the run directory",
         find=_damaged_entries,
-        remedy="stop that emulator and run: rm {damaged_names}",
+        remedy="stop that emulator and run: rm {damaged}",
     ),
 )

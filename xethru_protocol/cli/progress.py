@@ -1,8 +1,10 @@
 """Progress for people, on stderr: one line rewritten on a terminal, else a line now and then."""
 
+import os
 import sys
 import time
 from collections.abc import Callable
+from typing import TextIO
 
 from xethru_protocol.cli.output import is_terminal, show
 
@@ -35,7 +37,7 @@ class Progress:
             return
         self._shown_s = now_s
         if self._rewrites:
-            show(f"\r{state()}\x1b[K")
+            show(rewriting(state(), sys.stderr))
             self._is_open = True
         else:
             show(f"{self._name}: {state()}\n")
@@ -43,8 +45,17 @@ class Progress:
     def finish(self, state: Callable[[], str]) -> None:
         """Bring a rewritten line up to date and end it."""
         if self._is_open:
-            show(f"\r{state()}\x1b[K\n")
+            show(rewriting(state(), sys.stderr) + "\n")
             self._is_open = False
+
+
+def rewriting(line: str, terminal: TextIO) -> str:
+    """Text that replaces the line of a terminal, cut to fit: a longer one would scroll."""
+    try:
+        columns = os.get_terminal_size(terminal.fileno()).columns
+    except (OSError, ValueError):  # it does not tell
+        columns = 0
+    return f"\r{line[: columns - 1] if columns else line}\x1b[K"
 
 
 def bytes_text(count: int) -> str:

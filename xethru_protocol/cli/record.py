@@ -32,7 +32,7 @@ def record(
     as_json: bool,
 ) -> int:
     """Record until ``count`` messages, ``duration_s``, a signal, unplugging or a full disk."""
-    targets.make_room(replace=replace)
+    targets.check(replace=replace)
     signals: list[int] = []
     with Recorder(targets, count) as recorder:
         try:
@@ -40,14 +40,17 @@ def record(
                 radar.raw_listener = recorder.take_bytes
                 mode.prepare(radar)
                 say_warnings(radar)
+                recorder.open(replace=replace)
                 with _noted(signals):
                     _record_from(radar, recorder, mode, duration_s, signals)
         except XeThruError as error:
             recorder.fail(error)
     if as_json:
         print_json(recorder.summary() | {"ended_by": _end(recorder, signals)})
-    elif recorder.failure is None:
+    elif recorder.failure is None and recorder.messages:
         print_line(f"{targets.text}: {recorder.numbers()}")
+    elif recorder.failure is None:
+        warn("xethru record: nothing came, so nothing was written")
     if recorder.failure is not None:
         text = str(recorder.failure)
         if recorder.messages:
@@ -104,7 +107,11 @@ def _noted(signals: list[int]) -> Iterator[None]:
         signals.append(number)
         signal.signal(number, previous[signal.Signals(number)])
 
-    previous = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    previous = {
+        number: signal.signal(number, note)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        if signal.getsignal(number) is not signal.SIG_IGN  # after nohup
+    }
     try:
         yield
     finally:

@@ -1,7 +1,6 @@
 """Files that take what a driver hears, until they are full or it is enough."""
 
 import time
-from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +8,7 @@ from types import TracebackType
 from typing import Any, Literal, Self
 
 from xethru_protocol.cli.output import one_line
-from xethru_protocol.cli.overwriting import make_room
+from xethru_protocol.cli.overwriting import make_room, remove_unfinished, what_must_go
 from xethru_protocol.cli.progress import bytes_text
 from xethru_protocol.driver import X4M300
 from xethru_protocol.errors import XeThruError
@@ -69,24 +68,27 @@ class Targets:
         """What there is of both."""
         return tuple(path for path in (self.directory, self.wire) if path is not None)
 
-    def make_room(self, *, replace: bool) -> None:
-        """Remove what an earlier recording left, if that is allowed; see `make_room`."""
+    def check(self, *, replace: bool) -> None:
+        """Raise RecordingError if something is in the way and must stay."""
         if self.directory is not None and self.directory.exists() and not self.directory.is_dir():
             raise RecordingError(f"{self.directory} is no directory; name a new one")
         if self.wire is not None and self.wire.is_dir():
             raise RecordingError(f"{self.wire} is a directory; name a file in it")
-        make_room(self.paths, replace=replace)
+        what_must_go(self.paths, replace=replace)
 
 
 class Recorder:
     """Writes down what a driver hears.
+
+    Files are made, and older ones removed, only by `open`: a module that does not answer must
+    cost nobody an older recording. Bytes that come before that are kept until then.
 
     An error of a file is kept, not raised: whoever calls is in the middle of receiving.
 
     Parameters
     ----------
     targets
-        Where to; nothing may be there.
+        Where to.
     count
         Messages after which it is enough; None: never.
 
@@ -96,11 +98,6 @@ class Recorder:
         Messages taken.
     failure
         Why nothing more is written; None: all is well.
-
-    Raises
-    ------
-    RecordingError
-        If a target cannot be made.
     """
 
     def __init__(self, targets: Targets, count: int | None) -> None:
@@ -111,21 +108,10 @@ class Recorder:
         self._statistics = LinkStatistics()
         self._began_ns = self._newest_ns = time.monotonic_ns()
         self._since_1970_ns = time.time_ns() - self._began_ns
-        self._fresh = [path for path in targets.paths if not path.exists()]
+        self._early: list[tuple[Literal["rx", "tx"], bytes, int]] | None = []
+        self._were_there: dict[Path, bool] = {}
         self._writer: RecordingWriter | None = None
         self._wire: WireCapture | None = None
-        try:
-            if targets.directory is not None:
-                self._writer = RecordingWriter(
-                    targets.directory,
-                    session_id=targets.session_id,
-                    profile_id=targets.profile_id,
-                )
-            if targets.wire is not None:
-                self._wire = WireCapture(targets.wire, {"port": targets.port})
-        except RecordingError:
-            self._remove_empty()
-            raise
 
     def __enter__(self) -> Self:
         """Return the recorder itself."""
@@ -145,7 +131,32 @@ class Recorder:
             except RecordingError as failure:
                 self.fail(failure)
         if not self.messages:
-            self._remove_empty()
+            # the wire capture first: it may lie in the directory
+            for path, was_there in reversed(self._were_there.items()):
+                remove_unfinished(path, was_there=was_there)
+
+    def open(self, *, replace: bool) -> None:
+        """Make the files.
+
+        Raises
+        ------
+        RecordingError
+            If something is in the way and must stay, or a file cannot be made.
+        """
+        targets = self._targets
+        make_room(targets.paths, replace=replace)
+        self._were_there = {path: path.exists() for path in targets.paths}
+        if targets.directory is not None:
+            self._writer = RecordingWriter(
+                targets.directory,
+                session_id=targets.session_id,
+                profile_id=targets.profile_id,
+            )
+        if targets.wire is not None:
+            self._wire = WireCapture(targets.wire, {"port": targets.port})
+        early, self._early = self._early or [], None
+        for heard in early:
+            self.take_bytes(*heard)
 
     def listen_to(self, radar: X4M300) -> None:
         """Take the module's messages from now on; the time of the recording begins."""
@@ -177,6 +188,8 @@ class Recorder:
 
     def take_bytes(self, direction: Literal["rx", "tx"], data: bytes, t_ns: int) -> None:
         """Write bytes of the line."""
+        if self._early is not None and self._targets.wire is not None:
+            self._early.append((direction, bytes(data), t_ns))
         if self._wire is None or self.failure is not None:
             return
         try:
@@ -220,8 +233,3 @@ class Recorder:
             "duration_s": (self._newest_ns - self._began_ns) * 1e-9,
             "link": self._statistics.summary(),
         }
-
-    def _remove_empty(self) -> None:
-        for path in self._fresh:
-            with suppress(OSError):
-                path.rmdir() if path.is_dir() else path.unlink()

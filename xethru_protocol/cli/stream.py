@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from xethru_protocol.cli.output import is_terminal, print_json, print_text, warn
+from xethru_protocol.cli.progress import rewriting
 from xethru_protocol.cli.session import module_at, say_warnings
 from xethru_protocol.driver import X4M300, Frame, RawConfig
 
@@ -64,10 +65,12 @@ class _Live:
         self._shown_ns = 0
         self._frames = 0
         self._newest: Frame | None = None
-        self._began_ns = time.monotonic_ns()
+        self._began_ns = 0  # arrival of the first
 
     def show(self, frame: Frame) -> None:
         """Count a frame, and say so a few times a second."""
+        if self._newest is None:
+            self._began_ns = time.monotonic_ns()
         self._frames += 1
         self._newest = frame
         now_ns = time.monotonic_ns()
@@ -84,9 +87,11 @@ class _Live:
     def _write(self, frame: Frame, now_ns: int) -> None:
         geometry = frame.geometry
         strongest = int(np.argmax(np.abs(frame.samples)))
-        rate = self._frames / max((now_ns - self._began_ns) * 1e-9, 1e-3)
-        print_text(
-            f"\r{self._frames} frames, {rate:.1f}/s, {geometry.n_bins} bins, "
+        span_s = (now_ns - self._began_ns) * 1e-9
+        rate = f"{(self._frames - 1) / span_s:.1f}" if self._frames > 1 else "-"
+        line = (
+            f"{self._frames} frames, {rate}/s, {geometry.n_bins} bins, "
             f"strongest at {geometry.range_start_m + strongest * geometry.bin_length_m:.3f} m, "
-            f"{self._radar.frames_lost} lost \x1b[K"
+            f"{self._radar.frames_lost} lost"
         )
+        print_text(rewriting(line, sys.stdout))

@@ -37,6 +37,15 @@ def not_empty(text: str) -> str:
     return text
 
 
+def text(text: str) -> str:
+    """Read a text."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:  # bytes that the shell passed on
+        raise ArgumentTypeError("this is no text in UTF-8") from None
+    return text
+
+
 def _number(text: str) -> float:
     try:
         return float(text)

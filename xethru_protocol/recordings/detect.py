@@ -81,6 +81,8 @@ def recording_format(path: Path | str) -> RecordingFormat:
             raise RecordingError(f"there is no recording {path}")
         if path.is_dir() or is_vendor_file(path):
             return "vendor"
+        if not path.is_file():  # a pipe would be waited for
+            raise RecordingError(f"{path} is no file; a recording is read from files only")
         with path.open("rb") as stream:
             start = stream.read(8)
     except OSError as error:

@@ -1,6 +1,7 @@
 """``xethru dump`` and ``convert`` on recordings that the vendor's own library wrote."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import pytest
 from xethru_protocol import messages as m
 from xethru_protocol.cli import main
 from xethru_protocol.connection import Connection, Role
-from xethru_protocol.recordings import WireCapture
+from xethru_protocol.recordings import RecordingError, WireCapture, convert
 
 Capture = pytest.CaptureFixture[str]
 RECORDINGS = Path(__file__).parents[3] / "fixtures" / "recordings"
@@ -226,3 +227,49 @@ def test_a_conversion_that_fails_leaves_nothing(
     monkeypatch.setattr("xethru_protocol.cli.convert.convert_recording", stopped)
     assert main(["convert", str(IQ), str(tmp_path / "c.npz")]) == 130
     assert list(tmp_path.iterdir()) == []
+
+
+def test_faults_by_the_hundred_are_not_all_told(tmp_path: Path, capsys: Capture) -> None:
+    (tmp_path / "xethru_sleep_20261121_003557.csv").write_bytes(b"no;such;row\n" * 200)
+    for command in (["dump", str(tmp_path)], ["convert", str(tmp_path), f"{tmp_path}.mcap"]):
+        assert main(command) == 1
+        lines = capsys.readouterr().err.splitlines()
+        assert len([line for line in lines if "a line cannot be read" in line]) < 11
+        assert lines[-1].startswith(f"xethru {command[0]}: and ")
+        assert lines[-1].endswith(" faults more")
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path, capsys: Capture) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for command in (["dump", f"{tmp_path}/pipe"], ["convert", f"{tmp_path}/pipe", "target.mcap"]):
+        assert main(command) == 1
+        assert capsys.readouterr().err == (
+            f"xethru {command[0]}: {tmp_path}/pipe is no file; "
+            "a recording is read from files only\n"
+        )
+
+
+@pytest.mark.parametrize("name", ["copy.mcap", "copy"])
+def test_a_conversion_that_fails_brings_the_older_one_back(
+    name: str, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = tmp_path / name
+    assert main(["convert", str(RECORDINGS / "single"), str(target)]) == 0
+    before = snapshot(tmp_path)
+
+    def fails(source: str, target: str, on_progress: object) -> None:
+        convert(IQ, target)
+        raise RecordingError("the disk is full")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("xethru_protocol.cli.convert.convert_recording", fails)
+        assert main(["convert", str(IQ), str(target), "--force"]) == 1
+    assert snapshot(tmp_path) == before
+    assert main(["convert", str(IQ), str(target), "--force"]) == 0
+    after = snapshot(tmp_path)
+    assert after != before
+    assert not [path for path in after if path.name.endswith(".old")]
+
+
+def snapshot(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}

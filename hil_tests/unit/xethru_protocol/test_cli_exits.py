@@ -2,8 +2,10 @@
 
 import io
 import os
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +16,7 @@ from hil_tests.unit.xethru_protocol.pty_module import PtyModule
 from xethru_protocol.cli import main, output, session
 from xethru_protocol.driver import X4M300
 from xethru_protocol.errors import Disconnected, ResponseTimeout
+from xethru_protocol.recordings import describe_recording
 
 XETHRU = f"{sys.executable} -m xethru_protocol.cli"
 DECODE = f"printf '7D 10 6D 7E\\n7D 10 6D 7E\\n' | {XETHRU} decode --hex"
@@ -62,6 +65,52 @@ def test_a_port_is_not_opened_in_place_of_a_closed_stream(tmp_path: Path) -> Non
         result = shell(f"{XETHRU} ping --port {module.path} <&- 2>&-")
     assert (result.returncode, result.stderr) == (0, "")
     assert result.stdout.startswith(f"{module.path}: ready (")
+
+
+def test_input_that_is_closed() -> None:
+    result = shell(f"{XETHRU} decode <&-")
+    assert (result.returncode, result.stdout, result.stderr) == (
+        *(1, ""),
+        "xethru decode: standard input is closed; there is nothing to decode\n",
+    )
+
+
+def test_a_dash_is_standard_input() -> None:
+    result = shell(f"{DECODE} -")
+    assert (result.returncode, result.stdout, result.stderr) == (0, 2 * ACK, "")
+
+
+# --- a terminal that closes -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("before", "code"),
+    [(signal.SIG_DFL, 129), (signal.SIG_IGN, 0)],
+    ids=["without nohup", "with nohup"],
+)
+def test_the_module_is_stopped_when_the_terminal_closes(
+    before: signal.Handlers, code: int, tmp_path: Path
+) -> None:
+    out = tmp_path / "recording"
+    command = [*XETHRU.split(), "record", "--out", str(out), "--count", "100", "--port"]
+    with (
+        PtyModule() as module,
+        subprocess.Popen(
+            [*command, module.path],
+            stderr=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            preexec_fn=lambda: signal.signal(signal.SIGHUP, before),
+        ) as process,
+    ):
+        while not any(path.stat().st_size for path in out.glob("xethru_datafloat_*")):
+            assert process.poll() is None
+            time.sleep(0.01)
+        process.send_signal(signal.SIGHUP)
+        _, errors = process.communicate(timeout=10)
+        assert module.fps == 0
+    assert (process.returncode, errors) == (code, b"")
+    kept = describe_recording(out)  # complete: no faults
+    assert (kept.faults, kept.messages["DATA FLOAT"] == 100) == ((), code == 0)
 
 
 @pytest.mark.parametrize("name", ["line\nend", "tab\tbell\a", "\udcff\udcfe", "größer ☃"])

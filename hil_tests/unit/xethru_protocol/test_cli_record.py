@@ -106,6 +106,36 @@ def test_force_takes_a_file_for_no_directory_and_back(tmp_path: Path, capsys: Ca
     assert len(list(directory.iterdir())) == 1
 
 
+def test_a_module_that_does_not_answer_costs_no_older_recording(
+    module: PtyModule, tmp_path: Path, capsys: Capture
+) -> None:
+    out = tmp_path / "recording"
+    assert main(["record", "--port", module.path, "--out", str(out), "--count", "2"]) == 0
+    before = {path: path.read_bytes() for path in out.iterdir()}
+    assert main(["record", "--port", str(tmp_path / "none"), "--out", str(out), "--force"]) == 1
+    with SickModule(silent) as deaf:
+        assert main(["record", "--port", deaf.path, "--out", str(out), "--force"]) == 1
+    assert {path: path.read_bytes() for path in out.iterdir()} == before
+
+
+def test_a_file_that_cannot_be_made_leaves_nothing(
+    module: PtyModule, tmp_path: Path, capsys: Capture
+) -> None:
+    out, wire = tmp_path / "recording", tmp_path / "none" / "port.xtwire"
+    arguments = ["--out", str(out), "--wire", str(wire)]
+    assert main(["record", "--port", module.path, *arguments]) == 1
+    assert capsys.readouterr().err.startswith(f"xethru record: {wire} cannot be written: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_wire_capture_within_the_directory(module: PtyModule, tmp_path: Path) -> None:
+    out = tmp_path / "recording"
+    arguments = ["--out", str(out), "--wire", str(out / "port.xtwire")]
+    assert main(["record", "--port", module.path, *arguments, "--count", "2"]) == 0
+    assert counters(out) == [0, 1]
+    assert counters(out / "port.xtwire")[:2] == [0, 1]
+
+
 def test_the_wire_alone(module: PtyModule, tmp_path: Path) -> None:
     wire = tmp_path / "port.xtwire"
     assert main(["record", "--port", module.path, "--wire", str(wire), "--count", "3"]) == 0
@@ -198,6 +228,8 @@ def test_a_full_disk_keeps_what_is_there(module: PtyModule, tmp_path: Path) -> N
     [
         [],
         ["--out", ""],
+        ["--out", "o", "--wire", "o"],
+        ["--out", "o", "--session-id", "\udcff"],
         ["--out", "o", "--duration", "0"],
         ["--out", "o", "--duration", "nan"],
         ["--out", "o", "--count", "0"],
@@ -212,7 +244,7 @@ def test_wrong_usage(arguments: list[str], capsys: Capture) -> None:
     with pytest.raises(SystemExit) as caught:
         main(["record", "--port", "p", *arguments])
     assert caught.value.code == 2
-    assert "usage: xethru" in capsys.readouterr().err
+    assert "usage: xethru record" in capsys.readouterr().err
 
 
 def test_the_second_signal_insists() -> None:
