@@ -56,17 +56,16 @@ class AsyncSerialTransport:
 
     async def read(self, timeout_s: float) -> bytes:
         """See `AsyncTransport.read`."""
-        data = self._port.read(0.0)
         loop = asyncio.get_running_loop()
+        if loop.time() > self._turn_ends_s:  # a line that never pauses: now the other tasks
+            await asyncio.sleep(0)  # before reading: a task cancelled here must lose no bytes
+            self._turn_ends_s = loop.time() + _TURN_S
+        data = self._port.read(0.0)
         if data or timeout_s <= 0:
-            if loop.time() > self._turn_ends_s:  # a line that never pauses: now the other tasks
-                await asyncio.sleep(0)
-                self._turn_ends_s = loop.time() + _TURN_S
             return data
+        ready = await self._wait(loop.add_reader, loop.remove_reader, timeout_s)
         self._turn_ends_s = loop.time() + _TURN_S
-        if not await self._wait(loop.add_reader, loop.remove_reader, timeout_s):
-            return b""
-        return self._port.read(0.0)
+        return self._port.read(0.0) if ready else b""
 
     async def write(self, data: bytes) -> None:
         """See `AsyncTransport.write`."""

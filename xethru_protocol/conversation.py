@@ -114,7 +114,7 @@ class Conversation:
         self._clock = clock
         self._observer = observer
         self._take_data = take_data
-        self._connection = self._new_connection()
+        self._connection = Connection(Role.HOST, self.statistics)
         self._answers: deque[Response] = deque()
         self._request: _Request | None = None
         self._answer_owed = False
@@ -194,6 +194,10 @@ class Conversation:
             raise DeviceError(found.code, summary(request.command), meaning)
         return found
 
+    def give_up(self) -> None:
+        """Ask for nothing any more; the answer may still come and belongs to nobody then."""
+        self._request = None
+
     def wait_s(self) -> float:
         """How long the answer to the outstanding request should be waited for now [s]."""
         if self._request is None:
@@ -239,14 +243,21 @@ class Conversation:
 
     def receive(self, data: bytes, arrival_ns: int) -> None:
         """Sort what came."""
-        self._connection.receive_data(data)
-        while (event := self._connection.next_event()) is not NEED_DATA:
-            if isinstance(event, Response):
-                self._sort(event, arrival_ns)
-            elif isinstance(event, FramingFault) and not self._winding_down:
-                self.fault_count += 1
-                self._damaged_since = True
-                self.tell("fault", f"{event.kind.value} at byte {event.offset}")
+        connection = self._connection
+        try:
+            connection.receive_data(data)
+            while (event := connection.next_event()) is not NEED_DATA:
+                if isinstance(event, Response):
+                    self._sort(event, arrival_ns)
+                elif isinstance(event, FramingFault) and not self._winding_down:
+                    self.fault_count += 1
+                    self._damaged_since = True
+                    self.tell("fault", f"{event.kind.value} at byte {event.offset}")
+        except Exception:  # of a listener or an observer
+            raise
+        except BaseException:  # an interrupt, perhaps while the receiver moved its bytes
+            self._connection = Connection(Role.HOST, self.statistics)
+            raise
 
     def _sort(self, message: Response, arrival_ns: int) -> None:
         if self.listener is not None:
@@ -257,7 +268,10 @@ class Conversation:
             return
         if self._is_answer(message):
             self._sign_of_life()
-            self._answers.append(message)
+            if self._request is None:
+                self.stray_count += 1  # not kept: a sick module may never stop sending them
+            else:
+                self._answers.append(message)
             if isinstance(message, Pong):
                 self._pongs_owed = max(self._pongs_owed - 1, 0)
         elif isinstance(message, System):
@@ -286,7 +300,8 @@ class Conversation:
     def new_line(self, name: str) -> None:
         """Begin anew on a line that was just opened: nothing is owed and nothing half-read."""
         self.name = name
-        self._connection = self._new_connection()
+        self.statistics.junk_bytes += self._connection.buffered  # the rest of them never came
+        self._connection = Connection(Role.HOST, self.statistics)
         self._answers.clear()
         self._request = None
         self._answer_owed = False
@@ -297,14 +312,11 @@ class Conversation:
         """From now on care for answers only.
 
         An interrupt may have come while bytes were taken in, so what is half-read is forgotten;
-        the rest of a packet that was cut so looks like damage and is not reported.
+        the rest of a packet that was cut so looks like damage and is neither reported nor counted.
         """
         self._winding_down = True
-        self._connection = self._new_connection()
+        self._connection = Connection(Role.HOST)
         self._answers.clear()
-
-    def _new_connection(self) -> Connection:
-        return Connection(Role.HOST, self.statistics)
 
     # --- telling --------------------------------------------------------------------------------
 

@@ -11,6 +11,7 @@ from xethru_protocol.messages import Command, Response
 from xethru_protocol.raw_config import RawConfig
 
 POWER_UP_BAUD = 115200  # a UART module's rate after every restart (Protocol reference 10)
+_WARNINGS = 1000  # kept; a radar may run for months
 _MESSAGES = 4096  # of a profile that wait unread: pulse-Doppler sends one per range bin
 
 
@@ -64,7 +65,8 @@ class RadarCore:
     Attributes
     ----------
     warnings
-        What was asked of the module although it is likely to fail, and what went wrong quietly.
+        What was asked of the module although it is likely to fail, and what went wrong quietly;
+        the last 1000.
     messages
         Messages of the running profile that were not taken yet; None: nobody wants them.
     home
@@ -134,6 +136,8 @@ class RadarCore:
 
     def warn(self, text: str) -> None:
         """Note what the user should know although nothing failed."""
+        if len(self.warnings) >= _WARNINGS:
+            del self.warnings[0]
         self.warnings.append(text)
         self.conversation.tell("warning", text)
 

@@ -27,7 +27,10 @@ class DriverFacts:
 
     @property
     def warnings(self) -> list[str]:
-        """What was asked of the module although it is likely to fail, or went wrong quietly."""
+        """What was asked of the module although it is likely to fail, or went wrong quietly.
+
+        The last 1000, oldest first; whoever has shown them may clear the list.
+        """
         return self._core.warnings
 
     @property

@@ -54,6 +54,7 @@ class FrameQueue:
         self._warn = warn
         self._frames: deque[Frame] = deque()
         self._in_burst = False
+        self._gap = (0, 0)  # the last one: counter before it, frames missing in it
         self._baseband_geometry: FrameGeometry | None = None
 
     def __len__(self) -> int:
@@ -71,11 +72,12 @@ class FrameQueue:
         """Forget the frames that wait and their counters: what comes now follows on nothing."""
         self._frames.clear()
         self._in_burst = False
-        self.last_counter = None
+        self.break_off()
 
     def break_off(self) -> None:
         """Keep the frames that wait, but what comes now does not follow on them."""
         self.last_counter = None
+        self._gap = (0, 0)
 
     def take(self, message: DataFloat | BasebandIq, arrival_ns: int) -> None:
         """Queue a message's frame, or count the message as discarded."""
@@ -109,15 +111,27 @@ class FrameQueue:
         self, counter: int, samples: Samples, geometry: FrameGeometry, arrival_ns: int
     ) -> None:
         if self.last_counter is not None:
-            missing = (counter - self.last_counter - 1) % _COUNTER_WRAP
-            if missing < _COUNTER_WRAP // 2:  # else it went back: the chip was restarted
-                self._statistics.frames_lost += missing
+            self._count_missing(self.last_counter, counter)
         self.last_counter = counter
         if len(self._frames) >= self._limit:
             self._drop_oldest()
         self._frames.append(
             Frame(counter=counter, samples=samples, geometry=geometry, arrival_ns=arrival_ns)
         )
+
+    def _count_missing(self, last: int, counter: int) -> None:
+        missing = (counter - last - 1) % _COUNTER_WRAP
+        if missing < _COUNTER_WRAP // 2:
+            self._statistics.frames_lost += missing
+            self._gap = (last, missing)
+            return
+        # It went back: the chip was restarted, or the last counter was damaged. Then this one
+        # lies in the gap which that one seemed to make, and one of those before it did come.
+        before, gap = self._gap
+        inside = (counter - before - 1) % _COUNTER_WRAP
+        if 1 <= inside <= gap:
+            self._statistics.frames_lost += inside - 1 - gap
+        self._gap = (0, 0)
 
     def _drop_oldest(self) -> None:
         self._frames.popleft()

@@ -84,9 +84,12 @@ def request(
 def _exchange(core: RadarCore, command: Command[Response], timeout_s: float) -> Procedure[Response]:
     yield from take_stale_input()
     conversation = core.conversation
-    yield Write(conversation.ask(command, timeout_s))
-    while (answer := conversation.answer()) is None:
-        yield Read(conversation.wait_s())
+    try:
+        yield Write(conversation.ask(command, timeout_s))
+        while (answer := conversation.answer()) is None:
+            yield Read(conversation.wait_s())
+    finally:  # also after a cancellation or an interrupt
+        conversation.give_up()
     return answer
 
 
@@ -98,13 +101,17 @@ def take_stale_input() -> Procedure[None]:
 
 
 def listen(core: RadarCore, done: Callable[[], bool], timeout_s: float) -> Procedure[bool]:
-    """Hear what comes until ``done()``; False if that did not happen in time."""
+    """Hear what comes until ``done()``; False if that did not happen in time.
+
+    What has come already is heard whatever the timeout.
+    """
     deadline_ns = core.conversation.deadline_ns(timeout_s)
+    left_s = timeout_s
     while not done():
+        yield Read(left_s)
         left_s = core.left_s(deadline_ns)
         if left_s <= 0:
-            return False
-        yield Read(left_s)
+            return done()
     return True
 
 

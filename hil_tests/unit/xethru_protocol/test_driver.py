@@ -124,6 +124,37 @@ def test_counters_wrap_without_loss_and_restarts_are_no_loss(driver_on: DriverOn
     assert radar.frames_lost == 0
 
 
+@pytest.mark.parametrize(
+    ("counters", "lost"),
+    [
+        ((5, 1_000_006, 7, 8), 0),  # 6, damaged
+        ((5, 1_000_006, 9, 10), 2),
+        ((5, 9, 10, 7, 8), 3),  # the chip was restarted after a true gap
+        ((5, 0x8000_0006, 7), 0),
+        ((0xFFFF_FFFE, 0x0FFF_FFFF, 0, 1), 0),  # FFFFFFFF, damaged
+    ],
+)
+def test_damaged_counter_is_no_gap(
+    driver_on: DriverOn, counters: tuple[int, ...], lost: int
+) -> None:
+    radar, line = driver_on()
+    radar.configure_raw()
+    line.say(*map(frame, counters))
+    assert [got.counter for got in radar.frames(len(counters))] == list(counters)
+    assert radar.frames_lost == lost
+
+
+def test_gap_of_the_last_stream_explains_nothing_in_the_next(driver_on: DriverOn) -> None:
+    radar, line = driver_on()
+    radar.configure_raw()
+    line.say(frame(5), frame(100))
+    list(radar.frames(2))
+    radar.start(17.0)
+    line.say(frame(30), frame(29))
+    list(radar.frames(2))
+    assert radar.frames_lost == 94
+
+
 def test_frames_of_the_last_stream_are_no_part_of_the_next(driver_on: DriverOn) -> None:
     radar, line = driver_on()
     radar.configure_raw()

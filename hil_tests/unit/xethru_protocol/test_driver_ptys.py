@@ -119,6 +119,28 @@ def test_waiting_task_can_be_cancelled_and_stops_nobody_else(machine: PtyMachine
     asyncio.run(use())
 
 
+def test_cancelled_read_loses_no_bytes() -> None:
+    """Also on a line that never pauses, where a read lets other tasks have their turn."""
+
+    async def use() -> None:
+        master, slave = pty.openpty()
+        line = AsyncSerialTransport(os.ttyname(slave))
+        try:
+            os.write(master, b"first")
+            reading = asyncio.create_task(line.read(60.0))
+            await asyncio.sleep(0)  # it lets us have our turn
+            reading.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await reading
+            assert await line.read(1.0) == b"first"
+        finally:
+            line.close()
+            os.close(master)
+            os.close(slave)
+
+    asyncio.run(use())
+
+
 def test_closing_wakes_the_task_that_reads(machine: PtyMachine) -> None:
     async def use() -> None:
         radar = AsyncX4M300.open(machine.path("home"), reconnect_s=10.0)

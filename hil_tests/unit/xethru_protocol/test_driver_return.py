@@ -181,6 +181,18 @@ def test_counters_on_either_side_of_an_outage_make_no_gap(
     assert radar.frames_lost == 0
 
 
+def test_packet_cut_by_an_outage_is_counted_as_junk(driver_on: DriverOn, machine: Machine) -> None:
+    machine.plug(HOME, PlainModule(), from_s=2.0)
+    radar, line = driver_on(ports=machine.ports, name=HOME, reconnect_s=10.0)
+    machine.runs_on(line)
+    radar.configure_raw()
+    line.say(line._bytes(frame(7))[:100])
+    radar._pump(0.0)
+    unplug(line)
+    radar.ping()
+    assert (radar.reconnects, radar.statistics.junk_bytes) == (1, 100)
+
+
 def test_request_is_repeated_on_the_new_line_and_waiting_frames_are_kept(
     driver_on: DriverOn, machine: Machine
 ) -> None:
