@@ -1,12 +1,11 @@
 """``xethru convert``: a recording in another format."""
 
-import os
 from pathlib import Path
 
 from xethru_protocol.cli.faults import warn_of
 from xethru_protocol.cli.output import one_line, print_json, print_line, warn
-from xethru_protocol.cli.overwriting import set_aside
-from xethru_protocol.cli.progress import Progress
+from xethru_protocol.cli.overwriting import is_part_of, set_aside
+from xethru_protocol.cli.progress import Progress, counted
 from xethru_protocol.recordings import RecordingError, recording_facts
 from xethru_protocol.recordings import convert as convert_recording
 
@@ -15,7 +14,7 @@ def convert(source: str, target: str, *, replace: bool, as_json: bool) -> int:
     """Write ``source`` again as ``target``; 1 if a part of it could not be read."""
     recording_facts(source)  # raises before anything is removed
     path = Path(target)
-    if path.exists() and os.path.samefile(source, target):
+    if is_part_of(Path(source), path):
         raise RecordingError(f"{source} cannot be converted into itself")
     progress = Progress("xethru convert")
     newest = 0
@@ -43,7 +42,7 @@ def convert(source: str, target: str, *, replace: bool, as_json: bool) -> int:
             }
         )
     else:
-        print_line(f"{one_line(target)}: {done.messages} messages")
+        print_line(f"{one_line(target)}: {counted(done.messages, 'message')}")
     for name, number in sorted(done.skipped.items()):
         warn(f"xethru convert: {number} {name} left out: the format has no place for them")
     warn_of("convert", done.faults)

@@ -12,6 +12,7 @@ from xethru_protocol.cli.output import one_line, print_json, print_line
 from xethru_protocol.cli.patient import Patient
 from xethru_protocol.cli.port_checks import PORT_CHECKS
 from xethru_protocol.cli.profiles import profile_name
+from xethru_protocol.cli.progress import counted
 from xethru_protocol.errors import XeThruError
 from xethru_protocol.ports import find_ports, run_directory
 
@@ -39,7 +40,7 @@ def doctor(paths: Sequence[str], *, as_json: bool) -> int:
     if as_json:
         print_json({"ok": not faults, "reports": [_as_json(report) for report in reports]})
     else:
-        print_line("all is well" if not faults else f"{faults} fault{'s' if faults > 1 else ''}")
+        print_line("all is well" if not faults else counted(faults, "fault"))
     return 1 if faults else 0
 
 
@@ -100,7 +101,7 @@ def _lines(report: Report) -> Iterator[str]:
     yield f"{one_line(report.subject)}{': ' if report.about else ''}{report.about}"
     well = sum(finding.level is Level.OK for finding in report.findings)
     if well:
-        yield f"  ok     {well} check{'s' if well > 1 else ''}"
+        yield f"  ok     {counted(well, 'check')}"
     for finding in report.findings:
         if finding.level is not Level.OK:
             yield from _wrapped(f"  {finding.level.value:<6} ", one_line(finding.found))

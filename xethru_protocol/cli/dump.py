@@ -7,7 +7,7 @@ from typing import Any
 from xethru_protocol.cli.faults import warn_of
 from xethru_protocol.cli.output import one_line, print_json, print_line
 from xethru_protocol.cli.profiles import profile_name
-from xethru_protocol.cli.progress import bytes_text
+from xethru_protocol.cli.progress import bytes_text, counted
 from xethru_protocol.codec import describe, encode
 from xethru_protocol.messages import Response, UnknownMessage
 from xethru_protocol.packets import Framing
@@ -70,7 +70,7 @@ def _as_json(message: Response, t_ns: int | None) -> dict[str, Any]:
 def _head(summary: RecordingSummary) -> Iterator[str]:
     total = sum(summary.messages.values())
     yield (
-        f"{one_line(str(summary.path))}: {summary.format} recording, {total} messages, "
+        f"{one_line(str(summary.path))}: {summary.format} recording, {counted(total, 'message')}, "
         f"{bytes_text(summary.size_bytes)}"
     )
     for name, count in sorted(summary.messages.items()):

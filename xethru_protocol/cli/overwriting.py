@@ -26,6 +26,13 @@ def what_must_go(targets: Iterable[Path], *, replace: bool) -> list[Path]:
     return old
 
 
+def is_part_of(source: Path, target: Path) -> bool:
+    """Whether writing to ``target`` would replace ``source``."""
+    return target.exists() and any(
+        path.exists() and path.samefile(source) for path in (target, *_recording_files(target))
+    )
+
+
 def make_room(targets: Iterable[Path], *, replace: bool) -> None:
     """Remove older recordings where new ones shall be, if that is allowed.
 

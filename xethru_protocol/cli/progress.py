@@ -58,6 +58,15 @@ def rewriting(line: str, terminal: TextIO) -> str:
     return f"\r{line[: columns - 1] if columns else line}\x1b[K"
 
 
+def counted(count: int, noun: str) -> str:
+    """Write a number of things, for people.
+
+    >>> counted(0, "frame"), counted(1, "frame"), counted(2, "frame")
+    ('0 frames', '1 frame', '2 frames')
+    """
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def bytes_text(count: int) -> str:
     """Amount of data, for people.
 

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from types import FrameType
 
 from xethru_protocol.cli.output import one_line, print_json, print_line, warn
-from xethru_protocol.cli.progress import Progress
+from xethru_protocol.cli.progress import Progress, counted
 from xethru_protocol.cli.recorder import Recorder, Targets
 from xethru_protocol.cli.recording_modes import RecordingMode
 from xethru_protocol.cli.session import CommandFailed, module_at, say_warnings
@@ -54,7 +54,7 @@ def record(
     if recorder.failure is not None:
         text = str(recorder.failure)
         if recorder.messages:
-            text += f"; kept {recorder.messages} messages in {targets.text}"
+            text += f"; kept {counted(recorder.messages, 'message')} in {targets.text}"
         if not signals:
             raise CommandFailed(text)
         warn(f"xethru record: {one_line(text)}")

@@ -9,7 +9,7 @@ from typing import Any, Literal, Self
 
 from xethru_protocol.cli.output import one_line
 from xethru_protocol.cli.overwriting import make_room, remove_unfinished, what_must_go
-from xethru_protocol.cli.progress import bytes_text
+from xethru_protocol.cli.progress import bytes_text, counted
 from xethru_protocol.driver import X4M300
 from xethru_protocol.errors import XeThruError
 from xethru_protocol.messages import (
@@ -219,7 +219,7 @@ class Recorder:
         span_s = (self._newest_ns - self._began_ns) * 1e-9
         rate = f", {self.messages / span_s:.1f}/s" if span_s > 0 else ""
         return (
-            f"{self.messages} messages in {span_s:.1f} s{rate}, "
+            f"{counted(self.messages, 'message')} in {span_s:.1f} s{rate}, "
             f"{bytes_text(self._statistics.bytes)}, {self._statistics.frames_lost} lost"
         )
 

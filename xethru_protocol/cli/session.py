@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from xethru_protocol.cli.output import one_line, warn
+from xethru_protocol.cli.progress import counted
 from xethru_protocol.driver import X4M300
 from xethru_protocol.errors import Disconnected, XeThruError
 
@@ -55,7 +56,10 @@ def say_warnings(radar: X4M300) -> None:
 def _losses(radar: X4M300) -> str:
     if not radar.frames_lost and not radar.fault_count:
         return ""
-    return f"{radar.frames_lost} frames lost, {radar.fault_count} damaged places on the line"
+    return (
+        f"{counted(radar.frames_lost, 'frame')} lost, "
+        f"{counted(radar.fault_count, 'damaged place')} on the line"
+    )
 
 
 def _say_end(radar: X4M300, losses: str) -> None:

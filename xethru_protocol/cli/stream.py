@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from xethru_protocol.cli.output import is_terminal, print_json, print_text, warn
-from xethru_protocol.cli.progress import rewriting
+from xethru_protocol.cli.progress import counted, rewriting
 from xethru_protocol.cli.session import module_at, say_warnings
 from xethru_protocol.driver import X4M300, Frame, RawConfig
 
@@ -90,7 +90,7 @@ class _Live:
         span_s = (now_ns - self._began_ns) * 1e-9
         rate = f"{(self._frames - 1) / span_s:.1f}" if self._frames > 1 else "-"
         line = (
-            f"{self._frames} frames, {rate}/s, {geometry.n_bins} bins, "
+            f"{counted(self._frames, 'frame')}, {rate}/s, {geometry.n_bins} bins, "
             f"strongest at {geometry.range_start_m + strongest * geometry.bin_length_m:.3f} m, "
             f"{self._radar.frames_lost} lost"
         )

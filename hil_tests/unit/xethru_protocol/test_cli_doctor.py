@@ -200,6 +200,22 @@ def test_a_link_to_nothing(tmp_path: Path, capsys: Capture) -> None:
     assert finding["remedy"].endswith(f"rm {link}")
 
 
+def test_names_in_remedies_can_be_given_to_a_shell(tmp_path: Path, capsys: Capture) -> None:
+    link = tmp_path / "my {radar} $(id)"
+    link.symlink_to(tmp_path / "gone")
+    _, finding = only_finding(capsys, str(link))
+    assert finding["remedy"].endswith(f"rm '{link}'")
+
+
+def test_a_port_that_vanishes_while_it_is_examined(
+    capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(patient.Patient, "exists", True)
+    _, finding = only_finding(capsys, "/dev/none")
+    assert finding["check"] == "is a serial port"
+    assert finding["found"] == "this could not be found out: No such file or directory"
+
+
 def test_no_such_port(tmp_path: Path, capsys: Capture) -> None:
     code, finding = only_finding(capsys, str(tmp_path / "radar"))
     assert (code, finding["check"]) == (1, "port exists")

@@ -271,5 +271,19 @@ def test_a_conversion_that_fails_brings_the_older_one_back(
     assert not [path for path in after if path.name.endswith(".old")]
 
 
+def test_a_part_of_a_recording_is_not_converted_into_it(tmp_path: Path, capsys: Capture) -> None:
+    own = tmp_path / "own"
+    shutil.copytree(IQ, own)
+    before = snapshot(own)
+    for source in (own, own / IQ_FILE, own / "xethru_recording_meta.dat"):
+        assert main(["convert", str(source), str(own), "--force"]) == 1
+        assert capsys.readouterr().err == (
+            f"xethru convert: {source} cannot be converted into itself\n"
+        )
+    assert snapshot(own) == before
+    assert main(["convert", str(own), str(tmp_path / "copy.npz")]) == 0
+    assert main(["convert", str(tmp_path / "copy.npz"), str(tmp_path)]) == 0
+
+
 def snapshot(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}

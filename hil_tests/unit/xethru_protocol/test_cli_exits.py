@@ -205,5 +205,5 @@ def test_after_a_signal_it_is_a_warning(
         raise KeyboardInterrupt
     assert capsys.readouterr().err == (
         "xethru: the module was not stopped: no answer\n"
-        "xethru: 2 frames lost, 1 damaged places on the line\n"
+        "xethru: 2 frames lost, 1 damaged place on the line\n"
     )
