@@ -100,7 +100,7 @@ class PacketReader:
         self._queue: deque[bytes] = deque()  # received and not in the buffer yet
         self._taken = 0  # bytes of the queue's first chunk that were moved to the buffer
         self._queued = 0
-        self._missing = 1  # bytes without which parsing cannot go on
+        self._missing = 1  # bytes without which parsing cannot go on; 0: it can
         self._wanted = 1  # bytes worth joining to the buffer at once
         self._ended = False
         self._damage_end = -1  # end of the bytes a fault was reported for; -1: none since a packet
@@ -140,10 +140,16 @@ class PacketReader:
     def next_span(self) -> Span | FramingFault | NeedData:
         """Like ``next_packet``, but tells where the payload lies instead of copying it."""
         while True:
+            if self._missing and not self._refill():  # parsing would tell nothing new
+                if not self._ended or not self.buffered:
+                    return NEED_DATA
+                fault = self._reject_last_start()
+                if fault is not None:
+                    return fault
             buffer, pos = self._buffer, self._pos
             if len(buffer) - pos >= 23:
-                # The way of nearly every byte: a whole, consistent DATA FLOAT. It accepts
-                # nothing that _no_escape() would not.
+                # The way of nearly every byte: a consistent DATA FLOAT. It accepts nothing that
+                # _no_escape() would not.
                 magic, length, code, kind, count = _FRAME_HEADER.unpack_from(buffer, pos)
                 end = pos + 9 + length
                 if (
@@ -151,9 +157,11 @@ class PacketReader:
                     and length == 14 + 4 * count
                     and code == 0xA0
                     and kind == 0x12
-                    and end <= len(buffer)
                     and length <= MAX_LENGTH
                 ):
+                    if end > len(buffer):
+                        self._need(end - len(buffer))
+                        continue
                     self._pos = end
                     self._damage_end = -1
                     self.statistics.packets += 1
@@ -161,17 +169,15 @@ class PacketReader:
             found = self._parse()
             if found is not NEED_DATA:
                 return found
-            if self._refill():
-                continue
-            if not self._ended or not self.buffered:
-                return NEED_DATA
-            if self._queued:
-                self._need(self._queued)
-                self._refill()
-            limit = self._base + len(self._buffer)
-            fault = self._reject(FaultKind.INCOMPLETE, self._base + self._pos, limit)
-            if fault is not None:
-                return fault
+
+    def _reject_last_start(self) -> FramingFault | None:
+        """Give up a packet whose end will not come, with all that came of it."""
+        if self._queued:
+            self._need(self._queued)
+            self._refill()
+        self._missing = 0
+        limit = self._base + len(self._buffer)
+        return self._reject(FaultKind.INCOMPLETE, self._base + self._pos, limit)
 
     def _parse(self) -> Span | FramingFault | NeedData:
         """Next packet or fault in the buffer; NEED_DATA if ``_missing`` more bytes are needed."""
@@ -294,6 +300,7 @@ class PacketReader:
         """
         if self._queued < self._missing:
             return False
+        self._missing = 0
         self._base += self._pos
         rest = len(self._buffer) - self._pos
         if rest <= self._taken:  # all of it was copied from the chunk that goes on: parse it there
