@@ -107,13 +107,18 @@ class AsyncX4M300(DriverFacts):
 
         ``baudrate`` is the rate at which a UART module talks now; USB and ptys have none.
         """
-        radar = cls(
-            AsyncSerialTransport(path, baudrate),
-            clock=clock,
-            observer=observer,
-            queue_frames=queue_frames,
-            reconnect_s=reconnect_s,
-        )
+        transport = AsyncSerialTransport(path, baudrate)
+        try:
+            radar = cls(
+                transport,
+                clock=clock,
+                observer=observer,
+                queue_frames=queue_frames,
+                reconnect_s=reconnect_s,
+            )
+        except BaseException:
+            transport.close()
+            raise
         radar._core.baudrate = baudrate
         return radar
 

@@ -62,11 +62,17 @@ class RawConfig:
         """Raise `LocalProtocolError` if a module would make no bin of the frame area."""
         area = x4.frame_area(*self.frame_area_m, self.offset_m, self.downconversion)
         if area.n_bins <= 0:
-            begin = self.offset_m - x4.COARSE_STEP_M
+            start_m, end_m = self.frame_area_m
+            nearest_m = self.offset_m - x4.COARSE_STEP_M + area.bin_length_m
+            longest_m = area.requested_end_m - area.requested_start_m
+            cut = (
+                f", of which the module keeps {longest_m:.4f} m,"
+                if end_m - start_m > longest_m
+                else ""
+            )
             raise LocalProtocolError(
-                f"frame area {self.frame_area_m[0]:g} ... {self.frame_area_m[1]:g} m has no bins; "
-                f"it must end at least {area.bin_length_m:.4f} m behind its start "
-                f"and behind {begin + area.bin_length_m:.4f} m"
+                f"frame area {start_m:g} ... {end_m:g} m{cut} has no bins; what is kept must be at "
+                f"least {area.bin_length_m:.4f} m long and end behind {nearest_m:.4f} m"
             )
 
     @property

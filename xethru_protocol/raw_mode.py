@@ -1,5 +1,6 @@
 """Raw radar mode: from any state to frames of one geometry, and back. Protocol reference 13."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -23,6 +24,7 @@ from xethru_protocol.procedures import (
 from xethru_protocol.raw_config import RawConfig
 from xethru_protocol.steps import Procedure
 
+_LARGEST_FPS = 65535  # 16 bits (Protocol reference 9.6)
 _QUANTISATION_M = 1e-5  # far below a bin, far above a float32 rounding
 
 
@@ -149,6 +151,9 @@ def leave(core: RadarCore) -> Procedure[None]:
 
 
 def _warn_of_rate(core: RadarCore, fps: float) -> None:
+    whole = max(math.floor(fps), 1) if fps < _LARGEST_FPS else _LARGEST_FPS
+    if fps != whole:
+        core.warn(f"the module's timer takes whole numbers: {fps:g} frames/s will be {whole}")
     config = core.plan.config if isinstance(core.plan, RawPlan) else None
     if config is not None and fps > config.fps_max:
         core.warn(

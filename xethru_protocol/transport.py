@@ -70,7 +70,8 @@ class SerialTransport:
         self.name = path
         try:
             self._port = serial.Serial(path, baudrate, timeout=0, exclusive=True)
-        except (OSError, ValueError) as error:  # SerialException is an OSError
+        # SerialException is an OSError; no rate can have more than 32 bits
+        except (OSError, ValueError, OverflowError) as error:
             raise PortUnavailable(_why(path, error)) from None
         self._fd: int = self._port.fileno()
         # select(), which pyserial's write uses, cannot wait on descriptors above 1023

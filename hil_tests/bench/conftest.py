@@ -16,21 +16,23 @@ def processor() -> str:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Print the frames per second that benchmarks noted as ``frames_per_s``."""
+    """Print the frames per second of benchmarks that noted their ``frames`` per round."""
     # the plugin shows extra_info only in its JSON
     session = getattr(terminalreporter.config, "_benchmarksession", None)
-    rates = {
-        benchmark.name.removeprefix("test_"): benchmark.extra_info["frames_per_s"]
+    timed = [
+        (benchmark.name.removeprefix("test_"), benchmark.extra_info["frames"], benchmark.stats)
         for benchmark in getattr(session, "benchmarks", [])
-        if "frames_per_s" in benchmark.extra_info
-    }
-    if not rates:
+        if "frames" in benchmark.extra_info
+    ]
+    if not timed:
         return
-    terminalreporter.section("frames per second, at the fastest round")
+    terminalreporter.section("frames per second")
     terminalreporter.line(
         f"{processor()}, {platform.system()} {platform.machine()}, "
         f"Python {platform.python_version()}, numpy {np.__version__}"
     )
-    width = max(map(len, rates))
-    for name, rate in rates.items():
-        terminalreporter.line(f"{name:{width}}  {rate:>9,.0f}")
+    width = max(len(name) for name, _, _ in timed)
+    terminalreporter.line(f"{'':{width}}  {'median':>9}  {'fastest':>9}")
+    for name, frames, stats in timed:
+        rates = f"{frames / stats.median:>9,.0f}  {frames / stats.min:>9,.0f}"
+        terminalreporter.line(f"{name:{width}}  {rates}")

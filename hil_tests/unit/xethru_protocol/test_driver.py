@@ -436,9 +436,26 @@ def test_impossible_area_is_refused_before_anything_is_sent(driver_on: DriverOn)
 
 def test_area_without_bins_is_refused_before_anything_is_sent(driver_on: DriverOn) -> None:
     radar, line = driver_on()
-    with pytest.raises(LocalProtocolError, match=r"has no bins; it must end at least 0\.0064 m"):
+    with pytest.raises(
+        LocalProtocolError, match=r"-3 \.\.\. -2 m has no bins; .* behind -0\.4309 m"
+    ):
         radar.configure_raw(RawConfig(frame_area_m=(-3.0, -2.0)))
+    cut = r"-1000 \.\.\. 1000 m, of which the module keeps 9\.8765 m, has no bins"
+    with pytest.raises(LocalProtocolError, match=cut):
+        radar.configure_raw(RawConfig(frame_area_m=(-1000.0, 1000.0)))
     assert line.received == []
+
+
+@pytest.mark.parametrize(
+    ("fps", "made"), [(1e-9, "1"), (17.5, "17"), (70000.0, "65535"), (17.0, None)]
+)
+def test_rate_that_the_timer_cannot_make_is_warned_of(
+    driver_on: DriverOn, fps: float, made: str | None
+) -> None:
+    radar, _ = driver_on()
+    radar.start(fps)
+    warned = [text for text in radar.warnings if "whole numbers" in text]
+    assert [text.rpartition(" ")[2] for text in warned] == ([] if made is None else [made])
 
 
 @pytest.mark.parametrize(("name", "largest"), [("iterations", 255), ("pulses_per_step", 65535)])

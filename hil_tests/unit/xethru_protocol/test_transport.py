@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 import serial
 
-from xethru_protocol.errors import Disconnected, PortUnavailable
+from xethru_protocol.driver import X4M300
+from xethru_protocol.errors import Disconnected, LocalProtocolError, PortUnavailable
 from xethru_protocol.transport import SerialTransport
 
 
@@ -207,3 +208,16 @@ def test_what_is_no_port_is_called_so(tmp_path: Path, kind: str) -> None:
         path.write_text("hello")
     with pytest.raises(PortUnavailable, match="is not a serial port"):
         SerialTransport(str(path))
+
+
+def test_a_rate_beyond_all_sense_is_no_port(line: Line) -> None:
+    with pytest.raises(PortUnavailable, match=line.path):
+        SerialTransport(line.path, 2**40)
+
+
+def test_driver_that_cannot_be_made_gives_its_port_back(line: Line) -> None:
+    # the error is held, and with it everything that its frames refer to
+    with pytest.raises(LocalProtocolError, match="queue needs room") as refused:
+        X4M300.open(line.path, queue_frames=0)
+    SerialTransport(line.path).close()
+    assert refused.value
