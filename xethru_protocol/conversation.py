@@ -337,7 +337,9 @@ class Conversation:
         """
         missing = f"no {what} from {self.name} within {timeout_s:g} s"
         if self._rebooted_since:
-            return ResponseTimeout(f"{missing}: the module restarted meanwhile; start it again")
+            return ResponseTimeout(
+                f"{missing}: the module restarted meanwhile and forgot its settings; begin again"
+            )
         if self._damaged_since:
             return ResponseTimeout(
                 f"{missing}, but bytes that are no XeThru packets; "

@@ -95,6 +95,8 @@ def _read_geometry(core: RadarCore, config: RawConfig) -> Procedure[FrameGeometr
             f"{core.conversation.name} reads back frame area {area} with {n_bins} bins"
         )
     start_m, end_m = float(area[0]), float(area[1])
+    if end_m < config.frame_area_m[1] - _QUANTISATION_M:
+        core.warn(f"the module's frame ends at {end_m:.4f} m, not at {config.frame_area_m[1]:g} m")
     predicted = x4.frame_area(*config.frame_area_m, config.offset_m, config.downconversion)
     if n_bins != predicted.n_bins or not np.allclose(
         (start_m, end_m), (predicted.start_m, predicted.end_m), rtol=0.0, atol=_QUANTISATION_M

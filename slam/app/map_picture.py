@@ -131,8 +131,8 @@ def _write_title(axes: Axes, summary: Summary) -> None:
         pad=24,
     )
     axes.annotate(
-        "drawn as estimated from the start pose; the ATE is after SE(2) alignment; "
-        f"at the last state it is off by {1e3 * summary.final_error_m:.0f} mm, unaligned",
+        "drawn from the start pose, while the ATE is after SE(2) alignment; "
+        f"last state {1e3 * summary.final_error_m:.0f} mm off",
         xy=(0.0, 1.0),
         xytext=(0.0, 8.0),
         xycoords="axes fraction",

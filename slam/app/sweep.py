@@ -119,6 +119,7 @@ def run_sweep(options: SweepOptions, stop: StopFlag) -> None:
     part = options.out.with_name(f"{options.out.name}.part")
     with ExitStack() as held:
         with naming(part):  # what cannot be written ends the command before any run, too
+            part.parent.mkdir(parents=True, exist_ok=True)
             part.touch()
             try:
                 held.enter_context(locked(part))

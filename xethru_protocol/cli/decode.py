@@ -15,6 +15,7 @@ from xethru_protocol.framing import PacketReader
 from xethru_protocol.messages import Ack, Message, Pong, UnknownMessage
 from xethru_protocol.packets import Framing, FramingFault, Packet
 from xethru_protocol.plausibility import Direction
+from xethru_protocol.recordings.wire_capture import MAGIC as WIRE_CAPTURE
 from xethru_protocol.statistics import LinkStatistics
 from xethru_protocol.wire import hex_bytes
 
@@ -37,7 +38,7 @@ def decode(file: str | None, *, is_hex: bool, sender: str, with_statistics: bool
                 for number, line in enumerate(source, start=1):
                     _print_all(iter((_from_hex(line, name, number),)), sender, statistics)
             else:
-                _print_all(_chunks(source), sender, statistics)
+                _print_all(_chunks(source, name), sender, statistics)
     except BrokenPipeError:  # of stdout
         raise
     except OSError as error:
@@ -111,10 +112,14 @@ def _print_all(chunks: Iterable[bytes], sender: str, statistics: LinkStatistics)
         )
 
 
-def _chunks(source: BinaryIO) -> Iterator[bytes]:
+def _chunks(source: BinaryIO, name: str) -> Iterator[bytes]:
     read = getattr(source, "read1", source.read)  # read1 returns what there is, not a full chunk
-    while chunk := read(_CHUNK_BYTES):
+    chunk = read(_CHUNK_BYTES)
+    if chunk.startswith(WIRE_CAPTURE):
+        raise DecodeError(f"{name} is a wire capture and no bare bytes; use xethru dump")
+    while chunk:
         yield chunk
+        chunk = read(_CHUNK_BYTES)
 
 
 def _from_hex(line: bytes, name: str, number: int) -> bytes:

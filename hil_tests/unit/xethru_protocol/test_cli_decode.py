@@ -12,6 +12,7 @@ import pytest
 from hil_tests.golden.test_protocol_vectors import KNOWN
 from hil_tests.golden.vectors import ABOUT, Vector, load
 from xethru_protocol.cli import main
+from xethru_protocol.recordings import WireCapture
 
 VECTORS = load()
 PING = "7D 01 AE EA AA EE 7C 7E"
@@ -194,3 +195,10 @@ def test_packets_are_printed_as_they_come() -> None:
         assert json.loads(process.stdout.readline())["message"] == "ACK"  # input is still open
         process.stdin.close()
         assert process.wait() == 0
+
+
+def test_a_wire_capture_belongs_to_dump(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    with WireCapture(tmp_path / "line.xtwire") as capture:
+        capture.write("rx", ACK, 0)
+    assert main(["decode", str(tmp_path / "line.xtwire")]) == 1
+    assert "use xethru dump" in capsys.readouterr().err

@@ -446,6 +446,13 @@ def test_area_without_bins_is_refused_before_anything_is_sent(driver_on: DriverO
     assert line.received == []
 
 
+def test_frame_shorter_than_asked_for_is_warned_of(driver_on: DriverOn) -> None:
+    radar, _ = driver_on()
+    radar.configure_raw(RawConfig(frame_area_m=(0.2, 40.0)))
+    (warning,) = [text for text in radar.warnings if "not at 40 m" in text]
+    assert "ends at 9.4007 m" in warning  # where the scripted module ends
+
+
 @pytest.mark.parametrize(
     ("fps", "made"), [(1e-9, "1"), (17.5, "17"), (70000.0, "65535"), (17.0, None)]
 )

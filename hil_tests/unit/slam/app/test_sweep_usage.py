@@ -51,3 +51,15 @@ def test_what_is_no_regular_file_is_never_replaced(tmp_path: Path) -> None:
         run_sweep(options, stop)
     assert pipe.is_fifo()
     assert list(tmp_path.iterdir()) == [pipe]
+
+
+def test_the_folder_of_the_results_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def dying(*_: object) -> NoReturn:
+        raise BrokenExecutor
+
+    monkeypatch.setattr(sweep, "worker_results", dying)
+    out = tmp_path / "new" / "out.json"
+    options = SweepOptions(scenes=("lab",), presets=("paper",), n_seeds=2, jobs=2, out=out)
+    with StopFlag() as stop, pytest.raises(AppError, match="worker process died"):
+        run_sweep(options, stop)
+    assert out.parent.is_dir()
