@@ -14,6 +14,8 @@ from typing import Any, TypeVar
 from emulator.chip import Chip
 from emulator.identity import Identity
 from emulator.modes import ModeMachine
+from emulator.options import DeviceOptions
+from emulator.profile_settings import ProfileSettings
 from emulator.refusal import Refusal
 from xethru_protocol import messages as m
 from xethru_protocol.codes import DirCode, ErrorCode, PongCode, X4Setting
@@ -35,13 +37,21 @@ class Module:
         Its radar chip.
     modes
         Its mode machine.
+    options
+        How it answers what the reference leaves open.
+    profile
+        Settings of the loaded profile.
     reset_requested
         True once MOD_RESET was acknowledged; whoever keeps the time restarts the module.
     """
 
-    def __init__(self, identity: Identity, chip: Chip) -> None:
+    def __init__(
+        self, identity: Identity, chip: Chip, options: DeviceOptions | None = None
+    ) -> None:
         self.identity = identity
         self.chip = chip
+        self.options = options or DeviceOptions()
+        self.profile = ProfileSettings.shipped(self.options)
         self.modes = ModeMachine()
         self.reset_requested = False
 
