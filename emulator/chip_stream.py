@@ -71,6 +71,9 @@ class ChipStream:
             self.skip_due_before(now_ns)
         self._was_streaming = streaming
 
+    def restarted(self, ready_ns: int) -> None:
+        """Change nothing: the chip is off until a host sets a rate again."""
+
     def port_opened(self, now_ns: int) -> None:
         """Change nothing: a radar does not know who listens."""
 

@@ -3,8 +3,8 @@
 `Device` joins the parts: the connection turns bytes into commands, `commands` answers them, a
 `MessageStream` makes messages of its own accord, an `Outbox` holds what waits for the line.
 
-A reset keeps the port: ACK, half a second later the module restarts, is deaf for two seconds,
-then sends BOOTING and READY. Ports that vanish on reset are not emulated here.
+A reset: ACK, half a second later the module restarts, is deaf for two seconds, then sends BOOTING
+and READY. Whoever owns the port asks `Device.port_present` whether it is there meanwhile.
 
 Source: protocol reference 8.
 """
@@ -12,20 +12,28 @@ Source: protocol reference 8.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from emulator.chip import Chip
 from emulator.chip_stream import ChipStream
 from emulator.commands import Module, answer
 from emulator.echo_source import EchoSource
 from emulator.identity import Identity
+from emulator.modes import State
+from emulator.options import DeviceOptions
 from emulator.outbox import FirmwareOutbox, LosslessOutbox, MessageKind, MessageStream, Outbox
 from emulator.pace import Pace
+from emulator.saved_state import Memory
 from xethru_protocol.codes import SystemCode
 from xethru_protocol.connection import Connection, Role
 from xethru_protocol.messages import Command, Response, System
 from xethru_protocol.packets import NeedData
 
 __all__ = ["BootTiming", "Device", "radar_device"]
+
+NORMAL_START = 0x7D
+NORMAL_BUFFER = 8000
+"""Bytes of a Normal packet, escapes included, that a module can send (protocol reference 1.1)."""
 
 ASAP_BLOCK = 32
 # Radars in step refill at the same moment: four blocks of 8 cost 2 ms, four of 32 cost 7 ms.
@@ -47,6 +55,13 @@ class BootTiming:
 
     ack_to_reset_ns: int = 500_000_000
     reset_to_ready_ns: int = 2_000_000_000
+
+
+class _Held(NamedTuple):
+    """A reply that takes its time; further commands wait behind it."""
+
+    due_ns: int
+    reply: Response
 
 
 class Device:
@@ -72,6 +87,7 @@ class Device:
         self._connection = Connection(Role.MODULE)
         self._reset_ns: int | None = None
         self._ready_ns: int | None = None
+        self._held: _Held | None = None
         self.faults_seen = 0
 
     @property
@@ -82,52 +98,109 @@ class Device:
     @property
     def wants_data(self) -> bool:
         """Whether more commands should be read now; a host that never reads is held back."""
-        return self._outbox.takes_replies
+        return self._held is None and self._outbox.takes_replies
+
+    def port_present(self, now_ns: int) -> bool:
+        """Whether the port is there; a restart takes it away if the options say so."""
+        if self._module.options.port_on_reset == "stay":
+            return True
+        if self._reset_ns is not None and now_ns >= self._reset_ns:
+            return now_ns >= self._reset_ns + self._boot.reset_to_ready_ns
+        return self._ready_ns is None or now_ns >= self._ready_ns
 
     def receive_data(self, data: bytes, now_ns: int) -> None:
         """Take bytes from the host and carry out the commands they complete."""
         self.advance(now_ns)
-        if self._ready_ns is not None:
-            return  # booting: nobody listens yet
+        if self._ready_ns is not None or self._module.asleep:
+            return  # nobody listens
         self._connection.receive_data(data)
-        while not isinstance(event := self._connection.next_event(), NeedData):
+        self._carry_out_commands(now_ns)
+
+    def _carry_out_commands(self, now_ns: int) -> None:
+        while self._held is None and not self._module.asleep:
+            event = self._connection.next_event()
+            if isinstance(event, NeedData):
+                return
             if isinstance(event, Command):
                 self._carry_out(event, now_ns)
             else:
                 self.faults_seen += 1
 
     def _carry_out(self, command: Command[Response], now_ns: int) -> None:
-        self._outbox.put(MessageKind.REPLY, answer(self._module, command), now_ns)
-        if self._module.reset_requested and self._reset_ns is None:
-            self._reset_ns = now_ns + self._boot.ack_to_reset_ns
+        reply = answer(self._module, command)
+        for notice in self._module.notices:
+            self._outbox.put(MessageKind.DEBUG, notice, now_ns)
+        self._module.notices.clear()
+        delay_ns, self._module.reply_delay_ns = self._module.reply_delay_ns, 0
+        if reply is not None and delay_ns:
+            self._held = _Held(now_ns + delay_ns, reply)
+        elif reply is not None:
+            self._outbox.put(MessageKind.REPLY, reply, now_ns)
+        self._plan_restart(now_ns)
         self._stream.command_done(command, now_ns)
+
+    def _plan_restart(self, now_ns: int) -> None:
+        restart = self._module.restart
+        if restart is not None and restart.at_once:
+            self._reset_ns = now_ns if self._reset_ns is None else min(now_ns, self._reset_ns)
+        elif restart is not None and self._reset_ns is None:
+            self._reset_ns = now_ns + self._boot.ack_to_reset_ns
 
     def advance(self, now_ns: int) -> None:
         """Let time pass: restart when due, and queue the frames that fell due."""
+        self._module.advance(now_ns)
+        self._plan_restart(now_ns)
         if self._reset_ns is not None and now_ns >= self._reset_ns:
-            self._ready_ns = self._reset_ns + self._boot.reset_to_ready_ns
-            self._reset_ns = None
-            self._outbox.clear()
-            self._connection = Connection(Role.MODULE)
-            self._module.power_up()
+            self._restart(self._reset_ns)
         if self._ready_ns is not None and now_ns >= self._ready_ns:
             self._ready_ns = None
-            for code in (SystemCode.XTS_SPRS_BOOTING, SystemCode.XTS_SPRS_READY):
-                self._outbox.put(MessageKind.REPLY, System(code=code), now_ns)
-        self._outbox.refill_on_time(self._stream, now_ns)
+            if self._module.state is not State.BOOTLOADER:
+                for code in (SystemCode.XTS_SPRS_BOOTING, SystemCode.XTS_SPRS_READY):
+                    self._outbox.put(MessageKind.REPLY, System(code=code), now_ns)
+        if self._held is not None and now_ns >= self._held.due_ns:
+            held, self._held = self._held, None
+            self._outbox.put(MessageKind.REPLY, held.reply, now_ns)
+            self._carry_out_commands(now_ns)
+        if self._sends:
+            self._outbox.refill_on_time(self._stream, now_ns)
+
+    def _restart(self, reset_ns: int) -> None:
+        restart = self._module.restart
+        self._ready_ns = reset_ns + self._boot.reset_to_ready_ns
+        self._reset_ns = None
+        self._held = None
+        self._outbox.clear()
+        self._connection = Connection(Role.MODULE)
+        self._module.power_up(into_bootloader=restart is not None and restart.into_bootloader)
+        self._stream.restarted(self._ready_ns)
+
+    @property
+    def _sends(self) -> bool:
+        """Whether the module makes messages of its own accord."""
+        return not self._module.asleep and self._module.state is not State.BOOTLOADER
 
     def next_packet(self, now_ns: int) -> bytes | None:
         """Return the next packet for the line, complete; None if there is nothing to send now."""
-        self._outbox.refill_on_demand(self._stream, now_ns)
+        if self._sends:
+            self._outbox.refill_on_demand(self._stream, now_ns)
         message = self._outbox.take(now_ns)
-        return None if message is None else self._connection.send(message)
+        if message is None:
+            return None
+        packet = self._connection.send(message)
+        # the firmware escapes into a buffer and loses what does not fit
+        return packet[:NORMAL_BUFFER] if packet[0] == NORMAL_START else packet
 
     def wake_ns(self, now_ns: int) -> int | None:
         """Return when `advance` (and then `next_packet`) should be called next; None if never.
 
         What merely waits for the line to take it needs no waking and is not counted.
         """
-        candidates = (self._reset_ns, self._ready_ns, self._outbox.wake_ns(self._stream, now_ns))
+        candidates = [self._reset_ns, self._ready_ns]
+        candidates.append(None if self._held is None else self._held.due_ns)
+        if self._module.restart is not None and self._reset_ns is None:
+            candidates.append(now_ns)  # a fault from outside
+        if self._sends:
+            candidates.append(self._outbox.wake_ns(self._stream, now_ns))
         return min((time_ns for time_ns in candidates if time_ns is not None), default=None)
 
     def port_opened(self, now_ns: int) -> None:
@@ -147,6 +220,8 @@ def radar_device(
     scene_time_zero_ns: int = 0,
     skew_ns: int = 0,
     boot: BootTiming | None = None,
+    options: DeviceOptions | None = None,
+    memory: Memory | None = None,
 ) -> Device:
     """Return a stock X4M300 that sees what an echo source synthesises.
 
@@ -166,9 +241,13 @@ def radar_device(
         scene times.
     boot
         Timing of a restart; the documented one if None.
+    options
+        How it answers what the reference leaves open; the documented defaults if None.
+    memory
+        Where its flash is kept; None forgets it with the device.
     """
     largest_block = ASAP_BLOCK if pace is Pace.ASAP else REALTIME_BLOCK
-    module = Module(identity, Chip(source, largest_block))
+    module = Module(identity, Chip(source, largest_block), options, memory)
     stream = ChipStream(module, pace=pace, scene_time_zero_ns=scene_time_zero_ns, skew_ns=skew_ns)
     outbox = LosslessOutbox() if pace is Pace.ASAP else FirmwareOutbox()
     return Device(module, stream, outbox, boot=boot or BootTiming())

@@ -54,8 +54,10 @@ class Identity:
         if len(self.serial) != 12 or not self.serial.isascii() or not self.serial.isdigit():
             raise ValueError(f"serial number {self.serial!r}: an X4M300 has 12 digits")
 
-    def info(self, item: int) -> str | None:
+    def info(self, item: int, *, base_firmware: bool = False) -> str | None:
         """Return the text of one info item; None for an item this firmware does not know.
+
+        The base firmware knows no product: neither item number, order code nor serial number.
 
         Examples
         --------
@@ -64,6 +66,8 @@ class Identity:
         >>> Identity(serial="202611210001").info(0x05) is None
         True
         """
+        if base_firmware:
+            return self._base_firmware_info(item)
         texts: dict[int, str] = {
             InfoItem.XTID_SSIC_ITEMNUMBER: self.item_number,
             InfoItem.XTID_SSIC_ORDERCODE: self.order_code,
@@ -76,6 +80,17 @@ class Identity:
                 f"{self.firmware_id}:{self.version};XEP:{self.xep_version};X4C51:2.1.0"
                 f";{self.dsp_library}"
             ),
+            InfoItem.XTID_SSIC_SYSTEMCOREID: f"emulated-{self.serial}",
+            InfoItem.XTID_SSIC_BOOTLOADER: "unknown",
+        }
+        return texts.get(item)
+
+    def _base_firmware_info(self, item: int) -> str | None:
+        texts: dict[int, str] = {
+            InfoItem.XTID_SSIC_FIRMWAREID: "XEP",
+            InfoItem.XTID_SSIC_VERSION: self.xep_version,
+            InfoItem.XTID_SSIC_BUILD: f"{self.xep_version}+0.sha.{self.build}",
+            InfoItem.XTID_SSIC_VERSIONLIST: f"XEP:{self.xep_version};X4C51:2.1.0",
             InfoItem.XTID_SSIC_SYSTEMCOREID: f"emulated-{self.serial}",
             InfoItem.XTID_SSIC_BOOTLOADER: "unknown",
         }

@@ -48,6 +48,10 @@ class MessageStream(Protocol):
         """Learn that the module carried out, or refused, a command."""
         ...
 
+    def restarted(self, ready_ns: int) -> None:
+        """Learn that the module restarts, and when it will be ready; until then it is silent."""
+        ...
+
     def port_opened(self, now_ns: int) -> None:
         """Learn that a host opened the port."""
         ...

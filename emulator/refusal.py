@@ -1,8 +1,8 @@
-"""How a module says no to a command."""
+"""How a module says no to a command, or says nothing."""
 
 from __future__ import annotations
 
-__all__ = ["Refusal"]
+__all__ = ["Refusal", "Silence"]
 
 
 class Refusal(Exception):  # noqa: N818 - a refusal is an answer of the module, not an error of ours
@@ -17,3 +17,7 @@ class Refusal(Exception):  # noqa: N818 - a refusal is an answer of the module, 
     def __init__(self, code: int) -> None:
         super().__init__(f"refused with ERROR {code}")
         self.code = code
+
+
+class Silence(Exception):  # noqa: N818 - as above
+    """A command the module does not answer."""
