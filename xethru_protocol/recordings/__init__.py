@@ -13,15 +13,17 @@ from xethru_protocol.recordings.detect import (
     read_recording,
     recording_facts,
     recording_format,
+    recording_radars,
 )
 from xethru_protocol.recordings.errors import RecordingError, RecordingFault
-from xethru_protocol.recordings.records import RecordingFacts
+from xethru_protocol.recordings.records import RadarFacts, RecordingFacts
 from xethru_protocol.recordings.vendor_writer import RecordingWriter, Split
 from xethru_protocol.recordings.wire_capture import Chunk, WireCapture, read_chunks, read_note
 
 __all__ = [
     "Chunk",
     "Conversion",
+    "RadarFacts",
     "RecordingError",
     "RecordingFacts",
     "RecordingFault",
@@ -37,4 +39,5 @@ __all__ = [
     "read_recording",
     "recording_facts",
     "recording_format",
+    "recording_radars",
 ]

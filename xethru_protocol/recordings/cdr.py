@@ -76,3 +76,17 @@ def unpack_array(data: bytes, dtype: str) -> npt.NDArray[Any]:
         position += -position % 4 + 8
     (count,) = _U32.unpack_from(body, position + 4)
     return np.frombuffer(body, dtype, count, position + 8)
+
+
+def unpack_string(data: bytes) -> str:
+    """Text of a String message.
+
+    Raises
+    ------
+    ValueError, struct.error
+        If the bytes are none.
+    """
+    if data[:4] != _LITTLE_ENDIAN:
+        raise ValueError("the text is not little-endian CDR")
+    (length,) = _U32.unpack_from(data, 4)
+    return data[8 : 8 + length].rstrip(b"\0").decode()

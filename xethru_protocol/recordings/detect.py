@@ -14,7 +14,7 @@ from xethru_protocol.recordings.errors import (
     unreadable,
 )
 from xethru_protocol.recordings.npz import npz_facts, read_npz
-from xethru_protocol.recordings.records import RecordingFacts, Timed
+from xethru_protocol.recordings.records import RadarFacts, RecordingFacts, Timed
 from xethru_protocol.recordings.vendor_meta import PARAMETER_FILE_NAME
 from xethru_protocol.recordings.vendor_reader import is_vendor_file, read_vendor, vendor_facts
 from xethru_protocol.recordings.wire_capture import read_wire, wire_facts
@@ -96,7 +96,9 @@ def recording_format(path: Path | str) -> RecordingFormat:
     )
 
 
-def read_recording(path: Path | str, on_fault: FaultHandler | None = None) -> Iterator[Timed]:
+def read_recording(
+    path: Path | str, on_fault: FaultHandler | None = None, *, radar: str | None = None
+) -> Iterator[Timed]:
     """Messages of a recording with their times, whatever its format.
 
     Parameters
@@ -107,6 +109,8 @@ def read_recording(path: Path | str, on_fault: FaultHandler | None = None) -> It
     on_fault
         Called with what could not be read; the rest is read all the same. None: what costs
         messages raises, what costs only times passes.
+    radar
+        Which radar's, by its name in `recording_radars`; needed where there are several.
 
     Yields
     ------
@@ -127,9 +131,25 @@ def read_recording(path: Path | str, on_fault: FaultHandler | None = None) -> It
         case "mcap":
             from xethru_protocol.recordings.mcap_file import read_mcap
 
-            yield from read_mcap(path, on_fault)
+            yield from read_mcap(path, on_fault, radar)
         case "vendor":
             yield from read_vendor(path, on_fault)
+
+
+def recording_radars(path: Path | str) -> tuple[RadarFacts, ...]:
+    """Return the radars of a recording; only a session (MCAP) has several, and names them.
+
+    Raises
+    ------
+    RecordingError
+        If there is nothing that this can read.
+    """
+    path = Path(path)
+    if recording_format(path) != "mcap":
+        return (RadarFacts(),)
+    from xethru_protocol.recordings.mcap_file import mcap_radars
+
+    return mcap_radars(path)
 
 
 def recording_facts(path: Path | str) -> RecordingFacts:

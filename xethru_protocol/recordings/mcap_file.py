@@ -10,6 +10,7 @@ A cut file loses its last chunk of at most 256 KiB.
 """
 
 import json
+import math
 import os
 import re
 import struct
@@ -43,6 +44,7 @@ from xethru_protocol.recordings.cdr import (
     pack_array,
     pack_string,
     unpack_array,
+    unpack_string,
 )
 from xethru_protocol.recordings.errors import (
     FaultHandler,
@@ -52,8 +54,9 @@ from xethru_protocol.recordings.errors import (
     unreadable,
     unwritable,
 )
-from xethru_protocol.recordings.records import RecordingFacts, Timed, TimedMessages
+from xethru_protocol.recordings.records import RadarFacts, RecordingFacts, Timed, TimedMessages
 from xethru_protocol.table import ROWS, Response, UnknownMessage
+from xethru_protocol.x4 import RF_BIN_M
 
 _FACTS = "xethru-hil recording"
 _LENGTH_UNIT = "module metres, c = 3.0e8 m/s"
@@ -209,13 +212,15 @@ def write_mcap(
         raise unwritable(path, error) from None
 
 
-def read_mcap(path: Path, on_fault: FaultHandler | None) -> TimedMessages:
+def read_mcap(path: Path, on_fault: FaultHandler | None, radar: str | None = None) -> TimedMessages:
     """Messages of an MCAP file of this program: a recording, or a session of one radar.
+
+    Of a session of several, those of the named ``radar``.
 
     Raises
     ------
     RecordingError
-        If it holds no radar or several, or is damaged and ``on_fault`` is None.
+        If it holds no radar, or several and none is named, or is damaged and ``on_fault`` is None.
     """
     topics: dict[int, tuple[str, bool]] = {}
     radars: set[str] = set()
@@ -227,10 +232,10 @@ def read_mcap(path: Path, on_fault: FaultHandler | None) -> TimedMessages:
 
     for record in _records(path, note):
         if isinstance(record, Channel):
-            radar, topic = _radar_topic(record.topic)
-            if radar and topic in {"frame", "payload"}:
+            name, topic = _radar_topic(record.topic)
+            if name and topic in {"frame", "payload"} and radar in {None, name}:
                 topics[record.id] = topic, record.metadata.get("xethru-hil") is None
-                radars.add(radar)
+                radars.add(name)
                 if len(radars) > 1:
                     names = ", ".join(sorted(radars))
                     raise RecordingError(f"{path} holds several radars ({names}), not one")
@@ -243,6 +248,42 @@ def read_mcap(path: Path, on_fault: FaultHandler | None) -> TimedMessages:
             yield message, record.log_time if timed else None
     if not radars and not faults:
         raise RecordingError(f"{path} holds no topic /radar/<name>/frame or .../payload")
+
+
+def mcap_radars(path: Path) -> tuple[RadarFacts, ...]:
+    """Return the radars of a file in the order in which their topics begin; damage passes."""
+    names: dict[str, None] = {}  # a set in order
+    channels: dict[int, str] = {}
+    said: dict[str, RadarFacts] = {}
+    for record in _records(path, lambda fault: None):
+        if isinstance(record, Channel):
+            name, topic = _radar_topic(record.topic)
+            if name and topic in {"frame", "payload"}:
+                names[name] = None
+            elif name and topic == "info":
+                channels[record.id] = name
+        elif isinstance(record, Message) and record.channel_id in channels:
+            name = channels[record.channel_id]
+            said[name] = _radar_facts(name, record.data)
+    return tuple(said.get(name, RadarFacts(name=name)) for name in names)
+
+
+def _radar_facts(name: str, data: bytes) -> RadarFacts:
+    """Read what a latched info says of a radar; nothing where it makes no sense."""
+    try:
+        info = json.loads(unpack_string(data))
+        start_m, bin_m = float(info["range_start_m"]), float(info["bin_length_m"])
+        # the read-back of baseband ends at the last bin, that of RF one behind it
+        steps = int(info["n_bins"]) - (bin_m > 4 * RF_BIN_M)
+        area_m = start_m, start_m + bin_m * steps
+    except (KeyError, ValueError, TypeError, OverflowError, RecursionError, struct.error):
+        return RadarFacts(name=name)
+    serial = info.get("serial")
+    return RadarFacts(
+        name=name,
+        serial=serial if isinstance(serial, str) and serial else None,
+        area_m=area_m if all(map(math.isfinite, area_m)) else None,
+    )
 
 
 def mcap_facts(path: Path) -> RecordingFacts:

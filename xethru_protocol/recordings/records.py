@@ -18,6 +18,25 @@ TimedMessages = Iterator[Timed]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RadarFacts:
+    """What a recording says of one of its radars besides the messages.
+
+    Attributes
+    ----------
+    name
+        Its name in the recording; None where the recording is of one module and names none.
+    serial
+        Serial number; None where unknown.
+    area_m
+        Frame area as the module read it back [module metres]; None where unknown.
+    """
+
+    name: str | None = None
+    serial: str | None = None
+    area_m: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingFacts:
     """What a recording says about itself besides its messages.
 
