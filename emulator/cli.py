@@ -11,20 +11,25 @@ import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from emulator.pace import Pace
 from emulator.stopping import Stop, stop_signals
 
+if TYPE_CHECKING:
+    from emulator.device_ports import LinkOptions
+
 __all__ = ["main"]
 
-MOST_BARE = 32
+MOST_BARE = 64
+LAST_PORT = 65535
 
 _SERVE_HELP = """\
 Each radar of the scene becomes a stock X4M300 on a pseudo-terminal, published as a link in the
 link directory. One JSON line on stdout says that all ports are ready:
 
   {"ready":true,"scene_time_zero_ns":N,"odometry":"PATH or null",
-   "devices":[{"name":"...","path":"...","serial":"...","tcp":null}]}
+   "devices":[{"name":"...","path":"...","serial":"...","tcp":PORT or null}]}
 
 scene_time_zero_ns is the monotonic time of scene time 0; the odometry path is a unix socket that
 gives every client the wheel odometry as TUM lines. Ctrl-C, SIGTERM or SIGHUP ends it: links,
@@ -32,6 +37,10 @@ socket and a directory of its own are removed, exit 0.
 
 pace realtime: frames at their deadlines; a host that does not keep up loses frames as on the
 real module. pace asap: as fast as the host reads, nothing is lost.
+
+--tcp: each module on a TCP port, too, for one client at a time: a second one is hung up on, and so
+is one that comes while a host has the module's pseudo-terminal open. While a client is connected,
+the pseudo-terminal is deaf and dumb.
 """
 
 _PLAY_HELP = """\
@@ -73,11 +82,22 @@ def _run(arguments: argparse.Namespace, stop: Stop) -> int:
             )
         else:
             scene = arguments.count if arguments.bare else arguments.scene
-            serve(scene, arguments.seed, arguments.pace, folder, stop)
+            links = _link_options(arguments)
+            serve(scene, arguments.seed, arguments.pace, folder, stop, links=links)
     except CannotServeError as error:
         _say(str(error))
         return error.exit_code
     return 0
+
+
+def _link_options(arguments: argparse.Namespace) -> LinkOptions:
+    from emulator.device_ports import LinkOptions
+    from emulator.tcp_link import is_loopback
+
+    host: str = arguments.tcp_host
+    if arguments.tcp is not None and not is_loopback(host):
+        _warn(f"--tcp-host {host}: whoever reaches this address can command the modules")
+    return LinkOptions(tcp_base=arguments.tcp, tcp_host=host)
 
 
 def _warn(text: str) -> None:
@@ -119,6 +139,18 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         help="which clock drives the modules (default realtime)",
     )
     _add_link_dir(serve)
+    serve.add_argument(
+        "--tcp",
+        type=_tcp_port,
+        metavar="BASEPORT",
+        help="a TCP port for each module, from this one on; 0: any that are free",
+    )
+    serve.add_argument(
+        "--tcp-host",
+        default="127.0.0.1",
+        metavar="HOST",
+        help="address to listen at (default 127.0.0.1, which only this machine reaches)",
+    )
 
     play = commands.add_parser(
         "play",
@@ -167,6 +199,13 @@ def _seed(text: str) -> int:
     value = _whole(text)
     if not 0 <= value < 2**63:
         raise argparse.ArgumentTypeError(f"{value} is not in 0...2**63 - 1")
+    return value
+
+
+def _tcp_port(text: str) -> int:
+    value = _whole(text)
+    if not 0 <= value <= LAST_PORT:
+        raise argparse.ArgumentTypeError(f"{value} is not in 0...{LAST_PORT}")
     return value
 
 

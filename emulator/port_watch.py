@@ -41,12 +41,17 @@ class PortWatch:
         self._opened = opened
         self._closed = closed
         self._hosts = 0
-        self._fd = _watch(terminal)
+        self._fd, self._watch = _watch(terminal)
 
     @property
     def works(self) -> bool:
         """Whether this system tells who opens a port."""
         return self._fd >= 0
+
+    @property
+    def in_use(self) -> bool:
+        """Whether a host has the terminal open, as far as this system tells."""
+        return self._hosts > 0
 
     def register(self, selector: selectors.BaseSelector) -> None:
         """Register with the loop."""
@@ -71,8 +76,9 @@ class PortWatch:
             data = os.read(self._fd, 64 * _EVENT.size)
         except BlockingIOError:
             return
-        for _, mask, _, _ in _EVENT.iter_unpack(data):
-            self._count(mask, now_ns)
+        for watch, mask, _, _ in _EVENT.iter_unpack(data):
+            if watch == self._watch:  # else of a terminal that is gone
+                self._count(mask, now_ns)
 
     def _count(self, mask: int, now_ns: int) -> None:
         if mask & _IN_OPEN:
@@ -85,17 +91,19 @@ class PortWatch:
                 self._closed(now_ns)
 
 
-def _watch(terminal: str) -> int:
-    """Return an inotify descriptor that watches one path; -1 where that is not possible."""
+def _watch(terminal: str) -> tuple[int, int]:
+    """Return an inotify descriptor and its watch of one path; -1 where that is not possible."""
     libc = ctypes.CDLL(None, use_errno=True)
     try:
         start, add = libc.inotify_init1, libc.inotify_add_watch
     except AttributeError:
-        return -1  # not Linux
+        return -1, -1  # not Linux
     descriptor = int(start(_IN_NONBLOCK | os.O_CLOEXEC))
     if descriptor < 0:
-        return -1
-    if add(descriptor, terminal.encode(), _IN_OPEN | _IN_CLOSE_WRITE | _IN_CLOSE_NOWRITE) < 0:
+        return -1, -1
+    mask = _IN_OPEN | _IN_CLOSE_WRITE | _IN_CLOSE_NOWRITE
+    watch = int(add(descriptor, os.fsencode(terminal), mask))
+    if watch < 0:
         os.close(descriptor)
-        return -1
-    return descriptor
+        return -1, -1
+    return descriptor, watch

@@ -48,7 +48,10 @@ class ByteLink(Protocol):
     """What the server needs of a line: see `emulator.link.PtyLink`."""
 
     def fileno(self) -> int:
-        """Return the descriptor to wait on."""
+        """Return the descriptor to wait on; -1 while the line is unplugged.
+
+        It may change between turns. Whoever closes it takes it out of the selector first.
+        """
         ...
 
     def read(self) -> bytes:
@@ -97,8 +100,21 @@ class Port:
         if data:
             self.device.receive_data(data, now_ns)
 
+    def advance(self, now_ns: int) -> None:
+        """Let time pass."""
+        self.device.advance(now_ns)
+
+    def wake_ns(self, now_ns: int) -> int | None:
+        """Return when time alone changes something; None if never."""
+        return self.device.wake_ns(now_ns)
+
     def room(self) -> None:
         """Note that the line takes more."""
+        self._blocked = False
+
+    def cut(self) -> None:
+        """Forget what was half sent: the line is unplugged, and the next host begins afresh."""
+        self._unsent = memoryview(b"")
         self._blocked = False
 
     def send(self, now_ns: int) -> bool:
@@ -144,7 +160,6 @@ class Server:
         self._stopped = False
         self._busy = True
         self._selector = selectors.DefaultSelector()
-        self._registered: dict[int, int] = {}
         self._wake_fd, self._waker_fd = os.pipe()
         os.set_blocking(self._wake_fd, False)
         os.set_blocking(self._waker_fd, False)
@@ -183,7 +198,10 @@ class Server:
         self._busy = False
         for port in self._ports:
             now_ns = self._clock_ns()
-            port.device.advance(now_ns)
+            port.advance(now_ns)
+            if port.link.fileno() < 0:
+                port.cut()
+                continue
             self._busy |= port.send(now_ns)
             self._watch(port)
 
@@ -191,7 +209,7 @@ class Server:
         if self._busy:
             return 0.0
         now_ns = self._clock_ns()
-        wakes = [port.device.wake_ns(now_ns) for port in self._ports]
+        wakes = [port.wake_ns(now_ns) for port in self._ports]
         wakes += [service.wake_ns(now_ns) for service in self._services]
         waits_s = [max(wake_ns - now_ns, 0) / NS_PER_S for wake_ns in wakes if wake_ns is not None]
         if longest_wait_s is not None:
@@ -201,10 +219,12 @@ class Server:
     def _watch(self, port: Port) -> None:
         """Keep the selector's interest in a port up to date, at one system call per change."""
         descriptor, events = port.link.fileno(), port.events
-        known = self._registered.get(descriptor, 0)
+        if descriptor < 0:  # the host left while we wrote
+            return
+        key = self._selector.get_map().get(descriptor)
+        known = 0 if key is None else key.events
         if events == known:
             return
-        self._registered[descriptor] = events
 
         def ready(now_events: int, now_ns: int) -> None:
             if now_events & selectors.EVENT_WRITE:

@@ -10,13 +10,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
-from emulator.device import Device, radar_device
+from emulator.device import radar_device
+from emulator.device_ports import DevicePorts, LinkOptions, NamedDevice, open_ports
 from emulator.echo import echo_source
 from emulator.identity import Identity
-from emulator.link import LinkError, PtyLink
+from emulator.link import LinkError
 from emulator.odometry import scene_odometry
 from emulator.odometry_feed import OdometryFeed
 from emulator.pace import Pace
@@ -25,7 +25,7 @@ from emulator.playback import RecordingError, recording_device
 from emulator.port_watch import PortWatch
 from emulator.run_directory import Announcement, fresh_port_folder
 from emulator.scene import Scene, SceneError, UnknownSceneError, empty_room, load_scene
-from emulator.server import Port, Server, Service
+from emulator.server import Server, Service
 from emulator.stopping import Stop
 
 __all__ = ["CannotServeError", "play", "serve"]
@@ -50,16 +50,15 @@ class CannotServeError(Exception):
         self.exit_code = exit_code
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NamedDevice:
-    """A device and what the ready line says about it."""
-
-    name: str
-    serial: str
-    device: Device
-
-
-def serve(scene: str | int, seed: int, pace: Pace, link_dir: Path | None, stop: Stop) -> None:
+def serve(
+    scene: str | int,
+    seed: int,
+    pace: Pace,
+    link_dir: Path | None,
+    stop: Stop,
+    *,
+    links: LinkOptions,
+) -> None:
     """Emulate the radars of a scene until a signal asks for the end.
 
     Parameters
@@ -74,6 +73,8 @@ def serve(scene: str | int, seed: int, pace: Pace, link_dir: Path | None, stop: 
         Where the links appear; a fresh directory if None.
     stop
         Ends it, also before it has begun.
+    links
+        What leads to the modules.
 
     Raises
     ------
@@ -96,13 +97,13 @@ def serve(scene: str | int, seed: int, pace: Pace, link_dir: Path | None, stop: 
                     scene_time_zero_ns=zero_ns,
                 )
                 cleanup.callback(feed.close)
-            ports = _open_ports(devices, folder, cleanup)
+            ports = open_ports(devices, folder, links, cleanup)
         except UnknownSceneError as error:
             raise CannotServeError(str(error), exit_code=2) from error
         except (SceneError, LinkError) as error:
             raise CannotServeError(str(error)) from error
         services: list[Service] = [] if feed is None else [feed]
-        ready = _ready_line(devices, folder, zero_ns, None if feed is None else feed.path)
+        ready = _ready_line(ports, zero_ns, None if feed is None else feed.path)
         _run(ports, services, ready, stop, cleanup)
 
 
@@ -150,14 +151,14 @@ def play(
             )
             folder = cleanup.enter_context(_link_folder(link_dir))
             devices = [NamedDevice(name="player", serial=identity.serial, device=device)]
-            ports = _open_ports(devices, folder, cleanup)
+            ports = open_ports(devices, folder, LinkOptions(), cleanup)
         except (RecordingError, LinkError) as error:
             raise CannotServeError(str(error)) from error
         watch = PortWatch(
             os.fspath(folder / "player"), opened=device.port_opened, closed=device.port_closed
         )
         cleanup.callback(watch.close)
-        ready = _ready_line(devices, folder, time.monotonic_ns(), None)
+        ready = _ready_line(ports, time.monotonic_ns(), None)
         _run(ports, [watch], ready, stop, cleanup)
 
 
@@ -178,34 +179,17 @@ def _radar_devices(scene: Scene, seed: int, pace: Pace, zero_ns: int) -> list[Na
     ]
 
 
-def _open_ports(
-    devices: Sequence[NamedDevice], folder: Path, cleanup: contextlib.ExitStack
-) -> list[Port]:
-    links = [cleanup.enter_context(PtyLink(folder / named.name)) for named in devices]
-    return [Port(link, named.device) for link, named in zip(links, devices, strict=True)]
-
-
-def _ready_line(
-    devices: Sequence[NamedDevice], folder: Path, zero_ns: int, odometry: Path | None
-) -> dict[str, object]:
+def _ready_line(ports: DevicePorts, zero_ns: int, odometry: Path | None) -> dict[str, object]:
     return {
         "ready": True,
         "scene_time_zero_ns": zero_ns,
         "odometry": None if odometry is None else os.fspath(odometry),
-        "devices": [
-            {
-                "name": named.name,
-                "path": os.fspath(folder / named.name),
-                "serial": named.serial,
-                "tcp": None,
-            }
-            for named in devices
-        ],
+        "devices": ports.entries(),
     }
 
 
 def _run(
-    ports: Sequence[Port],
+    ports: DevicePorts,
     services: Sequence[Service],
     ready: dict[str, object],
     stop: Stop,
@@ -213,7 +197,7 @@ def _run(
 ) -> None:
     if stop.requested:
         return  # nobody shall learn of ports that go away at once
-    server = Server(ports, services)
+    server = Server(ports.ports, [*services, *ports.services])
     cleanup.callback(server.close)
     stop.attach(server)
     cleanup.callback(stop.detach)  # a second signal must not reach a loop that is being closed

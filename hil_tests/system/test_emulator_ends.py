@@ -15,8 +15,11 @@ from pathlib import Path
 import pytest
 
 from hil_tests.device.serving import emulator
-from xethru_protocol.codes import PongCode
+from xethru_protocol.codes import InfoItem, PongCode
+from xethru_protocol.connection import Connection, Role
 from xethru_protocol.driver import X4M300, RawConfig
+from xethru_protocol.messages import ReplyString, SystemGetInfo
+from xethru_protocol.packets import NeedData
 
 pytestmark = pytest.mark.slow
 
@@ -219,3 +222,18 @@ def test_a_long_link_directory_still_gets_a_socket(tmp_path: Path) -> None:
         assert lines_of(served.odometry, 1)
         assert served.end() == 0
     assert not Path(served.odometry).parent.exists()
+
+
+def test_tcp_ports_are_told_and_reach_the_same_modules(tmp_path: Path) -> None:
+    arguments = ("serve", "--bare", "--count", "2", "--tcp", "0")
+    with emulator(*arguments, environment=environment(tmp_path)) as served:
+        (word,) = (tmp_path / "xethru").glob("*.json")
+        for told in json.loads(word.read_text())["devices"]:
+            with socket.create_connection(("127.0.0.1", told["tcp"]), timeout=10) as client:
+                line = Connection(Role.HOST)
+                client.sendall(line.send(SystemGetInfo(item=InfoItem.XTID_SSIC_SERIALNUMBER)))
+                while isinstance(event := line.next_event(), NeedData):
+                    line.receive_data(client.recv(4096))
+                assert isinstance(event, ReplyString)
+                assert event.text == told["serial"]
+        assert served.end() == 0

@@ -1,0 +1,136 @@
+"""Which lines lead to each emulated module, and what they are called."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from emulator.link import PtyLink
+from emulator.port_watch import PortWatch
+from emulator.server import ByteDevice, Port, Service
+from emulator.shared_device import SharedDevice
+from emulator.tcp_link import TcpLink
+
+__all__ = ["DevicePorts", "LinkOptions", "NamedDevice", "open_ports"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NamedDevice:
+    """A device and what the ready line says about it."""
+
+    name: str
+    serial: str
+    device: ByteDevice
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkOptions:
+    """What leads to the modules beside or instead of a plain pseudo-terminal.
+
+    Attributes
+    ----------
+    tcp_base
+        TCP port of the first module, the others' follow; 0: any that are free; None: no TCP.
+    tcp_host
+        Address to listen at.
+    """
+
+    tcp_base: int | None = None
+    tcp_host: str = "127.0.0.1"
+
+
+@dataclass(slots=True, kw_only=True)
+class DevicePorts:
+    """Everything that leads to the modules of one emulator.
+
+    Attributes
+    ----------
+    ports
+        For the server's loop.
+    services
+        Likewise.
+    """
+
+    ports: list[Port] = field(default_factory=list)
+    services: list[Service] = field(default_factory=list)
+    _words: list[tuple[NamedDevice, PtyLink, TcpLink | None]] = field(default_factory=list)
+
+    def entries(self) -> list[dict[str, object]]:
+        """Return what the ready line says about the modules."""
+        return [
+            {
+                "name": named.name,
+                "path": os.fspath(link.path),
+                "serial": named.serial,
+                "tcp": None if tcp is None else tcp.port,
+            }
+            for named, link, tcp in self._words
+        ]
+
+    def add(
+        self,
+        named: NamedDevice,
+        path: Path,
+        tcp_port: int | None,
+        options: LinkOptions,
+        cleanup: contextlib.ExitStack,
+    ) -> None:
+        """Open the lines to one more module.
+
+        Raises
+        ------
+        LinkError
+            When one cannot be had.
+        """
+        link = cleanup.enter_context(PtyLink(path))
+        tcp = None
+        device = named.device
+        if tcp_port is not None:
+            shared = SharedDevice(device)
+            watch = PortWatch(link.terminal, opened=_nothing, closed=_nothing)
+            cleanup.callback(watch.close)
+
+            def set_guest(present: bool) -> None:
+                shared.guest_present = present
+
+            tcp = TcpLink(
+                options.tcp_host,
+                tcp_port,
+                admits=lambda: not watch.in_use,
+                came=lambda: set_guest(True),
+                left=lambda: set_guest(False),
+            )
+            cleanup.callback(tcp.close)
+            device = shared.port
+            self.ports.append(Port(tcp, shared.guest))
+            self.services += [watch, tcp]
+        self.ports.append(Port(link, device))
+        self._words.append((named, link, tcp))
+
+
+def open_ports(
+    devices: Sequence[NamedDevice],
+    folder: Path,
+    options: LinkOptions,
+    cleanup: contextlib.ExitStack,
+) -> DevicePorts:
+    """Open the lines to all modules; what was opened is closed with ``cleanup``.
+
+    Raises
+    ------
+    LinkError
+        When one cannot be had.
+    """
+    opened = DevicePorts()
+    for index, named in enumerate(devices):
+        base = options.tcp_base
+        tcp_port = base + index if base else base
+        opened.add(named, folder / named.name, tcp_port, options, cleanup)
+    return opened
+
+
+def _nothing(now_ns: int) -> None:
+    """Who opens a terminal matters only when somebody else wants the module."""
