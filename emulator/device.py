@@ -141,9 +141,11 @@ class Device:
 
     def _plan_restart(self, now_ns: int) -> None:
         restart = self._module.restart
-        if restart is not None and restart.at_once:
-            self._reset_ns = now_ns if self._reset_ns is None else min(now_ns, self._reset_ns)
-        elif restart is not None and self._reset_ns is None:
+        if restart is None:
+            return
+        if restart.at_ns is not None:
+            self._reset_ns = restart.at_ns
+        elif self._reset_ns is None:
             self._reset_ns = now_ns + self._boot.ack_to_reset_ns
 
     def advance(self, now_ns: int) -> None:

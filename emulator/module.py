@@ -37,12 +37,12 @@ class Restart:
     ----------
     into_bootloader
         Whether the bootloader stays in charge.
-    at_once
-        Whether there is no half second for an ACK to leave, as after a fault.
+    at_ns
+        When, as after a fault; None for half a second after the ACK.
     """
 
     into_bootloader: bool = False
-    at_once: bool = False
+    at_ns: int | None = None
 
 
 def _placeholder_noise_maps() -> tuple[bytes, bytes]:
@@ -146,10 +146,10 @@ class Module:
         self.chip.init()
         self._power_up_parts(into_bootloader=into_bootloader)
 
-    def power_cycle(self) -> None:
+    def power_cycle(self, now_ns: int) -> None:
         """Ask for a restart as after a power cut: at once, and faults are forgotten."""
         self.faults.clear()
-        self.restart = Restart(at_once=True)
+        self.restart = Restart(at_ns=now_ns)
 
     def advance(self, now_ns: int) -> None:
         """Let time pass."""
@@ -182,7 +182,7 @@ class Module:
         except Refusal:
             pass  # no room for a dump: the firmware has nowhere else to put it
         self.save()
-        self.restart = Restart(into_bootloader=hopeless, at_once=True)
+        self.restart = Restart(into_bootloader=hopeless, at_ns=now_ns)
 
     def load_profile(self, profile_id: int) -> None:
         """Load a profile with its own last settings, or raise `Refusal`."""
