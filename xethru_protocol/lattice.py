@@ -128,6 +128,18 @@ class Lattice:
         bad = samples.size - in_range.size + doubtful.size - self._count_neighbours(doubtful)
         return int(bad)
 
+    def nearest(self, samples: Float32s) -> Float32s:
+        """Return what the chip would give for samples: of the nearest counter it can hold.
+
+        Parameters
+        ----------
+        samples
+            Finite values, shape (n,), float32.
+        """
+        counters = np.rint((samples + self.dac_offset) * (self.tap_sum / self.quantum))
+        counters = np.clip(counters, self.min_counter, self.max_counter).astype(np.float32)
+        return _values(counters, self.quantum, self.dac_offset, self.tap_sum)
+
     def _rounded(self, samples: Float32s) -> Float32s:
         """Round each sample to the value of the nearest counter, found in float32."""
         scale = self.tap_sum / self.quantum

@@ -1,0 +1,393 @@
+"""A device with faults: between a module and its line, it spoils what it was told to spoil.
+
+While no fault is armed every byte goes through as it is. Whatever the faults, everything depends
+on the bytes, the times and the seed alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import cast
+
+from emulator.faults.armed import Armed, Opportunity
+from emulator.faults.inner_device import InnerDevice
+from emulator.faults.kind import (
+    Action,
+    CommandEffect,
+    Context,
+    MomentEffect,
+    Piece,
+    Restart,
+    SayToModule,
+    Target,
+    Unplug,
+)
+from emulator.faults.line_queue import LineQueue
+from emulator.faults.packets import PacketClass, classify, command_bytes
+from emulator.faults.plan import FaultPlan, FaultSpec
+from emulator.faults.spoiling import spoiled_pieces
+from emulator.faults.truth import Injected, TruthLog
+from emulator.faults.watch import Watch
+from xethru_protocol.messages import Command, ModReset, Response
+
+__all__ = ["FaultyDevice", "wrap"]
+
+PACKETS_PER_CALL = 32
+_RETRY_NS = 10_000_000
+"""How much later a call goes on that found only packets to lose: time must pass meanwhile."""
+
+
+class FaultyDevice:
+    """A module and its faults, as one device.
+
+    Parameters
+    ----------
+    inner
+        The module.
+    name
+        Of the radar, as scenarios and the truth log call it.
+    plan
+        What to do to it.
+    truth
+        Where every injected fault is written down.
+    zero_ns
+        Device time from which the scenario counts; the first time it hears of if None.
+    """
+
+    def __init__(
+        self,
+        inner: InnerDevice,
+        name: str,
+        plan: FaultPlan,
+        truth: TruthLog,
+        *,
+        zero_ns: int | None = None,
+    ) -> None:
+        self.inner = inner
+        self.name = name
+        self.truth = truth
+        self._seed = plan.seed
+        self._zero_ns = zero_ns
+        self._armed: list[Armed] = []
+        self._numbered = 0
+        self._watch = Watch()
+        self._queue = LineQueue()
+        self._actions: list[tuple[int, Action]] = []
+        self._sent_bytes = 0
+        self._away = False
+        self._back_ns: int | None = None
+        self._deaf = False  # from a restart until BOOTING
+        self._cut_next: Unplug | None = None
+        self._again_ns: int | None = None
+        self._passed = 0  # bytes of a half command that the module has already
+        for spec in plan.fault:
+            if not spec.radar or name in spec.radar:
+                self.add(spec)
+
+    # --- faults ---------------------------------------------------------------------------------
+
+    def add(self, spec: FaultSpec) -> int:
+        """Arm a fault; return the number by which `clear` knows it."""
+        self._numbered += 1
+        self._armed.append(Armed(self._numbered, spec, self.name, self._seed))
+        return self._numbered
+
+    def clear(self, number: int | None = None) -> int:
+        """Disarm one fault, or all; return how many that were."""
+        before = len(self._armed)
+        self._armed = [armed for armed in self._armed if number not in (None, armed.number)]
+        return before - len(self._armed)
+
+    @property
+    def armed(self) -> Sequence[Armed]:
+        """Faults that may still come or last."""
+        return tuple(self._armed)
+
+    def injected(self, number: int) -> int:
+        """Return how often an armed fault was injected so far."""
+        return sum(armed.firings for armed in self._armed if armed.number == number)
+
+    # --- the port -------------------------------------------------------------------------------
+
+    def port_present(self, now_ns: int) -> bool:
+        """Whether the port exists."""
+        present = getattr(self.inner, "port_present", None)
+        return not self._away and (present is None or bool(present(now_ns)))
+
+    def unplug(self, now_ns: int, away_ns: int | None = None) -> None:
+        """Take the port away, for good or for a while; what was under way is lost."""
+        self._away = True
+        self._back_ns = None if away_ns is None else now_ns + away_ns
+        self._queue.clear()
+        self._cut_next = None
+
+    def plug(self, now_ns: int) -> None:
+        """Give the port back; the module was without power, so it starts anew."""
+        if self._away:
+            self._away = False
+            self._back_ns = None
+            self.restart(now_ns)
+
+    def restart(self, now_ns: int) -> None:
+        """Restart the module without having been asked; it is deaf until it says BOOTING."""
+        self._watch.restarted()
+        self._queue.clear()
+        self._deaf = True
+        crash = getattr(self.inner, "crash", None)
+        if crash is not None:
+            crash(now_ns)
+        else:
+            self.inner.receive_data(command_bytes(ModReset()), now_ns)
+
+    def port_opened(self, now_ns: int) -> None:
+        """Learn that a host opened the port."""
+        self.inner.port_opened(now_ns)
+
+    def port_closed(self, now_ns: int) -> None:
+        """Learn that the last host closed the port."""
+        self.inner.port_closed(now_ns)
+
+    # --- from the host --------------------------------------------------------------------------
+
+    @property
+    def wants_data(self) -> bool:
+        """Whether more bytes should be read from the host now."""
+        return self.inner.wants_data
+
+    def receive_data(self, data: bytes, now_ns: int) -> None:
+        """Take bytes from the host."""
+        self.advance(now_ns)
+        if self._away or self._deaf:
+            return
+        holds = any(armed.target is Target.COMMAND for armed in self._armed)
+        begun = self._passed
+        for piece in self._watch.host_pieces(data):
+            fresh, touched = piece.data[begun:], begun > 0
+            begun = max(begun - len(piece.data), 0)
+            if piece.command is not None and holds and not touched:
+                self._command(piece.command, piece.data, now_ns)
+                continue
+            if piece.command is not None:
+                self._watch.command_sent(piece.command)
+            if holds:
+                self.inner.receive_data(fresh, now_ns)
+        rest = self._watch.half_command
+        if not holds:
+            self.inner.receive_data(data, now_ns)
+            begun = len(rest)
+        elif begun:  # the module has the start of it already
+            self.inner.receive_data(rest[begun:], now_ns)
+            begun = len(rest)
+        self._passed = begun
+
+    def _command(self, command: Command[Response], data: bytes, now_ns: int) -> None:
+        opportunity = Opportunity(
+            time_ns=self._scenario_ns(now_ns),
+            counter=self._watch.counter,
+            command=command,
+            to_module=True,
+        )
+        for armed in self._armed:
+            if not armed.concerns(opportunity) or not armed.due(opportunity):
+                continue
+            effect = cast("CommandEffect", armed.kind.effect)
+            context = Context(now_ns=now_ns, since_ns=now_ns, command=command)
+            handling = effect(data, armed.parameters, armed.dice, context)
+            if handling is None:
+                continue
+            self._note(armed, now_ns)
+            if handling.command is not None:
+                self._watch.command_sent(handling.command)
+            if handling.to_module:
+                self.inner.receive_data(handling.to_module, now_ns)
+            self._queue.put(handling.to_host, PacketClass.REPLY, now_ns)
+            return
+        self._watch.command_sent(command)
+        self.inner.receive_data(data, now_ns)
+
+    # --- to the host ----------------------------------------------------------------------------
+
+    def advance(self, now_ns: int) -> None:
+        """Let time pass."""
+        time_ns = self._scenario_ns(now_ns)
+        if self._armed:
+            self._moments(now_ns, time_ns)
+        if self._actions:
+            due = [action for due_ns, action in self._actions if due_ns <= now_ns]
+            self._actions = [entry for entry in self._actions if entry[0] > now_ns]
+            for action in due:
+                self._act(action, now_ns)
+        if self._back_ns is not None and now_ns >= self._back_ns:
+            self.plug(now_ns)
+        self.inner.advance(now_ns)
+
+    def next_packet(self, now_ns: int) -> bytes | None:
+        """Return the next bytes for the line; None if there is nothing to send now."""
+        self._again_ns = None
+        if self._away:
+            return None
+        packet = self._queue.take(now_ns)
+        for _ in range(PACKETS_PER_CALL):
+            if packet is not None:
+                self._sent_bytes += len(packet)
+                return packet
+            fresh = self.inner.next_packet(now_ns)
+            if fresh is None:
+                return None
+            packet = self._through(fresh, now_ns)
+            if self._deaf:
+                break
+        if packet is not None:
+            self._sent_bytes += len(packet)
+            return packet
+        self._again_ns = now_ns + _RETRY_NS
+        return None
+
+    def wake_ns(self, now_ns: int) -> int | None:
+        """Return when `advance` (and then `next_packet`) should be called next; None if never."""
+        time_ns = self._scenario_ns(now_ns)
+        moments = [armed.next_ns(time_ns) for armed in self._armed]
+        zero_ns = now_ns - time_ns
+        candidates = [
+            self.inner.wake_ns(now_ns),
+            self._again_ns,
+            self._back_ns,
+            self._queue.wake_ns(),
+            *(zero_ns + moment_ns for moment_ns in moments if moment_ns is not None),
+            *(due_ns for due_ns, _ in self._actions),
+        ]
+        return min((due_ns for due_ns in candidates if due_ns is not None), default=None)
+
+    def _through(self, packet: bytes, now_ns: int) -> bytes | None:
+        """Take one packet through the faults; return bytes to send at once."""
+        packet_class = classify(packet)
+        command: Command[Response] | None = None
+        if self._deaf:
+            if not self._watch.is_booting(packet):
+                return None
+            self._deaf = False
+        if packet_class is PacketClass.REPLY:
+            command, silent = self._watch.answered()
+            if silent:
+                return None
+        self._watch.sent(packet, packet_class)
+        if self._cut_next is not None and packet_class is PacketClass.FRAME:
+            return self._cut_off(packet, self._cut_next, now_ns)
+        if not self._armed and not self._queue:
+            return packet
+        opportunity = Opportunity(
+            time_ns=self._scenario_ns(now_ns),
+            packet_class=packet_class,
+            counter=self._watch.counter,
+            command=command,
+        )
+        self._queue.put(self._spoil(packet, opportunity, now_ns), packet_class, now_ns)
+        return self._queue.take(now_ns)
+
+    def _spoil(self, packet: bytes, opportunity: Opportunity, now_ns: int) -> Sequence[Piece]:
+        pieces: Sequence[Piece] = [Piece(packet)]
+        for armed in self._armed:
+            if not armed.concerns(opportunity):
+                continue
+            fires = armed.due(opportunity)
+            if armed.kind.target is Target.MOMENT:
+                if fires:
+                    self._start(armed, now_ns)
+                continue
+            lasts = armed.kind.lasting and armed.firings > 0
+            if not fires and not lasts:
+                continue
+            spoiled = spoiled_pieces(armed, pieces, opportunity, self._watch, now_ns, fires=fires)
+            if spoiled is None:
+                continue
+            pieces = spoiled
+            if fires:
+                self._note(armed, now_ns)
+            else:
+                armed.packets_since += 1
+        self._armed = [armed for armed in self._armed if not armed.over(opportunity.time_ns)]
+        return pieces
+
+    def _cut_off(self, packet: bytes, cut: Unplug, now_ns: int) -> bytes:
+        part = packet[: max(round(len(packet) * cut.part_of_frame), 1)]
+        self._cut_next = None
+        self._actions.append((now_ns, Unplug(cut.away_ns)))
+        return part
+
+    # --- moments --------------------------------------------------------------------------------
+
+    def _moments(self, now_ns: int, time_ns: int) -> None:
+        opportunity = Opportunity(time_ns=time_ns, counter=self._watch.counter)
+        for armed in self._armed:
+            if armed.concerns(opportunity) and armed.due(opportunity):
+                self._start(armed, now_ns)
+        self._armed = [armed for armed in self._armed if not armed.over(time_ns)]
+
+    def _start(self, armed: Armed, now_ns: int) -> None:
+        effect = cast("MomentEffect", armed.kind.effect)
+        self._note(armed, now_ns)
+        for action in effect(armed.parameters, armed.dice):
+            delay_ns = action.delay_ns if isinstance(action, Restart) else 0
+            self._actions.append((now_ns + delay_ns, action))
+
+    def _act(self, action: Action, now_ns: int) -> None:
+        match action:
+            case Restart():
+                self.restart(now_ns)
+            case Unplug() if action.part_of_frame:
+                self._cut_next = action
+            case Unplug():
+                self.unplug(now_ns, action.away_ns)
+            case SayToModule(command):
+                self._watch.command_sent(command, silent=True)
+                self.inner.receive_data(command_bytes(command), now_ns)
+
+    def _note(self, armed: Armed, now_ns: int) -> None:
+        armed.fired(now_ns, self._watch.counter)
+        self.truth.note(
+            Injected(
+                t_ns=now_ns,
+                radar=self.name,
+                kind=armed.kind.name,
+                parameters=armed.parameters.model_dump(),
+                counter=self._watch.counter,
+                offset=self._sent_bytes + self._queue.waiting_bytes,
+            )
+        )
+
+    def _scenario_ns(self, now_ns: int) -> int:
+        if self._zero_ns is None:
+            self._zero_ns = now_ns
+        return now_ns - self._zero_ns
+
+
+def wrap(
+    device: InnerDevice,
+    name: str,
+    plan: FaultPlan | None = None,
+    truth: TruthLog | None = None,
+    *,
+    zero_ns: int | None = None,
+) -> FaultyDevice:
+    """Return a device with the faults of a plan.
+
+    Parameters
+    ----------
+    device
+        The module.
+    name
+        Of the radar, as scenarios and the truth log call it.
+    plan
+        None: no faults until some are added.
+    truth
+        None: a log of its own, in memory.
+    zero_ns
+        Device time from which the scenario counts; the first time it hears of if None.
+    """
+    return FaultyDevice(
+        device,
+        name,
+        FaultPlan() if plan is None else plan,
+        TruthLog() if truth is None else truth,
+        zero_ns=zero_ns,
+    )

@@ -1,0 +1,207 @@
+"""Scenario files: which faults hit which radar, when, how often.
+
+A scenario is TOML that a person reads and writes; a mistake is one `FaultPlanError` line naming
+file, key and what is allowed::
+
+    seed = 7
+
+    [[fault]]
+    kind = "bad_checksum"      # see `xethru-emulator faults`
+    radar = ["front"]          # all if left out
+    command = "X4DRIVER_GET"   # only what answers, or is, this command; a name or an opcode
+    at_s = 2.0                 # from 2 s after the start
+    until_s = 10.0             # no longer than this
+    frame = 120                # from this frame counter on
+    every = 50                 # every 50th opportunity
+    probability = 0.01         # each opportunity with this chance
+    packet = "frame"           # faults of any packet: frame, reply, system or data only
+    count = 3                  # how often; 1 if left out, 0: without end
+    parameters = { }           # of the kind
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StrictInt,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+
+from emulator.faults.catalogue import KINDS
+from emulator.faults.kind import Kind, Parameters, Target
+from xethru_protocol.messages import Command
+from xethru_protocol.table import ROWS
+
+__all__ = ["FaultPlan", "FaultPlanError", "FaultSpec", "fault_spec", "load_plan", "parse_plan"]
+
+_COMMANDS = frozenset(row.name for message, row in ROWS.items() if issubclass(message, Command))
+
+
+class FaultPlanError(ValueError):
+    """A scenario that cannot be used; the message is one line with the remedy."""
+
+
+def _finite(value: object) -> object:
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError("must be a finite number")
+    return value
+
+
+Seconds = Annotated[float, BeforeValidator(_finite), Field(ge=0, le=86_400 * 365)]
+Seed = Annotated[StrictInt, Field(ge=0, lt=2**63)]
+
+
+class _Table(BaseModel):
+    """One TOML table: frozen, and an unknown key is an error."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class FaultSpec(_Table):
+    """One fault of a scenario: what, to whom, when, how often; see the module for the keys."""
+
+    kind: str
+    radar: tuple[str, ...] = ()
+    command: str | StrictInt | None = None
+    at_s: Seconds = 0.0
+    until_s: Seconds | None = None
+    frame: Annotated[StrictInt, Field(ge=0, lt=2**32)] | None = None
+    every: Annotated[StrictInt, Field(ge=1)] = 1
+    probability: Annotated[float, BeforeValidator(_finite), Field(gt=0, le=1)] = 1.0
+    packet: Literal["any", "frame", "reply", "system", "data"] = "any"
+    count: Annotated[StrictInt, Field(ge=0)] = 1
+    seed: Seed | None = None
+    parameters: dict[str, Any] = Field(default_factory=dict)
+
+    @field_validator("kind")
+    @classmethod
+    def _known_kind(cls, kind: str) -> str:
+        if kind not in KINDS:
+            raise ValueError(f"no kind of fault is called {kind!r}; known are {', '.join(KINDS)}")
+        return kind
+
+    @field_validator("command")
+    @classmethod
+    def _known_command(cls, command: str | int | None) -> str | int | None:
+        if isinstance(command, str) and command not in _COMMANDS:
+            known = ", ".join(sorted(_COMMANDS))
+            raise ValueError(f"no command is called {command!r}; known are {known}")
+        if isinstance(command, int) and not 0 <= command <= 0xFF:
+            raise ValueError(f"an opcode is 0 ... 255, not {command}")
+        return command
+
+    @model_validator(mode="after")
+    def _parameters_fit(self) -> FaultSpec:
+        try:
+            self.kind_parameters()
+        except ValidationError as error:
+            allowed = list(self.row.parameters.model_fields)
+            raise ValueError(f"parameters.{_one_line(error, allowed)}") from None
+        if self.packet != "any" and self.row.target is not Target.PACKET:
+            raise ValueError(f"packet: {self.kind} acts on {self.row.target.value} anyway")
+        return self
+
+    @property
+    def row(self) -> Kind:
+        """The row of the catalogue."""
+        return KINDS[self.kind]
+
+    def kind_parameters(self) -> Parameters:
+        """Return the parameters of the kind, with its defaults."""
+        return self.row.parameters.model_validate(self.parameters)
+
+
+class FaultPlan(_Table):
+    """A scenario. ``seed`` is that of every fault without its own."""
+
+    seed: Seed = 0
+    description: str = ""
+    fault: tuple[FaultSpec, ...] = ()
+
+
+def fault_spec(kind: str, **keys: Any) -> FaultSpec:  # noqa: ANN401 - any key, all validated
+    """Return one fault; what is no key of a fault is a parameter of its kind.
+
+    Raises
+    ------
+    FaultPlanError
+        Naming the key and what is allowed.
+
+    >>> fault_spec("missing_frames", frames=2, count=3).parameters
+    {'frames': 2}
+    """
+    parameters = dict(keys.pop("parameters", {}))
+    parameters |= {key: keys.pop(key) for key in set(keys) - set(FaultSpec.model_fields)}
+    return parse_fault({"kind": kind, "parameters": parameters, **keys})
+
+
+def parse_fault(table: object, source: str = "fault") -> FaultSpec:
+    """Return a fault from a table; `FaultPlanError` if it is none."""
+    try:
+        return FaultSpec.model_validate(table)
+    except ValidationError as error:
+        said = _one_line(error, list(FaultSpec.model_fields))
+        raise FaultPlanError(f"{source}: {said}") from None
+
+
+def parse_plan(text: str, source: str = "scenario") -> FaultPlan:
+    """Return a plan from TOML text; `FaultPlanError` naming the source otherwise."""
+    try:
+        table = tomllib.loads(text)
+    except ValueError as error:  # not TOML, or an integer of thousands of digits
+        raise FaultPlanError(f"{source}: not valid TOML: {error}") from None
+    except RecursionError:
+        raise FaultPlanError(f"{source}: brackets are nested too deep for a scenario") from None
+    try:
+        return FaultPlan.model_validate(table)
+    except ValidationError as error:
+        in_fault = len(error.errors(include_url=False)[0]["loc"]) > 1
+        model = FaultSpec if in_fault else FaultPlan
+        raise FaultPlanError(f"{source}: {_one_line(error, list(model.model_fields))}") from None
+
+
+def load_plan(path: Path | str) -> FaultPlan:
+    """Return the plan of a scenario file.
+
+    Raises
+    ------
+    FaultPlanError
+        File missing or unreadable, TOML broken, key unknown, or value refused.
+    """
+    try:
+        text = Path(path).read_bytes().decode()
+    except OSError as error:
+        raise FaultPlanError(f"{path}: cannot read the scenario: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise FaultPlanError(f"{path}: not UTF-8 text at byte {error.start}") from error
+    return parse_plan(text, str(path))
+
+
+def _one_line(error: ValidationError, allowed: list[str]) -> str:
+    """Say the first problem in one line, and how many more there are."""
+    problems = error.errors(include_url=False)
+    first = problems[0]
+    parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"])
+    key = "".join(parts).removeprefix(".")
+    match first["type"]:
+        case "extra_forbidden":
+            said = f"unknown key; allowed are {', '.join(allowed) or 'none'}"
+        case "missing":
+            said = "missing; this key is required"
+        case "value_error":
+            said = str(first["ctx"]["error"])
+        case _:
+            shown = repr(first["input"])
+            said = f"{first['msg']}, got {shown if len(shown) <= 60 else shown[:57] + '...'}"
+    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    return f"{key}: {said}{more}" if key else f"{said}{more}"

@@ -1,0 +1,563 @@
+"""For each kind of fault: a driver counts exactly what was injected, or it cannot, and why."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emulator.faults.catalogue import KINDS
+from hil_tests.faulty import SERIAL, FaultyLine, fault, faulty_line
+from xethru_protocol import messages as m
+from xethru_protocol.codes import PongCode, SensorMode, X4Setting
+from xethru_protocol.driver import X4M300
+from xethru_protocol.errors import DeviceError, ResponseTimeout
+from xethru_protocol.frames import Frame
+from xethru_protocol.packets import FaultKind
+
+__all__ = ["faulty_line"]  # a fixture
+
+FPS = 20.0
+READ = {"command": "X4DRIVER_GET"}
+ASKED = m.X4DriverGet(setting=X4Setting.PULSESPERSTEP)
+PULSES = 100
+
+
+@dataclass(frozen=True, kw_only=True)
+class Expected:
+    """What one injected fault makes a driver count; the rest must stay 0."""
+
+    keys: dict[str, Any] = field(default_factory=dict)
+    faults: dict[FaultKind, int] = field(default_factory=dict)
+    more_faults: bool = False  # samples that are junk may look like starts
+    junk_bytes: int | None = 0  # None: not told
+    unknown: int = 0
+    lost: int = 0
+    discarded: int = 0
+    off_lattice: int | None = 0
+    stray: int = 0
+    reboots: int = 0
+    timeouts: int = 0
+    refusals: int = 0
+
+
+def damaged(kind: FaultKind) -> Expected:
+    """Expect that a reply is lost by one damage of a kind."""
+    return Expected(keys=READ, faults={kind: 1}, junk_bytes=None, timeouts=1)
+
+
+def reply_damage(kind: FaultKind, **parameters: float) -> Expected:
+    keys = {"packet": "reply", **READ, "parameters": parameters}
+    return Expected(keys=keys, faults={kind: 1}, junk_bytes=None, timeouts=1)
+
+
+CHECKSUM, TRUNCATED, GARBAGE = FaultKind.CHECKSUM, FaultKind.TRUNCATED, FaultKind.GARBAGE
+CLEAN_REPLY = Expected(keys=READ)
+
+# Faults of answers: 3 questions are asked, then a good one.
+REPLIES: dict[str, Expected] = {
+    "drop_bytes": reply_damage(CHECKSUM, at=1),
+    "duplicate_bytes": reply_damage(CHECKSUM, at=3),
+    "flip_bits": reply_damage(CHECKSUM, at=1),
+    "insert_bytes": reply_damage(CHECKSUM, at=1),
+    "burst_errors": reply_damage(GARBAGE, enter=1.0, leave=0.01),  # the start is hit, too
+    "escape_lost": Expected(  # the byte behind it is a start now
+        keys=READ, faults={TRUNCATED: 1, CHECKSUM: 1}, junk_bytes=None, timeouts=1
+    ),
+    # code, type and content id are 11, an odd number of them
+    "flow_control_swallowed": reply_damage(CHECKSUM),
+    "wrong_baud": Expected(
+        keys={"packet": "reply", **READ}, faults={GARBAGE: 1}, junk_bytes=None, timeouts=1
+    ),
+    "bad_checksum": damaged(CHECKSUM),
+    "missing_end": damaged(TRUNCATED),
+    "missing_start": damaged(GARBAGE),
+    "double_start": Expected(keys=READ, junk_bytes=1),
+    "double_end": Expected(keys=READ, faults={GARBAGE: 1}, junk_bytes=1),
+    "early_end": damaged(CHECKSUM),
+    "truncated_reply": damaged(TRUNCATED),
+    "stray_data": CLEAN_REPLY,
+    "nack": Expected(keys={**READ, "parameters": {"code": 7}}, refusals=1),
+    "no_reply": Expected(keys=READ, timeouts=1),
+    "slow_reply": Expected(keys={**READ, "parameters": {"delay_ms": 3000.0}}, timeouts=1, stray=1),
+    "duplicate_ack": Expected(keys=READ, stray=1),
+    "stale_ack": Expected(keys=READ, stray=1),
+    "late_reply": Expected(keys=READ, timeouts=1, stray=1),
+    "wrong_reply": Expected(keys=READ, timeouts=1, stray=1),
+    "system_message": Expected(keys={"packet": "reply", **READ}, reboots=1),
+    "command_lost": Expected(keys=READ, timeouts=1),
+    "command_damaged": Expected(keys=READ, timeouts=1),
+}
+
+NOISE = {"packet": "frame", "every": 4}
+EVERY = {"every": 4}
+FRAME_BYTES = 9 + 14 + 4 * 94
+
+# Faults in a running stream: 3 of them, 4 frames apart.
+STREAMS: dict[str, Expected] = {
+    "noise_between": Expected(
+        keys={**NOISE, "parameters": {"bytes": 5}}, faults={GARBAGE: 1}, junk_bytes=5
+    ),
+    "seven_bits": Expected(
+        keys=NOISE, faults={FaultKind.HEADER: 1}, more_faults=True, junk_bytes=FRAME_BYTES, lost=1
+    ),
+    "split_writes": Expected(keys={**NOISE, "parameters": {"bytes": 64}}),
+    "one_byte_writes": Expected(keys={**NOISE, "parameters": {"gap_us": 10.0}}),
+    "escaped_checksum": Expected(keys=NOISE, unknown=1),
+    "truncated_frame": Expected(
+        keys={**EVERY, "parameters": {"keep": 100}},
+        faults={GARBAGE: 1},
+        junk_bytes=100,
+        lost=1,
+        off_lattice=None,
+    ),
+    "oversized": Expected(keys=NOISE, faults={FaultKind.OVERSIZE: 1}, junk_bytes=2 * 7999 + 10),
+    "empty_packet": Expected(keys=NOISE, faults={FaultKind.EMPTY: 1}, junk_bytes=2),
+    "unknown_response": Expected(keys=NOISE, unknown=1),
+    "unknown_content": Expected(keys=NOISE, unknown=1),
+    "nan_samples": Expected(keys={**EVERY, "parameters": {"samples": 4}}, off_lattice=4),
+    "infinite_samples": Expected(keys={**EVERY, "parameters": {"samples": 4}}, off_lattice=4),
+    "denormal_samples": Expected(keys={**EVERY, "parameters": {"samples": 4}}, off_lattice=4),
+    "off_lattice_samples": Expected(keys={**EVERY, "parameters": {"samples": 4}}, off_lattice=4),
+    "in_range_samples": Expected(keys={**EVERY, "parameters": {"samples": 4}}),
+    "wrong_bin_count": Expected(keys=EVERY, discarded=1, lost=1),
+    "wrong_length": Expected(
+        keys=EVERY, faults={FaultKind.HEADER: 1}, more_faults=True, junk_bytes=FRAME_BYTES, lost=1
+    ),
+    # 199 bytes into the packet a sample begins: the ACK takes its place, the last one falls off
+    "packet_inside_frame": Expected(keys=EVERY, faults={GARBAGE: 1}, junk_bytes=4, off_lattice=1),
+    "normal_framed": Expected(keys=EVERY),
+    "false_bulk_start": Expected(keys=NOISE, faults={FaultKind.HEADER: 1}, junk_bytes=9),
+    "counter_jump": Expected(keys={**EVERY, "parameters": {"frames": 3}}, lost=3),
+    "counter_back": Expected(keys={**EVERY, "frame": 30, "parameters": {"frames": 5}}),
+    "counter_wrap": Expected(keys={"every": 20}),
+    "counter_reset": Expected(keys={"every": 20}),
+    "duplicate_frame": Expected(keys=EVERY),
+    "missing_frames": Expected(keys={**EVERY, "parameters": {"frames": 2}}, lost=2),
+    "reordered_frames": Expected(keys=EVERY, lost=2),
+    "saturation": Expected(keys=EVERY),
+    "dead_bins": Expected(keys=EVERY),
+    "dc_step": Expected(keys={}),
+    "stale_frame": Expected(keys=EVERY),
+    "slow_rate": Expected(),
+    "stall": Expected(),
+    "start_offset": Expected(),
+    "clock_drift": Expected(keys={"parameters": {"ppm": 10_000.0}}),
+    "jitter": Expected(),
+    "usb_latency": Expected(),
+    "range_offset_drift": Expected(),
+    "strong_clutter": Expected(),
+    "interference": Expected(),
+    "fading": Expected(),
+}
+
+# Those with a test of their own below.
+SINGLE = {
+    "cancelling_flips",
+    "not_ready",
+    "ack_then_ignore",
+    "ack_quantised",
+    "unplug",
+    "disconnect_mid_frame",
+    "watchdog_reboot",
+    "brown_out",
+    "safe_mode",
+    "wrong_profile",
+    "wrong_version",
+    "duplicate_serial",
+    "mode_lost",
+    "stream_stopped",
+    "silent",
+}
+
+
+def test_every_kind_is_tested() -> None:
+    assert set(REPLIES) | set(STREAMS) | SINGLE == set(KINDS)
+    assert len(KINDS) >= 40
+
+
+def check(
+    radar: X4M300, line: FaultyLine, wanted: Expected, timeouts: int = 0, refusals: int = 0
+) -> None:
+    n = len(line.truth.records)
+    seen = radar.statistics
+    assert {kind: seen.faults[kind] for kind in wanted.faults} == {
+        kind: n * count for kind, count in wanted.faults.items()
+    }
+    assert radar.fault_count == seen.faults.total()
+    assert wanted.more_faults or radar.fault_count == n * sum(wanted.faults.values())
+    assert wanted.junk_bytes is None or seen.junk_bytes == n * wanted.junk_bytes
+    assert seen.unknown == n * wanted.unknown
+    assert seen.frames_lost == n * wanted.lost
+    assert radar.frames_discarded == n * wanted.discarded
+    assert wanted.off_lattice is None or seen.off_lattice_samples == n * wanted.off_lattice
+    assert radar.stray_count == n * wanted.stray
+    assert radar.reboots == n * wanted.reboots
+    assert timeouts == n * wanted.timeouts
+    assert refusals == n * wanted.refusals
+
+
+@pytest.mark.parametrize("kind", REPLIES)
+def test_faults_of_answers_are_counted(kind: str, faulty_line: FaultyLine) -> None:
+    wanted = REPLIES[kind]
+    pulses = 0x7D if kind == "escape_lost" else PULSES
+    radar = faulty_line.radar()
+    radar.request(m.X4DriverInit(), 10.0)
+    radar.request(m.X4DriverSet(setting=X4Setting.PULSESPERSTEP, value=pulses))
+    timeouts = refusals = 0
+    with fault(faulty_line.device, kind, count=3, **wanted.keys) as injection:
+        for _ in range(3):
+            try:
+                radar.request(ASKED)
+            except ResponseTimeout:
+                timeouts += 1
+            except DeviceError as error:
+                refusals += error.code == 7
+    assert injection.injected == faulty_line.truth.counts[kind] == 3
+    faulty_line.sleep(10.0)
+    radar.ping()
+    assert radar.request(ASKED).values == (pulses,)
+    check(radar, faulty_line, wanted, timeouts, refusals)
+
+
+@pytest.mark.parametrize("kind", STREAMS)
+def test_faults_of_a_stream_are_counted(kind: str, faulty_line: FaultyLine) -> None:
+    wanted = STREAMS[kind]
+    radar = faulty_line.streaming(FPS)
+    radar.read_frame()  # the one with which the stream began
+    count = 1 if KINDS[kind].lasting and "every" not in wanted.keys else 3
+    with fault(faulty_line.device, kind, **{"count": count, **wanted.keys}) as injection:
+        frames = list(radar.frames(75))
+    assert injection.injected == faulty_line.truth.counts[kind] == count
+    check(radar, faulty_line, wanted)
+    hidden = not (wanted.faults or wanted.lost or wanted.off_lattice or wanted.unknown)
+    assert bool(KINDS[kind].hidden) == (hidden and not wanted.discarded)
+    if kind in WITNESSES:
+        WITNESSES[kind](frames, list(FaultyLine().streaming(FPS).frames(100))[1:], faulty_line)
+
+
+Witness = Callable[[list[Frame], list[Frame], FaultyLine], None]
+
+
+def counters(frames: list[Frame]) -> list[int]:
+    return [frame.counter for frame in frames]
+
+
+def changed(frames: list[Frame], true: list[Frame]) -> dict[int, int]:
+    """How many samples of a frame are not what they should be, by counter."""
+    truth = {frame.counter: frame.samples for frame in true}
+    return {
+        frame.counter: int(np.count_nonzero(frame.samples != truth[frame.counter]))
+        for frame in frames
+        if frame.samples.tobytes() != truth[frame.counter].tobytes()
+    }
+
+
+def hit(line: FaultyLine) -> list[int | None]:
+    return [record.counter for record in line.truth.records]
+
+
+def arrivals_s(frames: list[Frame]) -> np.ndarray[Any, np.dtype[np.float64]]:
+    return np.array([frame.arrival_ns for frame in frames]) * 1e-9
+
+
+def same_content(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
+    assert not changed(frames, true)
+
+
+def four_samples(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
+    assert changed(frames, true) == dict.fromkeys(hit(line), 4)
+
+
+def frames_that_were_hit(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
+    assert list(changed(frames, true)) == hit(line)
+
+
+def all_from_the_first(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
+    assert set(changed(frames, true)) >= set(counters(frames)[1:])
+
+
+def steps_back(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
+    steps = np.diff(counters(frames))
+    assert sorted(set(steps.tolist())) == [-4, 1]
+    assert np.count_nonzero(steps < 0) == 3
+
+
+def one_wrap(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
+    assert counters(frames).count(2**32 - 1) == counters(frames)[20:].count(0) == 3
+
+
+def starts_again(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
+    assert counters(frames)[1:].count(0) == 3
+
+
+def twice(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
+    repeated = [a for a, b in itertools.pairwise(counters(frames)) if a == b]
+    assert repeated == hit(line)
+
+
+def old_samples(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
+    pairs = itertools.pairwise(frames)
+    stale = [b.counter for a, b in pairs if a.samples.tobytes() == b.samples.tobytes()]
+    assert stale == hit(line)
+
+
+def ten_percent_slower(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
+    ratio = np.diff(arrivals_s(frames)) / np.diff(arrivals_s(true[:75]))
+    np.testing.assert_allclose(ratio, 1.1, atol=1e-6)
+
+
+def gap_then_burst(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
+    late = arrivals_s(frames) - arrivals_s(true[:75])
+    first = late[0]
+    assert first == pytest.approx(1.5)
+    periods = np.arange(75) * np.diff(arrivals_s(true))[0]
+    np.testing.assert_allclose(late, np.maximum(1.5 - periods, 0), atol=1e-3)
+
+
+def twenty_ms_late(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
+    np.testing.assert_allclose(arrivals_s(frames) - arrivals_s(true[:75]), 0.02, atol=1e-6)
+
+
+def one_percent_slow(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
+    ratio = np.diff(arrivals_s(frames)) / np.diff(arrivals_s(true[:75]))
+    np.testing.assert_allclose(ratio, 1.01, atol=1e-6)
+
+
+def wandering(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
+    late = arrivals_s(frames) - arrivals_s(true[:75])
+    assert late.min() >= 0
+    assert 0.0001 < late.std() < 0.01  # 75 steps of 0.2 ms
+
+
+def at_polls(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
+    since_s = line.truth.records[0].t_ns * 1e-9
+    polls = (arrivals_s(frames) - since_s) / 0.016
+    np.testing.assert_allclose(polls, np.rint(polls), atol=1e-4)
+    late = arrivals_s(frames) - arrivals_s(true[:75])
+    assert 0 <= late.min() < late.max() < 0.016
+
+
+def dead(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
+    stuck = [f.counter for f in frames if np.unique(f.samples[:8]).size == 1]
+    assert stuck == hit(line) == list(changed(frames, true))
+
+
+def clipped(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
+    largest = {f.counter: np.abs(f.samples).max() for f in true}
+    for frame in frames:
+        part = np.abs(frame.samples).max() / largest[frame.counter]
+        assert part == pytest.approx(0.5 if frame.counter in hit(line) else 1.0, rel=0.01)
+
+
+def lifted(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
+    for frame, before in zip(frames, true, strict=False):
+        np.testing.assert_allclose(frame.samples - before.samples, 0.01, atol=2e-5)
+
+
+def wandered(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
+    assert frames[0].samples.tobytes() == true[0].samples.tobytes()
+    shifts = [
+        next(k for k in range(5) if (f.samples[k:] == t.samples[: f.samples.size - k]).all())
+        for f, t in zip(frames, true, strict=False)
+    ]
+    assert shifts == sorted(shifts)
+    assert shifts[-1] == 1  # 4 bins in 10 s; 3.75 s have passed
+
+
+def clutter(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
+    added = np.mean([f.samples - t.samples for f, t in zip(frames, true, strict=False)], axis=0)
+    assert np.abs(added).argmax() == 20
+    assert added[20] == pytest.approx(0.05, abs=1e-4)
+    assert np.abs(added[60:]).max() < 1e-4
+
+
+def rain(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
+    for frame, before in zip(frames, true, strict=False):
+        added = np.abs(frame.samples - before.samples) > 0.01
+        assert 0 < np.count_nonzero(added) <= 5
+
+
+def faded(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
+    power = [np.std(f.samples) / np.std(t.samples) for f, t in zip(frames, true, strict=False)]
+    assert power[0] == pytest.approx(1.0, abs=0.01)
+    assert min(power) == pytest.approx(10 ** (-12 / 20), rel=0.02)
+
+
+WITNESSES: dict[str, Witness] = {
+    "split_writes": same_content,
+    "one_byte_writes": same_content,
+    "normal_framed": same_content,
+    "noise_between": same_content,
+    "in_range_samples": four_samples,
+    "off_lattice_samples": four_samples,
+    "counter_back": steps_back,
+    "counter_wrap": one_wrap,
+    "counter_reset": starts_again,
+    "duplicate_frame": twice,
+    "stale_frame": old_samples,
+    "saturation": clipped,
+    "dead_bins": dead,
+    "dc_step": lifted,
+    "slow_rate": ten_percent_slower,
+    "stall": gap_then_burst,
+    "start_offset": twenty_ms_late,
+    "clock_drift": one_percent_slow,
+    "jitter": wandering,
+    "usb_latency": at_polls,
+    "range_offset_drift": wandered,
+    "strong_clutter": clutter,
+    "interference": rain,
+    "fading": faded,
+}
+
+
+def test_flips_that_cancel_pass_the_checksum(faulty_line: FaultyLine) -> None:
+    radar = faulty_line.radar()
+    asked = m.X4DriverGet(setting=X4Setting.FRAMEAREA)
+    right = radar.request(asked)
+    with fault(faulty_line.device, "cancelling_flips", command="X4DRIVER_GET"):
+        wrong = radar.request(asked)
+    assert wrong != right
+    assert radar.statistics.clean
+    assert radar.stray_count == 0
+    assert KINDS["cancelling_flips"].hidden
+
+
+def test_not_ready_is_what_ping_says(faulty_line: FaultyLine) -> None:
+    radar = faulty_line.radar()
+    with fault(faulty_line.device, "not_ready", count=3) as injection:
+        answers = [radar.ping() for _ in range(5)]
+    assert answers.count(PongCode.XTS_SPRP_NOTREADY) == injection.injected == 3
+
+
+@pytest.mark.parametrize(
+    ("kind", "setting", "value"),
+    [
+        ("ack_then_ignore", X4Setting.ITERATIONS, 33),
+        ("ack_quantised", X4Setting.FRAMEAREAOFFSET, 0.18),
+    ],
+)
+def test_reading_back_shows_what_was_not_set(
+    kind: str, setting: X4Setting, value: float, faulty_line: FaultyLine
+) -> None:
+    radar = faulty_line.radar()
+    radar.request(m.X4DriverInit(), 10.0)
+    differs = 0
+    with fault(faulty_line.device, kind, count=2, command="X4DRIVER_SET") as injection:
+        for _ in range(4):
+            radar.request(m.X4DriverSet(setting=setting, value=value))
+            (read,) = radar.request(m.X4DriverGet(setting=setting)).values
+            differs += read != pytest.approx(value)
+    assert differs == injection.injected == 2
+
+
+def test_a_damaged_command_is_counted_by_the_module(faulty_line: FaultyLine) -> None:
+    radar = faulty_line.radar()
+    with fault(faulty_line.device, "command_damaged", count=2), pytest.raises(ResponseTimeout):
+        radar.ping()
+    assert faulty_line.device.inner.faults_seen == 1  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("kind", ["unplug", "disconnect_mid_frame"])
+def test_a_module_that_vanishes_is_found_again(kind: str, faulty_line: FaultyLine) -> None:
+    radar = faulty_line.streaming(FPS, reconnect_s=15.0)
+    before = list(radar.frames(5))
+    for _ in range(2):
+        with fault(faulty_line.device, kind, away_s=0.5):
+            began_ns = faulty_line.clock_ns()
+            list(radar.frames(10))
+            assert faulty_line.clock_ns() - began_ns < 5e9
+    assert radar.reconnects == faulty_line.truth.counts[kind] == 2
+    assert len(before) == 5
+    assert radar.frames_lost == 0
+
+
+def test_a_watchdog_reboot_is_counted(faulty_line: FaultyLine) -> None:
+    for n in range(1, 4):
+        radar = faulty_line.streaming(FPS)
+        reboots = radar.reboots
+        with (
+            fault(faulty_line.device, "watchdog_reboot"),
+            pytest.raises(ResponseTimeout, match="restarted"),
+        ):
+            list(radar.frames(200, timeout_s=4.0))
+        assert radar.reboots - reboots == 1
+        assert faulty_line.truth.counts["watchdog_reboot"] == n
+
+
+def test_a_brown_out_loop_is_counted(faulty_line: FaultyLine) -> None:
+    radar = faulty_line.radar()
+    with fault(faulty_line.device, "brown_out", restarts=4) as injection:
+        deadline_ns = faulty_line.clock_ns() + 20_000_000_000
+        while faulty_line.clock_ns() < deadline_ns:
+            try:
+                radar.ping(0.5)
+            except ResponseTimeout:
+                continue
+            faulty_line.sleep(0.1)
+    assert injection.injected == 1
+    assert radar.reboots == 4
+
+
+def test_safe_mode_is_warned_of(faulty_line: FaultyLine) -> None:
+    radar = faulty_line.radar()
+    with fault(faulty_line.device, "safe_mode"):
+        radar.configure_raw()
+        assert radar.ping() is PongCode.XTS_SPRP_SAFEMODE
+    assert sum("safe mode" in warning for warning in radar.warnings) == 1
+    assert radar.ping() is PongCode.XTS_SPRP_READY
+
+
+def test_what_a_module_tells_of_itself_can_be_wrong(faulty_line: FaultyLine) -> None:
+    radar = faulty_line.radar()
+    true = radar.info()
+    with (
+        fault(faulty_line.device, "wrong_version", version="9.9.9"),
+        fault(faulty_line.device, "duplicate_serial", serial="000000000007"),
+        fault(faulty_line.device, "wrong_profile", profile=0x12345678),
+    ):
+        told = radar.info()
+        profile = radar.request(m.GetProfileId()).values
+    assert (told.version, told.serial_number) == ("9.9.9", "000000000007")
+    assert profile == (0x12345678,)
+    assert (true.version, true.serial_number) != (told.version, told.serial_number)
+    assert radar.info() == true
+    assert true.serial_number == SERIAL
+    assert sorted(faulty_line.truth.counts.values()) == [1, 1, 1]
+
+
+def test_a_lost_mode_shows_when_it_is_asked_for(faulty_line: FaultyLine) -> None:
+    radar = faulty_line.streaming(FPS)
+    with fault(faulty_line.device, "mode_lost"), pytest.raises(ResponseTimeout):
+        list(radar.frames(20))
+    assert radar.request(m.GetMode()).values == bytes((SensorMode.XTID_SM_STOP,))
+    assert radar.stray_count == 0
+    assert faulty_line.truth.counts["mode_lost"] == 1
+
+
+def test_a_stopped_stream_shows_when_its_rate_is_asked_for(faulty_line: FaultyLine) -> None:
+    radar = faulty_line.streaming(FPS)
+    with fault(faulty_line.device, "stream_stopped"), pytest.raises(ResponseTimeout):
+        list(radar.frames(20))
+    (rate,) = radar.request(m.X4DriverGet(setting=X4Setting.FPS)).values
+    assert rate == 0.0
+    assert radar.stray_count == 0
+
+
+def test_a_silent_radar_loses_what_it_would_have_said(faulty_line: FaultyLine) -> None:
+    radar = faulty_line.streaming(FPS)
+    list(radar.frames(5))
+    with fault(faulty_line.device, "silent", seconds=1.0):
+        list(radar.frames(20))
+    assert radar.frames_lost in (20, 21)  # of the second that the first one lost begins
+    with fault(faulty_line.device, "silent"):
+        with pytest.raises(ResponseTimeout):
+            radar.read_frame(1.0)
+        with pytest.raises(ResponseTimeout):
+            radar.ping()
+    assert faulty_line.truth.counts["silent"] == 2
