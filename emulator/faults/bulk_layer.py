@@ -13,7 +13,12 @@ from emulator.faults.dice import Dice
 from emulator.faults.kind import Context, Kind, Layer, Parameters, Piece, Target
 from emulator.faults.packets import PacketClass, frame_packet, frame_parts, response_bytes
 from xethru_protocol.messages import Ack
-from xethru_protocol.packets import NO_ESCAPE_HEADER_BYTES, NO_ESCAPE_START, encode_normal
+from xethru_protocol.packets import (
+    MAX_NORMAL_BYTES,
+    NO_ESCAPE_HEADER_BYTES,
+    NO_ESCAPE_START,
+    encode_normal,
+)
 
 __all__ = ["KINDS"]
 
@@ -127,9 +132,10 @@ def _normal_framed(
     packet: bytes, wanted: Parameters, dice: Dice, context: Context
 ) -> list[Piece] | None:
     del wanted, dice, context
-    if not packet.startswith(NO_ESCAPE_START):
+    payload = packet[NO_ESCAPE_HEADER_BYTES:]
+    if not packet.startswith(NO_ESCAPE_START) or not 0 < len(payload) < MAX_NORMAL_BYTES:
         return None
-    return [Piece(encode_normal(packet[NO_ESCAPE_HEADER_BYTES:]))]
+    return [Piece(encode_normal(payload))]
 
 
 def _row(  # noqa: PLR0917 - the columns of a table

@@ -42,8 +42,19 @@ from emulator.faults.kind import Kind, Parameters, Target
 from xethru_protocol.messages import Command
 from xethru_protocol.table import ROWS
 
-__all__ = ["FaultPlan", "FaultPlanError", "FaultSpec", "fault_spec", "load_plan", "parse_plan"]
+__all__ = [
+    "FaultPlan",
+    "FaultPlanError",
+    "FaultSpec",
+    "fault_spec",
+    "load_plan",
+    "parse_fault",
+    "parse_plan",
+    "plan_names",
+]
 
+# Beside this package, in the repository and in the wheel alike.
+_SHIPPED = Path(__file__).parents[2] / "fixtures" / "faults"
 _COMMANDS = frozenset(row.name for message, row in ROWS.items() if issubclass(message, Command))
 
 
@@ -170,16 +181,31 @@ def parse_plan(text: str, source: str = "scenario") -> FaultPlan:
         raise FaultPlanError(f"{source}: {_one_line(error, list(model.model_fields))}") from None
 
 
+def plan_names() -> tuple[str, ...]:
+    """Return the names of the scenarios that ship with the package, sorted."""
+    return tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))
+
+
 def load_plan(path: Path | str) -> FaultPlan:
-    """Return the plan of a scenario file.
+    """Return the plan of a scenario file, or of a shipped one by its name ("lossy_line").
+
+    A string without a path separator and without ``.toml`` is a name.
 
     Raises
     ------
     FaultPlanError
-        File missing or unreadable, TOML broken, key unknown, or value refused.
+        Name unknown, file missing or unreadable, TOML broken, key unknown, or value refused.
     """
+    source = Path(path)
+    if isinstance(path, str) and "/" not in path and not path.endswith(".toml"):
+        if path not in plan_names():
+            raise FaultPlanError(
+                f"{path}: no such scenario; known are {', '.join(plan_names())}, "
+                "or give the path of a .toml file"
+            )
+        source = _SHIPPED / f"{path}.toml"
     try:
-        text = Path(path).read_bytes().decode()
+        text = source.read_bytes().decode()
     except OSError as error:
         raise FaultPlanError(f"{path}: cannot read the scenario: {error.strerror}") from error
     except UnicodeDecodeError as error:

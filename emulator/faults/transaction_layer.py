@@ -81,7 +81,7 @@ def _wrong_reply(
 ) -> Sequence[Piece] | None:
     del wanted, dice, context
     payload = normal_payload(packet)
-    if payload is None or payload[0] != ResponseCode.XTS_SPR_REPLY:
+    if payload is None or len(payload) < 6 or payload[0] != ResponseCode.XTS_SPR_REPLY:
         return None
     content_id = struct.unpack_from("<I", payload, 2)[0] ^ 0xFFFF
     return [Piece(encode_normal(payload[:2] + struct.pack("<I", content_id) + payload[6:]))]
