@@ -1,0 +1,327 @@
+"""A hostile client beside a well-behaved one, in virtual time.
+
+``python -m hil_tests.bench.hostile_client --minutes 20`` serves two bare modules in one loop. One
+has a host that does everything a host must not: random bytes, half commands, every command of the
+golden vectors, whole and damaged, in any order, lengths that never come, resets, cuts of its
+power, a long time without reading, opening and closing. The other has a host that reads its
+frames. Afterwards the first must still answer a PING, the second have lost no frame, and the
+memory be flat. Everything follows from ``--seed``; a minute takes less than a second.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import os
+import random
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+
+from emulator.device import Device, radar_device
+from emulator.echo import echo_source
+from emulator.identity import Identity
+from emulator.pace import Pace
+from emulator.scene import empty_room
+from emulator.server import Port, Server
+from hil_tests.bench.pair_line import PairLine
+from hil_tests.golden.vectors import load, load_hand_made
+from xethru_protocol import messages as m
+from xethru_protocol.codes import PongCode, SensorMode, X4Setting
+from xethru_protocol.connection import Connection, Role
+from xethru_protocol.packets import NeedData, encode_normal
+from xethru_protocol.x4 import real_frame_rate
+
+NS_PER_S = 1_000_000_000
+STEP_NS = 10_000_000
+FPS = 17.0
+WARM_UP = 0.25
+"""Share of the time after which memory must not grow any more: by then every queue was full."""
+MOST_OBJECTS_GROWN = 2000
+"""Live objects more than after the warm-up: what a full queue and a full flash may differ by."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome:
+    """What a run left behind.
+
+    Attributes
+    ----------
+    minutes
+        Of device time.
+    seconds
+        Of real time.
+    actions
+        What the hostile host did, by name.
+    sent_bytes, heard_bytes
+        Of the hostile host.
+    faults_seen
+        Damaged packets that its module noticed.
+    answers
+        Whether its module answered a PING after a reset at the end.
+    frames, frames_due, gaps, in_order
+        Of the well-behaved host: frames got, frames that fell due, counters missing, and whether
+        every counter was larger than the one before.
+    objects_grown, rss_grown_kib
+        Growth of Python's container objects and of the resident set after the warm-up.
+    """
+
+    minutes: float
+    seconds: float
+    actions: dict[str, int]
+    sent_bytes: int
+    heard_bytes: int
+    faults_seen: int
+    answers: bool
+    frames: int
+    frames_due: int
+    gaps: int
+    in_order: bool
+    objects_grown: int
+    rss_grown_kib: int
+
+    @property
+    def undisturbed(self) -> bool:
+        """Whether all that must hold holds; at most two frames may still be on their way."""
+        return (
+            self.answers
+            and self.gaps == 0
+            and self.in_order
+            and self.frames_due - 2 <= self.frames <= self.frames_due + 1
+            and self.objects_grown <= MOST_OBJECTS_GROWN
+        )
+
+
+class HostileHost:
+    """Acts at random moments; what the line does not take is thrown away, half a command or not."""
+
+    def __init__(self, line: PairLine, device: Device, seed: int) -> None:
+        self._line = line
+        self._device = device
+        self._random = random.Random(seed)
+        self._commands = [v.wire for v in (*load(), *load_hand_made()) if v.from_host]
+        self._payloads = [v.payload for v in (*load(), *load_hand_made()) if v.from_host]
+        self._deaf_until_ns = 0
+        self._next_ns = 0
+        self.actions: Counter[str] = Counter()
+        self.sent_bytes = self.heard_bytes = 0
+        self._does: tuple[Callable[[int], None], ...] = (
+            self._random_bytes,
+            self._half_command,
+            *(3 * (self._command,)),
+            *(3 * (self._damaged_payload,)),
+            self._start_streaming,
+            self._huge_length,
+            self._stop_reading,
+            self._open_and_close,
+            self._burst,
+            self._cut_power,
+        )
+
+    def step(self, now_ns: int) -> None:
+        """Read, or not, and perhaps do something."""
+        if now_ns >= self._deaf_until_ns:
+            self.heard_bytes += len(self._line.host_read())
+        if now_ns >= self._next_ns:
+            act = self._random.choice(self._does)
+            self.actions[act.__name__.lstrip("_")] += 1
+            act(now_ns)
+            self._next_ns = now_ns + round(self._random.expovariate(10.0) * NS_PER_S)
+
+    def _send(self, data: bytes) -> None:
+        self.sent_bytes += self._line.host_write(data)
+
+    def _random_bytes(self, now_ns: int) -> None:
+        del now_ns
+        self._send(self._random.randbytes(self._random.randrange(1, 5000)))
+
+    def _command(self, now_ns: int) -> None:
+        del now_ns
+        self._send(self._random.choice(self._commands))
+
+    def _half_command(self, now_ns: int) -> None:
+        del now_ns
+        whole = self._random.choice(self._commands)
+        self._send(whole[: self._random.randrange(len(whole))])
+
+    def _damaged_payload(self, now_ns: int) -> None:
+        """Send a command with wrong arguments under a right checksum."""
+        del now_ns
+        payload = bytearray(self._random.choice(self._payloads) or b"\x01")
+        for _ in range(self._random.randrange(1, 4)):
+            payload[self._random.randrange(len(payload))] = self._random.choice(
+                (0, 1, 0x7F, 0x80, 0xFF, self._random.randrange(256))
+            )
+        if self._random.random() < 0.2:
+            payload = payload[: self._random.randrange(1, len(payload) + 1)]
+        self._send(encode_normal(bytes(payload)))
+
+    def _start_streaming(self, now_ns: int) -> None:
+        del now_ns
+        line = Connection(Role.HOST)
+        fps = self._random.choice((1.0, 17.0, 400.0, 1e6))
+        self._send(
+            line.send(m.SetMode(mode=SensorMode.XTID_SM_MANUAL))
+            + line.send(m.X4DriverSet(setting=X4Setting.FPS, value=fps))
+        )
+
+    def _huge_length(self, now_ns: int) -> None:
+        del now_ns
+        length = self._random.choice((0xFFFFFFFF, 1 << 31, 1 << 20, 65536))
+        self._send(b"\x7c" * 4 + length.to_bytes(4, "little") + b"\x00" + b"\x01" * 100)
+
+    def _stop_reading(self, now_ns: int) -> None:
+        self._deaf_until_ns = now_ns + round(self._random.expovariate(1 / 5.0) * NS_PER_S)
+
+    def _open_and_close(self, now_ns: int) -> None:
+        for _ in range(self._random.randrange(1, 20)):
+            self._device.port_closed(now_ns)
+            self._device.port_opened(now_ns)
+
+    def _cut_power(self, now_ns: int) -> None:
+        """Wake a module that was sent to sleep or into its bootloader."""
+        self._device.module.power_cycle(now_ns)
+
+    def _burst(self, now_ns: int) -> None:
+        del now_ns
+        self._send(b"".join(self._random.choices(self._commands, k=50)))
+
+
+class GoodHost:
+    """Starts the stream and reads it."""
+
+    def __init__(self, line: PairLine) -> None:
+        self._line = line
+        self._connection = Connection(Role.HOST)
+        self.counters: list[int] = []
+        for command in (
+            m.SetMode(mode=SensorMode.XTID_SM_MANUAL),
+            m.X4DriverInit(),
+            m.X4DriverSet(setting=X4Setting.FPS, value=FPS),
+        ):
+            line.host_write(self._connection.send(command))
+
+    def step(self) -> None:
+        """Read all there is; anything that is neither ACK nor a frame is a mistake."""
+        while data := self._line.host_read():
+            self._connection.receive_data(data)
+            while not isinstance(event := self._connection.next_event(), NeedData):
+                if isinstance(event, m.DataFloat):
+                    self.counters.append(event.info)
+                elif not isinstance(event, m.Ack | m.System):
+                    raise AssertionError(f"a quiet module said {event}")
+
+
+class World:
+    """Two modules in one loop, and a clock that goes on by steps."""
+
+    def __init__(self, paces: tuple[Pace, Pace], seed: int) -> None:
+        scene = empty_room(2)
+        self.now_ns = 0
+        self.lines = [PairLine(), PairLine()]
+        self.devices = [
+            radar_device(Identity(serial=radar.serial), echo_source(scene, index, seed), pace)
+            for index, (radar, pace) in enumerate(zip(scene.radars, paces, strict=True))
+        ]
+        ports = [Port(line, device) for line, device in zip(self.lines, self.devices, strict=True)]
+        self._server = Server(ports, clock_ns=lambda: self.now_ns)
+        self._server.turn(longest_wait_s=0)
+
+    def step(self) -> None:
+        """Let time pass, and every port have its share."""
+        self.now_ns += STEP_NS
+        self._server.turn(longest_wait_s=0)
+
+    def close(self) -> None:
+        """Give the descriptors back."""
+        self._server.close()
+        for line in self.lines:
+            line.close()
+
+    def answers(self) -> bool:
+        """Whether the first module, after its power was cut, answers a PING.
+
+        What it was sent before is still in the line: half a packet of any claimed length may lie
+        before the first command, and takes as many bytes to get through.
+        """
+        self.devices[0].module.power_cycle(self.now_ns)
+        line, heard = Connection(Role.HOST), 0
+        for _ in range(3000):
+            self.lines[0].host_write(line.send(m.Ping()))
+            self.step()
+            while data := self.lines[0].host_read():
+                line.receive_data(data)
+                while not isinstance(event := line.next_event(), NeedData):
+                    heard += event == m.Pong(value=PongCode.XTS_SPRP_READY)
+            if heard >= 3:
+                return True
+        return False
+
+
+def run(minutes: float, seed: int, pace: Pace) -> Outcome:
+    """Let the two hosts live beside each other; raises whatever the emulator raises.
+
+    The well-behaved host's module is always in real time, by the virtual clock.
+    """
+    world = World((pace, Pace.REALTIME), seed)
+    began = time.monotonic()
+    try:
+        hostile = HostileHost(world.lines[0], world.devices[0], seed)
+        good = GoodHost(world.lines[1])
+        steps = round(minutes * 60 * NS_PER_S / STEP_NS)
+        warm = memory()
+        for step in range(steps):
+            hostile.step(world.now_ns)
+            world.step()
+            good.step()
+            if step == int(WARM_UP * steps):
+                warm = memory()
+        after = memory()
+        answers = world.answers()
+    finally:
+        world.close()
+    counters = good.counters
+    return Outcome(
+        minutes=minutes,
+        seconds=round(time.monotonic() - began, 1),
+        actions=dict(sorted(hostile.actions.items())),
+        sent_bytes=hostile.sent_bytes,
+        heard_bytes=hostile.heard_bytes,
+        faults_seen=world.devices[0].faults_seen,
+        answers=answers,
+        frames=len(counters),
+        frames_due=int(steps * STEP_NS * real_frame_rate(FPS) / NS_PER_S),
+        gaps=counters[-1] - counters[0] + 1 - len(counters),
+        in_order=all(a < b for a, b in pairwise(counters)),
+        objects_grown=after[0] - warm[0],
+        rss_grown_kib=after[1] - warm[1],
+    )
+
+
+def memory() -> tuple[int, int]:
+    """Return the number of live container objects and the resident set, KiB (0: unknown)."""
+    gc.collect()
+    statm = Path("/proc/self/statm")
+    pages = int(statm.read_text().split()[1]) if statm.exists() else 0
+    return len(gc.get_objects()), pages * os.sysconf("SC_PAGE_SIZE") // 1024
+
+
+def main() -> int:
+    """Run and print what came of it; return 0 if nothing was disturbed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--minutes", type=float, default=20.0, help="device time (default 20)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--pace", type=Pace, choices=list(Pace), default=Pace.REALTIME)
+    arguments = parser.parse_args()
+    outcome = run(arguments.minutes, arguments.seed, arguments.pace)
+    print(json.dumps(asdict(outcome), indent=2))  # noqa: T201 - the numbers are the result
+    return 0 if outcome.undisturbed else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
