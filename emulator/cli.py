@@ -41,11 +41,16 @@ real module. pace asap: as fast as the host reads, nothing is lost.
 --tcp: each module on a TCP port, too, for one client at a time: a second one is hung up on, and so
 is one that comes while a host has the module's pseudo-terminal open. While a client is connected,
 the pseudo-terminal is deaf and dumb.
+
+--port-on-reset vanish: a reset takes the port away for two seconds, as USB does: whoever has it
+open sees it hang up, its name is gone. rename: it returns as NAME-2, NAME-3 and so on; running
+emulators' ports are found with `xethru list`.
 """
 
 _PLAY_HELP = """\
 Plays a recording at the port of an emulated X4M300, every message byte-exact: a directory of
-ModuleConnector, a wire capture (.xtwire), MCAP or .npz. Same ready line as serve.
+ModuleConnector, a wire capture (.xtwire), MCAP or .npz. Same ready line as serve. A session of
+several radars gets a port for each, named as in the session; they loop in step.
 
 Playing begins anew for every host that opens the port: at once when the host starts the radar
 (FPS above 0, or SETMODE RUN), else half a second after it opened the port or sent its last
@@ -65,6 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(arguments: argparse.Namespace, stop: Stop) -> int:
     # heavy imports only now: --help and usage errors answer at once
+    from emulator.playback import PlayOptions
     from emulator.serving import CannotServeError, play, serve
 
     if stop.requested:
@@ -72,10 +78,15 @@ def _run(arguments: argparse.Namespace, stop: Stop) -> int:
     folder = arguments.link_dir
     try:
         if arguments.command == "play":
+            kinds = None if arguments.only is None else frozenset(arguments.only)
             play(
                 arguments.recording,
-                arguments.rate,
-                arguments.loop,
+                PlayOptions(
+                    rate=arguments.rate,
+                    loop=arguments.loop,
+                    from_ns=round(arguments.from_s * 1e9),
+                    kinds=kinds,
+                ),
                 folder,
                 warn=_warn,
                 stop=stop,
@@ -97,7 +108,7 @@ def _link_options(arguments: argparse.Namespace) -> LinkOptions:
     host: str = arguments.tcp_host
     if arguments.tcp is not None and not is_loopback(host):
         _warn(f"--tcp-host {host}: whoever reaches this address can command the modules")
-    return LinkOptions(tcp_base=arguments.tcp, tcp_host=host)
+    return LinkOptions(port_on_reset=arguments.port_on_reset, tcp_base=arguments.tcp, tcp_host=host)
 
 
 def _warn(text: str) -> None:
@@ -152,6 +163,13 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         help="address to listen at (default 127.0.0.1, which only this machine reaches)",
     )
 
+    serve.add_argument(
+        "--port-on-reset",
+        choices=["stay", "vanish", "rename"],
+        default="stay",
+        help="what a reset does to the port (default stay)",
+    )
+
     play = commands.add_parser(
         "play",
         help="play a recording at the port of an emulated module",
@@ -167,6 +185,22 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         help="multiple of real time; 0: as fast as the port takes it (default 1)",
     )
     play.add_argument("--loop", action="store_true", help="begin again at the end")
+    play.add_argument(
+        "--from",
+        dest="from_s",
+        type=_seconds,
+        default=0.0,
+        metavar="S",
+        help="leave out the first S seconds, in every round of a loop",
+    )
+    play.add_argument(
+        "--only",
+        nargs="+",
+        type=_kind,
+        metavar="KIND",
+        help="play messages of these kinds only, named as by `xethru dump`; the time of what is "
+        "left out passes all the same",
+    )
     _add_link_dir(play)
 
     arguments = parser.parse_args(argv)
@@ -214,6 +248,23 @@ def _whole(text: str) -> int:
         return int(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
+
+
+def _seconds(text: str) -> float:
+    value = _rate(text)
+    if value > 1e9:
+        raise argparse.ArgumentTypeError(f"{text} s is longer than any recording")
+    return value
+
+
+def _kind(text: str) -> str:
+    from emulator.playback_control import kinds
+
+    try:
+        (kind,) = kinds([text])
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return kind
 
 
 def _rate(text: str) -> float:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from emulator.link import PtyLink
+from emulator.plug import Plug
 from emulator.port_watch import PortWatch
 from emulator.server import ByteDevice, Port, Service
 from emulator.shared_device import SharedDevice
@@ -19,11 +21,22 @@ __all__ = ["DevicePorts", "LinkOptions", "NamedDevice", "open_ports"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NamedDevice:
-    """A device and what the ready line says about it."""
+    """A device and what the ready line says about it.
+
+    Attributes
+    ----------
+    name, serial
+        For the ready line.
+    device
+        The module.
+    present
+        Whether its own port is there at a time, ns; None if it always is.
+    """
 
     name: str
     serial: str
     device: ByteDevice
+    present: Callable[[int], bool] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,14 +45,22 @@ class LinkOptions:
 
     Attributes
     ----------
+    port_on_reset
+        Whether a restart keeps the port, takes it away for a while, or has it return under
+        another name.
     tcp_base
         TCP port of the first module, the others' follow; 0: any that are free; None: no TCP.
     tcp_host
         Address to listen at.
     """
 
+    port_on_reset: Literal["stay", "vanish", "rename"] = "stay"
     tcp_base: int | None = None
     tcp_host: str = "127.0.0.1"
+
+
+def _nothing_moved() -> None:
+    """Nobody wants to know that a port came back."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -52,10 +73,16 @@ class DevicePorts:
         For the server's loop.
     services
         Likewise.
+    plugs
+        What takes the ports away, by the modules' names.
+    moved
+        Called when a port came back, maybe under another name.
     """
 
     ports: list[Port] = field(default_factory=list)
     services: list[Service] = field(default_factory=list)
+    plugs: dict[str, Plug] = field(default_factory=dict)
+    moved: Callable[[], None] = _nothing_moved
     _words: list[tuple[NamedDevice, PtyLink, TcpLink | None]] = field(default_factory=list)
 
     def entries(self) -> list[dict[str, object]]:
@@ -86,28 +113,27 @@ class DevicePorts:
             When one cannot be had.
         """
         link = cleanup.enter_context(PtyLink(path))
-        tcp = None
-        device = named.device
+        tcp, watch, device = None, None, named.device
         if tcp_port is not None:
-            shared = SharedDevice(device)
-            watch = PortWatch(link.terminal, opened=_nothing, closed=_nothing)
+            watch = PortWatch(link.terminal, opened=_unheard, closed=_unheard)
             cleanup.callback(watch.close)
-
-            def set_guest(present: bool) -> None:
-                shared.guest_present = present
-
-            tcp = TcpLink(
-                options.tcp_host,
-                tcp_port,
-                admits=lambda: not watch.in_use,
-                came=lambda: set_guest(True),
-                left=lambda: set_guest(False),
-            )
+            shared = SharedDevice(device)
+            tcp = _tcp_link(shared, link, watch, tcp_port, options)
             cleanup.callback(tcp.close)
             device = shared.port
             self.ports.append(Port(tcp, shared.guest))
             self.services += [watch, tcp]
         self.ports.append(Port(link, device))
+        plug = Plug(
+            link,
+            named.present or _always,
+            tcp=tcp,
+            watch=watch,
+            renames=options.port_on_reset == "rename",
+            moved=lambda: self.moved(),
+        )
+        self.services.append(plug)
+        self.plugs[named.name] = plug
         self._words.append((named, link, tcp))
 
 
@@ -132,5 +158,25 @@ def open_ports(
     return opened
 
 
-def _nothing(now_ns: int) -> None:
+def _tcp_link(
+    shared: SharedDevice, link: PtyLink, watch: PortWatch, tcp_port: int, options: LinkOptions
+) -> TcpLink:
+    def set_guest(present: bool) -> None:
+        shared.guest_present = present
+
+    return TcpLink(
+        options.tcp_host,
+        tcp_port,
+        admits=lambda: link.fileno() >= 0 and not watch.in_use,
+        came=lambda: set_guest(True),
+        left=lambda: set_guest(False),
+    )
+
+
+def _unheard(now_ns: int) -> None:
     """Who opens a terminal matters only when somebody else wants the module."""
+
+
+def _always(now_ns: int) -> bool:
+    del now_ns
+    return True

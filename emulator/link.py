@@ -17,7 +17,7 @@ class LinkError(Exception):
 
 
 class PtyLink:
-    """One pseudo-terminal, published as a symbolic link until closed.
+    """One pseudo-terminal, published as a symbolic link until closed or taken away.
 
     The slave side is raw from the start, because a client that does not set the line up itself
     would get its bytes echoed and translated; a slave descriptor kept open preserves that, and
@@ -36,10 +36,15 @@ class PtyLink:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._open()
+
+    def _open(self) -> None:
         try:
             self._master_fd, self._slave_fd = os.openpty()
         except OSError as error:
-            raise LinkError(f"{path}: no pseudo-terminal to be had: {error.strerror}") from error
+            raise LinkError(
+                f"{self.path}: no pseudo-terminal to be had: {error.strerror}"
+            ) from error
         try:
             tty.setraw(self._slave_fd)
             os.set_blocking(self._master_fd, False)
@@ -49,12 +54,30 @@ class PtyLink:
             self._close_descriptors()
             raise
 
+    def reopen(self, path: Path) -> None:
+        """Appear with a fresh terminal after `close`, as a device that was plugged in again.
+
+        Parameters
+        ----------
+        path
+            Where the link appears; `path` is this from now on.
+
+        Raises
+        ------
+        LinkError
+            As when it was made.
+        """
+        self.path = path
+        self._open()
+
     def fileno(self) -> int:
-        """Return the master's descriptor, for a selector."""
+        """Return the master's descriptor, for a selector; -1 while closed."""
         return self._master_fd
 
     def read(self) -> bytes:
         """Return what the host wrote; ``b""`` when there is nothing."""
+        if self._master_fd < 0:
+            return b""
         try:
             return os.read(self._master_fd, LARGEST_READ)
         except BlockingIOError:
@@ -68,7 +91,10 @@ class PtyLink:
             return 0
 
     def close(self) -> None:
-        """Remove the link, if it is still ours, and give the terminal back."""
+        """Remove the link, if it is still ours, and give the terminal back.
+
+        A host that has the terminal open sees it hang up: EIO, end of file.
+        """
         if self._master_fd < 0:
             return
         try:

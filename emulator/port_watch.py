@@ -41,7 +41,10 @@ class PortWatch:
         self._opened = opened
         self._closed = closed
         self._hosts = 0
-        self._fd, self._watch = _watch(terminal)
+        self._watch = -1
+        self._fd = _inotify()
+        if self.works and not self.follow(terminal):
+            self.close()
 
     @property
     def works(self) -> bool:
@@ -52,6 +55,15 @@ class PortWatch:
     def in_use(self) -> bool:
         """Whether a host has the terminal open, as far as this system tells."""
         return self._hosts > 0
+
+    def follow(self, terminal: str) -> bool:
+        """Watch another terminal, which nobody has open yet; return whether that is possible."""
+        self._hosts = 0
+        mask = _IN_OPEN | _IN_CLOSE_WRITE | _IN_CLOSE_NOWRITE
+        if self.works:  # the watch of a terminal that is gone went with it
+            path = os.fsencode(terminal)
+            self._watch = int(ctypes.CDLL(None).inotify_add_watch(self._fd, path, mask))
+        return self._watch >= 0
 
     def register(self, selector: selectors.BaseSelector) -> None:
         """Register with the loop."""
@@ -91,19 +103,10 @@ class PortWatch:
                 self._closed(now_ns)
 
 
-def _watch(terminal: str) -> tuple[int, int]:
-    """Return an inotify descriptor and its watch of one path; -1 where that is not possible."""
-    libc = ctypes.CDLL(None, use_errno=True)
+def _inotify() -> int:
+    """Return a descriptor that tells of file events; -1 where there is no such thing."""
     try:
-        start, add = libc.inotify_init1, libc.inotify_add_watch
+        start = ctypes.CDLL(None, use_errno=True).inotify_init1
     except AttributeError:
-        return -1, -1  # not Linux
-    descriptor = int(start(_IN_NONBLOCK | os.O_CLOEXEC))
-    if descriptor < 0:
-        return -1, -1
-    mask = _IN_OPEN | _IN_CLOSE_WRITE | _IN_CLOSE_NOWRITE
-    watch = int(add(descriptor, os.fsencode(terminal), mask))
-    if watch < 0:
-        os.close(descriptor)
-        return -1, -1
-    return descriptor, watch
+        return -1  # not Linux
+    return int(start(_IN_NONBLOCK | os.O_CLOEXEC))

@@ -51,12 +51,17 @@ class Announcement:
         if folder is None:
             return
         _remove_stale(folder)
-        path = folder / f"{os.getpid()}.json"
+        self._path = folder / f"{os.getpid()}.json"
+        self.update(ready)
+
+    def update(self, ready: dict[str, Any]) -> None:
+        """Say something else from now on; who reads it sees the old word or the new one."""
+        if self._path is None:
+            return
         with contextlib.suppress(OSError):
-            fresh = path.with_suffix(".new")
+            fresh = self._path.with_suffix(".new")
             fresh.write_text(json.dumps({"pid": os.getpid(), **ready}) + "\n")
-            fresh.replace(path)
-            self._path = path
+            fresh.replace(self._path)
 
     def close(self) -> None:
         """Remove the entry."""

@@ -99,6 +99,8 @@ class Port:
         data = self.link.read()
         if data:
             self.device.receive_data(data, now_ns)
+        elif self.link.fileno() < 0:
+            self.cut()
 
     def advance(self, now_ns: int) -> None:
         """Let time pass."""

@@ -19,9 +19,10 @@ from emulator.identity import Identity
 from emulator.link import LinkError
 from emulator.odometry import scene_odometry
 from emulator.odometry_feed import OdometryFeed
+from emulator.options import DeviceOptions
 from emulator.pace import Pace
 from emulator.path_lock import PathInUseError, locked
-from emulator.playback import RecordingError, recording_device
+from emulator.playback import PlayOptions, RecordingError, played_radars
 from emulator.port_watch import PortWatch
 from emulator.run_directory import Announcement, fresh_port_folder
 from emulator.scene import Scene, SceneError, UnknownSceneError, empty_room, load_scene
@@ -33,7 +34,6 @@ __all__ = ["CannotServeError", "play", "serve"]
 NS_PER_MS = 1_000_000
 LONGEST_SOCKET_PATH = 100  # bytes; Linux takes 107, macOS 103
 SOCKET_NAME = "odometry.sock"
-PLAYED_SERIAL = "000000000000"
 
 
 class CannotServeError(Exception):
@@ -87,7 +87,7 @@ def serve(
             loaded = empty_room(scene) if isinstance(scene, int) else load_scene(scene)
             folder = cleanup.enter_context(_link_folder(link_dir))
             zero_ns = time.monotonic_ns()
-            devices = _radar_devices(loaded, seed, pace, zero_ns)
+            devices = _radar_devices(loaded, seed, pace, zero_ns, _device_options(links))
             feed = None
             if not bare:
                 feed = OdometryFeed(
@@ -109,25 +109,22 @@ def serve(
 
 def play(
     recording: Path,
-    rate: float,
-    loop: bool,
+    options: PlayOptions,
     link_dir: Path | None,
     *,
     warn: Callable[[str], None],
     stop: Stop,
 ) -> None:
-    """Play a recording at the port of an emulated module until a signal asks for the end.
+    """Play a recording, each radar at a port of its own, until a signal asks for the end.
 
     Parameters
     ----------
     recording
         Anything that `read_recording` takes.
-    rate
-        Multiple of real time; 0 for as fast as the port takes it.
-    loop
-        Whether to begin again at the end.
+    options
+        How it is played.
     link_dir
-        Where the link appears; a fresh directory if None.
+        Where the links appear; a fresh directory if None.
     warn
         Called with one line about a part of the recording that cannot be read; the rest plays.
     stop
@@ -140,43 +137,58 @@ def play(
     """
     with contextlib.ExitStack() as cleanup:
         try:
-            identity = Identity(serial=PLAYED_SERIAL)
-            device = recording_device(
+            radars = played_radars(
                 recording,
-                identity,
-                rate=rate,
-                loop=loop,
+                options,
                 on_fault=lambda fault: warn(f"{fault.file}: {fault.reason}; the rest is played"),
                 warn=warn,
             )
             folder = cleanup.enter_context(_link_folder(link_dir))
-            devices = [NamedDevice(name="player", serial=identity.serial, device=device)]
+            devices = [
+                NamedDevice(name=radar.name, serial=radar.serial, device=radar.device)
+                for radar in radars
+            ]
             ports = open_ports(devices, folder, LinkOptions(), cleanup)
         except (RecordingError, LinkError) as error:
             raise CannotServeError(str(error)) from error
-        watch = PortWatch(
-            os.fspath(folder / "player"), opened=device.port_opened, closed=device.port_closed
-        )
-        cleanup.callback(watch.close)
+        watches = [
+            PortWatch(
+                os.fspath(folder / radar.name),
+                opened=radar.device.port_opened,
+                closed=radar.device.port_closed,
+            )
+            for radar in radars
+        ]
+        for watch in watches:
+            cleanup.callback(watch.close)
         ready = _ready_line(ports, time.monotonic_ns(), None)
-        _run(ports, [watch], ready, stop, cleanup)
+        _run(ports, watches, ready, stop, cleanup)
 
 
-def _radar_devices(scene: Scene, seed: int, pace: Pace, zero_ns: int) -> list[NamedDevice]:
-    return [
-        NamedDevice(
-            name=radar.name,
-            serial=radar.serial,
-            device=radar_device(
-                Identity(serial=radar.serial),
-                echo_source(scene, index, seed),
-                pace,
-                scene_time_zero_ns=zero_ns,
-                skew_ns=round(radar.start_skew_ms * NS_PER_MS),
-            ),
+def _device_options(links: LinkOptions) -> DeviceOptions:
+    stays = links.port_on_reset == "stay"
+    return DeviceOptions(port_on_reset="stay" if stays else "vanish")
+
+
+def _radar_devices(
+    scene: Scene, seed: int, pace: Pace, zero_ns: int, options: DeviceOptions
+) -> list[NamedDevice]:
+    made = []
+    for index, radar in enumerate(scene.radars):
+        device = radar_device(
+            Identity(serial=radar.serial),
+            echo_source(scene, index, seed),
+            pace,
+            scene_time_zero_ns=zero_ns,
+            skew_ns=round(radar.start_skew_ms * NS_PER_MS),
+            options=options,
         )
-        for index, radar in enumerate(scene.radars)
-    ]
+        made.append(
+            NamedDevice(
+                name=radar.name, serial=radar.serial, device=device, present=device.port_present
+            )
+        )
+    return made
 
 
 def _ready_line(ports: DevicePorts, zero_ns: int, odometry: Path | None) -> dict[str, object]:
@@ -201,7 +213,9 @@ def _run(
     cleanup.callback(server.close)
     stop.attach(server)
     cleanup.callback(stop.detach)  # a second signal must not reach a loop that is being closed
-    cleanup.callback(Announcement(ready).close)
+    announcement = Announcement(ready)
+    cleanup.callback(announcement.close)
+    ports.moved = lambda: announcement.update({**ready, "devices": ports.entries()})
     _say_ready(ready)
     server.run()
 

@@ -47,6 +47,7 @@ INPUT_AND_OUTPUT = {
         "odometry_feed",
         "path_lock",
         "playback",
+        "plug",
         "port_watch",
         "run_directory",
         "scene",

@@ -1,0 +1,93 @@
+"""A module that restarts: with its port closed, open, and while streaming, through a real port.
+
+How long it took is told on the module's clock: a frame's counter is scene time, and the ready line
+says when scene time 0 was.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hil_tests.device.serving import Served, emulator
+from xethru_protocol.driver import X4M300, Frame, RawConfig
+from xethru_protocol.errors import Disconnected, PortUnavailable, ResponseTimeout
+from xethru_protocol.messages import ModReset
+from xethru_protocol.ports import find_ports
+
+pytestmark = pytest.mark.slow
+
+CONFIG = RawConfig(frame_area_m=(0.4, 5.0))
+FPS = 17.0
+RATE_HZ = 17.049379  # Protocol reference 9.6, n = 17
+# Protocol reference 8.1: it restarts half a second after the ACK, and is silent for two seconds.
+SOONEST_S, LATEST_S = 2.5, 5.0
+
+
+@pytest.fixture(params=["stay", "vanish", "rename"])
+def mode(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def served(mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with emulator("serve", "--bare", "--count", "2", "--port-on-reset", mode) as made:
+        yield made
+
+
+def seconds_after(served: Served, asked_ns: int, frame: Frame) -> float:
+    return frame.counter / RATE_HZ - (asked_ns - served.scene_time_zero_ns) / 1e9
+
+
+def where_it_is(serial: str) -> str | None:
+    return next((port.path for port in find_ports() if port.serial == serial), None)
+
+
+def test_with_the_port_closed(served: Served) -> None:
+    with X4M300.open(served.paths[0]) as radar:
+        asked_ns = time.monotonic_ns()
+        radar.reset()
+    back_s = 0.0
+    while back_s < SOONEST_S:  # it answers on for half a second before it restarts
+        assert time.monotonic_ns() - asked_ns < LATEST_S * 1e9, "it did not come back"
+        try:
+            with X4M300.open(where_it_is(served.serials[0]) or served.paths[0]) as radar:
+                radar.configure_raw(CONFIG)
+                radar.start(FPS)
+                back_s = seconds_after(served, asked_ns, radar.read_frame(timeout_s=1.0))
+        except (PortUnavailable, ResponseTimeout, Disconnected):
+            time.sleep(0.05)
+    assert back_s < LATEST_S
+
+
+def test_with_the_port_open(served: Served) -> None:
+    with X4M300.open(served.paths[0]) as radar:
+        asked_ns = time.monotonic_ns()
+        radar.reset(wait=True)
+        radar.configure_raw(CONFIG)
+        radar.start(FPS)
+        assert SOONEST_S < seconds_after(served, asked_ns, radar.read_frame()) < LATEST_S
+        assert radar.info().serial_number == served.serials[0]
+
+
+def test_while_streaming(served: Served, mode: str) -> None:
+    with X4M300.open(served.paths[0], reconnect_s=10.0) as radar:
+        geometry = radar.configure_raw(CONFIG)
+        radar.start(FPS)
+        radar.read_frame()
+        asked_ns = time.monotonic_ns()
+        if mode == "stay":
+            radar.reset(wait=True)  # nothing hangs up: only who asked knows
+            radar.configure_raw(CONFIG)
+            radar.start(FPS)
+        else:
+            radar.request(ModReset())
+        while (back_s := seconds_after(served, asked_ns, frame := radar.read_frame())) < SOONEST_S:
+            pass
+        assert back_s < LATEST_S
+        assert frame.geometry == geometry
+        assert frame.samples.shape == (716,)  # Protocol reference 9.4
