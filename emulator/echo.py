@@ -17,7 +17,8 @@ Amplitude a = amplitude_1m R**-1.5 (rod) or R**-2 (point), cos(angle)**n, TX pow
     Radar equation for amplitudes: a point spreads twice as a sphere, a long rod once as a sphere
     and once as a cylinder. The beam's n makes the two-way -3 dB full width 65 degrees; there is
     no edge, and nothing is heard from behind. Ground, elevation, polarisation, aspect
-    and shadowing are left out, and the law is held at 5 cm from there inwards.
+    and shadowing are left out, and the law is held at 5 cm from there inwards. People are points
+    that move (``emulator.people``); they are placed anew for every frame, like the robot.
 Phase
     Each reflector's is fixed by its name (SHA-256), for every radar, aspect and seed.
 Leakage L
@@ -37,13 +38,20 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emulator.echo_source import CaptureSettings, EchoSource
 from emulator.noise import UNITS_PER_SIGMA, frame_noise_units
+from emulator.people import (
+    AMPLITUDE_OF_1_M2,
+    PersonSpec,
+    chest_displacement_m,
+    positions_m,
+    present,
+)
 from emulator.pulse import sum_of_pulses
 from emulator.scene import RadarSpec, Scene, TargetSpec
 from xethru_protocol import x4
@@ -55,6 +63,7 @@ __all__ = [
     "SceneEcho",
     "beam_gain",
     "echo_source",
+    "person_reflections",
     "reflection_phase_rad",
     "target_reflections",
 ]
@@ -121,6 +130,50 @@ def target_reflections(
     robot_poses
         Shape (n_frames, 3), float64: true x [m], y [m], heading [rad] at each sample time.
     """
+    return _reflections(
+        radar,
+        robot_poses,
+        at_x=np.array([target.x_m for target in targets]),
+        at_y=np.array([target.y_m for target in targets]),
+        strength=np.array([target.amplitude_1m for target in targets]),
+        exponent=np.array([_RANGE_EXPONENT[target.kind] for target in targets]),
+        phase_rad=np.array([reflection_phase_rad(target.name) for target in targets]),
+    )
+
+
+def person_reflections(
+    person: PersonSpec,
+    radar: RadarSpec,
+    robot_poses: NDArray[np.float64],
+    t_ns: NDArray[np.int64],
+) -> Reflections:
+    """Return the echo of a person, k = 1, at scene times of shape (n_frames,), int64."""
+    position = positions_m(person, t_ns)
+    strength = AMPLITUDE_OF_1_M2 * math.sqrt(person.rcs_m2)
+    standing = _reflections(
+        radar,
+        robot_poses,
+        at_x=position[:, :1],
+        at_y=position[:, 1:],
+        strength=np.where(present(person, t_ns), strength, 0.0)[:, np.newaxis],
+        exponent=np.array([_RANGE_EXPONENT["point"]]),
+        phase_rad=np.array([reflection_phase_rad(person.name)]),
+    )
+    chest_m = chest_displacement_m(person, t_ns)[:, np.newaxis]
+    return replace(standing, range_m=standing.range_m - chest_m)
+
+
+def _reflections(
+    radar: RadarSpec,
+    robot_poses: NDArray[np.float64],
+    *,
+    at_x: NDArray[np.float64],
+    at_y: NDArray[np.float64],
+    strength: NDArray[np.float64],
+    exponent: NDArray[np.float64],
+    phase_rad: NDArray[np.float64],
+) -> Reflections:
+    """Return echoes from points of shape (k,) or (n_frames, k), world frame."""
     x, y, heading = robot_poses.T[:, :, np.newaxis]
     cosine, sine = np.cos(heading), np.sin(heading)
     radar_x = x + cosine * radar.x_m - sine * radar.y_m
@@ -129,17 +182,15 @@ def target_reflections(
     boresight_x = cosine * math.cos(yaw_rad) - sine * math.sin(yaw_rad)
     boresight_y = sine * math.cos(yaw_rad) + cosine * math.sin(yaw_rad)
 
-    dx = np.array([target.x_m for target in targets]) - radar_x
-    dy = np.array([target.y_m for target in targets]) - radar_y
+    dx = at_x - radar_x
+    dy = at_y - radar_y
     range_m = np.sqrt(dx * dx + dy * dy)
     near_m = np.maximum(range_m, _NEAREST_M)
     cos_angle = (dx * boresight_x + dy * boresight_y) / near_m
-    strength = np.array([target.amplitude_1m for target in targets])
-    exponent = np.array([_RANGE_EXPONENT[target.kind] for target in targets])
     return Reflections(
         range_m=range_m,
         amplitude=strength * near_m**-exponent * beam_gain(cos_angle),
-        phase_rad=np.array([reflection_phase_rad(target.name) for target in targets]),
+        phase_rad=phase_rad,
     )
 
 
@@ -161,7 +212,8 @@ class SceneEcho:
         Shape (n_frames, capture.n_samples), float64, normalised units. A reflection weaker than
         one count is skipped.
         """
-        poses = self._trajectory.poses(scene_times_ns + self._skew_ns)
+        times_ns = scene_times_ns + self._skew_ns
+        poses = self._trajectory.poses(times_ns)
         leakage = self._scene.leakage
         terms = [
             target_reflections(self._scene.targets, self._radar, poses),
@@ -169,6 +221,10 @@ class SceneEcho:
                 range_m=np.full((len(poses), 1), leakage.range_m),
                 amplitude=np.full((len(poses), 1), leakage.amplitude),
                 phase_rad=np.array([reflection_phase_rad("leakage")]),
+            ),
+            *(
+                person_reflections(person, self._radar, poses, times_ns)
+                for person in self._scene.people
             ),
         ]
         range_m = np.concatenate([term.range_m for term in terms], axis=1)

@@ -25,6 +25,7 @@ from pydantic import (
     model_validator,
 )
 
+from emulator.people import PersonSpec
 from emulator.trajectory import Trajectory, drive
 
 __all__ = [
@@ -184,6 +185,7 @@ class Scene(_Table):
     description: str
     radars: Annotated[tuple[RadarSpec, ...], Field(min_length=1, max_length=32)]
     targets: tuple[TargetSpec, ...] = ()
+    people: Annotated[tuple[PersonSpec, ...], Field(max_length=32)] = ()
     path: PathSpec = PathSpec()
     odometry: OdometrySpec = OdometrySpec()
     noise: NoiseSpec = NoiseSpec()
@@ -195,6 +197,7 @@ class Scene(_Table):
             ("radars.name", [radar.name for radar in self.radars]),
             ("radars.serial", [radar.serial for radar in self.radars]),
             ("targets.name", [target.name for target in self.targets]),
+            ("people.name", [person.name for person in self.people]),
         ):
             twice = sorted({value for value in values if values.count(value) > 1})
             if twice:

@@ -1,0 +1,87 @@
+"""A module that only runs its profile, rooms with one person, and messages by virtual time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+from emulator.echo import SceneEcho
+from emulator.modes import ModeMachine
+from emulator.options import DeviceOptions
+from emulator.pace import Pace
+from emulator.people import PersonSpec
+from emulator.profile_settings import ProfileSettings
+from emulator.profiles.stream import ProfileStream
+from emulator.scene import LeakageSpec, NoiseSpec, Scene, empty_room
+from xethru_protocol import messages as m
+from xethru_protocol.codes import SensorMode
+
+SECOND = 1_000_000_000
+DEFAULT_MAP = 6  # protocol reference 4.6: default map, no extra initialisation
+FRAME_HZ = 17.049379  # protocol reference 9.6: what 17 frames/s really are
+
+
+@dataclass
+class FakeModes:
+    mode: SensorMode = SensorMode.XTID_SM_RUN
+
+
+@dataclass
+class FakeModule:
+    profile: ProfileSettings
+    fake_modes: FakeModes = field(default_factory=FakeModes)
+    options: DeviceOptions = field(default_factory=DeviceOptions)
+
+    @property
+    def modes(self) -> ModeMachine:
+        return cast(ModeMachine, self.fake_modes)
+
+
+def room(*people: PersonSpec, quiet: bool = False) -> Scene:
+    """Return an empty room with people, with or without receiver noise and leakage."""
+    changes: dict[str, Any] = {"people": people}
+    if quiet:
+        changes |= {"noise": NoiseSpec(rf_sigma=0.0), "leakage": LeakageSpec(amplitude=0.0)}
+    return empty_room().model_copy(update=changes)
+
+
+def standing(range_m: float, **changes: object) -> PersonSpec:
+    return PersonSpec.model_validate(
+        {"name": "somebody", "waypoints_m": ((range_m, 0.0),)} | changes
+    )
+
+
+def walking(start_m: float, end_m: float, **changes: object) -> PersonSpec:
+    return PersonSpec.model_validate(
+        {"name": "somebody", "waypoints_m": ((start_m, 0.0), (end_m, 0.0))} | changes
+    )
+
+
+def profile(
+    scene: Scene,
+    *,
+    outputs: dict[int, int] | None = None,
+    pace: Pace = Pace.REALTIME,
+    zero_ns: int = 0,
+    **settings: Any,  # noqa: ANN401 - whatever ProfileSettings takes
+) -> tuple[ProfileStream, FakeModule]:
+    module = FakeModule(ProfileSettings(**({"noise_map_control": DEFAULT_MAP} | settings)))
+    if outputs is not None:
+        module.profile.outputs = outputs
+    source = SceneEcho(scene, scene.radars[0], seed=1)
+    return ProfileStream(module, source, pace=pace, scene_time_zero_ns=zero_ns), module
+
+
+def heard_until(stream: ProfileStream, end_ns: int) -> Iterator[tuple[float, m.Response]]:
+    """Yield due time [s] and message of everything due before a time."""
+    while (due_ns := stream.next_due_ns()) is not None and due_ns < end_ns:
+        yield due_ns / SECOND, stream.take()
+
+
+def presence_until(stream: ProfileStream, end_s: float) -> list[tuple[float, m.PresenceSingle]]:
+    return [
+        (due_s, message)
+        for due_s, message in heard_until(stream, round(end_s * SECOND))
+        if isinstance(message, m.PresenceSingle)
+    ]
