@@ -106,3 +106,20 @@ def test_help_loads_nothing_heavy(arguments: list[str]) -> None:
     )
     assert result.stdout.endswith("\n[]\n")
     assert "usage: xethru-emulator" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--from", "-1"], "-1 is not a finite number >= 0"),
+        (["--from", "1e12"], "1e12 s is longer than any recording"),
+        (["--only", "x-ray"], "'x-ray' is no kind of message; known are "),
+    ],
+)
+def test_wrong_play_options_are_told(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as exit_info:
+        main(["play", "recording", *arguments])
+    assert exit_info.value.code == 2
+    assert message in capsys.readouterr().err
