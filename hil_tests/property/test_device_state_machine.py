@@ -24,9 +24,11 @@ from xethru_protocol import messages as m
 from xethru_protocol.codes import X4Setting
 
 SECOND = 1_000_000_000
-PRESENCE_OUTPUTS = (0x723BFA1E, 0x723BFA1F)
 REPLIES = (m.Ack, m.Error, m.Pong, m.ReplyByte, m.ReplyInt, m.ReplyFloat, m.System)
-FEATURES = st.sampled_from([*VOLATILE, *PRESENCE_OUTPUTS])
+FEATURES = (*VOLATILE, 0x723BFA1E, 0x723BFA1F)
+
+
+MODES = st.sampled_from([RUN, RUN, RUN, IDLE, IDLE, MANUAL, STOP, REG, 0x10])
 
 
 class DeviceMachine(RuleBasedStateMachine):
@@ -57,7 +59,7 @@ class DeviceMachine(RuleBasedStateMachine):
             assert heard == [m.System(code=0x10), m.System(code=0x11)]
 
     @precondition(lambda self: not self.model.bootloader)
-    @rule(mode=st.sampled_from([RUN, IDLE, MANUAL, STOP, REG, 0x10, 0x00, 0xFF]))
+    @rule(mode=MODES)
     def set_mode(self, mode: int) -> None:
         self.expect(m.SetMode(mode=mode), self.model.set_mode(mode), m.Ack())
 
@@ -87,7 +89,7 @@ class DeviceMachine(RuleBasedStateMachine):
             self.model.now.band = value
 
     @precondition(lambda self: not self.model.bootloader)
-    @rule(feature=FEATURES, bits=st.integers(0, 3))
+    @rule(feature=st.sampled_from(FEATURES), bits=st.integers(0, 3))
     def set_output(self, feature: int, bits: int) -> None:
         verdict = self.model.may_output(feature)
         self.expect(m.OutputSetControl(feature=feature, control=bits), verdict, m.Ack())
@@ -95,20 +97,10 @@ class DeviceMachine(RuleBasedStateMachine):
             self.model.set_output(feature, bits)
 
     @precondition(lambda self: not self.model.bootloader)
-    @rule(feature=FEATURES)
-    def get_output(self, feature: int) -> None:
-        verdict = self.model.may_get(observed_silent=True)
-        bits = self.model.now.outputs.get(feature, 0)
-        self.expect(m.OutputGetControl(feature=feature), verdict, m.ReplyInt(values=(bits,)))
-
-    @precondition(lambda self: not self.model.bootloader)
     @rule()
-    def get_settings(self) -> None:
-        verdict = self.model.may_get(observed_silent=False)
-        sensitivity = m.ReplyInt(content_id=0x10A5112B, values=(self.model.now.sensitivity,))
-        self.expect(m.GetSensitivity(), verdict, sensitivity)
-        band = m.ReplyInt(content_id=0x71AF2A2B, values=(self.model.now.band,))
-        self.expect(m.GetTxCenterFrequency(), verdict, band)
+    def load_and_run(self) -> None:
+        self.load(PRESENCE_2)
+        self.set_mode(RUN)
 
     @precondition(lambda self: not self.model.bootloader)
     @rule(fps=st.sampled_from([0.0, 17.0]))
@@ -128,7 +120,7 @@ class DeviceMachine(RuleBasedStateMachine):
         self.model.host_reset()
         self.restarted()
 
-    @rule(times=st.sampled_from([1, 1, 3, 10, 16]))
+    @rule(times=st.sampled_from([1, 1, 1, 9, 6]))
     def crash(self, times: int) -> None:
         for _ in range(times):
             if self.model.bootloader:
@@ -157,6 +149,20 @@ class DeviceMachine(RuleBasedStateMachine):
         profile_id = PRESENCE_2 if self.model.loaded else 0
         self.expect(m.GetProfileId(), verdict, m.ReplyInt(values=(profile_id,)))
 
+    @invariant()
+    def tells_its_settings(self) -> None:
+        if self.model.bootloader:
+            return
+        verdict = self.model.may_get(observed_silent=False)
+        sensitivity = m.ReplyInt(content_id=0x10A5112B, values=(self.model.now.sensitivity,))
+        self.expect(m.GetSensitivity(), verdict, sensitivity)
+        band = m.ReplyInt(content_id=0x71AF2A2B, values=(self.model.now.band,))
+        self.expect(m.GetTxCenterFrequency(), verdict, band)
+        verdict = self.model.may_get(observed_silent=True)
+        for feature in FEATURES:
+            bits = self.model.now.outputs.get(feature, 0)
+            self.expect(m.OutputGetControl(feature=feature), verdict, m.ReplyInt(values=(bits,)))
 
-DeviceMachine.TestCase.settings = hypothesis_settings(max_examples=40, stateful_step_count=30)
+
+DeviceMachine.TestCase.settings = hypothesis_settings(max_examples=40, stateful_step_count=40)
 TestDeviceMachine = DeviceMachine.TestCase
