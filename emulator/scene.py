@@ -183,7 +183,7 @@ class Scene(_Table):
     name: Name
     environment: Literal["lab", "classroom"]
     description: str
-    radars: Annotated[tuple[RadarSpec, ...], Field(min_length=1, max_length=32)]
+    radars: Annotated[tuple[RadarSpec, ...], Field(min_length=1, max_length=64)]
     targets: tuple[TargetSpec, ...] = ()
     people: Annotated[tuple[PersonSpec, ...], Field(max_length=32)] = ()
     path: PathSpec = PathSpec()
