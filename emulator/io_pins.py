@@ -21,9 +21,7 @@ SENSOR_PINS = tuple(pin for pin in IoPin if IoPin.IO1 <= pin <= IoPin.IO6)
 XEP_PINS = tuple(pin for pin in IoPin if pin is not IoPin.ALL)
 _SENSOR_FEATURES = frozenset(IoPinFeature) - {IoPinFeature.BREATHING}
 """A presence profile sees no breathing."""
-_ALL_SETUP_BITS = (
-    IoPinSetup.OUTPUT | IoPinSetup.PUSH_PULL | IoPinSetup.ACTIVE_LOW | IoPinSetup.PULL_UP
-)
+_ALL_SETUP_BITS = sum(IoPinSetup)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
