@@ -23,6 +23,8 @@ from emulator.modes import State
 from emulator.options import DeviceOptions
 from emulator.outbox import FirmwareOutbox, LosslessOutbox, MessageKind, MessageStream, Outbox
 from emulator.pace import Pace
+from emulator.profiles.combined_stream import CombinedStream
+from emulator.profiles.stream import ProfileStream
 from emulator.saved_state import Memory
 from xethru_protocol.codes import SystemCode
 from xethru_protocol.connection import Connection, Role
@@ -249,7 +251,14 @@ def radar_device(
         Where its flash is kept; None forgets it with the device.
     """
     largest_block = ASAP_BLOCK if pace is Pace.ASAP else REALTIME_BLOCK
-    module = Module(identity, Chip(source, largest_block), options, memory)
-    stream = ChipStream(module, pace=pace, scene_time_zero_ns=scene_time_zero_ns, skew_ns=skew_ns)
+    # neighbours in a series of modules take turns in making blocks
+    block_phase = None if pace is Pace.ASAP else int(identity.serial) % largest_block
+    chip = Chip(source, largest_block, block_phase)
+    module = Module(identity, chip, options, memory)
+    timing = {"scene_time_zero_ns": scene_time_zero_ns, "skew_ns": skew_ns}
+    stream = CombinedStream(
+        ChipStream(module, pace=pace, **timing),
+        ProfileStream(module, source, pace=pace, largest_block=REALTIME_BLOCK, **timing),
+    )
     outbox = LosslessOutbox() if pace is Pace.ASAP else FirmwareOutbox()
     return Device(module, stream, outbox, boot=boot or BootTiming())

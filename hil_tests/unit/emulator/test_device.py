@@ -228,7 +228,7 @@ def test_reset_acks_goes_deaf_and_comes_back_stopped(host: BareHost) -> None:
 
 def test_reset_of_a_running_module_restores_its_profile(host: BareHost) -> None:
     host.ask(m.ModReset())
-    host.now_ns = 10 * SECOND
+    host.now_ns = 3 * SECOND  # before the profile's first message
     host.device.advance(host.now_ns)
     assert len(host.hear()) == 2
     assert mode_of(host) == 0x01
@@ -282,7 +282,7 @@ def test_idle_needs_a_profile_too(host: BareHost) -> None:
 def test_what_waits_is_lost_by_a_reset(host: BareHost) -> None:
     host.send(m.ModReset())
     host.send(m.Ping())
-    host.now_ns = 10 * SECOND
+    host.now_ns = 3 * SECOND  # before the profile's first message
     host.device.advance(host.now_ns)
     assert host.hear() == [m.System(code=0x10), m.System(code=0x11)]
 
@@ -317,8 +317,9 @@ def test_realtime_frames_are_due_at_absolute_deadlines() -> None:
 def test_a_late_start_in_realtime_skips_what_is_past() -> None:
     source = RampSource()
     device = radar_device(IDENTITY, source, Pace.REALTIME)
-    host = BareHost(device, now_ns=10 * SECOND + 1)
+    host = BareHost(device)
     host.enter_manual()
+    host.now_ns = 10 * SECOND + 1
     host.set(X4Setting.FPS, 50.0)
     host.now_ns += SECOND // 50
     device.advance(host.now_ns)

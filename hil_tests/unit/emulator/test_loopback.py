@@ -38,6 +38,7 @@ def test_the_driver_gets_frames_of_the_documented_length(downconversion: bool, b
 def test_virtual_time_makes_a_silent_module_time_out_at_once() -> None:
     transport = LoopbackTransport(ramp_device())
     with X4M300(transport, clock=transport.clock_ns) as radar:
+        radar.configure_raw()  # ends the profile
         began = time.monotonic()
         with pytest.raises(ResponseTimeout):
             radar.read_frame(timeout_s=3600.0)

@@ -249,6 +249,7 @@ def test_a_host_that_dies_while_streaming_leaves_a_usable_module(terminal: Bench
 def test_one_greedy_port_does_not_hold_up_another(bench: Bench) -> None:
     bench.host(0).stream(fps=1e6)
     quiet = bench.host(2)
+    quiet.ask(m.SetMode(mode=SensorMode.XTID_SM_STOP))  # ends the profile
     bench.clock.now_ns += 10**9
     quiet.send(m.Ping())
     bench.server.turn(longest_wait_s=0)  # one turn serves every port, whatever the others want
