@@ -67,6 +67,9 @@ class Chip:
         What its sampler sees.
     largest_block
         Most frames synthesised at once: many are cheap each, few disturb nobody's deadline.
+    block_phase
+        Blocks end with counters congruent to it modulo `largest_block`, so that of many radars
+        in step only some synthesise at a time; None: each block is as long as it may be.
 
     Attributes
     ----------
@@ -80,9 +83,15 @@ class Chip:
         False after ENABLE 0, until INIT.
     """
 
-    def __init__(self, source: EchoSource, largest_block: int = DEFAULT_LARGEST_BLOCK) -> None:
+    def __init__(
+        self,
+        source: EchoSource,
+        largest_block: int = DEFAULT_LARGEST_BLOCK,
+        block_phase: int | None = None,
+    ) -> None:
         self._source = source
         self._largest_block = largest_block
+        self._block_phase = block_phase
         self._block: _Block | None = None
         self._block_frames = 1
         self.init()
@@ -138,12 +147,18 @@ class Chip:
         counter = self.timeline.next_counter
         block = self._block
         if block is None or not 0 <= counter - block.first_counter < len(block.values):
-            block = self._block = self._synthesise(counter, self._block_frames)
+            block = self._block = self._synthesise(counter, self._frames_from(counter))
             self._block_frames = min(2 * self._block_frames, self._largest_block)
         index = counter - block.first_counter
         self.timeline.next_counter = counter + 1
         self._guard_transmitter(bool(block.all_zero[index]))
         return ChipFrame(counter=counter & 0xFFFFFFFF, values=block.values[index])
+
+    def _frames_from(self, counter: int) -> int:
+        """Return how many frames the block that begins with a counter shall have."""
+        if self._block_phase is None:
+            return self._block_frames
+        return min(self._block_frames, 1 + (self._block_phase - counter) % self._largest_block)
 
     def _check_powered(self) -> None:
         if not self.powered:

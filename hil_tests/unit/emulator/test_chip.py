@@ -309,3 +309,20 @@ def test_registers_start_as_the_driver_leaves_them() -> None:
     assert chip.read_register(X4Setting.XIFREGISTER, 9) == 99
     chip.init()
     assert chip.read_register(X4Setting.XIFREGISTER, 9) == 0
+
+
+def test_of_modules_in_step_few_make_a_block_at_a_time() -> None:
+    """Eight neighbours: once the blocks have grown, one of them synthesises per frame."""
+    sources = [RampSource() for _ in range(8)]
+    chips = [Chip(source, 8, block_phase=phase) for phase, source in enumerate(sources)]
+    for chip in chips:
+        chip.set(X4Setting.FPS, 17.0)
+    made = []
+    for _ in range(64):
+        before = [len(source.blocks) for source in sources]
+        frames = [chip.next_frame() for chip in chips]
+        made.append(sum(len(s.blocks) - n for s, n in zip(sources, before, strict=True)))
+        assert all(np.array_equal(frame.values, frames[0].values) for frame in frames)
+    assert made[0] == 8
+    assert made[24:] == [1] * 40
+    assert [source.blocks[-1] for source in sources] == [8] * 8
