@@ -12,11 +12,18 @@ from typing import Literal
 from emulator.link import PtyLink
 from emulator.plug import Plug
 from emulator.port_watch import PortWatch
+from emulator.serial_rate import DEFAULT_BAUDRATE
 from emulator.server import ByteDevice, Port, Service
 from emulator.shared_device import SharedDevice
 from emulator.tcp_link import TcpLink
+from emulator.uart_line import UartLine
+from emulator.usb_line import UsbLine
 
 __all__ = ["DevicePorts", "LinkOptions", "NamedDevice", "open_ports"]
+
+
+def _power_up_baud() -> int:
+    return DEFAULT_BAUDRATE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,12 +38,15 @@ class NamedDevice:
         The module.
     present
         Whether its own port is there at a time, ns; None if it always is.
+    uart_baud
+        The rate of its UART now, bit/s.
     """
 
     name: str
     serial: str
     device: ByteDevice
     present: Callable[[int], bool] | None = None
+    uart_baud: Callable[[], int] = _power_up_baud
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,6 +55,13 @@ class LinkOptions:
 
     Attributes
     ----------
+    kind
+        What the module is connected by.
+    usb_latency_ns
+        How long USB transfers of at most 512 bytes are under way; None: bytes pass at once.
+    host_baud
+        Rate of the host's side of a UART, bit/s; None: what it sets its terminal to, and for a
+        TCP client the module's.
     port_on_reset
         Whether a restart keeps the port, takes it away for a while, or has it return under
         another name.
@@ -54,6 +71,9 @@ class LinkOptions:
         Address to listen at.
     """
 
+    kind: Literal["usb", "uart"] = "usb"
+    usb_latency_ns: int | None = None
+    host_baud: int | None = None
     port_on_reset: Literal["stay", "vanish", "rename"] = "stay"
     tcp_base: int | None = None
     tcp_host: str = "127.0.0.1"
@@ -112,7 +132,11 @@ class DevicePorts:
         LinkError
             When one cannot be had.
         """
-        link = cleanup.enter_context(PtyLink(path))
+        line = _line(named, options)
+        flushed = line.flush_output if isinstance(line, UartLine) else None
+        link = cleanup.enter_context(PtyLink(path, flushed=flushed))
+        if isinstance(line, UartLine) and options.host_baud is None:
+            line.host_baud = link.host_baud
         tcp, watch, device = None, None, named.device
         if tcp_port is not None:
             watch = PortWatch(link.terminal, opened=_unheard, closed=_unheard)
@@ -121,9 +145,9 @@ class DevicePorts:
             tcp = _tcp_link(shared, link, watch, tcp_port, options)
             cleanup.callback(tcp.close)
             device = shared.port
-            self.ports.append(Port(tcp, shared.guest))
+            self.ports.append(Port(tcp, shared.guest, _line(named, options)))
             self.services += [watch, tcp]
-        self.ports.append(Port(link, device))
+        self.ports.append(Port(link, device, line))
         plug = Plug(
             link,
             named.present or _always,
@@ -156,6 +180,12 @@ def open_ports(
         tcp_port = base + index if base else base
         opened.add(named, folder / named.name, tcp_port, options, cleanup)
     return opened
+
+
+def _line(named: NamedDevice, options: LinkOptions) -> UsbLine | UartLine | None:
+    if options.kind == "uart":
+        return UartLine(named.uart_baud, lambda: options.host_baud)
+    return None if options.usb_latency_ns is None else UsbLine(options.usb_latency_ns)
 
 
 def _tcp_link(

@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import os
+import struct
+import termios
 import tty
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 
 __all__ = ["LinkError", "PtyLink"]
 
 LARGEST_READ = 4096  # what the line discipline hands out at once, and a bit
+# Linux: the speed as a number, which tcgetattr() does not give for rates without a constant
+_TCGETS2, _TERMIOS2 = 0x802C542A, struct.Struct("=4IB19B2I")
+_SPEEDS = {
+    getattr(termios, name): int(name[1:])
+    for name in dir(termios)
+    if name[0] == "B" and name[1:].isdigit()
+}
 
 
 class LinkError(Exception):
@@ -27,6 +39,8 @@ class PtyLink:
     ----------
     path
         Where the link appears. A link left behind by a killed emulator is replaced.
+    flushed
+        Called when the host flushes what it wrote and has not sent yet, where the system tells.
 
     Raises
     ------
@@ -34,8 +48,10 @@ class PtyLink:
         When no terminal can be had, or something that is no link is in the way.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, flushed: Callable[[], None] | None = None) -> None:
         self.path = path
+        self._flushed = flushed
+        self._in_packets = False
         self._open()
 
     def _open(self) -> None:
@@ -49,6 +65,7 @@ class PtyLink:
             tty.setraw(self._slave_fd)
             os.set_blocking(self._master_fd, False)
             self.terminal = os.ttyname(self._slave_fd)
+            self._in_packets = self._flushed is not None and self._ask_for_packets()
             self._publish()
         except BaseException:
             self._close_descriptors()
@@ -79,9 +96,14 @@ class PtyLink:
         if self._master_fd < 0:
             return b""
         try:
-            return os.read(self._master_fd, LARGEST_READ)
+            data = os.read(self._master_fd, LARGEST_READ)
         except BlockingIOError:
             return b""
+        if not self._in_packets:
+            return data
+        if data[0] & termios.TIOCPKT_FLUSHWRITE and self._flushed is not None:
+            self._flushed()
+        return data[1:]  # of a packet that tells something, nothing is left
 
     def write(self, data: memoryview) -> int:
         """Write as much as fits; return how much."""
@@ -89,6 +111,18 @@ class PtyLink:
             return os.write(self._master_fd, data)
         except BlockingIOError:
             return 0
+
+    def host_baud(self) -> int | None:
+        """Return the speed the host set its side to, bit/s; None where nobody can tell."""
+        if self._master_fd < 0:
+            return None
+        with contextlib.suppress(OSError):  # not Linux
+            answer = fcntl.ioctl(self._master_fd, _TCGETS2, bytes(_TERMIOS2.size))
+            return int(_TERMIOS2.unpack(answer)[-1])
+        try:
+            return _SPEEDS.get(termios.tcgetattr(self._master_fd)[5])
+        except termios.error:
+            return None
 
     def close(self) -> None:
         """Remove the link, if it is still ours, and give the terminal back.
@@ -116,6 +150,13 @@ class PtyLink:
     ) -> None:
         """Close the link."""
         self.close()
+
+    def _ask_for_packets(self) -> bool:
+        try:
+            fcntl.ioctl(self._master_fd, termios.TIOCPKT, struct.pack("i", 1))
+        except (AttributeError, OSError):  # not everywhere
+            return False
+        return True
 
     def _publish(self) -> None:
         if os.path.lexists(self.path) and not self.path.is_symlink():

@@ -13,6 +13,8 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
+from emulator.line import Line
+
 __all__ = ["ByteDevice", "ByteLink", "Port", "Server", "Service"]
 
 NS_PER_S = 1_000_000_000
@@ -82,22 +84,27 @@ class Service(Protocol):
 class Port:
     """A device on its line, and the packet that is half sent."""
 
-    def __init__(self, link: ByteLink, device: ByteDevice) -> None:
+    def __init__(self, link: ByteLink, device: ByteDevice, line: Line | None = None) -> None:
         self.link = link
         self.device = device
+        self._line = line
         self._unsent = memoryview(b"")
         self._blocked = False
 
     @property
     def events(self) -> int:
         """Return what the loop should wait for."""
-        reading = selectors.EVENT_READ if self.device.wants_data else 0
+        takes_bytes = self._line is None or self._line.takes_bytes
+        reading = selectors.EVENT_READ if self.device.wants_data and takes_bytes else 0
         return reading | (selectors.EVENT_WRITE if self._blocked else 0)
 
     def receive(self, now_ns: int) -> None:
         """Read what the host wrote."""
         data = self.link.read()
-        if data:
+        if data and self._line is not None:
+            self.device.advance(now_ns)  # its rate may have changed since
+            self._line.from_host(data, now_ns)
+        elif data:
             self.device.receive_data(data, now_ns)
         elif self.link.fileno() < 0:
             self.cut()
@@ -105,10 +112,20 @@ class Port:
     def advance(self, now_ns: int) -> None:
         """Let time pass."""
         self.device.advance(now_ns)
+        while self._line is not None and self.device.wants_data:
+            data = self._line.to_module(now_ns)
+            if not data:
+                return
+            self.device.receive_data(data, now_ns)
 
     def wake_ns(self, now_ns: int) -> int | None:
         """Return when time alone changes something; None if never."""
-        return self.device.wake_ns(now_ns)
+        candidates = [self.device.wake_ns(now_ns)]
+        if self._line is not None and not self._blocked:
+            candidates.append(self._line.to_host_ns())
+        if self._line is not None and self.device.wants_data:
+            candidates.append(self._line.to_module_ns())
+        return min((time_ns for time_ns in candidates if time_ns is not None), default=None)
 
     def room(self) -> None:
         """Note that the line takes more."""
@@ -118,6 +135,8 @@ class Port:
         """Forget what was half sent: the line is unplugged, and the next host begins afresh."""
         self._unsent = memoryview(b"")
         self._blocked = False
+        if self._line is not None:
+            self._line.clear()
 
     def send(self, now_ns: int) -> bool:
         """Send a share of what waits; return whether there may be more to send right away."""
@@ -125,8 +144,8 @@ class Port:
             return False
         for _ in range(PACKETS_PER_TURN):
             if not self._unsent:
-                packet = self.device.next_packet(now_ns)
-                if packet is None:
+                packet = self._next_piece(now_ns)
+                if not packet:
                     return False
                 self._unsent = memoryview(packet)
             self._unsent = self._unsent[self.link.write(self._unsent) :]
@@ -134,6 +153,20 @@ class Port:
                 self._blocked = True
                 return False
         return True
+
+    def _next_piece(self, now_ns: int) -> bytes | None:
+        """Return a packet, or what of one has passed the line by now."""
+        if self._line is None:
+            return self.device.next_packet(now_ns)
+        data = self._line.to_host(now_ns)
+        if data:
+            return data
+        while self._line.takes_packet:
+            packet = self.device.next_packet(now_ns)
+            if packet is None:
+                break
+            self._line.from_module(packet, now_ns)
+        return self._line.to_host(now_ns)
 
 
 class Server:
