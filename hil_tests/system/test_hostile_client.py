@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import select
+import time
+from pathlib import Path
+
 import pytest
 
 from emulator.pace import Pace
 from hil_tests.bench.hostile_client import MOST_OBJECTS_GROWN, run
+from hil_tests.device.serving import Served, emulator
+from xethru_protocol import messages as m
+from xethru_protocol.codes import PongCode, SensorMode, X4Setting
+from xethru_protocol.connection import Connection, Role
+from xethru_protocol.packets import NeedData
 
 
 @pytest.mark.parametrize("pace", list(Pace))
@@ -19,3 +30,104 @@ def test_a_hostile_client_disturbs_nobody(seed: int, pace: Pace) -> None:
     assert outcome.sent_bytes > 50_000
     assert outcome.faults_seen > 20
     assert min(outcome.actions.values()) > 5
+
+
+class Watched:
+    """A process from outside, and a reader of one of its ports that must miss no frame."""
+
+    def __init__(self, served: Served, port: int) -> None:
+        self._process = Path(f"/proc/{served.process.pid}")
+        self.fd = os.open(served.paths[port], os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        self._line = Connection(Role.HOST)
+        self.counters: list[int] = []
+        for command in (
+            m.SetMode(mode=SensorMode.XTID_SM_MANUAL),
+            m.X4DriverSet(setting=X4Setting.FPS, value=17.0),
+        ):
+            os.write(self.fd, self._line.send(command))
+
+    def descriptors(self) -> int:
+        return len(list((self._process / "fd").iterdir()))
+
+    def resident_kib(self) -> int:
+        pages = int((self._process / "statm").read_text().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE") // 1024
+
+    def read(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            while data := os.read(self.fd, 65536):
+                self._line.receive_data(data)
+        while not isinstance(event := self._line.next_event(), NeedData):
+            if isinstance(event, m.DataFloat):
+                self.counters.append(event.info)
+
+    def read_for(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            select.select([self.fd], [], [], left)
+            self.read()
+
+
+def open_port(path: str) -> int:
+    return os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+
+
+def ping_through_whatever(path: str) -> bool:
+    """Whether a module answers, behind all that earlier hosts left in its line."""
+    line, fd = Connection(Role.HOST), open_port(path)
+    end = time.monotonic() + 10
+    try:
+        while time.monotonic() < end:
+            with contextlib.suppress(BlockingIOError):
+                os.write(fd, line.send(m.Ping()))
+            select.select([fd], [], [], 0.05)
+            with contextlib.suppress(BlockingIOError):
+                line.receive_data(os.read(fd, 65536))
+            while not isinstance(event := line.next_event(), NeedData):
+                if event == m.Pong(value=PongCode.XTS_SPRP_READY):
+                    return True
+    finally:
+        os.close(fd)
+    return False
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="tells memory by /proc: Linux only")
+def test_hostile_hosts_at_real_ports() -> None:
+    """A thousand openings, two hosts at one port, a host that never reads; one port is at peace."""
+    with emulator("serve", "--bare", "--count", "4") as served:
+        watched = Watched(served, 3)
+        opened, shared, deaf = served.paths[:3]
+        line = Connection(Role.HOST)
+        stream = line.send(m.SetMode(mode=SensorMode.XTID_SM_MANUAL)) + line.send(
+            m.X4DriverSet(setting=X4Setting.FPS, value=200.0)
+        )
+        deaf_fd = open_port(deaf)
+        two = [open_port(shared), open_port(shared)]
+        for fd in (deaf_fd, *two):
+            os.write(fd, stream)
+        watched.read_for(1.5)  # the deaf host's line and queue fill up
+        before = watched.descriptors(), watched.resident_kib()
+        for number in range(1000):
+            fd = open_port(opened)
+            os.write(fd, stream if number % 2 else line.send(m.Ping())[: number % 8])
+            os.close(fd)
+            if number % 20 == 0:
+                for fd in two:  # each gets a part of what the module says, and both talk at once
+                    with contextlib.suppress(BlockingIOError):
+                        os.read(fd, 4096)
+                    os.write(fd, line.send(m.GetMode())[:3])
+                watched.read_for(0.02)
+        watched.read_for(1.0)
+        after = watched.descriptors(), watched.resident_kib()
+        for fd in (deaf_fd, *two):
+            os.close(fd)
+        assert after[0] == before[0], "descriptors"
+        assert after[1] - before[1] < 4096, "KiB of memory"
+        assert len(watched.counters) > 17 * 2
+        first = watched.counters[0]
+        assert watched.counters == list(range(first, first + len(watched.counters)))
+        for path in (opened, shared, deaf):
+            assert ping_through_whatever(path), path
+        os.close(watched.fd)
+        assert served.end() == 0
