@@ -26,9 +26,20 @@ from emulator.pace import Pace
 from emulator.profiles.combined_stream import CombinedStream
 from emulator.profiles.stream import ProfileStream
 from emulator.saved_state import Memory
+from xethru_protocol.codec import encode
 from xethru_protocol.codes import SystemCode
 from xethru_protocol.connection import Connection, Role
-from xethru_protocol.messages import Command, Response, System
+from xethru_protocol.messages import (
+    Command,
+    InjectFrame,
+    Response,
+    SetFileData,
+    SetParameterFile,
+    System,
+    UnknownMessage,
+    X4DriverWrite,
+    X4DriverWriteI2c,
+)
 from xethru_protocol.packets import NeedData
 
 __all__ = ["BootTiming", "Device", "radar_device"]
@@ -36,6 +47,17 @@ __all__ = ["BootTiming", "Device", "radar_device"]
 NORMAL_START = 0x7D
 NORMAL_BUFFER = 8000
 """Bytes of a Normal packet, escapes included, that a module can send (protocol reference 1.1)."""
+
+LARGEST_POOL_BLOCK = 7000
+"""Payload bytes of the largest command that a module processes (protocol reference 1.1)."""
+_LONG_COMMANDS = (
+    InjectFrame,
+    SetFileData,
+    SetParameterFile,
+    UnknownMessage,
+    X4DriverWrite,
+    X4DriverWriteI2c,
+)
 
 ASAP_BLOCK = 32
 # Radars in step refill at the same moment: four blocks of 8 cost 2 ms, four of 32 cost 7 ms.
@@ -57,6 +79,11 @@ class BootTiming:
 
     ack_to_reset_ns: int = 500_000_000
     reset_to_ready_ns: int = 2_000_000_000
+
+
+def _is_oversized(command: Command[Response]) -> bool:
+    """Whether a command fits no block of the firmware's message pool; it drops those silently."""
+    return isinstance(command, _LONG_COMMANDS) and len(encode(command)) > LARGEST_POOL_BLOCK
 
 
 class _Held(NamedTuple):
@@ -124,7 +151,8 @@ class Device:
             if isinstance(event, NeedData):
                 return
             if isinstance(event, Command):
-                self._carry_out(event, now_ns)
+                if not _is_oversized(event):
+                    self._carry_out(event, now_ns)
             else:
                 self.faults_seen += 1
 

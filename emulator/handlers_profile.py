@@ -6,7 +6,7 @@ Source: protocol reference 4.4 to 4.7, 11 and 16.
 from __future__ import annotations
 
 from emulator.handler_table import answers
-from emulator.module import Module
+from emulator.module import NOISE_MAPS, Module
 from emulator.profile_settings import ZONE_LIMITS_M
 from emulator.refusal import Refusal
 from xethru_protocol import messages as m
@@ -20,7 +20,6 @@ from xethru_protocol.codes import (
 )
 
 PARAMETER_FILE = (int(FileType.PARAMETER_FILE), 0)
-NOISE_MAPS = ((int(FileType.NOISEMAP_SLOW), 0), (int(FileType.NOISEMAP_FAST), 0))
 
 
 @answers(m.SetDetectionZone)
@@ -128,12 +127,7 @@ def _get_periodic_store(module: Module, command: m.NoiseMapGetPeriodicStore) -> 
 
 @answers(m.StoreNoiseMap)
 def _store_noise_map(module: Module, command: m.StoreNoiseMap) -> m.Response:
-    if module.now_ns < module.noise_map_busy_until_ns:
-        raise Refusal(ErrorCode.XTS_SPRE_BUSY)
-    for key, data in zip(NOISE_MAPS, module.noise_maps(), strict=True):
-        module.files.replace(key, data)
-    module.noise_map_busy_until_ns = module.now_ns + module.options.noise_map_store_ns
-    module.save()
+    module.store_noise_maps()
     return m.Ack()
 
 

@@ -6,6 +6,7 @@ Source: protocol reference 4, 8.2 and 8.5.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 
 from emulator.chip import Chip
@@ -20,11 +21,13 @@ from emulator.safe_mode import FaultCounter
 from emulator.saved_state import Memory, SavedState, VolatileMemory
 from emulator.serial_rate import DEFAULT_BAUDRATE
 from xethru_protocol import messages as m
-from xethru_protocol.codes import FileType, TraceLevel
+from xethru_protocol.codes import ErrorCode, FileType, TraceLevel
 
-__all__ = ["CRASH_DUMP", "Module", "Restart"]
+__all__ = ["CRASH_DUMP", "NOISE_MAPS", "Module", "Restart"]
 
 CRASH_DUMP = (int(FileType.CRASH_DUMP), 0)
+NOISE_MAPS = ((int(FileType.NOISEMAP_SLOW), 0), (int(FileType.NOISEMAP_FAST), 0))
+NS_PER_MIN = 60_000_000_000
 BAUDRATE_DELAY_NS = 500_000_000
 """From the ACK of SETBAUDRATE to the switch."""
 
@@ -124,6 +127,8 @@ class Module:
         self.now_ns = 0
         self.restart: Restart | None = None
         self._baudrate_change: tuple[int, int] | None = None
+        self._noise_map_busy_until_ns = 0
+        self._noise_map_stored_ns = 0
         self._power_up_parts(into_bootloader=False)
 
     @property
@@ -157,6 +162,21 @@ class Module:
         if self._baudrate_change is not None and now_ns >= self._baudrate_change[0]:
             self.uart_baudrate = self._baudrate_change[1]
             self._baudrate_change = None
+        interval_ns = self.profile.noise_map_interval_min * NS_PER_MIN
+        running = self.state is State.RUN
+        if running and interval_ns and now_ns - self._noise_map_stored_ns >= interval_ns:
+            with suppress(Refusal):  # no room: the next interval tries again
+                self.store_noise_maps()
+            self._noise_map_stored_ns = now_ns
+
+    def store_noise_maps(self) -> None:
+        """Store the noise maps as files, or raise `Refusal`."""
+        if self.now_ns < self._noise_map_busy_until_ns:
+            raise Refusal(ErrorCode.XTS_SPRE_BUSY)
+        for key, data in zip(NOISE_MAPS, self.noise_maps(), strict=True):
+            self.files.replace(key, data)
+        self._noise_map_busy_until_ns = self.now_ns + self.options.noise_map_store_ns
+        self.save()
 
     def change_baudrate(self, baudrate: int) -> None:
         """Change the UART's rate once the ACK has left."""
@@ -176,11 +196,9 @@ class Module:
         if hopeless:
             self.faults.clear()
         dump = f"{reason}\nat {now_ns} ns\nfault {self.faults.count} in a row\n".encode()
-        try:
-            self.files.close_all()
+        self.files.close_all()
+        with suppress(Refusal):  # no room for a dump: the firmware has nowhere else to put it
             self.files.replace(CRASH_DUMP, dump)
-        except Refusal:
-            pass  # no room for a dump: the firmware has nowhere else to put it
         self.save()
         self.restart = Restart(into_bootloader=hopeless, at_ns=now_ns)
 
@@ -195,6 +213,7 @@ class Module:
         self.modes.set_mode(mode)
         if self.state is State.RUN:
             self._saved_profiles[self.modes.profile_id] = self.profile.copy()
+            self._noise_map_stored_ns = self.now_ns
         self.save()
 
     def restore_factory_settings(self) -> None:
@@ -230,7 +249,8 @@ class Module:
         self.postprocessing: dict[int, m.PostprocessingValue] = {}
         self.i2c: dict[int, bytes] = {}
         self.i2c_address = 0
-        self.noise_map_busy_until_ns = 0
+        self._noise_map_busy_until_ns = 0
+        self._noise_map_stored_ns = self.now_ns
         self.files.close_all()
         self.pins.reset()
         self._working: dict[int, ProfileSettings] = {}

@@ -2,7 +2,7 @@
 
 Rows and columns are those of protocol reference 8.3, with columns for certification mode (as
 MANUAL), the bare base firmware (2) and the bootloader (4.12) added. What the reference leaves
-open is an option; a verdict names it.
+open is an option; a verdict names it. ``python -m emulator.permissions`` prints the table.
 
 Source: protocol reference 2, 8.3, 8.5.
 """
@@ -19,7 +19,7 @@ from emulator.refusal import Refusal, Silence
 from xethru_protocol import messages as m
 from xethru_protocol.codes import ErrorCode
 
-__all__ = ["GROUPS", "PERMISSIONS", "Group", "Verdict", "check_permission"]
+__all__ = ["GROUPS", "PERMISSIONS", "Group", "Verdict", "check_permission", "permission_table"]
 
 
 class Group(Enum):
@@ -172,6 +172,24 @@ def check_permission(command: m.Message, state: State, options: DeviceOptions) -
     raise Refusal(_ERRORS[verdict](options))
 
 
+def permission_table() -> str:
+    """Return the table as Markdown, a row per group and a column per state.
+
+    Examples
+    --------
+    >>> permission_table().splitlines()[0].split("|")[2]
+    ' RUN '
+    """
+    lines = [
+        "| Commands | " + " | ".join(state.name for state in _ORDER) + " |",
+        "|" + "---|" * (len(_ORDER) + 1),
+    ]
+    for group, verdicts in PERMISSIONS.items():
+        cells = (verdicts[state].value for state in _ORDER)
+        lines.append(f"| {group.value} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
 _ERRORS: dict[Verdict, Callable[[DeviceOptions], int]] = {
     Verdict.UNKNOWN: lambda options: ErrorCode.XTS_SPRE_NOT_RECOGNIZED,
     Verdict.QUIET: lambda options: ErrorCode.XTS_SPRE_NOT_RECOGNIZED,
@@ -179,3 +197,7 @@ _ERRORS: dict[Verdict, Callable[[DeviceOptions], int]] = {
     Verdict.BUSY_PROFILE: lambda options: options.busy_profile_error,
     Verdict.RUNNING_OUTPUT: lambda options: options.busy_profile_error,
 }
+
+
+if __name__ == "__main__":
+    print(permission_table())  # noqa: T201 - this is what running the module is for
