@@ -1,4 +1,4 @@
-"""Four emulated radars through ptys: share of a core, punctuality, and the fastest it can go.
+"""Emulated radars through ptys: share of a core, punctuality, and the fastest they can go.
 
 The bar of the design: four radars at 400 frames/s with synthesis in under a quarter of a core,
 p99 of the interval error under 5 ms on an idle machine. Nothing is asserted about time here.
@@ -15,18 +15,21 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
+from emulator.chip import Chip
 from emulator.device import radar_device
 from emulator.echo import echo_source
 from emulator.identity import Identity
 from emulator.loopback import LoopbackTransport
 from emulator.pace import Pace
 from emulator.scene import load_scene
+from hil_tests.bench.virtual_time import counters_of
 from hil_tests.device.serving import Served, emulator
 from xethru_protocol import messages as m
 from xethru_protocol.codes import SensorMode, X4Setting
 from xethru_protocol.connection import Connection, Role
 from xethru_protocol.driver import X4M300, RawConfig
 from xethru_protocol.packets import NeedData
+from xethru_protocol.x4 import real_frame_rate
 
 FAST = RawConfig(iterations=16, pulses_per_step=10)
 SECONDS = 5.0
@@ -34,7 +37,7 @@ SECONDS = 5.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measured:
-    """What four streams cost and how punctual they were."""
+    """What the streams of an emulator cost and how punctual they were."""
 
     cpu_share: float
     frames: int
@@ -51,10 +54,10 @@ def cpu_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def measure(served: Served, fps: float) -> Measured:
+def measure(served: Served, fps: float, config: RawConfig) -> Measured:
     drivers = [X4M300.open(path) for path in served.paths]
     for driver in drivers:
-        driver.configure_raw(FAST)
+        driver.configure_raw(config)
         driver.close()  # the settings stay; the stream is read below without a driver's cost
     descriptors = [os.open(path, os.O_RDWR | os.O_NOCTTY) for path in served.paths]
     lines = {descriptor: Connection(Role.HOST) for descriptor in descriptors}
@@ -102,11 +105,54 @@ def measure(served: Served, fps: float) -> Measured:
 def test_four_radars_in_real_time(benchmark: BenchmarkFixture, fps: float) -> None:
     with emulator("serve", "lab") as served:
         measured = benchmark.pedantic(  # type: ignore[no-untyped-call] # the plugin has no annotation there
-            measure, args=(served, fps), rounds=1
+            measure, args=(served, fps, FAST), rounds=1
         )
     for name in Measured.__dataclass_fields__:
         benchmark.extra_info[name] = round(getattr(measured, name), 4)
     assert measured.frames > 0.9 * 4 * fps * SECONDS
+
+
+@pytest.mark.timeout(120)
+def test_sixty_four_radars_in_real_time(benchmark: BenchmarkFixture) -> None:
+    """One process, 1431 bins at 17 frames/s each."""
+    with emulator("serve", "--bare", "--count", "64") as served:
+        measured = benchmark.pedantic(  # type: ignore[no-untyped-call] # as above
+            measure, args=(served, 17.0, RawConfig()), rounds=1
+        )
+    for name in Measured.__dataclass_fields__:
+        benchmark.extra_info[name] = round(getattr(measured, name), 4)
+    benchmark.extra_info["frames_per_s"] = measured.frames / SECONDS
+    assert measured.lost == 0
+    assert measured.frames > 0.9 * 64 * 17 * SECONDS
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("minutes", [60], ids=["an_hour"])
+def test_device_time_under_a_virtual_clock(benchmark: BenchmarkFixture, minutes: int) -> None:
+    frames = benchmark.pedantic(counters_of, args=(minutes * 60.0, RawConfig()), rounds=1)  # type: ignore[no-untyped-call] # as above
+    assert frames == list(range(frames[0], frames[0] + len(frames)))
+    assert len(frames) == pytest.approx(minutes * 60 * real_frame_rate(17.0), abs=2)
+    if benchmark.stats is not None:
+        seconds = benchmark.stats.stats.median
+        benchmark.extra_info["times_real_time"] = minutes * 60 / seconds
+        benchmark.extra_info["frames_per_s"] = len(frames) / seconds
+
+
+@pytest.mark.parametrize("downconversion", [False, True], ids=["rf", "baseband"])
+@pytest.mark.parametrize("block", [1, 8, 32])
+def test_synthesis_of_frames(benchmark: BenchmarkFixture, block: int, downconversion: bool) -> None:
+    """What a frame of the lab costs from echo to float32 values, by how many are made at once."""
+    chip = Chip(echo_source(load_scene("lab"), 0, 0), block)
+    driver_settings = {X4Setting.DOWNCONVERSION: int(downconversion), X4Setting.FPS: 17.0}
+    chip.set(X4Setting.FRAMEAREA, (0.2, 9.4))
+    for setting, value in driver_settings.items():
+        chip.set(setting, value)
+    for _ in range(64):
+        chip.next_frame()  # blocks grow
+    benchmark(lambda: [chip.next_frame() for _ in range(32)])
+    if benchmark.stats is not None:
+        benchmark.extra_info["us_per_frame"] = benchmark.stats.stats.median * 1e6 / 32
+        benchmark.extra_info["frames_per_s"] = 32 / benchmark.stats.stats.median
 
 
 @pytest.mark.parametrize("downconversion", [False, True], ids=["rf", "baseband"])

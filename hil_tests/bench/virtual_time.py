@@ -1,0 +1,39 @@
+"""Device time without waiting: a driver and a module in real time on a virtual clock."""
+
+from __future__ import annotations
+
+from emulator.device import radar_device
+from emulator.echo import echo_source
+from emulator.identity import Identity
+from emulator.loopback import LoopbackTransport
+from emulator.pace import Pace
+from emulator.scene import load_scene
+from xethru_protocol.driver import X4M300, RawConfig
+
+NS_PER_S = 1_000_000_000
+FPS = 17.0
+
+
+def counters_of(duration_s: float, config: RawConfig) -> list[int]:
+    """Return the counters of the frames that a radar of the lab sends in a time of its own clock.
+
+    The module has the firmware's queue and absolute deadlines, so that a frame that came late by
+    a second, or met a full queue, would be missing.
+    """
+    scene = load_scene("lab")
+    device = radar_device(
+        Identity(serial=scene.radars[0].serial), echo_source(scene, 0, 0), Pace.REALTIME
+    )
+    line = LoopbackTransport(device)
+    with X4M300(line, clock=line.clock_ns) as driver:
+        driver.configure_raw(config)
+        driver.start(FPS)
+        end_ns = line.clock_ns() + round(duration_s * NS_PER_S)
+        counters = []
+        for frame in driver.frames(timeout_s=5.0):
+            if frame.arrival_ns > end_ns:
+                break
+            assert frame.samples.size == frame.geometry.n_bins
+            counters.append(frame.counter)
+        assert (driver.frames_lost, driver.fault_count) == (0, 0)
+    return counters
