@@ -9,31 +9,36 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from emulator import cli_faults
 from emulator.pace import Pace
 from emulator.stopping import Stop, stop_signals
 
 if TYPE_CHECKING:
     from emulator.device_ports import LinkOptions
+    from emulator.saved_state import Memory
 
 __all__ = ["main"]
 
 MOST_BARE = 64
 LAST_PORT = 65535
+NS_PER_MS = 1_000_000
+_LINKS = {"usb": (0, 1000), "uart": (600, 10_000_000)}
+"""Links and the numbers they take: latency in ms, baud rate."""
 
 _SERVE_HELP = """\
 Each radar of the scene becomes a stock X4M300 on a pseudo-terminal, published as a link in the
 link directory. One JSON line on stdout says that all ports are ready:
 
   {"ready":true,"scene_time_zero_ns":N,"odometry":"PATH or null",
-   "devices":[{"name":"...","path":"...","serial":"...","tcp":PORT or null}]}
+   "control":"PATH","devices":[{"name":"...","path":"...","serial":"...","tcp":PORT or null}]}
 
 scene_time_zero_ns is the monotonic time of scene time 0; the odometry path is a unix socket that
-gives every client the wheel odometry as TUM lines. Ctrl-C, SIGTERM or SIGHUP ends it: links,
-socket and a directory of its own are removed, exit 0.
+gives every client the wheel odometry as TUM lines, the control path one for `xethru-emulator ctl`.
+Ctrl-C, SIGTERM or SIGHUP ends it: links, sockets and a directory of its own are removed, exit 0.
 
 pace realtime: frames at their deadlines; a host that does not keep up loses frames as on the
 real module. pace asap: as fast as the host reads, nothing is lost.
@@ -41,6 +46,11 @@ real module. pace asap: as fast as the host reads, nothing is lost.
 --tcp: each module on a TCP port, too, for one client at a time: a second one is hung up on, and so
 is one that comes while a host has the module's pseudo-terminal open. While a client is connected,
 the pseudo-terminal is deaf and dumb.
+
+--link usb: bytes pass at once; usb:MS: transfers of at most 512 bytes, MS milliseconds under way.
+--link uart: ten bits per byte at the speed that the host sets its terminal to; a host at another
+speed than the module's (115200 after power-up, then what SETBAUDRATE says) hears and sends
+garbage. uart:BAUD: the host's side runs at BAUD, whatever its terminal says.
 
 --port-on-reset vanish: a reset takes the port away for two seconds, as USB does: whoever has it
 open sees it hang up, its name is gone. rename: it returns as NAME-2, NAME-3 and so on; running
@@ -69,6 +79,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace, stop: Stop) -> int:
+    if arguments.command in cli_faults.COMMANDS:
+        return cli_faults.run(arguments)
     # heavy imports only now: --help and usage errors answer at once
     from emulator.playback import PlayOptions
     from emulator.serving import CannotServeError, play, serve
@@ -94,7 +106,17 @@ def _run(arguments: argparse.Namespace, stop: Stop) -> int:
         else:
             scene = arguments.count if arguments.bare else arguments.scene
             links = _link_options(arguments)
-            serve(scene, arguments.seed, arguments.pace, folder, stop, links=links)
+            serve(
+                scene,
+                arguments.seed,
+                arguments.pace,
+                folder,
+                stop,
+                links=links,
+                faults=arguments.faults,
+                truth=arguments.truth,
+                memory=_memory(arguments.state_dir),
+            )
     except CannotServeError as error:
         _say(str(error))
         return error.exit_code
@@ -108,7 +130,24 @@ def _link_options(arguments: argparse.Namespace) -> LinkOptions:
     host: str = arguments.tcp_host
     if arguments.tcp is not None and not is_loopback(host):
         _warn(f"--tcp-host {host}: whoever reaches this address can command the modules")
-    return LinkOptions(port_on_reset=arguments.port_on_reset, tcp_base=arguments.tcp, tcp_host=host)
+    kind, number = arguments.link
+    usb_latency_ns = round(number * NS_PER_MS) if kind == "usb" and number is not None else None
+    return LinkOptions(
+        kind=kind,
+        usb_latency_ns=usb_latency_ns,
+        host_baud=round(number) if kind == "uart" and number is not None else None,
+        port_on_reset=arguments.port_on_reset,
+        tcp_base=arguments.tcp,
+        tcp_host=host,
+    )
+
+
+def _memory(state_dir: Path | None) -> Callable[[str], Memory] | None:
+    if state_dir is None:
+        return None
+    from emulator.state_store import DirectoryMemory
+
+    return lambda serial: DirectoryMemory(state_dir, serial, _warn)
 
 
 def _warn(text: str) -> None:
@@ -151,6 +190,12 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     _add_link_dir(serve)
     serve.add_argument(
+        "--faults", metavar="FILE", help="fault scenario: a .toml file, or a shipped one by name"
+    )
+    serve.add_argument(
+        "--truth", type=Path, metavar="FILE", help="gets a JSON line for every injected fault"
+    )
+    serve.add_argument(
         "--tcp",
         type=_tcp_port,
         metavar="BASEPORT",
@@ -163,6 +208,19 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         help="address to listen at (default 127.0.0.1, which only this machine reaches)",
     )
 
+    serve.add_argument(
+        "--link",
+        type=_link,
+        default=("usb", None),
+        metavar="{usb[:MS],uart[:BAUD]}",
+        help="what the modules are connected by (default usb)",
+    )
+    serve.add_argument(
+        "--state-dir",
+        type=Path,
+        metavar="DIR",
+        help="keep each module's settings, files and noise maps here (default: forget them)",
+    )
     serve.add_argument(
         "--port-on-reset",
         choices=["stay", "vanish", "rename"],
@@ -203,6 +261,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     _add_link_dir(play)
 
+    cli_faults.add_commands(commands)
     arguments = parser.parse_args(argv)
     if arguments.command == "serve":
         if arguments.bare == (arguments.scene is not None):
@@ -234,6 +293,26 @@ def _seed(text: str) -> int:
     if not 0 <= value < 2**63:
         raise argparse.ArgumentTypeError(f"{value} is not in 0...2**63 - 1")
     return value
+
+
+def _link(text: str) -> tuple[str, float | None]:
+    kind, colon, number = text.partition(":")
+    if kind not in _LINKS:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither usb nor uart")
+    if not colon:
+        return kind, None
+    least, most = _LINKS[kind]
+    value = _number(number)
+    if not least <= value <= most:  # so not-a-number, too
+        raise argparse.ArgumentTypeError(f"{number!r} of {kind} is not in {least}...{most}")
+    return kind, value
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def _tcp_port(text: str) -> int:
@@ -268,10 +347,7 @@ def _kind(text: str) -> str:
 
 
 def _rate(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
+    value = _number(text)
     if not (math.isfinite(value) and value >= 0):
         raise argparse.ArgumentTypeError(f"{text} is not a finite number >= 0")
     return value

@@ -10,11 +10,14 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
-from emulator.device import radar_device
+from emulator.device import Device, radar_device
 from emulator.device_ports import DevicePorts, LinkOptions, NamedDevice, open_ports
 from emulator.echo import echo_source
+from emulator.fault_bench import FaultBench
+from emulator.faults.plan import FaultPlanError, load_plan
 from emulator.identity import Identity
 from emulator.link import LinkError
 from emulator.odometry import scene_odometry
@@ -25,6 +28,7 @@ from emulator.path_lock import PathInUseError, locked
 from emulator.playback import PlayOptions, RecordingError, played_radars
 from emulator.port_watch import PortWatch
 from emulator.run_directory import Announcement, fresh_port_folder
+from emulator.saved_state import Memory
 from emulator.scene import Scene, SceneError, UnknownSceneError, empty_room, load_scene
 from emulator.server import Server, Service
 from emulator.stopping import Stop
@@ -34,6 +38,7 @@ __all__ = ["CannotServeError", "play", "serve"]
 NS_PER_MS = 1_000_000
 LONGEST_SOCKET_PATH = 100  # bytes; Linux takes 107, macOS 103
 SOCKET_NAME = "odometry.sock"
+CONTROL_NAME = "control.sock"
 
 
 class CannotServeError(Exception):
@@ -58,6 +63,9 @@ def serve(
     stop: Stop,
     *,
     links: LinkOptions,
+    faults: Path | str | None = None,
+    truth: Path | None = None,
+    memory: Callable[[str], Memory] | None = None,
 ) -> None:
     """Emulate the radars of a scene until a signal asks for the end.
 
@@ -75,11 +83,17 @@ def serve(
         Ends it, also before it has begun.
     links
         What leads to the modules.
+    faults
+        Name or path of a fault scenario; None: no faults until the control socket adds some.
+    truth
+        File that gets a line for every injected fault; None: none.
+    memory
+        Returns where the module with a serial number keeps its flash; None: nowhere.
 
     Raises
     ------
     CannotServeError
-        When scene or ports cannot be had.
+        When scene, fault scenario or ports cannot be had.
     """
     with contextlib.ExitStack() as cleanup:
         try:
@@ -87,7 +101,12 @@ def serve(
             loaded = empty_room(scene) if isinstance(scene, int) else load_scene(scene)
             folder = cleanup.enter_context(_link_folder(link_dir))
             zero_ns = time.monotonic_ns()
-            devices = _radar_devices(loaded, seed, pace, zero_ns, _device_options(links))
+            plan = None if faults is None else load_plan(faults)
+            bench = FaultBench(plan, truth, cleanup, zero_ns=zero_ns)
+            options = _device_options(links)
+            devices = _radar_devices(loaded, seed, pace, zero_ns, options, bench, memory)
+            bench.check_names()
+            control = bench.control(_socket_path(folder, cleanup, CONTROL_NAME))
             feed = None
             if not bare:
                 feed = OdometryFeed(
@@ -100,10 +119,10 @@ def serve(
             ports = open_ports(devices, folder, links, cleanup)
         except UnknownSceneError as error:
             raise CannotServeError(str(error), exit_code=2) from error
-        except (SceneError, LinkError) as error:
+        except (SceneError, LinkError, FaultPlanError) as error:
             raise CannotServeError(str(error)) from error
-        services: list[Service] = [] if feed is None else [feed]
-        ready = _ready_line(ports, zero_ns, None if feed is None else feed.path)
+        services: list[Service] = [control] if feed is None else [feed, control]
+        ready = _ready_line(ports, zero_ns, None if feed is None else feed.path, control.path)
         _run(ports, services, ready, stop, cleanup)
 
 
@@ -170,8 +189,14 @@ def _device_options(links: LinkOptions) -> DeviceOptions:
     return DeviceOptions(port_on_reset="stay" if stays else "vanish")
 
 
-def _radar_devices(
-    scene: Scene, seed: int, pace: Pace, zero_ns: int, options: DeviceOptions
+def _radar_devices(  # noqa: PLR0917 - what makes a radar
+    scene: Scene,
+    seed: int,
+    pace: Pace,
+    zero_ns: int,
+    options: DeviceOptions,
+    bench: FaultBench,
+    memory: Callable[[str], Memory] | None,
 ) -> list[NamedDevice]:
     made = []
     for index, radar in enumerate(scene.radars):
@@ -182,20 +207,33 @@ def _radar_devices(
             scene_time_zero_ns=zero_ns,
             skew_ns=round(radar.start_skew_ms * NS_PER_MS),
             options=options,
+            memory=None if memory is None else memory(radar.serial),
         )
+        faulty = bench.wrap(device, radar.name)
         made.append(
             NamedDevice(
-                name=radar.name, serial=radar.serial, device=device, present=device.port_present
+                name=radar.name,
+                serial=radar.serial,
+                device=faulty,
+                present=faulty.port_present,
+                uart_baud=partial(_uart_baud, device),
             )
         )
     return made
 
 
-def _ready_line(ports: DevicePorts, zero_ns: int, odometry: Path | None) -> dict[str, object]:
+def _uart_baud(device: Device) -> int:
+    return device.module.uart_baudrate
+
+
+def _ready_line(
+    ports: DevicePorts, zero_ns: int, odometry: Path | None, control: Path | None = None
+) -> dict[str, object]:
     return {
         "ready": True,
         "scene_time_zero_ns": zero_ns,
         "odometry": None if odometry is None else os.fspath(odometry),
+        "control": None if control is None else os.fspath(control),
         "devices": ports.entries(),
     }
 
@@ -266,19 +304,19 @@ def _link_folder(wanted: Path | None) -> Iterator[Path]:
                     wanted.rmdir()
 
 
-def _socket_path(folder: Path, cleanup: contextlib.ExitStack) -> Path:
-    """Return where the odometry socket goes: among the links, if the kernel takes such a path."""
-    path = folder / SOCKET_NAME
+def _socket_path(folder: Path, cleanup: contextlib.ExitStack, name: str = SOCKET_NAME) -> Path:
+    """Return where a socket goes: among the links, if the kernel takes such a path."""
+    path = folder / name
     if _fits(path):
         return path
     for parent in (tempfile.gettempdir(), "/tmp"):  # the former may be as long
-        if _fits(Path(parent) / "xethru-12345678" / SOCKET_NAME):
+        if _fits(Path(parent) / "xethru-12345678" / name):
             with contextlib.suppress(OSError):
                 short = Path(tempfile.mkdtemp(prefix="xethru-", dir=parent))
                 cleanup.callback(shutil.rmtree, short, ignore_errors=True)
-                return short / SOCKET_NAME
+                return short / name
     raise LinkError(
-        f"{path}: too long for the odometry socket, {LONGEST_SOCKET_PATH} bytes at most; "
+        f"{path}: too long for the {path.stem} socket, {LONGEST_SOCKET_PATH} bytes at most; "
         "choose a shorter --link-dir or TMPDIR"
     )
 

@@ -6,6 +6,7 @@ on the bytes, the times and the seed alone.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import cast
 
@@ -74,6 +75,7 @@ class FaultyDevice:
         self._queue = LineQueue()
         self._actions: list[tuple[int, Action]] = []
         self._sent_bytes = 0
+        self._injected: Counter[str] = Counter()
         self._away = False
         self._back_ns: int | None = None
         self._deaf = False  # from a restart until BOOTING
@@ -103,9 +105,10 @@ class FaultyDevice:
         """Faults that may still come or last."""
         return tuple(self._armed)
 
-    def injected(self, number: int) -> int:
-        """Return how often an armed fault was injected so far."""
-        return sum(armed.firings for armed in self._armed if armed.number == number)
+    @property
+    def injected_by_kind(self) -> dict[str, int]:
+        """How often each kind was injected so far, cleared faults included."""
+        return dict(self._injected)
 
     # --- the port -------------------------------------------------------------------------------
 
@@ -344,6 +347,7 @@ class FaultyDevice:
 
     def _note(self, armed: Armed, now_ns: int) -> None:
         armed.fired(now_ns, self._watch.counter)
+        self._injected[armed.kind.name] += 1
         self.truth.note(
             Injected(
                 t_ns=now_ns,

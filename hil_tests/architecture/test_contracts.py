@@ -42,7 +42,10 @@ INPUT_AND_OUTPUT = {
     },
     "emulator": {
         "cli",
+        "cli_faults",
+        "control_socket",
         "device_ports",
+        "fault_bench",
         "link",
         "odometry_feed",
         "path_lock",

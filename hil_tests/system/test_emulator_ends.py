@@ -49,7 +49,7 @@ def test_a_signal_ends_it_with_0_and_nothing_is_left(
     ) as served:
         assert served.odometry is not None
         assert sorted(path.name for path in links.iterdir()) == sorted(
-            [*served.names, "odometry.sock"]
+            [*served.names, "control.sock", "odometry.sock"]
         )
         (announced,) = (tmp_path / "xethru").glob("*.json")
         assert json.loads(announced.read_text())["pid"] == served.process.pid
@@ -110,7 +110,7 @@ def test_a_killed_emulator_is_succeeded_by_the_next(tmp_path: Path) -> None:
     arguments = ("serve", "smoke", "--link-dir", links)
     with emulator(*arguments, environment=environment(tmp_path)) as first:
         first.end(signal.SIGKILL)
-    assert len(list(links.iterdir())) == 5, "a killed process cleans nothing up"
+    assert len(list(links.iterdir())) == 6, "a killed process cleans nothing up"
     with emulator(*arguments, environment=environment(tmp_path)) as second:
         for path in second.paths:
             with X4M300.open(path) as driver:

@@ -1,0 +1,254 @@
+"""Live control of a running emulator: one JSON object per line asks, one per line answers.
+
+| verb | keys | does |
+|---|---|---|
+| state | | what every radar does: port, faults, playback |
+| fault add | fault, radar | arms a fault, written as in a scenario file |
+| fault list | radar | armed faults, and how often each was injected |
+| fault clear | id, radar | disarms one, or all |
+| unplug | radar, seconds | takes the port away, for good or for a while |
+| plug | radar | gives it back; the module starts anew |
+| reset | radar | restarts the module, as by its watchdog |
+| pause, resume | radar | of a playback |
+| rate | value, radar | multiple of real time; 0: as fast as the port takes it |
+| seek | seconds, radar | time of the recording |
+| loop | value, radar | true or false |
+| filter | kinds, radar | which kinds of messages are played; null: all |
+
+Without ``radar`` all are meant. The answer is ``{"ok":true,...}``, or
+``{"ok":false,"error":"..."}`` with the remedy. No I/O here.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from emulator.faults.faulty_device import FaultyDevice
+from emulator.faults.plan import FaultPlanError, parse_fault
+from emulator.playback_control import kinds
+from emulator.player import PlayStream
+
+__all__ = ["VERBS", "Control"]
+
+NS_PER_S = 1_000_000_000
+_LONGEST_S = 86_400.0 * 365
+_KEYS = ("verb", "radar", "fault", "id", "seconds", "value", "kinds")
+
+
+class _RefusedError(Exception):
+    """What was asked cannot be done; the message is the answer."""
+
+
+class Control:
+    """Carries out what is asked.
+
+    Parameters
+    ----------
+    devices
+        The radars by name.
+    players
+        Playbacks by the names of their radars.
+    """
+
+    def __init__(
+        self,
+        devices: Mapping[str, FaultyDevice],
+        players: Mapping[str, PlayStream] | None = None,
+    ) -> None:
+        self._devices = devices
+        self._players = {} if players is None else players
+
+    def answer(self, line: bytes, now_ns: int) -> bytes:
+        """Return the answer to a line, with its line end; never raises."""
+        try:
+            said = {"ok": True, **self._carry_out(line, now_ns)}
+        except (_RefusedError, FaultPlanError, ValueError) as error:
+            said = {"ok": False, "error": " ".join(str(error).split())}
+        return json.dumps(said, separators=(",", ":")).encode() + b"\n"
+
+    def _carry_out(self, line: bytes, now_ns: int) -> dict[str, Any]:
+        try:
+            asked = json.loads(line)
+        except (ValueError, RecursionError):
+            raise _RefusedError("a line must be one JSON object") from None
+        if not isinstance(asked, dict):
+            raise _RefusedError("a line must be one JSON object")
+        for key in asked:
+            if key not in _KEYS:
+                raise _RefusedError(f"{key}: unknown key; allowed are {', '.join(_KEYS)}")
+        verb = VERBS.get(str(asked.get("verb")))
+        if verb is None:
+            raise _RefusedError(f"verb: must be one of {', '.join(VERBS)}")
+        return verb(self, asked, now_ns)
+
+    def _named(self, asked: Mapping[str, Any]) -> list[FaultyDevice]:
+        name = asked.get("radar")
+        if name is None:
+            return list(self._devices.values())
+        if not isinstance(name, str) or name not in self._devices:
+            raise _RefusedError(f"radar: must be one of {', '.join(self._devices)}")
+        return [self._devices[name]]
+
+    def _played(self, asked: Mapping[str, Any]) -> list[PlayStream]:
+        names = [device.name for device in self._named(asked)]
+        players = [self._players[name] for name in names if name in self._players]
+        if not players:
+            raise _RefusedError("nothing is played here; this verb is for `xethru-emulator play`")
+        return players
+
+    # --- verbs ----------------------------------------------------------------------------------
+
+    def _state(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        return {
+            "t_ns": now_ns,
+            "radars": {
+                device.name: {
+                    "present": device.port_present(now_ns),
+                    "faults": _faults(device),
+                    "injected": device.injected_by_kind,
+                    "playback": self._playback(device.name, now_ns),
+                }
+                for device in self._named(asked)
+            },
+        }
+
+    def _playback(self, name: str, now_ns: int) -> dict[str, Any] | None:
+        player = self._players.get(name)
+        if player is None:
+            return None
+        state = player.state(now_ns)
+        return {
+            "playing": state.playing,
+            "paused": state.paused,
+            "position_s": state.position_ns / NS_PER_S,
+            "rate": state.rate,
+            "loop": state.loop,
+            "kinds": None if state.kinds is None else sorted(state.kinds),
+        }
+
+    def _fault_add(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        del now_ns
+        spec = parse_fault(asked.get("fault"))
+        chosen = [
+            device for device in self._named(asked) if not spec.radar or device.name in spec.radar
+        ]
+        if not chosen:
+            raise _RefusedError(f"fault.radar: must be some of {', '.join(self._devices)}")
+        return {"ids": {device.name: device.add(spec) for device in chosen}}
+
+    def _fault_list(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        del now_ns
+        return {"faults": {device.name: _faults(device) for device in self._named(asked)}}
+
+    def _fault_clear(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        del now_ns
+        number = asked.get("id")
+        if number is not None and (not isinstance(number, int) or isinstance(number, bool)):
+            raise _RefusedError("id: must be the number that `fault add` gave")
+        cleared = sum(device.clear(number) for device in self._named(asked))
+        if number is not None and not cleared:
+            raise _RefusedError(f"id: no armed fault has number {number}")
+        return {"cleared": cleared}
+
+    def _unplug(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        seconds = None if asked.get("seconds") is None else _number(asked, "seconds", _LONGEST_S)
+        for device in self._named(asked):
+            device.unplug(now_ns, None if seconds is None else round(seconds * NS_PER_S))
+        return {}
+
+    def _plug(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        for device in self._named(asked):
+            device.plug(now_ns)
+        return {}
+
+    def _reset(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        for device in self._named(asked):
+            device.restart(now_ns)
+        return {}
+
+    def _pause(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        for player in self._played(asked):
+            player.pause(now_ns)
+        return {}
+
+    def _resume(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        for player in self._played(asked):
+            player.resume(now_ns)
+        return {}
+
+    def _rate(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        rate = _number(asked, "value", 1e9)
+        for player in self._played(asked):
+            player.set_rate(rate, now_ns)
+        return {}
+
+    def _seek(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        position_ns = round(_number(asked, "seconds", _LONGEST_S) * NS_PER_S)
+        for player in self._played(asked):
+            player.seek(position_ns, now_ns)
+        return {}
+
+    def _loop(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        value = asked.get("value")
+        if not isinstance(value, bool):
+            raise _RefusedError("value: must be true or false")
+        for player in self._played(asked):
+            player.set_loop(value, now_ns)
+        return {}
+
+    def _filter(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        names = asked.get("kinds")
+        if names is not None and not (
+            isinstance(names, list) and all(isinstance(name, str) for name in names)
+        ):
+            raise _RefusedError("kinds: must be a list of names, or null for all")
+        chosen = None if names is None else kinds(names)
+        for player in self._played(asked):
+            player.set_filter(chosen, now_ns)
+        return {}
+
+
+VERBS: dict[str, Callable[[Control, Mapping[str, Any], int], dict[str, Any]]] = {
+    "state": Control._state,
+    "fault add": Control._fault_add,
+    "fault list": Control._fault_list,
+    "fault clear": Control._fault_clear,
+    "unplug": Control._unplug,
+    "plug": Control._plug,
+    "reset": Control._reset,
+    "pause": Control._pause,
+    "resume": Control._resume,
+    "rate": Control._rate,
+    "seek": Control._seek,
+    "loop": Control._loop,
+    "filter": Control._filter,
+}
+"""What each verb does."""
+
+
+def _faults(device: FaultyDevice) -> list[dict[str, Any]]:
+    return [
+        {
+            "id": armed.number,
+            "kind": armed.kind.name,
+            "parameters": armed.parameters.model_dump(),
+            "injected": armed.firings,
+            "count": armed.spec.count,
+        }
+        for armed in device.armed
+    ]
+
+
+def _number(asked: Mapping[str, Any], key: str, most: float) -> float:
+    value = asked.get(key)
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | float)
+        or not math.isfinite(value)
+        or not 0 <= value <= most
+    ):
+        raise _RefusedError(f"{key}: must be a number from 0 to {most:g}")
+    return float(value)
