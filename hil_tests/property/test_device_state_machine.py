@@ -164,5 +164,5 @@ class DeviceMachine(RuleBasedStateMachine):
             self.expect(m.OutputGetControl(feature=feature), verdict, m.ReplyInt(values=(bits,)))
 
 
-DeviceMachine.TestCase.settings = hypothesis_settings(max_examples=40, stateful_step_count=40)
+DeviceMachine.TestCase.settings = hypothesis_settings(max_examples=25, stateful_step_count=40)
 TestDeviceMachine = DeviceMachine.TestCase
