@@ -1,0 +1,37 @@
+"""Cost of one frame of a running profile: synthesis, matrices, noise map and detection."""
+
+from __future__ import annotations
+
+import pytest
+from pytest_benchmark.fixture import BenchmarkFixture
+
+from hil_tests.unit.emulator.profiles.doubles import SECOND, profile, room, standing
+from xethru_protocol.codes import OutputFeature
+
+FRAMES = 340
+OUTPUTS = {
+    "presence": {int(OutputFeature.PRESENCE_SINGLE): 1},
+    "baseband": {int(OutputFeature.BASEBAND_IQ): 1},
+    "matrices": {int(OutputFeature.PULSEDOPPLER_BYTE): 3, int(OutputFeature.NOISEMAP_BYTE): 3},
+}
+
+
+@pytest.mark.parametrize("name", sorted(OUTPUTS))
+def test_profile_frames(benchmark: BenchmarkFixture, name: str) -> None:
+    """One module in RUN over its whole zone, one person in the room."""
+    stream, _ = profile(room(standing(3.0)), outputs=OUTPUTS[name])
+    stream.skip_due_before(25 * SECOND)
+    due_ns = stream.next_due_ns()
+    assert due_ns is not None
+    ends = iter(range(due_ns, due_ns + 10**15, 20 * SECOND))
+
+    def twenty_seconds() -> None:
+        end_ns = next(ends)
+        while (due_ns := stream.next_due_ns()) is not None and due_ns < end_ns:
+            stream.take()
+
+    benchmark.pedantic(twenty_seconds, rounds=10, warmup_rounds=2)  # type: ignore[no-untyped-call]
+    if benchmark.stats is not None:  # absent under --benchmark-disable
+        median_s = benchmark.stats.stats.median
+        benchmark.extra_info["us_per_frame"] = median_s * 1e6 / FRAMES
+        benchmark.extra_info["core_percent"] = median_s / 20 * 100
