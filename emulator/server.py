@@ -19,6 +19,8 @@ __all__ = ["ByteDevice", "ByteLink", "Port", "Server", "Service"]
 
 NS_PER_S = 1_000_000_000
 PACKETS_PER_TURN = 8
+LONGEST_WAIT_S = 86400.0
+"""The system waits no longer than 24 days; a playback at a small rate may ask for years."""
 
 
 class ByteDevice(Protocol):
@@ -240,7 +242,7 @@ class Server:
             self._busy |= port.send(now_ns)
             self._watch(port)
 
-    def _wait_s(self, longest_wait_s: float | None) -> float | None:
+    def _wait_s(self, longest_wait_s: float | None) -> float:
         if self._busy:
             return 0.0
         now_ns = self._clock_ns()
@@ -249,7 +251,7 @@ class Server:
         waits_s = [max(wake_ns - now_ns, 0) / NS_PER_S for wake_ns in wakes if wake_ns is not None]
         if longest_wait_s is not None:
             waits_s.append(longest_wait_s)
-        return min(waits_s, default=None)
+        return min([*waits_s, LONGEST_WAIT_S])
 
     def _watch(self, port: Port) -> None:
         """Keep the selector's interest in a port up to date, at one system call per change."""

@@ -325,3 +325,26 @@ def test_a_turn_sends_a_bounded_share() -> None:
     device = Endless()
     assert Port(Bottomless(), device).send(0)
     assert device.sent == PACKETS_PER_TURN
+
+
+def test_a_deadline_beyond_what_the_system_waits_for_is_no_error() -> None:
+    class Distant:
+        wants_data = True
+
+        def receive_data(self, data: bytes, now_ns: int) -> None: ...
+
+        def advance(self, now_ns: int) -> None: ...
+
+        def next_packet(self, now_ns: int) -> bytes | None:
+            return None
+
+        def wake_ns(self, now_ns: int) -> int | None:
+            return 10**24
+
+    link = PairLink()
+    server = Server([Port(link, Distant())], clock_ns=lambda: 0)
+    server.stop()  # its wait ends at once, if it begins
+    server.turn()
+    server.turn(longest_wait_s=0)
+    server.close()
+    link.close()
