@@ -32,6 +32,10 @@ class PairLine:
         except BlockingIOError:
             return 0
 
+    def host_fileno(self) -> int:
+        """Return the host's descriptor."""
+        return self._host_end.fileno()
+
     def host_read(self) -> bytes:
         """Return what the module wrote; ``b""`` when there is nothing."""
         with contextlib.suppress(BlockingIOError):

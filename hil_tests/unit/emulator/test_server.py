@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -21,6 +20,7 @@ from emulator.device import Device
 from emulator.link import PtyLink
 from emulator.pace import Pace
 from emulator.server import PACKETS_PER_TURN, Port, Server
+from hil_tests.bench.pair_line import PairLine
 from hil_tests.unit.emulator.doubles import ramp_device
 from xethru_protocol import messages as m
 from xethru_protocol.codes import SensorMode, X4Setting
@@ -40,33 +40,11 @@ LIMIT_S = 60
 """Only ends a test that has failed anyway."""
 
 
-class PairLink:
+class PairLink(PairLine):
     """A line without a terminal, which holds a few packets."""
 
-    def __init__(self) -> None:
-        self._end, self._host_end = socket.socketpair()
-        for end in (self._end, self._host_end):
-            end.setblocking(False)
-            end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 16384)
-
-    def fileno(self) -> int:
-        return self._end.fileno()
-
-    def read(self) -> bytes:
-        return self._end.recv(4096)
-
-    def write(self, data: memoryview) -> int:
-        try:
-            return self._end.send(data)
-        except BlockingIOError:
-            return 0
-
     def host_fd(self) -> int:
-        return os.dup(self._host_end.fileno())
-
-    def close(self) -> None:
-        self._end.close()
-        self._host_end.close()
+        return os.dup(self.host_fileno())
 
 
 class TerminalLink(PtyLink):
