@@ -284,9 +284,8 @@ def radar_device(
     chip = Chip(source, largest_block, block_phase)
     module = Module(identity, chip, options, memory)
     timing = {"scene_time_zero_ns": scene_time_zero_ns, "skew_ns": skew_ns}
-    stream = CombinedStream(
-        ChipStream(module, pace=pace, **timing),
-        ProfileStream(module, source, pace=pace, largest_block=REALTIME_BLOCK, **timing),
-    )
+    profile = ProfileStream(module, source, pace=pace, largest_block=REALTIME_BLOCK, **timing)
+    module.noise_maps = profile.noise_map_files
+    stream = CombinedStream(ChipStream(module, pace=pace, **timing), profile)
     outbox = LosslessOutbox() if pace is Pace.ASAP else FirmwareOutbox()
     return Device(module, stream, outbox, boot=boot or BootTiming())

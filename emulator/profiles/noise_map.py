@@ -11,6 +11,7 @@ Source: protocol reference 4.6.
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass
 from enum import Enum, auto
 
@@ -35,6 +36,8 @@ CREATION_TICKS = 100
 """Matrices that are averaged for a new map, one per tick of 0.997 s."""
 ADAPTATION = 1 / 600
 """Share of the newest matrix in the adapting map, per tick."""
+
+_FILE_HEADER = struct.Struct("<ffII")
 
 Powers = dict[MatrixInstance, NDArray[np.float64]]
 
@@ -117,6 +120,20 @@ class StoredMap:
     zone_m: tuple[float, float]
     tx_center_frequency: int
     noise_map: NoiseMap
+
+    def files(self) -> tuple[bytes, bytes]:
+        """Return the content of the two files, slow and fast.
+
+        Each is zone start and end (f32), band and frequencies (u32), then power (f32) by range;
+        little-endian. The layout is ours.
+        """
+        header = (*self.zone_m, self.tx_center_frequency)
+        slow, fast = (
+            _FILE_HEADER.pack(*header, matrix.pulses)
+            + self.noise_map.power[matrix.instance].astype("<f4").tobytes()
+            for matrix in MATRICES
+        )
+        return slow, fast
 
 
 def default_noise_map(n_bins: int, tx_center_frequency: int) -> NoiseMap:

@@ -155,6 +155,11 @@ class ProfileStream:
     def port_closed(self, now_ns: int) -> None:
         """Change nothing: the profile runs on."""
 
+    def noise_map_files(self) -> tuple[bytes, bytes]:
+        """Return what the slow and the fast noise map's files would hold now; empty without map."""
+        current = self._current_map()
+        return (b"", b"") if current is None else current.files()
+
     def _go_on(self, now_ns: int) -> None:
         run = self._run
         if run is None:
@@ -213,11 +218,14 @@ class ProfileStream:
             self._store_map()
 
     def _store_map(self) -> None:
+        self.stored_map = self._current_map() or self.stored_map
+
+    def _current_map(self) -> StoredMap | None:
         run = self._run
         if run is None or not run.processing.noise_map.complete:
-            return
+            return None
         settings = self._module.profile
-        self.stored_map = StoredMap(
+        return StoredMap(
             zone_m=settings.zone_m,
             tx_center_frequency=settings.tx_center_frequency,
             noise_map=run.processing.noise_map.copy(),

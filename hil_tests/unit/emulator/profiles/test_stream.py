@@ -173,6 +173,22 @@ def test_a_created_map_is_stored_and_used_again() -> None:
     assert set(states) == {PresenceState.INITIALIZING}
 
 
+def test_the_files_of_a_map_hold_its_powers() -> None:
+    """Zone, band and frequencies in front, then a float32 per range and frequency."""
+    stream, _ = profile(room(), noise_map_control=6, outputs={OutputFeature.NOISEMAP_FLOAT: 2})
+    fast_rows = [message for _, message in heard_until(stream, round(20.9 * SECOND))]
+    first = fast_rows[0]
+    assert isinstance(first, m.NoiseMapFloat)
+    slow, fast = stream.noise_map_files()
+    assert (len(slow), len(fast)) == (16 + 4 * 179 * 85, 16 + 4 * 179 * 34)
+    assert np.frombuffer(fast[:8], "<f4") == pytest.approx([0.18 + 4 * BIN_M, 0.18 + 180 * BIN_M])
+    assert np.frombuffer(fast[8:16], "<u4").tolist() == [3, 34]
+    powers = np.frombuffer(fast[16:], "<f4").reshape(179, 34)
+    assert powers[0] == pytest.approx(first.power, rel=0.05)
+    empty, _ = profile(room(), noise_map_control=7)
+    assert empty.noise_map_files() == (b"", b"")
+
+
 def test_another_zone_does_not_use_the_stored_map() -> None:
     stream, module = profile(room(), noise_map_control=3)
     presence_until(stream, 125)
