@@ -83,7 +83,7 @@ def _run(arguments: argparse.Namespace, stop: Stop) -> int:
         return cli_faults.run(arguments)
     # heavy imports only now: --help and usage errors answer at once
     from emulator.playback import PlayOptions
-    from emulator.serving import CannotServeError, play, serve
+    from emulator.serving import CannotServeError, play, proxy, serve
 
     if stop.requested:
         return 0
@@ -102,6 +102,16 @@ def _run(arguments: argparse.Namespace, stop: Stop) -> int:
                 folder,
                 warn=_warn,
                 stop=stop,
+            )
+        elif arguments.command == "proxy":
+            proxy(
+                arguments.port,
+                arguments.baud,
+                folder,
+                stop,
+                faults=arguments.faults,
+                truth=arguments.truth,
+                wire=arguments.wire,
             )
         else:
             scene = arguments.count if arguments.bare else arguments.scene
@@ -261,6 +271,8 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     _add_link_dir(play)
 
+    proxy = cli_faults.add_proxy(commands)
+    _add_link_dir(proxy)
     cli_faults.add_commands(commands)
     arguments = parser.parse_args(argv)
     if arguments.command == "serve":

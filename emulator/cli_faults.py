@@ -13,11 +13,15 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from emulator.faults.kind import Kind
 
-__all__ = ["COMMANDS", "add_commands", "run"]
+__all__ = ["COMMANDS", "add_commands", "add_proxy", "run"]
 
 COMMANDS = ("faults", "ctl")
 TIMEOUT_S = 10.0
 
+_PROXY_HELP = (
+    "A pseudo-terminal that leads to a real module: the same ready line as serve, the same faults. "
+    "While no fault is armed no byte is changed. Ends with exit 1 when the module's port vanishes."
+)
 _CTL_HELP = """\
 Controls a running emulator: SOCKET is the "control" of its ready line, or one of its ports.
 
@@ -51,6 +55,32 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     ctl.add_argument("words", nargs="+", metavar="VERB", help="what to do, see above")
     ctl.add_argument("--radar", metavar="NAME", help="which radar; all if left out")
     ctl.set_defaults(usage_error=ctl.error)
+
+
+def add_proxy(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser],
+) -> argparse.ArgumentParser:
+    """Add the sub-command ``proxy``, and return its parser."""
+    proxy = commands.add_parser(
+        "proxy", help="put faults on the line of a real module", description=_PROXY_HELP
+    )
+    proxy.add_argument("--port", type=Path, required=True, metavar="P", help="port of the module")
+    proxy.add_argument(
+        "--baud", type=int, default=115_200, metavar="B", help="of a UART (default 115200)"
+    )
+    proxy.add_argument(
+        "--faults", metavar="FILE", help="fault scenario: a .toml file, or a shipped one by name"
+    )
+    proxy.add_argument(
+        "--truth", type=Path, metavar="FILE", help="gets a JSON line for every injected fault"
+    )
+    proxy.add_argument(
+        "--wire",
+        type=Path,
+        metavar="FILE",
+        help="new .xtwire file: all that passes the module's port",
+    )
+    return proxy
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -27,18 +27,21 @@ from emulator.pace import Pace
 from emulator.path_lock import PathInUseError, locked
 from emulator.playback import PlayOptions, RecordingError, played_radars
 from emulator.port_watch import PortWatch
+from emulator.proxy import ModuleLine, open_module
 from emulator.run_directory import Announcement, fresh_port_folder
 from emulator.saved_state import Memory
 from emulator.scene import Scene, SceneError, UnknownSceneError, empty_room, load_scene
 from emulator.server import Server, Service
 from emulator.stopping import Stop
+from xethru_protocol.recordings.wire_capture import Way, WireCapture
 
-__all__ = ["CannotServeError", "play", "serve"]
+__all__ = ["CannotServeError", "play", "proxy", "serve"]
 
 NS_PER_MS = 1_000_000
 LONGEST_SOCKET_PATH = 100  # bytes; Linux takes 107, macOS 103
 SOCKET_NAME = "odometry.sock"
 CONTROL_NAME = "control.sock"
+PROXY_NAME = "proxy"
 
 
 class CannotServeError(Exception):
@@ -182,6 +185,72 @@ def play(
             cleanup.callback(watch.close)
         ready = _ready_line(ports, time.monotonic_ns(), None)
         _run(ports, watches, ready, stop, cleanup)
+
+
+def proxy(
+    port: Path,
+    baud: int,
+    link_dir: Path | None,
+    stop: Stop,
+    *,
+    faults: Path | str | None,
+    truth: Path | None,
+    wire: Path | None,
+) -> None:
+    """Put faults on the line of a real module until a signal asks for the end.
+
+    Parameters
+    ----------
+    port
+        Of the module.
+    baud
+        Of a UART; USB has none.
+    link_dir, stop, faults, truth
+        As for `serve`.
+    wire
+        New file for a capture of what passes the module's port; None: none.
+
+    Raises
+    ------
+    CannotServeError
+        When the module's port, the scenario or our own port cannot be had, or the module vanishes.
+    """
+    lost = False
+
+    def gone() -> None:
+        nonlocal lost
+        lost = True
+        stop.request(0, None)
+
+    with contextlib.ExitStack() as cleanup:
+        try:
+            capture = None
+            if wire is not None:
+                capture = cleanup.enter_context(WireCapture(wire, {"port": os.fspath(port)}))
+
+            def tap(direction: Way, data: bytes) -> None:
+                if capture is not None:
+                    capture.write(direction, data, time.time_ns())
+
+            zero_ns = time.monotonic_ns()
+            plan = None if faults is None else load_plan(faults)
+            bench = FaultBench(plan, truth, cleanup, zero_ns=zero_ns)
+            module = ModuleLine(open_module(port, baud), tap, gone)
+            cleanup.callback(module.close)
+            faulty = bench.wrap(module, PROXY_NAME)
+            bench.check_names()
+            folder = cleanup.enter_context(_link_folder(link_dir))
+            control = bench.control(_socket_path(folder, cleanup, CONTROL_NAME))
+            named = NamedDevice(
+                name=PROXY_NAME, serial="", device=faulty, present=faulty.port_present
+            )
+            ports = open_ports([named], folder, LinkOptions(), cleanup)
+        except (RecordingError, LinkError, FaultPlanError) as error:
+            raise CannotServeError(str(error)) from error
+        ready = _ready_line(ports, zero_ns, None, control.path)
+        _run(ports, [module, control], ready, stop, cleanup)
+    if lost:
+        raise CannotServeError(f"{port}: the module's port vanished")
 
 
 def _device_options(links: LinkOptions) -> DeviceOptions:

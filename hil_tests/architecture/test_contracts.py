@@ -52,6 +52,7 @@ INPUT_AND_OUTPUT = {
         "playback",
         "plug",
         "port_watch",
+        "proxy",
         "run_directory",
         "scene",
         "server",
