@@ -58,6 +58,7 @@ INPUT_AND_OUTPUT = {
         "server",
         "serving",
         "shared_device",
+        "state_store",
         "stop",
         "tcp_link",
     },
