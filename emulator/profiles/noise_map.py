@@ -135,6 +135,32 @@ class StoredMap:
         )
         return slow, fast
 
+    @classmethod
+    def of_files(cls, files: tuple[bytes, bytes]) -> StoredMap | None:
+        """Return the map in the two files; None if they hold none, or two of different runs."""
+        power: Powers = {}
+        headers = set()
+        for matrix, data in zip(MATRICES, files, strict=True):
+            if len(data) <= _FILE_HEADER.size:
+                return None
+            start_m, end_m, band, frequencies = _FILE_HEADER.unpack_from(data)
+            rows = len(data) - _FILE_HEADER.size
+            if frequencies != matrix.pulses or rows % (4 * matrix.pulses):
+                return None
+            values = np.frombuffer(data, dtype="<f4", offset=_FILE_HEADER.size)
+            power[matrix.instance] = values.astype(np.float64).reshape(-1, matrix.pulses)
+            headers.add((start_m, end_m, band, rows // (4 * matrix.pulses)))
+        if len(headers) != 1 or not all(np.isfinite(one).all() for one in power.values()):
+            return None
+        ((start_m, end_m, band, _),) = headers
+        return cls(zone_m=(start_m, end_m), tx_center_frequency=band, noise_map=NoiseMap(power))
+
+    def fits(self, zone_m: tuple[float, float], tx_center_frequency: int, n_bins: int) -> bool:
+        """Whether it was made in this zone and band."""
+        bins = {len(power) for power in self.noise_map.power.values()}
+        same_zone = np.allclose(self.zone_m, zone_m, atol=1e-5)
+        return same_zone and self.tx_center_frequency == tx_center_frequency and bins == {n_bins}
+
 
 def default_noise_map(n_bins: int, tx_center_frequency: int) -> NoiseMap:
     """Return the map of nominal receiver noise: white, equal in all bins."""

@@ -14,9 +14,11 @@ Source: protocol reference 4.6, 8.1 to 8.3.
 
 from __future__ import annotations
 
+import contextlib
 from typing import Protocol
 
 from emulator.echo_source import EchoSource
+from emulator.filesystem import FileSystem
 from emulator.modes import ModeMachine
 from emulator.options import DeviceOptions
 from emulator.pace import Pace
@@ -31,10 +33,13 @@ from emulator.profiles.noise_map import (
 from emulator.profiles.presence import PresenceProcessing
 from emulator.profiles.run import ProfileRun
 from emulator.profiles.sweep import ProfileSweep
-from xethru_protocol.codes import NoiseMapControl, SensorMode
-from xethru_protocol.messages import Command, DeleteNoiseMap, Response, StoreNoiseMap
+from emulator.refusal import Refusal
+from xethru_protocol.codes import FileType, NoiseMapControl, SensorMode
+from xethru_protocol.messages import Command, Response
 
 __all__ = ["ProfileHost", "ProfileStream"]
+
+_FILES = ((int(FileType.NOISEMAP_SLOW), 0), (int(FileType.NOISEMAP_FAST), 0))
 
 
 class ProfileHost(Protocol):
@@ -55,6 +60,15 @@ class ProfileHost(Protocol):
         """How open questions are answered."""
         ...
 
+    @property
+    def files(self) -> FileSystem:
+        """Where noise maps are kept over restarts."""
+        ...
+
+    def save(self) -> None:
+        """Keep what the flash holds."""
+        ...
+
 
 class ProfileStream:
     """Messages of a module in RUN.
@@ -73,11 +87,6 @@ class ProfileStream:
         How much later than nominal this radar samples, ns.
     largest_block
         Most frames synthesised at once.
-
-    Attributes
-    ----------
-    stored_map
-        The noise map kept over restarts, if there is one.
     """
 
     def __init__(
@@ -99,7 +108,7 @@ class ProfileStream:
         self._run: ProfileRun | None = None
         self._paused = False
         self._was_silent = False
-        self.stored_map: StoredMap | None = None
+        self._creating = False
         self.restarted(scene_time_zero_ns)
 
     @property
@@ -138,10 +147,7 @@ class ProfileStream:
             self._paused = True
         else:
             self._run = None
-        if isinstance(command, StoreNoiseMap):
-            self._store_map()
-        elif isinstance(command, DeleteNoiseMap):
-            self.stored_map = None
+        del command  # the mode says all
 
     def restarted(self, ready_ns: int) -> None:
         """Begin anew at a time, if the module is in RUN then."""
@@ -193,32 +199,44 @@ class ProfileStream:
             zero_ns=zero_ns,
             sampling_hz=self._module.options.baseband_sampling_hz,
         )
+        self._creating = not self._run.processing.noise_map.complete
         self._paused = False
         self._was_silent = self._run.silent
 
     def _first_map(self, sweep: ProfileSweep) -> NoiseMap:
         settings = self._module.profile
-        stored = self.stored_map
-        valid = stored is not None and (stored.zone_m, stored.tx_center_frequency) == (
-            settings.zone_m,
-            settings.tx_center_frequency,
-        )
-        match map_source(settings.noise_map_control, stored=valid):
+        stored = self._stored_map(sweep)
+        match map_source(settings.noise_map_control, stored=stored is not None):
             case MapSource.STORED if stored is not None:
-                return stored.noise_map.copy()
+                return stored.noise_map
             case MapSource.DEFAULT:
                 return default_noise_map(sweep.n_bins, settings.tx_center_frequency)
         return NoiseMap()
 
+    def _stored_map(self, sweep: ProfileSweep) -> StoredMap | None:
+        """Return the map in the module's files, if there is one of this zone and band."""
+        slow, fast = (self._module.files.get(key) or b"" for key in _FILES)
+        stored = StoredMap.of_files((slow, fast))
+        zone_m = self._module.profile.zone_m
+        if stored is None or not stored.fits(zone_m, sweep.tx_center_frequency, sweep.n_bins):
+            return None
+        return stored
+
     def _keep_created_map(self) -> None:
         """Store a map that has just been created, if stored maps are in use."""
         control = self._module.profile.noise_map_control
-        uses_stored = not control & NoiseMapControl.IGNORE_STORED
-        if uses_stored and control & NoiseMapControl.NO_DEFAULT and self.stored_map is None:
-            self._store_map()
-
-    def _store_map(self) -> None:
-        self.stored_map = self._current_map() or self.stored_map
+        wanted = control & NoiseMapControl.NO_DEFAULT and not (
+            control & NoiseMapControl.IGNORE_STORED
+        )
+        current = self._current_map() if self._creating else None
+        if current is None:
+            return
+        self._creating = False
+        if wanted:
+            with contextlib.suppress(Refusal):  # no room: the next start creates one again
+                for key, data in zip(_FILES, current.files(), strict=True):
+                    self._module.files.replace(key, data)
+            self._module.save()
 
     def _current_map(self) -> StoredMap | None:
         run = self._run

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, cast
 
 from emulator.echo import SceneEcho
+from emulator.filesystem import FileSystem
 from emulator.modes import ModeMachine
 from emulator.options import DeviceOptions
 from emulator.pace import Pace
@@ -32,6 +33,11 @@ class FakeModule:
     profile: ProfileSettings
     fake_modes: FakeModes = field(default_factory=FakeModes)
     options: DeviceOptions = field(default_factory=DeviceOptions)
+    files: FileSystem = field(default_factory=lambda: FileSystem(0x48000))
+    saves: int = 0
+
+    def save(self) -> None:
+        self.saves += 1
 
     @property
     def modes(self) -> ModeMachine:

@@ -160,17 +160,27 @@ def test_hours_of_silence_cost_little_and_end_in_the_right_state(control: int) -
 
 
 def test_a_created_map_is_stored_and_used_again() -> None:
-    """Protocol reference 4.6, control 3; and deleted by 4.4."""
-    stream, _ = profile(room(), noise_map_control=3)
+    """Protocol reference 4.6, control 3; deleting its files deletes it."""
+    stream, module = profile(room(), noise_map_control=3)
     presence_until(stream, 125)
-    assert stream.stored_map is not None
+    assert (len(module.files.names()), module.saves) == (2, 1)
     stream.restarted(200 * SECOND)
     states = [one.state for time_s, one in presence_until(stream, 225) if time_s > 220.5]
     assert set(states) == {PresenceState.NO_PRESENCE}
-    stream.command_done(m.DeleteNoiseMap(), 226 * SECOND)
+    for key in module.files.names():
+        module.files.delete(key)
     stream.restarted(300 * SECOND)
     states = [one.state for _, one in presence_until(stream, 325)]
     assert set(states) == {PresenceState.INITIALIZING}
+
+
+@pytest.mark.parametrize("damage", [b"", b"x" * 64, b"\x00" * 100])
+def test_a_damaged_map_is_created_anew(damage: bytes) -> None:
+    stream, module = profile(room(), noise_map_control=3)
+    presence_until(stream, 125)
+    module.files.replace(module.files.names()[0], damage)
+    stream.restarted(200 * SECOND)
+    assert {one.state for _, one in presence_until(stream, 225)} == {PresenceState.INITIALIZING}
 
 
 def test_the_files_of_a_map_hold_its_powers() -> None:
