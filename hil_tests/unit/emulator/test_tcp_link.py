@@ -195,6 +195,19 @@ def test_a_thousand_clients_leak_nothing(bench: Bench) -> None:
     assert bench.tcp().ask(m.Ping()) == PONG
 
 
+def test_after_the_last_host_the_loop_rests(bench: Bench) -> None:
+    for index in range(20):
+        for host in (bench.pty(index % 2), bench.tcp(index % 2)):
+            os.write(host.fd, bytes(range(256)))
+            bench.turns(2)
+            host.close()
+    bench.turns(20)
+    begin_s = time.monotonic()
+    for _ in range(5):  # a loop that spins does millions
+        bench.server.turn(longest_wait_s=0.1)
+    assert time.monotonic() - begin_s > 0.2
+
+
 def test_a_port_that_is_taken_is_one_clear_line(bench: Bench, tmp_path: Path) -> None:
     taken = bench.opened.entries()[0]["tcp"]
     assert isinstance(taken, int)
