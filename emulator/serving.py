@@ -166,10 +166,15 @@ def play(
                 warn=warn,
             )
             folder = cleanup.enter_context(_link_folder(link_dir))
+            bench = FaultBench(None, None, cleanup, zero_ns=time.monotonic_ns())
             devices = [
-                NamedDevice(name=radar.name, serial=radar.serial, device=radar.device)
-                for radar in radars
+                NamedDevice(
+                    name=one.name, serial=one.serial, device=bench.wrap(one.device, one.name)
+                )
+                for one in radars
             ]
+            players = {radar.name: radar.stream for radar in radars}
+            control = bench.control(_socket_path(folder, cleanup, CONTROL_NAME), players)
             ports = open_ports(devices, folder, LinkOptions(), cleanup)
         except (RecordingError, LinkError) as error:
             raise CannotServeError(str(error)) from error
@@ -183,8 +188,8 @@ def play(
         ]
         for watch in watches:
             cleanup.callback(watch.close)
-        ready = _ready_line(ports, time.monotonic_ns(), None)
-        _run(ports, watches, ready, stop, cleanup)
+        ready = _ready_line(ports, time.monotonic_ns(), None, control.path)
+        _run(ports, [*watches, control], ready, stop, cleanup)
 
 
 def proxy(

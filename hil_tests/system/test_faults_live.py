@@ -74,3 +74,13 @@ def test_the_list_of_faults_is_json() -> None:
     listed = json.loads(result.stdout)
     assert len(listed) >= 40
     assert {"kind", "layer", "parameters", "counted", "hidden", "example"} <= set(listed[0])
+
+
+def test_a_playback_is_paused_and_goes_on() -> None:
+    recording = Path(__file__).parents[2] / "fixtures" / "recordings" / "float"
+    with emulator("play", str(recording)) as served:
+        for words, paused in ((("pause",), True), (("resume",), False)):
+            done = ctl(served.paths[0], *words)
+            assert done.returncode == 0, done.stderr
+            (told,) = json.loads(ctl(served.paths[0], "state").stdout)["radars"].values()
+            assert told["playback"]["paused"] is paused
