@@ -32,6 +32,7 @@ from xethru_protocol.connection import Connection, Role
 from xethru_protocol.messages import (
     Command,
     InjectFrame,
+    PresenceSingle,
     Response,
     SetFileData,
     SetParameterFile,
@@ -218,6 +219,8 @@ class Device:
         message = self._outbox.take(now_ns)
         if message is None:
             return None
+        if isinstance(message, PresenceSingle):
+            self._module.pins.follow(message.state, message.direction)
         packet = self._connection.send(message)
         # the firmware escapes into a buffer and loses what does not fit
         return packet[:NORMAL_BUFFER] if packet[0] == NORMAL_START else packet

@@ -13,7 +13,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from emulator.refusal import Refusal
-from xethru_protocol.codes import IoPin, IoPinError, IoPinFeature, IoPinSetup, PresenceState
+from xethru_protocol.codes import (
+    IoPin,
+    IoPinError,
+    IoPinFeature,
+    IoPinSetup,
+    PresenceDirection,
+    PresenceState,
+)
 
 __all__ = ["IoPins", "PinControl"]
 
@@ -75,6 +82,11 @@ class IoPins:
         """Disable all pins; what is wired to them stays."""
         self._controls: dict[int, PinControl] = {}
         self._values: dict[int, int] = {}
+
+    def follow(self, presence: int, direction: int) -> None:
+        """Let PRESENCE, NO_PRESENCE and MOVEMENT follow what a presence message says."""
+        self.presence = presence
+        self.movement = presence == PresenceState.PRESENCE and direction != PresenceDirection.STILL
 
     def set_control(self, pin: int, setup: int, feature: int) -> None:
         """Say what a pin does; pin 0 is all."""

@@ -21,7 +21,13 @@ from emulator.safe_mode import FaultCounter
 from emulator.saved_state import Memory, SavedState, VolatileMemory
 from emulator.serial_rate import DEFAULT_BAUDRATE
 from xethru_protocol import messages as m
-from xethru_protocol.codes import ErrorCode, FileType, TraceLevel
+from xethru_protocol.codes import (
+    ErrorCode,
+    FileType,
+    PresenceDirection,
+    PresenceState,
+    TraceLevel,
+)
 
 __all__ = ["CRASH_DUMP", "NOISE_MAPS", "Module", "Restart"]
 
@@ -214,6 +220,8 @@ class Module:
         if self.state is State.RUN:
             self._saved_profiles[self.modes.profile_id] = self.profile.copy()
             self._noise_map_stored_ns = self.now_ns
+        else:
+            self.pins.follow(PresenceState.UNKNOWN, PresenceDirection.STILL)
         self.save()
 
     def restore_factory_settings(self) -> None:

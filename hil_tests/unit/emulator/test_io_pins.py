@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from emulator.outbox import MessageKind
 from hil_tests.unit.emulator.doubles import BareHost, ramp_device
 from xethru_protocol import messages as m
 
@@ -94,3 +95,24 @@ def test_chosen_functions(host: BareHost) -> None:
     assert host.ask(m.IoPinGetControl(pin_id=3)) == m.ReplyInt(
         content_id=0x11, values=(OUTPUT, MOVEMENT)
     )
+
+
+def test_pins_follow_the_presence_messages_of_a_running_profile(host: BareHost) -> None:
+    """IO1 goes low when a message says presence; stopped, nothing is known."""
+
+    def say(state: int, direction: int) -> None:
+        message = m.PresenceSingle(
+            counter=1, state=state, distance_m=1.0, direction=direction, signal_quality=5
+        )
+        host.device._outbox.put(MessageKind.FRAME, message, 0)
+        assert message in host.hear(1)
+
+    assert control(host, 0, 0, DEFAULT) == m.Ack()
+    assert control(host, 3, OUTPUT, MOVEMENT) == m.Ack()
+    say(1, 2)
+    assert [level(host, pin) for pin in (1, 2, 3)] == [0, 1, 1]
+    say(0, 0)
+    assert [level(host, pin) for pin in (1, 2, 3)] == [1, 0, 0]
+    say(1, 0)
+    assert host.ask(m.SetMode(mode=0x13)) == m.Ack()
+    assert [level(host, pin) for pin in (1, 2, 3)] == [1, 1, 0]
