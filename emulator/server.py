@@ -122,10 +122,12 @@ class Port:
 
     def wake_ns(self, now_ns: int) -> int | None:
         """Return when time alone changes something; None if never."""
+        if self._line is None:
+            return self.device.wake_ns(now_ns)
         candidates = [self.device.wake_ns(now_ns)]
-        if self._line is not None and not self._blocked:
+        if not self._blocked:
             candidates.append(self._line.to_host_ns())
-        if self._line is not None and self.device.wants_data:
+        if self.device.wants_data:
             candidates.append(self._line.to_module_ns())
         return min((time_ns for time_ns in candidates if time_ns is not None), default=None)
 
@@ -197,6 +199,7 @@ class Server:
         self._stopped = False
         self._busy = True
         self._selector = selectors.DefaultSelector()
+        self._keys = self._selector.get_map()  # a view: services register and unregister, too
         self._wake_fd, self._waker_fd = os.pipe()
         os.set_blocking(self._wake_fd, False)
         os.set_blocking(self._waker_fd, False)
@@ -258,7 +261,7 @@ class Server:
         descriptor, events = port.link.fileno(), port.events
         if descriptor < 0:  # the host left while we wrote
             return
-        key = self._selector.get_map().get(descriptor)
+        key = self._keys.get(descriptor)
         known = 0 if key is None else key.events
         if events == known:
             return
