@@ -36,6 +36,8 @@ class ChipStream:
         self._pace = pace
         self._zero_ns = scene_time_zero_ns + skew_ns
         self._was_streaming = False
+        self._known = False  # the due time, until a frame, a command or a restart changes it
+        self._due_ns: int | None = None
 
     @property
     def streaming(self) -> bool:
@@ -45,6 +47,11 @@ class ChipStream:
 
     def next_due_ns(self) -> int | None:
         """Return when the next frame is due; 0, long past, under `Pace.ASAP`."""
+        if not self._known:
+            self._due_ns, self._known = self._next_due_ns(), True
+        return self._due_ns
+
+    def _next_due_ns(self) -> int | None:
         if not self.streaming:
             return None
         if self._pace is Pace.ASAP:
@@ -54,25 +61,30 @@ class ChipStream:
 
     def take(self) -> Response:
         """Return the next frame; its counter moves on."""
+        self._known = False
         frame = self._module.chip.next_frame()
         return DataFloat(info=frame.counter, values=frame.values)
 
     def skip_due_before(self, time_ns: int) -> int:
         """Let the counter run past every frame due before a time."""
-        if not self.streaming or self._pace is Pace.ASAP:
+        due_ns = self.next_due_ns()
+        if due_ns is None or due_ns >= time_ns or self._pace is Pace.ASAP:
             return 0
+        self._known = False
         return self._module.chip.timeline.skip_before(time_ns - self._zero_ns)
 
     def command_done(self, command: Command[Response], now_ns: int) -> None:
         """Begin with the first frame still ahead when a command started the stream."""
         del command  # any command may have started or stopped it
+        self._known = False
         streaming = self.streaming
         if streaming and not self._was_streaming:
             self.skip_due_before(now_ns)
         self._was_streaming = streaming
 
     def restarted(self, ready_ns: int) -> None:
-        """Change nothing: the chip is off until a host sets a rate again."""
+        """Look again: the chip is off until a host sets a rate again."""
+        self._known = False
 
     def port_opened(self, now_ns: int) -> None:
         """Change nothing: a radar does not know who listens."""

@@ -26,6 +26,7 @@ __all__ = [
     "PacketClass",
     "classify",
     "command_bytes",
+    "frame_counter",
     "frame_packet",
     "frame_parts",
     "normal_payload",
@@ -73,7 +74,7 @@ def classify(packet: bytes) -> PacketClass:
     <PacketClass.REPLY: 'reply'>
     """
     if packet.startswith(NO_ESCAPE_START):
-        return PacketClass.FRAME if frame_parts(packet) is not None else PacketClass.DATA
+        return PacketClass.FRAME if frame_counter(packet) is not None else PacketClass.DATA
     if len(packet) < 4 or packet[0] != START:
         return PacketClass.DATA
     code = packet[2] if packet[1] == ESCAPE else packet[1]
@@ -82,8 +83,8 @@ def classify(packet: bytes) -> PacketClass:
     return PacketClass.SYSTEM if code == ResponseCode.XTS_SPR_SYSTEM else PacketClass.DATA
 
 
-def frame_parts(packet: bytes) -> FrameParts | None:
-    """Return counter and samples of a radar frame; None for anything else."""
+def frame_counter(packet: bytes) -> int | None:
+    """Return the counter of a radar frame; None for anything else."""
     if len(packet) < _FRAME.size:
         return None
     magic, length, code, kind, content_id, counter, count = _FRAME.unpack_from(packet)
@@ -92,7 +93,13 @@ def frame_parts(packet: bytes) -> FrameParts | None:
         and (code, kind, content_id) == (ResponseCode.XTS_SPR_DATA, ElementType.XTS_SPRD_FLOAT, 0)
         and length == len(packet) - NO_ESCAPE_HEADER_BYTES == _PAYLOAD.size + 4 * count
     )
-    if not is_frame:
+    return counter if is_frame else None
+
+
+def frame_parts(packet: bytes) -> FrameParts | None:
+    """Return counter and samples of a radar frame; None for anything else."""
+    counter = frame_counter(packet)
+    if counter is None:
         return None
     return FrameParts(counter=counter, samples=np.frombuffer(packet, "<f4", offset=_FRAME.size))
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import deque
 from typing import NamedTuple
 
-from emulator.faults.packets import PacketClass, frame_parts, response_bytes
+from emulator.faults.packets import PacketClass, frame_counter, response_bytes
 from xethru_protocol.codec import decode_command
 from xethru_protocol.codes import SystemCode, X4Setting
 from xethru_protocol.errors import LocalProtocolError
@@ -120,11 +120,14 @@ class Watch:
     def sent(self, packet: bytes, packet_class: PacketClass) -> None:
         """Learn what the module sent."""
         if packet_class is PacketClass.FRAME:
-            parts = frame_parts(packet)
-            self.previous_frame, self.frame = self.frame, packet
-            self.counter = None if parts is None else parts.counter
+            self.frame_sent(packet, frame_counter(packet))
         elif self.is_booting(packet):
             self.restarted()
+
+    def frame_sent(self, packet: bytes, counter: int | None) -> None:
+        """Learn that the module sent a radar frame."""
+        self.previous_frame, self.frame = self.frame, packet
+        self.counter = counter
 
     def restarted(self) -> None:
         """Learn that the module forgot everything."""

@@ -23,15 +23,12 @@ class CombinedStream:
     def __init__(self, raw: ChipStream, profile: ProfileStream) -> None:
         self._raw = raw
         self._profile = profile
+        self._active = self._choice()
 
     @property
     def profile(self) -> ProfileStream:
         """The running profile, for inspection."""
         return self._profile
-
-    @property
-    def _active(self) -> ChipStream | ProfileStream:
-        return self._raw if self._raw.streaming else self._profile
 
     def next_due_ns(self) -> int | None:
         """Return when the next message is due; None while nothing streams."""
@@ -39,7 +36,9 @@ class CombinedStream:
 
     def take(self) -> Response:
         """Return the next message; there must be one."""
-        return self._active.take()
+        message = self._active.take()
+        self._active = self._choice()  # a transmitter that saw nothing for long is off now
+        return message
 
     def skip_due_before(self, time_ns: int) -> int:
         """Give up every message due before a time; return how many."""
@@ -49,14 +48,20 @@ class CombinedStream:
         """Let both see the command: it may have ended the one and begun the other."""
         self._raw.command_done(command, now_ns)
         self._profile.command_done(command, now_ns)
+        self._active = self._choice()
 
     def restarted(self, ready_ns: int) -> None:
         """Let both start anew."""
         self._raw.restarted(ready_ns)
         self._profile.restarted(ready_ns)
+        self._active = self._choice()
 
     def port_opened(self, now_ns: int) -> None:
         """Change nothing: a radar does not know who listens."""
 
     def port_closed(self, now_ns: int) -> None:
         """Change nothing: the module runs on, and overflows."""
+
+    def _choice(self) -> ChipStream | ProfileStream:
+        """Return who speaks until a message, a command or a restart changes it."""
+        return self._raw if self._raw.streaming else self._profile
