@@ -75,12 +75,13 @@ who opens a port, a host's first command counts as opening it.)
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return its exit code."""
     with stop_signals() as stop:  # the imports take most of a second: a signal may come in them
-        return _run(_parse(argv), stop)
+        arguments = _parse(argv)
+        if arguments.command not in cli_faults.COMMANDS:
+            return _run(arguments, stop)
+    return cli_faults.run(arguments)  # a signal ends these at once: there is nothing to clean up
 
 
 def _run(arguments: argparse.Namespace, stop: Stop) -> int:
-    if arguments.command in cli_faults.COMMANDS:
-        return cli_faults.run(arguments)
     # heavy imports only now: --help and usage errors answer at once
     from emulator.playback import PlayOptions
     from emulator.serving import CannotServeError, play, proxy, serve
@@ -155,8 +156,15 @@ def _link_options(arguments: argparse.Namespace) -> LinkOptions:
 def _memory(state_dir: Path | None) -> Callable[[str], Memory] | None:
     if state_dir is None:
         return None
-    from emulator.state_store import DirectoryMemory
+    from emulator.serving import CannotServeError
+    from emulator.state_store import DirectoryMemory, make_state_directory
 
+    try:
+        make_state_directory(state_dir)
+    except OSError as error:
+        raise CannotServeError(
+            f"{state_dir}: cannot keep state there: {error.strerror}; choose another --state-dir"
+        ) from error
     return lambda serial: DirectoryMemory(state_dir, serial, _warn)
 
 
@@ -213,11 +221,10 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     serve.add_argument(
         "--tcp-host",
-        default="127.0.0.1",
+        type=_host,
         metavar="HOST",
         help="address to listen at (default 127.0.0.1, which only this machine reaches)",
     )
-
     serve.add_argument(
         "--link",
         type=_link,
@@ -280,6 +287,9 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
             serve.error("give either a SCENE or --bare")
         if arguments.count is not None and not arguments.bare:
             serve.error("--count needs --bare")
+        if arguments.tcp_host is not None and arguments.tcp is None:
+            serve.error("--tcp-host needs --tcp")
+        arguments.tcp_host = arguments.tcp_host or "127.0.0.1"
         arguments.count = arguments.count or 1
     return arguments
 
@@ -305,6 +315,12 @@ def _seed(text: str) -> int:
     if not 0 <= value < 2**63:
         raise argparse.ArgumentTypeError(f"{value} is not in 0...2**63 - 1")
     return value
+
+
+def _host(text: str) -> str:
+    if not text.strip():
+        raise argparse.ArgumentTypeError("a name or address is missing")
+    return text
 
 
 def _link(text: str) -> tuple[str, float | None]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
+import os
 import socket
 import sys
 from collections.abc import Sequence
@@ -17,6 +19,8 @@ __all__ = ["COMMANDS", "add_commands", "add_proxy", "run"]
 
 COMMANDS = ("faults", "ctl")
 TIMEOUT_S = 10.0
+_INTERRUPTED = 130
+"""Exit code after SIGINT, as of a shell."""
 
 _PROXY_HELP = (
     "A pseudo-terminal that leads to a real module: the same ready line as serve, the same faults. "
@@ -85,7 +89,16 @@ def add_proxy(
 
 def run(arguments: argparse.Namespace) -> int:
     """Run one of them; return the exit code."""
-    return _list(arguments) if arguments.command == "faults" else _control(arguments)
+    try:
+        return _list(arguments) if arguments.command == "faults" else _control(arguments)
+    except KeyboardInterrupt:
+        return _INTERRUPTED
+    except BrokenPipeError:  # whoever read our output has enough
+        _forget_output()
+        return 0
+    except OSError as error:
+        _forget_output()
+        return _failed(f"stdout: cannot write: {error.strerror}")
 
 
 # --- faults -------------------------------------------------------------------------------------
@@ -98,7 +111,8 @@ def _list(arguments: argparse.Namespace) -> int:
     if arguments.kind is not None:
         kinds = [kind for kind in kinds if kind.name == arguments.kind]
         if not kinds:
-            return _failed(f"no kind of fault is called {arguments.kind!r}", exit_code=2)
+            remedy = "`xethru-emulator faults` lists them"
+            return _failed(f"no kind of fault is called {arguments.kind!r}; {remedy}", exit_code=2)
     if arguments.json:
         _print(json.dumps([described(kind) for kind in kinds], indent=2))
         return 0
@@ -219,8 +233,9 @@ def _socket_of(path: Path) -> Path:
     """Return the control socket of the emulator that has a port; a socket is itself."""
     from xethru_protocol.ports import run_directory
 
-    if path.is_socket():
-        return path
+    with contextlib.suppress(OSError):  # a path that cannot be, too long for one; connecting tells
+        if path.is_socket():
+            return path
     for entry in sorted(run_directory().glob("*.json")):
         try:
             word = json.loads(entry.read_text())
@@ -250,6 +265,12 @@ def _ask(path: Path, request: dict[str, Any]) -> bytes:
 def _print(text: str) -> None:
     if sys.stdout is not None:
         sys.stdout.write(f"{text}\n")
+        sys.stdout.flush()  # what fails shall fail here, not when the interpreter ends
+
+
+def _forget_output() -> None:
+    """Keep the interpreter from trying to write again what could not be written."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _failed(text: str, *, exit_code: int = 1) -> int:

@@ -22,7 +22,6 @@ Without ``radar`` all are meant. The answer is ``{"ok":true,...}``, or
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -247,8 +246,7 @@ def _number(asked: Mapping[str, Any], key: str, most: float) -> float:
     if (
         isinstance(value, bool)
         or not isinstance(value, int | float)
-        or not math.isfinite(value)
-        or not 0 <= value <= most
+        or not 0 <= value <= most  # so not-a-number and infinity, too
     ):
         raise _RefusedError(f"{key}: must be a number from 0 to {most:g}")
     return float(value)

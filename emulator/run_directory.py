@@ -72,7 +72,8 @@ class Announcement:
 
 
 def _remove_stale(folder: Path) -> None:
-    for entry in folder.glob("*.json"):
+    # one that was killed while it wrote leaves a .new
+    for entry in (*folder.glob("*.json"), *folder.glob("*.new")):
         if _is_dead(entry.stem):
             with contextlib.suppress(OSError):
                 entry.unlink()

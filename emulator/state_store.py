@@ -7,6 +7,7 @@ starts as shipped.
 
 from __future__ import annotations
 
+import errno
 import os
 from base64 import b64decode, b64encode
 from collections.abc import Callable
@@ -21,7 +22,7 @@ from emulator.modes import Start, State
 from emulator.profile_settings import ProfileSettings
 from emulator.saved_state import SavedState
 
-__all__ = ["DirectoryMemory"]
+__all__ = ["DirectoryMemory", "make_state_directory"]
 
 U32 = Annotated[int, Field(ge=0, lt=1 << 32)]
 
@@ -60,6 +61,19 @@ class _State(_Document):
     files: list[_File] = Field(max_length=MAX_FILES)
     parameter_file_name: str
     certification: bool
+
+
+def make_state_directory(directory: Path) -> None:
+    """Make a directory of states, if it is missing.
+
+    Raises
+    ------
+    OSError
+        When nothing could be kept there: told before the start, not at the first save.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    if not os.access(directory, os.R_OK | os.W_OK | os.X_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
 
 class DirectoryMemory:

@@ -85,9 +85,9 @@ class TcpLink:
             self._listener = socket.create_server(
                 (address[0], port), family=family, backlog=BACKLOG
             )
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # the latter of a name that no host can have
             raise LinkError(
-                f"{host}:{port}: cannot listen: {error.strerror}; "
+                f"{host}:{port}: cannot listen: {_reason(error)}; "
                 "choose another --tcp or --tcp-host"
             ) from error
         self._listener.setblocking(False)
@@ -182,3 +182,10 @@ class TcpLink:
             self._listener.accept()[0].close()
         with contextlib.suppress(OSError):
             self._spare_fd = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
+
+
+def _reason(error: OSError | UnicodeError) -> str:
+    """Return what the system says; Python adds the address to it, which was told already."""
+    if isinstance(error, OSError) and error.errno is not None and error.errno > 0:
+        return os.strerror(error.errno)
+    return str(error.args[-1])

@@ -9,11 +9,11 @@ from pydantic import Field
 
 from emulator.faults.dice import Dice
 from emulator.faults.kind import Context, Kind, Layer, Parameters, Piece, Target
+from emulator.uart_bits import what_is_heard
 from xethru_protocol.packets import ESCAPE, START
 
 __all__ = ["KINDS"]
 
-_BITS_PER_CHARACTER = 10  # start bit, eight of data, stop bit
 _FLOW_CONTROL = b"\x11\x13"
 _CALM = bytes(code for code in range(256) if code not in b"\x7c\x7d\x7e\x7f")
 
@@ -162,41 +162,7 @@ def _wrong_baud(data: bytes, wanted: _Baud, dice: Dice, context: Context) -> Seq
     del dice, context
     if wanted.sent == wanted.heard:
         return None
-    return [Piece(resampled(data, wanted.sent, wanted.heard))]
-
-
-def resampled(data: bytes, sent_baud: int, heard_baud: int) -> bytes:
-    """Return what a UART hears of a line that runs at another rate.
-
-    The receiver waits for a falling edge, looks at the middle of each bit by its own clock, and
-    drops a character whose stop bit is low.
-
-    >>> resampled(b"A}", 115200, 115200)
-    b'A}'
-    """
-    line: list[int] = []
-    for byte in data:
-        line += (0, *(byte >> bit & 1 for bit in range(8)), 1)
-    ratio = sent_baud / heard_baud  # bits sent while the receiver counts one
-    heard = bytearray()
-    at, before = 0.0, 1
-    while at < len(line):
-        level = line[int(at)]
-        if before == 1 and level == 0:
-            bits = [_level(line, at + (index + 0.5) * ratio) for index in range(10)]
-            if bits[0] == 0 and bits[9] == 1:
-                heard.append(sum(bit << index for index, bit in enumerate(bits[1:9])))
-            at += (_BITS_PER_CHARACTER - 0.5) * ratio
-            before = _level(line, at)
-            at = int(at) + 1.0
-        else:
-            before = level
-            at += 1.0
-    return bytes(heard)
-
-
-def _level(line: Sequence[int], at: float) -> int:
-    return line[int(at)] if at < len(line) else 1  # an idle line is high
+    return [Piece(what_is_heard(data, wanted.sent, wanted.heard))]
 
 
 _DAMAGE = "one damaged place, of the kind that the byte's role makes it"

@@ -112,6 +112,12 @@ class FaultSpec(_Table):
         return command
 
     @model_validator(mode="after")
+    def _has_time(self) -> FaultSpec:
+        if self.until_s is not None and self.until_s <= self.at_s:
+            raise ValueError(f"until_s: must be later than at_s, {self.at_s:g}; it never happens")
+        return self
+
+    @model_validator(mode="after")
     def _parameters_fit(self) -> FaultSpec:
         try:
             self.kind_parameters()
@@ -213,6 +219,14 @@ def load_plan(path: Path | str) -> FaultPlan:
     return parse_plan(text, str(path))
 
 
+def _shown(value: object) -> str:
+    try:
+        shown = repr(value)
+    except ValueError:  # an integer of thousands of digits
+        return "a number of thousands of digits"
+    return shown if len(shown) <= 60 else shown[:57] + "..."
+
+
 def _one_line(error: ValidationError, allowed: list[str]) -> str:
     """Say the first problem in one line, and how many more there are."""
     problems = error.errors(include_url=False)
@@ -227,7 +241,6 @@ def _one_line(error: ValidationError, allowed: list[str]) -> str:
         case "value_error":
             said = str(first["ctx"]["error"])
         case _:
-            shown = repr(first["input"])
-            said = f"{first['msg']}, got {shown if len(shown) <= 60 else shown[:57] + '...'}"
+            said = f"{first['msg'].replace('tuple', 'list')}, got {_shown(first['input'])}"
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     return f"{key}: {said}{more}" if key else f"{said}{more}"

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -24,6 +27,8 @@ from emulator.path_lock import locked
         ["serve", "--bare", "--count", "x"],
         ["serve", "lab", "--pace", "slow"],
         ["serve", "lab", "--seed", "-1"],
+        ["serve", "lab", "--tcp-host", "localhost"],
+        ["serve", "lab", "--tcp", "0", "--tcp-host", ""],
         ["play"],
         ["play", "x", "--rate", "-1"],
         ["play", "x", "--rate", "nan"],
@@ -46,6 +51,11 @@ def test_wrong_usage_exits_2(arguments: list[str], capsys: pytest.CaptureFixture
         (["play", "missing"], "there is no recording missing"),
         (["serve", "--bare", "--link-dir", "FILE/links"], "cannot make the link directory"),
         (["serve", "--bare", "--link-dir", "FILE"], "cannot make the link directory"),
+        (["serve", "--bare", "--state-dir", "FILE"], "file: cannot keep state there: File exists"),
+        (["serve", "--bare", "--state-dir", "FILE/s"], "cannot keep state there: Not a directory"),
+        (["serve", "--bare", "--faults", "none.toml"], "none.toml: cannot read the scenario"),
+        (["ctl", "EMPTY", "state"], "no emulator answers"),
+        (["ctl", "x" * 300, "state"], "no emulator answers"),
         (["play", "EMPTY"], "holds no recording this can read"),
     ],
 )
@@ -91,6 +101,49 @@ def test_a_closed_stderr_leaves_the_exit_code() -> None:
     command = f"exec {sys.executable} -m emulator.cli serve no_such_scene 2>&-"
     run = subprocess.run(["sh", "-c", command], stdout=subprocess.PIPE, check=False)
     assert (run.returncode, run.stdout) == (2, b"")
+
+
+@pytest.mark.parametrize("arguments", ["faults", "faults --json"])
+def test_a_reader_of_the_list_that_left_is_no_failure(arguments: str) -> None:
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    run = subprocess.run(
+        [sys.executable, "-m", "emulator.cli", *arguments.split()],
+        stdout=write_end,
+        stderr=subprocess.PIPE,
+        check=False,
+    )
+    os.close(write_end)
+    assert (run.returncode, run.stderr) == (0, b"")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk_is_one_line() -> None:
+    with Path("/dev/full").open("wb") as full:
+        run = subprocess.run(
+            [sys.executable, "-m", "emulator.cli", "faults"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    said = "xethru-emulator: stdout: cannot write: No space left on device\n"
+    assert (run.returncode, run.stderr) == (1, said)
+
+
+def test_ctrl_c_ends_a_question_that_nobody_answers(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as silent:
+        silent.bind(str(tmp_path / "s"))
+        silent.listen()
+        command = [sys.executable, "-m", "emulator.cli", "ctl", str(tmp_path / "s"), "state"]
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as asking:
+            silent.settimeout(10)
+            connection, _ = silent.accept()
+            with connection:
+                assert connection.recv(100).endswith(b"\n")
+                asking.send_signal(signal.SIGINT)
+                _, said = asking.communicate(timeout=5)
+    assert (asking.returncode, said) == (130, "")
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["serve", "--help"], ["play", "--help"]])

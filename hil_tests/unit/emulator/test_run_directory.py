@@ -40,6 +40,7 @@ def test_what_dead_emulators_left_is_removed_and_nothing_else(folder: Path) -> N
     pid = dead_pid()
     mine = fresh_port_folder()
     (folder / f"{pid}.json").write_text("{}")
+    (folder / f"{pid}.new").write_text("killed while it wr")
     (folder / f"ports-{pid}-abc").mkdir()
     (folder / f"ports-{pid}-abc" / "radar_1").symlink_to("/dev/pts/99999")
     (folder / "notes.json").write_text("{}")

@@ -219,3 +219,18 @@ def test_a_port_that_is_taken_is_one_clear_line(bench: Bench, tmp_path: Path) ->
         ):
             open_ports(devices, tmp_path, LinkOptions(tcp_base=port), cleanup)
     assert not (tmp_path / "other").is_symlink()
+
+
+@pytest.mark.parametrize(
+    ("host", "why"),
+    [("a" * 300, "label"), ("192.0.2.1", "Cannot assign requested address"), ("a..b", "label")],
+)
+def test_an_address_that_cannot_be_is_one_clear_line(host: str, why: str, tmp_path: Path) -> None:
+    devices = [NamedDevice(name="other", serial="3", device=ramp_device())]
+    with contextlib.ExitStack() as cleanup, pytest.raises(LinkError) as caught:
+        open_ports(devices, tmp_path, LinkOptions(tcp_base=0, tcp_host=host), cleanup)
+    said = str(caught.value)
+    assert said.startswith(f"{host}:0: cannot listen: ")
+    assert said.endswith("; choose another --tcp or --tcp-host")
+    assert why in said
+    assert said.count(host) == 1, "said once is enough"

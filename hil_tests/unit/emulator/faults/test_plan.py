@@ -67,6 +67,12 @@ def test_every_parameter_has_a_meaning_and_a_limit(kind: str) -> None:
         ("[[fault]]\nkind = 'nack'\npacket = 'frame'", "packet: nack acts on a command"),
         ("[[fault", "not valid TOML"),
         ("a = " + "[" * 5000, "scenario: "),
+        ("seed = 0x" + "f" * 5000, "seed: Input should be less than"),
+        ("fault = 1", "fault: Input should be a valid list, got 1"),
+        (
+            "[[fault]]\nkind = 'stall'\nat_s = 2\nuntil_s = 2",
+            "fault[0]: until_s: must be later than at_s, 2; it never happens",
+        ),
     ],
 )
 def test_a_mistake_is_one_line_with_the_remedy(text: str, said: str) -> None:
