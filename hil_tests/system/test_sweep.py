@@ -100,7 +100,8 @@ def test_ctrl_c_while_workers_start(tmp_path: Path) -> None:
 def test_an_out_that_cannot_be_written_fails_before_the_first_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for out, said in ((tmp_path, "is a folder"), (tmp_path / "no" / "o", "No such file")):
+    (tmp_path / "file").touch()
+    for out, said in ((tmp_path, "is a folder"), (tmp_path / "file" / "o", "file")):
         assert main(["sweep", "--seeds", "1000", "--json", str(out)]) == 1
         text = capsys.readouterr()
         assert said in text.err

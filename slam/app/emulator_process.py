@@ -54,6 +54,7 @@ class EmulatorProcess:
         self._cleanup = contextlib.ExitStack()
         self.devices: tuple[EmulatedDevice, ...] = ()
         self.odometry_socket = ""
+        self._control_socket = ""
 
     def __enter__(self) -> Self:
         """Start the process; its ports are there after `wait_until_ready`."""
@@ -129,6 +130,7 @@ class EmulatorProcess:
                 for row in ready["devices"]
             )
             self.odometry_socket = ready["odometry"]
+            self._control_socket = ready["control"]
         except (ValueError, KeyError, TypeError):
             raise EmulatorError(f"the emulator's ready line is unknown: {line[:200]!r}") from None
 
@@ -151,7 +153,7 @@ class EmulatorProcess:
 
     def _remove_links(self) -> None:
         left = [Path(device.path) for device in self.devices]
-        left += [Path(self.odometry_socket)] if self.odometry_socket else []
+        left += [Path(path) for path in (self.odometry_socket, self._control_socket) if path]
         for path in left:
             path.unlink(missing_ok=True)
         for folder in {path.parent for path in left}:
