@@ -130,6 +130,23 @@ class Device:
         """Whether more commands should be read now; a host that never reads is held back."""
         return self._held is None and self._outbox.takes_replies
 
+    @property
+    def listens(self) -> bool:
+        """Whether it hears the host: not while it starts or sleeps."""
+        return self._ready_ns is None and not self._module.asleep
+
+    def crash(self, reason: str, now_ns: int) -> None:
+        """Fail as by a watchdog or a hard fault and restart at once; the module counts it."""
+        self.advance(now_ns)
+        self._module.crash(reason, now_ns)
+        self.advance(now_ns)
+
+    def power_cycle(self, now_ns: int) -> None:
+        """Restart at once, as after a power cut."""
+        self.advance(now_ns)
+        self._module.power_cycle(now_ns)
+        self.advance(now_ns)
+
     def port_present(self, now_ns: int) -> bool:
         """Whether the port is there; a restart takes it away if the options say so."""
         if self._module.options.port_on_reset == "stay":
@@ -141,8 +158,8 @@ class Device:
     def receive_data(self, data: bytes, now_ns: int) -> None:
         """Take bytes from the host and carry out the commands they complete."""
         self.advance(now_ns)
-        if self._ready_ns is not None or self._module.asleep:
-            return  # nobody listens
+        if not self.listens:
+            return
         self._connection.receive_data(data)
         self._carry_out_commands(now_ns)
 

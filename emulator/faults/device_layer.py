@@ -89,7 +89,9 @@ def _watchdog(wanted: Parameters, dice: Dice) -> Sequence[Action]:
 def _brown_out(wanted: _Loop, dice: Dice) -> Sequence[Action]:
     del dice
     period_ns = round(wanted.period_s * _NS_PER_S)
-    return [Restart(delay_ns=index * period_ns) for index in range(wanted.restarts)]
+    return [
+        Restart(delay_ns=index * period_ns, reason="brown-out") for index in range(wanted.restarts)
+    ]
 
 
 def _mode_lost(wanted: Parameters, dice: Dice) -> Sequence[Action]:
@@ -201,14 +203,14 @@ KINDS = (
     _row(
         "watchdog_reboot",
         Target.MOMENT,
-        "The module restarts by itself; its port stays.",
+        "The module restarts by itself and counts it towards safe mode; its port stays.",
         "1 reboot, and ResponseTimeout where frames were waited for",
         _watchdog,
     ),
     _row(
         "brown_out",
         Target.MOMENT,
-        "The module restarts several times in a row.",
+        "The module restarts several times in a row; ten faults in a row start safe mode.",
         "restarts reboots",
         _brown_out,
         _Loop,

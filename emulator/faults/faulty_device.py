@@ -26,10 +26,11 @@ from emulator.faults.kind import (
 from emulator.faults.line_queue import LineQueue
 from emulator.faults.packets import PacketClass, classify, command_bytes
 from emulator.faults.plan import FaultPlan, FaultSpec
+from emulator.faults.power import Power
 from emulator.faults.spoiling import spoiled_pieces
 from emulator.faults.truth import Injected, TruthLog
 from emulator.faults.watch import Watch
-from xethru_protocol.messages import Command, ModReset, Response
+from xethru_protocol.messages import Command, Response
 
 __all__ = ["FaultyDevice", "wrap"]
 
@@ -78,7 +79,7 @@ class FaultyDevice:
         self._injected: Counter[str] = Counter()
         self._away = False
         self._back_ns: int | None = None
-        self._deaf = False  # from a restart until BOOTING
+        self._power = Power(inner)
         self._cut_next: Unplug | None = None
         self._again_ns: int | None = None
         self._passed = 0  # bytes of a half command that the module has already
@@ -129,18 +130,13 @@ class FaultyDevice:
         if self._away:
             self._away = False
             self._back_ns = None
-            self.restart(now_ns)
+            self._power.cycle(now_ns)
 
-    def restart(self, now_ns: int) -> None:
-        """Restart the module without having been asked; it is deaf until it says BOOTING."""
+    def restart(self, now_ns: int, reason: str = "watchdog") -> None:
+        """Restart the module without having been asked, as after a fault that it counts."""
         self._watch.restarted()
         self._queue.clear()
-        self._deaf = True
-        crash = getattr(self.inner, "crash", None)
-        if crash is not None:
-            crash(now_ns)
-        else:
-            self.inner.receive_data(command_bytes(ModReset()), now_ns)
+        self._power.crash(reason, now_ns)
 
     def port_opened(self, now_ns: int) -> None:
         """Learn that a host opened the port."""
@@ -160,7 +156,7 @@ class FaultyDevice:
     def receive_data(self, data: bytes, now_ns: int) -> None:
         """Take bytes from the host."""
         self.advance(now_ns)
-        if self._away or self._deaf:
+        if self._away or not self._power.hears:
             return
         holds = any(armed.target is Target.COMMAND for armed in self._armed)
         begun = self._passed
@@ -238,7 +234,7 @@ class FaultyDevice:
             if fresh is None:
                 return None
             packet = self._through(fresh, now_ns)
-            if self._deaf:
+            if self._power.deaf:
                 break
         if packet is not None:
             self._sent_bytes += len(packet)
@@ -249,6 +245,9 @@ class FaultyDevice:
     def wake_ns(self, now_ns: int) -> int | None:
         """Return when `advance` (and then `next_packet`) should be called next; None if never."""
         time_ns = self._scenario_ns(now_ns)
+        waits = self._armed or self._actions or self._queue
+        if not waits and self._again_ns is None and self._back_ns is None:
+            return self.inner.wake_ns(now_ns)
         moments = [armed.next_ns(time_ns) for armed in self._armed]
         zero_ns = now_ns - time_ns
         candidates = [
@@ -265,10 +264,10 @@ class FaultyDevice:
         """Take one packet through the faults; return bytes to send at once."""
         packet_class = classify(packet)
         command: Command[Response] | None = None
-        if self._deaf:
+        if self._power.deaf:
             if not self._watch.is_booting(packet):
                 return None
-            self._deaf = False
+            self._power.deaf = False
         if packet_class is PacketClass.REPLY:
             command, silent = self._watch.answered()
             if silent:
@@ -335,8 +334,8 @@ class FaultyDevice:
 
     def _act(self, action: Action, now_ns: int) -> None:
         match action:
-            case Restart():
-                self.restart(now_ns)
+            case Restart(reason=reason):
+                self.restart(now_ns, reason)
             case Unplug() if action.part_of_frame:
                 self._cut_next = action
             case Unplug():
@@ -388,10 +387,5 @@ def wrap(
     zero_ns
         Device time from which the scenario counts; the first time it hears of if None.
     """
-    return FaultyDevice(
-        device,
-        name,
-        FaultPlan() if plan is None else plan,
-        TruthLog() if truth is None else truth,
-        zero_ns=zero_ns,
-    )
+    truth = TruthLog() if truth is None else truth
+    return FaultyDevice(device, name, plan or FaultPlan(), truth, zero_ns=zero_ns)

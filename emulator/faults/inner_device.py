@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
-__all__ = ["InnerDevice"]
+__all__ = ["EmulatedInside", "InnerDevice"]
 
 
 class InnerDevice(Protocol):
@@ -37,4 +37,22 @@ class InnerDevice(Protocol):
 
     def port_closed(self, now_ns: int) -> None:
         """Learn that the last host closed the port."""
+        ...
+
+
+@runtime_checkable
+class EmulatedInside(Protocol):
+    """What an emulated module has beyond that: its inside can be made to fail."""
+
+    @property
+    def listens(self) -> bool:
+        """Whether it hears the host: not while it starts or sleeps."""
+        ...
+
+    def crash(self, reason: str, now_ns: int) -> None:
+        """Restart at once as after a fault, which counts towards safe mode."""
+        ...
+
+    def power_cycle(self, now_ns: int) -> None:
+        """Restart at once as after a power cut, which forgets the faults."""
         ...

@@ -153,6 +153,7 @@ class Restart:
     """The module restarts without having been asked."""
 
     delay_ns: int = 0
+    reason: str = "watchdog"
 
 
 @dataclass(frozen=True, slots=True)

@@ -120,14 +120,10 @@ class Watch:
     def sent(self, packet: bytes, packet_class: PacketClass) -> None:
         """Learn what the module sent."""
         if packet_class is PacketClass.FRAME:
-            self.frame_sent(packet, frame_counter(packet))
+            self.previous_frame, self.frame = self.frame, packet
+            self.counter = frame_counter(packet)
         elif self.is_booting(packet):
             self.restarted()
-
-    def frame_sent(self, packet: bytes, counter: int | None) -> None:
-        """Learn that the module sent a radar frame."""
-        self.previous_frame, self.frame = self.frame, packet
-        self.counter = counter
 
     def restarted(self) -> None:
         """Learn that the module forgot everything."""

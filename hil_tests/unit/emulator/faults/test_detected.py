@@ -504,6 +504,45 @@ def test_a_brown_out_loop_is_counted(faulty_line: FaultyLine) -> None:
     assert radar.reboots == 4
 
 
+@pytest.mark.parametrize("kind", ["watchdog_reboot", "brown_out"])
+def test_faults_count_towards_safe_mode_and_the_bootloader(
+    kind: str, faulty_line: FaultyLine
+) -> None:
+    """8.5: ten in a row start safe mode, the sixteenth ends in the bootloader."""
+    radar = faulty_line.radar()
+
+    def fail(times: int) -> None:
+        in_a_row = 1 if kind == "watchdog_reboot" else times
+        parameters = {} if kind == "watchdog_reboot" else {"restarts": times, "period_s": 3}
+        for _ in range(times // in_a_row):
+            with fault(faulty_line.device, kind, **parameters):
+                faulty_line.sleep(3.5 * in_a_row)
+
+    fail(9)
+    assert radar.ping() is PongCode.XTS_SPRP_READY
+    fail(1)
+    assert radar.ping() is PongCode.XTS_SPRP_SAFEMODE
+    fail(5)
+    assert radar.ping() is PongCode.XTS_SPRP_SAFEMODE
+    fail(1)
+    with pytest.raises(ResponseTimeout):
+        radar.ping()
+    reply = radar.request(m.BootloaderGetDeviceInfo())
+    assert isinstance(reply, m.UnknownMessage), "not deaf"
+
+
+def test_unplugging_forgets_the_faults(faulty_line: FaultyLine) -> None:
+    """8.5: power-on is not counted, and clears."""
+    for _ in range(9):
+        with fault(faulty_line.device, "watchdog_reboot"):
+            faulty_line.sleep(3)
+    with fault(faulty_line.device, "unplug", away_s=0.5):
+        faulty_line.sleep(3)
+    with fault(faulty_line.device, "watchdog_reboot"):
+        faulty_line.sleep(3)
+    assert faulty_line.radar().ping() is PongCode.XTS_SPRP_READY
+
+
 def test_safe_mode_is_warned_of(faulty_line: FaultyLine) -> None:
     radar = faulty_line.radar()
     with fault(faulty_line.device, "safe_mode"):
