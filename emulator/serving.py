@@ -5,11 +5,9 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import shutil
 import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -20,15 +18,15 @@ from emulator.fault_bench import FaultBench
 from emulator.faults.plan import FaultPlanError, load_plan
 from emulator.identity import Identity
 from emulator.link import LinkError
+from emulator.link_folder import link_folder, socket_path
 from emulator.odometry import scene_odometry
 from emulator.odometry_feed import OdometryFeed
 from emulator.options import DeviceOptions
 from emulator.pace import Pace
-from emulator.path_lock import PathInUseError, locked
 from emulator.playback import PlayOptions, RecordingError, played_radars
 from emulator.port_watch import PortWatch
 from emulator.proxy import ModuleLine, open_module
-from emulator.run_directory import Announcement, fresh_port_folder
+from emulator.run_directory import Announcement
 from emulator.saved_state import Memory
 from emulator.scene import Scene, SceneError, UnknownSceneError, empty_room, load_scene
 from emulator.server import Server, Service
@@ -38,7 +36,6 @@ from xethru_protocol.recordings.wire_capture import Way, WireCapture
 __all__ = ["CannotServeError", "play", "proxy", "serve"]
 
 NS_PER_MS = 1_000_000
-LONGEST_SOCKET_PATH = 100  # bytes; Linux takes 107, macOS 103
 SOCKET_NAME = "odometry.sock"
 CONTROL_NAME = "control.sock"
 PROXY_NAME = "proxy"
@@ -102,18 +99,18 @@ def serve(
         try:
             bare = isinstance(scene, int)
             loaded = empty_room(scene) if isinstance(scene, int) else load_scene(scene)
-            folder = cleanup.enter_context(_link_folder(link_dir))
+            folder = cleanup.enter_context(link_folder(link_dir))
             zero_ns = time.monotonic_ns()
             plan = None if faults is None else load_plan(faults)
             bench = FaultBench(plan, truth, cleanup, zero_ns=zero_ns)
             options = _device_options(links)
             devices = _radar_devices(loaded, seed, pace, zero_ns, options, bench, memory)
             bench.check_names()
-            control = bench.control(_socket_path(folder, cleanup, CONTROL_NAME))
+            control = bench.control(socket_path(folder, cleanup, CONTROL_NAME))
             feed = None
             if not bare:
                 feed = OdometryFeed(
-                    _socket_path(folder, cleanup),
+                    socket_path(folder, cleanup, SOCKET_NAME),
                     scene_odometry(loaded, seed),
                     pace,
                     scene_time_zero_ns=zero_ns,
@@ -165,7 +162,7 @@ def play(
                 on_fault=lambda fault: warn(f"{fault.file}: {fault.reason}; the rest is played"),
                 warn=warn,
             )
-            folder = cleanup.enter_context(_link_folder(link_dir))
+            folder = cleanup.enter_context(link_folder(link_dir))
             bench = FaultBench(None, None, cleanup, zero_ns=time.monotonic_ns())
             devices = [
                 NamedDevice(
@@ -174,7 +171,7 @@ def play(
                 for one in radars
             ]
             players = {radar.name: radar.stream for radar in radars}
-            control = bench.control(_socket_path(folder, cleanup, CONTROL_NAME), players)
+            control = bench.control(socket_path(folder, cleanup, CONTROL_NAME), players)
             ports = open_ports(devices, folder, LinkOptions(), cleanup)
         except (RecordingError, LinkError) as error:
             raise CannotServeError(str(error)) from error
@@ -244,8 +241,8 @@ def proxy(
             cleanup.callback(module.close)
             faulty = bench.wrap(module, PROXY_NAME)
             bench.check_names()
-            folder = cleanup.enter_context(_link_folder(link_dir))
-            control = bench.control(_socket_path(folder, cleanup, CONTROL_NAME))
+            folder = cleanup.enter_context(link_folder(link_dir))
+            control = bench.control(socket_path(folder, cleanup, CONTROL_NAME))
             named = NamedDevice(
                 name=PROXY_NAME, serial="", device=faulty, present=faulty.port_present
             )
@@ -342,58 +339,3 @@ def _say_ready(ready: dict[str, object]) -> None:
         # nobody will ever learn our ports; and the interpreter must not try to flush again
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise CannotServeError(f"stdout: cannot write the ready line: {error.strerror}") from error
-
-
-@contextlib.contextmanager
-def _link_folder(wanted: Path | None) -> Iterator[Path]:
-    """Provide the directory of the links; remove it afterwards if we made it and it is empty.
-
-    A given directory serves one running emulator: a second one would take its names over.
-    """
-    if wanted is None:
-        folder = fresh_port_folder()
-        try:
-            yield folder
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
-        return
-    existed = wanted.exists()
-    with contextlib.ExitStack() as held:
-        try:
-            wanted.mkdir(parents=True, exist_ok=True)
-            held.enter_context(locked(wanted))
-        except OSError as error:
-            raise LinkError(
-                f"{wanted}: cannot make the link directory: {error.strerror}"
-            ) from error
-        except PathInUseError as error:
-            raise LinkError(
-                f"{wanted}: a running emulator has its links there; choose another --link-dir"
-            ) from error
-        try:
-            yield wanted.absolute()
-        finally:
-            if not existed:
-                with contextlib.suppress(OSError):  # somebody else uses it too
-                    wanted.rmdir()
-
-
-def _socket_path(folder: Path, cleanup: contextlib.ExitStack, name: str = SOCKET_NAME) -> Path:
-    """Return where a socket goes: among the links, if the kernel takes such a path."""
-    path = folder / name
-    if _fits(path):
-        return path
-    for parent in (tempfile.gettempdir(), "/tmp"):  # the former may be as long
-        if _fits(Path(parent) / "xethru-12345678" / name):
-            with contextlib.suppress(OSError):
-                short = Path(tempfile.mkdtemp(prefix="xethru-", dir=parent))
-                cleanup.callback(shutil.rmtree, short, ignore_errors=True)
-                return short / name
-    raise LinkError(
-        f"{path}: too long for the {path.stem} socket, {LONGEST_SOCKET_PATH} bytes at most; "
-        "choose a shorter --link-dir or TMPDIR"
-    )
-
-
-def _fits(path: Path) -> bool:
-    return len(os.fsencode(path)) <= LONGEST_SOCKET_PATH
