@@ -157,6 +157,7 @@ def _add_dump(commands: _Commands) -> None:
         "file", type=values.not_empty, metavar="FILE", help="file or directory of a recording"
     )
     one.add_argument("--samples", action="store_true", help="print arrays whole")
+    _add_radar(one)
     _add_json(one)
 
 
@@ -178,8 +179,18 @@ def _add_convert(commands: _Commands) -> None:
     one.add_argument(
         "target", type=values.not_empty, metavar="TARGET", help="file or directory to write"
     )
+    _add_radar(one)
     _add_force(one, "replace TARGET if it exists")
     _add_json(one)
+
+
+def _add_radar(one: argparse.ArgumentParser) -> None:
+    one.add_argument(
+        "--radar",
+        type=values.not_empty,
+        metavar="NAME",
+        help="which radar of a session that holds several",
+    )
 
 
 def _add_decode(commands: _Commands) -> None:
@@ -350,14 +361,23 @@ def _record(arguments: argparse.Namespace) -> int:
 def _dump(arguments: argparse.Namespace) -> int:
     from xethru_protocol.cli.dump import dump
 
-    return dump(arguments.file, with_samples=arguments.samples, as_json=arguments.json)
+    return dump(
+        arguments.file,
+        with_samples=arguments.samples,
+        as_json=arguments.json,
+        radar=arguments.radar,
+    )
 
 
 def _convert(arguments: argparse.Namespace) -> int:
     from xethru_protocol.cli.convert import convert
 
     return convert(
-        arguments.source, arguments.target, replace=arguments.force, as_json=arguments.json
+        arguments.source,
+        arguments.target,
+        replace=arguments.force,
+        as_json=arguments.json,
+        radar=arguments.radar,
     )
 
 

@@ -10,7 +10,7 @@ from xethru_protocol.recordings import RecordingError, recording_facts
 from xethru_protocol.recordings import convert as convert_recording
 
 
-def convert(source: str, target: str, *, replace: bool, as_json: bool) -> int:
+def convert(source: str, target: str, *, replace: bool, as_json: bool, radar: str | None) -> int:
     """Write ``source`` again as ``target``; 1 if a part of it could not be read."""
     recording_facts(source)  # raises before anything is removed
     path = Path(target)
@@ -26,7 +26,7 @@ def convert(source: str, target: str, *, replace: bool, as_json: bool) -> int:
 
     with set_aside(path, replace=replace):
         try:
-            done = convert_recording(source, target, show)
+            done = convert_recording(source, target, show, radar=radar)
         finally:
             progress.finish(lambda: f"{newest} messages")
     if as_json:

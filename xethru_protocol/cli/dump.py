@@ -24,17 +24,17 @@ _FEW = 3  # elements of an array that are shown
 _LONGEST_TEXT = 60
 
 
-def dump(file: str, *, with_samples: bool, as_json: bool) -> int:
+def dump(file: str, *, with_samples: bool, as_json: bool, radar: str | None) -> int:
     """Print every message of a recording; 1 if a part could not be read."""
     faults: list[RecordingFault] = []
     if as_json:
-        for message, t_ns in read_recording(file, faults.append):
+        for message, t_ns in read_recording(file, faults.append, radar=radar):
             print_json(_as_json(message, t_ns))
     else:
-        summary = describe_recording(file)
+        summary = describe_recording(file, radar=radar)
         for line in _head(summary):
             print_line(line)
-        for message, t_ns in read_recording(file, faults.append):
+        for message, t_ns in read_recording(file, faults.append, radar=radar):
             time = _since(t_ns, summary.start_ns)
             print_line(f"{time}  {message_line(message, with_samples=with_samples)}")
     warn_of("dump", faults)

@@ -46,6 +46,8 @@ def convert(
     source: Path | str,
     target: Path | str,
     on_progress: Callable[[int], None] | None = None,
+    *,
+    radar: str | None = None,
 ) -> Conversion:
     """Write a recording again in the format that the target's suffix names.
 
@@ -58,6 +60,8 @@ def convert(
         directory of ModuleConnector.
     on_progress
         Called with the number of messages so far, every thousand and at the end.
+    radar
+        Which radar of a session of several, as in `read_recording`.
 
     Raises
     ------
@@ -69,7 +73,7 @@ def convert(
     write = _writer(target)
     faults: list[RecordingFault] = []
     facts = recording_facts(source)
-    counted = _Counted(read_recording(source, faults.append), on_progress)
+    counted = _Counted(read_recording(source, faults.append, radar=radar), on_progress)
     skipped = write(target, iter(counted), facts)
     if on_progress is not None:
         on_progress(counted.messages)

@@ -123,7 +123,10 @@ def read_recording(
         If there is nothing to read, or messages are lost and ``on_fault`` is None.
     """
     path = Path(path)
-    match recording_format(path):
+    found = recording_format(path)
+    if radar is not None and found != "mcap":
+        raise RecordingError(f"{path} is of one radar and names none; leave the name out")
+    match found:
         case "wire":
             yield from read_wire(path, on_fault)
         case "npz":
@@ -168,13 +171,16 @@ def recording_facts(path: Path | str) -> RecordingFacts:
             return vendor_facts(path)
 
 
-def describe_recording(path: Path | str) -> RecordingSummary:
-    """Read a whole recording and say what it holds; RecordingError if it holds nothing."""
+def describe_recording(path: Path | str, *, radar: str | None = None) -> RecordingSummary:
+    """Read a whole recording and say what it holds; RecordingError if it holds nothing.
+
+    Of a session of several radars, only the named one, as in `read_recording`.
+    """
     path = Path(path)
     faults: list[RecordingFault] = []
     counts: Counter[str] = Counter()
     first_ns = last_ns = None
-    for message, t_ns in read_recording(path, faults.append):
+    for message, t_ns in read_recording(path, faults.append, radar=radar):
         counts[message_name(message)] += 1
         if t_ns is not None:
             first_ns = t_ns if first_ns is None else min(first_ns, t_ns)

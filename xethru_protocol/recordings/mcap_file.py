@@ -237,8 +237,10 @@ def read_mcap(path: Path, on_fault: FaultHandler | None, radar: str | None = Non
                 topics[record.id] = topic, record.metadata.get("xethru-hil") is None
                 radars.add(name)
                 if len(radars) > 1:
-                    names = ", ".join(sorted(radars))
-                    raise RecordingError(f"{path} holds several radars ({names}), not one")
+                    raise RecordingError(
+                        f"{path} holds several radars ({_names(path)}), not one; "
+                        "choose one: --radar NAME, in Python radar="
+                    )
         elif isinstance(record, Message) and record.channel_id in topics:
             topic, timed = topics[record.channel_id]
             try:
@@ -246,6 +248,8 @@ def read_mcap(path: Path, on_fault: FaultHandler | None, radar: str | None = Non
             except (ValueError, struct.error) as error:
                 raise RecordingError(f"{path}: a message is damaged: {error}") from None
             yield message, record.log_time if timed else None
+    if not radars and radar is not None and (names := _names(path)):
+        raise RecordingError(f"{path} holds no radar {radar!r}; it holds {names}")
     if not radars and not faults:
         raise RecordingError(f"{path} holds no topic /radar/<name>/frame or .../payload")
 
@@ -266,6 +270,10 @@ def mcap_radars(path: Path) -> tuple[RadarFacts, ...]:
             name = channels[record.channel_id]
             said[name] = _radar_facts(name, record.data)
     return tuple(said.get(name, RadarFacts(name=name)) for name in names)
+
+
+def _names(path: Path) -> str:
+    return ", ".join(sorted(facts.name or "" for facts in mcap_radars(path)))
 
 
 def _radar_facts(name: str, data: bytes) -> RadarFacts:

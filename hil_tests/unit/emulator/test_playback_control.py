@@ -292,7 +292,7 @@ def test_one_radar_of_a_session_is_read_by_its_name(tmp_path: Path) -> None:
     assert [message for message, _ in read] == [
         m.DataFloat(info=counter, values=samples(1, counter)) for counter in range(6)
     ]
-    with pytest.raises(RecordingError, match="holds no topic"):
+    with pytest.raises(RecordingError, match="holds no radar 'middle'; it holds left, right"):
         list(read_recording(path, radar="middle"))
 
 

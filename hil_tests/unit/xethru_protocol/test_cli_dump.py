@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hil_tests.unit.emulator.test_playback_control import samples, write_session
 from xethru_protocol import messages as m
 from xethru_protocol.cli import main
 from xethru_protocol.connection import Connection, Role
-from xethru_protocol.recordings import RecordingError, WireCapture, convert
+from xethru_protocol.recordings import RecordingError, WireCapture, convert, read_recording
 
 Capture = pytest.CaptureFixture[str]
 RECORDINGS = Path(__file__).parents[3] / "fixtures" / "recordings"
@@ -220,7 +221,7 @@ def test_what_was_left_out_and_what_was_damaged_is_said(tmp_path: Path, capsys: 
 def test_a_conversion_that_fails_leaves_nothing(
     tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stopped(source: object, target: str, show: object) -> None:
+    def stopped(source: object, target: str, show: object, *, radar: object) -> None:
         Path(target).write_bytes(b"half")
         raise KeyboardInterrupt
 
@@ -257,7 +258,7 @@ def test_a_conversion_that_fails_brings_the_older_one_back(
     assert main(["convert", str(RECORDINGS / "single"), str(target)]) == 0
     before = snapshot(tmp_path)
 
-    def fails(source: str, target: str, on_progress: object) -> None:
+    def fails(source: str, target: str, on_progress: object, *, radar: object) -> None:
         convert(IQ, target)
         raise RecordingError("the disk is full")
 
@@ -287,3 +288,55 @@ def test_a_part_of_a_recording_is_not_converted_into_it(tmp_path: Path, capsys: 
 
 def snapshot(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+NAMES = ("left", "middle", "right")
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Path:
+    path = tmp_path / "session.mcap"
+    write_session(path, {name: 10**9 for name in NAMES}, n_frames=3)
+    return path
+
+
+@pytest.mark.parametrize("words", ["dump", "dump --json", "convert"])
+def test_a_session_of_several_radars_asks_which(words: str, session: Path, capsys: Capture) -> None:
+    command, *options = words.split()
+    target = [str(session.with_suffix(".npz"))] if command == "convert" else []
+    assert main([command, str(session), *target, *options]) == 1
+    printed, errors = capsys.readouterr()
+    assert printed == ""
+    assert errors == (
+        f"xethru {command}: {session} holds several radars (left, middle, right), not one; "
+        "choose one: --radar NAME, in Python radar=\n"
+    )
+    assert list(session.parent.iterdir()) == [session]
+
+
+def test_one_radar_of_a_session_is_dumped_and_converted(session: Path, capsys: Capture) -> None:
+    expected = [samples(1, counter).tolist() for counter in range(3)]
+    assert main(["dump", str(session), "--radar", "middle", "--json"]) == 0
+    told = [json.loads(line)["fields"] for line in capsys.readouterr().out.splitlines()]
+    assert [fields["data"] for fields in told] == [pytest.approx(row) for row in expected]
+    assert main(["dump", str(session), "--radar", "middle"]) == 0
+    assert "  3 DATA FLOAT" in capsys.readouterr().out.splitlines()
+    target = session.with_suffix(".npz")
+    assert main(["convert", str(session), str(target), "--radar", "middle"]) == 0
+    rows = [
+        message.values.tolist()
+        for message, _ in read_recording(target)
+        if isinstance(message, m.DataFloat)
+    ]
+    assert rows == expected
+
+
+def test_an_unknown_radar_is_told_with_those_there_are(
+    session: Path, capsys: Capture, tmp_path: Path
+) -> None:
+    assert main(["dump", str(session), "--radar", "top"]) == 1
+    said = f"{session} holds no radar 'top'; it holds left, middle, right"
+    assert capsys.readouterr().err == f"xethru dump: {said}\n"
+    shutil.copytree(RECORDINGS / "single", tmp_path / "r")
+    assert main(["dump", str(tmp_path / "r"), "--radar", "top"]) == 1
+    assert "is of one radar and names none; leave the name out" in capsys.readouterr().err
