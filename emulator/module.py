@@ -198,15 +198,14 @@ class Module:
         if self.state is State.BOOTLOADER or self.asleep:
             return
         self.faults.fault(now_ns)
-        hopeless = self.faults.hopeless
-        if hopeless:
-            self.faults.clear()
         dump = f"{reason}\nat {now_ns} ns\nfault {self.faults.count} in a row\n".encode()
         self.files.close_all()
         with suppress(Refusal):  # no room for a dump: the firmware has nowhere else to put it
             self.files.replace(CRASH_DUMP, dump)
         self.save()
-        self.restart = Restart(into_bootloader=hopeless, at_ns=now_ns)
+        self.restart = Restart(into_bootloader=self.faults.hopeless, at_ns=now_ns)
+        if self.faults.hopeless:
+            self.faults.clear()
 
     def load_profile(self, profile_id: int) -> None:
         """Load a profile with its own last settings, or raise `Refusal`."""

@@ -126,9 +126,8 @@ def _says(item: InfoItem, text: str, context: Context) -> Sequence[Piece] | None
     command = context.command
     if not isinstance(command, SystemGetInfo) or command.item != item:
         return None
-    return [
-        Piece(response_bytes(ReplyString(content_id=DirCode.XTS_SDC_SYSTEM_GET_INFO, text=text)))
-    ]
+    content_id = DirCode.XTS_SDC_SYSTEM_GET_INFO
+    return [Piece(response_bytes(ReplyString(content_id=content_id, info=item, text=text)))]
 
 
 def _wrong_version(

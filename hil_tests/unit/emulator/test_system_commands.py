@@ -180,6 +180,8 @@ def test_more_than_fifteen_faults_end_in_the_bootloader(host: BareHost) -> None:
     crash(host, 1)
     host.send(m.Ping())
     assert host.hear() == []
+    (dump,) = host.device.module.files.contents.values()
+    assert b"fault 16 in a row" in dump
 
 
 @pytest.mark.parametrize(("pause_s", "pong"), [(290, SAFE), (301, READY)])
