@@ -180,7 +180,9 @@ def _say(text: str) -> None:
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
-        prog="xethru-emulator", description="Emulated X4M300 radars on pseudo-terminals."
+        prog="xethru-emulator",
+        description="Emulated X4M300 radars on pseudo-terminals. To begin: `xethru-emulator "
+        "serve --bare` tells the path of a port; `xethru info --port PATH` asks what is there.",
     )
     commands = parser.add_subparsers(dest="command", required=True)
 

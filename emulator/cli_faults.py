@@ -37,14 +37,20 @@ Controls a running emulator: SOCKET is the "control" of its ready line, or one o
   reset                          restart the module, as by its watchdog
   pause | resume | rate R | seek SECONDS | loop on|off | filter [KIND...]   of a playback
 
-Prints the answer as one JSON line. Exit 1 when the emulator refuses.
+Prints the answer as one JSON line. Exit 1 when the emulator refuses. For example:
+
+  xethru-emulator ctl SOCKET fault add bad_checksum count=3
+  xethru-emulator ctl SOCKET fault add missing_frames every=50 count=0 frames=2
 """
 
 
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the sub-commands to a parser."""
     faults = commands.add_parser(
-        "faults", help="list the kinds of faults, with parameters and an example each"
+        "faults",
+        help="list the kinds of faults",
+        description="Lists the kinds of faults with their parameters; of one KIND all about it, "
+        "with an example for a scenario file, which `serve --faults FILE` takes.",
     )
     faults.add_argument("kind", nargs="?", metavar="KIND", help="only this one")
     faults.add_argument("--json", action="store_true", help="as JSON")
@@ -126,20 +132,23 @@ def _text(kind: Kind, *, full: bool) -> str:
 
     said = described(kind)
     parameters = ", ".join(
-        f"{name}={parameter['default']}" for name, parameter in said["parameters"].items()
+        name if parameter["default"] is None else f"{name}={parameter['default']}"
+        for name, parameter in said["parameters"].items()
     )
     if not full:
-        return f"{kind.layer.value:11} {kind.name:24} {kind.summary}  [{parameters}]"
+        defaults = f"  [{parameters}]" if parameters else ""
+        return f"{kind.layer.value:11} {kind.name:24} {kind.summary}{defaults}"
     lines = [f"{kind.name} ({kind.layer.value} layer)", kind.summary, ""]
-    lines += [f"acts on:  {kind.target.value}", f"counted:  {kind.counted}"]
-    lines += [f"hidden:   {kind.hidden}"] if kind.hidden else []
+    lines += [f"acts on:            {kind.target.value}", f"the driver counts:  {kind.counted}"]
+    lines += [f"hidden:             {kind.hidden}"] if kind.hidden else []
     for name, parameter in said["parameters"].items():
         limits = ", ".join(
             f"{key.replace('_', ' ')} {value}"
             for key, value in parameter.items()
             if key not in ("default", "meaning")
         )
-        lines.append(f"  {name} = {parameter['default']}: {parameter['meaning']} ({limits})")
+        default = "" if parameter["default"] is None else f" = {parameter['default']}"
+        lines.append(f"  {name}{default}: {parameter['meaning']} ({limits})")
     return "\n".join([*lines, "", said["example"]])
 
 

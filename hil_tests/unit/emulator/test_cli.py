@@ -176,3 +176,19 @@ def test_wrong_play_options_are_told(
         main(["play", "recording", *arguments])
     assert exit_info.value.code == 2
     assert message in capsys.readouterr().err
+
+
+def test_the_list_of_faults_shows_defaults_and_a_kind_shows_an_example(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["faults"]) == 0
+    listed = capsys.readouterr().out
+    assert "Bytes of a packet are lost.  [at, bytes=1]\n" in listed
+    assert "None" not in listed
+    assert main(["faults", "stall"]) == 0
+    shown = capsys.readouterr().out
+    assert "  seconds = 1.5: how long, s (at most 86400, above 0)\n" in shown
+    assert '\n\n[[fault]]\nkind = "stall"\n' in shown
+    assert main(["faults", "crc"]) == 2
+    said = "no kind of fault is called 'crc'; `xethru-emulator faults` lists them"
+    assert capsys.readouterr().err == f"xethru-emulator: {said}\n"
