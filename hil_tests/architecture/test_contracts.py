@@ -47,6 +47,7 @@ INPUT_AND_OUTPUT = {
         "device_ports",
         "fault_bench",
         "link",
+        "link_folder",
         "odometry_feed",
         "path_lock",
         "playback",
