@@ -24,6 +24,11 @@ class Line(Protocol):
         """Whether more should be read from the host."""
         ...
 
+    @property
+    def waits_for_host(self) -> bool:
+        """Whether what the host's side has no room for waits; if not, it is lost."""
+        ...
+
     def from_module(self, packet: bytes, now_ns: int) -> None:
         """Take a packet of the module."""
         ...

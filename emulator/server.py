@@ -153,7 +153,9 @@ class Port:
                     return False
                 self._unsent = memoryview(packet)
             self._unsent = self._unsent[self.link.write(self._unsent) :]
-            if self._unsent:
+            if self._unsent and self._line is not None and not self._line.waits_for_host:
+                self._unsent = memoryview(b"")  # or an old backlog would meet the next host
+            elif self._unsent:
                 self._blocked = True
                 return False
         return True

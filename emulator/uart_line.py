@@ -52,6 +52,11 @@ class UartLine:
         return self._to_host.is_empty
 
     @property
+    def waits_for_host(self) -> bool:
+        """False: without flow control the bits come whether anybody listens or not."""
+        return False
+
+    @property
     def takes_bytes(self) -> bool:
         """Whether the host may write on."""
         return len(self._to_module) < MOST_UNDER_WAY

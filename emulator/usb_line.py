@@ -36,6 +36,11 @@ class UsbLine:
         return len(self._to_host) < MOST_UNDER_WAY
 
     @property
+    def waits_for_host(self) -> bool:
+        """True: the host's controller fetches bytes when it has room for them."""
+        return True
+
+    @property
     def takes_bytes(self) -> bool:
         """Whether not too much is under way."""
         return len(self._to_module) < MOST_UNDER_WAY

@@ -211,7 +211,7 @@ def set_output(core: RadarCore, feature: OutputFeature, control: int = 1) -> Pro
 def output(core: RadarCore, feature: OutputFeature) -> Procedure[int]:
     """Ask whether a message is on: its control bits."""
     values = (yield from request(core, m.OutputGetControl(feature=feature))).values
-    return _first(core, values, feature.name) & 0xFFFFFFFF
+    return _first(core, values, f"the control of output {feature:#x}") & 0xFFFFFFFF
 
 
 # --- running ------------------------------------------------------------------------------------

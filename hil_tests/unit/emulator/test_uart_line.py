@@ -78,6 +78,7 @@ class Descriptor:
     def __init__(self) -> None:
         self.heard = bytearray()
         self.to_send = b""
+        self.room = 1 << 30
 
     def fileno(self) -> int:
         return 99
@@ -87,8 +88,10 @@ class Descriptor:
         return data
 
     def write(self, data: memoryview) -> int:
-        self.heard += data
-        return len(data)
+        taken = data[: self.room]
+        self.room -= len(taken)
+        self.heard += taken
+        return len(taken)
 
 
 class Bench:
@@ -209,6 +212,20 @@ def test_nothing_is_lost_when_the_clock_waits_for_the_line() -> None:
     counters = [message.info for message in bench.heard() if isinstance(message, m.DataFloat)]
     assert counters == list(range(len(counters)))
     assert len(counters) == pytest.approx(20, abs=1)  # Protocol reference 10: 2.0 per second
+
+
+def test_a_uart_talks_on_when_nobody_listens() -> None:
+    bench = uart_bench(115200)
+    bench.stream(17.0)
+    bench.run(bench.now_ns + 5 * SECOND)
+    bench.end.room = 0  # the host has gone, or reads no more
+    bench.say(bench.host.send(m.X4DriverSet(setting=X4Setting.FPS, value=0.0)))
+    # Protocol reference 10: 50 frames of 5747 bytes take 25 s at 2.0 frames/s
+    bench.run(bench.now_ns + 27 * SECOND)
+    bench.end.room = 1 << 30
+    bench.end.heard.clear()
+    bench.host = Connection(Role.HOST)
+    assert bench.ask(m.Ping()) == [m.Pong(value=0xAAEEAEEA)]
 
 
 def test_usb_transfers_are_delayed_and_short() -> None:
