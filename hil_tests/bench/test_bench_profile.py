@@ -30,7 +30,7 @@ def test_profile_frames(benchmark: BenchmarkFixture, name: str) -> None:
         while (due_ns := stream.next_due_ns()) is not None and due_ns < end_ns:
             stream.take()
 
-    benchmark.pedantic(twenty_seconds, rounds=10, warmup_rounds=2)  # type: ignore[no-untyped-call]
+    benchmark.pedantic(twenty_seconds, rounds=10, warmup_rounds=2)  # type: ignore[no-untyped-call] # the plugin has no types
     if benchmark.stats is not None:  # absent under --benchmark-disable
         median_s = benchmark.stats.stats.median
         benchmark.extra_info["us_per_frame"] = median_s * 1e6 / FRAMES

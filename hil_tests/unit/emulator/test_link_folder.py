@@ -16,7 +16,7 @@ LONG = "long" * 30
 
 
 def test_a_short_folder_holds_its_socket(tmp_path: Path) -> None:
-    short = Path("/tmp/links")
+    short = Path("/run/links")
     with contextlib.ExitStack() as cleanup:
         assert link_folder.socket_path(short, cleanup, "odometry.sock") == short / "odometry.sock"
 

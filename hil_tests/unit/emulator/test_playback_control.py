@@ -231,7 +231,7 @@ def test_every_radar_of_a_session_plays_its_own_bytes(tmp_path: Path) -> None:
     for number, radar in enumerate(radars.values()):
         module = Connection(Role.MODULE)
         line = LoopbackTransport(radar.device)
-        sent = b"".join(iter(lambda line=line: line.read(10.0), b""))  # type: ignore[misc]
+        sent = b"".join(iter(lambda line=line: line.read(10.0), b""))  # type: ignore[misc] # mypy has no type for it
         assert sent == b"".join(
             module.send(m.DataFloat(info=counter, values=samples(number, counter)))
             for counter in range(6)

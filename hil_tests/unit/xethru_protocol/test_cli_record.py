@@ -282,7 +282,7 @@ def test_progress_rewrites_one_line_on_a_terminal(monkeypatch: pytest.MonkeyPatc
     times = iter([0.0, 0.05, 0.25, 0.3, 0.5])
     progress = Progress("xethru record", lambda: next(times))
     for number in range(4):
-        progress.show(lambda number=number: f"{number} frames")  # type: ignore[misc]
+        progress.show(lambda number=number: f"{number} frames")  # type: ignore[misc] # mypy has no type for it
     progress.finish(lambda: "done")
     assert screen.getvalue() == "\r1 frames\x1b[K\r3 frames\x1b[K\rdone\x1b[K\n"
 
@@ -291,6 +291,6 @@ def test_progress_is_a_line_now_and_then_elsewhere(capsys: Capture) -> None:
     times = iter([0.0, 5.0, 10.5, 15.0, 21.0])
     progress = Progress("xethru record", lambda: next(times))
     for number in range(4):
-        progress.show(lambda number=number: f"{number} frames")  # type: ignore[misc]
+        progress.show(lambda number=number: f"{number} frames")  # type: ignore[misc] # mypy has no type for it
     progress.finish(lambda: "done")
     assert capsys.readouterr().err == "xethru record: 1 frames\nxethru record: 3 frames\n"

@@ -90,8 +90,8 @@ def test_warnings_are_kept_up_to_a_thousand(driver_on: DriverOn) -> None:
 
 @pytest.mark.parametrize("radar", [X4M300, AsyncX4M300])
 def test_methods_are_documented_as_they_are_called(radar: type) -> None:
-    assert str(inspect.signature(radar.start)) == "(self, fps: float) -> float"  # type: ignore[attr-defined]
-    assert inspect.getdoc(radar.start).startswith("Start frames")  # type: ignore[attr-defined, union-attr]
+    assert str(inspect.signature(radar.start)) == "(self, fps: float) -> float"  # type: ignore[attr-defined] # both
+    assert inspect.getdoc(radar.start).startswith("Start frames")  # type: ignore[attr-defined, union-attr] # both
     members = inspect.getmembers(radar, inspect.isfunction)
     for cls in (Presence, AsyncPresence, Files, AsyncFiles):
         members += inspect.getmembers(cls, inspect.isfunction)

@@ -28,7 +28,7 @@ BIN_M = 8 * 1.5e8 / 23.328e9
 SLOW, FAST = 1, 2  # bits of the control; instances 0 and 1
 
 
-def matrices(scene: Any, outputs: dict[int, int], end_s: float) -> list[list[Any]]:  # noqa: ANN401
+def matrices(scene: Any, outputs: dict[int, int], end_s: float) -> list[list[Any]]:  # noqa: ANN401 - rows differ in type
     """Return complete matrices in order of arrival, each a list of messages by range."""
     stream, _ = profile(scene, outputs=outputs)
     kinds: dict[tuple[type, int], list[Any]] = {}
@@ -46,7 +46,7 @@ def matrices(scene: Any, outputs: dict[int, int], end_s: float) -> list[list[Any
     return complete
 
 
-def frequencies(message: Any) -> NDArray[np.float64]:  # noqa: ANN401
+def frequencies(message: Any) -> NDArray[np.float64]:  # noqa: ANN401 - rows differ in type
     steps = np.arange(message.frequency_count) * message.frequency_step_hz
     return np.asarray(message.frequency_start_hz + steps, dtype=np.float64)
 
