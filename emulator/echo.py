@@ -36,24 +36,25 @@ or a power moves an echo by 1e-11 counts before it is rounded to an integer.
 
 from __future__ import annotations
 
-import hashlib
 import math
-from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emulator.echo_source import CaptureSettings, EchoSource
-from emulator.noise import UNITS_PER_SIGMA, frame_noise_units
-from emulator.people import (
-    AMPLITUDE_OF_1_M2,
-    PersonSpec,
-    chest_displacement_m,
-    positions_m,
-    present,
-)
+from emulator.module_clock import ModuleClock
 from emulator.pulse import sum_of_pulses
-from emulator.scene import RadarSpec, Scene, TargetSpec
+from emulator.receiver import one_count, rf_counters
+from emulator.reflections import (
+    BEAM_EXPONENT,
+    Reflections,
+    beam_gain,
+    person_reflections,
+    reflection_phase_rad,
+    target_reflections,
+)
+from emulator.scene import Scene
+from emulator.scene_tables import RadarSpec
 from xethru_protocol import x4
 
 __all__ = [
@@ -72,126 +73,8 @@ SPEED_OF_LIGHT_MPS = 299_792_458.0
 _SAMPLES_PER_M = 2 * x4.SAMPLING_RATE_HZ / SPEED_OF_LIGHT_MPS
 _SAMPLES_PER_MODULE_M = 2 * x4.SAMPLING_RATE_HZ / x4.MODULE_SPEED_MPS
 
-BEAM_EXPONENT = math.log(math.sqrt(0.5)) / math.log(math.cos(math.radians(65 / 2)))
-"""n of the two-way amplitude pattern cos(angle)**n: 2.0354."""
-_RANGE_EXPONENT = {"rod": 1.5, "point": 2.0}
-_NEAREST_M = 0.05
-
 # Assumed: the X4 documents its power steps by name only (off, low, medium, high); 3 dB apart.
 _TX_AMPLITUDE = {0: 0.0, 1: math.sqrt(0.5), 2: 1.0, 3: math.sqrt(2.0)}
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Reflections:
-    """Paths from transmitter to receiver, frame by frame.
-
-    Attributes
-    ----------
-    range_m
-        Shape (n_frames, k), float64: half the path's length, true metres.
-    amplitude
-        Shape (n_frames, k), float64: of the envelope, normalised units, at TX power 2.
-    phase_rad
-        Shape (k,), float64: carrier phase added by the reflection.
-    """
-
-    range_m: NDArray[np.float64]
-    amplitude: NDArray[np.float64]
-    phase_rad: NDArray[np.float64]
-
-
-def reflection_phase_rad(name: str) -> float:
-    """Return the fixed reflection phase of a named reflector, in [0, 2 pi).
-
-    >>> round(reflection_phase_rad("rod_01"), 6) == round(reflection_phase_rad("rod_02"), 6)
-    False
-    """
-    fraction = int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "big") / 2**32
-    return math.tau * fraction
-
-
-def beam_gain(cos_angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the two-way amplitude pattern for cosines of the angle off boresight, any shape."""
-    gain: NDArray[np.float64] = np.maximum(cos_angle, 0.0) ** BEAM_EXPONENT
-    return gain
-
-
-def target_reflections(
-    targets: tuple[TargetSpec, ...], radar: RadarSpec, robot_poses: NDArray[np.float64]
-) -> Reflections:
-    """Return the direct echoes of targets.
-
-    Parameters
-    ----------
-    targets
-        Reflectors in the world frame, k of them.
-    radar
-        The mount.
-    robot_poses
-        Shape (n_frames, 3), float64: true x [m], y [m], heading [rad] at each sample time.
-    """
-    return _reflections(
-        radar,
-        robot_poses,
-        at_x=np.array([target.x_m for target in targets]),
-        at_y=np.array([target.y_m for target in targets]),
-        strength=np.array([target.amplitude_1m for target in targets]),
-        exponent=np.array([_RANGE_EXPONENT[target.kind] for target in targets]),
-        phase_rad=np.array([reflection_phase_rad(target.name) for target in targets]),
-    )
-
-
-def person_reflections(
-    person: PersonSpec,
-    radar: RadarSpec,
-    robot_poses: NDArray[np.float64],
-    t_ns: NDArray[np.int64],
-) -> Reflections:
-    """Return the echo of a person, k = 1, at scene times of shape (n_frames,), int64."""
-    position = positions_m(person, t_ns)
-    strength = AMPLITUDE_OF_1_M2 * math.sqrt(person.rcs_m2)
-    standing = _reflections(
-        radar,
-        robot_poses,
-        at_x=position[:, :1],
-        at_y=position[:, 1:],
-        strength=np.where(present(person, t_ns), strength, 0.0)[:, np.newaxis],
-        exponent=np.array([_RANGE_EXPONENT["point"]]),
-        phase_rad=np.array([reflection_phase_rad(person.name)]),
-    )
-    chest_m = chest_displacement_m(person, t_ns)[:, np.newaxis]
-    return replace(standing, range_m=standing.range_m - chest_m)
-
-
-def _reflections(
-    radar: RadarSpec,
-    robot_poses: NDArray[np.float64],
-    *,
-    at_x: NDArray[np.float64],
-    at_y: NDArray[np.float64],
-    strength: NDArray[np.float64],
-    exponent: NDArray[np.float64],
-    phase_rad: NDArray[np.float64],
-) -> Reflections:
-    """Return echoes from points of shape (k,) or (n_frames, k), world frame."""
-    x, y, heading = robot_poses.T[:, :, np.newaxis]
-    cosine, sine = np.cos(heading), np.sin(heading)
-    radar_x = x + cosine * radar.x_m - sine * radar.y_m
-    radar_y = y + sine * radar.x_m + cosine * radar.y_m
-    yaw_rad = math.radians(radar.yaw_deg)
-    boresight_x = cosine * math.cos(yaw_rad) - sine * math.sin(yaw_rad)
-    boresight_y = sine * math.cos(yaw_rad) + cosine * math.sin(yaw_rad)
-
-    dx = at_x - radar_x
-    dy = at_y - radar_y
-    range_m = np.sqrt(dx * dx + dy * dy)
-    near_m = np.maximum(range_m, _NEAREST_M)
-    cos_angle = (dx * boresight_x + dy * boresight_y) / near_m
-    return Reflections(
-        range_m=range_m,
-        amplitude=strength * near_m**-exponent * beam_gain(cos_angle),
-        phase_rad=phase_rad,
-    )
 
 
 class SceneEcho:
@@ -202,7 +85,8 @@ class SceneEcho:
         self._radar = radar
         self._seed = seed
         self._trajectory = scene.trajectory()
-        self._skew_ns = round(radar.start_skew_ms * 1e6)
+        self._clock = ModuleClock(skew_ns=round(radar.start_skew_ms * 1e6), ppm=radar.clock_ppm)
+        self._gain = 10.0 ** (radar.gain_db / 20)
 
     def echo(
         self, capture: CaptureSettings, scene_times_ns: NDArray[np.int64]
@@ -212,7 +96,7 @@ class SceneEcho:
         Shape (n_frames, capture.n_samples), float64, normalised units. A reflection weaker than
         one count is skipped.
         """
-        times_ns = scene_times_ns + self._skew_ns
+        times_ns = self._clock.scene_times_ns(scene_times_ns)
         poses = self._trajectory.poses(times_ns)
         leakage = self._scene.leakage
         terms = [
@@ -231,10 +115,10 @@ class SceneEcho:
         amplitude = np.concatenate([term.amplitude for term in terms], axis=1)
         phase_rad = np.concatenate([term.phase_rad for term in terms])
 
-        amplitude *= _TX_AMPLITUDE[capture.tx_power]
-        position = (range_m + self._radar.range_offset_m) * _SAMPLES_PER_M
+        amplitude *= _TX_AMPLITUDE[capture.tx_power] * self._gain
+        position = (range_m + self._radar.range_offset_m) * (_SAMPLES_PER_M * self._clock.rate)
         position -= capture.first_sample_m * _SAMPLES_PER_MODULE_M
-        frame, path = np.nonzero(amplitude >= _count(capture))
+        frame, path = np.nonzero(amplitude >= one_count(capture))
         return sum_of_pulses(
             frame=frame,
             position=position[frame, path],
@@ -251,35 +135,15 @@ class SceneEcho:
         scene_times_ns: NDArray[np.int64],
     ) -> NDArray[np.int64]:
         """Return raw RF chip counters, shape (n_frames, n_samples); see ``EchoSource``."""
-        normalisation = x4.Normalisation.of(
-            iterations=capture.iterations,
-            pulses_per_step=capture.pulses_per_step,
-            dac_min=capture.dac_min,
-            dac_max=capture.dac_max,
-            dac_step=capture.dac_step,
+        return rf_counters(
+            self.echo(capture, scene_times_ns),
+            frame_counters,
+            self._clock.scene_times_ns(scene_times_ns),
+            capture=capture,
+            scene=self._scene,
+            radar=self._radar,
+            seed=self._seed,
         )
-        pulses = capture.iterations * capture.pulses_per_step
-        noise = self._scene.noise
-        sigma = noise.rf_sigma * math.sqrt(noise.iterations * noise.pulses_per_step / pulses)
-
-        units = frame_noise_units(
-            frame_counters, capture.n_samples, seed=self._seed, stream=int(self._radar.serial)
-        )
-        counts: NDArray[np.float64] = units * (sigma / UNITS_PER_SIGMA)
-        counts += self.echo(capture, scene_times_ns)
-        counts += normalisation.dac_offset
-        counts *= 1 / _count(capture)
-        np.rint(counts, out=counts)
-        np.clip(counts, 0, normalisation.max_counter, out=counts)
-        return counts.astype(np.int64)
-
-
-def _count(capture: CaptureSettings) -> float:
-    """Return one chip count in normalised units (protocol reference 9.7).
-
-    In float64: `xethru_protocol.x4.Normalisation` rounds it to float32, as the wire needs it.
-    """
-    return 2.0**capture.dac_step / (capture.iterations * capture.pulses_per_step) / 1024
 
 
 def echo_source(scene: Scene, radar_index: int, seed: int) -> EchoSource:

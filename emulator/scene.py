@@ -13,19 +13,24 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    StrictFloat,
-    StrictInt,
-    ValidationError,
-    field_validator,
-    model_validator,
-)
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from emulator.people import PersonSpec
+from emulator.scene_tables import (
+    ClutterSpec,
+    JitterSpec,
+    LeakageSpec,
+    MultipathSpec,
+    Name,
+    NoiseSpec,
+    ObjectSpec,
+    OdometrySpec,
+    PathSpec,
+    RadarSpec,
+    Table,
+    TargetSpec,
+    WallSpec,
+)
 from emulator.trajectory import Trajectory, drive
 
 __all__ = [
@@ -61,123 +66,7 @@ class UnknownSceneError(SceneError):
     """A name that is none of the shipped scenes: wrong usage, while a bad file is a failure."""
 
 
-def _finite(value: object) -> object:
-    """Refuse TOML's inf and nan with words a person can act on."""
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError("must be a finite number")
-    return value
-
-
-Metres = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-1000, le=1000)]
-Sigma = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=1)]
-Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
-
-
-class _Table(BaseModel):
-    """One TOML table: frozen, and an unknown key is an error."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class RadarSpec(_Table):
-    """One X4M300 on the robot.
-
-    ``x_m``, ``y_m`` and ``yaw_deg`` place the antennas' phase centre and boresight in the body
-    frame (x forward, y left, yaw counter-clockwise). ``range_offset_m`` is added to every true
-    range (the module's own delay error; positive reads too far). ``start_skew_ms`` is how much
-    later than the nominal scene time of a counter this radar samples.
-    """
-
-    name: Name
-    serial: Annotated[str, Field(pattern=r"^[0-9]{12}$")]
-    x_m: Metres
-    y_m: Metres
-    yaw_deg: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-360, le=360)]
-    range_offset_m: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-1, le=1)] = 0.0
-    start_skew_ms: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=10_000)] = 0.0
-
-
-class TargetSpec(_Table):
-    """One reflector, in the world frame.
-
-    ``kind`` selects the amplitude law: a ``rod`` falls with R**-1.5, a ``point`` with R**-2;
-    ``amplitude_1m`` is the echo's amplitude on boresight at 1 m. The reflection phase is fixed
-    by the name (``emulator.echo``).
-    """
-
-    name: Name
-    kind: Literal["rod", "point"]
-    x_m: Metres
-    y_m: Metres
-    amplitude_1m: Annotated[StrictFloat, BeforeValidator(_finite), Field(gt=0, le=10)] = 0.015
-
-
-class PathSpec(_Table):
-    """A closed course of waypoints driven in laps, turning on the spot.
-
-    ``laps`` lists the direction of every lap: ``forward`` visits the waypoints as written and
-    returns to the first, ``backward`` the other way round. No laps: the robot stands.
-    """
-
-    waypoints_m: tuple[tuple[Metres, Metres], ...] = ((0.0, 0.0),)
-    laps: tuple[Literal["forward", "backward"], ...] = ()
-    speed_mps: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=1e-3, le=10)] = 0.05
-    turn_rate_deg_per_s: Annotated[
-        StrictFloat, BeforeValidator(_finite), Field(ge=0.1, le=3600)
-    ] = 28.125
-
-    @field_validator("waypoints_m")
-    @classmethod
-    def _starts_at_origin(
-        cls, value: tuple[tuple[float, float], ...]
-    ) -> tuple[tuple[float, float], ...]:
-        along_x = len(value) < 2 or (value[1][0] > 0 and value[1][1] == 0)
-        if not value or value[0] != (0.0, 0.0) or not along_x:
-            raise ValueError(
-                "the world frame is the robot's start pose: "
-                "begin with [0.0, 0.0] and go on to a point on the positive x axis"
-            )
-        return value
-
-    def stops_m(self) -> tuple[tuple[float, float], ...]:
-        """Return every stop of the whole drive in order, (x, y) [m], world frame."""
-        first, *others = self.waypoints_m
-        stops = [first]
-        for lap in self.laps:
-            stops.extend(others if lap == "forward" else reversed(others))
-            stops.append(first)
-        return tuple(stops)
-
-
-class OdometrySpec(_Table):
-    """How the wheels drift: standard deviations of the model in ``emulator.odometry``."""
-
-    rate_hz: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0.1, le=1000)] = 5.0
-    scale_sigma: Sigma = 0.0
-    turn_scale_sigma: Sigma = 0.0
-    curvature_sigma_rad_per_m: Sigma = 0.0
-    along_sigma_m_per_sqrt_m: Sigma = 0.0
-    across_sigma_m_per_sqrt_m: Sigma = 0.0
-    heading_sigma_rad_per_sqrt_m: Sigma = 0.0
-    heading_sigma_rad_per_rad: Sigma = 0.0
-
-
-class NoiseSpec(_Table):
-    """White receiver noise: ``rf_sigma`` per RF sample at the named working point."""
-
-    rf_sigma: Sigma = 5e-4
-    iterations: Annotated[StrictInt, Field(ge=1, le=255)] = 16
-    pulses_per_step: Annotated[StrictInt, Field(ge=1, le=65535)] = 300
-
-
-class LeakageSpec(_Table):
-    """The direct pulse from transmitter to receiver, at TX power 2."""
-
-    amplitude: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=10)] = 0.06
-    range_m: Metres = 0.05
-
-
-class Scene(_Table):
+class Scene(Table):
     """A whole scene. ``environment`` names the preset values a SLAM run should use for it."""
 
     name: Name
@@ -186,10 +75,15 @@ class Scene(_Table):
     radars: Annotated[tuple[RadarSpec, ...], Field(min_length=1, max_length=64)]
     targets: tuple[TargetSpec, ...] = ()
     people: Annotated[tuple[PersonSpec, ...], Field(max_length=32)] = ()
+    walls: Annotated[tuple[WallSpec, ...], Field(max_length=64)] = ()
+    objects: Annotated[tuple[ObjectSpec, ...], Field(max_length=64)] = ()
+    multipath: MultipathSpec = MultipathSpec()
     path: PathSpec = PathSpec()
     odometry: OdometrySpec = OdometrySpec()
     noise: NoiseSpec = NoiseSpec()
     leakage: LeakageSpec = LeakageSpec()
+    clutter: ClutterSpec = ClutterSpec()
+    jitter: JitterSpec = JitterSpec()
 
     @model_validator(mode="after")
     def _names_are_unique(self) -> Scene:
@@ -198,6 +92,8 @@ class Scene(_Table):
             ("radars.serial", [radar.serial for radar in self.radars]),
             ("targets.name", [target.name for target in self.targets]),
             ("people.name", [person.name for person in self.people]),
+            ("walls.name", [wall.name for wall in self.walls]),
+            ("objects.name", [box.name for box in self.objects]),
         ):
             twice = sorted({value for value in values if values.count(value) > 1})
             if twice:

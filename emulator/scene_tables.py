@@ -1,0 +1,262 @@
+"""The tables of a scene file: frozen, validated models, one for every TOML table.
+
+Lengths are true metres, angles degrees, amplitudes normalised X4 units (full scale of the 11 bit
+DAC is +-1). What each number does to an echo is on the model page, ``emulator.echo``; to the
+odometry, in ``emulator.odometry``.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StrictBool,
+    StrictFloat,
+    StrictInt,
+    field_validator,
+    model_validator,
+)
+
+from emulator.people import AMPLITUDE_OF_1_M2
+
+__all__ = [
+    "MIRROR_AMPLITUDE_1M",
+    "ClutterSpec",
+    "JitterSpec",
+    "LeakageSpec",
+    "MultipathSpec",
+    "Name",
+    "NoiseSpec",
+    "ObjectSpec",
+    "OdometrySpec",
+    "PathSpec",
+    "RadarSpec",
+    "Table",
+    "TargetSpec",
+    "WallSpec",
+]
+
+MIRROR_AMPLITUDE_1M = AMPLITUDE_OF_1_M2 * math.sqrt(math.pi)
+"""Echo of a large perfect mirror on boresight at 1 m: 0.106, as strong as pi R**2 at R."""
+SHORTEST_FACE_M = 0.01
+
+
+def _finite(value: object) -> object:
+    """Refuse TOML's inf and nan with words a person can act on."""
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError("must be a finite number")
+    return value
+
+
+Metres = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-1000, le=1000)]
+Degrees = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-360, le=360)]
+Sigma = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=1)]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
+
+
+class Table(BaseModel):
+    """One TOML table: frozen, and an unknown key is an error."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class RadarSpec(Table):
+    """One X4M300 on the robot.
+
+    ``x_m``, ``y_m`` and ``yaw_deg`` place the antennas' phase centre and boresight in the body
+    frame (x forward, y left, yaw counter-clockwise). ``range_offset_m`` is added to every true
+    range (the module's own delay error; positive reads too far). ``gain_db`` is the error of its
+    receiver's gain: it scales echoes, leakage and clutter, not the counts. ``start_skew_ms`` is
+    how much later than the nominal scene time of counter 0 this radar samples, and ``clock_ppm``
+    how fast its clock is: its frames come earlier and its bins are shorter
+    (``emulator.module_clock``).
+    """
+
+    name: Name
+    serial: Annotated[str, Field(pattern=r"^[0-9]{12}$")]
+    x_m: Metres
+    y_m: Metres
+    yaw_deg: Degrees
+    range_offset_m: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-1, le=1)] = 0.0
+    gain_db: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-40, le=40)] = 0.0
+    start_skew_ms: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=10_000)] = 0.0
+    clock_ppm: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-1000, le=1000)] = 0.0
+
+
+class TargetSpec(Table):
+    """One reflector, in the world frame.
+
+    ``kind`` selects the amplitude law: a ``rod`` falls with R**-1.5, a ``point`` with R**-2, and
+    a ``cylinder`` of ``radius_m`` is seen at the point of its surface nearest to the radar.
+    ``amplitude_1m`` is the echo's amplitude on boresight at 1 m (of a cylinder: 1 m from its
+    surface). The reflection phase is fixed by the name (``emulator.echo``).
+    """
+
+    name: Name
+    kind: Literal["rod", "point", "cylinder"]
+    x_m: Metres
+    y_m: Metres
+    amplitude_1m: Annotated[StrictFloat, BeforeValidator(_finite), Field(gt=0, le=10)] = 0.015
+    radius_m: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=10)] = 0.0
+
+    @model_validator(mode="after")
+    def _radius_belongs_to_a_cylinder(self) -> TargetSpec:
+        if (self.kind == "cylinder") != (self.radius_m > 0):
+            raise ValueError(
+                "radius_m: a cylinder needs one greater than 0, a rod or a point has none"
+            )
+        return self
+
+
+class _Surface(Table):
+    """What walls and boxes are made of.
+
+    ``amplitude_1m`` is the echo of a large flat one on boresight at 1 m; it falls with R**-1, and
+    a perfect mirror's is ``MIRROR_AMPLITUDE_1M``. ``transmission`` is the factor on the
+    amplitude of what passes through, one way. What is reflected and what passes cannot carry
+    more than what arrives.
+    """
+
+    amplitude_1m: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=1)] = 0.035
+    transmission: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=1)] = 0.0
+
+    @property
+    def reflection(self) -> float:
+        """Return the magnitude of the reflection coefficient, 0 ... 1."""
+        return self.amplitude_1m / MIRROR_AMPLITUDE_1M
+
+    @model_validator(mode="after")
+    def _creates_no_energy(self) -> _Surface:
+        most = MIRROR_AMPLITUDE_1M * math.sqrt(1 - self.transmission**2)
+        if self.amplitude_1m > most * (1 + 1e-9):
+            raise ValueError(
+                f"amplitude_1m: at most {most:.4f} beside a transmission of "
+                f"{self.transmission:g}; a perfect mirror gives {MIRROR_AMPLITUDE_1M:.4f}"
+            )
+        return self
+
+
+class WallSpec(_Surface):
+    """A straight wall from one end to the other, in the world frame; it reflects on both sides."""
+
+    name: Name
+    from_m: tuple[Metres, Metres]
+    to_m: tuple[Metres, Metres]
+
+    @model_validator(mode="after")
+    def _has_a_length(self) -> WallSpec:
+        if math.dist(self.from_m, self.to_m) < SHORTEST_FACE_M:
+            raise ValueError(f"to_m: must be at least {SHORTEST_FACE_M} m from from_m")
+        return self
+
+
+class ObjectSpec(_Surface):
+    """A box: centred at ``x_m``, ``y_m`` in the world frame, turned by ``yaw_deg``.
+
+    ``width_m`` lies along its own x axis, ``depth_m`` along its own y axis. Its four faces are
+    like walls; its edges are weak points.
+    """
+
+    name: Name
+    x_m: Metres
+    y_m: Metres
+    width_m: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=SHORTEST_FACE_M, le=100)]
+    depth_m: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=SHORTEST_FACE_M, le=100)]
+    yaw_deg: Degrees = 0.0
+
+
+class MultipathSpec(Table):
+    """Which paths of more than one reflection are heard, where there are walls or objects.
+
+    ``double_bounce`` is by way of a wall and a target or a person, ``corners`` of two walls.
+    """
+
+    double_bounce: StrictBool = True
+    corners: StrictBool = True
+
+
+class ClutterSpec(Table):
+    """Slow correlated clutter: ``sigma`` per RF sample, normalised units."""
+
+    sigma: Sigma = 0.0
+    correlation_s: Annotated[StrictFloat, BeforeValidator(_finite), Field(gt=0, le=86_400)] = 10.0
+
+
+class JitterSpec(Table):
+    """Jitter of the carrier's phase, common to all echoes of a frame: white and slow."""
+
+    white_rad: Sigma = 0.0
+    slow_rad: Sigma = 0.0
+    slow_correlation_s: Annotated[StrictFloat, BeforeValidator(_finite), Field(gt=0, le=86_400)] = (
+        10.0
+    )
+
+
+class PathSpec(Table):
+    """A closed course of waypoints driven in laps, turning on the spot.
+
+    ``laps`` lists the direction of every lap: ``forward`` visits the waypoints as written and
+    returns to the first, ``backward`` the other way round. No laps: the robot stands.
+    """
+
+    waypoints_m: tuple[tuple[Metres, Metres], ...] = ((0.0, 0.0),)
+    laps: tuple[Literal["forward", "backward"], ...] = ()
+    speed_mps: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=1e-3, le=10)] = 0.05
+    turn_rate_deg_per_s: Annotated[
+        StrictFloat, BeforeValidator(_finite), Field(ge=0.1, le=3600)
+    ] = 28.125
+
+    @field_validator("waypoints_m")
+    @classmethod
+    def _starts_at_origin(
+        cls, value: tuple[tuple[float, float], ...]
+    ) -> tuple[tuple[float, float], ...]:
+        along_x = len(value) < 2 or (value[1][0] > 0 and value[1][1] == 0)
+        if not value or value[0] != (0.0, 0.0) or not along_x:
+            raise ValueError(
+                "the world frame is the robot's start pose: "
+                "begin with [0.0, 0.0] and go on to a point on the positive x axis"
+            )
+        return value
+
+    def stops_m(self) -> tuple[tuple[float, float], ...]:
+        """Return every stop of the whole drive in order, (x, y) [m], world frame."""
+        first, *others = self.waypoints_m
+        stops = [first]
+        for lap in self.laps:
+            stops.extend(others if lap == "forward" else reversed(others))
+            stops.append(first)
+        return tuple(stops)
+
+
+class OdometrySpec(Table):
+    """How the wheels drift: standard deviations of the model in ``emulator.odometry``."""
+
+    rate_hz: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0.1, le=1000)] = 5.0
+    scale_sigma: Sigma = 0.0
+    turn_scale_sigma: Sigma = 0.0
+    curvature_sigma_rad_per_m: Sigma = 0.0
+    along_sigma_m_per_sqrt_m: Sigma = 0.0
+    across_sigma_m_per_sqrt_m: Sigma = 0.0
+    heading_sigma_rad_per_sqrt_m: Sigma = 0.0
+    heading_sigma_rad_per_rad: Sigma = 0.0
+
+
+class NoiseSpec(Table):
+    """White receiver noise: ``rf_sigma`` per RF sample at the named working point."""
+
+    rf_sigma: Sigma = 5e-4
+    iterations: Annotated[StrictInt, Field(ge=1, le=255)] = 16
+    pulses_per_step: Annotated[StrictInt, Field(ge=1, le=65535)] = 300
+
+
+class LeakageSpec(Table):
+    """The direct pulse from transmitter to receiver, at TX power 2."""
+
+    amplitude: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=10)] = 0.06
+    range_m: Metres = 0.05
