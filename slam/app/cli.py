@@ -11,7 +11,9 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from slam.app.errors import EXIT_FAILED, AppError
+from slam.app.arguments import count, folder, seed
+from slam.app.errors import EXIT_FAILED, AppError, naming
+from slam.app.experiments import EXPERIMENTS, Experiment, ExperimentModule
 from slam.app.standard_streams import drop_what_cannot_be_said, open_closed_streams
 from slam.app.stop import StopFlag, StopRequestedError
 
@@ -73,12 +75,10 @@ def _parser() -> argparse.ArgumentParser:
         description="Starts the emulator, opens its four radars through serial ports, runs SLAM "
         "while frames arrive, and writes session, map and numbers. All numbers are simulated.",
     )
-    demo.add_argument(
-        "--out", type=_folder, default=Path("out/demo"), help="folder for the results"
-    )
+    demo.add_argument("--out", type=folder, default=Path("out/demo"), help="folder for the results")
     demo.add_argument(
         "--seed",
-        type=_seed,
+        type=seed,
         default=_TYPICAL_SEED,
         help="seed of noise and odometry drift (default: %(default)s, a typical run)",
     )
@@ -105,33 +105,41 @@ def _parser() -> argparse.ArgumentParser:
     )
     sweep.add_argument("--scene", nargs="+", default=["lab"], help="names or files of scenes")
     sweep.add_argument("--preset", nargs="+", default=["paper"], help="settings of SLAM")
-    sweep.add_argument("--seeds", type=_count, default=20, help="number of seeds, from 0")
-    sweep.add_argument("--jobs", type=_count, default=1, help="processes")
+    sweep.add_argument("--seeds", type=count, default=20, help="number of seeds, from 0")
+    sweep.add_argument("--jobs", type=count, default=1, help="processes")
     sweep.add_argument("--json", type=Path, required=True, metavar="OUT", help="result file")
     sweep.set_defaults(command=_sweep)
+
+    experiment = commands.add_parser(
+        "experiment",
+        help="repeat an experiment of the paper, or show a limit, as picture and numbers",
+        description="Runs one experiment on emulated radars; writes NAME.png and NAME.json. All "
+        "numbers are simulated.",
+    )
+    names = experiment.add_subparsers(
+        required=True, metavar="NAME", dest="name", parser_class=_ExperimentParser
+    )
+    for row in EXPERIMENTS.values():
+        parser_of_row = names.add_parser(row.name, help=row.help, description=row.help)
+        parser_of_row.experiment = row
+        parser_of_row.add_argument(
+            "--out", type=folder, default=Path("out/experiments"), help="folder for the results"
+        )
     return parser
 
 
-def _folder(text: str) -> Path:
-    try:
-        text.encode()
-    except UnicodeEncodeError:  # Rerun's writer takes no other
-        raise argparse.ArgumentTypeError(f"must be a UTF-8 name, not {text!r}") from None
-    return Path(text)
+class _ExperimentParser(argparse.ArgumentParser):
+    """Imports its experiment, which adds its own options, only once it is named."""
 
+    experiment: Experiment
 
-def _seed(text: str) -> int:
-    return _whole_number(text, least=0)
-
-
-def _count(text: str) -> int:
-    return _whole_number(text, least=1)
-
-
-def _whole_number(text: str, *, least: int) -> int:
-    if not text.isascii() or not text.isdigit() or not least <= int(text) < 2**63:
-        raise argparse.ArgumentTypeError(f"must be a whole number, {least} or more, not {text!r}")
-    return int(text)
+    def parse_known_args(  # type: ignore[override]  # of its overloads, argparse uses this one
+        self, args: Sequence[str] | None = None, namespace: None = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        module = self.experiment.load()
+        module.add_arguments(self)
+        self.set_defaults(command=_experiment, module=module)
+        return super().parse_known_args(args, namespace)
 
 
 def _demo(arguments: argparse.Namespace, stop: StopFlag) -> None:
@@ -163,6 +171,14 @@ def _sweep(arguments: argparse.Namespace, stop: StopFlag) -> None:
         out=arguments.json,
     )
     run_sweep(options, stop)
+
+
+def _experiment(arguments: argparse.Namespace, stop: StopFlag) -> None:
+    module: ExperimentModule = arguments.module
+    out: Path = arguments.out
+    with naming(out):
+        out.mkdir(parents=True, exist_ok=True)
+    module.run(arguments, stop)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,51 @@
+"""The experiments of `uwb-slam experiment NAME`: one row each, one module each.
+
+Importing this package loads nothing heavy. A row's module is imported once its experiment is named
+on the command line, for its ``--help`` too, so it imports numpy and the like inside ``run``. It has
+
+``add_arguments(parser)``
+    adds its own options to an ``argparse.ArgumentParser`` that has ``--out`` already, a
+    ``pathlib.Path``;
+``run(arguments, stop)``
+    writes ``<out>/<name>.png`` and ``<out>/<name>.json``, prints a table to stdout and progress to
+    stderr, and asks ``stop.check()`` now and then. The folder exists and can be written.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from types import MappingProxyType
+from typing import Protocol, cast
+
+from slam.app.stop import StopFlag
+
+
+class ExperimentModule(Protocol):
+    """What the module of a row offers."""
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Add the experiment's own options."""
+
+    def run(self, arguments: argparse.Namespace, stop: StopFlag) -> None:
+        """Measure, draw, write, print."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Experiment:
+    """One row: what the experiment is called, what it shows in a line, where it lives."""
+
+    name: str
+    help: str
+    module: str
+
+    def load(self) -> ExperimentModule:
+        """Import the module."""
+        return cast(ExperimentModule, import_module(self.module))
+
+
+_ROWS: tuple[Experiment, ...] = ()
+
+EXPERIMENTS: Mapping[str, Experiment] = MappingProxyType({row.name: row for row in _ROWS})
