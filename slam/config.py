@@ -8,17 +8,13 @@ other values correct. Lengths in metres, angles in radians unless the name says 
 from __future__ import annotations
 
 import math
-import tomllib
-from collections.abc import Mapping
 from enum import StrEnum
-from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
 from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
-    ValidationError,
     ValidationInfo,
     field_validator,
     model_validator,
@@ -27,12 +23,20 @@ from pydantic import (
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
-# The top level of a preset file holds the values of this environment (paper, Table I).
-BASE_ENVIRONMENT = "lab"
+
+class FrontEnd(StrEnum):
+    """How echoes are found in a frame."""
+
+    PAPER = "paper"  # as printed: magnitude, smoothing, local maxima
+    MATCHED_FILTER = "matched_filter"  # correlation with the pulse; ranges at the Cramer-Rao bound
+    JOINT = "joint"  # the same, and pulses that overlap are fitted together
 
 
-class ConfigError(ValueError):
-    """A preset file or an override that cannot be used; one line with file, key and remedy."""
+class LeakageFilter(StrEnum):
+    """What happens to the part of a frame that moves with the radar, leakage above all."""
+
+    NONE = "none"  # as printed
+    RUNNING_MEAN = "running_mean"  # near the antenna, the mean of past frames is subtracted
 
 
 class BackgroundFilter(StrEnum):
@@ -47,6 +51,20 @@ class PeakPosition(StrEnum):
 
     BIN = "bin"  # as printed: the sample of the local maximum
     PARABOLA = "parabola"  # vertex through the maximum and its neighbours
+
+
+class SampleTime(StrEnum):
+    """From where the robot is taken to have looked when an echo was received."""
+
+    NOMINAL = "nominal"  # as printed: all radars look from the pose of the collected state
+    OWN = "own"  # each radar from the pose at the time of its own frame
+
+
+class PairBearing(StrEnum):
+    """What gives the direction of an echo that two radars of a pair see."""
+
+    RANGES = "ranges"  # as printed: the difference of the two ranges
+    PHASE = "phase"  # that difference refined by the carrier's phase, see slam/phase_bearing.py
 
 
 class Pairing(StrEnum):
@@ -111,8 +129,8 @@ class Assignment(StrEnum):
     ONE_TO_ONE = "one_to_one"  # all together, no landmark twice, least total distance
 
 
-# Validation context of settings that come as text, from a command line.
-_TEXT_ALLOWED = "text allowed"
+TEXT_ALLOWED = "text allowed"
+"""Validation context of settings that come as text, from a command line."""
 
 
 class _Model(BaseModel):
@@ -126,14 +144,18 @@ class _Model(BaseModel):
             raise ValueError("must be a number or a name, not true or false")
         assert info.field_name is not None
         is_number = cls.model_fields[info.field_name].annotation in (int, float)
-        if is_number and isinstance(value, str) and info.context != _TEXT_ALLOWED:
+        if is_number and isinstance(value, str) and info.context != TEXT_ALLOWED:
             raise ValueError("must be a number, not text; write it without quotes")
         return value
 
 
 class DetectionConfig(_Model):
-    """Denoising and peak search in one frame (paper, section Signal Processing)."""
+    """Denoising and peak search in one frame (paper, section Signal Processing).
 
+    The range limits and ``front_end`` hold for every front end, the rest for the paper's.
+    """
+
+    front_end: FrontEnd = FrontEnd.PAPER
     background: BackgroundFilter = BackgroundFilter.BELOW_MEAN_TO_ZERO
     smoothing_length_bins: Annotated[int, Field(ge=3)] = 15
     smoothing_order: Annotated[int, Field(ge=0)] = 5
@@ -155,6 +177,29 @@ class DetectionConfig(_Model):
         return self
 
 
+class MatchedFilterConfig(_Model):
+    """The front ends that know the pulse: ``matched_filter`` and ``joint``."""
+
+    carrier_hz: Positive = 7.29e9
+    bandwidth_hz: Positive = 1.4e9
+    # How many peaks a frame of noise alone gives on average; sets the threshold.
+    false_alarms_per_frame: Annotated[float, Field(gt=0, lt=1)] = 1e-3
+    # Standard deviation of the noise per RF sample; 0 estimates it in every frame.
+    noise_sigma: NonNegative = 0.0
+    # Unexplained over expected energy from which ``joint`` looks for several pulses.
+    max_single_misfit: Positive = 4.0
+
+
+class LeakageConfig(_Model):
+    """Subtraction of what moves with the radar, before any front end."""
+
+    filter: LeakageFilter = LeakageFilter.NONE
+    # Subtracted up to here; a wall farther away never is, however long it keeps its distance.
+    max_range_m: Positive = 0.35
+    # Frames after which an old state of affairs is forgotten to 1/e.
+    memory_frames: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 50.0
+
+
 class TrilaterationConfig(_Model):
     """Which pairs of ranges become a fix (paper eq. 1 and 2)."""
 
@@ -164,6 +209,8 @@ class TrilaterationConfig(_Model):
     # their counters carry equal stamps where the counters are equal, so a limit acts only where
     # frames are stamped by their arrival.
     max_stamp_difference_s: Annotated[float, Field(ge=0, allow_inf_nan=True)] = math.inf
+    sample_time: SampleTime = SampleTime.NOMINAL
+    bearing: PairBearing = PairBearing.RANGES
 
     @property
     def field_of_view_rad(self) -> float:
@@ -242,113 +289,11 @@ class SlamConfig(_Model):
     """Everything one run of the pipeline is told."""
 
     detection: DetectionConfig = DetectionConfig()
+    matched_filter: MatchedFilterConfig = MatchedFilterConfig()
+    leakage: LeakageConfig = LeakageConfig()
     trilateration: TrilaterationConfig = TrilaterationConfig()
     window: WindowConfig = WindowConfig()
     clustering: ClusteringConfig = ClusteringConfig()
     motion: MotionConfig = MotionConfig()
     observation: ObservationConfig = ObservationConfig()
     association: AssociationConfig = AssociationConfig()
-
-
-# Beside this package, in the repository and in the wheel alike; a folder named "fixtures" in the
-# user's own project must not come first, as it would by that name.
-_SHIPPED_PRESETS = Path(__file__).parent.parent / "fixtures" / "presets"
-
-
-def load_preset(name: str, environment: str = BASE_ENVIRONMENT) -> SlamConfig:
-    """Return the preset ``fixtures/presets/<name>.toml`` for one environment.
-
-    Raises
-    ------
-    ConfigError
-        Unknown preset or environment, unreadable file, unknown key or value out of range.
-    """
-    known = sorted(file.stem for file in _SHIPPED_PRESETS.glob("*.toml"))
-    if name not in known:
-        raise ConfigError(f"unknown preset {name!r}; known: {', '.join(known)}")
-    file = _SHIPPED_PRESETS / f"{name}.toml"
-    source = f"preset {name}.toml"
-    try:
-        tables = tomllib.loads(file.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{source}: not TOML: {error}") from error
-    return config_from_tables(tables, environment=environment, source=source)
-
-
-def config_from_tables(
-    tables: Mapping[str, Any], *, environment: str = BASE_ENVIRONMENT, source: str
-) -> SlamConfig:
-    """Return the configuration that the tables of a preset file describe.
-
-    Parameters
-    ----------
-    tables
-        The parsed file: one table per part of SlamConfig, and ``environment.<name>`` with the
-        values that differ there.
-    environment
-        "lab" is the top level itself; any other name must have its table. The tables of all
-        environments are checked, whichever is asked for.
-    source
-        What to call the tables in an error message.
-    """
-    base = {key: value for key, value in tables.items() if key != "environment"}
-    overrides = _table(tables.get("environment", {}), "environment", source)
-    if environment != BASE_ENVIRONMENT and environment not in overrides:
-        allowed = ", ".join([BASE_ENVIRONMENT, *sorted(overrides)])
-        raise ConfigError(f"{source}: no environment {environment!r}; known: {allowed}")
-    configs = {BASE_ENVIRONMENT: _validated(base, source)}
-    for name, values in overrides.items():
-        key = f"environment.{name}"
-        merged = dict(base)
-        for part, changes in _table(values, key, source).items():
-            general = merged.get(part, {})
-            merged[part] = {**general, **_table(changes, f"{key}.{part}", source)}
-        configs[name] = _validated(merged, f"{source}: {key}")
-    return configs[environment]
-
-
-def override(config: SlamConfig, settings: Mapping[str, object]) -> SlamConfig:
-    """Return the configuration with dotted keys replaced; text is read as the key's type.
-
-    >>> override(SlamConfig(), {"association.gate": "1.6"}).association.gate
-    1.6
-    """
-    tables = config.model_dump()
-    for key, value in settings.items():
-        part, _, field = key.partition(".")
-        tables.setdefault(part, {})
-        if not isinstance(tables[part], dict) or not field:
-            raise ConfigError(f"setting {key!r}: write it as part.key; parts: {_parts()}")
-        tables[part] = {**tables[part], field: value}
-    return _validated(tables, "setting", context=_TEXT_ALLOWED)
-
-
-def _table(value: object, key: str, source: str) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise ConfigError(f"{source}: {key}: must be a table (given: {value!r})")
-    return value
-
-
-def _validated(tables: Mapping[str, Any], source: str, context: str | None = None) -> SlamConfig:
-    try:
-        return SlamConfig.model_validate(tables, context=context)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in first["loc"])
-        if first["type"] == "extra_forbidden":
-            raise ConfigError(f"{source}: unknown key {key}; allowed: {_siblings(key)}") from error
-        message = first["msg"].removeprefix("Value error, ")
-        given = f" (given: {first['input']!r})" if not isinstance(first["input"], dict) else ""
-        raise ConfigError(f"{source}: {key}: {message}{given}") from error
-
-
-def _parts() -> str:
-    return ", ".join(SlamConfig.model_fields)
-
-
-def _siblings(key: str) -> str:
-    part, _, field = key.partition(".")
-    model = SlamConfig.model_fields[part].annotation if field else SlamConfig
-    assert isinstance(model, type)
-    assert issubclass(model, BaseModel)
-    return ", ".join(model.model_fields)

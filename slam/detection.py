@@ -7,39 +7,25 @@ observations, where the magnitude comes first.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 from scipy.signal import find_peaks, savgol_filter
 
-from slam.config import BackgroundFilter, DetectionConfig, PeakPosition
+from slam.config import BackgroundFilter, DetectionConfig, FrontEnd, PeakPosition, SlamConfig
+from slam.detector import Detection, Detector
 from slam.frames import RadarFrame
+
+__all__ = ["Detection", "Detector", "PaperDetector", "SavitzkyGolay", "make_detector"]
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Detection:
-    """One echo seen by one radar: a range without a direction.
-
-    Attributes
-    ----------
-    radar
-        Index of the mount.
-    t_ns
-        Session time of the frame.
-    range_m
-        True metres from the antenna, the mount's range offset removed.
-    amplitude
-        Height of the smoothed peak, normalised RF units.
-    """
-
-    radar: int
-    t_ns: int
-    range_m: float
-    amplitude: float
+def make_detector(config: SlamConfig) -> Detector:
+    """Return the front end that ``config.detection.front_end`` names."""
+    return {FrontEnd.PAPER: PaperDetector}[config.detection.front_end](config.detection)
 
 
 class PaperDetector:
@@ -88,6 +74,12 @@ class PaperDetector:
                 strict=True,
             )
         )
+
+    def detect_many(
+        self, frames: Sequence[RadarFrame], offsets_m: Sequence[float]
+    ) -> list[tuple[Detection, ...]]:
+        """Return the echoes of each frame; see ``Detector``."""
+        return [self.detect(*each) for each in zip(frames, offsets_m, strict=True)]
 
     def smooth(self, samples: NDArray[np.float32]) -> Array:
         """Return the magnitude, background set to zero, smoothed; shape (n_bins,), float64."""

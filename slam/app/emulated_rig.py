@@ -20,8 +20,9 @@ from slam.app.emulator_process import EmulatedDevice
 from slam.app.errors import AppError, UsageError
 from slam.app.sources import RadarLink, RigSource
 from slam.app.tum import NS_PER_S
-from slam.config import ConfigError, SlamConfig, load_preset
+from slam.config import SlamConfig
 from slam.geometry import Mount, Rig
+from slam.presets import ConfigError, load_preset
 from xethru_protocol.driver import X4M300, ProtocolRecord, RawConfig
 from xethru_protocol.errors import XeThruError
 from xethru_protocol.x4 import real_frame_rate

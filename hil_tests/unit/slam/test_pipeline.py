@@ -7,12 +7,13 @@ import pytest
 from numpy.typing import NDArray
 
 from hil_tests.unit.slam.simulation import CLASSROOM, FRAME_NS, LAB, Room, World, simulate
-from slam.config import EndOfRun, SlamConfig, WindowConfig, load_preset
+from slam.config import EndOfRun, SlamConfig, WindowConfig
 from slam.detection import Detection
 from slam.frames import RadarFrame
 from slam.geometry import paper_rig
 from slam.metrics import ate_rmse_m
 from slam.pipeline import StepResult, UwbRadarSlam
+from slam.presets import load_preset
 
 Array = NDArray[np.float64]
 

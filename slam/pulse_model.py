@@ -1,0 +1,123 @@
+"""The pulse a front end expects: Gaussian envelope on a carrier, in the bins of a frame.
+
+An echo of amplitude A and phase phi at position u (in bins) is, at RF sample n,
+
+    A Re{ p(n - u) exp(j phi) },   p(x) = exp(-x**2 / (2 s**2)) exp(j kappa x)
+
+with s the envelope's standard deviation and kappa the carrier's phase per bin. A range R is a
+two-way delay 2 R / c, so everything follows from two frequencies and the length of a bin.
+
+Cramer-Rao bound of the position, A and phi unknown, white noise of standard deviation sigma per
+sample (Kay 1993, Fundamentals of Statistical Signal Processing vol. 1: eq. 3.21, and section 3.7
+for more than one parameter). Amplitude and phase enter the pulse linearly as a complex number, so
+what counts is the part of the derivative that they do not explain: the carrier's share of dp/du
+is a turn of the phase, the envelope's share remains. With the sums over n as integrals,
+
+    I(u) = A**2 / (2 sigma**2) int e'(x)**2 dx = A**2 sqrt(pi) / (4 s sigma**2),   e = |p|
+    std(u) >= (2 sigma / A) sqrt(s / sqrt(pi))
+
+``position_bound_bins``. The matched filter's amplitude has the standard deviation
+sigma sqrt(2 / (s sqrt(pi))) in either quadrature, so the same bound reads sqrt(2) s over the ratio
+of amplitude to that.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+_SPEED_OF_LIGHT_MPS = 299_792_458.0
+# Half the length of a sampled pulse in standard deviations: 1.5e-8 of the amplitude is cut off.
+_HALF_LENGTH_SIGMAS = 6.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PulseModel:
+    """Gaussian envelope on a carrier.
+
+    Attributes
+    ----------
+    carrier_hz
+        Centre frequency.
+    bandwidth_hz
+        Full width of the power spectrum at -10 dB.
+    """
+
+    carrier_hz: float = 7.29e9
+    bandwidth_hz: float = 1.4e9
+
+    @property
+    def sigma_m(self) -> float:
+        """Return the envelope's standard deviation as a range.
+
+        The spectrum exp(-(2 pi f sigma_t)**2) is 0.1 at half the bandwidth.
+
+        >>> round(1e3 * PulseModel().sigma_m, 1)
+        51.7
+        """
+        sigma_s = math.sqrt(math.log(10)) / (math.pi * self.bandwidth_hz)
+        return sigma_s * _SPEED_OF_LIGHT_MPS / 2
+
+    @property
+    def wavelength_m(self) -> float:
+        """Return the range after which the carrier of an echo repeats, half a wavelength in air.
+
+        >>> round(1e3 * PulseModel().wavelength_m, 2)
+        20.56
+        """
+        return _SPEED_OF_LIGHT_MPS / (2 * self.carrier_hz)
+
+    def sigma_bins(self, bin_length_m: float) -> float:
+        """Return s: the envelope's standard deviation in bins."""
+        return self.sigma_m / bin_length_m
+
+    def carrier_rad(self, bin_length_m: float) -> float:
+        """Return kappa: the carrier's phase per bin."""
+        return math.tau * bin_length_m / self.wavelength_m
+
+    def half_length(self, bin_length_m: float) -> int:
+        """Return how many samples a sampled pulse has on either side of its middle one."""
+        return math.ceil(_HALF_LENGTH_SIGMAS * self.sigma_bins(bin_length_m))
+
+    def samples(self, offset_bins: Array, bin_length_m: float) -> ComplexArray:
+        """Return pulses of amplitude 1 and phase 0, sampled around their nearest bins.
+
+        Parameters
+        ----------
+        offset_bins
+            shape (k,): where each pulse lies from its nearest bin, -0.5 ... 0.5.
+        bin_length_m
+            Spacing of the samples, true metres.
+
+        Returns
+        -------
+        shape (k, 2 half_length + 1), the nearest bin in the middle. The real part of a row times
+        ``A exp(j phi)`` is the RF pulse.
+        """
+        half = self.half_length(bin_length_m)
+        x = np.arange(-half, half + 1) - np.asarray(offset_bins, dtype=np.float64)[:, np.newaxis]
+        envelope = np.exp(-0.5 * (x / self.sigma_bins(bin_length_m)) ** 2)
+        pulses: ComplexArray = envelope * np.exp(1j * self.carrier_rad(bin_length_m) * x)
+        return pulses
+
+    def position_bound_bins(self, snr: float, bin_length_m: float) -> float:
+        """Return the least standard deviation of a position, amplitude and phase unknown.
+
+        Parameters
+        ----------
+        snr
+            A / sigma, amplitude over the standard deviation of the white noise per RF sample.
+        bin_length_m
+            Spacing of the samples, true metres.
+
+        >>> bin_m = 299_792_458 / (2 * 23.328e9)
+        >>> round(1e3 * bin_m * PulseModel().position_bound_bins(30.0, bin_m), 2)
+        0.91
+        """
+        return 2 / snr * math.sqrt(self.sigma_bins(bin_length_m) / math.sqrt(math.pi))
