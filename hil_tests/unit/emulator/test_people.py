@@ -108,8 +108,8 @@ def test_a_bad_file_is_one_clear_line(tmp_path: Path, line: str, words: str) -> 
     assert "\n" not in str(caught.value)
 
 
-def test_the_corridor_has_somebody_who_comes_when_the_noise_map_is_made() -> None:
-    corridor = load_scene("corridor")
-    (visitor,) = corridor.people
+def test_the_visitor_is_somebody_who_comes_when_the_noise_map_is_made() -> None:
+    scene = load_scene("visitor")
+    (visitor,) = scene.people
     assert visitor.enters_s > 120
-    assert len(corridor.radars) == 2
+    assert len(scene.radars) == 2

@@ -28,7 +28,7 @@ def expected_state(time_s: float) -> PresenceState | None:
 
 def test_a_stock_module_sees_the_visitor_of_the_corridor() -> None:
     """It powers up with its profile running; the visitor comes after 130 s, at 5.5 m."""
-    scene = load_scene("corridor")
+    scene = load_scene("visitor")
     device = radar_device(
         Identity(serial=scene.radars[0].serial), echo_source(scene, 0, 0), Pace.REALTIME
     )
@@ -52,7 +52,7 @@ def test_a_stock_module_sees_the_visitor_of_the_corridor() -> None:
 
 def test_settings_of_a_host_reach_the_profile() -> None:
     """A zone that ends before the visitor's path, then one that holds it."""
-    scene = load_scene("corridor")
+    scene = load_scene("visitor")
     device = radar_device(
         Identity(serial=scene.radars[0].serial), echo_source(scene, 0, 0), Pace.REALTIME
     )
