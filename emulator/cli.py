@@ -34,10 +34,13 @@ Each radar of the scene becomes a stock X4M300 on a pseudo-terminal, published a
 link directory. One JSON line on stdout says that all ports are ready:
 
   {"ready":true,"scene_time_zero_ns":N,"odometry":"PATH or null",
-   "control":"PATH","devices":[{"name":"...","path":"...","serial":"...","tcp":PORT or null}]}
+   "control":"PATH","devices":[{"name":"...","path":"...","serial":"...","start_skew_ns":N,
+                                "tcp":PORT or null}]}
 
 scene_time_zero_ns is the monotonic time of scene time 0; the odometry path is a unix socket that
 gives every client the wheel odometry as TUM lines, the control path one for `xethru-emulator ctl`.
+start_skew_ns is when, in scene time, the module takes its frame of counter 0; radars are not
+synchronised, and a host needs it where it cannot tell from when frames arrive.
 Ctrl-C, SIGTERM or SIGHUP ends it: links, sockets and a directory of its own are removed, exit 0.
 
 pace realtime: frames at their deadlines; a host that does not keep up loses frames as on the

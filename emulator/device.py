@@ -20,6 +20,7 @@ from emulator.commands import Module, answer
 from emulator.echo_source import EchoSource
 from emulator.identity import Identity
 from emulator.modes import State
+from emulator.module_clock import ModuleClock
 from emulator.options import DeviceOptions
 from emulator.outbox import FirmwareOutbox, LosslessOutbox, MessageKind, MessageStream, Outbox
 from emulator.pace import Pace
@@ -270,7 +271,7 @@ def radar_device(
     pace: Pace,
     *,
     scene_time_zero_ns: int = 0,
-    skew_ns: int = 0,
+    clock: ModuleClock | None = None,
     boot: BootTiming | None = None,
     options: DeviceOptions | None = None,
     memory: Memory | None = None,
@@ -288,9 +289,8 @@ def radar_device(
         `Pace.REALTIME`: frames at absolute deadlines, firmware overflow.
     scene_time_zero_ns
         Device time of scene time 0 (`Pace.REALTIME`), ns.
-    skew_ns
-        How much later than nominal this radar samples, ns; the source adds the same skew to its
-        scene times.
+    clock
+        The module's own, which the source must know, too; one without error if None.
     boot
         Timing of a restart; the documented one if None.
     options
@@ -303,9 +303,17 @@ def radar_device(
     block_phase = None if pace is Pace.ASAP else int(identity.serial) % largest_block
     chip = Chip(source, largest_block, block_phase)
     module = Module(identity, chip, options, memory)
-    timing = {"scene_time_zero_ns": scene_time_zero_ns, "skew_ns": skew_ns}
-    profile = ProfileStream(module, source, pace=pace, largest_block=REALTIME_BLOCK, **timing)
+    clock = clock or ModuleClock()
+    profile = ProfileStream(
+        module,
+        source,
+        pace=pace,
+        clock=clock,
+        scene_time_zero_ns=scene_time_zero_ns,
+        largest_block=REALTIME_BLOCK,
+    )
     module.noise_maps = profile.noise_map_files
-    stream = CombinedStream(ChipStream(module, pace=pace, **timing), profile)
+    chip_stream = ChipStream(module, pace=pace, clock=clock, scene_time_zero_ns=scene_time_zero_ns)
+    stream = CombinedStream(chip_stream, profile)
     outbox = LosslessOutbox() if pace is Pace.ASAP else FirmwareOutbox()
     return Device(module, stream, outbox, boot=boot or BootTiming())

@@ -36,6 +36,8 @@ class NamedDevice:
         For the ready line.
     device
         The module.
+    start_skew_ns
+        Scene time at which it takes the frame of counter 0; None where nobody knows.
     present
         Whether its own port is there at a time, ns; None if it always is.
     uart_baud
@@ -45,6 +47,7 @@ class NamedDevice:
     name: str
     serial: str
     device: ByteDevice
+    start_skew_ns: int | None = None
     present: Callable[[int], bool] | None = None
     uart_baud: Callable[[], int] = _power_up_baud
 
@@ -112,6 +115,7 @@ class DevicePorts:
                 "name": named.name,
                 "path": os.fspath(link.path),
                 "serial": named.serial,
+                "start_skew_ns": named.start_skew_ns,
                 "tcp": None if tcp is None else tcp.port,
             }
             for named, link, tcp in self._words

@@ -17,7 +17,8 @@ class RadarFrame:
     radar
         Index of the radar's mount in the rig.
     t_ns
-        Session time of the frame, int64 nanoseconds.
+        Session time at which this radar really took the frame, int64 nanoseconds; radars are not
+        synchronised, so those of one scan differ.
     counter
         Frame counter of the module; gaps show lost frames.
     samples
@@ -27,6 +28,9 @@ class RadarFrame:
         own ``range_offset_m`` is removed.
     bin_length_m
         Spacing of the samples in true metres.
+    limits
+        Smallest and largest value the module's sampler can give, normalised RF amplitude; a
+        sample at one of them was cut off there. None where nobody knows.
     """
 
     radar: int
@@ -35,6 +39,7 @@ class RadarFrame:
     samples: NDArray[np.float32]
     range_start_m: float
     bin_length_m: float
+    limits: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         """Refuse anything that is not one real-valued frame."""

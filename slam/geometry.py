@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -99,13 +99,35 @@ class Mount:
     range_offset_m: float = 0.0
 
 
+def mount_at(mount: Mount, motion: Array) -> Mount:
+    """Return where a mount was when it sampled, in the body frame of another time.
+
+    ``m' = d + Rot(a) m`` and ``yaw' = yaw + a`` for a motion (d, a).
+
+    Parameters
+    ----------
+    mount
+        The mount on the robot.
+    motion
+        Shape (3,), [m, m, rad]: the pose of the robot at the sample's time, seen from its pose at
+        the time whose body frame is wanted (``between``).
+    """
+    cosine, sine = math.cos(motion[2]), math.sin(motion[2])
+    return replace(
+        mount,
+        x_m=float(motion[0]) + cosine * mount.x_m - sine * mount.y_m,
+        y_m=float(motion[1]) + sine * mount.x_m + cosine * mount.y_m,
+        yaw_rad=mount.yaw_rad + float(motion[2]),
+    )
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RadarPair:
     """Two radars that look the same way, and the triangle base between them.
 
-    ``first`` and ``second`` are mount indices, ordered so that the boresight lies to the left of
-    the base from first to second. On the paper's left side first is the rear radar, on its right
-    side the front one: a rotation by pi, not a mirror image.
+    ``first`` and ``second`` are mount indices; in the pairs of a rig they are ordered so that the
+    boresight lies to the left of the base from first to second. On the paper's left side first is
+    the rear radar, on its right side the front one: a rotation by pi, not a mirror image.
 
     Attributes
     ----------
@@ -116,8 +138,10 @@ class RadarPair:
     along, ahead
         shape (2,) each, unit vectors, body frame: along the base from first to second, and
         square to it on the side of the boresight.
-    boresight_rad
-        Angle of the boresight from ``along``, in (0, pi); pi/2 in the paper's rig.
+    boresights_rad
+        Angle of each boresight, of the first and of the second radar, from ``along`` towards
+        ``ahead``, in [-pi/2, 3 pi/2); pi/2 in the paper's rig. They differ only where the two
+        sampled at different times while the robot turned.
     """
 
     first: int
@@ -126,7 +150,7 @@ class RadarPair:
     midpoint: Array
     along: Array
     ahead: Array
-    boresight_rad: float
+    boresights_rad: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,7 +163,7 @@ class Rig:
         """Return every pair of mounts that look the same way, side by side."""
         pairs = []
         for first, second in combinations(range(len(self.mounts)), 2):
-            pair = _pair(self.mounts, first, second)
+            pair = _side_by_side(self.mounts, first, second)
             if pair is not None:
                 pairs.append(pair)
         return tuple(pairs)
@@ -157,19 +181,24 @@ def paper_rig() -> Rig:
     )
 
 
-def _pair(mounts: Sequence[Mount], first: int, second: int) -> RadarPair | None:
-    """Return the ordered pair, or None where the two cannot form a triangle base."""
-    a, b = mounts[first], mounts[second]
-    if abs(wrap_angle(a.yaw_rad - b.yaw_rad)) > _SAME_BORESIGHT_RAD:
-        return None
+def pair_of(first: int, second: int, mounts: tuple[Mount, Mount]) -> RadarPair | None:
+    """Return the triangle base between two mounts; None where they are at the same place.
+
+    Parameters
+    ----------
+    first, second
+        What the pair calls its radars.
+    mounts
+        Where the two are, in one body frame: on the robot, or each moved to its own sample time.
+        The view is on the side of the base that the boresights look to.
+    """
+    a, b = mounts
     baseline_m = math.hypot(b.x_m - a.x_m, b.y_m - a.y_m)
     if baseline_m == 0.0:
         return None
-    boresight_rad = wrap_angle(a.yaw_rad - math.atan2(b.y_m - a.y_m, b.x_m - a.x_m))
-    if abs(math.sin(boresight_rad)) < _SAME_BORESIGHT_RAD:
-        return None  # one looks at the other's back: no base across the view
-    if boresight_rad < 0.0:
-        return _pair(mounts, second, first)
+    base_rad = math.atan2(b.y_m - a.y_m, b.x_m - a.x_m)
+    boresights_rad = [wrap_angle(mount.yaw_rad - base_rad) for mount in mounts]
+    side = 1.0 if sum(math.sin(boresight_rad) for boresight_rad in boresights_rad) >= 0 else -1.0
     along = np.array([b.x_m - a.x_m, b.y_m - a.y_m]) / baseline_m
     return RadarPair(
         first=first,
@@ -177,6 +206,23 @@ def _pair(mounts: Sequence[Mount], first: int, second: int) -> RadarPair | None:
         baseline_m=baseline_m,
         midpoint=np.array([a.x_m + b.x_m, a.y_m + b.y_m]) / 2,
         along=along,
-        ahead=np.array([-along[1], along[0]]),
-        boresight_rad=boresight_rad,
+        ahead=side * np.array([-along[1], along[0]]),
+        boresights_rad=(_from_base(side * boresights_rad[0]), _from_base(side * boresights_rad[1])),
     )
+
+
+def _from_base(angle_rad: float) -> float:
+    """Return an angle in [-pi/2, 3 pi/2): near those of points ahead of the base, 0 to pi."""
+    return angle_rad if angle_rad >= -math.pi / 2 else angle_rad + math.tau
+
+
+def _side_by_side(mounts: Sequence[Mount], first: int, second: int) -> RadarPair | None:
+    """Return the ordered pair, or None where the two do not look the same way across a base."""
+    a, b = mounts[first], mounts[second]
+    if abs(wrap_angle(a.yaw_rad - b.yaw_rad)) > _SAME_BORESIGHT_RAD:
+        return None
+    base_rad = math.atan2(b.y_m - a.y_m, b.x_m - a.x_m)
+    boresight_rad = wrap_angle(a.yaw_rad - base_rad)
+    if abs(math.sin(boresight_rad)) < _SAME_BORESIGHT_RAD:
+        return None  # one looks at the other's back: no base across the view
+    return pair_of(first, second, (a, b)) if boresight_rad > 0 else pair_of(second, first, (b, a))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,15 +11,18 @@ from numpy.typing import NDArray
 
 from slam.association import Association, update_map
 from slam.clustering import Observation, filter_window
-from slam.config import EndOfRun, SlamConfig
-from slam.detection import Detection, PaperDetector
+from slam.config import EndOfRun, SampleTime, SlamConfig
+from slam.detection import Detection, make_detector
 from slam.ekf_slam import Belief, motion_noise, predict, start
 from slam.frames import RadarFrame
 from slam.geometry import Rig, between
-from slam.trilateration import Fix, Trilaterator
+from slam.trilateration import NO_MOTIONS, Fix, Trilaterator
 from slam.window import CollectedState, has_moved
 
 Array = NDArray[np.float64]
+
+PoseAt = Callable[[int], Array]
+"""Odometry pose at a session time [ns]: shape (3,), [x m, y m, heading rad], odometry frame."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -76,7 +79,7 @@ class UwbRadarSlam:
         self.belief: Belief = start()
         sensor = config.observation
         self._Q = np.diag([sensor.sigma_range_m**2, sensor.sigma_bearing_rad**2])
-        self._detector = PaperDetector(config.detection)
+        self._detector = make_detector(config)
         self._trilaterator = Trilaterator(config.trilateration, rig)
         self._window: deque[CollectedState] = deque()
         self._collected_pose: Array | None = None  # odometry where the last state was collected
@@ -84,26 +87,28 @@ class UwbRadarSlam:
         self._n_estimated = 0
 
     def step(
-        self, frames: Sequence[RadarFrame], odometry_pose: Array, t_ns: int
+        self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
-        """Take in what sensors say at one time; return the state that became ready, if any.
+        """Take in what sensors say around one time; return the state that became ready, if any.
 
         Parameters
         ----------
         frames
-            At most one frame per radar; a radar whose frame was lost is simply absent.
-        odometry_pose
-            shape (3,), [x m, y m, heading rad], odometry frame.
+            At most one frame per radar, each with the time it was taken at; a radar whose frame
+            was lost is simply absent.
+        pose_at
+            Odometry; asked for the pose at ``t_ns`` and, where ``trilateration.sample_time`` is
+            "own", at the time of every frame with an echo.
         t_ns
-            Session time.
+            Session time of the state.
         """
-        return self._take(lambda: self._detect(frames), odometry_pose, t_ns)
+        return self._take(lambda: self._detect(frames), pose_at, t_ns)
 
     def step_detections(
-        self, detections: Sequence[Detection], odometry_pose: Array, t_ns: int
+        self, detections: Sequence[Detection], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
         """Do what ``step`` does, from ranges that some other front end found."""
-        return self._take(lambda: tuple(detections), odometry_pose, t_ns)
+        return self._take(lambda: tuple(detections), pose_at, t_ns)
 
     def flush(self) -> tuple[StepResult, ...]:
         """Return the states still in the window at the end of a run, if the preset wants them."""
@@ -112,10 +117,10 @@ class UwbRadarSlam:
         return tuple(self._estimate() for _ in range(len(self._window)))
 
     def _take(
-        self, detect: Callable[[], tuple[Detection, ...]], odometry_pose: Array, t_ns: int
+        self, detect: Callable[[], tuple[Detection, ...]], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
         """Collect a state where the robot has moved; estimate the oldest once w are there."""
-        pose = np.array(odometry_pose, dtype=np.float64)
+        pose = np.array(pose_at(t_ns), dtype=np.float64)
         if self._collected_pose is None:  # Odom[0] <- origin
             self._collected_pose = self._estimated_pose = pose
             return ()
@@ -123,7 +128,8 @@ class UwbRadarSlam:
             return ()
         self._collected_pose = pose
         detections = detect()
-        fixes = self._trilaterator.locate(detections)
+        motions = self._motions(detections, pose, pose_at, t_ns)
+        fixes = self._trilaterator.locate(detections, t_ns, motions)
         self._window.append(
             CollectedState(t_ns=t_ns, odometry_pose=pose, detections=detections, fixes=fixes)
         )
@@ -154,6 +160,15 @@ class UwbRadarSlam:
             associations=associations,
             rejected=filtered.rejected,
         )
+
+    def _motions(
+        self, detections: Sequence[Detection], pose: Array, pose_at: PoseAt, t_ns: int
+    ) -> Mapping[int, Array]:
+        """Return how the robot moved from the state to each detection's own time, if it counts."""
+        if self.config.trilateration.sample_time is SampleTime.NOMINAL:
+            return NO_MOTIONS
+        stamps_ns = {detection.t_ns for detection in detections} - {t_ns}
+        return {stamp_ns: between(pose, pose_at(stamp_ns)) for stamp_ns in stamps_ns}
 
     def _is_update_due(self) -> bool:
         return self._n_estimated % self.config.window.stride == 0

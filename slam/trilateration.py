@@ -7,8 +7,9 @@ of the radars is kept. Everything follows from the mounts: the same formula serv
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 
 from slam.config import Pairing, TrilaterationConfig
 from slam.detection import Detection
-from slam.geometry import RadarPair, Rig
+from slam.geometry import RadarPair, Rig, mount_at, pair_of
 
 Array = NDArray[np.float64]
 
@@ -25,6 +26,10 @@ _NS_PER_S = 1_000_000_000
 _MAX_LENGTH_M = 1e150
 # Amplitudes are compared between these: a peak without a height counts as very faint.
 _AMPLITUDES = (1e-12, 1e12)
+
+NO_MOTIONS: Mapping[int, Array] = MappingProxyType({})
+"""All radars sampled at one time, or are taken to have."""
+_STANDING: Array = np.zeros(3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,9 +41,10 @@ class Fix:
     pair
         Index into ``Rig.pairs()``.
     t_ns
-        The later of the two stamps.
+        Session time of the pose in whose body frame the position is given; the two detections
+        keep their own times.
     x_m, y_m
-        Position in the body frame of the pose it was seen from.
+        Position in that body frame.
     detections
         The two ranges it was made of, first and second radar of the pair.
     """
@@ -82,7 +88,7 @@ def bilaterate(
     first_m, second_m
         shape (n,) each, ranges from the first and the second antenna of the pair [m].
     pair
-        The two mounts.
+        The two mounts, each at the time of its sample.
     field_of_view_rad
         Opening angle theta of one radar.
 
@@ -107,8 +113,8 @@ def bilaterate(
     half_view = field_of_view_rad / 2
     accepted = (
         meets
-        & (np.abs(alpha - pair.boresight_rad) < half_view)
-        & (np.abs(math.pi - beta - pair.boresight_rad) < half_view)
+        & (np.abs(alpha - pair.boresights_rad[0]) < half_view)
+        & (np.abs(math.pi - beta - pair.boresights_rad[1]) < half_view)
     )
     xy = pair.midpoint + u[:, None] * pair.along + v[:, None] * pair.ahead
     return xy, accepted
@@ -148,10 +154,30 @@ class Trilaterator:
 
     def __init__(self, config: TrilaterationConfig, rig: Rig) -> None:
         self.config = config
+        self.rig = rig
         self.pairs = rig.pairs()
 
-    def locate(self, detections: Sequence[Detection]) -> tuple[Fix, ...]:
-        """Return the fixes of one pose from the detections of all radars."""
+    def locate(
+        self,
+        detections: Sequence[Detection],
+        t_ns: int,
+        motions: Mapping[int, Array] = NO_MOTIONS,
+    ) -> tuple[Fix, ...]:
+        """Return the fixes of one pose from the detections of all radars.
+
+        Which radars are a pair follows from the rig; the triangle of two detections has its base
+        between the mounts at the detections' own times, and their own two boresights.
+
+        Parameters
+        ----------
+        detections
+            Ranges of all radars.
+        t_ns
+            Session time of the pose, in whose body frame the fixes are.
+        motions
+            By session time: pose of the robot then, seen from the pose at ``t_ns``, shape (3,).
+            Detections of a time without entry were made at ``t_ns``.
+        """
         by_radar: dict[int, list[Detection]] = {}
         for detection in detections:
             by_radar.setdefault(detection.radar, []).append(detection)
@@ -163,24 +189,51 @@ class Trilaterator:
                 for b in by_radar.get(pair.second, ())
                 if abs(a.t_ns - b.t_ns) <= self.config.max_stamp_difference_s * _NS_PER_S
             ]
-            if combinations:
-                of_pair = self._fixes(index, combinations)
-                one_each = self.config.pairing is Pairing.ONE_TO_ONE
-                fixes.extend(one_to_one(of_pair) if one_each else of_pair)
+            of_pair = self._fixes(index, combinations, t_ns, motions)
+            one_each = self.config.pairing is Pairing.ONE_TO_ONE and of_pair
+            fixes.extend(one_to_one(of_pair) if one_each else of_pair)
         return tuple(fixes)
 
-    def _fixes(self, index: int, combinations: Sequence[tuple[Detection, Detection]]) -> list[Fix]:
-        ranges_m = np.array([(a.range_m, b.range_m) for a, b in combinations])
-        xy, accepted = bilaterate(
-            ranges_m[:, 0], ranges_m[:, 1], self.pairs[index], self.config.field_of_view_rad
-        )
-        return [
-            Fix(pair=index, t_ns=max(a.t_ns, b.t_ns), x_m=x, y_m=y, detections=(a, b))
-            for (a, b), (x, y), seen in zip(
-                combinations, xy.tolist(), accepted.tolist(), strict=True
+    def _fixes(
+        self,
+        index: int,
+        combinations: Sequence[tuple[Detection, Detection]],
+        t_ns: int,
+        motions: Mapping[int, Array],
+    ) -> list[Fix]:
+        by_stamps: dict[tuple[int, int], list[tuple[Detection, Detection]]] = {}
+        for a, b in combinations:
+            by_stamps.setdefault((a.t_ns, b.t_ns), []).append((a, b))
+        fixes = []
+        for stamps_ns, members in by_stamps.items():
+            pair = self._pair_at(index, stamps_ns, motions)
+            if pair is None:
+                continue
+            ranges_m = np.array([(a.range_m, b.range_m) for a, b in members])
+            xy, accepted = bilaterate(
+                ranges_m[:, 0], ranges_m[:, 1], pair, self.config.field_of_view_rad
             )
-            if seen
-        ]
+            fixes += [
+                Fix(pair=index, t_ns=t_ns, x_m=x, y_m=y, detections=(a, b))
+                for (a, b), (x, y), seen in zip(
+                    members, xy.tolist(), accepted.tolist(), strict=True
+                )
+                if seen
+            ]
+        return fixes
+
+    def _pair_at(
+        self, index: int, stamps_ns: tuple[int, int], motions: Mapping[int, Array]
+    ) -> RadarPair | None:
+        """Return the pair as it sampled; None where motion brought one to the other's place."""
+        pair = self.pairs[index]
+        if motions.keys().isdisjoint(stamps_ns):
+            return pair
+        first, second = (
+            mount_at(self.rig.mounts[radar], motions.get(stamp_ns, _STANDING))
+            for radar, stamp_ns in zip((pair.first, pair.second), stamps_ns, strict=True)
+        )
+        return pair_of(pair.first, pair.second, (first, second))
 
 
 def one_to_one(fixes: Sequence[Fix]) -> list[Fix]:

@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
+from emulator.module_clock import ModuleClock
 from emulator.profiles.baseband import baseband_ap, baseband_iq
 from emulator.profiles.doppler import MATRICES, SLOW, Matrix
 from emulator.profiles.noise_map import Powers
@@ -65,6 +66,8 @@ class ProfileRun:
         Of its first frame.
     zero_ns
         Device time of scene time 0, ns.
+    clock
+        The module's own.
     sampling_hz
         Sampling frequency that baseband messages claim.
     """
@@ -77,6 +80,7 @@ class ProfileRun:
         *,
         first_counter: int,
         zero_ns: int,
+        clock: ModuleClock,
         sampling_hz: float,
     ) -> None:
         self.sweep = sweep
@@ -84,6 +88,7 @@ class ProfileRun:
         self._settings = settings
         self._first_counter = first_counter
         self._zero_ns = zero_ns
+        self._clock = clock
         self._sampling_hz = sampling_hz
         self._taken = 0  # frames so far
         self._ready: deque[Response] = deque()
@@ -124,7 +129,8 @@ class ProfileRun:
             self._ready.clear()
 
     def _due_ns(self, index: int) -> int:
-        return self._zero_ns + self.sweep.scene_time_ns(self._first_counter + index)
+        nominal_ns = self.sweep.scene_time_ns(self._first_counter + index)
+        return self._zero_ns + self._clock.scene_time_ns(nominal_ns)
 
     def _on(self, feature: int) -> int:
         return self._settings().outputs.get(feature, 0)

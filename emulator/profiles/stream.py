@@ -2,9 +2,10 @@
 
 The radar runs on the emulator's clock under both paces: a presence message a second is what makes
 a profile useful to a host. Under `Pace.REALTIME` counter k is due at
-``scene_time_zero_ns + skew_ns + scene time of k``, and a profile that starts begins with the first
-counter still ahead. Under `Pace.ASAP` the start of the profile is scene time 0, so that what a
-host gets does not depend on when it starts it, and nothing is dropped.
+``scene_time_zero_ns`` + the scene time at which the module's clock shows k's nominal time, and a
+profile that starts begins with the first counter still ahead. Under `Pace.ASAP` the start of the
+profile is scene time 0, so that what a host gets does not depend on when it starts it, and nothing
+is dropped.
 
 RUN after a pause fills the matrices anew (assumed) and keeps the noise map. A module that restarts
 begins when it is ready.
@@ -20,6 +21,7 @@ from typing import Protocol
 from emulator.echo_source import EchoSource
 from emulator.filesystem import FileSystem
 from emulator.modes import ModeMachine
+from emulator.module_clock import ModuleClock
 from emulator.options import DeviceOptions
 from emulator.pace import Pace
 from emulator.profile_settings import ProfileSettings
@@ -81,10 +83,10 @@ class ProfileStream:
         What its radar sees.
     pace
         Whether anything may be dropped.
+    clock
+        The module's own: its start skew and its rate error.
     scene_time_zero_ns
         Device time of scene time 0, and of power-up [ns].
-    skew_ns
-        How much later than nominal this radar samples, ns.
     largest_block
         Most frames synthesised at once.
     """
@@ -95,15 +97,15 @@ class ProfileStream:
         source: EchoSource,
         *,
         pace: Pace,
+        clock: ModuleClock,
         scene_time_zero_ns: int = 0,
-        skew_ns: int = 0,
         largest_block: int = 8,
     ) -> None:
         self._module = module
         self._source = source
         self._pace = pace
         self._zero_ns = scene_time_zero_ns
-        self._skew_ns = skew_ns
+        self._clock = clock
         self._largest_block = largest_block
         self._run: ProfileRun | None = None
         self._paused = False
@@ -186,17 +188,19 @@ class ProfileStream:
             tx_center_frequency=settings.tx_center_frequency,
             largest_block=self._largest_block,
         )
+        clock = self._clock
         if self._pace is Pace.ASAP:
-            zero_ns, first_counter = now_ns, 0
+            zero_ns, first_counter = now_ns - clock.skew_ns, 0
         else:
-            zero_ns = self._zero_ns + self._skew_ns
-            first_counter = sweep.first_counter_from(now_ns - zero_ns)
+            zero_ns = self._zero_ns
+            first_counter = sweep.first_counter_from(clock.nominal_ns(now_ns - zero_ns))
         self._run = ProfileRun(
             sweep,
             PresenceProcessing(sweep, noise_map or self._first_map(sweep)),
             lambda: self._module.profile,
             first_counter=first_counter,
             zero_ns=zero_ns,
+            clock=clock,
             sampling_hz=self._module.options.baseband_sampling_hz,
         )
         self._creating = not self._run.processing.noise_map.complete

@@ -12,6 +12,7 @@ from hypothesis.extra import numpy as npst
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from hil_tests.unit.slam.pose_tracks import at_rest
 from slam.clustering import NOISE, Observation, cluster_labels, filter_window
 from slam.config import (
     ClusterCount,
@@ -220,7 +221,7 @@ def run_along_a_wall(config: SlamConfig, n_states: int) -> list[StepResult]:
             )
             for radar in (0, 1)
         ]
-        results += slam.step_detections(seen, pose, k)
+        results += slam.step_detections(seen, at_rest(pose), k)
     return results + list(slam.flush())
 
 

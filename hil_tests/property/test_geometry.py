@@ -70,7 +70,7 @@ def test_paper_rig_has_one_pair_per_side_turned_by_pi() -> None:
     ]
     for pair, sign in ((left, 1.0), (right, -1.0)):
         assert pair.baseline_m == pytest.approx(0.2)
-        assert pair.boresight_rad == pytest.approx(math.pi / 2)
+        assert pair.boresights_rad == pytest.approx((math.pi / 2, math.pi / 2))
         assert pair.midpoint == pytest.approx([0.0, 0.2 * sign])
         assert pair.along == pytest.approx([sign, 0.0])
         assert pair.ahead == pytest.approx([0.0, sign])

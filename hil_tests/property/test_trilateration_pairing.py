@@ -46,13 +46,13 @@ def test_every_true_pair_is_found_among_at_most_k_squared(
     rig = paper_rig()
     trilaterator = Trilaterator(TrilaterationConfig(), rig)
     detections = echoes(rig, targets)
-    fixes = trilaterator.locate(detections)
+    fixes = trilaterator.locate(detections, 0)
     assert len(fixes) <= len(targets) ** 2
     for target in targets:
         assert min(math.dist((fix.x_m, fix.y_m), target) for fix in fixes) <= 1e-12
     shuffled = list(detections)
     shuffler.shuffle(shuffled)
-    assert set(trilaterator.locate(shuffled)) == set(fixes)
+    assert set(trilaterator.locate(shuffled, 0)) == set(fixes)
 
 
 @given(
@@ -62,11 +62,11 @@ def test_every_true_pair_is_found_among_at_most_k_squared(
 def test_impossible_ranges_give_no_fix_and_leave_the_others_alone(
     impossible: list[tuple[int, float]], pairing: Pairing
 ) -> None:
-    locate = Trilaterator(TrilaterationConfig(pairing=pairing), paper_rig()).locate
+    trilaterator = Trilaterator(TrilaterationConfig(pairing=pairing), paper_rig())
     bad = [Detection(radar=k, t_ns=0, range_m=r, amplitude=0.01) for k, r in impossible]
-    assert locate(bad) == ()
+    assert trilaterator.locate(bad, 0) == ()
     good = echoes(paper_rig(), [np.array([0.0, 1.0])])
-    assert locate([*bad, *good]) == locate(good) != ()
+    assert trilaterator.locate([*bad, *good], 0) == trilaterator.locate(good, 0) != ()
 
 
 # --- each detection used once -------------------------------------------------------------------
@@ -90,9 +90,9 @@ def test_one_to_one_is_the_best_choice_among_all_pairs_in_any_order(
         for range_m, amplitude in dict(found).items()
     ]
     rig = paper_rig()
-    pairs_of_all = Trilaterator(TrilaterationConfig(), rig).locate(detections)
+    pairs_of_all = Trilaterator(TrilaterationConfig(), rig).locate(detections, 0)
     one_each = Trilaterator(TrilaterationConfig(pairing=Pairing.ONE_TO_ONE), rig)
-    fixes = one_each.locate(detections)
+    fixes = one_each.locate(detections, 0)
     assert len(fixes) <= min(len(first), len(second))
     assert set(fixes) <= set(pairs_of_all)
     used = [detection for fix in fixes for detection in fix.detections]
@@ -107,7 +107,7 @@ def test_one_to_one_is_the_best_choice_among_all_pairs_in_any_order(
     assert len(fixes) == most[0]
     assert -mismatch(fixes) == pytest.approx(most[1], abs=1e-9)
     shuffler.shuffle(detections)
-    assert set(one_each.locate(detections)) == set(fixes)
+    assert set(one_each.locate(detections, 0)) == set(fixes)
 
 
 def mismatch(fixes: Sequence[Fix]) -> float:
@@ -119,10 +119,10 @@ def mismatch(fixes: Sequence[Fix]) -> float:
 def test_one_to_one_gives_at_most_k_fixes(targets: list[Array], shuffler: Random) -> None:
     one_each = Trilaterator(TrilaterationConfig(pairing=Pairing.ONE_TO_ONE), paper_rig())
     detections = echoes(paper_rig(), targets)
-    fixes = one_each.locate(detections)
+    fixes = one_each.locate(detections, 0)
     assert 1 <= len(fixes) <= len(targets)
     shuffler.shuffle(detections)
-    assert set(one_each.locate(detections)) == set(fixes)
+    assert set(one_each.locate(detections, 0)) == set(fixes)
 
 
 def test_one_to_one_tells_two_targets_apart_by_their_loudness() -> None:
@@ -134,9 +134,9 @@ def test_one_to_one_tells_two_targets_apart_by_their_loudness() -> None:
         for radar in (0, 1)
         for t, loud in zip(targets, ((0.02, 0.021)[radar], (0.008, 0.0077)[radar]), strict=True)
     ]
-    assert len(Trilaterator(TrilaterationConfig(), rig).locate(detections)) == 4
+    assert len(Trilaterator(TrilaterationConfig(), rig).locate(detections, 0)) == 4
     config = TrilaterationConfig(pairing=Pairing.ONE_TO_ONE)
-    found = sorted((f.x_m, f.y_m) for f in Trilaterator(config, rig).locate(detections))
+    found = sorted((f.x_m, f.y_m) for f in Trilaterator(config, rig).locate(detections, 0))
     assert found == [pytest.approx(tuple(t), abs=1e-12) for t in targets]
 
 
@@ -149,7 +149,7 @@ def test_stamps_too_far_apart_make_no_fix() -> None:
 
     def locate(limit_s: float) -> tuple[Fix, ...]:
         config = TrilaterationConfig(max_stamp_difference_s=limit_s)
-        return Trilaterator(config, rig).locate(detections)
+        return Trilaterator(config, rig).locate(detections, 0)
 
     assert len(locate(math.inf)) == len(locate(0.1)) == 1
     assert locate(0.099) == ()

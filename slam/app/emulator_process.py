@@ -27,11 +27,12 @@ END_LIMIT_S = 3.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EmulatedDevice:
-    """One emulated module, as the ready line names it."""
+    """One emulated module, as the ready line names it; `start_skew_ns` is that of its samples."""
 
     name: str
     path: str
     serial: str
+    start_skew_ns: int
 
 
 class EmulatorProcess:
@@ -126,7 +127,12 @@ class EmulatorProcess:
         try:
             ready = json.loads(line)
             self.devices = tuple(
-                EmulatedDevice(name=row["name"], path=row["path"], serial=row["serial"])
+                EmulatedDevice(
+                    name=row["name"],
+                    path=row["path"],
+                    serial=row["serial"],
+                    start_skew_ns=row["start_skew_ns"],
+                )
                 for row in ready["devices"]
             )
             self.odometry_socket = ready["odometry"]

@@ -87,7 +87,7 @@ def run_slam(
             counter_at[scan.t_ns] = scan.counter
             n_frames += len(scan.frames)
             duration_ns = scan.t_ns
-            take(slam.step(scan.frames, odometry.pose_at(scan.t_ns), scan.t_ns))
+            take(slam.step(scan.frames, odometry.pose_at, scan.t_ns))
         take(slam.flush())
     return RunRecord(
         results=tuple(results),

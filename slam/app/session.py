@@ -18,10 +18,10 @@ from slam.frames import RadarFrame
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RadarInfo:
-    """One radar of a run: who it is, where it is mounted, how its samples lie in range.
+    """One radar of a run: who it is, where it is mounted, how its samples lie in range and time.
 
     `range_start_m` and `bin_length_m` are module metres, as FRAMEAREA was read back; the same in
-    true metres are in every RadarFrame.
+    true metres are in every RadarFrame. `start_skew_ns` is the session time of counter 0.
     """
 
     name: str
@@ -36,6 +36,7 @@ class RadarInfo:
     n_bins: int
     rate_hz: float
     settings: Mapping[str, object]
+    start_skew_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,7 +54,13 @@ class SessionInfo:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scan:
-    """The frames that share one counter, at most one per radar; a missing radar lost its frame."""
+    """The frames of one tick, at most one per radar; a missing radar lost its frame.
+
+    A tick is one frame period; `counter` numbers them from session time 0, and `t_ns` is when a
+    radar without start skew samples, whether there is one or not. Every frame has its own stamp,
+    in the period that begins with `t_ns`. The counters of the frames are that of the tick, less
+    the whole periods that their radar started late (none, unless it started more than one late).
+    """
 
     counter: int
     t_ns: int

@@ -132,8 +132,9 @@ class SessionLog:
         self._cut_chunk()
 
     def on_scan(self, scan: Scan) -> None:
-        """Write the frames of one counter, and the odometry that its pose is interpolated from."""
-        while self._odometry_ns < scan.t_ns and (sample := next(self._samples, None)) is not None:
+        """Write the frames of one tick, and the odometry that their poses come from."""
+        needed_ns = max(scan.t_ns, *(frame.t_ns for frame in scan.frames))
+        while self._odometry_ns < needed_ns and (sample := next(self._samples, None)) is not None:
             self._write(self._odometry, sample.t_ns, ros.odometry(sample))
             self._odometry_ns = sample.t_ns
         for frame in scan.frames:

@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 
 from slam.app.errors import AppError, RadarSilentError
 from slam.app.session import RadarInfo, Scan
+from slam.app.tum import NS_PER_S
 from slam.frames import RadarFrame
 from slam.geometry import Mount
 from xethru_protocol.driver import X4M300, Frame, RawConfig
 from xethru_protocol.errors import Disconnected, ResponseTimeout, XeThruError
-from xethru_protocol.x4 import MODULE_SPEED_MPS, frame_time_ns
+from xethru_protocol.x4 import MODULE_SPEED_MPS, Normalisation, frame_time_ns
 
 LIGHT_MPS = 299_792_458.0
 TRUE_PER_MODULE_METRE = LIGHT_MPS / MODULE_SPEED_MPS
@@ -32,16 +33,50 @@ _POLL_S = 0.25
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RadarLink:
-    """An open driver and what it is called: its mount on the robot, its port, its serial number."""
+    """An open driver and what it is called: its mount on the robot, its port, its serial number.
+
+    `start_skew_ns` is the session time of its counter 0, 0 or later.
+    """
 
     mount: Mount
     port: str
     serial: str
     driver: X4M300
+    start_skew_ns: int = 0
 
 
-def radar_frame(radar: int, frame: Frame, rate_hz: float) -> RadarFrame:
+def sampler_limits(config: RawConfig) -> tuple[float, float]:
+    """Return the smallest and the largest value of a raw RF sample, normalised units.
+
+    What the counter's ends are as float32 on the wire, so that samples can be compared with them
+    exactly. Protocol reference 9.7.
+
+    >>> sampler_limits(RawConfig(dac_min=949, dac_max=1100))
+    (-0.07421875, 0.07421875)
+    """
+    scale = Normalisation.of(
+        iterations=config.iterations,
+        pulses_per_step=config.pulses_per_step,
+        dac_min=config.dac_min,
+        dac_max=config.dac_max,
+        dac_step=config.dac_step,
+    )
+    largest = np.float32(scale.max_counter) * np.float32(scale.quantum)
+    return -scale.dac_offset, float(largest - np.float32(scale.dac_offset))
+
+
+def radar_frame(
+    radar: int,
+    frame: Frame,
+    rate_hz: float,
+    *,
+    start_skew_ns: int = 0,
+    limits: tuple[float, float] | None = None,
+) -> RadarFrame:
     """Turn a driver's frame into one for SLAM: true metres, time by the counter.
+
+    The counter is the only clock here: what the module's own clock is off by (tens of ppm, tens
+    of milliseconds after a quarter of an hour) does not show in it.
 
     Parameters
     ----------
@@ -51,20 +86,36 @@ def radar_frame(radar: int, frame: Frame, rate_hz: float) -> RadarFrame:
         What the driver read; its geometry is in module metres.
     rate_hz
         The chip's real frame rate, as read back.
+    start_skew_ns
+        Session time of its counter 0.
+    limits
+        Of the sampler, see `RadarFrame`.
     """
     return RadarFrame(
         radar=radar,
-        t_ns=frame_time_ns(frame.counter, rate_hz),
+        t_ns=start_skew_ns + frame_time_ns(frame.counter, rate_hz),
         counter=frame.counter,
         # raw RF was configured, so they are real; RadarFrame refuses anything else
         samples=cast(NDArray[np.float32], frame.samples),
         range_start_m=frame.geometry.range_start_m * TRUE_PER_MODULE_METRE,
         bin_length_m=frame.geometry.bin_length_m * TRUE_PER_MODULE_METRE,
+        limits=limits,
     )
 
 
+def whole_periods(start_skew_ns: int, rate_hz: float) -> int:
+    """Return how many whole frame periods a radar started late, its counter behind the ticks.
+
+    >>> whole_periods(190_000_000, 5.0), whole_periods(200_000_000, 5.0)
+    (0, 1)
+    """
+    nearly = int(start_skew_ns * rate_hz / NS_PER_S)  # rounded, so it may be one off
+    fitting = (n for n in (nearly + 1, nearly) if frame_time_ns(n, rate_hz) <= start_skew_ns)
+    return next(fitting, nearly - 1)
+
+
 class RigSource:
-    """All radars of a robot as one stream of scans, in counter order.
+    """All radars of a robot as one stream of scans, in the order of time.
 
     Attributes
     ----------
@@ -77,6 +128,7 @@ class RigSource:
     def __init__(self, links: Sequence[RadarLink]) -> None:
         self._links = self._open_links = tuple(links)
         self.radars: tuple[RadarInfo, ...] = ()
+        self._limits: tuple[float, float] | None = None
         self.lost_frames = 0
 
     def __enter__(self) -> Self:
@@ -129,17 +181,19 @@ class RigSource:
                     n_bins=geometry.n_bins,
                     rate_hz=rate_hz,
                     settings=asdict(config),
+                    start_skew_ns=link.start_skew_ns,
                 )
             )
         self.radars = tuple(radars)
+        self._limits = sampler_limits(config)
 
     def scans(self, end_counter: int, check: Callable[[], None]) -> Iterator[Scan]:
-        """Yield the frames of counters below `end_counter`, one scan per counter.
+        """Yield the frames of ticks below `end_counter`, one scan per tick; see `Scan`.
 
         Parameters
         ----------
         end_counter
-            First counter that is not wanted any more.
+            First tick that is not wanted any more.
         check
             Called once per scan and while waiting; may raise to stop.
 
@@ -148,25 +202,39 @@ class RigSource:
         RadarSilentError
             A radar sent no frame for 5 s, or its port is gone.
         """
-        expected = [0] * len(self._links)
+        # By tick, from here on: a radar's counter and the periods that it started late.
+        late = [whole_periods(info.start_skew_ns, info.rate_hz) for info in self.radars]
+        expected = list(late)
         heads: list[Frame | None] = [None] * len(self._links)
         while True:
             check()
             for radar, head in enumerate(heads):
                 if head is None:
-                    frame = self._next_frame(radar, expected[radar], check)
-                    self.lost_frames += min(frame.counter, end_counter) - expected[radar]
-                    expected[radar] = frame.counter + 1
+                    frame = self._next_frame(radar, expected[radar] - late[radar], check)
+                    tick = frame.counter + late[radar]
+                    self.lost_frames += max(min(tick, end_counter) - expected[radar], 0)
+                    expected[radar] = tick + 1
                     heads[radar] = frame
-            counter = min(head.counter for head in heads if head is not None)
-            if counter >= end_counter:
+            tick = min(expected) - 1
+            if tick >= end_counter:
                 return
             frames = []
             for radar, head in enumerate(heads):
-                if head is not None and head.counter == counter:
-                    frames.append(radar_frame(radar, head, self.radars[radar].rate_hz))
+                if head is not None and expected[radar] - 1 == tick:
+                    frames.append(self._radar_frame(radar, head))
                     heads[radar] = None
-            yield Scan(counter=counter, t_ns=frames[0].t_ns, frames=tuple(frames))
+            t_ns = frame_time_ns(tick, self.radars[frames[0].radar].rate_hz)
+            yield Scan(counter=tick, t_ns=t_ns, frames=tuple(frames))
+
+    def _radar_frame(self, radar: int, frame: Frame) -> RadarFrame:
+        info = self.radars[radar]
+        return radar_frame(
+            radar,
+            frame,
+            info.rate_hz,
+            start_skew_ns=info.start_skew_ns,
+            limits=self._limits,
+        )
 
     def _next_frame(self, radar: int, expected: int, check: Callable[[], None]) -> Frame:
         link = self._links[radar]

@@ -8,6 +8,7 @@ import pytest
 
 from emulator.device import BootTiming, radar_device
 from emulator.identity import Identity
+from emulator.module_clock import ModuleClock
 from emulator.pace import Pace
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource, ramp_device
 from xethru_protocol import messages as m
@@ -297,7 +298,11 @@ def test_a_second_reset_does_not_postpone_the_first(host: BareHost) -> None:
 def test_realtime_frames_are_due_at_absolute_deadlines() -> None:
     zero_ns, skew_ns = 7 * SECOND, 3_000_000
     device = radar_device(
-        IDENTITY, RampSource(), Pace.REALTIME, scene_time_zero_ns=zero_ns, skew_ns=skew_ns
+        IDENTITY,
+        RampSource(),
+        Pace.REALTIME,
+        scene_time_zero_ns=zero_ns,
+        clock=ModuleClock(skew_ns=skew_ns),
     )
     host = BareHost(device, now_ns=zero_ns)
     host.enter_manual()

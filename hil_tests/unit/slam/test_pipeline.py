@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from hil_tests.unit.slam.pose_tracks import at_rest
 from hil_tests.unit.slam.simulation import CLASSROOM, FRAME_NS, LAB, Room, World, simulate
 from slam.config import EndOfRun, SlamConfig, WindowConfig
 from slam.detection import Detection
@@ -24,7 +25,7 @@ def run(world: World, config: SlamConfig) -> list[StepResult]:
     for t_ns, detections, pose in zip(
         world.stamps(), world.detections, world.odometry, strict=True
     ):
-        results += slam.step_detections(detections, pose, t_ns)
+        results += slam.step_detections(detections, at_rest(pose), t_ns)
     return results + list(slam.flush())
 
 
@@ -36,7 +37,9 @@ def trajectories(results: list[StepResult], world: World) -> tuple[Array, Array]
 def drive(slam: UwbRadarSlam, poses: list[Array]) -> list[int]:
     """Return the stamps that come out, one list entry per pose that went in."""
     return [
-        result.t_ns for k, pose in enumerate(poses) for result in slam.step_detections((), pose, k)
+        result.t_ns
+        for k, pose in enumerate(poses)
+        for result in slam.step_detections((), at_rest(pose), k)
     ]
 
 
@@ -47,10 +50,10 @@ def straight(n: int, step_m: float = 0.01) -> list[Array]:
 def test_estimates_lag_window_minus_one_states() -> None:
     slam = UwbRadarSlam(SlamConfig(), paper_rig())
     assert drive(slam, straight(15)) == []  # the first pose is the origin, not a state
-    (result,) = slam.step_detections((), np.array([0.15, 0.0, 0.0]), 15)
+    (result,) = slam.step_detections((), at_rest(np.array([0.15, 0.0, 0.0])), 15)
     assert result.t_ns == 1
     assert result.belief.pose == pytest.approx([0.01, 0.0, 0.0], abs=1e-12)
-    (result,) = slam.step_detections((), np.array([0.16, 0.0, 0.0]), 16)
+    (result,) = slam.step_detections((), at_rest(np.array([0.16, 0.0, 0.0])), 16)
     assert result.t_ns == 2
 
 
@@ -114,8 +117,8 @@ def test_frames_give_what_their_detections_give() -> None:
             detections.append(
                 Detection(radar=radar, t_ns=k, range_m=float(labels[peak]), amplitude=0.01)
             )
-        one += by_frames.step(frames, pose, k)
-        two += by_detections.step_detections(detections, pose, k)
+        one += by_frames.step(frames, at_rest(pose), k)
+        two += by_detections.step_detections(detections, at_rest(pose), k)
     one += by_frames.flush()
     two += by_detections.flush()
     assert [len(r.observations) for r in one] == [len(r.observations) for r in two]
@@ -128,8 +131,8 @@ def test_lost_frame_of_one_radar_costs_only_the_fixes_of_its_pair() -> None:
     rig = paper_rig()
     slam = UwbRadarSlam(SlamConfig(window=WindowConfig(size=1)), rig)
     seen = [Detection(radar=k, t_ns=1, range_m=0.8, amplitude=0.01) for k in (0, 2, 3)]
-    slam.step_detections((), np.zeros(3), 0)
-    (result,) = slam.step_detections(seen, np.array([0.01, 0.0, 0.0]), 1)
+    slam.step_detections((), at_rest(np.zeros(3)), 0)
+    (result,) = slam.step_detections(seen, at_rest(np.array([0.01, 0.0, 0.0])), 1)
     assert [fix.pair for fix in result.fixes] == [1]
     assert result.fixes[0].y_m < 0
 
@@ -141,7 +144,7 @@ def test_stride_updates_only_every_nth_state_and_predicts_the_others() -> None:
     results = [
         result
         for k, pose in enumerate(straight(30, step_m=0.006))
-        for result in slam.step_detections(seen, pose, k)
+        for result in slam.step_detections(seen, at_rest(pose), k)
     ]
     assert [k for k, result in enumerate(results) if result.observations] == [0, 5, 10, 15]
     assert all(result.belief.pose[0] > 0 for result in results)

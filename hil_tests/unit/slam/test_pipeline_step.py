@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from hil_tests.property.ekf_oracles import complex_step, move, observe, place
+from hil_tests.unit.slam.pose_tracks import at_rest
 from slam.config import (
     AssociationConfig,
     ClusteringConfig,
@@ -29,7 +30,7 @@ EVERY_FIX = ClusteringConfig(min_observations=1)
 
 def step(slam: UwbRadarSlam, pose: Array, *ranges_m: float) -> StepResult:
     seen = [Detection(radar=k, t_ns=0, range_m=r, amplitude=0.01) for k, r in enumerate(ranges_m)]
-    (result,) = slam.step_detections(seen, pose, 0)
+    (result,) = slam.step_detections(seen, at_rest(pose), 0)
     return result
 
 
@@ -47,7 +48,7 @@ def test_belief_after_motion_birth_and_second_look_is_the_textbooks() -> None:
         association=AssociationConfig(gate=100.0),
     )
     slam = UwbRadarSlam(config, paper_rig())
-    slam.step_detections((), np.array([4.0, 5.0, 0.3]), 0)
+    slam.step_detections((), at_rest(np.array([4.0, 5.0, 0.3])), 0)
     R, Q = np.diag([0.01**2, 0.01**2, 0.03**2]), np.diag([0.02**2, 0.3**2])
 
     # First step: 5 cm ahead and a turn of 0.2 rad; a landmark at (0.05, 1.0) in the body.
@@ -86,7 +87,7 @@ def test_belief_after_motion_birth_and_second_look_is_the_textbooks() -> None:
 def test_proportional_noise_lies_along_the_robots_heading_in_the_map() -> None:
     motion = MotionConfig(noise=MotionNoise.PROPORTIONAL)
     slam = UwbRadarSlam(SlamConfig(window=EVERY_STATE, motion=motion), paper_rig())
-    slam.step_detections((), np.zeros(3), 0)
+    slam.step_detections((), at_rest(np.zeros(3)), 0)
     step(slam, np.array([0.0, 0.0, math.pi / 2]))  # a turn on the spot: heading alone is unsure
     P = step(slam, np.array([0.0, 0.04, math.pi / 2])).belief.pose_covariance
     turned = (0.01 * math.pi / 2) ** 2
@@ -118,7 +119,7 @@ def test_range_offset_of_each_mount_is_subtracted() -> None:
         )
         for radar in range(4)
     ]
-    slam.step((), np.zeros(3), 0)
-    (result,) = slam.step(frames, np.array([0.01, 0.0, 0.0]), 1)
+    slam.step((), at_rest(np.zeros(3)), 0)
+    (result,) = slam.step(frames, at_rest(np.array([0.01, 0.0, 0.0])), 1)
     found = {detection.radar: detection.range_m for detection in result.detections}
     assert found == {k: pytest.approx(0.9 - 0.05 * k, abs=1e-9) for k in range(4)}

@@ -9,6 +9,7 @@ from typing import Any, cast
 from emulator.echo import SceneEcho
 from emulator.filesystem import FileSystem
 from emulator.modes import ModeMachine
+from emulator.module_clock import ModuleClock
 from emulator.options import DeviceOptions
 from emulator.pace import Pace
 from emulator.people import PersonSpec
@@ -76,7 +77,9 @@ def profile(
     if outputs is not None:
         module.profile.outputs = outputs
     source = SceneEcho(scene, scene.radars[0], seed=1)
-    return ProfileStream(module, source, pace=pace, scene_time_zero_ns=zero_ns), module
+    clock = ModuleClock()
+    stream = ProfileStream(module, source, pace=pace, clock=clock, scene_time_zero_ns=zero_ns)
+    return stream, module
 
 
 def heard_until(stream: ProfileStream, end_ns: int) -> Iterator[tuple[float, m.Response]]:

@@ -10,6 +10,7 @@ import pytest
 from emulator.chip import Chip
 from emulator.chip_stream import ChipStream
 from emulator.module import Module
+from emulator.module_clock import ModuleClock
 from emulator.pace import Pace
 from emulator.profile_settings import ProfileSettings
 from emulator.profiles.combined_stream import CombinedStream
@@ -216,7 +217,9 @@ def test_a_source_without_noise_divides_by_nothing() -> None:
 def test_the_line_carries_frames_in_manual_and_the_profile_in_run(mode: SensorMode) -> None:
     module = Module(IDENTITY, Chip(RampSource()))
     profile_stream, host = profile(room())
-    combined = CombinedStream(ChipStream(module, pace=Pace.REALTIME), profile_stream)
+    combined = CombinedStream(
+        ChipStream(module, pace=Pace.REALTIME, clock=ModuleClock()), profile_stream
+    )
     assert combined.next_due_ns() == pytest.approx(16 / FRAME_HZ * SECOND, rel=1e-6)
     module.modes.set_mode(mode)
     host.fake_modes.mode = mode

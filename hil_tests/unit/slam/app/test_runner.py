@@ -13,7 +13,7 @@ from slam.app.session import LogLine, Scan, Snapshot
 from slam.app.tum import TumSample
 from slam.ekf_slam import Belief
 from slam.frames import RadarFrame
-from slam.pipeline import StepResult, UwbRadarSlam
+from slam.pipeline import PoseAt, StepResult, UwbRadarSlam
 
 COUNTERS = (5, 6, 8, 11, 12)
 LAG = 2
@@ -26,8 +26,9 @@ class LateSlam:
         self.waiting: list[StepResult] = []
 
     def step(
-        self, frames: Sequence[RadarFrame], odometry_pose: NDArray[np.float64], t_ns: int
+        self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
+        odometry_pose = pose_at(t_ns)
         belief = Belief(mean=odometry_pose, covariance=np.eye(3), landmark_ids=(), next_id=0)
         self.waiting.append(
             StepResult(
