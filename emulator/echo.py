@@ -42,9 +42,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.echo_source import CaptureSettings, EchoSource
+from emulator.jitter import CarrierJitter
 from emulator.module_clock import ModuleClock
+from emulator.paths import ScenePaths
 from emulator.pulse import sum_of_pulses
-from emulator.receiver import one_count, rf_counters
+from emulator.receiver import Receiver, one_count
 from emulator.reflections import (
     BEAM_EXPONENT,
     Reflections,
@@ -81,51 +83,44 @@ class SceneEcho:
     """The echo of one radar of a scene: an :class:`~emulator.echo_source.EchoSource`."""
 
     def __init__(self, scene: Scene, radar: RadarSpec, seed: int) -> None:
-        self._scene = scene
         self._radar = radar
-        self._seed = seed
-        self._trajectory = scene.trajectory()
+        self._paths = ScenePaths(scene, radar)
         self._clock = ModuleClock(skew_ns=round(radar.start_skew_ms * 1e6), ppm=radar.clock_ppm)
         self._gain = 10.0 ** (radar.gain_db / 20)
+        self._jitter = CarrierJitter(scene.jitter, seed=seed, serial=int(radar.serial))
+        self._receiver = Receiver(scene, radar, seed)
 
     def echo(
-        self, capture: CaptureSettings, scene_times_ns: NDArray[np.int64]
+        self,
+        capture: CaptureSettings,
+        scene_times_ns: NDArray[np.int64],
+        carrier_phase_rad: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
         """Return the noise-free signal before quantisation, leakage included.
 
         Shape (n_frames, capture.n_samples), float64, normalised units. A reflection weaker than
-        one count is skipped.
+        one count is skipped. ``carrier_phase_rad`` of shape (n_frames,) is added to all echoes
+        of a frame.
         """
-        times_ns = self._clock.scene_times_ns(scene_times_ns)
-        poses = self._trajectory.poses(times_ns)
-        leakage = self._scene.leakage
-        terms = [
-            target_reflections(self._scene.targets, self._radar, poses),
-            Reflections(
-                range_m=np.full((len(poses), 1), leakage.range_m),
-                amplitude=np.full((len(poses), 1), leakage.amplitude),
-                phase_rad=np.array([reflection_phase_rad("leakage")]),
-            ),
-            *(
-                person_reflections(person, self._radar, poses, times_ns)
-                for person in self._scene.people
-            ),
-        ]
-        range_m = np.concatenate([term.range_m for term in terms], axis=1)
-        amplitude = np.concatenate([term.amplitude for term in terms], axis=1)
-        phase_rad = np.concatenate([term.phase_rad for term in terms])
-
-        amplitude *= _TX_AMPLITUDE[capture.tx_power] * self._gain
-        position = (range_m + self._radar.range_offset_m) * (_SAMPLES_PER_M * self._clock.rate)
+        wavelength_m = SPEED_OF_LIGHT_MPS / x4.CARRIER_HZ[capture.tx_center_frequency]
+        paths = self._paths.reflections(self._clock.scene_times_ns(scene_times_ns), wavelength_m)
+        amplitude = paths.amplitude * (_TX_AMPLITUDE[capture.tx_power] * self._gain)
+        position = (paths.range_m + self._radar.range_offset_m) * (
+            _SAMPLES_PER_M * self._clock.rate
+        )
         position -= capture.first_sample_m * _SAMPLES_PER_MODULE_M
         frame, path = np.nonzero(amplitude >= one_count(capture))
+        of_each_frame = paths.phase_rad.ndim > 1
+        phase_rad = paths.phase_rad[frame, path] if of_each_frame else paths.phase_rad[path]
+        if carrier_phase_rad is not None:
+            phase_rad = phase_rad + carrier_phase_rad[frame]
         return sum_of_pulses(
             frame=frame,
             position=position[frame, path],
             amplitude=amplitude[frame, path],
-            phase_rad=phase_rad[path],
+            phase_rad=phase_rad,
             tx_center_frequency=capture.tx_center_frequency,
-            shape=(len(poses), capture.n_samples),
+            shape=(len(amplitude), capture.n_samples),
         )
 
     def rf_counters(
@@ -135,14 +130,14 @@ class SceneEcho:
         scene_times_ns: NDArray[np.int64],
     ) -> NDArray[np.int64]:
         """Return raw RF chip counters, shape (n_frames, n_samples); see ``EchoSource``."""
-        return rf_counters(
-            self.echo(capture, scene_times_ns),
+        times_ns = self._clock.scene_times_ns(scene_times_ns)
+        jitter_rad = self._jitter.phases_rad(frame_counters, times_ns)
+        return self._receiver.counters(
+            self.echo(capture, scene_times_ns, jitter_rad),
             frame_counters,
-            self._clock.scene_times_ns(scene_times_ns),
-            capture=capture,
-            scene=self._scene,
-            radar=self._radar,
-            seed=self._seed,
+            times_ns,
+            capture,
+            gain=_TX_AMPLITUDE[capture.tx_power] * self._gain,
         )
 
 
