@@ -46,6 +46,22 @@ class Experiment:
         return cast(ExperimentModule, import_module(self.module))
 
 
-_ROWS: tuple[Experiment, ...] = ()
+_ROWS: tuple[Experiment, ...] = (
+    Experiment(
+        name="figure7",
+        help="one frame from raw to peaks, and a target that moves away in 1 cm steps",
+        module="slam.app.experiments.figure7",
+    ),
+    Experiment(
+        name="smoke",
+        help="observations in smoke and in clear air, raw and filtered",
+        module="slam.app.experiments.smoke",
+    ),
+    Experiment(
+        name="filter",
+        help="what window, minimum count and search radius of the outlier filter trade off",
+        module="slam.app.experiments.filter_tradeoffs",
+    ),
+)
 
 EXPERIMENTS: Mapping[str, Experiment] = MappingProxyType({row.name: row for row in _ROWS})

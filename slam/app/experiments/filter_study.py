@@ -1,0 +1,278 @@
+"""The outlier filter under many settings, on the same fixes, judged by the true geometry.
+
+A fix is made of two ranges. It is *true* if one landmark explains both, a *ghost* if each range is
+explained, but by different landmarks, and *clutter* otherwise: noise, walls, echoes that came by
+way of walls. Explained means within ``EXPLAINED_M`` of the true distance from the radar.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.odometry import scene_odometry
+from emulator.scene import Scene
+from slam.app.emulated_rig import (
+    FRAME_RATE_HZ,
+    RAW_CONFIG,
+    end_counter,
+    open_loopback,
+    rig_of,
+    scene_and_config,
+    true_landmarks_m,
+)
+from slam.app.odometry import OdometryTrack
+from slam.app.runner import run_slam
+from slam.app.tum import NS_PER_S
+from slam.clustering import filter_window
+from slam.config import ClusteringConfig, SlamConfig
+from slam.geometry import Rig, transform
+from slam.pipeline import UwbRadarSlam
+from slam.presets import load_preset
+from slam.trilateration import Fix
+from slam.window import CollectedState
+
+Array = NDArray[np.float64]
+
+EXPLAINED_M = 0.03
+"""Four standard deviations of the paper's front end."""
+WRONG_M = 0.15
+"""An observation farther from every landmark is wrong; the metric's radius of a match."""
+
+
+class Origin(Enum):
+    """What a fix is of."""
+
+    TRUE = "true"
+    GHOST = "ghost"
+    CLUTTER = "clutter"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Setting:
+    """One setting of the filter, in the paper's terms."""
+
+    window_size: int
+    min_opc: int
+    search_rad_m: float
+
+    def __str__(self) -> str:
+        """Return the three numbers as a row of a table has them."""
+        return f"{self.window_size}, {self.min_opc}, {1e2 * self.search_rad_m:g} cm"
+
+
+TABLE_I = Setting(window_size=15, min_opc=9, search_rad_m=0.2)
+WINDOWS = (9, 12, 15, 20, 30)
+COUNTS = (3, 6, 9, 12, 15)
+RADII_M = (0.025, 0.05, 0.1, 0.2, 0.4)
+SETTINGS = tuple(
+    dict.fromkeys(
+        [
+            *(Setting(window_size=w, min_opc=9, search_rad_m=0.2) for w in WINDOWS),
+            *(Setting(window_size=15, min_opc=c, search_rad_m=0.2) for c in COUNTS),
+            *(Setting(window_size=15, min_opc=9, search_rad_m=r) for r in RADII_M),
+        ]
+    )
+)
+"""One parameter at a time around Table I."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Seen:
+    """What one lap saw.
+
+    Attributes
+    ----------
+    scene
+        Its name.
+    states
+        Every collected state, in time order.
+    truth
+        Shape (n_states, 3): the true pose of each, world frame.
+    origins
+        For each state what its fixes are of.
+    landmarks_m
+        Shape (m, 2), world frame.
+    """
+
+    scene: str
+    states: tuple[CollectedState, ...]
+    truth: Array
+    origins: tuple[tuple[Origin, ...], ...]
+    landmarks_m: Array
+
+    def count(self, origin: Origin) -> int:
+        """Return how many fixes are of this origin."""
+        return sum(each is origin for of_state in self.origins for each in of_state)
+
+    @property
+    def n_true(self) -> int:
+        """Return the number of true fixes."""
+        return self.count(Origin.TRUE)
+
+    @property
+    def n_ghosts(self) -> int:
+        """Return the number of ghosts."""
+        return self.count(Origin.GHOST)
+
+    @property
+    def n_clutter(self) -> int:
+        """Return the number of the other fixes."""
+        return self.count(Origin.CLUTTER)
+
+    def numbers(self) -> dict[str, object]:
+        """Return what goes into the JSON file."""
+        return {
+            "scene": self.scene,
+            "states": len(self.states),
+            "true_fixes": self.n_true,
+            "ghosts": self.n_ghosts,
+            "clutter": self.n_clutter,
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome:
+    """What one setting did; shares are None where there is nothing to divide by.
+
+    Attributes
+    ----------
+    true_kept, ghosts_kept, clutter_kept
+        Shares of the fixes that some cluster confirmed, of those whose window was complete.
+    n_observations, wrong_observations
+        What went to the filter, and the share farther than 15 cm from every landmark, on true
+        poses.
+    latency_s
+        Median time from a state to the newest one of its window.
+    """
+
+    setting: Setting
+    true_kept: float | None
+    ghosts_kept: float | None
+    clutter_kept: float | None
+    n_observations: int
+    wrong_observations: float | None
+    latency_s: float
+
+    def numbers(self) -> dict[str, object]:
+        """Return what goes into the JSON file."""
+        return asdict(self)
+
+
+def drive(scene: str, *, seed: int, check: Callable[[], None] = lambda: None) -> Seen:
+    """Drive the first lap of a scene and return every state with all its fixes.
+
+    Raises
+    ------
+    AppError
+        The scene cannot be used; one line.
+    """
+    loaded, config = scene_and_config(scene, "paper")
+    path = loaded.path.model_copy(update={"laps": loaded.path.laps[:1]})
+    lap = loaded.model_copy(update={"path": path})
+    trajectory = lap.trajectory()
+    odometry = OdometryTrack.from_lines(scene_odometry(lap, seed))
+    # With a window of one state each comes out as it is collected.
+    alone = config.model_copy(update={"window": config.window.model_copy(update={"size": 1})})
+    with open_loopback(lap, seed) as source:
+        source.start(RAW_CONFIG, FRAME_RATE_HZ)
+        scans = source.scans(end_counter(trajectory.duration_ns), check)
+        record = run_slam(scans, odometry, UwbRadarSlam(alone, rig_of(lap)), trajectory.poses)
+    rig = rig_of(lap)
+    return Seen(
+        scene=lap.name,
+        states=tuple(
+            CollectedState(
+                t_ns=result.t_ns,
+                odometry_pose=result.odometry_pose,
+                detections=result.detections,
+                fixes=result.fixes,
+            )
+            for result in record.results
+        ),
+        truth=record.truth,
+        origins=tuple(
+            _origins(result.fixes, pose, rig, lap)
+            for result, pose in zip(record.results, record.truth, strict=True)
+        ),
+        landmarks_m=true_landmarks_m(lap),
+    )
+
+
+def _origins(fixes: Sequence[Fix], pose: Array, rig: Rig, scene: Scene) -> tuple[Origin, ...]:
+    if not fixes or not scene.targets:
+        return (Origin.CLUTTER,) * len(fixes)
+    antennas = transform(pose, np.array([(mount.x_m, mount.y_m) for mount in rig.mounts]))
+    targets = true_landmarks_m(scene)
+    radii = np.array([target.radius_m for target in scene.targets])
+    true_m = np.linalg.norm(antennas[:, np.newaxis] - targets[np.newaxis], axis=2) - radii
+    origins = []
+    for fix in fixes:
+        first, second = (
+            np.abs(true_m[each.radar] - each.range_m) <= EXPLAINED_M for each in fix.detections
+        )
+        if (first & second).any():
+            origins.append(Origin.TRUE)
+        elif first.any() and second.any():
+            origins.append(Origin.GHOST)
+        else:
+            origins.append(Origin.CLUTTER)
+    return tuple(origins)
+
+
+def outcomes(
+    seen: Seen,
+    settings: Sequence[Setting] = SETTINGS,
+    *,
+    check: Callable[[], None] = lambda: None,
+) -> tuple[Outcome, ...]:
+    """Return what each setting of the filter makes of the same states."""
+    return tuple(_outcome(seen, setting, check) for setting in settings)
+
+
+def _outcome(seen: Seen, setting: Setting, check: Callable[[], None]) -> Outcome:
+    clustering = _with(load_preset("paper"), setting)
+    kept = dict.fromkeys(Origin, 0)
+    judged = dict.fromkeys(Origin, 0)
+    errors_m: list[float] = []
+    latencies_ns: list[int] = []
+    for first in range(len(seen.states) - setting.window_size + 1):
+        check()
+        window = seen.states[first : first + setting.window_size]
+        filtered = filter_window(window, clustering)
+        rejected = {id(fix) for fix in filtered.rejected}
+        for fix, origin in zip(window[0].fixes, seen.origins[first], strict=True):
+            judged[origin] += 1
+            kept[origin] += id(fix) not in rejected
+        if filtered.observations:
+            points = np.array([(each.x_m, each.y_m) for each in filtered.observations])
+            errors_m += _distances_m(transform(seen.truth[first], points), seen.landmarks_m)
+        latencies_ns.append(window[-1].t_ns - window[0].t_ns)
+    share = {origin: kept[origin] / judged[origin] if judged[origin] else None for origin in Origin}
+    wrong = float(np.mean(np.array(errors_m) > WRONG_M)) if errors_m else None
+    return Outcome(
+        setting=setting,
+        true_kept=share[Origin.TRUE],
+        ghosts_kept=share[Origin.GHOST],
+        clutter_kept=share[Origin.CLUTTER],
+        n_observations=len(errors_m),
+        wrong_observations=wrong,
+        latency_s=float(np.median(latencies_ns)) / NS_PER_S if latencies_ns else 0.0,
+    )
+
+
+def _with(config: SlamConfig, setting: Setting) -> ClusteringConfig:
+    return config.clustering.model_copy(
+        update={"min_observations": setting.min_opc, "search_radius_m": setting.search_rad_m}
+    )
+
+
+def _distances_m(points: Array, landmarks_m: Array) -> list[float]:
+    """Return how far each point is from the nearest landmark; infinite where there is none."""
+    gaps = np.linalg.norm(points[:, np.newaxis] - landmarks_m[np.newaxis], axis=2)
+    distances: list[float] = gaps.min(axis=1, initial=np.inf).tolist()
+    return distances

@@ -1,0 +1,59 @@
+"""What all our pictures share: style, colours, and how one becomes a file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from slam.app.errors import naming
+
+TRUTH, ODOMETRY, ESTIMATE, LANDMARK = "#8a8f98", "#e08a2c", "#1f6fd0", "#c2255c"
+INK, PALE_INK, GRID = "#20242a", "#6a707a", "#eceef1"
+
+# The same picture on every machine: no user style, no font that may be missing.
+STYLE: dict[Any, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 10.0,
+    "axes.edgecolor": "#c8ccd2",
+    "axes.labelcolor": "#40444c",
+    "xtick.color": "#40444c",
+    "ytick.color": "#40444c",
+}
+
+
+@contextmanager
+def picture(path: Path, *, width_in: float, height_in: float, dpi: int = 100) -> Iterator[Figure]:
+    """Give a figure to draw in, and write it as a PNG file at the end.
+
+    No software version or date goes into the file: the same figure gives the same bytes.
+
+    Raises
+    ------
+    AppError
+        The file cannot be written.
+    """
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(
+            figsize=(width_in, height_in), dpi=dpi, layout="constrained", facecolor="white"
+        )
+        FigureCanvasAgg(figure)
+        yield figure
+        with naming(path):
+            figure.savefig(path, metadata={"Software": None}, pil_kwargs={"optimize": True})
+
+
+def label(axes: Axes, title: str, x_label: str, y_label: str) -> None:
+    """Give a panel its title, its axes' names with units, and a quiet grid."""
+    axes.set_title(title, loc="left", fontsize=10, color=INK)
+    axes.set_xlabel(x_label)
+    axes.set_ylabel(y_label)
+    axes.grid(color=GRID, linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.tick_params(length=0)
