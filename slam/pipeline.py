@@ -174,10 +174,6 @@ class UwbRadarSlam:
         return self._n_estimated % self.config.window.stride == 0
 
     def _detect(self, frames: Sequence[RadarFrame]) -> tuple[Detection, ...]:
-        return tuple(
-            detection
-            for frame in frames
-            for detection in self._detector.detect(
-                frame, self.rig.mounts[frame.radar].range_offset_m
-            )
-        )
+        offsets_m = [self.rig.mounts[frame.radar].range_offset_m for frame in frames]
+        found = self._detector.detect_many(frames, offsets_m)
+        return tuple(detection for of_frame in found for detection in of_frame)
