@@ -27,8 +27,6 @@ STATE_NS = 3_000_000_000
 SKEWS_NS = (0, 190_000_000, 100_000_000, 150_000_000)
 STAMPS_NS = tuple(STATE_NS + skew_ns for skew_ns in SKEWS_NS)
 
-finite = {"allow_nan": False, "allow_infinity": False}
-
 
 def plane(pose: Array) -> tuple[complex, complex]:
     """Return a pose as position and unit vector of its heading."""
@@ -80,7 +78,7 @@ def result_of(
 @st.composite
 def moments(draw: st.DrawFn, way_m: float = 0.03, turn_rad: float = 0.2) -> dict[int, Array]:
     """Draw where the robot is at the state's time and at the time of each radar's sample."""
-    coordinate = st.floats(-20, 20, **finite)
+    coordinate = st.floats(-20, 20)
     start = np.array([draw(coordinate), draw(coordinate), draw(st.floats(-3.1, 3.1))])
     poses = {STATE_NS: start}
     for stamp_ns in STAMPS_NS[1:]:

@@ -1,6 +1,7 @@
 """Algorithm 1 as a whole: what comes out when, and that it beats the odometry it is given."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,13 +9,13 @@ from numpy.typing import NDArray
 
 from hil_tests.unit.slam.pose_tracks import at_rest
 from hil_tests.unit.slam.simulation import CLASSROOM, FRAME_NS, LAB, Room, World, simulate
-from slam.config import EndOfRun, SlamConfig, WindowConfig
+from slam.config import EndOfRun, SampleTime, SlamConfig, WindowConfig
 from slam.detection import Detection
 from slam.frames import RadarFrame
 from slam.geometry import paper_rig
 from slam.metrics import ate_rmse_m
 from slam.pipeline import StepResult, UwbRadarSlam
-from slam.presets import load_preset
+from slam.presets import load_preset, override
 
 Array = NDArray[np.float64]
 
@@ -166,6 +167,41 @@ def test_without_noise_the_path_is_exact() -> None:
     results = run(world, load_preset("paper"))
     assert len(results[-1].belief.landmark_ids) >= 3
     assert ate_rmse_m(*trajectories(results, world)) < 1e-6
+
+
+def bytes_of(results: list[StepResult]) -> list[bytes]:
+    return [
+        r.belief.mean.tobytes()
+        + r.belief.covariance.tobytes()
+        + repr([(fix.x_m, fix.y_m) for fix in r.fixes]).encode()
+        for r in results
+    ]
+
+
+@pytest.mark.parametrize("sample_time", list(SampleTime))
+def test_the_rule_of_sample_times_changes_no_bit_where_it_must_not(sample_time: SampleTime) -> None:
+    """Take all samples at once under "own"; under "nominal", at any time within the frame."""
+    whole = simulate(LAB, paper_rig(), 5, laps=1)
+    n = 300  # with a corner
+    world = replace(
+        whole,
+        truth=whole.truth[:n],
+        odometry=whole.odometry[:n],
+        detections=whole.detections[:n],
+    )
+    paper = load_preset("paper")
+    changed = override(paper, {"trilateration.sample_time": sample_time.value})
+    if sample_time is SampleTime.NOMINAL:
+        skewed = [
+            tuple(replace(d, t_ns=d.t_ns + d.radar * 50_000_000) for d in frame)
+            for frame in world.detections
+        ]
+        other = replace(world, detections=skewed)
+    else:
+        other = world
+    results = run(other, changed)
+    assert sum(len(r.fixes) for r in results) > 100
+    assert bytes_of(results) == bytes_of(run(world, paper))
 
 
 def test_same_input_gives_the_same_bytes() -> None:

@@ -1,13 +1,17 @@
 """Scans from drivers: true metres, time by the counter, gaps, silence, and the real driver."""
 
+import dataclasses
 from collections.abc import Sequence
+from fractions import Fraction
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from emulator.scene import Scene, load_scene
+from emulator.scene import PathSpec, Scene, load_scene
 from hil_tests.system.short_scene import write_short_scene
 from slam.app import sources
 from slam.app.emulated_rig import RAW_CONFIG, end_counter, open_loopback, rig_of
@@ -17,6 +21,7 @@ from slam.geometry import Mount
 from xethru_protocol.driver import X4M300, Frame, FrameGeometry, RawConfig
 from xethru_protocol.errors import DeviceError, Disconnected, ResponseTimeout
 
+MS = 1_000_000
 GEOMETRY = FrameGeometry(range_start_m=0.3, bin_length_m=0.0064, n_bins=4, downconversion=False)
 
 
@@ -50,7 +55,8 @@ class Canned:
         self.closed += 1
 
 
-def rig_source(*drivers: Canned) -> RigSource:
+def rig_source(*drivers: Canned, skews_ns: Sequence[int] = ()) -> RigSource:
+    skews_ns = skews_ns or [0] * len(drivers)
     return RigSource(
         [
             RadarLink(
@@ -58,8 +64,9 @@ def rig_source(*drivers: Canned) -> RigSource:
                 port=f"port{index}",
                 serial="000000000001",
                 driver=cast(X4M300, driver),
+                start_skew_ns=skew_ns,
             )
-            for index, driver in enumerate(drivers)
+            for index, (driver, skew_ns) in enumerate(zip(drivers, skews_ns, strict=True))
         ]
     )
 
@@ -95,6 +102,65 @@ def test_a_counter_that_every_radar_lost_gives_no_scan() -> None:
     source = rig_source(Canned([1, 2, 9]), Canned([1, 2, 9]))
     assert counters_of(source, 5) == [(1, [0, 1]), (2, [0, 1])]
     assert source.lost_frames == 2 * 3
+
+
+def times_of(source: RigSource, end: int) -> list[tuple[int, int, list[tuple[int, int, int]]]]:
+    """Return tick and time [ms] of each scan, with radar, counter and time [ms] of its frames."""
+    source.start(RAW_CONFIG, 5)
+    return [
+        (
+            scan.counter,
+            scan.t_ns // MS,
+            [(one.radar, one.counter, one.t_ns // MS) for one in scan.frames],
+        )
+        for scan in source.scans(end, lambda: None)
+    ]
+
+
+def test_frames_are_stamped_with_their_own_radars_time() -> None:
+    drivers = [Canned(range(4)) for _ in range(4)]
+    source = rig_source(*drivers, skews_ns=[0, 190 * MS, 100 * MS, 150 * MS])
+    assert times_of(source, 2) == [
+        (0, 0, [(0, 0, 0), (1, 0, 190), (2, 0, 100), (3, 0, 150)]),
+        (1, 200, [(0, 1, 200), (1, 1, 390), (2, 1, 300), (3, 1, 350)]),
+    ]
+    assert source.lost_frames == 0
+
+
+def test_a_scans_time_is_the_ticks_whichever_radars_answered() -> None:
+    source = rig_source(Canned([0, 2, 3]), Canned([0, 1, 3]), skews_ns=[0, 190 * MS])
+    assert times_of(source, 3) == [
+        (0, 0, [(0, 0, 0), (1, 0, 190)]),
+        (1, 200, [(1, 1, 390)]),
+        (2, 400, [(0, 2, 400)]),
+    ]
+    assert source.lost_frames == 2
+
+
+def test_a_radar_that_started_periods_late_joins_the_scans_of_its_time() -> None:
+    """Counter 0 at 500 ms, 5 frames/s: it lies in the tick that begins at 400 ms."""
+    source = rig_source(Canned(range(9)), Canned([0, 2, 3, 4]), skews_ns=[0, 500 * MS])
+    assert times_of(source, 5) == [
+        (0, 0, [(0, 0, 0)]),
+        (1, 200, [(0, 1, 200)]),
+        (2, 400, [(0, 2, 400), (1, 0, 500)]),
+        (3, 600, [(0, 3, 600)]),
+        (4, 800, [(0, 4, 800), (1, 2, 900)]),
+    ]
+    assert source.lost_frames == 1
+
+
+def test_a_radar_that_starts_after_the_end_loses_nothing() -> None:
+    source = rig_source(Canned(range(9)), Canned([0, 1]), skews_ns=[0, 10_000 * MS])
+    assert [scan[0] for scan in times_of(source, 3)] == [0, 1, 2]
+    assert source.lost_frames == 0
+
+
+@given(st.integers(0, 10**11), st.floats(1.0, 400.0))
+def test_every_frame_lies_in_the_period_of_its_scan(start_skew_ns: int, rate_hz: float) -> None:
+    period = Fraction(10**9) / Fraction(rate_hz)
+    late_ns = start_skew_ns - sources.whole_periods(start_skew_ns, rate_hz) * period
+    assert -1 < late_ns < period + 1  # times are rounded to nanoseconds
 
 
 def test_silence_names_radar_port_and_last_frame(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -134,6 +200,45 @@ def test_drivers_are_closed_once() -> None:
     with source, source:
         pass
     assert driver.closed == 1
+
+
+def loud_scene(short_scene: Scene) -> Scene:
+    """Let leakage drive the sampler over both ends of its range."""
+    leakage = short_scene.leakage.model_copy(update={"amplitude": 9.0, "range_m": 0.7})
+    return short_scene.model_copy(update={"leakage": leakage})
+
+
+@pytest.mark.parametrize(
+    ("settings", "limit"),
+    [
+        ({}, 152 / 2048),  # protocol reference 9.7: 949 ... 1100 are 152 levels
+        ({"dac_min": 0, "dac_max": 2047}, 1.0),
+        ({"iterations": 7, "pulses_per_step": 11, "dac_min": 900, "dac_max": 1110}, 211 / 2048),
+        ({"iterations": 3, "pulses_per_step": 25, "dac_step": 2}, 152 / 2048),
+    ],
+)
+def test_limits_are_what_the_sampler_gives_at_its_ends(
+    short_scene: Scene, settings: dict[str, Any], limit: float
+) -> None:
+    config = dataclasses.replace(RAW_CONFIG, **settings)
+    with open_loopback(loud_scene(short_scene), 0) as source:
+        source.start(config, 1)
+        (scan,) = source.scans(1, lambda: None)
+    for one in scan.frames:
+        assert one.limits is not None
+        assert one.limits == (one.samples.min(), one.samples.max())  # the same floats
+        assert one.limits == pytest.approx((-limit, limit), rel=1e-6)
+
+
+def test_the_counter_knows_a_radars_skew_but_not_its_clocks_rate(short_scene: Scene) -> None:
+    standing = short_scene.model_copy(update={"path": PathSpec()})
+    late = standing.radars[1].model_copy(update={"start_skew_ms": 190.0, "clock_ppm": 50.0})
+    skewed = standing.model_copy(update={"radars": (standing.radars[0], late)})
+    with open_loopback(skewed, 0) as source:
+        source.start(RAW_CONFIG, 5)
+        scans = list(source.scans(3, lambda: None))
+    assert source.radars[1].start_skew_ns == 190 * MS
+    assert [[f.t_ns - scan.t_ns for f in scan.frames] for scan in scans] == [[0, 190 * MS]] * 3
 
 
 @pytest.fixture
