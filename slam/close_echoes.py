@@ -12,10 +12,15 @@ are found by Levenberg-Marquardt on what is left, the Jacobian projected off the
 the best pair of a grid over the whole window, so no first guess can lock the search; each further
 echo starts where it explains most of what the others leave, and as a half of each of them.
 
-How many echoes: one more is believed if it raises twice the log-likelihood by more than noise does
-with probability ``false_split`` anywhere in the window (the upcrossing rate of a chi-square process
-with 2 degrees; Davies 1987), plus ``model_error**2`` of the window's signal energy over the noise
-density. The second term is what keeps a pulse that is not quite ours, however strong, one echo.
+How many echoes: one more is believed if it raises twice the log-likelihood by more than
+
+    (sqrt(h) + model_error sqrt(E) / sigma)**2,    E = energy of the echoes so far.
+
+h is exceeded by noise alone, anywhere in the window, with probability ``false_split`` (upcrossings
+of a chi-square process with 2 degrees of freedom; Davies 1987). The other term keeps a pulse that
+is not quite ours one echo, however strong: what the pulse model leaves of it grows with the signal,
+and the noise adds to its root. Its price: of two echoes in phase, closer than the bandwidth can be
+trusted to tell from one wide pulse, or one far weaker than the other, only one is reported.
 
 All arithmetic is batched over windows of one length.
 """
@@ -212,7 +217,8 @@ def _try_one_more(
 ) -> tuple[State, NDArray[np.bool_]]:
     """Return the fits with one more echo that are believed, and of which rows, shape (r,)."""
     n_echoes = state.positions.shape[1] + 1
-    needed = threshold * data.noise_sigma**2 + split.model_error**2 * (energy - state.sse)
+    signal = np.sqrt(np.maximum(energy - state.sse, 0.0))
+    needed = (math.sqrt(threshold) * data.noise_sigma + split.model_error * signal) ** 2
     # no echo can explain more than all that is left
     believed = (state.sse > needed) & (n_echoes <= split.max_echoes)
     hopeful = np.flatnonzero(believed)
