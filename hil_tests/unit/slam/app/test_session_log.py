@@ -80,6 +80,25 @@ def test_odometry_is_written_as_far_as_the_scans_need_it(tmp_path: Path) -> None
     assert stamps[-2] < last_scan_ns <= stamps[-1]
 
 
+def test_frames_keep_their_own_stamps_and_the_odometry_they_need(tmp_path: Path) -> None:
+    """Radars of one scan sample at different times, up to a frame after the scan's own."""
+    path = tmp_path / "session.mcap"
+    log = SessionLog(path, session_info(), odometry())
+    skews_ns = (0, 190_000_000)
+    for counter in range(4):
+        one = scan(counter)
+        frames = tuple(
+            dataclasses.replace(frame, t_ns=frame.t_ns + skew_ns)
+            for frame, skew_ns in zip(one.frames, skews_ns, strict=True)
+        )
+        log.on_scan(dataclasses.replace(one, frames=frames))
+    log.close()
+    for radar, skew_ns in enumerate(skews_ns):
+        stamps = [row[:2] for row in messages(path, f"/radar/radar{radar}/frame")]
+        assert stamps == [(counter, scan(counter).t_ns + skew_ns) for counter in range(4)]
+    assert messages(path, "/odom")[-1][1] >= scan(3).t_ns + max(skews_ns)
+
+
 def test_states_landmarks_and_their_covariance_come_back(finished: Path) -> None:
     _, t_ns, cloud = messages(finished, "/landmarks")[7]
     sent = snapshot(7)
