@@ -8,11 +8,14 @@ to 2**-20; one normal is the sum of two such entries. The sum is what makes the 
 ``LARGEST_UNITS / UNITS_PER_SIGMA`` = 6.1 sigma; the excess kurtosis is -4e-4.
 
 A stream is keyed by (seed, stream number). Frame ``k`` owns the k-th block of a stream, so its
-noise depends neither on how many frames are asked for at once nor on their order.
+noise depends neither on how many frames are asked for at once nor on their order. The streams of a
+module are numbered by its serial number and what they are for (`Purpose`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from enum import IntEnum
 from itertools import pairwise
 
 import numpy as np
@@ -25,8 +28,12 @@ __all__ = [
     "LARGEST_UNITS",
     "MAX_SAMPLES",
     "UNITS_PER_SIGMA",
+    "Purpose",
+    "counter_normals",
     "frame_noise_units",
     "standard_normals",
+    "stream_of",
+    "uniform_below",
 ]
 
 MAX_SAMPLES = FRAME_SAMPLES
@@ -46,6 +53,26 @@ LARGEST_UNITS = 2 * int(_TABLE[-1])
 # Two 16 bit words per sample; one Philox block is four 64 bit words.
 _WORDS_PER_FRAME = 2 * MAX_SAMPLES * _TABLE_BITS // 64
 _BLOCKS_PER_FRAME = _WORDS_PER_FRAME // 4
+
+
+class Purpose(IntEnum):
+    """What a module's random streams are for."""
+
+    RECEIVER_NOISE = 0
+    JITTER_WHITE = 1
+    JITTER_SLOW = 2
+    CLUTTER = 3
+    CLUTTER_INSTANTS = 4
+
+
+def stream_of(serial: int, purpose: Purpose, part: int = 0) -> int:
+    """Return the number of a module's stream; ``part``, 0 ... 255, tells several of one purpose.
+
+    >>> stream_of(202305070101, Purpose.RECEIVER_NOISE)
+    202305070101
+    """
+    # twelve decimal digits take 40 bits; bit 63 is the odometry's
+    return purpose << 48 | part << 40 | serial
 
 
 def frame_noise_units(
@@ -69,10 +96,7 @@ def frame_noise_units(
     if n_samples > MAX_SAMPLES:
         raise ValueError(f"{n_samples} samples: the longest frame has {MAX_SAMPLES}")
     noise = np.empty((len(frame_counters), n_samples), dtype=np.int32)
-    breaks = np.flatnonzero(np.diff(frame_counters) != 1) + 1
-    for start, stop in pairwise([0, *breaks.tolist(), len(frame_counters)]):
-        if start == stop:
-            continue
+    for start, stop in _runs(frame_counters):
         philox = _philox(seed, stream, int(frame_counters[start]) * _BLOCKS_PER_FRAME)
         halves = _half_words(philox.random_raw((stop - start) * _WORDS_PER_FRAME))
         halves = halves.reshape(stop - start, 2, MAX_SAMPLES)
@@ -90,6 +114,42 @@ def standard_normals(count: int, *, seed: int, stream: int) -> NDArray[np.float6
     )
     normals: NDArray[np.float64] = units.ravel()[:count] / UNITS_PER_SIGMA
     return normals
+
+
+def counter_normals(counters: NDArray[np.int64], *, seed: int, stream: int) -> NDArray[np.float64]:
+    """Return one normal for each counter, selected by the counter alone.
+
+    Parameters
+    ----------
+    counters
+        Shape (n,), int64, each >= 0, in any order.
+    seed, stream
+        Key of the stream, each 0 ... 2**64 - 1.
+
+    Returns
+    -------
+    Shape (n,), float64, mean 0, variance 1.
+    """
+    units = np.empty(len(counters), dtype=np.int32)
+    for start, stop in _runs(counters):
+        words = _philox(seed, stream, int(counters[start])).random_raw(4 * (stop - start))
+        halves = _half_words(words).reshape(stop - start, 16)
+        units[start:stop] = _TABLE[halves[:, 0]] + _TABLE[halves[:, 1]]
+    normals: NDArray[np.float64] = units / UNITS_PER_SIGMA
+    return normals
+
+
+def uniform_below(end: int, *, seed: int, stream: int) -> int:
+    """Return the stream's first word as an integer 0 ... end - 1; ``end`` far below 2**64."""
+    return int(_philox(seed, stream, 0).random_raw()) % end
+
+
+def _runs(counters: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
+    """Yield start and end of each run of counters that follow each other."""
+    breaks = np.flatnonzero(np.diff(counters) != 1) + 1
+    for start, stop in pairwise([0, *breaks.tolist(), len(counters)]):
+        if start < stop:
+            yield start, stop
 
 
 def _philox(seed: int, stream: int, counter: int) -> np.random.Philox:

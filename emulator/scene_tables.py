@@ -56,6 +56,7 @@ def _finite(value: object) -> object:
 Metres = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-1000, le=1000)]
 Degrees = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-360, le=360)]
 Sigma = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=1)]
+CorrelationTime = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=1e-3, le=86_400)]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
 
 
@@ -181,20 +182,26 @@ class MultipathSpec(Table):
 
 
 class ClutterSpec(Table):
-    """Slow correlated clutter: ``sigma`` per RF sample, normalised units."""
+    """Slow correlated clutter (``emulator.clutter``).
+
+    ``sigma`` is its standard deviation per RF sample at TX power 2, normalised units;
+    ``correlation_s`` the lag at which its autocorrelation has fallen to 1/e.
+    """
 
     sigma: Sigma = 0.0
-    correlation_s: Annotated[StrictFloat, BeforeValidator(_finite), Field(gt=0, le=86_400)] = 10.0
+    correlation_s: CorrelationTime = 2.7
 
 
 class JitterSpec(Table):
-    """Jitter of the carrier's phase, common to all echoes of a frame: white and slow."""
+    """Jitter of the carrier's phase, common to all echoes of a frame (``emulator.jitter``).
+
+    ``white_rad`` and ``slow_rad`` are the standard deviations of a part that is new with every
+    frame and of one that falls to 1/e after ``slow_correlation_s``.
+    """
 
     white_rad: Sigma = 0.0
     slow_rad: Sigma = 0.0
-    slow_correlation_s: Annotated[StrictFloat, BeforeValidator(_finite), Field(gt=0, le=86_400)] = (
-        10.0
-    )
+    slow_correlation_s: CorrelationTime = 4.0
 
 
 class PathSpec(Table):
