@@ -188,6 +188,8 @@ class MatchedFilterConfig(_Model):
     noise_sigma: NonNegative = 0.0
     # Unexplained over expected energy from which ``joint`` looks for several pulses.
     max_single_misfit: Positive = 4.0
+    # Relative amplitude by which a real pulse may differ from the model; less is no second echo.
+    model_error: NonNegative = 0.08
 
 
 class LeakageConfig(_Model):

@@ -17,6 +17,7 @@ from scipy.signal import find_peaks, savgol_filter
 from slam.config import BackgroundFilter, DetectionConfig, FrontEnd, PeakPosition, SlamConfig
 from slam.detector import Detection, Detector
 from slam.frames import RadarFrame
+from slam.matched_filter import MatchedFilterDetector
 
 __all__ = ["Detection", "Detector", "PaperDetector", "SavitzkyGolay", "make_detector"]
 
@@ -25,7 +26,9 @@ Array = NDArray[np.float64]
 
 def make_detector(config: SlamConfig) -> Detector:
     """Return the front end that ``config.detection.front_end`` names."""
-    return {FrontEnd.PAPER: PaperDetector}[config.detection.front_end](config.detection)
+    if config.detection.front_end is FrontEnd.PAPER:
+        return PaperDetector(config.detection)
+    return MatchedFilterDetector(config)
 
 
 class PaperDetector:
