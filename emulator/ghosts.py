@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from emulator.diffraction import past_edge
 from emulator.reflections import NEAREST_M, Reflections, Scatterers, Viewpoint, beam_gain
-from emulator.walls import Faces, closed_ends, passing
+from emulator.walls import ON_THE_FACE_M, Faces, closed_ends, passing
 
 __all__ = ["direct_share", "ghost_reflections", "spread"]
 
@@ -146,6 +146,9 @@ def _legs(
     seen = (radar_height > 0) | ~faces.outward_only
     candidate = (radar_height * seen)[:, np.newaxis, :] * target_height > 0
     candidate &= faces.reflection > WEAKEST_LEG
+    # What stands on a face has no image in it: its strength is that of both together.
+    candidate &= np.abs(target_height) > ON_THE_FACE_M
+    candidate &= np.abs(radar_height)[:, np.newaxis, :] > ON_THE_FACE_M
     candidate &= (scatterers.strength > 0)[..., np.newaxis]
     frame, target, number = np.nonzero(candidate)
     face = faces.take(number)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,15 +15,14 @@ from numpy.typing import NDArray
 from emulator.diffraction import edge_wave, past_edge
 from emulator.reflections import NEAREST_M, Reflections, Viewpoint, beam_gain
 from emulator.scene_tables import MIRROR_AMPLITUDE_1M
-from emulator.walls import TOUCHING_M, Faces, closed_ends, passing
+from emulator.walls import ON_THE_FACE_M, TOUCHING_M, Faces, closed_ends, passing
 
 __all__ = ["CornerPairs", "corner_pairs", "corner_reflections", "face_reflections"]
 
 Array = NDArray[np.float64]
 
 _PARALLEL = math.sin(math.radians(5.0))
-_RIGHT = math.cos(math.radians(89.0))
-_OPEN_CORNER_M = 0.5
+_WEAKEST_CORNER = 1e-2  # of one whose edges are far: the rest is deep in Fresnel's shadow
 
 
 def face_reflections(faces: Faces, view: Viewpoint, wavelength_m: float) -> Reflections:
@@ -101,27 +99,18 @@ class CornerPairs:
 
 
 def corner_pairs(faces: Faces) -> CornerPairs:
-    """Return the pairs of faces that are not parallel and not out of each other's way."""
-    rows: list[tuple[int, int, float, float]] = []
-    for i, j in combinations(range(len(faces)), 2):
-        cross = float(faces.t_x[i] * faces.t_y[j] - faces.t_y[i] * faces.t_x[j])
-        silent = faces.reflection[i] * faces.reflection[j] == 0
-        if silent or faces.body[i] == faces.body[j] or abs(cross) < _PARALLEL:
-            continue
-        dx, dy = faces.a_x[j] - faces.a_x[i], faces.a_y[j] - faces.a_y[i]
-        on_i = float(dx * faces.t_y[j] - dy * faces.t_x[j]) / cross
-        on_j = float(dx * faces.t_y[i] - dy * faces.t_x[i]) / cross
-        inner = float(faces.t_x[i] * faces.t_x[j] + faces.t_y[i] * faces.t_y[j])
-        gap_m = max(-on_i, on_i - float(faces.length_m[i]), -on_j, on_j - float(faces.length_m[j]))
-        if abs(inner) < _RIGHT and gap_m > _OPEN_CORNER_M:
-            continue  # a right angle sends back by way of its apex only
-        rows += [(i, j, on_i, on_j), (j, i, on_j, on_i)]
-    table = np.array(rows, dtype=np.float64).reshape(-1, 4)
+    """Return the pairs of faces of different bodies that reflect and are not parallel."""
+    cross = faces.t_x[:, np.newaxis] * faces.t_y - faces.t_y[:, np.newaxis] * faces.t_x
+    reflect = (faces.reflection[:, np.newaxis] * faces.reflection) > 0
+    apart = faces.body[:, np.newaxis] != faces.body
+    first, second = np.nonzero(apart & reflect & (np.abs(cross) > _PARALLEL))
+    one, two = faces.take(first), faces.take(second)
+    dx, dy = two.a_x - one.a_x, two.a_y - one.a_y
     return CornerPairs(
-        first=table[:, 0].astype(np.int64),
-        second=table[:, 1].astype(np.int64),
-        meet_first_m=table[:, 2],
-        meet_second_m=table[:, 3],
+        first=first,
+        second=second,
+        meet_first_m=(dx * two.t_y - dy * two.t_x) / cross[first, second],
+        meet_second_m=(dx * one.t_y - dy * one.t_x) / cross[first, second],
     )
 
 
@@ -141,6 +130,7 @@ def corner_reflections(
     near1, far1, apex1 = _seen_part(one, pairs.meet_first_m, two, height2)
     near2, far2, apex2 = _seen_part(two, pairs.meet_second_m, one, height1)
     exists = (height_once * height2 > 0) & open1 & open2 & (near1 != far1) & (near2 != far2)
+    exists &= np.minimum(np.abs(height1), np.abs(height2)) > ON_THE_FACE_M
 
     share2 = height_once / np.where(exists, height_once + height2, 1.0)
     along_once = two.along(once_x, once_y)
@@ -178,7 +168,8 @@ def corner_reflections(
         window *= np.where(counts, passes, 1.0)
 
     half_m = path_m / 2
-    amplitude = MIRROR_AMPLITUDE_1M * one.reflection * two.reflection * window * exists
+    amplitude = MIRROR_AMPLITUDE_1M * one.reflection * two.reflection * window
+    amplitude *= exists & (window > _WEAKEST_CORNER)
     amplitude /= np.maximum(half_m, NEAREST_M)
     amplitude *= np.sqrt(beam_gain(_cos_angle(view, x1, y1)))
     amplitude *= np.sqrt(beam_gain(_cos_angle(view, x2, y2)))

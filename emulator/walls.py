@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from itertools import permutations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +16,22 @@ from numpy.typing import NDArray
 from emulator.diffraction import past_edge
 from emulator.scene_tables import ObjectSpec, WallSpec
 
-__all__ = ["Closure", "Faces", "closed_ends", "faces_of", "passing"]
+__all__ = [
+    "ON_THE_FACE_M",
+    "TOUCHING_M",
+    "Closure",
+    "Faces",
+    "closed_ends",
+    "faces_of",
+    "passing",
+]
 
 Array = NDArray[np.float64]
 
 TOUCHING_M = 0.02
 """Ends that come this near to another face meet it: nobody draws a plan to the millimetre."""
-_ON_THE_FACE_M = 1e-3
+ON_THE_FACE_M = 1e-3
+"""What is nearer to a face than this stands on it: neither before it nor behind."""
 _RIGHT_ANGLE_TOLERANCE = math.sin(math.radians(1.0))
 _LEGS_TIMES_FACES = 200_000  # of one block of `passing`: bounds its memory
 
@@ -169,23 +177,28 @@ def _clockwise_corners(box: ObjectSpec) -> list[tuple[float, float]]:
 
 
 def _with_closures(faces: Faces) -> Faces:
-    found = []
-    for face, other in permutations(range(len(faces)), 2):
-        if faces.body[face] == faces.body[other]:
-            continue  # a box has no inner corners
-        one = faces.take(np.array([other]))
-        across = faces.t_x[face] * one.t_x + faces.t_y[face] * one.t_y
-        if abs(float(across[0])) > _RIGHT_ANGLE_TOLERANCE:
-            continue
-        x = np.array([[faces.a_x[face]], [faces.b_x[face]]])
-        y = np.array([[faces.a_y[face]], [faces.b_y[face]]])
-        heights_m, alongs_m = one.height(x, y)[:, 0], one.along(x, y)[:, 0]
-        for end in (0, 1):
-            beside_m = max(-alongs_m[end], alongs_m[end] - float(one.length_m[0]), 0.0)
-            if math.hypot(beside_m, heights_m[end]) <= TOUCHING_M:
-                side = math.copysign(1.0, heights_m[1 - end])
-                found.append(Closure(face=face, end=end, other=other, side=side))
+    upright = np.abs(_outer(faces.t_x, faces.t_x) + _outer(faces.t_y, faces.t_y))
+    # A box has no inner corners of its own.
+    meets = (upright < _RIGHT_ANGLE_TOLERANCE) & (faces.body[:, np.newaxis] != faces.body)
+    ends = [(faces.a_x[:, np.newaxis], faces.a_y[:, np.newaxis])]
+    ends.append((faces.b_x[:, np.newaxis], faces.b_y[:, np.newaxis]))
+    found: list[Closure] = []
+    for end, (x, y) in enumerate(ends):
+        along = faces.along(x, y)
+        beside = np.maximum(np.maximum(-along, along - faces.length_m), 0.0)
+        touches = meets & (_length(beside, faces.height(x, y)) <= TOUCHING_M)
+        other_end = faces.height(*ends[1 - end])
+        found.extend(
+            Closure(
+                face=face, end=end, other=other, side=math.copysign(1.0, other_end[face, other])
+            )
+            for face, other in np.argwhere(touches).tolist()
+        )
     return replace(faces, closures=tuple(found))
+
+
+def _outer(one: Array, other: Array) -> Array:
+    return one[:, np.newaxis] * other
 
 
 def closed_ends(faces: Faces, height_m: Array) -> NDArray[np.bool_]:
@@ -238,7 +251,7 @@ def passing(
         x0, y0 = from_x[part, np.newaxis], from_y[part, np.newaxis]
         x1, y1 = to_x[part, np.newaxis], to_y[part, np.newaxis]
         h0, h1 = faces.height(x0, y0), faces.height(x1, y1)
-        crosses = (h0 * h1 < 0) & (np.minimum(np.abs(h0), np.abs(h1)) > _ON_THE_FACE_M)
+        crosses = (h0 * h1 < 0) & (np.minimum(np.abs(h0), np.abs(h1)) > ON_THE_FACE_M)
         for body in but:
             crosses &= faces.body != body[part, np.newaxis]
         leg, face = np.nonzero(crosses)
