@@ -27,6 +27,7 @@ from slam.app.errors import AppError, EmulatorError, RadarSilentError, naming
 from slam.app.evaluation import summarise
 from slam.app.link_log import LinkLog
 from slam.app.odometry import read_odometry_socket
+from slam.app.outlines import outlines_m
 from slam.app.progress import Progress
 from slam.app.report_table import print_table
 from slam.app.runner import RunRecord, run_slam
@@ -145,7 +146,7 @@ def _run(options: DemoOptions, scene: Scene, config: SlamConfig, stop: StopFlag)
             path.write_text(summary.to_json() + "\n", encoding="ascii")
         stop.check()
         with naming(path := options.out / "map.png"):
-            draw_map(path, info, record, summary)
+            draw_map(path, info, record, summary, outlines_m(scene))
         stop.check()
     print_table(
         summary,

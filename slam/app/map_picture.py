@@ -2,42 +2,36 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import matplotlib
 import matplotlib.colors
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from slam.app.ellipse import ellipse_95, rotate_covariances
+from slam.app.picture import ESTIMATE, GRID, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, picture
 from slam.app.runner import RunRecord
 from slam.app.session import SessionInfo
 from slam.app.summary import Summary
 from slam.ekf_slam import Belief
 from slam.geometry import transform
 
-_TRUTH, _ODOMETRY, _ESTIMATE, _LANDMARK = "#8a8f98", "#e08a2c", "#1f6fd0", "#c2255c"
 _MARGIN_M = 0.25
 
-# The same picture on every machine: no user style, no font that may be missing.
-_STYLE: dict[Any, Any] = {
-    "font.family": "DejaVu Sans",
-    "font.size": 10.0,
-    "axes.edgecolor": "#c8ccd2",
-    "axes.labelcolor": "#40444c",
-    "xtick.color": "#40444c",
-    "ytick.color": "#40444c",
-}
 
-
-def draw_map(path: Path, info: SessionInfo, record: RunRecord, summary: Summary) -> None:
+def draw_map(
+    path: Path,
+    info: SessionInfo,
+    record: RunRecord,
+    summary: Summary,
+    outlines_m: Sequence[NDArray[np.float64]] = (),
+) -> None:
     """Draw the map of a simulated run into a PNG file.
 
+    `outlines_m` are lines of shape (k, 2), world frame: walls and boxes, where there are any.
     Estimate and odometry are drawn where they began, at the robot's first pose, without the
     alignment that the ATE uses: drift is seen as it is.
     """
@@ -45,16 +39,17 @@ def draw_map(path: Path, info: SessionInfo, record: RunRecord, summary: Summary)
     truth = record.truth
     estimate = transform(place, np.array([row.belief.pose[:2] for row in record.results]))
     odometry = transform(place, np.array([row.odometry_pose[:2] for row in record.results]))
-    with matplotlib.rc_context(_STYLE):
-        figure = Figure(figsize=(9.0, 6.6), dpi=150, layout="constrained", facecolor="white")
-        FigureCanvasAgg(figure)
+    with picture(path, width_in=9.0, height_in=6.6, dpi=150) as figure:
         axes = figure.add_subplot()
         axes.set_aspect("equal", adjustable="datalim")
-        axes.grid(color="#eceef1", linewidth=0.8)
+        axes.grid(color=GRID, linewidth=0.8)
         axes.set_axisbelow(True)
-        axes.plot(*odometry.T, color=_ODOMETRY, linewidth=0.9, alpha=0.9, label="wheel odometry")
-        axes.plot(*truth[:, :2].T, color=_TRUTH, linewidth=3.2, alpha=0.55, label="true path")
-        axes.plot(*estimate.T, color=_ESTIMATE, linewidth=1.0, label="radar SLAM")
+        for number, line in enumerate(outlines_m):
+            name = "wall or box" if number == 0 else None
+            axes.plot(*line.T, color=INK, linewidth=1.6, alpha=0.45, label=name)
+        axes.plot(*odometry.T, color=ODOMETRY, linewidth=0.9, alpha=0.9, label="wheel odometry")
+        axes.plot(*truth[:, :2].T, color=TRUTH, linewidth=3.2, alpha=0.55, label="true path")
+        axes.plot(*estimate.T, color=ESTIMATE, linewidth=1.0, label="radar SLAM")
         _draw_start(axes, truth[0])
         if len(info.true_landmarks_m):
             axes.plot(
@@ -74,8 +69,6 @@ def draw_map(path: Path, info: SessionInfo, record: RunRecord, summary: Summary)
         axes.tick_params(length=0)
         _write_title(axes, summary)
         figure.legend(loc="outside right upper", frameon=False, handlelength=1.6)
-        # No software version or date in the file: the same run gives the same bytes.
-        figure.savefig(path, metadata={"Software": None})
 
 
 def _draw_start(axes: Axes, pose: NDArray[np.float64]) -> None:
@@ -102,8 +95,8 @@ def _draw_landmarks(axes: Axes, belief: Belief, place: NDArray[np.float64]) -> N
     axes.add_collection(
         PolyCollection(
             outlines,
-            facecolors=(*matplotlib.colors.to_rgb(_LANDMARK), 0.14),
-            edgecolors=_LANDMARK,
+            facecolors=(*matplotlib.colors.to_rgb(LANDMARK), 0.14),
+            edgecolors=LANDMARK,
             linewidths=1.0,
             label="95 % ellipse",
             zorder=3,
@@ -114,7 +107,7 @@ def _draw_landmarks(axes: Axes, belief: Belief, place: NDArray[np.float64]) -> N
         linestyle="none",
         marker="o",
         markersize=3.6,
-        color=_LANDMARK,
+        color=LANDMARK,
         label="estimated landmark",
         zorder=6,
     )
@@ -127,7 +120,7 @@ def _write_title(axes: Axes, summary: Summary) -> None:
         f"{summary.ate_ratio:.2f} of odometry's {1e3 * summary.odometry_ate_rmse_m:.1f} mm",
         loc="left",
         fontsize=11,
-        color="#20242a",
+        color=INK,
         pad=24,
     )
     axes.annotate(
@@ -138,5 +131,5 @@ def _write_title(axes: Axes, summary: Summary) -> None:
         xycoords="axes fraction",
         textcoords="offset points",
         fontsize=8.5,
-        color="#6a707a",
+        color=PALE_INK,
     )
