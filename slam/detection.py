@@ -14,7 +14,15 @@ from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 from scipy.signal import find_peaks, savgol_filter
 
-from slam.config import BackgroundFilter, DetectionConfig, FrontEnd, PeakPosition, SlamConfig
+from slam.background import LeakageFreeDetector
+from slam.config import (
+    BackgroundFilter,
+    DetectionConfig,
+    FrontEnd,
+    LeakageFilter,
+    PeakPosition,
+    SlamConfig,
+)
 from slam.detector import Detection, Detector
 from slam.frames import RadarFrame
 from slam.matched_filter import MatchedFilterDetector
@@ -25,10 +33,15 @@ Array = NDArray[np.float64]
 
 
 def make_detector(config: SlamConfig) -> Detector:
-    """Return the front end that ``config.detection.front_end`` names."""
-    if config.detection.front_end is FrontEnd.PAPER:
-        return PaperDetector(config.detection)
-    return MatchedFilterDetector(config)
+    """Return the front end that ``config`` names, behind its leakage filter if it has one.
+
+    With a leakage filter the result keeps a state per radar and belongs to one run.
+    """
+    paper = config.detection.front_end is FrontEnd.PAPER
+    detector = PaperDetector(config.detection) if paper else MatchedFilterDetector(config)
+    if config.leakage.filter is LeakageFilter.NONE:
+        return detector
+    return LeakageFreeDetector(detector, config.leakage)
 
 
 class PaperDetector:
@@ -52,44 +65,71 @@ class PaperDetector:
         Parameters
         ----------
         frame
-            The raw frame, longer than the smoothing filter.
+            The raw frame, longer than the smoothing filter. Samples that are NaN count as zero.
         range_offset_m
             What this module measures too long (``Mount.range_offset_m``).
         """
-        config = self.config
-        smoothed = self.smooth(frame.samples)
-        peaks, properties = find_peaks(
-            smoothed,
-            height=config.min_peak_height,
-            prominence=config.min_peak_prominence,
-            width=config.min_peak_width_bins or None,
-        )
-        positions = peaks.astype(np.float64)
-        if config.peak_position is PeakPosition.PARABOLA:
-            positions += _vertex_offsets(smoothed, peaks)
-        ranges_m = frame.range_start_m + positions * frame.bin_length_m - range_offset_m
-        inside = (ranges_m >= config.min_range_m) & (ranges_m <= config.max_range_m)
-        return tuple(
-            Detection(radar=frame.radar, t_ns=frame.t_ns, range_m=range_m, amplitude=amplitude)
-            for range_m, amplitude in zip(
-                ranges_m[inside].tolist(),
-                properties["peak_heights"][inside].tolist(),
-                strict=True,
-            )
-        )
+        return self.detect_many((frame,), (range_offset_m,))[0]
 
     def detect_many(
         self, frames: Sequence[RadarFrame], offsets_m: Sequence[float]
     ) -> list[tuple[Detection, ...]]:
         """Return the echoes of each frame; see ``Detector``."""
-        return [self.detect(*each) for each in zip(frames, offsets_m, strict=True)]
+        results: list[tuple[Detection, ...]] = [()] * len(frames)
+        for n_bins in {frame.samples.size for frame in frames}:
+            chosen = [index for index, frame in enumerate(frames) if frame.samples.size == n_bins]
+            row, position, height = self._peaks(np.stack([frames[i].samples for i in chosen]))
+            starts = np.searchsorted(row, np.arange(1, len(chosen)))
+            for index, positions, heights in zip(
+                chosen, np.split(position, starts), np.split(height, starts), strict=True
+            ):
+                results[index] = self._in_range(frames[index], positions, heights, offsets_m[index])
+        return results
 
     def smooth(self, samples: NDArray[np.float32]) -> Array:
-        """Return the magnitude, background set to zero, smoothed; shape (n_bins,), float64."""
+        """Return the magnitude, background set to zero, smoothed.
+
+        Shapes (..., n_bins), float64; each frame on its own, to the same bits however many.
+        """
         magnitude = np.abs(samples, dtype=np.float64)
+        mean = magnitude.mean(axis=-1, keepdims=True)
+        if np.isnan(mean).any():
+            magnitude = np.nan_to_num(magnitude, nan=0.0)
+            mean = magnitude.mean(axis=-1, keepdims=True)
         if self.config.background is BackgroundFilter.BELOW_MEAN_TO_ZERO:
-            magnitude *= magnitude >= magnitude.mean()
+            magnitude *= magnitude >= mean
         return self._smoother.smooth(magnitude)
+
+    def _peaks(self, samples: NDArray[np.float32]) -> tuple[NDArray[np.intp], Array, Array]:
+        """Return row, position in bins and height of the peaks of frames, in that order."""
+        config = self.config
+        n_frames, n_bins = samples.shape
+        # All frames end to end: a wall between two does what the end of a single one would do.
+        walled = np.full((n_frames, n_bins + 1), np.inf)
+        walled[:, :-1] = self.smooth(samples)
+        flat = walled.ravel()[:-1]
+        peaks, properties = find_peaks(
+            flat,
+            height=(config.min_peak_height, np.finfo(np.float64).max),
+            prominence=config.min_peak_prominence,
+            width=config.min_peak_width_bins or None,
+        )
+        row, bins = np.divmod(peaks, n_bins + 1)
+        position = bins.astype(np.float64)
+        if config.peak_position is PeakPosition.PARABOLA:
+            position += _vertex_offsets(flat, peaks)
+        return row, position, properties["peak_heights"]
+
+    def _in_range(
+        self, frame: RadarFrame, positions: Array, heights: Array, range_offset_m: float
+    ) -> tuple[Detection, ...]:
+        config = self.config
+        ranges_m = frame.range_start_m + positions * frame.bin_length_m - range_offset_m
+        return tuple(
+            Detection(radar=frame.radar, t_ns=frame.t_ns, range_m=range_m, amplitude=amplitude)
+            for range_m, amplitude in zip(ranges_m.tolist(), heights.tolist(), strict=True)
+            if config.min_range_m <= range_m <= config.max_range_m
+        )
 
 
 class SavitzkyGolay:
@@ -118,16 +158,21 @@ class SavitzkyGolay:
         self._kernel = response[length, length - half : length + half + 1].copy()
 
     def smooth(self, samples: Array) -> Array:
-        """Return the smoothed samples, shape (n,), n at least the filter's length."""
-        if samples.size < self.length:
+        """Return smoothed samples, shape (..., n), n at least the filter's length."""
+        if samples.shape[-1] < self.length:
             raise ValueError(
-                f"a frame of {samples.size} bins is shorter than the smoothing filter "
+                f"a frame of {samples.shape[-1]} bins is shorter than the smoothing filter "
                 f"({self.length}); ask the module for a longer frame area"
             )
-        smoothed: Array = correlate1d(samples, self._kernel, mode="constant")
+        smoothed: Array = correlate1d(samples, self._kernel, axis=-1, mode="constant")
         half = self.length // 2
-        smoothed[:half] = self._head @ samples[: self.length]
-        smoothed[-half:] = self._tail @ samples[-self.length :]
+        # Sums of products rather than matrix products: those round by the number of frames.
+        head, tail = (
+            samples[..., np.newaxis, : self.length],
+            samples[..., np.newaxis, -self.length :],
+        )
+        smoothed[..., :half] = (self._head * head).sum(axis=-1)
+        smoothed[..., -half:] = (self._tail * tail).sum(axis=-1)
         return smoothed
 
 

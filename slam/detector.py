@@ -7,7 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from slam.frames import RadarFrame
+
+# A sampler's limit is reached when this part of its span is missing: it comes as float32.
+_LIMIT_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,3 +74,25 @@ class Detector(Protocol):
         The frames may be of several radars; those that agree in length are filtered together.
         """
         ...
+
+
+def usable_samples(frame: RadarFrame) -> NDArray[np.bool_]:
+    """Return which samples are known (not NaN) and inside the frame's limits, shape (n_bins,)."""
+    usable: NDArray[np.bool_] = ~np.isnan(frame.samples)
+    if frame.limits is not None:
+        low, high = _inner_limits(frame.limits)
+        usable &= (frame.samples > low) & (frame.samples < high)
+    return usable
+
+
+def reaches_limits(frame: RadarFrame, lowest: float, highest: float) -> bool:
+    """Tell whether a frame with these extreme samples is cut off at its limits."""
+    if frame.limits is None:
+        return False
+    low, high = _inner_limits(frame.limits)
+    return lowest <= low or highest >= high
+
+
+def _inner_limits(limits: tuple[float, float]) -> tuple[float, float]:
+    margin = _LIMIT_TOLERANCE * (limits[1] - limits[0])
+    return limits[0] + margin, limits[1] - margin

@@ -27,14 +27,13 @@ from numpy.typing import NDArray
 
 from slam.close_echoes import SplitTest
 from slam.config import FrontEnd, SlamConfig
-from slam.detector import Detection
+from slam.detector import Detection, reaches_limits, usable_samples
 from slam.frames import RadarFrame
 from slam.pulse_filter import PulseFilter
 from slam.pulse_model import PulseModel
 from slam.pulse_refit import Filtered, Peaks, cut_pulses, refit
 
 Array = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 # Most echoes that a group is taken apart into.
 _MAX_ECHOES = 4
@@ -43,8 +42,6 @@ _SUSPICIOUS = 0.5
 _NEIGHBOURS = np.array([[-1], [0], [1]])
 # A float32 frame says its samples to this part of the largest; noise is never less.
 _RESOLUTION = float(np.finfo(np.float32).eps)
-# A sampler's limit is reached when this part of its span is missing: it comes as float32.
-_LIMIT_TOLERANCE = 1e-6
 
 
 class MatchedFilterDetector:
@@ -135,7 +132,7 @@ class MatchedFilterDetector:
         samples = frame.samples.astype(np.float64)
         lowest, highest = float(samples.min()), float(samples.max())
         usable = None
-        if math.isnan(lowest) or _reaches(frame.limits, lowest, highest):
+        if math.isnan(lowest) or reaches_limits(frame, lowest, highest):
             usable = usable_samples(frame)
             samples[np.isnan(samples)] = 0.0
             lowest, highest = float(samples.min()), float(samples.max())
@@ -156,23 +153,6 @@ class MatchedFilterDetector:
             sigma_y=sigma_y,
             pulse_filter=pulse_filter,
         )
-
-
-def usable_samples(frame: RadarFrame) -> BoolArray:
-    """Return where a frame's samples are known and below its limits, shape (n_bins,)."""
-    usable: BoolArray = ~np.isnan(frame.samples)
-    if frame.limits is not None:
-        margin = _LIMIT_TOLERANCE * (frame.limits[1] - frame.limits[0])
-        usable &= frame.samples > frame.limits[0] + margin
-        usable &= frame.samples < frame.limits[1] - margin
-    return usable
-
-
-def _reaches(limits: tuple[float, float] | None, lowest: float, highest: float) -> bool:
-    if limits is None:
-        return False
-    margin = _LIMIT_TOLERANCE * (limits[1] - limits[0])
-    return lowest <= limits[0] + margin or highest >= limits[1] - margin
 
 
 def _single_pulses(filtered: Filtered) -> tuple[Peaks, Array]:
