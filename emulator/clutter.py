@@ -34,7 +34,7 @@ from xethru_protocol.x4 import RF_BIN_M, SAMPLING_RATE_HZ
 
 __all__ = ["GRIDS", "ClutterField"]
 
-GRIDS = ((0.094, 0.19), (0.339, 0.26), (1.311, 0.55))
+GRIDS = ((0.054, 0.16), (0.239, 0.24), (1.205, 0.60))
 """Spacing of the knots in correlation times, and share of the variance, of the three processes."""
 
 _SCATTERER_SAMPLES = 8

@@ -189,7 +189,7 @@ class ClutterSpec(Table):
     """
 
     sigma: Sigma = 0.0
-    correlation_s: CorrelationTime = 2.7
+    correlation_s: CorrelationTime = 4.8
 
 
 class JitterSpec(Table):

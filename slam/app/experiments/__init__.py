@@ -62,6 +62,16 @@ _ROWS: tuple[Experiment, ...] = (
         help="what window, minimum count and search radius of the outlier filter trade off",
         module="slam.app.experiments.filter_tradeoffs",
     ),
+    Experiment(
+        name="limits",
+        help="range error, detection and resolution of the front ends beside their bounds",
+        module="slam.app.experiments.limits",
+    ),
+    Experiment(
+        name="recording",
+        help="a real recording of a standing module beside emulated frames",
+        module="slam.app.experiments.recording",
+    ),
 )
 
 EXPERIMENTS: Mapping[str, Experiment] = MappingProxyType({row.name: row for row in _ROWS})
