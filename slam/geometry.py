@@ -90,6 +90,9 @@ class Mount:
         Boresight in the body frame, counter-clockwise from forward.
     range_offset_m
         What this module measures too long; the front end subtracts it from every range.
+    phase_offset_rad
+        What this module and its antennas add to an echo's carrier phase; only its difference
+        between the radars of a pair counts, and only where bearings use the phase.
     """
 
     name: str
@@ -97,6 +100,7 @@ class Mount:
     y_m: float
     yaw_rad: float
     range_offset_m: float = 0.0
+    phase_offset_rad: float = 0.0
 
 
 def mount_at(mount: Mount, motion: Array) -> Mount:

@@ -37,6 +37,7 @@ class RadarInfo:
     rate_hz: float
     settings: Mapping[str, object]
     start_skew_ns: int = 0
+    phase_offset_rad: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

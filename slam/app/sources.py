@@ -182,6 +182,7 @@ class RigSource:
                     rate_hz=rate_hz,
                     settings=asdict(config),
                     start_skew_ns=link.start_skew_ns,
+                    phase_offset_rad=link.mount.phase_offset_rad,
                 )
             )
         self.radars = tuple(radars)
