@@ -57,7 +57,7 @@ def turn(one: float, other: float) -> float:
     return abs(math.remainder(one - other, math.tau))
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(clusters())
 def test_echoes_without_noise_are_recovered(cluster: tuple[Array, Array, Array]) -> None:
     positions, amplitudes, phases = cluster
@@ -68,7 +68,7 @@ def test_echoes_without_noise_are_recovered(cluster: tuple[Array, Array, Array])
     assert max(fit.misfit for fit in fits) < 1e-5
 
 
-@settings(max_examples=30)
+@settings(max_examples=12)
 @given(clusters(), st.integers(1, 20), st.integers(0, 2**32 - 1))
 def test_whole_bins_of_delay_shift_the_echoes_and_nothing_else(
     cluster: tuple[Array, Array, Array], shift: int, seed: int
@@ -96,7 +96,7 @@ def test_whole_bins_of_delay_shift_the_echoes_and_nothing_else(
         assert turn(after.phase_rad, before.phase_rad) < 0.05
 
 
-@settings(max_examples=30)
+@settings(max_examples=12)
 @given(clusters(), st.floats(1e-4, 1e4), st.integers(0, 2**32 - 1))
 def test_amplitudes_scale_with_the_samples_and_positions_do_not(
     cluster: tuple[Array, Array, Array], scale: float, seed: int
@@ -109,7 +109,7 @@ def test_amplitudes_scale_with_the_samples_and_positions_do_not(
     assert [f.amplitude / scale for f in scaled] == pytest.approx([f.amplitude for f in plain])
 
 
-@settings(max_examples=30)
+@settings(max_examples=12)
 @given(clusters(), st.floats(-math.pi, math.pi))
 def test_a_common_phase_turns_every_echo_and_moves_none(
     cluster: tuple[Array, Array, Array], phase: float
@@ -122,7 +122,7 @@ def test_a_common_phase_turns_every_echo_and_moves_none(
         assert turn(after.phase_rad - before.phase_rad, phase) < 1e-4
 
 
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(st.integers(0, 2**32 - 1))
 def test_a_window_does_not_depend_on_its_neighbours_or_their_order(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -145,7 +145,7 @@ def test_a_window_does_not_depend_on_its_neighbours_or_their_order(seed: int) ->
         assert [f.position_bins for f in alone[place]] == pytest.approx(positions, abs=1e-6)
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(
     st.integers(0, 2**32 - 1),
     st.sampled_from(["nothing", "flat", "noise", "one bin", "step", "tone", "huge", "tiny"]),
@@ -182,7 +182,7 @@ def test_whatever_the_samples_no_nan_and_no_more_echoes_than_asked(
     assert positions == sorted(positions)
 
 
-@settings(max_examples=30)
+@settings(max_examples=12)
 @given(clusters(), st.floats(1e-3, 0.03))
 def test_sigma_is_the_bound_of_the_whole_fisher_matrix(
     cluster: tuple[Array, Array, Array], noise_sigma: float
