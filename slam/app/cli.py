@@ -97,6 +97,21 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--json", action="store_true", help="print one JSON object")
     evaluate.set_defaults(command=_evaluate)
 
+    calibrate = commands.add_parser(
+        "calibrate",
+        help="estimate range offsets, mounts and gains from a recorded drive",
+        description="Estimates every radar's range offset, mount position and relative gain from a "
+        "session of `uwb-slam demo` past reflectors, and says what the drive cannot tell apart.",
+    )
+    calibrate.add_argument("session", type=Path, metavar="SESSION", help="a session.mcap")
+    calibrate.add_argument(
+        "--reflectors", metavar="FILE", help="known places: TOML with [[reflectors]], or a scene"
+    )
+    calibrate.add_argument("--rig", type=Path, metavar="OUT", help="write a rig file")
+    calibrate.add_argument("--truth", metavar="SCENE", help="print what this scene planted beside")
+    calibrate.add_argument("--json", action="store_true", help="print one JSON object")
+    calibrate.set_defaults(command=_calibrate)
+
     sweep = commands.add_parser(
         "sweep",
         help="repeat a run over scenes, presets and seeds",
@@ -158,6 +173,19 @@ def _evaluate(arguments: argparse.Namespace, stop: StopFlag) -> None:
     from slam.app.evaluate import run_evaluate  # heavy, see module text
 
     run_evaluate(arguments.estimate, arguments.reference, as_json=arguments.json)
+
+
+def _calibrate(arguments: argparse.Namespace, stop: StopFlag) -> None:
+    from slam.app.calibrate import CalibrateOptions, run_calibrate  # heavy, see module text
+
+    options = CalibrateOptions(
+        session=arguments.session,
+        reflectors=arguments.reflectors,
+        truth=arguments.truth,
+        rig=arguments.rig,
+        as_json=arguments.json,
+    )
+    run_calibrate(options, stop)
 
 
 def _sweep(arguments: argparse.Namespace, stop: StopFlag) -> None:

@@ -1,0 +1,117 @@
+"""Rig files: the radars of a robot with mounts, range offsets and gains, as TOML.
+
+What `uwb-slam calibrate --rig` writes and later runs read. Lengths in true metres, body frame x
+forward and y left, yaw in degrees counter-clockwise from forward; `range_offset_m` is what the
+module measures too long, `gain_db` how much louder it hears than the mean of the rig.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, ValidationError
+
+from slam.app.errors import AppError, naming
+from slam.geometry import Mount, Rig
+
+_Number = Annotated[StrictFloat | StrictInt, Field(ge=-1000, le=1000, allow_inf_nan=False)]
+
+
+class RigRadar(BaseModel):
+    """One radar: who it is, where it sits, what is known of its errors."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: Annotated[str, Field(min_length=1, max_length=80)]
+    serial: Annotated[str, Field(pattern=r"^[0-9]{12}$")]
+    x_m: _Number
+    y_m: _Number
+    yaw_deg: _Number
+    range_offset_m: _Number = 0.0
+    gain_db: _Number = 0.0
+
+
+class RigFile(BaseModel):
+    """The whole file: one `[[radars]]` table per radar."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    radars: Annotated[tuple[RigRadar, ...], Field(min_length=1, max_length=64)]
+
+    @property
+    def rig(self) -> Rig:
+        """Return the mounts; gains play no part in them."""
+        return Rig(
+            mounts=tuple(
+                Mount(
+                    name=radar.name,
+                    x_m=float(radar.x_m),
+                    y_m=float(radar.y_m),
+                    yaw_rad=math.radians(radar.yaw_deg),
+                    range_offset_m=float(radar.range_offset_m),
+                )
+                for radar in self.radars
+            )
+        )
+
+
+def load_rig(path: Path) -> RigFile:
+    """Read a rig file.
+
+    Raises
+    ------
+    AppError
+        One line with file, key and what is allowed.
+    """
+    try:
+        table = tomllib.loads(path.read_bytes().decode())
+    except OSError as error:
+        raise AppError(f"{path}: cannot read the rig file: {error.strerror or error}") from None
+    except ValueError as error:  # neither UTF-8 nor TOML
+        raise AppError(f"{path}: not valid TOML: {error}") from None
+    try:
+        rig = RigFile.model_validate(table)
+    except ValidationError as error:
+        raise AppError(f"{path}: {_one_line(error)}") from None
+    for key in ("name", "serial"):
+        values = [getattr(radar, key) for radar in rig.radars]
+        twice = sorted({value for value in values if values.count(value) > 1})
+        if twice:
+            raise AppError(f"{path}: radars.{key}: must be unique, {twice[0]!r} is used twice")
+    return rig
+
+
+def write_rig(path: Path, rig: RigFile) -> None:
+    """Write a rig file that `load_rig` reads back with the same floats.
+
+    Raises
+    ------
+    AppError
+        The file cannot be written.
+    """
+    tables = []
+    for radar in rig.radars:
+        # a JSON string of these names is a TOML string
+        lines = [f"{key} = {json.dumps(value)}" for key, value in radar.model_dump().items()]
+        tables.append("\n".join(["[[radars]]", *lines]))
+    with naming(path):
+        path.write_text("\n\n".join(tables) + "\n", encoding="utf-8")
+
+
+def _one_line(error: ValidationError) -> str:
+    first = error.errors(include_url=False)[0]
+    key = "".join(
+        f"[{part}]" if isinstance(part, int) else f".{part}"
+        for part in first["loc"]
+        if part not in ("float", "int")
+    ).removeprefix(".")
+    if first["type"] == "extra_forbidden":
+        model = RigRadar if "radars" in first["loc"] else RigFile
+        return f"{key}: unknown key; allowed are {', '.join(model.model_fields)}"
+    if first["type"] == "missing":
+        return f"{key}: missing; this key is required"
+    return f"{key}: {first['msg']}, got {first['input']!r}"
