@@ -1,34 +1,78 @@
 """What a radar hears: from a scene and the robot's true pose to integer chip counters.
 
-A frame is, in normalised units (full scale of the 11 bit DAC is +-1) at RF sample n,
+This is the page on the model: each term, its formula, its source, what it leaves out. The world is
+a floor plan seen from one phase centre per radar. In normalised units (full scale of the 11 bit
+DAC is +-1) RF sample n of a frame at true time t is
 
-    x[n] = sum_i a_i p(n - u_i; phase_i) + a_L p(n - u_L; phase_L) + sigma w[n]
+    x[n] = sum_i a_i p(n - u_i; phase_i + j(t)) + c[n](t) + sigma w[n]
 
-and the chip counts ``clip(round((x[n] + N / 2048) / q), 0, max)``.
+with the leakage among the paths i, and the chip counts ``clip(round((x[n] + N / 2048) / q), 0,
+max)``. Floor, ceiling, elevation, polarisation, and paths of more bounces than named here are left
+out.
 
 Pulse p
-    Gaussian envelope on the carrier (``emulator.pulse``).
-Position u = 2 fs (R + offset) / c - 2 fs L / c_module
-    R is the distance from the radar's phase centre (mount on the robot's true pose at the
-    radar's own sample time, start skew included) to the reflector; c = 299 792 458 m/s;
-    L is the label of sample 0, in module metres (c_module = 3.0e8 m/s, protocol reference 9.1).
-    The robot stands still within a frame (a sweep at 5 cm/s moves it by micrometres per pulse).
-Amplitude a = amplitude_1m R**-1.5 (rod) or R**-2 (point), cos(angle)**n, TX power
-    Radar equation for amplitudes: a point spreads twice as a sphere, a long rod once as a sphere
-    and once as a cylinder. The beam's n makes the two-way -3 dB full width 65 degrees; there is
-    no edge, and nothing is heard from behind. Ground, elevation, polarisation, aspect
-    and shadowing are left out, and the law is held at 5 cm from there inwards. People are points
-    that move (``emulator.people``); they are placed anew for every frame, like the robot.
+    Gaussian envelope on the carrier (``emulator.pulse``). The real pulse is a little asymmetric.
+Time t
+    Nominal time of the counter, made earlier by the module's fast clock and later by its start
+    skew (``emulator.module_clock``). The robot stands still within a frame: a sweep at 5 cm/s
+    moves it by micrometres per pulse.
+Position u = 2 fs (1 + ppm 1e-6) (R + offset) / c - 2 fs L / c_module
+    R is half the length of the path; c = 299 792 458 m/s; offset is the module's range error; L is
+    the label of sample 0 in module metres (c_module = 3.0e8 m/s, protocol reference 9.1).
+Amplitude a of rod, point, person (``emulator.reflections``)
+    amplitude_1m R**-1.5 (rod) or R**-2 (point), times the beam cos(angle)**n, the root of TX power
+    and the module's gain. Radar equation for amplitudes (Skolnik, Introduction to Radar Systems):
+    a point spreads twice as a sphere, a long rod once as a sphere and once as a cylinder. The
+    beam's n makes the two-way -3 dB full width 65 degrees; no hard edge, nothing from behind.
+    Aspect is left out, and the law is held at 5 cm from there inwards. People move
+    (``emulator.people``) and are placed anew for every frame, like the robot.
+Cylinder
+    Its surface, at R - radius, weakened by (1 / s) sqrt((1 + radius) / (s + radius)) over the
+    distance s to it: geometric optics of a convex mirror.
+Wall, face of a box (``emulator.wall_echoes``)
+    A mirror at the distance R of its line: amplitude_1m / R, phase pi. |reflection| is
+    amplitude_1m / (0.06 sqrt(pi)), because an image at 2 R equals a cross section of pi R**2 and
+    0.06 is the echo of 1 m**2 (``emulator.people``). Roughness, thickness and the reflection's
+    dependence on angle are left out.
+Edge of a wall (``emulator.diffraction``)
+    Kirchhoff's half-plane at the carrier (Born and Wolf, Principles of Optics, 8.7): the echo fades
+    over the first Fresnel zone as the mirror point leaves the wall, and half of it is left where
+    that point is the end.
+Corner
+    Image of image in two walls, both orders of bouncing. At 90 degrees each passes half of the
+    aperture, so together they are one image at the apex.
+Ghosts (``emulator.ghosts``)
+    Radar, wall, target, radar and its reverse, and by walls both ways: half path (L_out + L_back)
+    / 2, 1 / (s_1 s_2) for a point, sqrt(2 / (s_1 s_2 (s_1 + s_2))) for a rod; doubled where out
+    and back differ, phase pi per mirror, the beam once per leg.
+Shadow and transmission (``emulator.walls``)
+    Each leg is multiplied, per face it crosses, by |t + (1 - t) (E_a + E_b)|: what passes through
+    and what bends round both ends (single knife edge, ITU-R P.526). The bent way's own delay is
+    left out; people, rods and cylinders cast no shadow.
 Phase
     Each reflector's is fixed by its name (SHA-256), for every radar, aspect and seed.
-Leakage L
+Phase jitter j
+    White (by frame counter) and slow (by time), common to all echoes and the leakage of a frame
+    (``emulator.jitter``): figures of the strongest reflector of a real X4 recording. The envelope
+    is not moved; amplitude jitter is left out.
+Leakage
     The direct pulse at the scene's range and amplitude; antenna ringing is left out.
+Clutter c
+    Slow, correlated, inside the transmitted band (``emulator.clutter``): every 8 samples a complex
+    Gaussian scatterer that answers with the pulse, of equal strength at all ranges, times TX power
+    and gain; in time three stationary processes (``emulator.slow_noise``) fitted to the ten
+    farthest bins of that recording. It ignores where the robot is, and radars do not share it.
 Noise w
     White and Gaussian (``emulator.noise``), keyed by seed and the radar's serial, selected by
     the frame counter. sigma is given at a working point and falls with the root of
-    iterations x pulses per step. Flicker, interference and jitter are left out.
+    iterations x pulses per step; neither gain nor TX power change it. Flicker and interference
+    are left out.
 Count q = 2**dac_step / (iterations pulses_per_step) / 1024, N = dac_max - dac_min + 1
     Protocol reference 9.7; outside the DAC window the counter saturates.
+Smoke
+    Nothing. Particles far smaller than the wavelength absorb by their volume (Bohren and Huffman,
+    chapter 5): (6 pi / wavelength) (mass per m**3 / density) Im((m**2 - 1) / (m**2 + 2)), for 1
+    g/m**3 and water's density at most 4.6e-4 of the power per metre, 0.002 dB.
 
 Determinism: float64 throughout, no BLAS, no float32 function. A last-bit difference of a cosine
 or a power moves an echo by 1e-11 counts before it is rounded to an integer.
