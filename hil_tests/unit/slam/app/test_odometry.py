@@ -30,6 +30,25 @@ def test_between_two_samples_it_is_linear() -> None:
     np.testing.assert_allclose(track.pose_at(250_000_000), [1.0, -2.0, 0.25])
 
 
+@given(st.floats(-0.4, 0.4), st.floats(0.001, 0.1))
+def test_on_an_arc_it_is_off_by_no_more_than_the_arcs_height(turn_rad: float, arc_m: float) -> None:
+    """Chord / 2 tan(turn / 4), 0.12 mm for a centimetre and 5.6 degrees; the heading is exact."""
+
+    def on_arc(part: float) -> tuple[float, float, float]:
+        turned = part * turn_rad
+        chord_m = part * arc_m * float(np.sinc(turned / math.tau))
+        return chord_m * math.cos(turned / 2), chord_m * math.sin(turned / 2), turned
+
+    end = on_arc(1.0)
+    track = OdometryTrack.from_lines(lines_of([(0, 0.0, 0.0, 0.0), (1000, *end)]))
+    height_m = math.hypot(end[0], end[1]) / 2 * math.tan(abs(turn_rad) / 4)
+    for part in (0.1, 0.25, 0.5, 0.9):
+        x_m, y_m, heading_rad = track.pose_at(round(1000 * part))
+        assert heading_rad == pytest.approx(part * turn_rad, abs=1e-12)
+        assert math.dist((x_m, y_m), on_arc(part)[:2]) <= height_m + 1e-12
+    assert math.dist(track.pose_at(500)[:2], on_arc(0.5)[:2]) == pytest.approx(height_m, abs=1e-12)
+
+
 @pytest.mark.parametrize("turn_rad", [0.4, -0.4])
 def test_heading_crosses_half_a_turn_the_short_way(turn_rad: float) -> None:
     start = math.copysign(math.pi - 0.1, turn_rad)
