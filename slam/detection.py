@@ -69,7 +69,8 @@ class PaperDetector:
         range_offset_m
             What this module measures too long (``Mount.range_offset_m``).
         """
-        return self.detect_many((frame,), (range_offset_m,))[0]
+        bins, beyond, heights = self._peaks(self.smooth(frame.samples))
+        return self._in_range(frame, bins + beyond, heights, range_offset_m)
 
     def detect_many(
         self, frames: Sequence[RadarFrame], offsets_m: Sequence[float]
@@ -78,12 +79,15 @@ class PaperDetector:
         results: list[tuple[Detection, ...]] = [()] * len(frames)
         for n_bins in {frame.samples.size for frame in frames}:
             chosen = [index for index, frame in enumerate(frames) if frame.samples.size == n_bins]
-            row, position, height = self._peaks(np.stack([frames[i].samples for i in chosen]))
+            # All frames end to end: a wall between two does what the end of a single one does.
+            walled = np.full((len(chosen), n_bins + 1), np.inf)
+            walled[:, :-1] = self.smooth(np.stack([frames[index].samples for index in chosen]))
+            bins, beyond, heights = self._peaks(walled.ravel()[:-1])
+            row, bins = np.divmod(bins, n_bins + 1)
             starts = np.searchsorted(row, np.arange(1, len(chosen)))
-            for index, positions, heights in zip(
-                chosen, np.split(position, starts), np.split(height, starts), strict=True
-            ):
-                results[index] = self._in_range(frames[index], positions, heights, offsets_m[index])
+            places, heights_of = np.split(bins + beyond, starts), np.split(heights, starts)
+            for index, place, height in zip(chosen, places, heights_of, strict=True):
+                results[index] = self._in_range(frames[index], place, height, offsets_m[index])
         return results
 
     def smooth(self, samples: NDArray[np.float32]) -> Array:
@@ -100,25 +104,19 @@ class PaperDetector:
             magnitude *= magnitude >= mean
         return self._smoother.smooth(magnitude)
 
-    def _peaks(self, samples: NDArray[np.float32]) -> tuple[NDArray[np.intp], Array, Array]:
-        """Return row, position in bins and height of the peaks of frames, in that order."""
+    def _peaks(self, smoothed: Array) -> tuple[NDArray[np.intp], Array, Array]:
+        """Return the bin of each peak, how far beyond it the peak lies [bins], and its height."""
         config = self.config
-        n_frames, n_bins = samples.shape
-        # All frames end to end: a wall between two does what the end of a single one would do.
-        walled = np.full((n_frames, n_bins + 1), np.inf)
-        walled[:, :-1] = self.smooth(samples)
-        flat = walled.ravel()[:-1]
         peaks, properties = find_peaks(
-            flat,
+            smoothed,
             height=(config.min_peak_height, np.finfo(np.float64).max),
             prominence=config.min_peak_prominence,
             width=config.min_peak_width_bins or None,
         )
-        row, bins = np.divmod(peaks, n_bins + 1)
-        position = bins.astype(np.float64)
+        beyond = np.zeros(peaks.size)
         if config.peak_position is PeakPosition.PARABOLA:
-            position += _vertex_offsets(flat, peaks)
-        return row, position, properties["peak_heights"]
+            beyond = _vertex_offsets(smoothed, peaks)
+        return peaks, beyond, properties["peak_heights"]
 
     def _in_range(
         self, frame: RadarFrame, positions: Array, heights: Array, range_offset_m: float
