@@ -313,7 +313,7 @@ def _lines(report: CalibrationReport, scene: Scene | None) -> Iterable[str]:
     if marked:
         yield f"? known to no better than {1e3 * OFFSET_LIMIT_M:g} mm (1 sigma); not in --rig"
     yield from report.poor
-    if not report.poor or marked:
+    if marked:
         yield from dict.fromkeys(weak.words for weak in report.weak)
 
 

@@ -1,0 +1,58 @@
+"""`uwb-slam calibrate` on what `uwb-slam demo` records: planted offsets come back."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from slam.app.cli import main
+from slam.app.rig_file import load_rig
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(120)
+def test_a_recorded_drive_gives_back_what_the_scene_planted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["demo", "--scene", "calibration", "--seed", "0", "--out", str(tmp_path)]) == 0
+    capsys.readouterr()
+    session, rig = str(tmp_path / "session.mcap"), tmp_path / "rig.toml"
+    command = ["calibrate", session, "--truth", "calibration", "--json", "--rig", str(rig)]
+    assert main(command) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["landmarks"] == 6
+    assert facts["poor_drive"] == []
+    for radar in facts["radars"]:
+        assert abs(radar["range_offset_m"] - radar["planted_offset_m"]) < 1e-3, radar
+        assert abs(radar["gain_db"] - radar["planted_gain_db"]) < 0.05, radar
+        assert radar["told"]
+    offsets = [mount.range_offset_m for mount in load_rig(rig).rig.mounts]
+    assert offsets == [radar["range_offset_m"] for radar in facts["radars"]]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["none.mcap"], 1, "none.mcap: cannot read"),
+        (["none.mcap", "--truth", "nowhere"], 2, "nowhere: no such scene"),
+        (["none.mcap", "--reflectors", "nowhere"], 2, "nowhere: no such scene"),
+    ],
+)
+def test_what_cannot_be_used_is_one_line(
+    arguments: list[str], code: int, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["calibrate", *arguments]) == code
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+
+
+def test_a_reflector_without_a_place_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "places.toml"
+    file.write_text("[[reflectors]]\nx_m = 1.0\ny_m = 2\n[[reflectors]]\nx_m = true\ny_m = 0.0\n")
+    assert main(["calibrate", "none.mcap", "--reflectors", str(file)]) == 1
+    assert f"{file}: reflectors[1]: must be a table with x_m and y_m" in capsys.readouterr().err
