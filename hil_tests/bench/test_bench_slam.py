@@ -10,8 +10,15 @@ from threadpoolctl import threadpool_limits
 
 from slam.association import update_map
 from slam.clustering import filter_window
-from slam.config import AssociationConfig, ClusteringConfig, DetectionConfig, TrilaterationConfig
-from slam.detection import PaperDetector
+from slam.config import (
+    AssociationConfig,
+    ClusteringConfig,
+    DetectionConfig,
+    FrontEnd,
+    SlamConfig,
+    TrilaterationConfig,
+)
+from slam.detection import PaperDetector, make_detector
 from slam.ekf_slam import Belief, predict, update
 from slam.frames import RadarFrame
 from slam.geometry import paper_rig
@@ -54,12 +61,26 @@ def large_belief(n: int) -> Belief:
     )
 
 
-@pytest.mark.benchmark(group="front end, one frame of 1431 bins")
-def test_front_end_per_frame(benchmark: BenchmarkFixture) -> None:
-    detector = PaperDetector(DetectionConfig())
+@pytest.mark.parametrize("name", list(FrontEnd))
+@pytest.mark.benchmark(group="front end, one frame of 1431 bins (bar: 100 us)")
+def test_front_end_per_frame(benchmark: BenchmarkFixture, name: FrontEnd) -> None:
+    detector = make_detector(SlamConfig(detection=DetectionConfig(front_end=name)))
     one = frame(0)
+    benchmark.extra_info["frames"] = 1
     detections = benchmark(detector.detect, one)
     assert len(detections) >= 2
+
+
+@pytest.mark.parametrize(
+    ("name", "n"), [(FrontEnd.PAPER, 16), (FrontEnd.MATCHED_FILTER, 4), (FrontEnd.JOINT, 4)]
+)
+@pytest.mark.benchmark(group="front end, n frames of 1431 bins at once (bar: n x 100 us)")
+def test_front_end_batched(benchmark: BenchmarkFixture, name: FrontEnd, n: int) -> None:
+    detector = make_detector(SlamConfig(detection=DetectionConfig(front_end=name)))
+    scan, offsets_m = [frame(radar) for radar in range(n)], [0.0] * n
+    benchmark.extra_info["frames"] = n
+    found = benchmark(detector.detect_many, scan, offsets_m)
+    assert all(len(detections) >= 2 for detections in found)
 
 
 @pytest.mark.benchmark(group="trilateration of one pose")
