@@ -15,6 +15,7 @@ from emulator.echo import SceneEcho, echo_source
 from emulator.echo_source import CaptureSettings
 from emulator.pulse import sum_of_pulses
 from emulator.scene import LeakageSpec, Scene, load_scene
+from emulator.scene_tables import ClutterSpec
 
 CAPTURE = CaptureSettings(
     first_sample_m=0.19929,
@@ -182,7 +183,9 @@ def test_counters_stay_in_their_range(seed: int, step: int) -> None:
 @pytest.mark.parametrize(("one", "other"), [(0, 1), (0, 2), (1, 3), (2, 3)])
 def test_noise_of_two_radars_is_independent(one: int, other: int) -> None:
     """Same empty scene, so anything in common would be shared noise; fixed seed."""
-    empty = LAB.model_copy(update={"targets": (), "leakage": LeakageSpec(amplitude=0.0)})
+    # clutter is independent too, but the same in all of these frames, which are 1 ns apart
+    nothing = {"targets": (), "leakage": LeakageSpec(amplitude=0.0), "clutter": ClutterSpec()}
+    empty = LAB.model_copy(update=nothing)
     counters = np.arange(400)
     a, b = (
         echo_source(empty, radar, 11).rf_counters(CAPTURE, counters, counters) * COUNT - 152 / 2048

@@ -143,6 +143,31 @@ def test_it_stands_in_the_room_and_not_in_the_frame(shift: int) -> None:
     )
 
 
+def test_it_remembers_nothing_of_an_earlier_frame_area() -> None:
+    """The host may change area and carrier between two frames."""
+    field = ClutterField(ClutterSpec(sigma=1.0, correlation_s=CORRELATION_S), seed=0, serial=SERIAL)
+    rows = (
+        CAPTURE,
+        replace(CAPTURE, tx_center_frequency=4),
+        replace(CAPTURE, first_sample_m=0.8),
+        replace(CAPTURE, n_samples=100),
+    )
+    for step in range(12):  # so that a change falls on an instant that is kept
+        time_ns = np.array([step * 60_000_000], dtype=np.int64)
+        capture = rows[step % len(rows)]
+        signal = np.zeros((1, capture.n_samples))
+        field.add_to(signal, time_ns, capture, 1.0)
+        assert signal.tobytes() == clutter(time_ns, capture).tobytes()
+
+
+def test_it_flows_without_steps() -> None:
+    """In 1 ms, 1/260 of the fastest knots' spacing, it moves by less than 1 % of its strength."""
+    frames = clutter(np.arange(400, dtype=np.int64) * 1_000_000)
+    moves = np.sqrt((np.diff(frames, axis=0) ** 2).mean(axis=1))
+    assert moves.min() > 0.0005
+    assert moves.max() < 0.01
+
+
 def test_strength_and_gain_are_factors_and_zero_leaves_the_signal_alone() -> None:
     times_ns = np.array([0, 123_456_789], dtype=np.int64)
     np.testing.assert_allclose(
