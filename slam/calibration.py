@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.batch import Cauchy, Damping, Kernel, Solution, Square, Term, minimise
-from slam.batch_terms import Layout, OdometryTerm, PriorTerm, RangeTerm, WheelModel
+from slam.batch_terms import Layout, OdometryTerm, PriorTerm, RangeTerm
 from slam.calibration_association import (
     UNASSIGNED,
     assign,
@@ -27,15 +27,16 @@ from slam.calibration_association import (
     strengths,
     well_seen,
 )
+from slam.calibration_drive import Calibration, CalibrationPriors, Drive, make_drive, steps_of
 from slam.calibration_tracks import (
     PathNodes,
-    RangeSet,
     Track,
     follow_all,
     place,
     radar_poses,
 )
-from slam.geometry import Mount, Rig
+
+__all__ = ["Calibration", "CalibrationPriors", "Drive", "calibrate", "make_drive"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -57,162 +58,6 @@ _MERGE_VETO_FRAMES = 10
 _MAP_ORIGIN_SIGMA = 1e-6
 # Bounds a landmark that the drive leaves open along an arc.
 _SOMEWHERE_M = 30.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CalibrationPriors:
-    """What is known before the drive, standard deviations.
-
-    Attributes
-    ----------
-    offset_m
-        Range offset of a module.
-    mount_m
-        Mount position in x and in y: how well the rig was measured.
-    reflector_m
-        Survey of known reflectors.
-    start_m, start_rad
-        Start pose among known reflectors; without any, the start is the origin of the map.
-    wheels
-        The wheel model.
-    """
-
-    offset_m: float = 0.03
-    mount_m: float = 0.003
-    reflector_m: float = 0.001
-    start_m: float = 0.1
-    start_rad: float = 0.1
-    wheels: WheelModel = field(default_factory=WheelModel)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Drive:
-    """A recorded drive, ready for calibration.
-
-    Attributes
-    ----------
-    rig
-        Nominal mounts; their range offsets are not removed from the ranges.
-    path
-        What the wheels said, odometry frame.
-    step_sigmas
-        Shape (n_nodes - 1, 3): white noise of each step, along, across, turn.
-    ranges
-        All single ranges.
-    """
-
-    rig: Rig
-    path: PathNodes
-    step_sigmas: Array
-    ranges: RangeSet
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Calibration:
-    """What the drive told.
-
-    Attributes
-    ----------
-    offsets_m, mount_shifts_m
-        Shapes (r,) and (r, 2): offset of each radar, and how far its mount is from nominal.
-    covariance_m2
-        Shape (3 r, 3 r): for each radar its offset, mount x, mount y.
-    landmarks_m
-        Shape (k, 2), map frame: the body frame at the start, or the frame of known reflectors.
-    path
-        The most likely path, map frame.
-    wheels
-        Shape (3,): scale, turn scale, curvature [rad/m].
-    landmark
-        Shape (n_ranges,): the landmark each range was used for, or UNASSIGNED.
-    residuals_m
-        Shape (n_ranges,): expected less measured; NaN where not used.
-    sigma_m
-        Standard deviation of a used range, as found.
-    """
-
-    offsets_m: Array
-    mount_shifts_m: Array
-    covariance_m2: Array
-    landmarks_m: Array
-    path: PathNodes
-    wheels: Array
-    landmark: Indices
-    residuals_m: Array
-    sigma_m: float
-
-    @property
-    def offset_sigmas_m(self) -> Array:
-        """Return the standard deviation of each offset, shape (r,)."""
-        result: Array = np.sqrt(np.diag(self.covariance_m2)[0::3])
-        return result
-
-    @property
-    def mount_sigmas_m(self) -> Array:
-        """Return the standard deviations of each mount's x and y, shape (r, 2)."""
-        variances = np.diag(self.covariance_m2).reshape(-1, 3)
-        result: Array = np.sqrt(variances[:, 1:])
-        return result
-
-    def rig(self, nominal: Rig) -> Rig:
-        """Return the rig with offsets and mounts corrected."""
-        shifts = zip(
-            nominal.mounts, self.offsets_m.tolist(), self.mount_shifts_m.tolist(), strict=True
-        )
-        return Rig(
-            mounts=tuple(
-                Mount(
-                    name=mount.name,
-                    x_m=mount.x_m + shift_x,
-                    y_m=mount.y_m + shift_y,
-                    yaw_rad=mount.yaw_rad,
-                    range_offset_m=offset,
-                )
-                for mount, offset, (shift_x, shift_y) in shifts
-            )
-        )
-
-
-def make_drive(
-    rig: Rig,
-    stamps_ns: NDArray[np.int64],
-    poses: Array,
-    ranges: RangeSet,
-    *,
-    wheels: WheelModel | None = None,
-    least_step_ns: int = 100_000_000,
-) -> Drive:
-    """Cut odometry into steps for the batch.
-
-    Parameters
-    ----------
-    rig
-        Nominal mounts.
-    stamps_ns, poses
-        Shapes (n,) and (n, 3): odometry samples; headings in any turn.
-    ranges
-        All single ranges.
-    wheels
-        The white noise of each sample's step; it adds up over the samples of a node's step.
-    least_step_ns
-        Samples closer than this are joined into one step.
-    """
-    model = wheels or WheelModel()
-    poses = poses.copy()
-    poses[:, 2] = np.unwrap(poses[:, 2])
-    variances = np.vstack([np.zeros(3), model.sigmas(_steps(poses)) ** 2]).cumsum(axis=0)
-    chosen = [0]
-    for index in range(1, len(stamps_ns)):
-        if stamps_ns[index] - stamps_ns[chosen[-1]] >= least_step_ns:
-            chosen.append(index)
-    if len(chosen) > 1 and chosen[-1] != len(stamps_ns) - 1:
-        chosen[-1] = len(stamps_ns) - 1
-    return Drive(
-        rig=rig,
-        path=PathNodes(t_ns=stamps_ns[chosen], poses=poses[chosen]),
-        step_sigmas=np.sqrt(np.diff(variances[chosen], axis=0)),
-        ranges=ranges,
-    )
 
 
 def calibrate(
@@ -455,7 +300,7 @@ class _Estimator:
         return (
             OdometryTerm(
                 layout=layout,
-                steps=_steps(self._drive.path.poses),
+                steps=steps_of(self._drive.path.poses),
                 sigmas=self._drive.step_sigmas,
             ),
             PriorTerm(
@@ -506,10 +351,3 @@ def _at_origin(path: PathNodes) -> PathNodes:
         ]
     )
     return PathNodes(t_ns=path.t_ns, poses=moved)
-
-
-def _steps(poses: Array) -> Array:
-    """Return each step in the body frame at its start, shape (n - 1, 3)."""
-    step_x, step_y, turn = np.diff(poses, axis=0).T
-    cosine, sine = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
-    return np.column_stack([cosine * step_x + sine * step_y, cosine * step_y - sine * step_x, turn])
