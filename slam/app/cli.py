@@ -17,7 +17,7 @@ from slam.app.experiments import EXPERIMENTS, Experiment, ExperimentModule
 from slam.app.standard_streams import drop_what_cannot_be_said, open_closed_streams
 from slam.app.stop import StopFlag, StopRequestedError
 
-_TYPICAL_SEED = 2
+_TYPICAL_SEED = 19
 """Of seeds 0-19 in the lab, the one whose errors lie nearest the medians; see DECISIONS."""
 
 _Command = Callable[[argparse.Namespace, StopFlag], None]
