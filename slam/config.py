@@ -197,7 +197,7 @@ class LeakageConfig(_Model):
 
     filter: LeakageFilter = LeakageFilter.NONE
     # Subtracted up to here; a wall farther away never is, however long it keeps its distance.
-    max_range_m: Positive = 0.35
+    max_range_m: Positive = 0.45
     # Frames after which an old state of affairs is forgotten to 1/e.
     memory_frames: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 50.0
 
