@@ -178,14 +178,14 @@ def _frames(
 
 
 def front_ends() -> Mapping[str, SlamConfig]:
-    """Return the preset ``paper`` with each front end in turn, and the paper's between bins."""
+    """Return the preset ``paper`` with each front end in turn, by its name."""
     paper = load_preset("paper")
     detection = paper.detection
     return {
         str(front_end): paper.model_copy(
             update={"detection": detection.model_copy(update={"front_end": front_end})}
         )
-        for front_end in (FrontEnd.PAPER,)
+        for front_end in FrontEnd
     }
 
 
