@@ -99,17 +99,17 @@ class ClutterField:
         if strength == 0.0:
             return
         row = _Row.of(capture)
-        instants, fractions = self._scatterers.instants(scene_times_ns)
+        at: int | None = None
         clutter = np.empty(capture.n_samples)
         # frame by frame: one stays in the processor's cache, a block does not
-        for frame, instant, fraction in zip(
-            signal, instants.tolist(), fractions.tolist(), strict=True
-        ):
-            start, rise = self._line(instant, row)
+        for frame, time_ns in zip(signal, scene_times_ns.tolist(), strict=True):
+            instant, fraction = self._scatterers.instant_before(time_ns)
+            if instant != at:
+                start, rise = self._line(instant, row)
+                start, at = start * strength, instant
             np.multiply(rise, strength * fraction, out=clutter)
-            frame += clutter
-            np.multiply(start, strength, out=clutter)
-            frame += clutter
+            np.add(clutter, start, out=clutter)
+            np.add(frame, clutter, out=frame)
 
     def _line(self, instant: int, row: _Row) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the unit clutter at an instant and by how much it rises until the next."""

@@ -20,6 +20,7 @@ __all__ = ["CarrierJitter"]
 
 _INSTANTS_PER_KNOT = 16
 _MOST_INSTANTS_KEPT = 64
+_COUNTERS_AT_ONCE = 256
 
 
 class CarrierJitter:
@@ -47,6 +48,8 @@ class CarrierJitter:
             purpose=Purpose.JITTER_SLOW,
         )
         self._slow_rad: dict[int, float] = {}
+        self._page = -1
+        self._normals: list[float] = []
 
     def phases_rad(
         self, frame_counters: NDArray[np.int64], scene_times_ns: NDArray[np.int64]
@@ -64,17 +67,28 @@ class CarrierJitter:
         -------
         Shape (n_frames,), float64, rad.
         """
-        phases_rad = np.zeros(len(frame_counters))
+        white = [0.0] * len(frame_counters)
         if self._spec.white_rad > 0:
-            white = counter_normals(frame_counters, seed=self._seed, stream=self._white)
-            phases_rad += self._spec.white_rad * white
+            white = [self._white_at(counter) for counter in frame_counters.tolist()]
+        slow = [0.0] * len(frame_counters)
         if self._spec.slow_rad > 0:
-            instants, fractions = self._slow.instants(scene_times_ns)
-            distinct, of_frame = np.unique(instants, return_inverse=True)
-            before = np.array([self._slow_rad_at(instant) for instant in distinct.tolist()])
-            after = np.array([self._slow_rad_at(instant + 1) for instant in distinct.tolist()])
-            phases_rad += before[of_frame] + fractions * (after - before)[of_frame]
+            slow = [self._slow_at(time_ns) for time_ns in scene_times_ns.tolist()]
+        phases_rad: NDArray[np.float64] = np.array(white) * self._spec.white_rad + np.array(slow)
         return phases_rad
+
+    def _slow_at(self, time_ns: int) -> float:
+        instant, fraction = self._slow.instant_before(time_ns)
+        before = self._slow_rad_at(instant)
+        return before + fraction * (self._slow_rad_at(instant + 1) - before)
+
+    def _white_at(self, counter: int) -> float:
+        """Return the normal of a counter; made for many at once, since frames come one by one."""
+        page, place = divmod(counter, _COUNTERS_AT_ONCE)
+        if page != self._page:
+            counters = page * _COUNTERS_AT_ONCE + np.arange(_COUNTERS_AT_ONCE, dtype=np.int64)
+            normals = counter_normals(counters, seed=self._seed, stream=self._white)
+            self._page, self._normals = page, normals.tolist()
+        return self._normals[place]
 
     def _slow_rad_at(self, instant: int) -> float:
         if instant not in self._slow_rad:

@@ -92,16 +92,13 @@ class SlowNoise:
         self._knots = np.empty((len(grids) * _KNOTS, n_values))
         self._first_knots: list[int | None] = [None] * len(grids)
 
-    def instants(
-        self, times_ns: NDArray[np.int64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the instant before each scene time and the fraction of the way to the next.
+    def instant_before(self, time_ns: int) -> tuple[int, float]:
+        """Return the instant before a scene time and the fraction of the way to the next.
 
-        Shape (n,), int64, to ask `values_at` for it and its successor, and (n,), float64.
+        Ask `values_at` for it and its successor.
         """
-        since_ns = times_ns + self._instants_offset_ns
-        instants = since_ns // self._instant_ns
-        return instants, (since_ns - instants * self._instant_ns) / self._instant_ns
+        instant, rest_ns = divmod(time_ns + self._instants_offset_ns, self._instant_ns)
+        return instant, rest_ns / self._instant_ns
 
     def values_at(self, instant: int) -> NDArray[np.float64]:
         """Return the values at an instant, shape (n_values,), float64."""
