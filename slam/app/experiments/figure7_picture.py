@@ -183,7 +183,7 @@ def _draw_residuals(axes: Axes, steps: Steps, errors: Mapping[str, RangeErrors])
     axes.set_ylim(low, high + 0.25 * (high - low))  # room for the legend
     label(
         axes,
-        "(d) detected minus true range: dots frames, lines their mean",
+        "(d) error: dots frames, lines their mean",
         "true range of the rod [m]",
         "error [mm]",
     )
