@@ -1,0 +1,1 @@
+"""A range-only SLAM back end: right-invariant filter, joint association and relinearisation."""

@@ -1,0 +1,403 @@
+"""The robust back end: odometry increments and ranges in, pose and landmarks out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam.geometry import Rig
+from slam.robust.births import BodyPoint, give_birth, match, update_with_point
+from slam.robust.continuation import Continuation, continue_tracks, sure_landmarks
+from slam.robust.existence import Existence
+from slam.robust.leftovers import Leftovers
+from slam.robust.merging import apply_merge, find_merge
+from slam.robust.motion import Motion, calibrated_motion, predict
+from slam.robust.parameters import BackEndParameters
+from slam.robust.ranges import Antennas, RangeScan, View, antennas_of, rows_of, sides_of, view
+from slam.robust.run_log import RunLog
+from slam.robust.smoother import Smoother, start_prior
+from slam.robust.state import HEADING, State
+from slam.robust.symmetric import Array, SymmetricMatrix
+from slam.robust.tracklets import (
+    Tracker,
+    Tracklet,
+    find_tracklets,
+    pair_guesses,
+    single_guesses,
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MapLandmark:
+    """One landmark of the map: id, position (2,) [m], covariance (2, 2), frames that hit it."""
+
+    landmark_id: int
+    position_m: Array
+    covariance: Array
+    hits: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UpdateReport:
+    """What became of the ranges of one time.
+
+    Attributes
+    ----------
+    continued
+        (radar, index of the range in its scan, landmark id).
+    born, seen_again
+        Ids of landmarks that tracklets made, or were recognised as.
+    merged
+        (kept, gone) ids.
+    deleted
+        Ids.
+    nis, dof
+        Normalised innovation squared of the ranges that continued tracks, and its degrees of
+        freedom.
+    relinearised
+        Whether all poses were solved for.
+    """
+
+    continued: tuple[tuple[int, int, int], ...]
+    born: tuple[int, ...]
+    seen_again: tuple[int, ...]
+    merged: tuple[tuple[int, int], ...]
+    deleted: tuple[int, ...]
+    nis: float
+    dof: int
+    relinearised: bool
+
+
+class RobustBackEnd:
+    """Range SLAM that keeps track of how sure it is.
+
+    ``predict`` and ``update`` alternate: one motion, then what the radars saw at its end. The map
+    frame is the body frame at the start.
+
+    Parameters
+    ----------
+    rig
+        Where the radars sit.
+    parameters
+        Noise and rules.
+    """
+
+    def __init__(self, rig: Rig, parameters: BackEndParameters) -> None:
+        self.rig = rig
+        self.parameters = parameters
+        offsets = (parameters.ranges.offset_sigma_m,) * len(rig.mounts)
+        self.state = State(parameters.wheels.calibration_sigmas, offsets)
+        self._offset_sigmas = offsets
+        self._sides = sides_of(rig)
+        rule = parameters.tracklets
+        scale = rule.drift_share * parameters.wheels.scale_sigma
+        self._leftovers = Leftovers(
+            max(rule.window, rule.single_window), scale, scale * rule.lever_m
+        )
+        self._existence = Existence(parameters.map)
+        self._log = RunLog(parameters.wheels)
+        self._motion = _at_rest()
+        self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
+        self._landmark_of_label: dict[int, int] = {}
+        self._n_updates = 0
+
+    @property
+    def pose(self) -> Array:
+        """Return [x m, y m, heading rad], map frame, shape (3,)."""
+        return self.state.pose
+
+    @property
+    def pose_covariance(self) -> Array:
+        """Return the covariance of the pose, shape (3, 3)."""
+        return self.state.pose_covariance()
+
+    def landmarks(self) -> tuple[MapLandmark, ...]:
+        """Return the landmarks hit often enough to be reported."""
+        return tuple(
+            MapLandmark(
+                landmark_id=id_,
+                position_m=self.state.landmarks_m[row].copy(),
+                covariance=self.state.landmark_covariance(row),
+                hits=self._existence.hits(id_),
+            )
+            for row, id_ in enumerate(self.state.landmark_ids)
+            if self._existence.is_reported(id_)
+        )
+
+    def predict(self, increment: Array, covariance: Array | None = None) -> None:
+        """Move by one odometry increment.
+
+        Parameters
+        ----------
+        increment
+            shape (3,): dx, dy [m], turn [rad] in the body frame before it, as reported.
+        covariance
+            Its noise, shape (3, 3), if it is known better than the wheels' model tells.
+        """
+        wheels = self.parameters.wheels
+        motion = calibrated_motion(increment, self.state.calibration, wheels, covariance)
+        self._log.add_motion(
+            increment, motion.covariance, motion.walk_variance, self.state.calibration
+        )
+        predict(self.state, motion, wheels)
+        self._leftovers.move(motion)
+        self._motion = motion
+
+    def update(self, scans: Sequence[RangeScan]) -> UpdateReport:
+        """Take in what the radars saw; a radar without a frame is absent, not empty."""
+        antennas = antennas_of(self.rig, scans, self._motion)
+        self._silent = np.where(antennas.heard, 0, self._silent + 1)
+        continued, nis = self._continue_tracks(scans, antennas)
+        used = {(radar, index) for radar, index, _ in continued}
+        self._leftovers.keep(self._log.n_poses - 1, antennas, scans, used)
+        born, seen_again = self._raise_tracklets()
+        deleted = self._delete_lost()
+        self._n_updates += 1
+        merged = self._merge()
+        relinearised = self._relinearise_if_due()
+        self._log.set_causal(self.state.pose)
+        return UpdateReport(
+            continued=continued,
+            born=born,
+            seen_again=seen_again,
+            merged=merged,
+            deleted=deleted,
+            nis=nis,
+            dof=len(continued),
+            relinearised=relinearised,
+        )
+
+    def _continue_tracks(
+        self, scans: Sequence[RangeScan], antennas: Antennas
+    ) -> tuple[tuple[tuple[int, int, int], ...], float]:
+        """Find the ranges of known landmarks and correct the state with all of them at once."""
+        state, noise = self.state, self.parameters.ranges
+        if not state.landmark_ids:
+            return (), 0.0
+        seen = view(state, antennas)
+        found: list[Continuation] = []
+        doubtful: set[int] = set()
+        inside = seen.inside(
+            noise, -self.parameters.map.view_inset_rad, -self.parameters.map.view_inset_m
+        )
+        expected = np.zeros(len(state.landmark_ids), dtype=bool)
+        for side in self._sides:
+            sure, rows, prior = sure_landmarks(
+                state, seen, side, antennas, noise, self.parameters.continuation
+            )
+            if rows is None or not len(sure):
+                continue
+            found += continue_tracks(
+                sure,
+                rows,
+                prior,
+                [scan for scan in scans if scan.radar in side],
+                noise,
+                self.parameters.continuation,
+            )
+            heard = [radar for radar in side if antennas.heard[radar]]
+            expected[sure] |= inside[heard][:, sure].all(axis=0)
+        del doubtful
+        labelled = self._labelled(scans, seen)
+        if labelled is not None:
+            found = labelled
+        ids = state.landmark_ids
+        continued = tuple((c.radar, c.index, ids[c.row]) for c in found)
+        self._count_sightings(found, np.flatnonzero(expected), len(self._sides[0]))
+        if not found:
+            return (), 0.0
+        ranges = {scan.radar: scan.ranges_m for scan in scans}
+        radars = np.array([c.radar for c in found], dtype=np.intp)
+        rows = rows_of(state, seen, radars, np.array([c.row for c in found], dtype=np.intp))
+        z = np.array([ranges[c.radar][c.index] for c in found])
+        for c, range_m in zip(found, z.tolist(), strict=True):
+            antenna = antennas.position_m[c.radar]
+            self._log.add_range(
+                self._log.n_poses - 1,
+                c.radar,
+                ids[c.row],
+                (float(antenna[0]), float(antenna[1])),
+                range_m,
+            )
+        R = np.full(len(z), noise.sigma_m**2)
+        nis, _ = state.update(rows.at, rows.H, z - rows.predicted_m, R)
+        return continued, nis
+
+    def _labelled(self, scans: Sequence[RangeScan], seen: View) -> list[Continuation] | None:
+        """Return the associations that labels tell, or None where there are no labels."""
+        if all(scan.labels is None for scan in scans):
+            return None
+        rows = {id_: row for row, id_ in enumerate(self.state.landmark_ids)}
+        found = []
+        for scan in scans:
+            for index in range(len(scan.ranges_m)):
+                label = scan.label(index)
+                if label is not None and label in self._landmark_of_label:
+                    row = rows[self._landmark_of_label[label]]
+                    found.append(Continuation(row=row, radar=scan.radar, index=index))
+        return found
+
+    def _count_sightings(
+        self, found: Sequence[Continuation], expected: np.ndarray, whole: int
+    ) -> None:
+        ids = self.state.landmark_ids
+        count: dict[int, int] = {}
+        for continuation in found:
+            count[continuation.row] = count.get(continuation.row, 0) + 1
+        for row in count:
+            self._existence.hit(ids[row])
+        for row in expected.tolist():
+            if row not in count:
+                self._existence.miss(ids[row])
+        self._existence.seen_whole(ids[row] for row, n in count.items() if n >= max(whole, 2))
+
+    def _raise_tracklets(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Make tracklets of what is left over; each updates a landmark or becomes one."""
+        state, rule = self.state, self.parameters.tracklets
+        newest = self._leftovers.newest()
+        born: list[int] = []
+        again: list[int] = []
+        for side in self._sides:
+            radars, window = self._alive(side), rule.window
+            if not radars or not all(newest.unused[radar] for radar in radars):
+                continue
+            if len(radars) == 1:
+                window = rule.single_window
+            frames = self._leftovers.slots(radars, window)
+            noise = self.parameters.ranges
+            if len(radars) == 1:
+                guesses = single_guesses(frames[0])
+            else:
+                guesses = pair_guesses(frames[0], noise, rule)
+            if not guesses:
+                continue
+            offsets = np.arange(state.offsets.start, state.offsets.stop)
+            tracker = Tracker(noise, rule, state.offsets_m, state.P.block(offsets))
+            for tracklet in find_tracklets(
+                tracker, guesses, frames, min(len(radars), 2), rule
+            ):
+                landmark_id, is_new = self._place(tracklet)
+                (born if is_new else again).append(landmark_id)
+        return tuple(born), tuple(again)
+
+    def _alive(self, side: Sequence[int]) -> list[int]:
+        """Return the radars of a side that may make tracklets: those heard lately."""
+        limit = self.parameters.tracklets.partner_silence
+        return [radar for radar in side if self._silent[radar] <= limit]
+
+    def _place(self, tracklet: Tracklet) -> tuple[int, bool]:
+        """Bring a tracklet into the map; return the landmark's id and whether it is new."""
+        state = self.state
+        point = BodyPoint(
+            point_m=tracklet.point_m,
+            covariance=tracklet.covariance,
+            by_offsets=tracklet.by_offsets,
+        )
+        if tracklet.label is not None:
+            known = self._landmark_of_label.get(tracklet.label)
+            row = None if known is None else state.landmark_ids.index(known)
+        else:
+            row = match(state, point, self.parameters.map)
+        if row is None:
+            landmark_id = give_birth(state, point)
+            if tracklet.label is not None:
+                self._landmark_of_label[tracklet.label] = landmark_id
+        else:
+            landmark_id = state.landmark_ids[row]
+            update_with_point(state, row, point)
+        self._existence.hit(landmark_id, len({m.slot.back for m in tracklet.members}))
+        for member in tracklet.members:
+            slot = member.slot
+            self._log.add_range(
+                self._leftovers.pose_index(slot.back),
+                slot.radar,
+                landmark_id,
+                slot.antenna_then,
+                member.leftover.range_m,
+            )
+        return landmark_id, row is None
+
+    def _delete_lost(self) -> tuple[int, ...]:
+        lost = self._existence.lost()
+        for landmark_id in lost:
+            self.state.remove(self.state.landmark_ids.index(landmark_id))
+            self._existence.forget(landmark_id)
+            self._log.drop(landmark_id)
+        return tuple(lost)
+
+    def _merge(self) -> tuple[tuple[int, int], ...]:
+        rule = self.parameters.map
+        if self._landmark_of_label or self._n_updates % rule.merge_every:
+            return ()
+        merge = find_merge(self.state, self._existence, rule)
+        if merge is None:
+            return ()
+        ids = [
+            (self.state.landmark_ids[kept], self.state.landmark_ids[gone])
+            for kept, gone in merge.pairs
+        ]
+        apply_merge(self.state, merge.pairs, rule.merge_sigma_m)
+        for kept, gone in ids:
+            self._existence.merge(kept, gone)
+            self._log.rename(gone, kept)
+        return tuple(ids)
+
+    def _relinearise_if_due(self) -> bool:
+        rule = self.parameters.relinearisation
+        if rule is None or self._log.since_solved < rule.every:
+            return False
+        shift_m, turn_rad = self._log.parted(self.state.pose)
+        if turn_rad <= rule.turn_rad and shift_m <= rule.shift_m:
+            return False
+        return self.relinearise()
+
+    def relinearise(self) -> bool:
+        """Solve for all poses and replace the belief; tell whether that worked."""
+        rule, state = self.parameters.relinearisation, self.state
+        if rule is None or not state.landmark_ids:
+            return False
+        self._log.tried()
+        prior = start_prior(
+            self.parameters.wheels.calibration_sigmas,
+            self._offset_sigmas,
+            len(state.landmark_ids),
+        )
+        problem = self._log.problem(state, prior, self.parameters.ranges.sigma_m)
+        smoother = Smoother(problem, rule)
+        start = min(self._log.starts(state, problem), key=smoother.cost)
+        solution = smoother.solve(start)
+        if solution is None:
+            return False
+        estimate = solution.estimate
+        pose = estimate.poses[-1]
+        state.position_m = pose[:2].copy()
+        state.heading_rad = math.remainder(float(pose[2]), math.tau)
+        state.calibration = estimate.calibration[-1].copy()
+        state.offsets_m = estimate.offsets_m.copy()
+        state.landmarks_m = estimate.landmarks_m.copy()
+        state.P = SymmetricMatrix(_invariant_covariance(state, solution.information))
+        self._log.solved(estimate)
+        return True
+
+
+def _invariant_covariance(state: State, information: Array) -> Array:
+    """Return the covariance of the right-invariant error from additive information.
+
+    The smoother orders (x, y, heading, ...), the filter (heading, x, y, ...).
+    """
+    additive = np.linalg.inv(information)
+    order = np.concatenate([[2, 0, 1], np.arange(3, len(additive))])
+    additive = additive[np.ix_(order, order)]
+    T = state.additive_transform()
+    T[1:, HEADING] *= -1.0
+    P = T @ additive @ T.T
+    return np.asarray((P + P.T) / 2)
+
+
+def _at_rest() -> Motion:
+    return Motion(
+        step_m=np.zeros(2), turn_rad=0.0, covariance=np.zeros((3, 3)), walk_variance=0.0
+    )

@@ -1,0 +1,223 @@
+"""Single ranges continue tracks: the likeliest one-to-one assignment on one side of the robot.
+
+A landmark takes part if it may be in view and if the prior alone, without the noise of a range,
+predicts its ranges more surely than a range measures them. Where the map is less sure than that,
+a single range proves nothing, and only tracklets decide. For each landmark one option is chosen,
+a range of some of the radars of the side, or of none, at the cost
+
+    nu^T S^-1 nu + ln det(2 pi S) + 2 m ln(clutter density) - 2 m ln(Pd / (1 - Pd))
+
+for m ranges with joint innovation covariance S; none costs nothing. No range serves twice. The
+least sum is found by branch and bound, as joint compatibility is (Neira and Tardos, IEEE TRA
+17(6), 2001), with likelihoods for counts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.robust.parameters import ContinuationRule, RangeNoise
+from slam.robust.ranges import Antennas, RangeScan, Rows, View, rows_of
+from slam.robust.state import State
+from slam.robust.symmetric import Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Continuation:
+    """Range ``index`` of the scan of ``radar`` is of the landmark in ``row``."""
+
+    row: int
+    radar: int
+    index: int
+
+
+@dataclass(frozen=True, slots=True)
+class Option:
+    """One choice for one landmark: ``(radar, index)`` of the ranges used, and its cost."""
+
+    used: tuple[tuple[int, int], ...]
+    cost: float
+
+
+NOTHING = Option((), 0.0)
+
+
+def sure_landmarks(
+    state: State,
+    seen: View,
+    side: Sequence[int],
+    antennas: Antennas,
+    noise: RangeNoise,
+    rule: ContinuationRule,
+) -> tuple[NDArray[np.intp], Rows | None, Array]:
+    """Return the landmarks that may be continued from one side of the robot.
+
+    Returns
+    -------
+    landmarks
+        Rows of the landmarks, shape (c,).
+    rows
+        Their predicted ranges, radar by radar of the side that was heard, landmark by landmark.
+    prior
+        H P H^T of those rows, shape (k, k).
+    """
+    radars = np.array([radar for radar in side if antennas.heard[radar]], dtype=np.intp)
+    nobody: NDArray[np.intp] = np.zeros(0, dtype=np.intp)
+    if not len(radars) or not len(state.landmark_ids):
+        return nobody, None, np.zeros((0, 0))
+    margin_m = 5.0 * noise.sigma_m
+    inside = seen.inside(noise, rule.view_margin_rad, margin_m)[radars]
+    landmarks = np.flatnonzero(inside.any(axis=0))
+    if not len(landmarks):
+        return nobody, None, np.zeros((0, 0))
+    rows = rows_of(
+        state, seen, np.tile(radars, len(landmarks)), np.repeat(landmarks, len(radars))
+    )
+    prior = rows.H @ state.P.block(rows.at) @ rows.H.T
+    limit = (rule.tight_sigmas * noise.sigma_m) ** 2
+    variances = prior.diagonal()
+    sure = (variances.reshape(len(landmarks), len(radars)) <= limit).all(axis=1)
+    if sure.all():
+        return landmarks, rows, prior
+    keep = np.flatnonzero(np.repeat(sure, len(radars)))
+    rows = Rows(
+        radars=rows.radars[keep],
+        landmarks=rows.landmarks[keep],
+        at=rows.at,
+        H=rows.H[keep],
+        predicted_m=rows.predicted_m[keep],
+    )
+    return landmarks[sure], rows, prior[np.ix_(keep, keep)]
+
+
+def continue_tracks(
+    landmarks: NDArray[np.intp],
+    rows: Rows,
+    prior: Array,
+    scans: Sequence[RangeScan],
+    noise: RangeNoise,
+    rule: ContinuationRule,
+) -> list[Continuation]:
+    """Return the likeliest one-to-one assignment of ranges to landmarks.
+
+    ``landmarks``, ``rows`` and ``prior`` are those of ``sure_landmarks``.
+    """
+    per_landmark = len(rows.radars) // len(landmarks)
+    by_radar = {scan.radar: scan for scan in scans}
+    options: list[list[Option]] = []
+    for place in range(len(landmarks)):
+        mine = slice(place * per_landmark, (place + 1) * per_landmark)
+        options.append(
+            options_of(
+                [by_radar[int(radar)] for radar in rows.radars[mine]],
+                rows.predicted_m[mine],
+                prior[mine, mine],
+                noise,
+                rule,
+            )
+        )
+    return [
+        Continuation(row=int(landmarks[place]), radar=radar, index=index)
+        for place, option in enumerate(cheapest(options))
+        for radar, index in option.used
+    ]
+
+
+def options_of(
+    scans: Sequence[RangeScan],
+    predicted_m: Array,
+    prior: Array,
+    noise: RangeNoise,
+    rule: ContinuationRule,
+) -> list[Option]:
+    """Return the options of one landmark that beat none, cheapest first, none last."""
+    variance = noise.sigma_m**2
+    gate = rule.gates[0]
+    near: list[list[tuple[int, float] | None]] = []
+    for place, scan in enumerate(scans):
+        reach = math.sqrt(rule.gates[-1] * (float(prior[place, place]) + variance))
+        centre = float(predicted_m[place])
+        found: list[tuple[int, float] | None] = [None]
+        found += [
+            (index, range_m - centre)
+            for index, range_m in enumerate(scan.ranges_m)
+            if abs(range_m - centre) <= reach
+        ]
+        near.append(found)
+    odds = noise.detection_probability / (1.0 - noise.detection_probability)
+    per_range = 2.0 * math.log(noise.clutter_per_m / odds) + math.log(math.tau)
+    options = []
+    for choice in product(*near):
+        places = [place for place, taken in enumerate(choice) if taken is not None]
+        if not places:
+            continue
+        nu = [taken[1] for taken in choice if taken is not None]
+        gate = rule.gates[min(len(places), len(rule.gates)) - 1]
+        distance, log_det = _distance(nu, places, prior, variance)
+        cost = distance + log_det + len(places) * per_range
+        if distance <= gate and cost < 0.0:
+            used = tuple(
+                (scans[place].radar, taken[0])
+                for place, taken in enumerate(choice)
+                if taken is not None
+            )
+            options.append(Option(used, cost))
+    options.sort(key=lambda option: (option.cost, option.used))
+    return [*options, NOTHING]
+
+
+def _distance(
+    nu: list[float], places: list[int], prior: Array, variance: float
+) -> tuple[float, float]:
+    """Return nu^T S^-1 nu and ln det S."""
+    if len(places) == 1:
+        s = float(prior[places[0], places[0]]) + variance
+        return nu[0] ** 2 / s, math.log(s)
+    if len(places) == 2:
+        i, j = places
+        a, b = float(prior[i, i]) + variance, float(prior[j, j]) + variance
+        c = float(prior[i, j])
+        det = a * b - c * c
+        squared = b * nu[0] ** 2 - 2.0 * c * nu[0] * nu[1] + a * nu[1] ** 2
+        return squared / det, math.log(det)
+    S = prior[np.ix_(places, places)] + variance * np.eye(len(places))
+    return float(nu @ np.linalg.solve(S, nu)), float(np.linalg.slogdet(S)[1])
+
+
+def cheapest(options: Sequence[Sequence[Option]]) -> list[Option]:
+    """Return one option per landmark of least total cost that use no range twice.
+
+    Each landmark's options come cheapest first; the bound on what is still to come is the sum of
+    the cheapest. The result does not depend on the order of the landmarks unless costs tie.
+    """
+    bounds = [0.0] * (len(options) + 1)
+    for place in range(len(options) - 1, -1, -1):
+        bounds[place] = bounds[place + 1] + options[place][0].cost
+    best_cost = math.inf
+    best: list[Option] = [NOTHING] * len(options)
+    chosen: list[Option] = []
+    taken: set[tuple[int, int]] = set()
+
+    def branch(place: int, cost: float) -> None:
+        nonlocal best_cost, best
+        if cost + bounds[place] >= best_cost:
+            return
+        if place == len(options):
+            best_cost, best = cost, chosen.copy()
+            return
+        for option in options[place]:
+            if taken.isdisjoint(option.used):
+                taken.update(option.used)
+                chosen.append(option)
+                branch(place + 1, cost + option.cost)
+                chosen.pop()
+                taken.difference_update(option.used)
+
+    branch(0, 0.0)
+    return best

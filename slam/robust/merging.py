@@ -1,0 +1,139 @@
+"""Two landmarks that are one become one, once that is certain enough.
+
+The statement ``l_i - l_j = 0`` is a measurement of the whole state, H = [e_li: I, e_lj: -I]:
+merging after a loop bends the trajectory back, and everything that is correlated with it. It is
+made late, when one merge, or two disjoint ones together, stand out from all competitors.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam.robust.existence import Existence
+from slam.robust.parameters import MapRule
+from slam.robust.state import State
+from slam.robust.symmetric import Array, Indices
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Merge:
+    """Landmarks by row, the older first, and how likely the statement is.
+
+    ``log_likelihood`` is ln N(l_i - l_j; 0, S), that of several merges their joint one.
+    """
+
+    pairs: tuple[tuple[int, int], ...]
+    mahalanobis_sq: float
+    log_likelihood: float
+
+
+def merge_rows(
+    state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float
+) -> tuple[Indices, Array, Array, Array]:
+    """Return columns, H (2 k, 4 k), residual (2 k,) and R (2 k, 2 k) of k merges of rows."""
+    at = state.landmark_columns(np.array(pairs, dtype=np.intp).ravel())
+    H = np.kron(np.eye(len(pairs)), np.hstack([np.eye(2), -np.eye(2)]))
+    apart = [state.landmarks_m[i] - state.landmarks_m[j] for i, j in pairs]
+    return at, H, -np.concatenate(apart), sigma_m**2 * np.eye(2 * len(pairs))
+
+
+def judge(state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float) -> Merge:
+    """Return the likelihood of a merge, or of several together."""
+    at, H, residual, R = merge_rows(state, pairs, sigma_m)
+    S = H @ state.P.block(at) @ H.T + R
+    distance = float(residual @ np.linalg.solve(S, residual))
+    log_det = float(np.linalg.slogdet(S)[1])
+    k = len(residual)
+    return Merge(
+        pairs=pairs,
+        mahalanobis_sq=distance,
+        log_likelihood=-0.5 * (distance + log_det + k * math.log(math.tau)),
+    )
+
+
+def apply_merge(state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float) -> None:
+    """State that pairs of landmarks are one, and marginalise the second of each.
+
+    The covariance changes in Joseph's form: the statement is nearly free of noise.
+    """
+    at, H, residual, R = merge_rows(state, pairs, sigma_m)
+    PHt = state.P.columns(at) @ H.T
+    S = H @ PHt[at] + R
+    S = (S + S.T) / 2
+    K = np.linalg.solve(S, PHt.T).T
+    state.P.subtract_gains(K, PHt, S)
+    state.correct(K @ residual)
+    for row in sorted((second for _, second in pairs), reverse=True):
+        state.remove(row)
+
+
+def find_merge(state: State, existence: Existence, rule: MapRule) -> Merge | None:
+    """Return the merge to be made now, one or two disjoint ones, or None."""
+    candidates = _candidates(state, existence, rule)
+    floor = math.log(rule.unmapped_per_m2)
+    fair = [merge for merge in candidates if merge.log_likelihood > floor]
+    best: Merge | None = None
+    for merge in fair:
+        rivals = [
+            other.log_likelihood
+            for other in candidates
+            if other is not merge and _share_landmark(other, merge)
+        ]
+        stands_out = merge.log_likelihood - max(rivals, default=-math.inf) > rule.merge_lead
+        if stands_out and (best is None or merge.log_likelihood > best.log_likelihood):
+            best = merge
+    if best is not None:
+        return best
+    return _joint_merge(state, fair, 2.0 * floor, rule)
+
+
+def _candidates(state: State, existence: Existence, rule: MapRule) -> list[Merge]:
+    """Return all merges of two landmarks within reach that pass the gate."""
+    n = len(state.landmark_ids)
+    if n < 2:
+        return []
+    first, second = np.triu_indices(n, 1)
+    apart = state.landmarks_m[first] - state.landmarks_m[second]
+    near = np.flatnonzero(np.hypot(apart[:, 0], apart[:, 1]) <= rule.merge_reach_m)
+    found = []
+    for place in near:
+        i, j = int(first[place]), int(second[place])
+        if existence.are_apart(state.landmark_ids[i], state.landmark_ids[j]):
+            continue
+        merge = judge(state, ((i, j),), rule.merge_sigma_m)
+        if merge.mahalanobis_sq <= rule.merge_gate:
+            found.append(merge)
+    return found
+
+
+def _joint_merge(state: State, fair: list[Merge], floor: float, rule: MapRule) -> Merge | None:
+    """Return two disjoint merges that together beat every other two that contradict them."""
+    joint = []
+    for place, one in enumerate(fair):
+        for other in fair[place + 1 :]:
+            if _share_landmark(one, other):
+                continue
+            both = judge(state, one.pairs + other.pairs, rule.merge_sigma_m)
+            if both.mahalanobis_sq <= rule.merge_gate_joint and both.log_likelihood > floor:
+                joint.append(both)
+    joint.sort(key=lambda merge: -merge.log_likelihood)
+    if not joint:
+        return None
+    best = joint[0]
+    for rival in joint[1:]:
+        contradicts = any(
+            mine != theirs and set(mine) & set(theirs)
+            for mine in best.pairs
+            for theirs in rival.pairs
+        )
+        if contradicts and best.log_likelihood - rival.log_likelihood <= rule.merge_lead:
+            return None
+    return best
+
+
+def _share_landmark(one: Merge, other: Merge) -> bool:
+    mine = {row for pair in one.pairs for row in pair}
+    return any(row in mine for pair in other.pairs for row in pair)

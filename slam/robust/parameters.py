@@ -1,0 +1,233 @@
+"""What the robust back end is told: noise of wheels and radars, and the rules of its decisions.
+
+The noise numbers come from specifications of the robot and of the front end; the rules are the
+same for every scene. Lengths in metres, angles in radians.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WheelNoise:
+    """Errors of wheel odometry: three calibration errors and white noise.
+
+    A step of true body increment (dx, dy) of length D and turn a is reported as
+    ``(1 + s) (dx, dy) + white`` and ``(1 + w) a + kappa D + white``.
+
+    Attributes
+    ----------
+    along_m_per_sqrt_m, across_m_per_sqrt_m, heading_rad_per_sqrt_m
+        White noise of a step, in proportion to the square root of its length.
+    heading_rad_per_rad
+        White noise of a turn, in proportion to its angle.
+    scale_sigma, turn_scale_sigma, curvature_sigma_rad_per_m
+        Standard deviations of s (mean wheel radius), w (track width) and kappa (difference of
+        the radii) at the start.
+    walk_per_sqrt_m
+        How far each of the three wanders per square root of a metre travelled, as a share of its
+        standard deviation; a radian turned counts as ``walk_lever_m``. Zero: constants.
+    walk_lever_m
+        See above.
+    floor_m, floor_rad
+        Smallest standard deviation of one step.
+    """
+
+    along_m_per_sqrt_m: float = 2e-3
+    across_m_per_sqrt_m: float = 6e-4
+    heading_rad_per_sqrt_m: float = 4.2e-3
+    heading_rad_per_rad: float = 0.01
+    scale_sigma: float = 0.007
+    turn_scale_sigma: float = 0.007
+    curvature_sigma_rad_per_m: float = 0.0042
+    walk_per_sqrt_m: float = 0.0
+    walk_lever_m: float = 0.3
+    floor_m: float = 3e-6
+    floor_rad: float = 1e-6
+
+    @property
+    def calibration_sigmas(self) -> tuple[float, float, float]:
+        """Return the standard deviations of s, w and kappa."""
+        return (self.scale_sigma, self.turn_scale_sigma, self.curvature_sigma_rad_per_m)
+
+    def step_variances(self, distance_m: float, turn_rad: float) -> tuple[float, float, float]:
+        """Return the variances of one step: along [m^2], across [m^2], heading [rad^2]."""
+        floor = self.floor_m**2
+        heading = self.heading_rad_per_sqrt_m * math.sqrt(distance_m)
+        heading += self.heading_rad_per_rad * abs(turn_rad)
+        return (
+            self.along_m_per_sqrt_m**2 * distance_m + floor,
+            self.across_m_per_sqrt_m**2 * distance_m + floor,
+            heading**2 + self.floor_rad**2,
+        )
+
+    def walk_variance(self, distance_m: float, turn_rad: float) -> float:
+        """Return the variance one step adds to a calibration error, in units of its own."""
+        return self.walk_per_sqrt_m**2 * (distance_m + self.walk_lever_m * abs(turn_rad))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RangeNoise:
+    """How one radar of the rig measures.
+
+    Attributes
+    ----------
+    sigma_m
+        Standard deviation of a range.
+    offset_sigma_m
+        Standard deviation of each radar's unknown constant range offset; zero if calibrated.
+    detection_probability
+        That a target in view is detected in a frame.
+    clutter_per_m
+        False ranges per radar, frame and metre of range.
+    field_of_view_rad
+        Full opening angle.
+    min_range_m, max_range_m
+        Where targets are detected.
+    """
+
+    sigma_m: float = 7.4e-3
+    offset_sigma_m: float = 0.0
+    detection_probability: float = 0.92
+    clutter_per_m: float = 0.15 / 1.3
+    field_of_view_rad: float = math.radians(65.0)
+    min_range_m: float = 0.2
+    max_range_m: float = 1.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ContinuationRule:
+    """When single ranges may continue a track.
+
+    ``view_margin_rad`` widens the field of view. A landmark takes part while its predicted ranges
+    are surer than ``tight_sigmas`` range standard deviations. ``gates`` bounds the squared
+    Mahalanobis distance by the number of ranges, the last one holding for more.
+    """
+
+    view_margin_rad: float = 0.25
+    tight_sigmas: float = 1.0
+    gates: tuple[float, ...] = (9.0, 13.8)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackletRule:
+    """When ranges that continue nothing are evidence of one point at rest.
+
+    Attributes
+    ----------
+    window
+        Frames looked back.
+    min_frames, min_hits_per_radar, min_share
+        Fewest distinct frames, fewest ranges of each radar, and the least share of the frames
+        with the point in view that hit it.
+    prior_sigma_m, gate_sigmas
+        Spread about the first fix, and how far a member may lie from its prediction.
+    drift_share
+        Share of the wheels' scale error by which a frame grows uncertain with the way back to it.
+    lever_m
+        Lever by which turning back does.
+    excess_sigmas
+        How far chi-square may exceed its degrees of freedom, in its standard deviations.
+    single_window, single_min_frames, single_max_sigma_m
+        For a radar without a partner: frames looked back, fewest that hit, and the largest
+        standard deviation in any direction with which a point is used.
+    partner_silence
+        After how many frames without its partner a radar counts as alone.
+    """
+
+    window: int = 15
+    min_frames: int = 9
+    min_hits_per_radar: int = 4
+    min_share: float = 0.6
+    prior_sigma_m: float = 0.3
+    gate_sigmas: float = 3.0
+    drift_share: float = 0.7
+    lever_m: float = 0.3
+    excess_sigmas: float = 3.1
+    single_window: int = 40
+    single_min_frames: int = 20
+    single_max_sigma_m: float = 0.1
+    partner_silence: int = 20
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapRule:
+    """When a point is a known landmark, two landmarks are one, or a landmark is none.
+
+    Attributes
+    ----------
+    unmapped_per_m2
+        Density beta of landmarks not yet in the map: the likelihood of a match must exceed it.
+    match_gate, match_lead
+        Bound on d^2 of a point and a landmark (2 dof), and by how much ``d^2 + ln det S`` must
+        beat the next.
+    merge_every, merge_reach_m, merge_gate, merge_gate_joint, merge_lead
+        Frames between looks, largest distance, bounds on d^2 of one merge and of two together
+        (2 and 4 dof), and by how many nats a merge must beat its competitors.
+    merge_sigma_m
+        Noise of the statement that two landmarks are one.
+    apart_frames
+        Two landmarks seen whole in this many common frames are two.
+    hit, miss, most, least
+        Steps, ceiling and floor of a landmark's existence score.
+    view_inset_rad, view_inset_m
+        How far inside its limits a landmark must lie to be missed.
+    report_hits
+        Frames a landmark must have been hit in to be reported.
+    """
+
+    unmapped_per_m2: float = 1.0
+    match_gate: float = 13.8
+    match_lead: float = 6.0
+    merge_every: int = 5
+    merge_reach_m: float = 1.5
+    merge_gate: float = 11.8
+    merge_gate_joint: float = 18.5
+    merge_lead: float = 3.0
+    merge_sigma_m: float = 1e-5
+    apart_frames: int = 3
+    hit: float = 1.0
+    miss: float = 1.5
+    most: float = 20.0
+    least: float = -8.0
+    view_inset_rad: float = 0.1
+    view_inset_m: float = 0.05
+    report_hits: int = 9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RelinearisationRule:
+    """When all poses are solved for again, and how.
+
+    Attributes
+    ----------
+    turn_rad, shift_m
+        How far the filter's pose may part from the stored trajectory.
+    every
+        Fewest frames between two solutions.
+    iterations
+        Most steps of one solution.
+    outlier_sigmas, outliers_from
+        Ranges further off than this are left out from that iteration on.
+    """
+
+    turn_rad: float = 0.02
+    shift_m: float = 0.04
+    every: int = 20
+    iterations: int = 10
+    outlier_sigmas: float = 4.0
+    outliers_from: int = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BackEndParameters:
+    """Everything the back end is told."""
+
+    wheels: WheelNoise = field(default_factory=WheelNoise)
+    ranges: RangeNoise = field(default_factory=RangeNoise)
+    continuation: ContinuationRule = field(default_factory=ContinuationRule)
+    tracklets: TrackletRule = field(default_factory=TrackletRule)
+    map: MapRule = field(default_factory=MapRule)
+    relinearisation: RelinearisationRule | None = field(default_factory=RelinearisationRule)

@@ -1,0 +1,207 @@
+"""Ranges: where the radars were when they sampled, and what they should have measured.
+
+    z = |l - p - R m| + b + v,   H = [e_th: 0, e_p: -u, e_l: u, b: 1],
+
+u the unit vector from antenna to landmark in the map frame. The heading has no entry: a turn of
+robot and map together changes no range. A radar that sampled a fraction f of a step after the
+pose was at ``m' = f d + Rot(f a) m``, boresight ``yaw' = yaw + f a`` (f < 0: before it).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.geometry import Rig, wrap_angles
+from slam.robust.motion import Motion
+from slam.robust.parameters import RangeNoise
+from slam.robust.state import State, rotation
+from slam.robust.symmetric import Array, Indices
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RangeScan:
+    """What one radar detected in one frame; an empty scan says that it looked and saw nothing.
+
+    Attributes
+    ----------
+    radar
+        Index of the mount in the rig.
+    ranges_m
+        Ranges in true metres.
+    sampled_after
+        When it sampled, in steps after the pose: 0 with it, -0.5 half a step before it.
+    labels
+        Which target each range is of, where that is known; then nothing is left to association.
+    """
+
+    radar: int
+    ranges_m: tuple[float, ...]
+    sampled_after: float = 0.0
+    labels: tuple[int, ...] | None = None
+
+    def label(self, index: int) -> int | None:
+        """Return the label of one range, None where unknown."""
+        return None if self.labels is None else self.labels[index]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Antennas:
+    """Where the radars were when they sampled, in the body frame of the pose.
+
+    ``position_m`` has shape (r, 2), ``yaw_rad`` (r,), ``heard`` (r,) tells which sent a frame.
+    """
+
+    position_m: Array
+    yaw_rad: Array
+    heard: NDArray[np.bool_]
+
+
+def antennas_of(rig: Rig, scans: Sequence[RangeScan], motion: Motion) -> Antennas:
+    """Return where the antennas were; a radar without a scan stays at its mount, unheard."""
+    mounts = rig.mounts
+    position = np.array([[mount.x_m, mount.y_m] for mount in mounts])
+    yaw = np.array([mount.yaw_rad for mount in mounts])
+    heard = np.zeros(len(mounts), dtype=bool)
+    for scan in scans:
+        heard[scan.radar] = True
+        f = scan.sampled_after
+        if f != 0.0:
+            # The part of the step before a pose ends there: go back along it from its end.
+            turn = f * motion.turn_rad
+            forward = motion.step_m if f > 0 else rotation(-motion.turn_rad) @ motion.step_m
+            position[scan.radar] = f * forward + rotation(turn) @ position[scan.radar]
+            yaw[scan.radar] += turn
+    return Antennas(position_m=position, yaw_rad=yaw, heard=heard)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class View:
+    """All landmarks as all radars should see them, from the present mean.
+
+    Attributes
+    ----------
+    ranges_m
+        shape (r, n), offsets included.
+    off_boresight_rad
+        shape (r, n), in [-pi, pi).
+    directions
+        shape (r, n, 2), unit vectors u in the map frame.
+    """
+
+    ranges_m: Array
+    off_boresight_rad: Array
+    directions: Array
+
+    def inside(
+        self, noise: RangeNoise, widen_rad: float = 0.0, widen_m: float = 0.0
+    ) -> NDArray[np.bool_]:
+        """Return whether each radar has each landmark in view, shape (r, n)."""
+        return (
+            (np.abs(self.off_boresight_rad) <= noise.field_of_view_rad / 2 + widen_rad)
+            & (self.ranges_m >= noise.min_range_m - widen_m)
+            & (self.ranges_m <= noise.max_range_m + widen_m)
+        )
+
+
+def view(state: State, antennas: Antennas) -> View:
+    """Return the view of all landmarks; O(n), nothing of the covariance is touched."""
+    R = rotation(state.heading_rad)
+    body = (state.landmarks_m - state.position_m) @ R
+    offsets = body[None, :, :] - antennas.position_m[:, None, :]
+    ranges = np.hypot(offsets[..., 0], offsets[..., 1])
+    bearings = np.arctan2(offsets[..., 1], offsets[..., 0])
+    directions = (offsets / np.maximum(ranges, 1e-9)[..., None]) @ R.T
+    return View(
+        ranges_m=ranges + state.offsets_m[:, None],
+        off_boresight_rad=wrap_angles(bearings - antennas.yaw_rad[:, None]),
+        directions=directions,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rows:
+    """Range measurements that could be made: row i is of radar ``radars[i]``, one landmark each.
+
+    Attributes
+    ----------
+    radars, landmarks
+        shape (k,): index of the radar, row of the landmark.
+    at
+        Columns of the error that H has entries for, shape (c,).
+    H
+        shape (k, c).
+    predicted_m
+        shape (k,).
+    """
+
+    radars: Indices
+    landmarks: Indices
+    at: Indices
+    H: Array
+    predicted_m: Array
+
+
+def rows_of(state: State, seen: View, radars: Indices, landmarks: Indices) -> Rows:
+    """Return the rows of some (radar, landmark) pairs, shapes (k,) and (k,)."""
+    known, place = np.unique(landmarks, return_inverse=True)
+    n_offsets = len(state.offsets_m)
+    at = np.concatenate(
+        [
+            np.array([1, 2]),
+            np.arange(state.offsets.start, state.offsets.stop),
+            state.landmark_columns(known),
+        ]
+    )
+    k = np.arange(len(radars))
+    u = seen.directions[radars, landmarks]
+    H = np.zeros((len(radars), len(at)))
+    H[:, :2] = -u
+    H[k, 2 + radars] = 1.0
+    first = 2 + n_offsets + 2 * place
+    H[k, first] = u[:, 0]
+    H[k, first + 1] = u[:, 1]
+    return Rows(
+        radars=radars,
+        landmarks=landmarks,
+        at=at,
+        H=H,
+        predicted_m=seen.ranges_m[radars, landmarks],
+    )
+
+
+def sides_of(rig: Rig) -> tuple[tuple[int, ...], ...]:
+    """Return the groups of radars that look the same way; a radar without partner is its own."""
+    group = list(range(len(rig.mounts)))
+    for pair in rig.pairs():
+        old, new = group[pair.second], group[pair.first]
+        group = [new if g == old else g for g in group]
+    return tuple(
+        tuple(i for i, g in enumerate(group) if g == leader) for leader in dict.fromkeys(group)
+    )
+
+
+def fix_of_pair(
+    first_m: Array, second_m: Array, range_first_m: float, range_second_m: float, ahead: Array
+) -> Array | None:
+    """Return where two circles about the antennas meet on the side ``ahead``, or None.
+
+    Body frame, shapes (2,); paper eq. 1 with the arcs' angles as arccos.
+    """
+    base = second_m - first_m
+    length = math.hypot(base[0], base[1])
+    if length == 0.0:
+        return None
+    along = base / length
+    x = (range_first_m**2 - range_second_m**2 + length**2) / (2.0 * length)
+    square = range_first_m**2 - x**2
+    if square <= 0.0:
+        return None
+    across = np.array([-along[1], along[0]])
+    if across @ ahead < 0.0:
+        across = -across
+    return np.asarray(first_m + x * along + math.sqrt(square) * across)

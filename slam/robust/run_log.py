@@ -1,0 +1,198 @@
+"""What was measured and used so far: the material of a solution over all poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from slam.geometry import wrap_angle
+from slam.robust.motion import calibrated_motion
+from slam.robust.parameters import WheelNoise
+from slam.robust.smoother import Estimate, Prior, Problem
+from slam.robust.state import State, rotation
+from slam.robust.symmetric import Array
+
+
+@dataclass(slots=True)
+class _Ranges:
+    poses: list[int] = field(default_factory=list)
+    radars: list[int] = field(default_factory=list)
+    landmarks: list[int] = field(default_factory=list)
+    antennas: list[tuple[float, float]] = field(default_factory=list)
+    ranges_m: list[float] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class _Points:
+    poses: list[int] = field(default_factory=list)
+    landmarks: list[int] = field(default_factory=list)
+    points: list[Array] = field(default_factory=list)
+    roots: list[Array] = field(default_factory=list)
+
+
+class RunLog:
+    """Increments, used ranges and points, with the trajectory they were last solved for.
+
+    Landmarks are named by id; merges rename, deletions drop what belonged to the landmark.
+
+    Parameters
+    ----------
+    wheels
+        Noise of the increments.
+    """
+
+    def __init__(self, wheels: WheelNoise) -> None:
+        self._wheels = wheels
+        self._increments: list[Array] = []
+        self._covariances: list[Array] = []
+        self._walks: list[float] = []
+        self._causal: list[Array] = [np.zeros(3)]
+        self._ranges = _Ranges()
+        self._points = _Points()
+        self._names: dict[int, int | None] = {}
+        self._solved: Array = np.zeros((1, 3))
+        self._since_solved = 0
+        self._stored_pose: Array = np.zeros(3)
+
+    @property
+    def n_poses(self) -> int:
+        """Return the number of poses, the first included."""
+        return len(self._causal)
+
+    def add_motion(
+        self, increment: Array, covariance: Array, walk_variance: float, calibration: Array
+    ) -> None:
+        """Append a step as reported; the stored trajectory goes on by it."""
+        self._increments.append(np.array(increment, dtype=np.float64))
+        self._covariances.append(covariance)
+        self._walks.append(walk_variance)
+        self._stored_pose = _step(self._stored_pose, increment, calibration, self._wheels)
+        self._causal.append(self._stored_pose)
+        self._since_solved += 1
+
+    def set_causal(self, pose: Array) -> None:
+        """Note what the filter thinks of the newest pose, its measurements included."""
+        self._causal[-1] = pose
+
+    def parted(self, pose: Array) -> tuple[float, float]:
+        """Return how far [m], and by what angle [rad], a pose is from the stored trajectory."""
+        away = pose - self._stored_pose
+        return float(np.hypot(away[0], away[1])), abs(wrap_angle(float(away[2])))
+
+    @property
+    def since_solved(self) -> int:
+        """Return how many steps ago the trajectory was last solved for, or tried."""
+        return self._since_solved
+
+    def tried(self) -> None:
+        """Start counting anew without a solution."""
+        self._since_solved = 0
+
+    def add_range(
+        self, pose: int, radar: int, landmark_id: int, antenna: tuple[float, float], range_m: float
+    ) -> None:
+        """Append a range used; ``antenna`` is in the body frame of the pose."""
+        ranges = self._ranges
+        ranges.poses.append(pose)
+        ranges.radars.append(radar)
+        ranges.landmarks.append(landmark_id)
+        ranges.antennas.append(antenna)
+        ranges.ranges_m.append(range_m)
+
+    def add_point(self, landmark_id: int, point: Array, covariance: Array) -> None:
+        """Append a range and bearing of the newest pose with its covariance."""
+        points = self._points
+        points.poses.append(self.n_poses - 1)
+        points.landmarks.append(landmark_id)
+        points.points.append(np.array(point, dtype=np.float64))
+        points.roots.append(np.linalg.inv(np.linalg.cholesky(covariance)))
+
+    def rename(self, gone: int, kept: int) -> None:
+        """Let all of one landmark's measurements be of another."""
+        self._names[gone] = kept
+
+    def drop(self, landmark_id: int) -> None:
+        """Leave all of a landmark's measurements out from now on."""
+        self._names[landmark_id] = None
+
+    def problem(self, state: State, prior: Prior, range_sigma_m: float) -> Problem:
+        """Return all that was measured of the landmarks the state has now."""
+        rows = {id_: row for row, id_ in enumerate(state.landmark_ids)}
+        ranges, points = self._ranges, self._points
+        of_range = self._rows_of(ranges.landmarks, rows)
+        of_point = self._rows_of(points.landmarks, rows)
+        used, used_points = np.flatnonzero(of_range >= 0), np.flatnonzero(of_point >= 0)
+        sigmas = np.square(self._wheels.calibration_sigmas)
+        return Problem(
+            increments=np.array(self._increments),
+            covariances=np.array(self._covariances),
+            walks=np.array(self._walks)[:, None] * sigmas,
+            prior=prior,
+            range_poses=np.array(ranges.poses, dtype=np.intp)[used],
+            range_radars=np.array(ranges.radars, dtype=np.intp)[used],
+            range_landmarks=of_range[used],
+            range_antennas=np.array(ranges.antennas).reshape(-1, 2)[used],
+            ranges_m=np.array(ranges.ranges_m)[used],
+            range_sigma_m=range_sigma_m,
+            point_poses=np.array(points.poses, dtype=np.intp)[used_points],
+            point_landmarks=of_point[used_points],
+            points=np.array(points.points).reshape(-1, 2)[used_points],
+            point_roots=np.array(points.roots).reshape(-1, 2, 2)[used_points],
+        )
+
+    def starts(self, state: State, problem: Problem) -> list[Estimate]:
+        """Return values to start from.
+
+        One chains all increments with the calibration of now, which a closed loop has put right
+        for the whole run; the other keeps the filter's own past.
+        """
+        shape = (len(self._causal), 3) if problem.is_walking else (1, 3)
+        calibration = np.broadcast_to(state.calibration, shape).copy()
+        chained = _chain(problem.increments, state.calibration)
+        # Turn the chain so that it ends where the filter is: the map belongs to that end.
+        common = {
+            "calibration": calibration,
+            "offsets_m": state.offsets_m.copy(),
+            "landmarks_m": state.landmarks_m.copy(),
+        }
+        causal = np.array(self._causal)
+        causal[-1] = state.pose
+        return [
+            Estimate(poses=causal, **common),
+            Estimate(poses=chained, **common),
+        ]
+
+    def solved(self, estimate: Estimate) -> None:
+        """Store a solution's trajectory."""
+        self._causal = list(estimate.poses)
+        self._stored_pose = estimate.poses[-1].copy()
+        self._since_solved = 0
+
+    def _rows_of(self, ids: list[int], rows: dict[int, int]) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+        """Return the present row of each id, -1 for landmarks that are gone."""
+        final: dict[int, int] = {}
+        for id_ in set(ids):
+            name: int | None = id_
+            while name is not None and name in self._names:
+                name = self._names[name]
+            final[id_] = -1 if name is None else rows.get(name, -1)
+        return np.array([final[id_] for id_ in ids], dtype=np.intp)
+
+
+def _step(pose: Array, increment: Array, calibration: Array, wheels: WheelNoise) -> Array:
+    motion = calibrated_motion(increment, calibration, wheels)
+    moved = pose[:2] + rotation(float(pose[2])) @ motion.step_m
+    return np.array([moved[0], moved[1], wrap_angle(float(pose[2]) + motion.turn_rad)])
+
+
+def _chain(increments: Array, calibration: Array) -> Array:
+    """Return the poses that calibrated increments lead through from the origin."""
+    s, w, kappa = calibration
+    d = increments[:, :2] / (1.0 + s)
+    a = (increments[:, 2] - kappa * np.hypot(d[:, 0], d[:, 1])) / (1.0 + w)
+    heading = np.concatenate([[0.0], np.cumsum(a)])
+    c, sn = np.cos(heading[:-1]), np.sin(heading[:-1])
+    x = np.concatenate([[0.0], np.cumsum(c * d[:, 0] - sn * d[:, 1])])
+    y = np.concatenate([[0.0], np.cumsum(sn * d[:, 0] + c * d[:, 1])])
+    return np.column_stack([x, y, heading])
