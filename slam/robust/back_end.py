@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,12 +14,13 @@ from slam.robust.existence import Existence
 from slam.robust.leftovers import Leftovers
 from slam.robust.merging import apply_merge, find_merge
 from slam.robust.motion import Motion, calibrated_motion, predict
-from slam.robust.parameters import BackEndParameters
+from slam.robust.parameters import BackEndParameters, PointRule
+from slam.robust.points import RangeBearing, assign, range_bearing_rows
 from slam.robust.ranges import Antennas, RangeScan, View, antennas_of, rows_of, sides_of, view
+from slam.robust.relinearisation import is_due, relinearise
 from slam.robust.run_log import RunLog
-from slam.robust.smoother import Smoother, start_prior
-from slam.robust.state import HEADING, State
-from slam.robust.symmetric import Array, SymmetricMatrix
+from slam.robust.state import State
+from slam.robust.symmetric import Array
 from slam.robust.tracklets import (
     Tracker,
     Tracklet,
@@ -157,7 +157,7 @@ class RobustBackEnd:
         deleted = self._delete_lost()
         self._n_updates += 1
         merged = self._merge()
-        relinearised = self._relinearise_if_due()
+        relinearised = is_due(self._log, self.state, self.parameters) and self.relinearise()
         self._log.set_causal(self.state.pose)
         return UpdateReport(
             continued=continued,
@@ -170,89 +170,127 @@ class RobustBackEnd:
             relinearised=relinearised,
         )
 
+    def update_points(
+        self, points: Sequence[RangeBearing], rule: PointRule | None = None
+    ) -> tuple[int | None, ...]:
+        """Take in ranges and bearings of points seen from the newest pose.
+
+        Labelled points are of the landmark of that label, and new where it is. The others are
+        assigned by distance.
+
+        Returns
+        -------
+        landmark_ids
+            One per point; None where it was in doubt and left out.
+        """
+        rule = rule or PointRule()
+        state = self.state
+        named = [point.label is not None for point in points]
+        rows: list[int | None] = []
+        if not all(named):
+            rows = assign(state, points, rule.gate, rule.new_gate, rule.reach_m)
+        else:
+            known = {id_: row for row, id_ in enumerate(state.landmark_ids)}
+            labels = [point.label for point in points if point.label is not None]
+            rows = [known.get(self._landmark_of_label.get(label, -1), -1) for label in labels]
+        found: list[int | None] = []
+        for point, row in zip(points, rows, strict=True):
+            landmark_id = None if row is None else self._see_point(point, row)
+            found.append(landmark_id)
+        if is_due(self._log, state, self.parameters):
+            self.relinearise()
+        self._log.set_causal(state.pose)
+        return tuple(found)
+
+    def _see_point(self, point: RangeBearing, row: int) -> int:
+        """Update the landmark in a row with a point, or give birth to it (row -1)."""
+        state = self.state
+        if row < 0:
+            landmark_id = give_birth(state, point.body_point(len(state.offsets_m)))
+            if point.label is not None:
+                self._landmark_of_label[point.label] = landmark_id
+        else:
+            landmark_id = state.landmark_ids[row]
+            rows = range_bearing_rows(state, row, point)
+            state.update(rows.at, rows.H, rows.residual, point.covariance)
+        self._existence.hit(landmark_id)
+        self._log.add_point(landmark_id, point.values, point.covariance)
+        return landmark_id
+
+    def relinearise(self) -> bool:
+        """Solve for all poses and replace the belief; tell whether that worked."""
+        return relinearise(self._log, self.state, self.parameters)
+
     def _continue_tracks(
         self, scans: Sequence[RangeScan], antennas: Antennas
     ) -> tuple[tuple[tuple[int, int, int], ...], float]:
         """Find the ranges of known landmarks and correct the state with all of them at once."""
-        state, noise = self.state, self.parameters.ranges
+        state = self.state
         if not state.landmark_ids:
             return (), 0.0
         seen = view(state, antennas)
         found: list[Continuation] = []
-        doubtful: set[int] = set()
-        inside = seen.inside(
-            noise, -self.parameters.map.view_inset_rad, -self.parameters.map.view_inset_m
-        )
-        expected = np.zeros(len(state.landmark_ids), dtype=bool)
         for side in self._sides:
-            sure, rows, prior = sure_landmarks(
-                state, seen, side, antennas, noise, self.parameters.continuation
-            )
-            if rows is None or not len(sure):
-                continue
-            found += continue_tracks(
-                sure,
-                rows,
-                prior,
-                [scan for scan in scans if scan.radar in side],
-                noise,
-                self.parameters.continuation,
-            )
-            heard = [radar for radar in side if antennas.heard[radar]]
-            expected[sure] |= inside[heard][:, sure].all(axis=0)
-        del doubtful
-        labelled = self._labelled(scans, seen)
-        if labelled is not None:
-            found = labelled
-        ids = state.landmark_ids
-        continued = tuple((c.radar, c.index, ids[c.row]) for c in found)
-        self._count_sightings(found, np.flatnonzero(expected), len(self._sides[0]))
+            found += self._continue_side([s for s in scans if s.radar in side], seen)
+        if any(scan.labels is not None for scan in scans):
+            found = self._labelled(scans)
         if not found:
             return (), 0.0
+        ids = state.landmark_ids
+        continued = tuple((c.radar, c.index, ids[c.row]) for c in found)
         ranges = {scan.radar: scan.ranges_m for scan in scans}
-        radars = np.array([c.radar for c in found], dtype=np.intp)
-        rows = rows_of(state, seen, radars, np.array([c.row for c in found], dtype=np.intp))
         z = np.array([ranges[c.radar][c.index] for c in found])
-        for c, range_m in zip(found, z.tolist(), strict=True):
-            antenna = antennas.position_m[c.radar]
+        for radar, index, landmark_id in continued:
+            x, y = antennas.position_m[radar].tolist()
             self._log.add_range(
-                self._log.n_poses - 1,
-                c.radar,
-                ids[c.row],
-                (float(antenna[0]), float(antenna[1])),
-                range_m,
+                self._log.n_poses - 1, radar, landmark_id, (x, y), ranges[radar][index]
             )
-        R = np.full(len(z), noise.sigma_m**2)
+        rows = rows_of(
+            state,
+            seen,
+            np.array([c.radar for c in found], dtype=np.intp),
+            np.array([c.row for c in found], dtype=np.intp),
+        )
+        R = np.full(len(z), self.parameters.ranges.sigma_m**2)
         nis, _ = state.update(rows.at, rows.H, z - rows.predicted_m, R)
         return continued, nis
 
-    def _labelled(self, scans: Sequence[RangeScan], seen: View) -> list[Continuation] | None:
-        """Return the associations that labels tell, or None where there are no labels."""
-        if all(scan.labels is None for scan in scans):
-            return None
-        rows = {id_: row for row, id_ in enumerate(self.state.landmark_ids)}
-        found = []
-        for scan in scans:
-            for index in range(len(scan.ranges_m)):
-                label = scan.label(index)
-                if label is not None and label in self._landmark_of_label:
-                    row = rows[self._landmark_of_label[label]]
-                    found.append(Continuation(row=row, radar=scan.radar, index=index))
-        return found
-
-    def _count_sightings(
-        self, found: Sequence[Continuation], expected: np.ndarray, whole: int
-    ) -> None:
+    def _continue_side(self, scans: list[RangeScan], seen: View) -> list[Continuation]:
+        """Find the ranges of known landmarks on one side; count hits and misses."""
+        noise, rule, limits = (
+            self.parameters.ranges,
+            self.parameters.continuation,
+            self.parameters.map,
+        )
+        radars = [scan.radar for scan in scans]
+        sure = sure_landmarks(self.state, seen, radars, noise, rule) if radars else None
+        if sure is None:
+            return []
+        found = continue_tracks(sure, scans, noise, rule)
         ids = self.state.landmark_ids
         count: dict[int, int] = {}
         for continuation in found:
             count[continuation.row] = count.get(continuation.row, 0) + 1
         for row in count:
             self._existence.hit(ids[row])
-        for row in expected.tolist():
+        inside = seen.inside(noise, -limits.view_inset_rad, -limits.view_inset_m)
+        expected = inside[radars][:, sure.landmarks].all(axis=0)
+        for row in sure.landmarks[expected].tolist():
             if row not in count:
                 self._existence.miss(ids[row])
-        self._existence.seen_whole(ids[row] for row, n in count.items() if n >= max(whole, 2))
+        whole = max(len(scans), 2)
+        self._existence.seen_whole(ids[row] for row, n in count.items() if n >= whole)
+        return found
+
+    def _labelled(self, scans: Sequence[RangeScan]) -> list[Continuation]:
+        """Return the associations that labels tell."""
+        rows = {id_: row for row, id_ in enumerate(self.state.landmark_ids)}
+        return [
+            Continuation(row=rows[self._landmark_of_label[label]], radar=scan.radar, index=index)
+            for scan in scans
+            for index in range(len(scan.ranges_m))
+            if (label := scan.label(index)) in self._landmark_of_label and label is not None
+        ]
 
     def _raise_tracklets(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Make tracklets of what is left over; each updates a landmark or becomes one."""
@@ -276,9 +314,7 @@ class RobustBackEnd:
                 continue
             offsets = np.arange(state.offsets.start, state.offsets.stop)
             tracker = Tracker(noise, rule, state.offsets_m, state.P.block(offsets))
-            for tracklet in find_tracklets(
-                tracker, guesses, frames, min(len(radars), 2), rule
-            ):
+            for tracklet in find_tracklets(tracker, guesses, frames, min(len(radars), 2), rule):
                 landmark_id, is_new = self._place(tracklet)
                 (born if is_new else again).append(landmark_id)
         return tuple(born), tuple(again)
@@ -345,59 +381,6 @@ class RobustBackEnd:
             self._log.rename(gone, kept)
         return tuple(ids)
 
-    def _relinearise_if_due(self) -> bool:
-        rule = self.parameters.relinearisation
-        if rule is None or self._log.since_solved < rule.every:
-            return False
-        shift_m, turn_rad = self._log.parted(self.state.pose)
-        if turn_rad <= rule.turn_rad and shift_m <= rule.shift_m:
-            return False
-        return self.relinearise()
-
-    def relinearise(self) -> bool:
-        """Solve for all poses and replace the belief; tell whether that worked."""
-        rule, state = self.parameters.relinearisation, self.state
-        if rule is None or not state.landmark_ids:
-            return False
-        self._log.tried()
-        prior = start_prior(
-            self.parameters.wheels.calibration_sigmas,
-            self._offset_sigmas,
-            len(state.landmark_ids),
-        )
-        problem = self._log.problem(state, prior, self.parameters.ranges.sigma_m)
-        smoother = Smoother(problem, rule)
-        start = min(self._log.starts(state, problem), key=smoother.cost)
-        solution = smoother.solve(start)
-        if solution is None:
-            return False
-        estimate = solution.estimate
-        pose = estimate.poses[-1]
-        state.position_m = pose[:2].copy()
-        state.heading_rad = math.remainder(float(pose[2]), math.tau)
-        state.calibration = estimate.calibration[-1].copy()
-        state.offsets_m = estimate.offsets_m.copy()
-        state.landmarks_m = estimate.landmarks_m.copy()
-        state.P = SymmetricMatrix(_invariant_covariance(state, solution.information))
-        self._log.solved(estimate)
-        return True
-
-
-def _invariant_covariance(state: State, information: Array) -> Array:
-    """Return the covariance of the right-invariant error from additive information.
-
-    The smoother orders (x, y, heading, ...), the filter (heading, x, y, ...).
-    """
-    additive = np.linalg.inv(information)
-    order = np.concatenate([[2, 0, 1], np.arange(3, len(additive))])
-    additive = additive[np.ix_(order, order)]
-    T = state.additive_transform()
-    T[1:, HEADING] *= -1.0
-    P = T @ additive @ T.T
-    return np.asarray((P + P.T) / 2)
-
 
 def _at_rest() -> Motion:
-    return Motion(
-        step_m=np.zeros(2), turn_rad=0.0, covariance=np.zeros((3, 3)), walk_variance=0.0
-    )
+    return Motion(step_m=np.zeros(2), turn_rad=0.0, covariance=np.zeros((3, 3)), walk_variance=0.0)

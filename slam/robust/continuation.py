@@ -20,12 +20,11 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.robust.parameters import ContinuationRule, RangeNoise
-from slam.robust.ranges import Antennas, RangeScan, Rows, View, rows_of
+from slam.robust.ranges import RangeScan, Rows, View, rows_of
 from slam.robust.state import State
-from slam.robust.symmetric import Array
+from slam.robust.symmetric import Array, Indices
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,44 +47,48 @@ class Option:
 NOTHING = Option((), 0.0)
 
 
-def sure_landmarks(
-    state: State,
-    seen: View,
-    side: Sequence[int],
-    antennas: Antennas,
-    noise: RangeNoise,
-    rule: ContinuationRule,
-) -> tuple[NDArray[np.intp], Rows | None, Array]:
-    """Return the landmarks that may be continued from one side of the robot.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SureLandmarks:
+    """The landmarks that may be continued from one side of the robot.
 
-    Returns
-    -------
+    Attributes
+    ----------
     landmarks
         Rows of the landmarks, shape (c,).
     rows
-        Their predicted ranges, radar by radar of the side that was heard, landmark by landmark.
+        Their predicted ranges: landmark by landmark, radar by radar.
     prior
         H P H^T of those rows, shape (k, k).
     """
-    radars = np.array([radar for radar in side if antennas.heard[radar]], dtype=np.intp)
-    nobody: NDArray[np.intp] = np.zeros(0, dtype=np.intp)
-    if not len(radars) or not len(state.landmark_ids):
-        return nobody, None, np.zeros((0, 0))
+
+    landmarks: Indices
+    rows: Rows
+    prior: Array
+
+
+def sure_landmarks(
+    state: State,
+    seen: View,
+    radars: Sequence[int],
+    noise: RangeNoise,
+    rule: ContinuationRule,
+) -> SureLandmarks | None:
+    """Return the landmarks that radars of one side, all heard, may continue; None without any."""
+    looking = np.array(radars, dtype=np.intp)
     margin_m = 5.0 * noise.sigma_m
-    inside = seen.inside(noise, rule.view_margin_rad, margin_m)[radars]
+    inside = seen.inside(noise, rule.view_margin_rad, margin_m)[looking]
     landmarks = np.flatnonzero(inside.any(axis=0))
     if not len(landmarks):
-        return nobody, None, np.zeros((0, 0))
+        return None
     rows = rows_of(
-        state, seen, np.tile(radars, len(landmarks)), np.repeat(landmarks, len(radars))
+        state, seen, np.tile(looking, len(landmarks)), np.repeat(landmarks, len(looking))
     )
     prior = rows.H @ state.P.block(rows.at) @ rows.H.T
     limit = (rule.tight_sigmas * noise.sigma_m) ** 2
-    variances = prior.diagonal()
-    sure = (variances.reshape(len(landmarks), len(radars)) <= limit).all(axis=1)
-    if sure.all():
-        return landmarks, rows, prior
-    keep = np.flatnonzero(np.repeat(sure, len(radars)))
+    sure = (prior.diagonal().reshape(len(landmarks), len(looking)) <= limit).all(axis=1)
+    if not sure.any():
+        return None
+    keep = np.flatnonzero(np.repeat(sure, len(looking)))
     rows = Rows(
         radars=rows.radars[keep],
         landmarks=rows.landmarks[keep],
@@ -93,37 +96,29 @@ def sure_landmarks(
         H=rows.H[keep],
         predicted_m=rows.predicted_m[keep],
     )
-    return landmarks[sure], rows, prior[np.ix_(keep, keep)]
+    return SureLandmarks(landmarks=landmarks[sure], rows=rows, prior=prior[np.ix_(keep, keep)])
 
 
 def continue_tracks(
-    landmarks: NDArray[np.intp],
-    rows: Rows,
-    prior: Array,
-    scans: Sequence[RangeScan],
-    noise: RangeNoise,
-    rule: ContinuationRule,
+    sure: SureLandmarks, scans: Sequence[RangeScan], noise: RangeNoise, rule: ContinuationRule
 ) -> list[Continuation]:
-    """Return the likeliest one-to-one assignment of ranges to landmarks.
-
-    ``landmarks``, ``rows`` and ``prior`` are those of ``sure_landmarks``.
-    """
-    per_landmark = len(rows.radars) // len(landmarks)
+    """Return the likeliest one-to-one assignment of the ranges of one side to landmarks."""
+    rows, per_landmark = sure.rows, len(sure.rows.radars) // len(sure.landmarks)
     by_radar = {scan.radar: scan for scan in scans}
     options: list[list[Option]] = []
-    for place in range(len(landmarks)):
+    for place in range(len(sure.landmarks)):
         mine = slice(place * per_landmark, (place + 1) * per_landmark)
         options.append(
             options_of(
                 [by_radar[int(radar)] for radar in rows.radars[mine]],
                 rows.predicted_m[mine],
-                prior[mine, mine],
+                sure.prior[mine, mine],
                 noise,
                 rule,
             )
         )
     return [
-        Continuation(row=int(landmarks[place]), radar=radar, index=index)
+        Continuation(row=int(sure.landmarks[place]), radar=radar, index=index)
         for place, option in enumerate(cheapest(options))
         for radar, index in option.used
     ]

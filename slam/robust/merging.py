@@ -35,7 +35,9 @@ def merge_rows(
 ) -> tuple[Indices, Array, Array, Array]:
     """Return columns, H (2 k, 4 k), residual (2 k,) and R (2 k, 2 k) of k merges of rows."""
     at = state.landmark_columns(np.array(pairs, dtype=np.intp).ravel())
-    H = np.kron(np.eye(len(pairs)), np.hstack([np.eye(2), -np.eye(2)]))
+    H = np.asarray(
+        np.kron(np.eye(len(pairs)), np.hstack([np.eye(2), -np.eye(2)])), dtype=np.float64
+    )
     apart = [state.landmarks_m[i] - state.landmarks_m[j] for i, j in pairs]
     return at, H, -np.concatenate(apart), sigma_m**2 * np.eye(2 * len(pairs))
 
@@ -63,7 +65,7 @@ def apply_merge(state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float
     PHt = state.P.columns(at) @ H.T
     S = H @ PHt[at] + R
     S = (S + S.T) / 2
-    K = np.linalg.solve(S, PHt.T).T
+    K = np.asarray(np.linalg.solve(S, PHt.T).T, dtype=np.float64)
     state.P.subtract_gains(K, PHt, S)
     state.correct(K @ residual)
     for row in sorted((second for _, second in pairs), reverse=True):

@@ -222,6 +222,19 @@ class RelinearisationRule:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class PointRule:
+    """How points with range and bearing find their landmarks.
+
+    ``gate`` bounds d^2 of a match (2 dof, 99 %); what is farther than ``new_gate`` from every
+    landmark is new; ``reach_m`` limits the search.
+    """
+
+    gate: float = 9.21
+    new_gate: float = 25.0
+    reach_m: float = 20.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class BackEndParameters:
     """Everything the back end is told."""
 

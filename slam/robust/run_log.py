@@ -9,7 +9,7 @@ import numpy as np
 from slam.geometry import wrap_angle
 from slam.robust.motion import calibrated_motion
 from slam.robust.parameters import WheelNoise
-from slam.robust.smoother import Estimate, Prior, Problem
+from slam.robust.problem import Estimate, Prior, Problem
 from slam.robust.state import State, rotation
 from slam.robust.symmetric import Array
 
@@ -169,7 +169,9 @@ class RunLog:
         self._stored_pose = estimate.poses[-1].copy()
         self._since_solved = 0
 
-    def _rows_of(self, ids: list[int], rows: dict[int, int]) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+    def _rows_of(
+        self, ids: list[int], rows: dict[int, int]
+    ) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
         """Return the present row of each id, -1 for landmarks that are gone."""
         final: dict[int, int] = {}
         for id_ in set(ids):

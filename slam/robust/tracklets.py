@@ -226,7 +226,7 @@ class Tracker:
         offset_part = np.zeros((len(z), len(radars)))
         offset_part[np.arange(len(z)), place] = 1.0
         prior = self._offset_covariance[np.ix_(radars, radars)]
-        prior = np.linalg.inv(prior + 1e-12 * np.eye(len(radars)))
+        prior = np.asarray(np.linalg.inv(prior + 1e-12 * np.eye(len(radars))))
         point, offsets = walked.point_m.copy(), np.zeros(len(radars))
         for _ in range(4):
             away = point - antennas

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from slam.geometry import Mount, Rig, paper_rig
+from slam.geometry import Mount, Rig, paper_rig, transform
 from slam.metrics import align_se2, ate_rmse_m, landmark_metrics, nees_pose
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.parameters import (
@@ -134,7 +134,7 @@ def simulate(
         poses=poses,
         landmarks=landmarks,
         increments=increments,
-        scans=list(scans_of(poses, landmarks, rng, sigma_m, stress, labelled)),
+        scans=list(scans_of(poses, landmarks, rng, sigma_m, stress, labelled=labelled)),
     )
 
 
@@ -168,6 +168,7 @@ def scans_of(
     rng: np.random.Generator,
     sigma_m: float,
     stress: Stress,
+    *,
     labelled: bool,
 ) -> Iterator[list[RangeScan]]:
     """Yield what the radars detect at each pose but the first."""
@@ -181,7 +182,7 @@ def scans_of(
     for radar, mount in enumerate(mounts):
         at = sampled_poses(poses, stress.sampled_after[radar])
         ranges[radar], off = polar(at, mount, landmarks)
-        seen[radar] = (off <= math.radians(32.5)) & (0.2 <= ranges[radar]) & (ranges[radar] <= 1.5)
+        seen[radar] = (off <= math.radians(32.5)) & (ranges[radar] >= 0.2) & (ranges[radar] <= 1.5)
     seen &= rng.random(seen.shape) < 0.92
     ranges += sigma_m * rng.standard_normal(ranges.shape) + offsets[:, None, None]
     random = rng.random(ranges.shape) < stress.random_share
@@ -275,7 +276,9 @@ def drive(run: Run, back_end: RobustBackEnd, rig: Rig) -> tuple[Verdict, Array]:
     """Run the back end over a run; return the verdict and the causal path (k, 3)."""
     began = time.process_time()
     n = len(run.poses)
-    checks = {round(share * (n - 1)) for share in (0.1, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.9, 1)}
+    checks = {
+        round(share * (n - 1)) for share in (0.1, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.9, 1)
+    }
     path = [np.zeros(3)]
     nees = []
     nis = dof = relinearised = 0.0
@@ -293,8 +296,6 @@ def drive(run: Run, back_end: RobustBackEnd, rig: Rig) -> tuple[Verdict, Array]:
     counted = run.landmarks[observable_landmarks(rig, run.poses, run.landmarks)]
     alignment = align_se2(estimate[:, :2], run.poses[:, :2])
     score = landmark_metrics(landmarks, counted, alignment)
-    from slam.geometry import transform
-
     false = 0
     for point in transform(alignment, landmarks) if len(landmarks) else []:
         false += float(np.hypot(*(run.landmarks - point).T).min()) > 0.15
@@ -361,13 +362,16 @@ def summary(verdicts: list[Verdict]) -> dict[str, object]:
         "ate_median_mm": round(float(np.median(ate)), 2),
         "ate_p90_mm": round(float(np.percentile(ate, 90)), 2),
         "ate_max_mm": round(float(ate.max()), 1),
-        "odometry_median_mm": round(float(np.median([v.odometry_ate_m for v in verdicts])) * 1e3, 1),
+        "odometry_median_mm": round(
+            float(np.median([v.odometry_ate_m for v in verdicts])) * 1e3, 1
+        ),
         "anees_in_band": int(np.sum((anees >= low) & (anees <= high))),
         "anees": [round(float(x), 2) for x in anees],
         "no_duplicates_share": float(np.mean([v.duplicates == 0 for v in verdicts])),
         "duplicates_per_run": float(np.mean([v.duplicates for v in verdicts])),
         "false_per_run": float(np.mean([v.false for v in verdicts])),
-        "recall": f"{np.mean([v.matched for v in verdicts]):.2f}/{np.mean([v.true for v in verdicts]):.2f}",
+        "matched": round(float(np.mean([v.matched for v in verdicts])), 2),
+        "true": round(float(np.mean([v.true for v in verdicts])), 2),
         "landmark_rmse_mm": round(float(np.median(rmse)) * 1e3, 1) if rmse else None,
         "nis_per_dof": round(float(np.mean([v.nis_per_dof for v in verdicts])), 3),
         "relinearisations": float(np.mean([v.relinearisations for v in verdicts])),

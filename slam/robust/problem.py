@@ -1,0 +1,104 @@
+"""The least-squares problem over a whole run: what was measured, and values of the unknowns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam.robust.symmetric import Array, Indices
+
+# Standard deviations below these are taken as these, so that information stays finite.
+_LEAST_CALIBRATION = 1e-7
+_LEAST_OFFSET_M = 1e-7
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Estimate:
+    """Values of all unknowns.
+
+    Attributes
+    ----------
+    poses
+        shape (k + 1, 3): x, y, heading.
+    calibration
+        shape (k + 1, 3) if it walks, else (1, 3): s, w, kappa.
+    offsets_m, landmarks_m
+        shapes (r,) and (n, 2).
+    """
+
+    poses: Array
+    calibration: Array
+    offsets_m: Array
+    landmarks_m: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Prior:
+    """What is known beforehand of the first pose, its calibration, the offsets and landmarks.
+
+    ``information`` has shape (6 + r + 2 n,) squared in that order, about ``mean``.
+    """
+
+    information: Array
+    mean: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Problem:
+    """All that was measured.
+
+    Attributes
+    ----------
+    increments, covariances
+        shapes (k, 3) and (k, 3, 3): reported steps from pose to pose, and their noise.
+    walks
+        shape (k, 3): variance each calibration error gains per step; all zero: constants.
+    prior
+        Of the first pose and everything that does not move.
+    range_poses, range_radars, range_landmarks
+        shape (m,) each: which pose, radar and landmark a range belongs to.
+    range_antennas, ranges_m
+        shapes (m, 2) and (m,): antenna in the body frame of the pose.
+    range_sigma_m
+        Noise of a range.
+    point_poses, point_landmarks, points, point_roots
+        shapes (q,), (q,), (q, 2), (q, 2, 2): range and bearing seen from the body's origin,
+        and a matrix that makes their noise white.
+    """
+
+    increments: Array
+    covariances: Array
+    walks: Array
+    prior: Prior
+    range_poses: Indices
+    range_radars: Indices
+    range_landmarks: Indices
+    range_antennas: Array
+    ranges_m: Array
+    range_sigma_m: float
+    point_poses: Indices
+    point_landmarks: Indices
+    points: Array
+    point_roots: Array
+
+    @property
+    def is_walking(self) -> bool:
+        """Tell whether the calibration has one value per pose."""
+        return bool(np.any(self.walks > 0.0))
+
+
+def start_prior(
+    calibration_sigmas: tuple[float, float, float],
+    offset_sigmas_m: tuple[float, ...],
+    n_landmarks: int,
+    pose_sigma: float = 1e-6,
+) -> Prior:
+    """Return the prior of a run that starts at the origin of its own map."""
+    calibration = np.maximum(calibration_sigmas, _LEAST_CALIBRATION)
+    offsets = np.maximum(offset_sigmas_m, _LEAST_OFFSET_M)
+    sigmas = np.concatenate([np.full(3, pose_sigma), calibration, offsets])
+    size = len(sigmas) + 2 * n_landmarks
+    information = np.zeros((size, size))
+    np.fill_diagonal(information[: len(sigmas), : len(sigmas)], sigmas**-2.0)
+    return Prior(information=information, mean=np.zeros(size))

@@ -1,0 +1,67 @@
+"""When the filter has come far from where it linearised, all poses are solved for again."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from slam.robust.parameters import BackEndParameters
+from slam.robust.problem import start_prior
+from slam.robust.run_log import RunLog
+from slam.robust.smoother import Smoother
+from slam.robust.state import HEADING, State
+from slam.robust.symmetric import Array, SymmetricMatrix
+
+
+def is_due(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
+    """Tell whether the filter's pose has parted from the stored trajectory by too much."""
+    rule = parameters.relinearisation
+    if rule is None or not state.landmark_ids or log.since_solved < rule.every:
+        return False
+    shift_m, turn_rad = log.parted(state.pose)
+    return turn_rad > rule.turn_rad or shift_m > rule.shift_m
+
+
+def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
+    """Solve for all poses and let the result take the belief's place; tell whether it worked."""
+    rule = parameters.relinearisation
+    if rule is None:
+        return False
+    log.tried()
+    prior = start_prior(
+        parameters.wheels.calibration_sigmas,
+        (parameters.ranges.offset_sigma_m,) * len(state.offsets_m),
+        len(state.landmark_ids),
+    )
+    problem = log.problem(state, prior, parameters.ranges.sigma_m)
+    smoother = Smoother(problem, rule)
+    start = min(log.starts(state, problem), key=smoother.cost)
+    solution = smoother.solve(start)
+    if solution is None:
+        return False
+    estimate = solution.estimate
+    pose = estimate.poses[-1]
+    state.position_m = pose[:2].copy()
+    state.heading_rad = math.remainder(float(pose[2]), math.tau)
+    state.calibration = estimate.calibration[-1].copy()
+    state.offsets_m = estimate.offsets_m.copy()
+    state.landmarks_m = estimate.landmarks_m.copy()
+    state.P = SymmetricMatrix(invariant_covariance(state, solution.information))
+    log.solved(estimate)
+    return True
+
+
+def invariant_covariance(state: State, information: Array) -> Array:
+    """Return the covariance of the right-invariant error from the information of additive ones.
+
+    The smoother orders (x, y, heading, ...), the filter (heading, x, y, ...);
+    e_p = e_add,p - J p e_th, landmarks likewise.
+    """
+    additive = np.linalg.inv(information)
+    order = np.concatenate([[2, 0, 1], np.arange(3, len(additive))])
+    additive = additive[np.ix_(order, order)]
+    T = state.additive_transform()
+    T[1:, HEADING] *= -1.0
+    P = T @ additive @ T.T
+    return np.asarray((P + P.T) / 2)
