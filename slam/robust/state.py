@@ -42,7 +42,8 @@ def left_jacobian(angle_rad: float) -> Array:
     if abs(a) < _SMALL_RAD:
         along, across = 1.0 - a * a / 6.0, a / 2.0 - a**3 / 24.0
     else:
-        along, across = math.sin(a) / a, (1.0 - math.cos(a)) / a
+        # 1 - cos a = 2 sin^2(a / 2), without the cancellation.
+        along, across = math.sin(a) / a, 2.0 * math.sin(a / 2.0) ** 2 / a
     return np.array([[along, -across], [across, along]])
 
 

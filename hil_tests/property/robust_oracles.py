@@ -1,0 +1,149 @@
+"""What the robust filter must agree with: its error model written again in complex numbers.
+
+A derivative by complex step, ``Im f(x + i h) / h`` with h = 1e-30, has no rounding to speak of.
+"""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from slam.robust.state import State
+from slam.robust.symmetric import SymmetricMatrix
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+STEP = 1e-30
+N_RADARS = 4
+
+
+def derivative(function: Callable[[Complex], Complex], at: Array) -> Array:
+    """Return d function / d x at x, shape (outputs, inputs)."""
+    columns = []
+    for i in range(len(at)):
+        x = at.astype(np.complex128)
+        x[i] += 1j * STEP
+        columns.append(function(x).imag / STEP)
+    return np.column_stack(columns)
+
+
+def turn(angle: complex) -> Complex:
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+def v_matrix(angle: complex) -> Complex:
+    """Return V(a), by its series where a is tiny."""
+    if abs(angle) < 1e-8:
+        along, across = 1 - angle**2 / 6, angle / 2
+    else:
+        along, across = np.sin(angle) / angle, (1 - np.cos(angle)) / angle
+    return np.array([[along, -across], [across, along]])
+
+
+def values(state: State) -> Array:
+    """Return [theta, p, s, w, kappa, b, l...] in the order of the errors."""
+    return np.concatenate(
+        [
+            [state.heading_rad],
+            state.position_m,
+            state.calibration,
+            state.offsets_m,
+            state.landmarks_m.ravel(),
+        ]
+    )
+
+
+def plus(mean: Complex, error: Complex) -> Complex:
+    """Return the values that lie a right-invariant error off the mean."""
+    result = mean + error
+    R, V = turn(error[0]), v_matrix(error[0])
+    for first in (1, *range(6 + N_RADARS, len(mean), 2)):
+        at = slice(first, first + 2)
+        result[at] = R @ mean[at] + V @ error[at]
+    return result
+
+
+def minus(true: Complex, mean: Complex) -> Complex:
+    """Return the right-invariant error of a mean."""
+    error = true - mean
+    R, V = turn(error[0]), v_matrix(error[0])
+    for first in (1, *range(6 + N_RADARS, len(mean), 2)):
+        at = slice(first, first + 2)
+        error[at] = np.linalg.solve(V, true[at] - R @ mean[at])
+    return error
+
+
+def moved(x: Complex, increment: Array, noise: Complex) -> Complex:
+    """Return the values after a reported increment; noise (along, across, heading)."""
+    s, w, kappa = x[3:6]
+    d = increment[:2] / (1 + s)
+    D = np.sqrt(d @ d)
+    a = (increment[2] - kappa * D) / (1 + w)
+    result = x.copy()
+    result[1:3] = x[1:3] + turn(x[0]) @ (d + noise[:2])
+    result[0] = x[0] + a + noise[2]
+    return result
+
+
+def range_to(x: Complex, landmark: int, radar: int, antenna: Array) -> complex:
+    first = 6 + N_RADARS + 2 * landmark
+    away = x[first : first + 2] - x[1:3] - turn(x[0]) @ antenna
+    result: complex = np.sqrt(away @ away) + x[6 + radar]
+    return result
+
+
+def body_point(x: Complex, landmark: int) -> Complex:
+    first = 6 + N_RADARS + 2 * landmark
+    result: Complex = turn(x[0]).T @ (x[first : first + 2] - x[1:3])
+    return result
+
+
+def random_covariance(size: int, rng: np.random.Generator, scale: float = 0.05) -> Array:
+    root = scale * rng.standard_normal((size, size)) / math.sqrt(size)
+    return np.asarray(root @ root.T + 1e-6 * np.eye(size))
+
+
+def random_state(seed: int, n_landmarks: int, heading_rad: float) -> State:
+    """Return a state with everything unknown and correlated."""
+    rng = np.random.default_rng(seed)
+    state = State((0.02, 0.02, 0.01), (0.01,) * N_RADARS)
+    state.heading_rad = heading_rad
+    state.position_m = rng.uniform(-3, 3, 2)
+    state.calibration = 0.02 * rng.standard_normal(3)
+    state.offsets_m = 0.02 * rng.standard_normal(N_RADARS)
+    state.landmarks_m = rng.uniform(-3, 3, (n_landmarks, 2))
+    state.landmark_ids = list(range(n_landmarks))
+    state.next_id = n_landmarks
+    state.P = SymmetricMatrix(random_covariance(6 + N_RADARS + 2 * n_landmarks, rng))
+    return state
+
+
+def twin(state: State) -> State:
+    """Return an independent copy."""
+    copy = State((0.0, 0.0, 0.0), (0.0,) * len(state.offsets_m))
+    copy.heading_rad = state.heading_rad
+    copy.position_m = state.position_m.copy()
+    copy.calibration = state.calibration.copy()
+    copy.offsets_m = state.offsets_m.copy()
+    copy.landmarks_m = state.landmarks_m.copy()
+    copy.landmark_ids = list(state.landmark_ids)
+    copy.next_id = state.next_id
+    copy.P = SymmetricMatrix(state.P.full())
+    return copy
+
+
+def near_a_half_turn() -> st.SearchStrategy[float]:
+    """Return headings, those around +-pi often."""
+    return st.one_of(
+        st.floats(-math.pi, math.pi),
+        st.sampled_from([math.pi, -math.pi, math.pi - 1e-9, -math.pi + 1e-9, 0.0]),
+    )
+
+
+seeds = st.integers(0, 2**32 - 1)
+increments = st.tuples(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(-0.5, 0.5)).map(
+    lambda values: np.array(values) + 1e-6
+)
