@@ -150,7 +150,6 @@ class RunLog:
         shape = (len(self._causal), 3) if problem.is_walking else (1, 3)
         calibration = np.broadcast_to(state.calibration, shape).copy()
         chained = _chain(problem.increments, state.calibration)
-        # Turn the chain so that it ends where the filter is: the map belongs to that end.
         common = {
             "calibration": calibration,
             "offsets_m": state.offsets_m.copy(),
