@@ -195,14 +195,15 @@ def _seen_part(
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Return the part of a face on the radar's side of another: near and far end, and its kind.
 
-    Near and far are from where the faces' lines meet; they are equal where nothing is left. The
-    kind is whether the near end is the apex of the corner.
+    Near and far are from where the faces' lines meet; they are equal where nothing is left: what
+    is thinner than ``ON_THE_FACE_M`` is the rounding of faces that share an end. The kind is
+    whether the near end is the apex of the corner.
     """
     slope = other.t_x * face.t_y - other.t_y * face.t_x  # of the height over the other, along t
     upwards = slope * radar_height > 0
     near = np.where(upwards, np.maximum(meet_m, 0.0), np.minimum(meet_m, face.length_m))
     far = np.where(upwards, face.length_m, 0.0)
-    gone = np.where(upwards, far <= near, far >= near)
+    gone = np.where(upwards, far - near, near - far) <= ON_THE_FACE_M
     return near, np.where(gone, near, far), np.abs(near - meet_m) <= TOUCHING_M
 
 

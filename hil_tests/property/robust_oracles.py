@@ -35,9 +35,10 @@ def turn(angle: complex) -> Complex:
 
 
 def v_matrix(angle: complex) -> Complex:
-    """Return V(a), by its series where a is tiny."""
-    if abs(angle) < 1e-8:
-        along, across = 1 - angle**2 / 6, angle / 2
+    """Return V(a), by its series where 1 - cos a would lose digits."""
+    if abs(angle) < 1e-2:
+        along = 1 - angle**2 / 6 + angle**4 / 120
+        across = angle / 2 - angle**3 / 24 + angle**5 / 720
     else:
         along, across = np.sin(angle) / angle, (1 - np.cos(angle)) / angle
     return np.array([[along, -across], [across, along]])

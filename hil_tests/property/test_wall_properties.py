@@ -8,7 +8,7 @@ from contextlib import nullcontext
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from emulator.ghosts import spread
@@ -156,6 +156,11 @@ def test_a_rigid_motion_of_everything_changes_nothing(
 
 @settings(max_examples=50)
 @given(mount=st.tuples(coordinate, coordinate, angle_deg), walls=walls_st, target=target_st)
+@example(  # the second wall lies behind the first: nothing of it is left but a rounding error
+    (0.0, 0.0, 0.0),
+    (wall(0, ((0.0, 1.0), (1.0, -2.0))), wall(1, ((1.0, 0.0), (1.0, -2.0)))),
+    TargetSpec(name="target", kind="rod", x_m=0.0, y_m=0.0),
+)
 def test_it_does_not_matter_which_end_of_a_wall_is_written_first(
     mount: tuple[float, float, float], walls: tuple[WallSpec, ...], target: TargetSpec
 ) -> None:
