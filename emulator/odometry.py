@@ -9,9 +9,10 @@ frame at its start is (dx, dy) and a, with D = hypot(dx, dy), is reported as
 
 and the reported pose is the composition of the reported increments, starting at zero. White noise
 of a leg composes over steps (variance proportional to length), so it does not depend on the step;
-that of a turn is proportional to each step's angle, so it belongs to the scene's step rate. Wheel
-slip and slow changes of the three constants are left out. Source: the project's odometry model
-for this robot class; the scene holds its standard deviations.
+that of a turn is proportional to each step's angle, so it belongs to the scene's step rate. Where
+the scene says so, the three constants perform independent random walks from there. Wheel slip is
+left out. While the robot is carried its wheels stand still and report so. Source: the project's
+odometry model for this robot class; the scene holds its standard deviations.
 
 The TUM lines are canonical: whoever parses them, live or later, computes with the same floats.
 """
@@ -50,7 +51,11 @@ def odometry_times_ns(duration_ns: int, rate_hz: float) -> NDArray[np.int64]:
 
 
 def drift(
-    true_poses: NDArray[np.float64], model: OdometrySpec, *, seed: int
+    true_poses: NDArray[np.float64],
+    model: OdometrySpec,
+    *,
+    seed: int,
+    unseen: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float64]:
     """Return what the wheels report for a true path.
 
@@ -62,25 +67,37 @@ def drift(
         Standard deviations.
     seed
         Selects the run.
+    unseen
+        Shape (n - 1,): steps during which the wheels stood, whatever the robot did.
 
     Returns
     -------
     Shape (n, 3), float64: reported poses, the first all zero, heading [rad, continuous].
     """
     n_steps = len(true_poses) - 1
-    normals = standard_normals(3 + 3 * n_steps, seed=seed, stream=ODOMETRY_STREAM)
-    scale = model.scale_sigma * float(normals[0])
-    turn_scale = model.turn_scale_sigma * float(normals[1])
-    curvature = model.curvature_sigma_rad_per_m * float(normals[2])
+    # The normals of the walk lie behind all others, so it changes no other value.
+    n_white = 3 + 3 * n_steps
+    walks = model.walk_per_sqrt_s > 0
+    normals = standard_normals(n_white + 3 * n_steps * walks, seed=seed, stream=ODOMETRY_STREAM)
+    units = np.repeat(normals[np.newaxis, :3], n_steps, axis=0)
+    if walks:
+        per_step = model.walk_per_sqrt_s / math.sqrt(model.rate_hz)
+        units[1:] += per_step * np.cumsum(normals[n_white:-3].reshape(-1, 3), axis=0)
+    sigmas = (model.scale_sigma, model.turn_scale_sigma, model.curvature_sigma_rad_per_m)
+    errors = (units * np.array(sigmas)).tolist()
     # Python floats and math: the loop is short, and libm does not change with NumPy's dispatch.
     x, y, heading = 0.0, 0.0, 0.0
     reported = [(x, y, heading)]
-    steps = np.diff(true_poses, axis=0).tolist()
+    true_steps = np.diff(true_poses, axis=0)
+    if unseen is not None:
+        true_steps[unseen] = 0.0
+    steps = true_steps.tolist()
     headings = true_poses[:, 2].tolist()
-    white = normals[3:].reshape(n_steps, 3).tolist()
-    for (step_x, step_y, turn), true_heading, (n_along, n_across, n_turn) in zip(
-        steps, headings[:-1], white, strict=True
+    white = normals[3:n_white].reshape(n_steps, 3).tolist()
+    for (step_x, step_y, turn), true_heading, (scale, turn_scale, curvature), noise in zip(
+        steps, headings[:-1], errors, white, strict=True
     ):
+        n_along, n_across, n_turn = noise
         cosine, sine = math.cos(true_heading), math.sin(true_heading)
         distance = math.hypot(step_x, step_y)
         root = math.sqrt(distance)
@@ -118,7 +135,12 @@ def scene_odometry(scene: Scene, seed: int) -> tuple[str, ...]:
     """
     trajectory = scene.trajectory()
     times = odometry_times_ns(trajectory.duration_ns, scene.odometry.rate_hz)
-    return _tum_lines(times, drift(trajectory.poses(times), scene.odometry, seed=seed))
+    unseen = None
+    if trajectory.carried_ns is not None:
+        lifted_ns, down_ns = trajectory.carried_ns
+        unseen = (times[1:] > lifted_ns) & (times[:-1] < down_ns)
+    poses = drift(trajectory.poses(times), scene.odometry, seed=seed, unseen=unseen)
+    return _tum_lines(times, poses)
 
 
 def scene_truth(scene: Scene) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from emulator.people import PersonSpec
 from emulator.scene_tables import (
+    CarriedSpec,
     ClutterSpec,
     JitterSpec,
     LeakageSpec,
@@ -31,9 +32,10 @@ from emulator.scene_tables import (
     TargetSpec,
     WallSpec,
 )
-from emulator.trajectory import Trajectory, drive
+from emulator.trajectory import Trajectory, carried, drive
 
 __all__ = [
+    "CarriedSpec",
     "LeakageSpec",
     "NoiseSpec",
     "OdometrySpec",
@@ -102,7 +104,10 @@ class Scene(Table):
 
     @model_validator(mode="after")
     def _ends_some_day(self) -> Scene:
-        duration_s = self.trajectory().duration_ns / 1e9
+        try:
+            duration_s = self.trajectory().duration_ns / 1e9
+        except ValueError as error:
+            raise ValueError(f"path.carried: {error}") from None
         if duration_s > LONGEST_DRIVE_S:
             raise ValueError(
                 f"path: the drive takes {duration_s / 3600:.1f} h, at most "
@@ -118,10 +123,19 @@ class Scene(Table):
 
     def trajectory(self) -> Trajectory:
         """Return the robot's true path, world frame (the start pose is the origin)."""
-        return drive(
+        path = drive(
             self.path.stops_m(),
             speed_mps=self.path.speed_mps,
             turn_rate_rad_per_s=math.radians(self.path.turn_rate_deg_per_s),
+        )
+        lift = self.path.carried
+        if lift is None:
+            return path
+        return carried(
+            path,
+            at_ns=round(lift.at_s * 1e9),
+            skips_ns=round(lift.skips_s * 1e9),
+            takes_ns=round(lift.takes_s * 1e9),
         )
 
 

@@ -26,6 +26,7 @@ from emulator.people import AMPLITUDE_OF_1_M2
 
 __all__ = [
     "MIRROR_AMPLITUDE_1M",
+    "CarriedSpec",
     "ClutterSpec",
     "JitterSpec",
     "LeakageSpec",
@@ -56,6 +57,7 @@ def _finite(value: object) -> object:
 Metres = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-1000, le=1000)]
 Degrees = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-360, le=360)]
 Sigma = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=1)]
+Seconds = Annotated[StrictFloat, BeforeValidator(_finite), Field(gt=0, le=86_400)]
 CorrelationTime = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=1e-3, le=86_400)]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
 
@@ -204,6 +206,19 @@ class JitterSpec(Table):
     slow_correlation_s: CorrelationTime = 4.0
 
 
+class CarriedSpec(Table):
+    """Somebody picks the robot up and sets it down further on along its course.
+
+    At ``at_s`` of scene time it is lifted, for ``takes_s`` it moves straight to where it would
+    have been ``skips_s`` later, turned likewise, and drives on from there. Its radars see where
+    it really is; its wheels hang in the air and report nothing.
+    """
+
+    at_s: Seconds
+    skips_s: Seconds
+    takes_s: Seconds = 3.0
+
+
 class PathSpec(Table):
     """A closed course of waypoints driven in laps, turning on the spot.
 
@@ -217,6 +232,7 @@ class PathSpec(Table):
     turn_rate_deg_per_s: Annotated[
         StrictFloat, BeforeValidator(_finite), Field(ge=0.1, le=3600)
     ] = 28.125
+    carried: CarriedSpec | None = None
 
     @field_validator("waypoints_m")
     @classmethod
@@ -242,7 +258,11 @@ class PathSpec(Table):
 
 
 class OdometrySpec(Table):
-    """How the wheels drift: standard deviations of the model in ``emulator.odometry``."""
+    """How the wheels drift: standard deviations of the model in ``emulator.odometry``.
+
+    ``walk_per_sqrt_s`` lets scale, turn scale and curvature wander during a run: by this many of
+    their own standard deviations per square root of a second.
+    """
 
     rate_hz: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0.1, le=1000)] = 5.0
     scale_sigma: Sigma = 0.0
@@ -252,6 +272,7 @@ class OdometrySpec(Table):
     across_sigma_m_per_sqrt_m: Sigma = 0.0
     heading_sigma_rad_per_sqrt_m: Sigma = 0.0
     heading_sigma_rad_per_rad: Sigma = 0.0
+    walk_per_sqrt_s: Sigma = 0.0
 
 
 class NoiseSpec(Table):

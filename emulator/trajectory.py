@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Trajectory", "drive"]
+__all__ = ["Trajectory", "carried", "drive"]
 
 # A turn smaller than this is straight on; a U-turn within it of -180 deg is taken as +180 deg.
 _ANGLE_TOLERANCE_RAD = 1e-9
@@ -31,10 +31,13 @@ class Trajectory:
     knot_poses
         Shape (k, 3), float64: x [m], y [m], heading [rad, counter-clockwise,
         continuous: never wrapped], world frame.
+    carried_ns
+        From when to when the robot is carried and its wheels stand; None where it never is.
     """
 
     knot_times_ns: NDArray[np.int64]
     knot_poses: NDArray[np.float64]
+    carried_ns: tuple[int, int] | None = None
 
     @property
     def duration_ns(self) -> int:
@@ -114,4 +117,43 @@ def drive(
         poses.append((x, y, heading))
     return Trajectory(
         knot_times_ns=np.array(times, dtype=np.int64), knot_poses=np.array(poses, dtype=np.float64)
+    )
+
+
+def carried(path: Trajectory, *, at_ns: int, skips_ns: int, takes_ns: int) -> Trajectory:
+    """Return a path of which a stretch is skipped: the robot is picked up and set down after it.
+
+    Parameters
+    ----------
+    path
+        The drive without the lift.
+    at_ns, skips_ns
+        When it is lifted, and how much of the drive is left out from there.
+    takes_ns
+        Time in the air, moving straight and turning evenly to the other end of the stretch.
+
+    Raises
+    ------
+    ValueError
+        The stretch does not end before the drive does.
+    """
+    down_ns = at_ns + skips_ns
+    if not 0 < at_ns < down_ns < path.duration_ns:
+        raise ValueError(
+            f"the robot is set down {down_ns / 1e9:g} s into a drive of "
+            f"{path.duration_ns / 1e9:g} s, must be before its end"
+        )
+    before, after = path.knot_times_ns < at_ns, path.knot_times_ns > down_ns
+    ends_ns = np.array([at_ns, down_ns], dtype=np.int64)
+    times = (
+        path.knot_times_ns[before],
+        [at_ns, at_ns + takes_ns],
+        path.knot_times_ns[after] + takes_ns - skips_ns,
+    )
+    return Trajectory(
+        knot_times_ns=np.concatenate(times),
+        knot_poses=np.concatenate(
+            (path.knot_poses[before], path.poses(ends_ns), path.knot_poses[after])
+        ),
+        carried_ns=(at_ns, at_ns + takes_ns),
     )

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from emulator.odometry import drift, odometry_times_ns, scene_odometry, scene_truth, tum_line
-from emulator.scene import OdometrySpec, load_scene
+from emulator.scene import CarriedSpec, OdometrySpec, load_scene
 from emulator.trajectory import drive
 from slam.metrics import ate_rmse_m
 
@@ -215,3 +215,43 @@ def test_tum_line_of_a_quarter_turn() -> None:
     assert (stamp, x, y) == ("1.000000005", "1.5", "-0.1")
     assert float(qz) == pytest.approx(math.sqrt(0.5), abs=1e-15)
     assert float(qw) == pytest.approx(math.sqrt(0.5), abs=1e-15)
+
+
+def test_walking_errors_spread_like_a_random_walk_and_leave_the_rest_alone() -> None:
+    """The scale's spread about its start grows by 0.1 of its sigma per root second, to 1."""
+    still = OdometrySpec(rate_hz=4.0, scale_sigma=0.02, along_sigma_m_per_sqrt_m=1e-3)
+    walking = still.model_copy(update={"walk_per_sqrt_s": 0.1})
+    truth = straight(4.0, 400)  # 100 s
+    strayed = []
+    for seed in range(200):
+        steps = [np.diff(drift(truth, model, seed=seed)[:, 0]) for model in (still, walking)]
+        strayed.append((steps[1] - steps[0]) / 0.01 / 0.02)  # in standard deviations
+    walk = np.array(strayed)
+    np.testing.assert_allclose(walk[:, 0], 0.0, atol=1e-9)
+    # 200 seeds know a standard deviation to 5 %
+    np.testing.assert_allclose(walk[:, [100, 200, 399]].std(axis=0), [0.5, 0.707, 1.0], rtol=0.15)
+    increments = np.diff(walk, axis=1)
+    assert increments.std() == pytest.approx(0.05, rel=0.01)
+    assert abs(np.corrcoef(increments[:, 10], increments[:, 11])[0, 1]) < 0.2
+
+
+def test_wheels_do_not_see_that_the_robot_is_carried() -> None:
+    lab = load_scene("lab")
+    there = lab.model_copy(
+        update={
+            "odometry": OdometrySpec(),
+            "path": lab.path.model_copy(
+                update={"carried": CarriedSpec(at_s=60.0, skips_s=100.0, takes_s=3.0)}
+            ),
+        }
+    )
+    driven = lab.trajectory().poses(np.array([60, 160, 170]) * 10**9)
+    true = there.trajectory().poses(np.array([60, 63, 73]) * 10**9)
+    np.testing.assert_allclose(true, driven, atol=1e-12)
+    assert there.trajectory().duration_ns == lab.trajectory().duration_ns - 97 * 10**9
+    lines = scene_odometry(there, 0)
+    wheels = np.array([[float(word) for word in line.split()] for line in lines])
+    at_60, at_63, at_73 = (wheels[np.searchsorted(wheels[:, 0], t)] for t in (60, 63, 73))
+    np.testing.assert_array_equal(at_60[1:], at_63[1:])
+    driven_m = np.hypot(*(driven[2, :2] - driven[1, :2]))
+    assert np.hypot(*(at_73[1:3] - at_63[1:3])) == pytest.approx(driven_m, abs=1e-9)
