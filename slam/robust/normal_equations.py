@@ -89,9 +89,8 @@ class NormalEquations:
             flat = columns[:, j, None] * n_border + columns
             np.add.at(self.C.reshape(-1), flat, by_border[:, j, None] * by_border)
 
-    def add_prior(self, information: Array, away: Array) -> None:
+    def add_prior(self, information: Array, gradient: Array) -> None:
         """Add what is known of the first pose, its calibration, the offsets and landmarks."""
-        gradient = information @ away
         pose, rest = slice(0, 3), slice(BORDER_HEAD, None)
         self.g[0, :3] += gradient[:3]
         self.diagonal[0, :3, :3] += information[pose, pose]

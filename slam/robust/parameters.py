@@ -199,10 +199,12 @@ class MapRule:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RelinearisationRule:
-    """When all poses are solved for again, and how.
+    """When all poses that are kept are solved for again, and how.
 
     Attributes
     ----------
+    most_poses, kept_share
+        When more poses than this are kept, all but this share of it are condensed into a prior.
     turn_rad, shift_m
         How far the filter's pose may part from the stored trajectory.
     every
@@ -213,6 +215,8 @@ class RelinearisationRule:
         Ranges further off than this are left out from that iteration on.
     """
 
+    most_poses: int = 3000
+    kept_share: float = 0.67
     turn_rad: float = 0.02
     shift_m: float = 0.04
     every: int = 20

@@ -37,10 +37,12 @@ class Estimate:
 class Prior:
     """What is known beforehand of the first pose, its calibration, the offsets and landmarks.
 
-    ``information`` has shape (6 + r + 2 n,) squared in that order, about ``mean``.
+    A quadratic ``e^T information e + 2 gradient^T e`` in right-invariant errors e from ``mean``
+    (module ``prior``), all of size 6 + r + 2 n in that order.
     """
 
     information: Array
+    gradient: Array
     mean: Array
 
 
@@ -87,6 +89,27 @@ class Problem:
         """Tell whether the calibration has one value per pose."""
         return bool(np.any(self.walks > 0.0))
 
+    def beginning(self, n_steps: int) -> Problem:
+        """Return what was measured before pose ``n_steps``, and the steps up to it."""
+        ranges = self.range_poses < n_steps
+        points = self.point_poses < n_steps
+        return Problem(
+            increments=self.increments[:n_steps],
+            covariances=self.covariances[:n_steps],
+            walks=self.walks[:n_steps],
+            prior=self.prior,
+            range_poses=self.range_poses[ranges],
+            range_radars=self.range_radars[ranges],
+            range_landmarks=self.range_landmarks[ranges],
+            range_antennas=self.range_antennas[ranges],
+            ranges_m=self.ranges_m[ranges],
+            range_sigma_m=self.range_sigma_m,
+            point_poses=self.point_poses[points],
+            point_landmarks=self.point_landmarks[points],
+            points=self.points[points],
+            point_roots=self.point_roots[points],
+        )
+
 
 def start_prior(
     calibration_sigmas: tuple[float, float, float],
@@ -101,4 +124,4 @@ def start_prior(
     size = len(sigmas) + 2 * n_landmarks
     information = np.zeros((size, size))
     np.fill_diagonal(information[: len(sigmas), : len(sigmas)], sigmas**-2.0)
-    return Prior(information=information, mean=np.zeros(size))
+    return Prior(information=information, gradient=np.zeros(size), mean=np.zeros(size))

@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 
 import numpy as np
 
 from slam.robust.parameters import BackEndParameters
 from slam.robust.problem import start_prior
 from slam.robust.run_log import RunLog
-from slam.robust.smoother import Smoother
+from slam.robust.smoother import Smoother, Solution
 from slam.robust.state import HEADING, State
 from slam.robust.symmetric import Array, SymmetricMatrix
 
 
 def is_due(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
-    """Tell whether the filter's pose has parted from the stored trajectory by too much."""
+    """Tell whether the pose has parted too far from the stored trajectory, or that is too long."""
     rule = parameters.relinearisation
-    if rule is None or not state.landmark_ids or log.since_solved < rule.every:
+    if rule is None:
+        return False
+    if log.since_solved < rule.every:
+        return False
+    if log.n_kept > rule.most_poses:
+        return True
+    if not state.landmark_ids:
         return False
     shift_m, turn_rad = log.parted(state.pose)
     return turn_rad > rule.turn_rad or shift_m > rule.shift_m
@@ -38,8 +45,21 @@ def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> boo
     smoother = Smoother(problem, rule)
     start = min(log.starts(state, problem), key=smoother.cost)
     solution = smoother.solve(start)
-    if solution is None:
-        return False
+    if solution is not None:
+        _replace(state, solution)
+        log.solved(solution.estimate)
+    if log.n_kept > rule.most_poses:
+        # Best at the solution; but the log must not grow, not even where there is none.
+        known = start if solution is None else solution.estimate
+        n_steps = log.n_kept - math.ceil(rule.kept_share * rule.most_poses)
+        with suppress(np.linalg.LinAlgError):  # then it is tried again a little later
+            prior = smoother.condensed(known, n_steps, rule.outlier_sigmas)
+            log.condense(prior, state.landmark_ids, n_steps)
+    return solution is not None
+
+
+def _replace(state: State, solution: Solution) -> None:
+    """Let a solution take the place of the belief."""
     estimate = solution.estimate
     pose = estimate.poses[-1]
     state.position_m = pose[:2].copy()
@@ -48,8 +68,6 @@ def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> boo
     state.offsets_m = estimate.offsets_m.copy()
     state.landmarks_m = estimate.landmarks_m.copy()
     state.P = SymmetricMatrix(invariant_covariance(state, solution.information))
-    log.solved(estimate)
-    return True
 
 
 def invariant_covariance(state: State, information: Array) -> Array:

@@ -1,12 +1,18 @@
-"""What was measured and used so far: the material of a solution over all poses."""
+"""What was measured and used so far: the material of a solution over all poses.
+
+Of a long run the last poses are kept; what the older ones told is a prior on the first pose kept,
+the calibration, the offsets and the landmarks (module ``condensed``).
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from slam.geometry import wrap_angle
+from slam.robust.condensed import Condensed
 from slam.robust.motion import calibrated_motion
 from slam.robust.parameters import WheelNoise
 from slam.robust.problem import Estimate, Prior, Problem
@@ -22,6 +28,14 @@ class _Ranges:
     antennas: list[tuple[float, float]] = field(default_factory=list)
     ranges_m: list[float] = field(default_factory=list)
 
+    def keep(self, at: Sequence[int]) -> None:
+        """Drop all rows but some."""
+        self.poses = [self.poses[i] for i in at]
+        self.radars = [self.radars[i] for i in at]
+        self.landmarks = [self.landmarks[i] for i in at]
+        self.antennas = [self.antennas[i] for i in at]
+        self.ranges_m = [self.ranges_m[i] for i in at]
+
 
 @dataclass(slots=True)
 class _Points:
@@ -29,6 +43,13 @@ class _Points:
     landmarks: list[int] = field(default_factory=list)
     points: list[Array] = field(default_factory=list)
     roots: list[Array] = field(default_factory=list)
+
+    def keep(self, at: Sequence[int]) -> None:
+        """Drop all rows but some."""
+        self.poses = [self.poses[i] for i in at]
+        self.landmarks = [self.landmarks[i] for i in at]
+        self.points = [self.points[i] for i in at]
+        self.roots = [self.roots[i] for i in at]
 
 
 class RunLog:
@@ -44,6 +65,8 @@ class RunLog:
 
     def __init__(self, wheels: WheelNoise) -> None:
         self._wheels = wheels
+        self._first = 0
+        self._condensed: Condensed | None = None
         self._increments: list[Array] = []
         self._covariances: list[Array] = []
         self._walks: list[float] = []
@@ -57,7 +80,12 @@ class RunLog:
 
     @property
     def n_poses(self) -> int:
-        """Return the number of poses, the first included."""
+        """Return the number of poses so far, the first included."""
+        return self._first + len(self._causal)
+
+    @property
+    def n_kept(self) -> int:
+        """Return the number of poses that are still kept one by one."""
         return len(self._causal)
 
     def add_motion(
@@ -92,7 +120,7 @@ class RunLog:
     def add_range(
         self, pose: int, radar: int, landmark_id: int, antenna: tuple[float, float], range_m: float
     ) -> None:
-        """Append a range used; ``antenna`` is in the body frame of the pose."""
+        """Append a range used; ``antenna`` is in the body frame of the pose, which is kept."""
         ranges = self._ranges
         ranges.poses.append(pose)
         ranges.radars.append(radar)
@@ -111,13 +139,25 @@ class RunLog:
     def rename(self, gone: int, kept: int) -> None:
         """Let all of one landmark's measurements be of another."""
         self._names[gone] = kept
+        if self._condensed is not None:
+            self._condensed.rename(gone, kept)
 
     def drop(self, landmark_id: int) -> None:
-        """Leave all of a landmark's measurements out from now on."""
+        """Leave all of a landmark's measurements out from now on.
+
+        What condensed poses measured of it cannot be told apart any more: it is marginalised.
+        """
         self._names[landmark_id] = None
+        if self._condensed is not None:
+            self._condensed.drop(landmark_id)
 
     def problem(self, state: State, prior: Prior, range_sigma_m: float) -> Problem:
-        """Return all that was measured of the landmarks the state has now."""
+        """Return all that was measured of the landmarks the state has now.
+
+        ``prior`` is that of the start, which condensed poses have in them already.
+        """
+        if self._condensed is not None:
+            prior = self._condensed.of(state.landmark_ids)
         rows = {id_: row for row, id_ in enumerate(state.landmark_ids)}
         ranges, points = self._ranges, self._points
         of_range = self._rows_of(ranges.landmarks, rows)
@@ -125,17 +165,17 @@ class RunLog:
         used, used_points = np.flatnonzero(of_range >= 0), np.flatnonzero(of_point >= 0)
         sigmas = np.square(self._wheels.calibration_sigmas)
         return Problem(
-            increments=np.array(self._increments),
-            covariances=np.array(self._covariances),
+            increments=np.array(self._increments).reshape(-1, 3),
+            covariances=np.array(self._covariances).reshape(-1, 3, 3),
             walks=np.array(self._walks)[:, None] * sigmas,
             prior=prior,
-            range_poses=np.array(ranges.poses, dtype=np.intp)[used],
+            range_poses=np.array(ranges.poses, dtype=np.intp)[used] - self._first,
             range_radars=np.array(ranges.radars, dtype=np.intp)[used],
             range_landmarks=of_range[used],
             range_antennas=np.array(ranges.antennas).reshape(-1, 2)[used],
             ranges_m=np.array(ranges.ranges_m)[used],
             range_sigma_m=range_sigma_m,
-            point_poses=np.array(points.poses, dtype=np.intp)[used_points],
+            point_poses=np.array(points.poses, dtype=np.intp)[used_points] - self._first,
             point_landmarks=of_point[used_points],
             points=np.array(points.points).reshape(-1, 2)[used_points],
             point_roots=np.array(points.roots).reshape(-1, 2, 2)[used_points],
@@ -149,7 +189,7 @@ class RunLog:
         """
         shape = (len(self._causal), 3) if problem.is_walking else (1, 3)
         calibration = np.broadcast_to(state.calibration, shape).copy()
-        chained = _chain(problem.increments, state.calibration)
+        chained = _chain(self._causal[0], problem.increments, state.calibration)
         common = {
             "calibration": calibration,
             "offsets_m": state.offsets_m.copy(),
@@ -167,6 +207,24 @@ class RunLog:
         self._causal = list(estimate.poses)
         self._stored_pose = estimate.poses[-1].copy()
         self._since_solved = 0
+
+    def condense(self, prior: Prior, landmark_ids: Sequence[int], n_steps: int) -> None:
+        """Forget the first ``n_steps`` poses kept; ``prior`` is all they told.
+
+        Its landmarks are those of ``landmark_ids``, the map of now. Measurements of landmarks that
+        are gone go with it, and so do old names.
+        """
+        self._condensed = Condensed(prior, landmark_ids)
+        self._first += n_steps
+        for kept in (self._increments, self._covariances, self._walks, self._causal):
+            del kept[:n_steps]
+        rows = {id_: id_ for id_ in landmark_ids}
+        for table in (self._ranges, self._points):
+            names = self._rows_of(table.landmarks, rows)
+            stay = np.flatnonzero((names >= 0) & (np.array(table.poses) >= self._first)).tolist()
+            table.landmarks = names.tolist()
+            table.keep(stay)
+        self._names.clear()
 
     def _rows_of(
         self, ids: list[int], rows: dict[int, int]
@@ -187,13 +245,13 @@ def _step(pose: Array, increment: Array, calibration: Array, wheels: WheelNoise)
     return np.array([moved[0], moved[1], wrap_angle(float(pose[2]) + motion.turn_rad)])
 
 
-def _chain(increments: Array, calibration: Array) -> Array:
-    """Return the poses that calibrated increments lead through from the origin."""
+def _chain(first: Array, increments: Array, calibration: Array) -> Array:
+    """Return the poses that calibrated increments lead through from the first one, (3,)."""
     s, w, kappa = calibration
     d = increments[:, :2] / (1.0 + s)
     a = (increments[:, 2] - kappa * np.hypot(d[:, 0], d[:, 1])) / (1.0 + w)
-    heading = np.concatenate([[0.0], np.cumsum(a)])
+    heading = first[2] + np.concatenate([[0.0], np.cumsum(a)])
     c, sn = np.cos(heading[:-1]), np.sin(heading[:-1])
-    x = np.concatenate([[0.0], np.cumsum(c * d[:, 0] - sn * d[:, 1])])
-    y = np.concatenate([[0.0], np.cumsum(sn * d[:, 0] + c * d[:, 1])])
+    x = first[0] + np.concatenate([[0.0], np.cumsum(c * d[:, 0] - sn * d[:, 1])])
+    y = first[1] + np.concatenate([[0.0], np.cumsum(sn * d[:, 0] + c * d[:, 1])])
     return np.column_stack([x, y, heading])

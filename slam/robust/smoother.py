@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam.geometry import wrap_angles
 from slam.robust.normal_equations import (
     BORDER_HEAD,
     CALIBRATION,
@@ -26,7 +25,8 @@ from slam.robust.normal_equations import (
     solve,
 )
 from slam.robust.parameters import RelinearisationRule
-from slam.robust.problem import Estimate, Problem
+from slam.robust.prior import first_values, prior_about, prior_cost, prior_terms
+from slam.robust.problem import Estimate, Prior, Problem
 from slam.robust.residuals import measurement_residuals, motion_residuals
 from slam.robust.symmetric import Array
 
@@ -38,7 +38,8 @@ class Solution:
     """The least-squares estimate and what is left to know.
 
     ``information`` is the Schur complement on (last pose, its calibration, offsets, landmarks),
-    additive errors, shape (6 + r + 2 n,) squared; ``cost`` the sum of squared white residuals.
+    additive errors, shape (6 + r + 2 n,) squared; ``cost`` the sum of squared white residuals,
+    counted from where the prior was taken.
     """
 
     estimate: Estimate
@@ -108,19 +109,36 @@ class Smoother:
         total += float(np.sum(steps.residual**2))
         walk = self._walk_residual(estimate)
         total += float(np.sum(walk**2))
-        away = self._from_prior(estimate)
-        return total + float(away @ self._problem.prior.information @ away)
+        n_offsets = len(estimate.offsets_m)
+        return total + prior_cost(self._problem.prior, first_values(estimate), n_offsets)
 
-    def _from_prior(self, estimate: Estimate) -> Array:
-        parts = (
-            estimate.poses[0],
-            estimate.calibration[0],
-            estimate.offsets_m,
-            estimate.landmarks_m.ravel(),
+    def condensed(self, estimate: Estimate, n_steps: int, limit: float) -> Prior:
+        """Return all that the poses before pose ``n_steps`` tell, as a prior on what is left.
+
+        What lies beyond ``limit`` is left out. With the prior in place of the first ``n_steps``
+        steps and of the measurements from their poses, the normal equations at this estimate have
+        the same Schur complement: nothing is lost there, and nothing counts twice.
+        """
+        part = Smoother(self._problem.beginning(n_steps), self._rule)
+        calibration = estimate.calibration
+        if len(calibration) > 1:
+            calibration = calibration[: n_steps + 1]
+        beginning = Estimate(
+            poses=estimate.poses[: n_steps + 1],
+            calibration=calibration,
+            offsets_m=estimate.offsets_m,
+            landmarks_m=estimate.landmarks_m,
         )
-        away: Array = np.concatenate(parts) - self._problem.prior.mean
-        away[2] = wrap_angles(away[2])
-        return away
+        left = eliminate(part._equations(beginning, limit))
+        values = first_values(
+            Estimate(
+                poses=beginning.poses[-1:],
+                calibration=calibration[-1:],
+                offsets_m=estimate.offsets_m,
+                landmarks_m=estimate.landmarks_m,
+            )
+        )
+        return prior_about(left.information, left.gradient, values, len(estimate.offsets_m))
 
     def _walk_residual(self, estimate: Estimate) -> Array:
         if len(estimate.calibration) == 1:
@@ -140,8 +158,9 @@ class Smoother:
         rows = measurement_residuals(self._problem, estimate)
         weight = np.abs(rows.residual) <= limit
         equations.add_rows(rows, weight, len(estimate.offsets_m))
-        away = self._from_prior(estimate)
-        equations.add_prior(problem.prior.information, away)
+        n_offsets = len(estimate.offsets_m)
+        prior = prior_terms(problem.prior, first_values(estimate), n_offsets)
+        equations.add_prior(prior.information, prior.gradient)
         return equations
 
 
