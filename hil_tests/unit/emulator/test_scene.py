@@ -97,7 +97,10 @@ def test_a_scene_is_frozen() -> None:
             GOOD + "[path.carried]\nat_s = 1.0\nskips_s = 2.0\n",
             ["path.carried: the robot is set down 3 s into a drive of 0 s"],
         ),
-        (GOOD + "[path.carried]\nat = 1.0\n", ["path.carried.at", "unknown key", "skips_s"]),
+        (
+            GOOD + "[path.carried]\nat_s = 1.0\nskips_s = 2.0\nfor_s = 1.0\n",
+            ["path.carried.for_s", "unknown key", "takes_s"],
+        ),
         (GOOD + "[path]\nspeed_mps = 1e400\n", ["path.speed_mps", "must be a finite number"]),
         (GOOD + f"[path]\nspeed_mps = 1{'0' * 400}\n", ["path.speed_mps"]),
         (GOOD + f"[path]\nspeed_mps = 1{'0' * 5000}\n", ["not valid TOML"]),
