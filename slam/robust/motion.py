@@ -8,7 +8,7 @@ With the reported increment (ux, uy, ua) and the state's (s, w, kappa)::
 and to first order, with J = [0, -1; 1, 0], heading noise n_a and step noise n_d::
 
     q      = kappa D / ((1 + s)(1 + w)) e_s - a / (1 + w) e_w - D / (1 + w) e_kappa + n_a
-    e_th  += q,   e_p += -J p' q - R d / (1 + s) e_s + R n_d,   e_l += -J l q.
+    e_th  += q,   e_p += -J p' q - R d / (1 + s) e_s + R n_d,   e_l += -J l q,   e_phi -= q.
 
 That is the identity, two rows and a change of rank two: O(m^2), in place.
 """
@@ -102,7 +102,7 @@ def predict(state: State, motion: Motion, wheels: WheelNoise) -> None:
     direction = np.zeros(P.size)
     direction[HEADING] = 1.0
     direction[POSITION] = -quarter_turn(state.position_m)
-    direction[state.offsets.stop :] = -quarter_turn(state.landmarks_m).ravel()
+    direction[state.offsets.stop :] = -state.turned_features().ravel()
     along = head[:, 2:] @ gains
     along[POSITION] += by_scale * along[CALIBRATION.start]
     variance = float(gains @ along[CALIBRATION]) + float(motion.covariance[2, 2])

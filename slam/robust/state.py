@@ -4,10 +4,12 @@ The map frame is the body frame at the start. The state holds the heading theta,
 the calibration errors (s, w, kappa) of the wheels, one range offset b per radar, and landmarks l.
 Errors, in the order of the covariance P::
 
-    [e_th, e_p (2), e_s, e_w, e_kappa, e_b (one per radar), e_l0 (2), e_l1 (2), ...]
+    [e_th, e_p (2), e_s, e_w, e_kappa, e_b (one per radar), e_l0 (2), e_l1 (2), ..., e_w0 (2), ...]
     theta = theta^ + e_th,   p = Rot(e_th) p^ + V(e_th) e_p,   l = Rot(e_th) l^ + V(e_th) e_l,
+    phi = phi^ + e_th + e_phi,   d = d^ + e_d,
 
-all others additive. An error of the heading thus turns the whole map with the robot, which ranges
+all others additive; (phi, d) is a wall, the line n . x = d with n = [cos phi, sin phi] away from
+the robot. An error of the heading thus turns the whole map with the robot, which ranges
 cannot see: the linearised filter keeps the three unobservable directions of SLAM whatever the
 estimate does. Sources: Barrau and Bonnabel, "An EKF-SLAM algorithm with consistency properties",
 2015 (arXiv 1510.06263); Zhang, Wu, Song, Huang, Dissanayake, IEEE RA-L 2(2), 2017.
@@ -74,8 +76,12 @@ class State:
         shape (n, 2), map frame.
     landmark_ids
         n ids in row order; an id is never used twice.
+    walls
+        shape (w, 2): phi [rad], not wrapped, and d [m], map frame.
+    wall_ids
+        w ids in row order, of the same numbers as the landmarks'.
     P
-        Covariance of the errors, size 6 + r + 2 n.
+        Covariance of the errors, size 6 + r + 2 (n + w).
     """
 
     __slots__ = (
@@ -87,6 +93,8 @@ class State:
         "next_id",
         "offsets_m",
         "position_m",
+        "wall_ids",
+        "walls",
     )
 
     def __init__(
@@ -98,6 +106,8 @@ class State:
         self.offsets_m: Array = np.zeros(len(offset_sigmas_m))
         self.landmarks_m: Array = np.zeros((0, 2))
         self.landmark_ids: list[int] = []
+        self.walls: Array = np.zeros((0, 2))
+        self.wall_ids: list[int] = []
         self.next_id = 0
         sigmas = [0.0, 0.0, 0.0, *calibration_sigmas, *offset_sigmas_m]
         self.P = SymmetricMatrix(np.diag(np.square(sigmas)))
@@ -112,8 +122,18 @@ class State:
         """Return where the range offsets lie in the error."""
         return slice(HEAD_SIZE, HEAD_SIZE + len(self.offsets_m))
 
+    @property
+    def feature_ids(self) -> list[int]:
+        """Return the ids of landmarks and walls in the order of their columns."""
+        return self.landmark_ids + self.wall_ids
+
+    @property
+    def features(self) -> Array:
+        """Return landmarks and walls in the order of their columns, shape (n + w, 2)."""
+        return np.vstack([self.landmarks_m, self.walls])
+
     def landmark_columns(self, rows: NDArray[np.intp]) -> Indices:
-        """Return where landmarks lie in the error, shape (2 k,)."""
+        """Return where landmarks lie in the error, shape (2 k,); walls are the rows from n on."""
         first = self.offsets.stop + 2 * rows
         return np.stack([first, first + 1], axis=-1).ravel()
 
@@ -126,7 +146,9 @@ class State:
         self.calibration = self.calibration + error[CALIBRATION]
         self.offsets_m = self.offsets_m + error[self.offsets]
         shifts = error[self.offsets.stop :].reshape(-1, 2)
-        self.landmarks_m = self.landmarks_m @ turn.T + shifts @ V.T
+        n = len(self.landmarks_m)
+        self.landmarks_m = self.landmarks_m @ turn.T + shifts[:n] @ V.T
+        self.walls = self.walls + shifts[n:] + [angle, 0.0]
 
     def update(self, at: Indices, H: Array, residual: Array, R: Array) -> tuple[float, Array]:
         """Correct mean and covariance with k measurements, ``residual = z - h``.
@@ -164,18 +186,40 @@ class State:
     def augment(self, point_m: Array, cross: Array, corner: Array) -> int:
         """Append a landmark and return its id; ``cross`` (m, 2), ``corner`` (2, 2)."""
         self.P.grow(cross, corner)
+        if self.wall_ids:
+            self._move_last_before_walls()
         self.landmarks_m = np.vstack([self.landmarks_m, point_m])
         landmark_id = self.next_id
         self.landmark_ids.append(landmark_id)
         self.next_id += 1
         return landmark_id
 
+    def augment_wall(self, wall: Array, cross: Array, corner: Array) -> int:
+        """Append a wall (phi, d) and return its id; ``cross`` (m, 2), ``corner`` (2, 2)."""
+        self.P.grow(cross, corner)
+        self.walls = np.vstack([self.walls, wall])
+        wall_id = self.next_id
+        self.wall_ids.append(wall_id)
+        self.next_id += 1
+        return wall_id
+
+    def _move_last_before_walls(self) -> None:
+        m, n_walls = self.P.size, 2 * len(self.wall_ids)
+        order = np.arange(m)
+        order[m - n_walls - 2 :] = np.roll(order[m - n_walls - 2 :], 2)
+        self.P = SymmetricMatrix(self.P.full()[np.ix_(order, order)])
+
     def remove(self, row: int) -> None:
-        """Marginalise a landmark; the covariance of the rest stays bit for bit."""
+        """Marginalise a landmark, or a wall; the covariance of the rest stays bit for bit."""
         first = self.offsets.stop + 2 * row
         self.P.keep(np.delete(np.arange(self.P.size), [first, first + 1]))
-        self.landmarks_m = np.delete(self.landmarks_m, row, axis=0)
-        del self.landmark_ids[row]
+        n = len(self.landmark_ids)
+        if row < n:
+            self.landmarks_m = np.delete(self.landmarks_m, row, axis=0)
+            del self.landmark_ids[row]
+        else:
+            self.walls = np.delete(self.walls, row - n, axis=0)
+            del self.wall_ids[row - n]
 
     def pose_covariance(self) -> Array:
         """Return the covariance of [x, y, heading] with additive errors, shape (3, 3).
@@ -198,5 +242,11 @@ class State:
         """Return T with e_additive = T e, shape (m, m), at the present mean."""
         T = np.eye(self.P.size)
         T[POSITION, HEADING] = quarter_turn(self.position_m)
-        T[self.offsets.stop :, HEADING] = quarter_turn(self.landmarks_m).ravel()
+        T[self.offsets.stop :, HEADING] = self.turned_features().ravel()
         return T
+
+    def turned_features(self) -> Array:
+        """Return d(landmark, wall) / d(heading) as the whole map turns, shape (n + w, 2)."""
+        walls = np.zeros_like(self.walls)
+        walls[:, 0] = 1.0
+        return np.vstack([quarter_turn(self.landmarks_m), walls])
