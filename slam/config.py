@@ -53,6 +53,13 @@ class PeakPosition(StrEnum):
     PARABOLA = "parabola"  # vertex through the maximum and its neighbours
 
 
+class BackEnd(StrEnum):
+    """What makes pose and map of detections."""
+
+    PAPER = "paper"  # as printed: fixes of pairs, DBSCAN, EKF SLAM
+    ROBUST = "robust"  # ranges one by one, calibration states, relinearisation: slam/robust
+
+
 class SampleTime(StrEnum):
     """From where the robot is taken to have looked when an echo was received."""
 
@@ -287,6 +294,32 @@ class AssociationConfig(_Model):
         return -2.0 * math.log1p(-self.gate)
 
 
+class RobustConfig(_Model):
+    """What the robust back end is told of the radars; the wheels' errors come with the robot.
+
+    Limits of range are those of ``detection``; the window's rules say when a state is collected.
+    """
+
+    # Full opening angle within which the front end finds what is there, wider than -3 dB.
+    field_of_view_deg: Annotated[float, Field(gt=0, lt=180)] = 65.0
+    # Standard deviation of a range; 0 takes what the front end predicts for each echo.
+    range_sigma_m: NonNegative = 0.0
+    # What the front end's own prediction leaves out, added in squares: aspect, clutter, timing.
+    range_floor_m: NonNegative = 2.5e-3
+    # Standard deviation of each radar's unknown constant range offset.
+    offset_sigma_m: NonNegative = 0.0
+    detection_probability: Annotated[float, Field(gt=0, lt=1)] = 0.95
+    # Ranges of nothing that stands there, per radar and frame.
+    false_ranges_per_frame: Positive = 0.05
+    # How far the wheels' calibration wanders per root of a metre, in its standard deviations.
+    wheel_walk_per_sqrt_m: NonNegative = 0.0
+
+    @property
+    def field_of_view_rad(self) -> float:
+        """Return the opening angle in radians."""
+        return math.radians(self.field_of_view_deg)
+
+
 class SlamConfig(_Model):
     """Everything one run of the pipeline is told."""
 
@@ -299,3 +332,5 @@ class SlamConfig(_Model):
     motion: MotionConfig = MotionConfig()
     observation: ObservationConfig = ObservationConfig()
     association: AssociationConfig = AssociationConfig()
+    robust: RobustConfig = RobustConfig()
+    back_end: BackEnd = BackEnd.PAPER

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +18,13 @@ from slam.ekf_slam import Belief, motion_noise, predict, start
 from slam.frames import RadarFrame
 from slam.geometry import Rig, between
 from slam.pulse_model import PulseModel
+from slam.robust.reports import UpdateReport
 from slam.trilateration import NO_MOTIONS, Fix, Trilaterator
 from slam.window import CollectedState, has_moved
 
 Array = NDArray[np.float64]
+
+_NIS_DOF = 2
 
 PoseAt = Callable[[int], Array]
 """Odometry pose at a session time [ns]: shape (3,), [x m, y m, heading rad], odometry frame."""
@@ -33,7 +37,7 @@ class StepResult:
     Attributes
     ----------
     t_ns
-        Session time of the state, window - 1 states before the newest one.
+        Session time of the state; under the paper's window - 1 states before the newest one.
     odometry_pose
         shape (3,), what odometry said there, odometry frame.
     belief
@@ -44,21 +48,53 @@ class StepResult:
         What the outlier filter let through, and what became of each.
     rejected
         Fixes of this state that no cluster confirmed.
+    report
+        What the robust back end made of the detections; it has no fixes nor observations.
     """
 
     t_ns: int
     odometry_pose: Array
     belief: Belief
     detections: tuple[Detection, ...]
-    fixes: tuple[Fix, ...]
-    observations: tuple[Observation, ...]
-    associations: tuple[Association, ...]
-    rejected: tuple[Fix, ...]
+    fixes: tuple[Fix, ...] = ()
+    observations: tuple[Observation, ...] = ()
+    associations: tuple[Association, ...] = ()
+    rejected: tuple[Fix, ...] = ()
+    report: UpdateReport | None = None
 
     @property
     def nis(self) -> tuple[float, ...]:
         """Return the normalised innovation squared (2 dof) of each landmark seen again."""
         return tuple(a.nis for a in self.associations if a.nis is not None)
+
+    @property
+    def nis_per_dof(self) -> tuple[float, ...]:
+        """Return the same over its degrees of freedom; of a report, that of all ranges together."""
+        if self.report is not None:
+            return (self.report.nis / self.report.dof,) if self.report.dof else ()
+        return tuple(nis / _NIS_DOF for nis in self.nis)
+
+
+class Slam(Protocol):
+    """What runs a session: the paper's pipeline or the robust one."""
+
+    config: SlamConfig
+
+    def step(
+        self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
+    ) -> tuple[StepResult, ...]:
+        """Take in what sensors say around one time; return the states that became ready."""
+        ...
+
+    def step_detections(
+        self, detections: Sequence[Detection], pose_at: PoseAt, t_ns: int
+    ) -> tuple[StepResult, ...]:
+        """Do what ``step`` does, from ranges that some other front end found."""
+        ...
+
+    def flush(self) -> tuple[StepResult, ...]:
+        """Return the states still held back at the end of a run."""
+        ...
 
 
 class UwbRadarSlam:

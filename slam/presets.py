@@ -55,13 +55,16 @@ def config_from_tables(
         The parsed file: one table per part of SlamConfig, and ``environment.<name>`` with the
         values that differ there.
     environment
-        "lab" is the top level itself; any other name must have its table. The tables of all
-        environments are checked, whichever is asked for.
+        "lab" is the top level itself; any other name must have its table, unless the file has
+        none at all and so is the same everywhere. The tables of all environments are checked,
+        whichever is asked for.
     source
         What to call the tables in an error message.
     """
     base = {key: value for key, value in tables.items() if key != "environment"}
     overrides = _table(tables.get("environment", {}), "environment", source)
+    if "environment" not in tables:
+        return _validated(base, source)
     if environment != BASE_ENVIRONMENT and environment not in overrides:
         allowed = ", ".join([BASE_ENVIRONMENT, *sorted(overrides)])
         raise ConfigError(f"{source}: no environment {environment!r}; known: {allowed}")
@@ -85,6 +88,9 @@ def override(config: SlamConfig, settings: Mapping[str, object]) -> SlamConfig:
     tables = config.model_dump()
     for key, value in settings.items():
         part, _, field = key.partition(".")
+        if key in tables and not isinstance(tables[key], dict):
+            tables[key] = value
+            continue
         tables.setdefault(part, {})
         if not isinstance(tables[part], dict) or not field:
             raise ConfigError(f"setting {key!r}: write it as part.key; parts: {_parts()}")

@@ -21,6 +21,7 @@ from slam.app.emulated_rig import (
     scene_and_config,
     true_landmarks_m,
     versions,
+    wheels_of,
 )
 from slam.app.emulator_process import EmulatorProcess
 from slam.app.errors import AppError, EmulatorError, RadarSilentError, naming
@@ -36,7 +37,7 @@ from slam.app.session_log import SessionLog
 from slam.app.stop import StopFlag, StopRequestedError
 from slam.app.tum import Trajectory, write_tum
 from slam.config import SlamConfig
-from slam.pipeline import UwbRadarSlam
+from slam.robust_pipeline import make_slam
 
 OUTPUTS = (
     "session.mcap",
@@ -118,7 +119,7 @@ def _run(options: DemoOptions, scene: Scene, config: SlamConfig, stop: StopFlag)
         stack.callback(progress.close)
         observers += [log, view, progress]
         link_log.attach(log, view, progress)
-        slam = UwbRadarSlam(config, rig)
+        slam = make_slam(config, rig, wheels_of(scene))
         with _saying_what_is_left(kept), source:  # closed before the logs, for its last words
             scans = source.scans(end_counter(trajectory.duration_ns), stop.check)
             try:

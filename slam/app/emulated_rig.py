@@ -24,6 +24,7 @@ from slam.app.tum import NS_PER_S
 from slam.config import SlamConfig
 from slam.geometry import Mount, Rig
 from slam.presets import ConfigError, load_preset
+from slam.robust.parameters import WheelNoise
 from xethru_protocol.driver import X4M300, ProtocolRecord, RawConfig
 from xethru_protocol.errors import XeThruError
 from xethru_protocol.x4 import real_frame_rate
@@ -69,6 +70,23 @@ def rig_of(scene: Scene) -> Rig:
             )
             for radar in scene.radars
         )
+    )
+
+
+def wheels_of(scene: Scene) -> WheelNoise:
+    """Return how the robot's odometry errs, from its specification in the scene file.
+
+    Standard deviations, as a data sheet gives them; what was drawn for a run stays unknown.
+    """
+    spec = scene.odometry
+    return WheelNoise(
+        along_m_per_sqrt_m=spec.along_sigma_m_per_sqrt_m,
+        across_m_per_sqrt_m=spec.across_sigma_m_per_sqrt_m,
+        heading_rad_per_sqrt_m=spec.heading_sigma_rad_per_sqrt_m,
+        heading_rad_per_rad=spec.heading_sigma_rad_per_rad,
+        scale_sigma=spec.scale_sigma,
+        turn_scale_sigma=spec.turn_scale_sigma,
+        curvature_sigma_rad_per_m=spec.curvature_sigma_rad_per_m,
     )
 
 

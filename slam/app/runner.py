@@ -12,12 +12,10 @@ from threadpoolctl import threadpool_limits
 
 from slam.app.odometry import OdometryTrack
 from slam.app.session import Scan, SessionObserver, Snapshot
-from slam.pipeline import StepResult, UwbRadarSlam
+from slam.pipeline import Slam, StepResult
 
 TruthAt = Callable[[NDArray[np.int64]], NDArray[np.float64]]
 """True poses, shape (n, 3), world frame, at n session times [ns]."""
-
-_NIS_DOF = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -47,7 +45,7 @@ class RunRecord:
 def run_slam(
     scans: Iterable[Scan],
     odometry: OdometryTrack,
-    slam: UwbRadarSlam,
+    slam: Slam,
     truth_at: TruthAt,
     observers: Sequence[SessionObserver] = (),
 ) -> RunRecord:
@@ -121,5 +119,5 @@ def make_snapshot(
         landmark_covariances_m2=np.array([belief.landmark_covariance(row) for row in rows]).reshape(
             -1, 2, 2
         ),
-        nis_per_dof=tuple(nis / _NIS_DOF for nis in result.nis),
+        nis_per_dof=result.nis_per_dof,
     )

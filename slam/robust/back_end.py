@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from slam.geometry import Rig
 from slam.robust.births import BodyPoint, give_birth, match, update_with_point
-from slam.robust.continuation import Continuation, continue_tracks, sure_landmarks
+from slam.robust.continuation import (
+    Continuation,
+    SureLandmarks,
+    continue_tracks,
+    sure_landmarks,
+)
 from slam.robust.existence import Existence
 from slam.robust.leftovers import Leftovers
 from slam.robust.merging import apply_merge, find_merge
@@ -18,8 +22,9 @@ from slam.robust.parameters import BackEndParameters, PointRule
 from slam.robust.points import RangeBearing, assign, range_bearing_rows
 from slam.robust.ranges import Antennas, RangeScan, View, antennas_of, rows_of, sides_of, view
 from slam.robust.relinearisation import is_due, relinearise
+from slam.robust.reports import ExpectedRange, MapLandmark, UpdateReport
 from slam.robust.run_log import RunLog
-from slam.robust.state import State
+from slam.robust.state import State, rotation
 from slam.robust.symmetric import Array
 from slam.robust.tracklets import (
     Tracker,
@@ -28,47 +33,6 @@ from slam.robust.tracklets import (
     pair_guesses,
     single_guesses,
 )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MapLandmark:
-    """One landmark of the map: id, position (2,) [m], covariance (2, 2), frames that hit it."""
-
-    landmark_id: int
-    position_m: Array
-    covariance: Array
-    hits: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class UpdateReport:
-    """What became of the ranges of one time.
-
-    Attributes
-    ----------
-    continued
-        (radar, index of the range in its scan, landmark id).
-    born, seen_again
-        Ids of landmarks that tracklets made, or were recognised as.
-    merged
-        (kept, gone) ids.
-    deleted
-        Ids.
-    nis, dof
-        Normalised innovation squared of the ranges that continued tracks, and its degrees of
-        freedom.
-    relinearised
-        Whether all poses were solved for.
-    """
-
-    continued: tuple[tuple[int, int, int], ...]
-    born: tuple[int, ...]
-    seen_again: tuple[int, ...]
-    merged: tuple[tuple[int, int], ...]
-    deleted: tuple[int, ...]
-    nis: float
-    dof: int
-    relinearised: bool
 
 
 class RobustBackEnd:
@@ -103,6 +67,7 @@ class RobustBackEnd:
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
         self._landmark_of_label: dict[int, int] = {}
         self._n_updates = 0
+        self._expected: list[ExpectedRange] = []
 
     @property
     def pose(self) -> Array:
@@ -118,14 +83,21 @@ class RobustBackEnd:
         """Return the landmarks hit often enough to be reported."""
         return tuple(
             MapLandmark(
-                landmark_id=id_,
+                landmark_id=(id_ := self.state.landmark_ids[row]),
                 position_m=self.state.landmarks_m[row].copy(),
                 covariance=self.state.landmark_covariance(row),
                 hits=self._existence.hits(id_),
             )
+            for row in self.reported_rows()
+        )
+
+    def reported_rows(self) -> list[int]:
+        """Return the rows of the state whose landmarks were hit often enough to be reported."""
+        return [
+            row
             for row, id_ in enumerate(self.state.landmark_ids)
             if self._existence.is_reported(id_)
-        )
+        ]
 
     def predict(self, increment: Array, covariance: Array | None = None) -> None:
         """Move by one odometry increment.
@@ -150,6 +122,7 @@ class RobustBackEnd:
         """Take in what the radars saw; a radar without a frame is absent, not empty."""
         antennas = antennas_of(self.rig, scans, self._motion)
         self._silent = np.where(antennas.heard, 0, self._silent + 1)
+        self._expected = []
         continued, nis = self._continue_tracks(scans, antennas)
         used = {(radar, index) for radar, index, _ in continued}
         self._leftovers.keep(self._log.n_poses - 1, antennas, scans, used)
@@ -168,6 +141,7 @@ class RobustBackEnd:
             nis=nis,
             dof=len(continued),
             relinearised=relinearised,
+            expected=tuple(self._expected),
         )
 
     def update_points(
@@ -231,7 +205,7 @@ class RobustBackEnd:
         seen = view(state, antennas)
         found: list[Continuation] = []
         for side in self._sides:
-            found += self._continue_side([s for s in scans if s.radar in side], seen)
+            found += self._continue_side([s for s in scans if s.radar in side], seen, antennas)
         if any(scan.labels is not None for scan in scans):
             found = self._labelled(scans)
         if not found:
@@ -255,7 +229,9 @@ class RobustBackEnd:
         nis, _ = state.update(rows.at, rows.H, z - rows.predicted_m, R)
         return continued, nis
 
-    def _continue_side(self, scans: list[RangeScan], seen: View) -> list[Continuation]:
+    def _continue_side(
+        self, scans: list[RangeScan], seen: View, antennas: Antennas
+    ) -> list[Continuation]:
         """Find the ranges of known landmarks on one side; count hits and misses."""
         noise, rule, limits = (
             self.parameters.ranges,
@@ -266,6 +242,7 @@ class RobustBackEnd:
         sure = sure_landmarks(self.state, seen, radars, noise, rule) if radars else None
         if sure is None:
             return []
+        self._expect(sure, antennas)
         found = continue_tracks(sure, scans, noise, rule)
         ids = self.state.landmark_ids
         count: dict[int, int] = {}
@@ -281,6 +258,32 @@ class RobustBackEnd:
         whole = max(len(scans), 2)
         self._existence.seen_whole(ids[row] for row, n in count.items() if n >= whole)
         return found
+
+    def _expect(self, sure: SureLandmarks, antennas: Antennas) -> None:
+        """Note the ranges that could continue a track, before any is looked at."""
+        state, rows = self.state, sure.rows
+        turn = rotation(state.heading_rad)
+        body = ((state.landmarks_m[rows.landmarks] - state.position_m) @ turn).tolist()
+        places = antennas.position_m[rows.radars].tolist()
+        self._expected += [
+            ExpectedRange(
+                radar=radar,
+                landmark_id=state.landmark_ids[row],
+                range_m=range_m,
+                variance=variance,
+                antenna_m=(place[0], place[1]),
+                point_m=(point[0], point[1]),
+            )
+            for radar, row, range_m, variance, place, point in zip(
+                rows.radars.tolist(),
+                rows.landmarks.tolist(),
+                rows.predicted_m.tolist(),
+                sure.prior.diagonal().tolist(),
+                places,
+                body,
+                strict=True,
+            )
+        ]
 
     def _labelled(self, scans: Sequence[RangeScan]) -> list[Continuation]:
         """Return the associations that labels tell."""

@@ -1,0 +1,192 @@
+"""The pipeline around the robust back end: radar frames and odometry in, pose and map out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.config import BackEnd, SlamConfig
+from slam.detection import Detection, make_detector
+from slam.ekf_slam import Belief
+from slam.frames import RadarFrame
+from slam.geometry import Rig, between
+from slam.pipeline import PoseAt, Slam, StepResult, UwbRadarSlam
+from slam.robust.back_end import RobustBackEnd
+from slam.robust.parameters import BackEndParameters, RangeNoise, WheelNoise
+from slam.robust.ranges import RangeScan
+from slam.robust.state import quarter_turn
+from slam.window import has_moved
+
+Array = NDArray[np.float64]
+
+
+def make_slam(config: SlamConfig, rig: Rig, wheels: WheelNoise) -> Slam:
+    """Return the pipeline that a configuration names.
+
+    Parameters
+    ----------
+    config
+        ``back_end`` decides.
+    rig
+        Where the radars sit.
+    wheels
+        How the robot's odometry errs, as its specification says; preset ``paper`` has numbers of
+        its own.
+    """
+    if config.back_end is BackEnd.ROBUST:
+        return RobustSlam(config, rig, wheels)
+    return UwbRadarSlam(config, rig)
+
+
+class RobustSlam:
+    """Ranges of all radars, each at its own time, into the robust back end; nothing is delayed.
+
+    The map frame is the body frame at the first odometry pose. The belief's errors are additive,
+    as everywhere outside ``slam.robust``; it holds the landmarks that are believed in, and their
+    ids stay.
+
+    Parameters
+    ----------
+    config
+        Front end, window, and the table ``robust``.
+    rig
+        Where the radars sit.
+    wheels
+        How odometry errs.
+    """
+
+    def __init__(self, config: SlamConfig, rig: Rig, wheels: WheelNoise) -> None:
+        self.config = config
+        self.rig = rig
+        self.back_end = RobustBackEnd(rig, back_end_parameters(config, wheels))
+        self._detector = make_detector(config)
+        self._pose: Array | None = None  # odometry at the last state
+        self._t_ns = 0
+
+    def step(
+        self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
+    ) -> tuple[StepResult, ...]:
+        """Take in what sensors say around one time; return the state if the robot has moved.
+
+        Parameters
+        ----------
+        frames
+            At most one frame per radar, each with the time it was taken at; a radar whose frame
+            was lost is simply absent, and none at all leaves odometry alone.
+        pose_at
+            Odometry, asked for the pose at ``t_ns``.
+        t_ns
+            Session time of the state.
+        """
+        stamps_ns = {frame.radar: frame.t_ns for frame in frames}
+        return self._take(lambda: self._detect(frames), stamps_ns, pose_at, t_ns)
+
+    def step_detections(
+        self, detections: Sequence[Detection], pose_at: PoseAt, t_ns: int
+    ) -> tuple[StepResult, ...]:
+        """Do what ``step`` does, from ranges that some other front end found.
+
+        Every radar counts as heard; one without a detection looked at ``t_ns`` and saw nothing.
+        """
+        stamps_ns = dict.fromkeys(range(len(self.rig.mounts)), t_ns)
+        stamps_ns |= {detection.radar: detection.t_ns for detection in detections}
+        return self._take(lambda: tuple(detections), stamps_ns, pose_at, t_ns)
+
+    def flush(self) -> tuple[StepResult, ...]:
+        """Return the states not yet returned: none, for nothing is delayed."""
+        return ()
+
+    def _take(
+        self,
+        detect: Callable[[], tuple[Detection, ...]],
+        stamps_ns: dict[int, int],
+        pose_at: PoseAt,
+        t_ns: int,
+    ) -> tuple[StepResult, ...]:
+        pose = np.array(pose_at(t_ns), dtype=np.float64)
+        if self._pose is None:
+            self._pose, self._t_ns = pose, t_ns
+            return ()
+        # What is seen again from one place is no new evidence: clutter and aspect stay the same.
+        if not has_moved(self._pose, pose, self.config.window):
+            return ()
+        detections = detect()
+        back_end = self.back_end
+        back_end.predict(between(self._pose, pose))
+        report = back_end.update(self._scans(detections, stamps_ns, t_ns))
+        self._pose, self._t_ns = pose, t_ns
+        return (
+            StepResult(
+                t_ns=t_ns,
+                odometry_pose=pose,
+                belief=belief_of(back_end),
+                detections=detections,
+                report=report,
+            ),
+        )
+
+    def _scans(
+        self, detections: Sequence[Detection], stamps_ns: dict[int, int], t_ns: int
+    ) -> list[RangeScan]:
+        """Return the scan of every radar heard, empty where it saw nothing."""
+        period_ns = t_ns - self._t_ns
+        ranges: dict[int, list[float]] = {radar: [] for radar in stamps_ns}
+        for detection in detections:
+            ranges[detection.radar].append(detection.range_m)
+        return [
+            RangeScan(
+                radar=radar,
+                ranges_m=tuple(of_radar),
+                sampled_after=(stamps_ns[radar] - t_ns) / period_ns,
+            )
+            for radar, of_radar in ranges.items()
+        ]
+
+    def _detect(self, frames: Sequence[RadarFrame]) -> tuple[Detection, ...]:
+        offsets_m = [self.rig.mounts[frame.radar].range_offset_m for frame in frames]
+        found = self._detector.detect_many(frames, offsets_m)
+        return tuple(detection for of_frame in found for detection in of_frame)
+
+
+def back_end_parameters(config: SlamConfig, wheels: WheelNoise) -> BackEndParameters:
+    """Return what the back end is told, from the configuration and the robot's specification."""
+    told, limits = config.robust, config.detection
+    reach_m = limits.max_range_m - limits.min_range_m
+    return BackEndParameters(
+        wheels=wheels,
+        ranges=RangeNoise(
+            sigma_m=math.hypot(told.range_sigma_m, told.range_floor_m),
+            offset_sigma_m=told.offset_sigma_m,
+            detection_probability=told.detection_probability,
+            clutter_per_m=told.false_ranges_per_frame / reach_m,
+            field_of_view_rad=told.field_of_view_rad,
+            min_range_m=limits.min_range_m,
+            max_range_m=limits.max_range_m,
+        ),
+    )
+
+
+def belief_of(back_end: RobustBackEnd) -> Belief:
+    """Return pose and reported landmarks with additive errors, as a belief of its own.
+
+    With e_add = e + t e_th, t = J x for every point x (``State.additive_transform``), the
+    covariance is P + t p_th^T + p_th t^T + P_thth t t^T: O(m^2), not a product of matrices.
+    """
+    state = back_end.state
+    rows = np.array(back_end.reported_rows(), dtype=np.intp)
+    at = np.concatenate([np.array([1, 2, 0]), state.landmark_columns(rows)])
+    P = state.P.block(at)
+    landmarks = state.landmarks_m[rows]
+    turned = np.concatenate(
+        [quarter_turn(state.position_m), [0.0], quarter_turn(landmarks).ravel()]
+    )
+    along = np.outer(turned, P[2] + 0.5 * P[2, 2] * turned)
+    return Belief(
+        mean=np.concatenate([state.pose, landmarks.ravel()]),
+        covariance=P + along + along.T,
+        landmark_ids=tuple(state.landmark_ids[row] for row in rows),
+        next_id=state.next_id,
+    )
