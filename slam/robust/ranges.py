@@ -3,7 +3,12 @@
     z = |l - p - R m| + b + v,   H = [e_th: 0, e_p: -u, e_l: u, b: 1],
 
 u the unit vector from antenna to landmark in the map frame. The heading has no entry: a turn of
-robot and map together changes no range. A radar that sampled a fraction f of a step after the
+robot and map together changes no range. Of a wall (phi, d) the mirror image answers, along its
+normal n, from wherever the antenna q = p + R m is:
+
+    z = d - n . q + b + v,     H = [e_th: 0, e_p: -n, e_phi: -(J n) . q, e_d: 1, b: 1].
+
+A radar that sampled a fraction f of a step after the
 pose was at ``m' = f d + Rot(f a) m``, boresight ``yaw' = yaw + f a`` (f < 0: before it).
 """
 
@@ -19,7 +24,7 @@ from numpy.typing import NDArray
 from slam.geometry import Rig, wrap_angles
 from slam.robust.motion import Motion
 from slam.robust.parameters import RangeNoise
-from slam.robust.state import State, rotation
+from slam.robust.state import State, quarter_turn, rotation
 from slam.robust.symmetric import Array, Indices
 
 
@@ -81,21 +86,24 @@ def antennas_of(rig: Rig, scans: Sequence[RangeScan], motion: Motion) -> Antenna
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class View:
-    """All landmarks as all radars should see them, from the present mean.
+    """All n landmarks and behind them all w walls as all radars should see them.
 
     Attributes
     ----------
     ranges_m
-        shape (r, n), offsets included.
+        shape (r, n + w), offsets included; negative behind a wall.
     off_boresight_rad
-        shape (r, n), in [-pi, pi).
+        shape (r, n + w), in [-pi, pi).
     directions
-        shape (r, n, 2), unit vectors u in the map frame.
+        shape (r, n + w, 2), unit vectors u or n in the map frame.
+    by_feature
+        shape (r, n + w, 2), d(range) / d(error of the landmark or wall).
     """
 
     ranges_m: Array
     off_boresight_rad: Array
     directions: Array
+    by_feature: Array
 
     def inside(
         self, noise: RangeNoise, widen_rad: float = 0.0, widen_m: float = 0.0
@@ -109,17 +117,30 @@ class View:
 
 
 def view(state: State, antennas: Antennas) -> View:
-    """Return the view of all landmarks; O(n), nothing of the covariance is touched."""
+    """Return the view of everything mapped; O(n + w), nothing of the covariance is touched."""
     R = rotation(state.heading_rad)
     body = (state.landmarks_m - state.position_m) @ R
     offsets = body[None, :, :] - antennas.position_m[:, None, :]
     ranges = np.hypot(offsets[..., 0], offsets[..., 1])
     bearings = np.arctan2(offsets[..., 1], offsets[..., 0])
     directions = (offsets / np.maximum(ranges, 1e-9)[..., None]) @ R.T
+    by_feature = directions
+    if len(state.walls):
+        places = state.position_m + antennas.position_m @ R.T
+        phi, d = state.walls.T
+        normals = np.column_stack([np.cos(phi), np.sin(phi)])
+        turned = quarter_turn(normals)
+        ranges = np.hstack([ranges, d - places @ normals.T])
+        bearings = np.hstack([bearings, np.tile(phi - state.heading_rad, (len(places), 1))])
+        walls = np.broadcast_to(normals, (len(places), *normals.shape))
+        by_wall = np.stack([-places @ turned.T, np.ones((len(places), len(phi)))], axis=-1)
+        by_feature = np.concatenate([directions, by_wall], axis=1)
+        directions = np.concatenate([directions, walls], axis=1)
     return View(
         ranges_m=ranges + state.offsets_m[:, None],
         off_boresight_rad=wrap_angles(bearings - antennas.yaw_rad[:, None]),
         directions=directions,
+        by_feature=by_feature,
     )
 
 
@@ -130,7 +151,7 @@ class Rows:
     Attributes
     ----------
     radars, landmarks
-        shape (k,): index of the radar, row of the landmark.
+        shape (k,): index of the radar, row of the landmark; walls are the rows from n on.
     at
         Columns of the error that H has entries for, shape (c,).
     H
@@ -163,8 +184,9 @@ def rows_of(state: State, seen: View, radars: Indices, landmarks: Indices) -> Ro
     H[:, :2] = -u
     H[k, 2 + radars] = 1.0
     first = 2 + n_offsets + 2 * place
-    H[k, first] = u[:, 0]
-    H[k, first + 1] = u[:, 1]
+    by_feature = seen.by_feature[radars, landmarks]
+    H[k, first] = by_feature[:, 0]
+    H[k, first + 1] = by_feature[:, 1]
     return Rows(
         radars=radars,
         landmarks=landmarks,
