@@ -30,8 +30,10 @@ class Condensed:
         """Return the ids of the landmarks it tells something of."""
         return tuple(self._ids)
 
-    def of(self, landmark_ids: Sequence[int]) -> Prior:
+    def of(self, landmark_ids: Sequence[int], n_walls: int = 0) -> Prior:
         """Return the prior of a map: landmarks it does not know have no information.
+
+        The last ``n_walls`` of the ids are walls'.
 
         Raises
         ------
@@ -48,7 +50,7 @@ class Condensed:
         information[np.ix_(at, at)] = prior.information
         gradient, mean = np.zeros(size), np.zeros(size)
         gradient[at], mean[at] = prior.gradient, prior.mean
-        return Prior(information=information, gradient=gradient, mean=mean)
+        return Prior(information=information, gradient=gradient, mean=mean, n_walls=n_walls)
 
     def rename(self, gone: int, kept: int) -> None:
         """Let what is known of one landmark be of another, to which it is the same point.

@@ -198,6 +198,32 @@ class MapRule:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class WallRule:
+    """When ranges are a wall's, and when a wall is a known one.
+
+    Attributes
+    ----------
+    wall_lead, point_lead
+        By how much chi-square must be less under a law for a wall, or a point, to be believed.
+    match_gate, match_lead
+        Bound on d^2 of a wall seen and one mapped (2 dof), and by how much ``d^2 + ln det S`` must
+        beat the next.
+    unmapped_per_rad_m
+        Density of walls not yet in the map: the likelihood of a match must exceed it.
+    cell_m, reach_m
+        Walls are known in cells of this length; how far from one of them a wall may answer.
+    """
+
+    wall_lead: float = 12.0
+    point_lead: float = 0.0
+    match_gate: float = 13.8
+    match_lead: float = 6.0
+    unmapped_per_rad_m: float = 0.3
+    cell_m: float = 0.1
+    reach_m: float = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RelinearisationRule:
     """When all poses that are kept are solved for again, and how.
 
@@ -247,4 +273,5 @@ class BackEndParameters:
     continuation: ContinuationRule = field(default_factory=ContinuationRule)
     tracklets: TrackletRule = field(default_factory=TrackletRule)
     map: MapRule = field(default_factory=MapRule)
+    walls: WallRule | None = field(default_factory=WallRule)
     relinearisation: RelinearisationRule | None = field(default_factory=RelinearisationRule)

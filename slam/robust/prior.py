@@ -5,6 +5,7 @@ additive errors it would fix the direction of the map a little more at every suc
 no range can see it, and the estimate would become too sure. In right-invariant errors
 
     e_th = theta - theta0,   e_p = Rot(-e_th) p - p0,   e_l = Rot(-e_th) l - l0
+    e_phi = phi - e_th - phi0,   e_d = d - d0 (a wall's)
 
 it does not: turning and shifting robot and map together changes what ranges tell by nothing, and
 exactly so. Hence first estimates (FEJ: Huang, Mourikis, Roumeliotis, IJRR 29(5), 2010) need not be
@@ -60,10 +61,11 @@ def prior_terms(prior: Prior, values: Array, n_offsets: int) -> PriorTerms:
     e, turned = _errors(prior, values, n_offsets)
     pulled = prior.information @ e
     back = rotation(-wrap_angle(float(values[HEADING] - prior.mean[HEADING])))
-    by_heading = -_swept(turned, n_offsets)
-    half = _right(prior.information, back, by_heading, n_offsets)
-    information = _right(half.T, back, by_heading, n_offsets)
-    gradient = _right((pulled + prior.gradient)[None, :], back, by_heading, n_offsets)[0]
+    points = _points(len(values), n_offsets, prior.n_walls)
+    by_heading = -_swept(turned, points)
+    half = _right(prior.information, back, by_heading, points)
+    information = _right(half.T, back, by_heading, points)
+    gradient = _right((pulled + prior.gradient)[None, :], back, by_heading, points)[0]
     return PriorTerms(
         cost=float(e @ (pulled + 2.0 * prior.gradient)),
         information=(information + information.T) / 2,
@@ -71,43 +73,55 @@ def prior_terms(prior: Prior, values: Array, n_offsets: int) -> PriorTerms:
     )
 
 
-def prior_about(information: Array, gradient: Array, values: Array, n_offsets: int) -> Prior:
+def prior_about(
+    information: Array, gradient: Array, values: Array, n_offsets: int, n_walls: int = 0
+) -> Prior:
     """Return the prior that has this information and gradient of additive errors at values."""
-    by_heading = _swept(values, n_offsets)
+    points = _points(len(values), n_offsets, n_walls)
+    by_heading = _swept(values, points)
     stay = np.eye(2)
-    half = _right(information, stay, by_heading, n_offsets)
-    whole = _right(half.T, stay, by_heading, n_offsets)
+    half = _right(information, stay, by_heading, points)
+    whole = _right(half.T, stay, by_heading, points)
     return Prior(
         information=(whole + whole.T) / 2,
-        gradient=_right(gradient[None, :], stay, by_heading, n_offsets)[0],
+        gradient=_right(gradient[None, :], stay, by_heading, points)[0],
         mean=values.copy(),
+        n_walls=n_walls,
     )
 
 
 def _errors(prior: Prior, values: Array, n_offsets: int) -> tuple[Array, Array]:
     """Return the errors e, and the values with all points turned back by e_th."""
     angle = wrap_angle(float(values[HEADING] - prior.mean[HEADING]))
-    turned, first = values.copy(), 6 + n_offsets
+    turned, points = values.copy(), _points(len(values), n_offsets, prior.n_walls)
     back = rotation(-angle)
     turned[X] = back @ values[X]
-    turned[first:] = (values[first:].reshape(-1, 2) @ back.T).ravel()
+    turned[points] = (values[points].reshape(-1, 2) @ back.T).ravel()
+    turned[points.stop :: 2] -= angle
     e = turned - prior.mean
     e[HEADING] = angle
     return e, turned
 
 
-def _swept(values: Array, n_offsets: int) -> Array:
-    """Return how the points of some values move per radian about the origin, shape (m,)."""
-    swept, first = np.zeros(len(values)), 6 + n_offsets
+def _points(size: int, n_offsets: int, n_walls: int) -> slice:
+    """Return where the landmarks that are no walls lie."""
+    return slice(6 + n_offsets, size - 2 * n_walls)
+
+
+def _swept(values: Array, points: slice) -> Array:
+    """Return how points and walls of some values move per radian about the origin, shape (m,)."""
+    swept = np.zeros(len(values))
     swept[X] = quarter_turn(values[X])
-    swept[first:] = quarter_turn(values[first:].reshape(-1, 2)).ravel()
+    swept[points] = quarter_turn(values[points].reshape(-1, 2)).ravel()
+    swept[points.stop :: 2] = 1.0
     return swept
 
 
-def _right(rows: Array, turn: Array, by_heading: Array, n_offsets: int) -> Array:
+def _right(rows: Array, turn: Array, by_heading: Array, points: slice) -> Array:
     """Return rows times the matrix [points: turn, heading column: by_heading + 1, rest: I]."""
-    result, first = rows.copy(), 6 + n_offsets
+    result = rows.copy()
     result[:, HEADING] += rows @ by_heading
     result[:, X] = rows[:, X] @ turn
-    result[:, first:] = (rows[:, first:].reshape(len(rows), -1, 2) @ turn).reshape(len(rows), -1)
+    turned = rows[:, points].reshape(len(rows), -1, 2) @ turn
+    result[:, points] = turned.reshape(len(rows), -1)
     return result

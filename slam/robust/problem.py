@@ -24,7 +24,7 @@ class Estimate:
     calibration
         shape (k + 1, 3) if it walks, else (1, 3): s, w, kappa.
     offsets_m, landmarks_m
-        shapes (r,) and (n, 2).
+        shapes (r,) and (n, 2); the last of the landmarks may be walls, (phi, d).
     """
 
     poses: Array
@@ -38,12 +38,14 @@ class Prior:
     """What is known beforehand of the first pose, its calibration, the offsets and landmarks.
 
     A quadratic ``e^T information e + 2 gradient^T e`` in right-invariant errors e from ``mean``
-    (module ``prior``), all of size 6 + r + 2 n in that order.
+    (module ``prior``), all of size 6 + r + 2 n in that order; the last ``n_walls`` of the n
+    landmarks are walls.
     """
 
     information: Array
     gradient: Array
     mean: Array
+    n_walls: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -67,6 +69,8 @@ class Problem:
     point_poses, point_landmarks, points, point_roots
         shapes (q,), (q,), (q, 2), (q, 2, 2): range and bearing seen from the body's origin,
         and a matrix that makes their noise white.
+    n_walls
+        How many of the landmarks, the last ones, are walls.
     """
 
     increments: Array
@@ -83,6 +87,7 @@ class Problem:
     point_landmarks: Indices
     points: Array
     point_roots: Array
+    n_walls: int = 0
 
     @property
     def is_walking(self) -> bool:
@@ -108,6 +113,7 @@ class Problem:
             point_landmarks=self.point_landmarks[points],
             points=self.points[points],
             point_roots=self.point_roots[points],
+            n_walls=self.n_walls,
         )
 
 

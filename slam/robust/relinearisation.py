@@ -24,7 +24,7 @@ def is_due(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
         return False
     if log.n_kept > rule.most_poses:
         return True
-    if not state.landmark_ids:
+    if not state.feature_ids:
         return False
     shift_m, turn_rad = log.parted(state.pose)
     return turn_rad > rule.turn_rad or shift_m > rule.shift_m
@@ -39,7 +39,7 @@ def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> boo
     prior = start_prior(
         parameters.wheels.calibration_sigmas,
         (parameters.ranges.offset_sigma_m,) * len(state.offsets_m),
-        len(state.landmark_ids),
+        len(state.feature_ids),
     )
     problem = log.problem(state, prior, parameters.ranges.sigma_m)
     smoother = Smoother(problem, rule)
@@ -54,7 +54,7 @@ def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> boo
         n_steps = log.n_kept - math.ceil(rule.kept_share * rule.most_poses)
         with suppress(np.linalg.LinAlgError):  # then it is tried again a little later
             prior = smoother.condensed(known, n_steps, rule.outlier_sigmas)
-            log.condense(prior, state.landmark_ids, n_steps)
+            log.condense(prior, state.feature_ids, n_steps)
     return solution is not None
 
 
@@ -66,7 +66,9 @@ def _replace(state: State, solution: Solution) -> None:
     state.heading_rad = math.remainder(float(pose[2]), math.tau)
     state.calibration = estimate.calibration[-1].copy()
     state.offsets_m = estimate.offsets_m.copy()
-    state.landmarks_m = estimate.landmarks_m.copy()
+    n = len(state.landmark_ids)
+    state.landmarks_m = estimate.landmarks_m[:n].copy()
+    state.walls = estimate.landmarks_m[n:].copy()
     state.P = SymmetricMatrix(invariant_covariance(state, solution.information))
 
 

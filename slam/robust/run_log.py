@@ -157,8 +157,8 @@ class RunLog:
         ``prior`` is that of the start, which condensed poses have in them already.
         """
         if self._condensed is not None:
-            prior = self._condensed.of(state.landmark_ids)
-        rows = {id_: row for row, id_ in enumerate(state.landmark_ids)}
+            prior = self._condensed.of(state.feature_ids, len(state.wall_ids))
+        rows = {id_: row for row, id_ in enumerate(state.feature_ids)}
         ranges, points = self._ranges, self._points
         of_range = self._rows_of(ranges.landmarks, rows)
         of_point = self._rows_of(points.landmarks, rows)
@@ -179,6 +179,7 @@ class RunLog:
             point_landmarks=of_point[used_points],
             points=np.array(points.points).reshape(-1, 2)[used_points],
             point_roots=np.array(points.roots).reshape(-1, 2, 2)[used_points],
+            n_walls=len(state.wall_ids),
         )
 
     def starts(self, state: State, problem: Problem) -> list[Estimate]:
@@ -193,7 +194,7 @@ class RunLog:
         common = {
             "calibration": calibration,
             "offsets_m": state.offsets_m.copy(),
-            "landmarks_m": state.landmarks_m.copy(),
+            "landmarks_m": state.features,
         }
         causal = np.array(self._causal)
         causal[-1] = state.pose

@@ -138,7 +138,13 @@ class Smoother:
                 landmarks_m=estimate.landmarks_m,
             )
         )
-        return prior_about(left.information, left.gradient, values, len(estimate.offsets_m))
+        return prior_about(
+            left.information,
+            left.gradient,
+            values,
+            len(estimate.offsets_m),
+            self._problem.n_walls,
+        )
 
     def _walk_residual(self, estimate: Estimate) -> Array:
         if len(estimate.calibration) == 1:

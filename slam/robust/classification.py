@@ -1,0 +1,191 @@
+"""Point or wall: which law the ranges of one reflector follow while the robot moves.
+
+The specular echo of a wall comes from wherever the wall is nearest, so its range is *linear* in
+the antenna's position a; a point's is a hyperbola::
+
+    point at b:     r = |b - a|
+    wall (phi, d):  r = d - n . a,   n = [cos phi, sin phi]
+
+A corner of two walls sends the pulse back to where it came from by way of both, and the length of
+that way is twice the distance to the apex: a corner is a point, for ranges. Both laws have two
+unknowns, so the difference of their chi-squares is twice the logarithm of the likelihood ratio
+(and that of their BIC). Over a short displacement, or at a great distance, it is near zero, and
+nothing is decided. Source of the laws: Leonard and Durrant-Whyte, "Directed Sonar Sensing for
+Mobile Robot Navigation", 1992, chapter 2.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from slam.robust.symmetric import Array
+
+_STEPS = 8
+_DAMPING = 1e-6
+
+
+class Law(Enum):
+    """What ranges over displacement say of a reflector."""
+
+    POINT = "point"
+    WALL = "wall"
+    UNDECIDED = "undecided"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sightings:
+    """Ranges of one reflector from several places.
+
+    Attributes
+    ----------
+    antennas_m
+        shape (k, 2), in one frame.
+    ranges_m, variances
+        shape (k,): measured, without the offsets known, and their variances [m^2].
+    radars
+        shape (k,): index into the offsets.
+    offset_covariance
+        shape (r, r), of what is not known of the radars' offsets; None where they are known.
+    """
+
+    antennas_m: Array
+    ranges_m: Array
+    variances: Array
+    radars: Array
+    offset_covariance: Array | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """Chi-squares of the two laws, each at its best."""
+
+    point: float
+    wall: float
+
+    def law(self, lead: float) -> Law:
+        """Return the law whose chi-square is less by ``lead``, if one is."""
+        if self.wall - self.point >= lead:
+            return Law.POINT
+        return Law.WALL if self.point - self.wall >= lead else Law.UNDECIDED
+
+
+def compare(sightings: Sightings, toward_rad: float) -> Verdict:
+    """Fit both laws to the same ranges.
+
+    Parameters
+    ----------
+    sightings
+        What was measured.
+    toward_rad
+        Roughly the direction of the reflector, in the frame of the antennas.
+    """
+    middle = sightings.antennas_m.mean(axis=0)
+    range_m = float(sightings.ranges_m.mean())
+    n = np.array([math.cos(toward_rad), math.sin(toward_rad)])
+    point = _least(sightings, np.array([*(middle + range_m * n)]), _point_law)
+    wall = _least(sightings, np.array([toward_rad, range_m + float(n @ middle)]), _wall_law)
+    return Verdict(point=point, wall=wall)
+
+
+def corners(
+    points_m: Array, covariances: Array, walls: Array, gate: float, floor_m: float
+) -> list[bool]:
+    """Tell which points lie where two walls cross.
+
+    Parameters
+    ----------
+    points_m, covariances
+        shapes (n, 2) and (n, 2, 2), map frame.
+    walls
+        shape (w, 2): phi [rad], d [m].
+    gate
+        Bound on the squared Mahalanobis distance (2 dof) from the crossing.
+    floor_m
+        Standard deviation of the crossing.
+    """
+    crossings = wall_crossings(walls)
+    found = []
+    for point, covariance in zip(points_m, covariances, strict=True):
+        S = np.linalg.inv(covariance + floor_m**2 * np.eye(2))
+        away = crossings - point
+        found.append(bool(np.any(np.einsum("ki,ij,kj->k", away, S, away) <= gate)))
+    return found
+
+
+def wall_crossings(walls: Array) -> Array:
+    """Return where walls cross that are at least 30 degrees from parallel, shape (k, 2)."""
+    normals = np.column_stack([np.cos(walls[:, 0]), np.sin(walls[:, 0])])
+    found = []
+    for i in range(len(walls)):
+        for j in range(i + 1, len(walls)):
+            pair = normals[[i, j]]
+            if abs(float(np.linalg.det(pair))) >= 0.5:
+                found.append(np.linalg.solve(pair, walls[[i, j], 1]))
+    return np.array(found).reshape(-1, 2)
+
+
+def _point_law(unknown: Array, antennas: Array) -> tuple[Array, Array]:
+    away = unknown - antennas
+    distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-6)
+    return distance, away / distance[:, None]
+
+
+def _wall_law(unknown: Array, antennas: Array) -> tuple[Array, Array]:
+    c, s = math.cos(float(unknown[0])), math.sin(float(unknown[0]))
+    by_angle = s * antennas[:, 0] - c * antennas[:, 1]
+    distance = float(unknown[1]) - c * antennas[:, 0] - s * antennas[:, 1]
+    return distance, np.column_stack([by_angle, np.ones(len(antennas))])
+
+
+def _least(
+    sightings: Sightings, start: Array, predict: Callable[[Array, Array], tuple[Array, Array]]
+) -> float:
+    """Return the least chi-square of a law: Gauss-Newton, steps halved until it falls."""
+    extra, prior = _offset_part(sightings)
+    unknown, offsets = start, np.zeros(extra.shape[1])
+
+    def chi_square(unknown: Array, offsets: Array) -> float:
+        residual = sightings.ranges_m - predict(unknown, sightings.antennas_m)[0] - extra @ offsets
+        return float(residual @ (residual / sightings.variances) + offsets @ prior @ offsets)
+
+    best = chi_square(unknown, offsets)
+    for _ in range(_STEPS):
+        distance, J = predict(unknown, sightings.antennas_m)
+        residual = sightings.ranges_m - distance - extra @ offsets
+        J = np.hstack([J, extra])
+        weighted = J.T / sightings.variances
+        information, gradient = weighted @ J, weighted @ residual
+        information[2:, 2:] += prior
+        gradient[2:] -= prior @ offsets
+        information += _DAMPING * np.diag(information.diagonal() + 1.0)
+        change = np.linalg.solve(information, gradient)
+        share = 1.0
+        while share > 1e-3:
+            moved = unknown + share * change[:2], offsets + share * change[2:]
+            value = chi_square(*moved)
+            if value <= best:
+                break
+            share *= 0.5
+        else:
+            break
+        decrease, best = best - value, value
+        unknown, offsets = moved
+        if decrease < 1e-4:
+            break
+    return best
+
+
+def _offset_part(sightings: Sightings) -> tuple[Array, Array]:
+    """Return d(range) / d(offset), shape (k, q), and the offsets' information, shape (q, q)."""
+    k = len(sightings.ranges_m)
+    if sightings.offset_covariance is None:
+        return np.zeros((k, 0)), np.zeros((0, 0))
+    used: Sequence[int] = np.unique(sightings.radars).tolist()
+    part = (sightings.radars[:, None] == np.array(used)[None, :]).astype(np.float64)
+    covariance = sightings.offset_covariance[np.ix_(used, used)] + 1e-12 * np.eye(len(used))
+    return part, np.asarray(np.linalg.inv(covariance))
