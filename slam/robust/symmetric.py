@@ -68,7 +68,8 @@ class SymmetricMatrix:
     def columns(self, at: Indices) -> Array:
         """Return columns as they are in the full matrix, shape (m, k)."""
         m, lower = self._size, self._lower
-        result: Array = lower[:m, at]
+        # Rows together: small maps keep their bits, whatever is put off for large ones.
+        result: Array = np.ascontiguousarray(lower[:m, at])
         for place, column in enumerate(at.tolist()):
             result[:column, place] = lower[column, :column]
         if self._n_grams or self._n_pairs:
