@@ -10,11 +10,11 @@ from slam.geometry import Rig
 from slam.robust.births import BodyPoint, give_birth, match, update_with_point
 from slam.robust.continuation import (
     Continuation,
-    SureLandmarks,
     continue_tracks,
     sure_landmarks,
 )
 from slam.robust.existence import Existence
+from slam.robust.expected import expected_ranges
 from slam.robust.leftovers import Leftovers
 from slam.robust.merging import apply_merge, find_merge
 from slam.robust.motion import Motion, calibrated_motion, predict
@@ -22,17 +22,19 @@ from slam.robust.parameters import BackEndParameters, PointRule
 from slam.robust.points import RangeBearing, assign, range_bearing_rows
 from slam.robust.ranges import Antennas, RangeScan, View, antennas_of, rows_of, sides_of, view
 from slam.robust.relinearisation import is_due, relinearise
-from slam.robust.reports import ExpectedRange, MapLandmark, UpdateReport
+from slam.robust.reports import ExpectedRange, MapLandmark, MapWall, UpdateReport
 from slam.robust.run_log import RunLog
-from slam.robust.state import State, rotation
+from slam.robust.state import State
 from slam.robust.symmetric import Array
 from slam.robust.tracklets import (
+    Member,
     Tracker,
     Tracklet,
     find_tracklets,
     pair_guesses,
     single_guesses,
 )
+from slam.robust.wall_keeper import WallKeeper
 
 
 class RobustBackEnd:
@@ -64,6 +66,7 @@ class RobustBackEnd:
         self._existence = Existence(parameters.map)
         self._log = RunLog(parameters.wheels)
         self._motion = _at_rest()
+        self._walls = WallKeeper(self.state, parameters)
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
         self._landmark_of_label: dict[int, int] = {}
         self._n_updates = 0
@@ -98,6 +101,14 @@ class RobustBackEnd:
             for row, id_ in enumerate(self.state.landmark_ids)
             if self._existence.is_reported(id_)
         ]
+
+    def walls(self) -> tuple[MapWall, ...]:
+        """Return the walls hit often enough to be reported."""
+        return tuple(
+            self._walls.reported(row, self._existence.hits(id_))
+            for row, id_ in enumerate(self.state.wall_ids)
+            if self._existence.is_reported(id_)
+        )
 
     def predict(self, increment: Array, covariance: Array | None = None) -> None:
         """Move by one odometry increment.
@@ -200,9 +211,9 @@ class RobustBackEnd:
     ) -> tuple[tuple[tuple[int, int, int], ...], float]:
         """Find the ranges of known landmarks and correct the state with all of them at once."""
         state = self.state
-        if not state.landmark_ids:
+        if not state.feature_ids:
             return (), 0.0
-        seen = view(state, antennas)
+        seen = self._walls.look(view(state, antennas), antennas)
         found: list[Continuation] = []
         for side in self._sides:
             found += self._continue_side([s for s in scans if s.radar in side], seen, antennas)
@@ -210,7 +221,7 @@ class RobustBackEnd:
             found = self._labelled(scans)
         if not found:
             return (), 0.0
-        ids = state.landmark_ids
+        ids = state.feature_ids
         continued = tuple((c.radar, c.index, ids[c.row]) for c in found)
         ranges = {scan.radar: scan.ranges_m for scan in scans}
         z = np.array([ranges[c.radar][c.index] for c in found])
@@ -226,6 +237,7 @@ class RobustBackEnd:
             np.array([c.row for c in found], dtype=np.intp),
         )
         R = np.full(len(z), self.parameters.ranges.sigma_m**2)
+        self._walls.note(found)
         nis, _ = state.update(rows.at, rows.H, z - rows.predicted_m, R)
         return continued, nis
 
@@ -242,9 +254,9 @@ class RobustBackEnd:
         sure = sure_landmarks(self.state, seen, radars, noise, rule) if radars else None
         if sure is None:
             return []
-        self._expect(sure, antennas)
+        self._expected += expected_ranges(self.state, sure, antennas, self._walls.feet_m)
         found = continue_tracks(sure, scans, noise, rule)
-        ids = self.state.landmark_ids
+        ids = self.state.feature_ids
         count: dict[int, int] = {}
         for continuation in found:
             count[continuation.row] = count.get(continuation.row, 0) + 1
@@ -252,38 +264,13 @@ class RobustBackEnd:
             self._existence.hit(ids[row])
         inside = seen.inside(noise, -limits.view_inset_rad, -limits.view_inset_m)
         expected = inside[radars][:, sure.landmarks].all(axis=0)
+        expected &= self._walls.certain[sure.landmarks]
         for row in sure.landmarks[expected].tolist():
             if row not in count:
                 self._existence.miss(ids[row])
         whole = max(len(scans), 2)
         self._existence.seen_whole(ids[row] for row, n in count.items() if n >= whole)
         return found
-
-    def _expect(self, sure: SureLandmarks, antennas: Antennas) -> None:
-        """Note the ranges that could continue a track, before any is looked at."""
-        state, rows = self.state, sure.rows
-        turn = rotation(state.heading_rad)
-        body = ((state.landmarks_m[rows.landmarks] - state.position_m) @ turn).tolist()
-        places = antennas.position_m[rows.radars].tolist()
-        self._expected += [
-            ExpectedRange(
-                radar=radar,
-                landmark_id=state.landmark_ids[row],
-                range_m=range_m,
-                variance=variance,
-                antenna_m=(place[0], place[1]),
-                point_m=(point[0], point[1]),
-            )
-            for radar, row, range_m, variance, place, point in zip(
-                rows.radars.tolist(),
-                rows.landmarks.tolist(),
-                rows.predicted_m.tolist(),
-                sure.prior.diagonal().tolist(),
-                places,
-                body,
-                strict=True,
-            )
-        ]
 
     def _labelled(self, scans: Sequence[RangeScan]) -> list[Continuation]:
         """Return the associations that labels tell."""
@@ -315,9 +302,17 @@ class RobustBackEnd:
                 guesses = pair_guesses(frames[0], noise, rule)
             if not guesses:
                 continue
+            for wall in self._walls.find(frames) if len(radars) > 1 else ():
+                wall_id, is_new = self._walls.place(wall)
+                self._use(wall_id, wall.members)
+                (born if is_new else again).append(wall_id)
             offsets = np.arange(state.offsets.start, state.offsets.stop)
             tracker = Tracker(noise, rule, state.offsets_m, state.P.block(offsets))
-            for tracklet in find_tracklets(tracker, guesses, frames, min(len(radars), 2), rule):
+            n_radars = min(len(radars), 2)
+            is_point = self._walls.is_point if n_radars > 1 else None
+            for tracklet in find_tracklets(
+                tracker, guesses, frames, n_radars, rule, is_point=is_point
+            ):
                 landmark_id, is_new = self._place(tracklet)
                 (born if is_new else again).append(landmark_id)
         return tuple(born), tuple(again)
@@ -347,8 +342,13 @@ class RobustBackEnd:
         else:
             landmark_id = state.landmark_ids[row]
             update_with_point(state, row, point)
-        self._existence.hit(landmark_id, len({m.slot.back for m in tracklet.members}))
-        for member in tracklet.members:
+        self._use(landmark_id, tracklet.members)
+        return landmark_id, row is None
+
+    def _use(self, landmark_id: int, members: Sequence[Member]) -> None:
+        """Count and log the ranges of a tracklet as those of a landmark or a wall."""
+        self._existence.hit(landmark_id, len({m.slot.back for m in members}))
+        for member in members:
             slot = member.slot
             self._log.add_range(
                 self._leftovers.pose_index(slot.back),
@@ -357,12 +357,12 @@ class RobustBackEnd:
                 slot.antenna_then,
                 member.leftover.range_m,
             )
-        return landmark_id, row is None
 
     def _delete_lost(self) -> tuple[int, ...]:
         lost = self._existence.lost()
         for landmark_id in lost:
-            self.state.remove(self.state.landmark_ids.index(landmark_id))
+            self.state.remove(self.state.feature_ids.index(landmark_id))
+            self._walls.cells.forget(landmark_id)
             self._existence.forget(landmark_id)
             self._log.drop(landmark_id)
         return tuple(lost)

@@ -17,6 +17,30 @@ class MapLandmark:
     hits: int
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MapWall:
+    """One wall of the map: the line n . x = d, n = [cos phi, sin phi], and its known parts.
+
+    Attributes
+    ----------
+    wall_id, hits
+        Its id, of the same numbers as the landmarks', and the frames that hit it.
+    phi_rad, d_m
+        Direction of its normal, away from the robot, and distance along it from the origin.
+    covariance
+        shape (2, 2), of (phi, d), additive errors.
+    spans_m
+        shape (k, 2, 2): ends of the stretches that answered, map frame [m].
+    """
+
+    wall_id: int
+    phi_rad: float
+    d_m: float
+    covariance: Array
+    spans_m: Array
+    hits: int
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExpectedRange:
     """A range that could have continued a track, as predicted before any was looked at.

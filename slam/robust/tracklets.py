@@ -10,7 +10,7 @@ two ranges of different targets, does not stay at rest while the robot moves.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -288,8 +288,13 @@ def find_tracklets(
     frames: Sequence[Sequence[Slot]],
     n_radars: int,
     rule: TrackletRule,
+    *,
+    is_point: Callable[[Tracklet], bool] | None = None,
 ) -> list[Tracklet]:
-    """Return the believable tracklets, best first; their ranges are taken out of the frames."""
+    """Return the believable tracklets, best first; their ranges are taken out of the frames.
+
+    ``is_point`` may have doubts about a tracklet that is of a point at rest in all else.
+    """
     available: dict[int, int] = {}
     for slots in frames:
         for slot in slots:
@@ -301,6 +306,8 @@ def find_tracklets(
     while waiting:
         followed = [(tracker.follow(guess, frames), guess) for guess in waiting]
         believed = [pair for pair in followed if is_believable(pair[0], n_radars, rule)]
+        if is_point is not None:
+            believed = [pair for pair in believed if pair[0].label is not None or is_point(pair[0])]
         if not believed:
             break
         best, chosen = max(believed, key=lambda pair: pair[0].score)

@@ -39,6 +39,10 @@ class BodyWall:
     by_offsets: Array
     feet_m: Array
 
+    def in_map(self, state: State) -> Array:
+        """Return the places that answered in the map frame, shape (k, 2)."""
+        return np.asarray(state.position_m + self.feet_m @ rotation(state.heading_rad).T)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class WallRows:
@@ -142,7 +146,7 @@ def match_wall(state: State, seen: BodyWall, cells: WallCells, rule: WallRule) -
     As for points: the match must pass the gate, be likelier than a wall not yet in the map, and
     beat the next best; and the two must come within reach of each other along the line.
     """
-    feet = state.position_m + seen.feet_m @ rotation(state.heading_rad).T
+    feet = seen.in_map(state)
     scored = []
     for row, wall_id in enumerate(state.wall_ids):
         along = along_wall(state, row, feet)
@@ -195,9 +199,11 @@ def foot_points(state: State, wall_row: int, antennas: Antennas) -> Array:
 
 
 def hide_unreached(
-    state: State, seen: View, antennas: Antennas, cells: WallCells, reach_m: float
+    state: State, seen: View, feet_m: Array, cells: WallCells, reach_m: float
 ) -> tuple[View, NDArray[np.bool_]]:
     """Turn walls out of view where they are not known to be.
+
+    ``feet_m`` has shape (r, w, 2): where echoes come from.
 
     Returns
     -------
@@ -211,7 +217,7 @@ def hide_unreached(
     certain = np.ones(n + len(state.wall_ids), dtype=bool)
     off = seen.off_boresight_rad.copy()
     for row, wall_id in enumerate(state.wall_ids):
-        along = along_wall(state, row, foot_points(state, row, antennas)).tolist()
+        along = along_wall(state, row, feet_m[:, row]).tolist()
         certain[n + row] = all(cells.surrounds(wall_id, place) for place in along)
         for radar, place in enumerate(along):
             if cells.distance_m(wall_id, place) > reach_m:

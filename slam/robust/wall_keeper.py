@@ -1,0 +1,138 @@
+"""The walls of one run: found, recognised, looked for where they are known to be."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.robust.continuation import Continuation
+from slam.robust.leftovers import Slot
+from slam.robust.parameters import BackEndParameters, WallRule
+from slam.robust.ranges import Antennas, View
+from slam.robust.reports import MapWall
+from slam.robust.state import HEADING, State
+from slam.robust.symmetric import Array
+from slam.robust.tracklets import Tracklet
+from slam.robust.wall_tracklets import (
+    WallTracker,
+    WallTracklet,
+    find_wall_tracklets,
+    wall_guesses,
+)
+from slam.robust.walls import (
+    BodyWall,
+    WallCells,
+    along_wall,
+    foot_points,
+    give_birth_to_wall,
+    hide_unreached,
+    match_wall,
+    update_with_wall,
+)
+
+
+class WallKeeper:
+    """Keeps the walls of a state.
+
+    Parameters
+    ----------
+    state
+        Holds them.
+    parameters
+        Noise, and what is believed; without a rule for walls there are none.
+
+    Attributes
+    ----------
+    cells
+        Which parts of them have answered.
+    feet_m
+        shape (r, w, 2), map frame: where each radar's echo of each wall comes from now.
+    certain
+        shape (n + w,): what should be seen now if it is in view; walls only where they answered
+        before.
+    """
+
+    def __init__(self, state: State, parameters: BackEndParameters) -> None:
+        self._state, self._parameters = state, parameters
+        self._rule = parameters.walls or WallRule()
+        self.cells = WallCells(self._rule.cell_m)
+        self.feet_m: Array = np.zeros((len(state.offsets_m), 0, 2))
+        self.certain: NDArray[np.bool_] = np.zeros(0, dtype=bool)
+
+    def look(self, seen: View, antennas: Antennas) -> View:
+        """Return a view without the walls that end before they come into it."""
+        state = self._state
+        feet = [foot_points(state, row, antennas) for row in range(len(state.wall_ids))]
+        self.feet_m = np.array(feet).reshape(-1, len(antennas.yaw_rad), 2).transpose(1, 0, 2)
+        seen, self.certain = hide_unreached(
+            state, seen, self.feet_m, self.cells, self._rule.reach_m
+        )
+        return seen
+
+    def note(self, found: Sequence[Continuation]) -> None:
+        """Note which parts of which walls answered."""
+        state, n = self._state, len(self._state.landmark_ids)
+        for continuation in found:
+            row = continuation.row - n
+            if row >= 0:
+                foot = self.feet_m[continuation.radar, row]
+                self.cells.add(state.wall_ids[row], along_wall(state, row, foot[None, :]))
+
+    def is_point(self, tracklet: Tracklet) -> bool:
+        """Tell whether the ranges of a tracklet follow a point's law rather than a wall's."""
+        return self._parameters.walls is None or self._tracker().is_point(tracklet)
+
+    def _tracker(self) -> WallTracker:
+        state = self._state
+        offsets = np.arange(state.offsets.start, state.offsets.stop)
+        return WallTracker(self._parameters, self._rule, state.offsets_m, state.P.block(offsets))
+
+    def find(self, frames: Sequence[Sequence[Slot]]) -> list[WallTracklet]:
+        """Return the walls in the unused ranges of the last frames, which they use up."""
+        if self._parameters.walls is None:
+            return []
+        guesses = wall_guesses(frames[0], self._parameters.ranges)
+        return find_wall_tracklets(self._tracker(), guesses, frames) if guesses else []
+
+    def place(self, tracklet: WallTracklet) -> tuple[int, bool]:
+        """Bring a wall into the map; return its id and whether it is new."""
+        state = self._state
+        phi, d = tracklet.wall
+        n = np.array([np.cos(phi), np.sin(phi)])
+        antennas = np.array([(m.slot.x_m, m.slot.y_m) for m in tracklet.members])
+        seen = BodyWall(
+            wall=tracklet.wall,
+            covariance=tracklet.covariance,
+            by_offsets=tracklet.by_offsets,
+            feet_m=antennas + np.outer(d - antennas @ n, n),
+        )
+        row = match_wall(state, seen, self.cells, self._rule)
+        is_new = row is None
+        if row is None:
+            wall_id = give_birth_to_wall(state, seen)
+            row = len(state.wall_ids) - 1
+        else:
+            wall_id = state.wall_ids[row]
+            update_with_wall(state, row, seen)
+        self.cells.add(wall_id, along_wall(state, row, seen.in_map(state)))
+        return wall_id, is_new
+
+    def reported(self, row: int, hits: int) -> MapWall:
+        """Return a wall as the map reports it."""
+        state, wall_id = self._state, self._state.wall_ids[row]
+        phi, d = (float(value) for value in state.walls[row])
+        n, t = np.array([np.cos(phi), np.sin(phi)]), np.array([-np.sin(phi), np.cos(phi)])
+        columns = state.landmark_columns(np.array([len(state.landmark_ids) + row]))
+        P = state.P.block(np.concatenate([columns, [HEADING]]))
+        T = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+        spans = np.array(self.cells.spans_m(wall_id)).reshape(-1, 2)
+        return MapWall(
+            wall_id=wall_id,
+            phi_rad=phi,
+            d_m=d,
+            covariance=T @ P @ T.T,
+            spans_m=d * n + spans[:, :, None] * t,
+            hits=hits,
+        )
