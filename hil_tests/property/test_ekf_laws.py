@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hypothesis import Phase, given, settings
+from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 
 from hil_tests.property.ekf_oracles import (
@@ -193,6 +193,40 @@ LAWS = (
 @pytest.mark.parametrize("check", LAWS)
 def test_law_holds(check: Check) -> None:
     check(Filter())
+
+
+def test_jacobians_of_a_landmark_straight_behind() -> None:
+    """Its bearing jumps by a turn, its derivatives do not (MRPT issue 909)."""
+    for heading in (0.0, math.pi / 2, -math.pi, math.pi - 1e-9, 2.0):
+        c, s = math.cos(heading), math.sin(heading)
+        for aside in (-1e-12, 0.0, 1e-12):
+            pose = np.array([0.3, -0.2, heading])
+            landmark = pose[:2] - np.array([c + aside * s, s - aside * c])
+            H_pose, H_landmark = ekf_slam.observation_jacobians(pose, landmark[None])
+            fixed = pose.astype(np.complex128), landmark.astype(np.complex128)
+            by_pose = complex_step(lambda p, at=fixed[1]: observe(p, at), pose)
+            by_landmark = complex_step(lambda m, at=fixed[0]: observe(at, m), landmark)
+            assert np.abs(H_pose[0] - by_pose).max() <= 1e-10
+            assert np.abs(H_landmark[0] - by_landmark).max() <= 1e-10
+
+
+@given(st.one_of(angles, st.sampled_from([-math.pi, math.pi - 1e-9, math.pi])), increments)
+def test_motion_jacobian_is_the_complex_step_derivative(heading: float, u: Array) -> None:
+    pose = np.array([1.0, -2.0, heading])
+    wanted = complex_step(lambda p: move(p, u.astype(np.complex128)), pose)
+    assert np.abs(ekf_slam.motion_jacobian(heading, u) - wanted).max() <= 1e-10
+
+
+@given(st.floats(-20, 20), st.floats(-20, 20), st.sampled_from([-2, -1, 0, 1, 2]))
+@example(math.pi, 0.0, 0)
+@example(0.0, math.pi, 0)
+@example(math.pi - 1e-16, -math.pi, 0)
+def test_angle_of_an_innovation_lies_in_one_turn(observed: float, wanted: float, n: int) -> None:
+    observed += n * math.pi
+    r, angle = ekf_slam.innovation(np.array([1.0, observed]), np.array([0.75, wanted]))
+    assert r == 0.25
+    assert -math.pi <= angle < math.pi
+    assert turn_between(angle, observed - wanted) <= 1e-12
 
 
 # --- mutants: what existing filters get wrong ----------------------------------------------------
