@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from slam.association import Association, update_map
 from slam.clustering import Observation, filter_window
 from slam.config import EndOfRun, SampleTime, SlamConfig
-from slam.detection import Detection, make_detector
+from slam.detection import Detection, Detector, make_detector
 from slam.ekf_slam import Belief, motion_noise, predict, start
 from slam.frames import RadarFrame
 from slam.geometry import Rig, between
@@ -108,15 +108,17 @@ class UwbRadarSlam:
         Table I and the options around it.
     rig
         Where the radars sit.
+    detector
+        The front end, if not the one that the configuration names.
     """
 
-    def __init__(self, config: SlamConfig, rig: Rig) -> None:
+    def __init__(self, config: SlamConfig, rig: Rig, detector: Detector | None = None) -> None:
         self.config = config
         self.rig = rig
         self.belief: Belief = start()
         sensor = config.observation
         self._Q = np.diag([sensor.sigma_range_m**2, sensor.sigma_bearing_rad**2])
-        self._detector = make_detector(config)
+        self._detector = detector or make_detector(config)
         pulse = PulseModel(
             carrier_hz=config.matched_filter.carrier_hz,
             bandwidth_hz=config.matched_filter.bandwidth_hz,

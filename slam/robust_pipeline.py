@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.config import BackEnd, SlamConfig
-from slam.detection import Detection, make_detector
+from slam.detection import Detection, Detector, make_detector
 from slam.ekf_slam import Belief
 from slam.frames import RadarFrame
 from slam.geometry import Rig, between
@@ -23,7 +23,9 @@ from slam.window import has_moved
 Array = NDArray[np.float64]
 
 
-def make_slam(config: SlamConfig, rig: Rig, wheels: WheelNoise) -> Slam:
+def make_slam(
+    config: SlamConfig, rig: Rig, wheels: WheelNoise, detector: Detector | None = None
+) -> Slam:
     """Return the pipeline that a configuration names.
 
     Parameters
@@ -35,10 +37,12 @@ def make_slam(config: SlamConfig, rig: Rig, wheels: WheelNoise) -> Slam:
     wheels
         How the robot's odometry errs, as its specification says; preset ``paper`` has numbers of
         its own.
+    detector
+        The front end, if not the one that the configuration names.
     """
     if config.back_end is BackEnd.ROBUST:
-        return RobustSlam(config, rig, wheels)
-    return UwbRadarSlam(config, rig)
+        return RobustSlam(config, rig, wheels, detector)
+    return UwbRadarSlam(config, rig, detector)
 
 
 class RobustSlam:
@@ -56,13 +60,17 @@ class RobustSlam:
         Where the radars sit.
     wheels
         How odometry errs.
+    detector
+        The front end, if not the one that the configuration names.
     """
 
-    def __init__(self, config: SlamConfig, rig: Rig, wheels: WheelNoise) -> None:
+    def __init__(
+        self, config: SlamConfig, rig: Rig, wheels: WheelNoise, detector: Detector | None = None
+    ) -> None:
         self.config = config
         self.rig = rig
         self.back_end = RobustBackEnd(rig, back_end_parameters(config, wheels))
-        self._detector = make_detector(config)
+        self._detector = detector or make_detector(config)
         self._pose: Array | None = None  # odometry at the last state
         self._t_ns = 0
 
