@@ -16,6 +16,7 @@ from slam.app.errors import EXIT_FAILED, AppError, naming
 from slam.app.experiments import EXPERIMENTS, Experiment, ExperimentModule
 from slam.app.standard_streams import drop_what_cannot_be_said, open_closed_streams
 from slam.app.stop import StopFlag, StopRequestedError
+from slam.app.stress import STRESSES
 
 _TYPICAL_SEED = 19
 """Of seeds 0-19 in the lab, the one whose errors lie nearest the medians; see DECISIONS."""
@@ -112,18 +113,18 @@ def _parser() -> argparse.ArgumentParser:
     calibrate.add_argument("--json", action="store_true", help="print one JSON object")
     calibrate.set_defaults(command=_calibrate)
 
-    sweep = commands.add_parser(
-        "sweep",
-        help="repeat a run over scenes, presets and seeds",
-        description="Runs every scene with every preset and seed in process, without ports, and "
-        "writes each run's summary and the statistics of each group.",
+    _add_sweep(
+        commands.add_parser(
+            "sweep",
+            help="repeat a run over scenes, presets and seeds",
+            description="Runs every scene with every preset and seed in process, without ports, "
+            "and writes each run's summary and the statistics of each group. Stopped, the same "
+            "command goes on where it was. All numbers are simulated.",
+            epilog="STRESS is one of: "
+            + "; ".join(f"{row.name}: {row.help}" for row in STRESSES.values())
+            + ".",
+        )
     )
-    sweep.add_argument("--scene", nargs="+", default=["lab"], help="names or files of scenes")
-    sweep.add_argument("--preset", nargs="+", default=["paper"], help="settings of SLAM")
-    sweep.add_argument("--seeds", type=count, default=20, help="number of seeds, from 0")
-    sweep.add_argument("--jobs", type=count, default=1, help="processes")
-    sweep.add_argument("--json", type=Path, required=True, metavar="OUT", help="result file")
-    sweep.set_defaults(command=_sweep)
 
     experiment = commands.add_parser(
         "experiment",
@@ -141,6 +142,50 @@ def _parser() -> argparse.ArgumentParser:
             "--out", type=folder, default=Path("out/experiments"), help="folder for the results"
         )
     return parser
+
+
+def _setting(text: str) -> tuple[str, tuple[str, ...]]:
+    key, _, values = text.partition("=")
+    named = tuple(value.strip() for value in values.split(","))
+    if not key or not all(named):
+        raise argparse.ArgumentTypeError(f"must be KEY=VALUE or KEY=V1,V2, not {text!r}")
+    return key.strip(), named
+
+
+def _add_sweep(sweep: argparse.ArgumentParser) -> None:
+    sweep.add_argument("--scene", nargs="+", action="extend", help="names or files (default: lab)")
+    sweep.add_argument(
+        "--preset", nargs="+", action="extend", help="settings of SLAM (default: paper)"
+    )
+    sweep.add_argument("--seeds", type=count, default=20, help="number of seeds, from 0")
+    sweep.add_argument(
+        "--set",
+        type=_setting,
+        action="append",
+        default=[],
+        metavar="KEY=V1,V2",
+        help="replace a setting of the presets, like association.gate=0.6,9.2; several values, or "
+        "several --set, make a group for every combination",
+    )
+    sweep.add_argument(
+        "--stress",
+        nargs="+",
+        action="extend",
+        default=[],
+        choices=tuple(STRESSES),
+        metavar="STRESS",
+        help="run under these hardships, too, and print how much worse it gets",
+    )
+    sweep.add_argument(
+        "--bound",
+        action="store_true",
+        help="compute on each run's data what is possible with the true associations (GTSAM)",
+    )
+    where = sweep.add_mutually_exclusive_group()
+    where.add_argument("--jobs", type=count, help="processes (default: one per core)")
+    where.add_argument("--dask", metavar="ADDRESS", help="scheduler of a Dask cluster to run on")
+    sweep.add_argument("--json", type=Path, required=True, metavar="OUT", help="result file")
+    sweep.set_defaults(command=_sweep)
 
 
 class _ExperimentParser(argparse.ArgumentParser):
@@ -189,14 +234,20 @@ def _calibrate(arguments: argparse.Namespace, stop: StopFlag) -> None:
 
 
 def _sweep(arguments: argparse.Namespace, stop: StopFlag) -> None:
-    from slam.app.sweep import SweepOptions, run_sweep  # heavy, see module text
+    from joblib import cpu_count  # heavy, see module text
+
+    from slam.app.sweep import SweepOptions, run_sweep
 
     options = SweepOptions(
-        scenes=tuple(arguments.scene),
-        presets=tuple(arguments.preset),
+        scenes=tuple(arguments.scene or ["lab"]),
+        presets=tuple(arguments.preset or ["paper"]),
         n_seeds=arguments.seeds,
-        jobs=arguments.jobs,
+        jobs=arguments.jobs or cpu_count(),
         out=arguments.json,
+        settings=tuple(arguments.set),
+        stresses=tuple(arguments.stress),
+        bound=arguments.bound,
+        dask=arguments.dask,
     )
     run_sweep(options, stop)
 

@@ -72,6 +72,16 @@ _ROWS: tuple[Experiment, ...] = (
         help="a real recording of a standing module beside emulated frames",
         module="slam.app.experiments.recording",
     ),
+    Experiment(
+        name="consistency",
+        help="mean NEES and NIS of a sweep at ten times, against their bands",
+        module="slam.app.experiments.consistency",
+    ),
+    Experiment(
+        name="stress",
+        help="what each hardship of a sweep costs, in units of its clean runs",
+        module="slam.app.experiments.stress",
+    ),
 )
 
 EXPERIMENTS: Mapping[str, Experiment] = MappingProxyType({row.name: row for row in _ROWS})

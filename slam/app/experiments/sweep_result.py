@@ -1,0 +1,33 @@
+"""What `uwb-slam sweep` left behind, for pictures of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from slam.app.errors import AppError
+
+_NEEDED = {"scene", "preset", "settings", "stress", "ate_rmse_m", "anees_pose", "nis_times"}
+
+
+def read_groups(path: Path) -> list[dict[str, Any]]:
+    """Return the groups of a sweep's result file, in its order.
+
+    Raises
+    ------
+    AppError
+        It cannot be read, or no sweep wrote it; one line.
+    """
+    try:
+        groups: list[dict[str, Any]] = json.loads(path.read_bytes())["groups"]
+        complete = all(group.keys() >= _NEEDED for group in groups)
+    except OSError as error:
+        raise AppError(
+            f"{path}: cannot be read: {error.strerror or error}; `uwb-slam sweep --json` writes it"
+        ) from None
+    except (ValueError, LookupError, TypeError, AttributeError):
+        complete, groups = False, []
+    if not groups or not complete:
+        raise AppError(f"{path}: is not a result of this version's `uwb-slam sweep --json`")
+    return groups

@@ -1,0 +1,149 @@
+"""Statistics of a sweep: medians, 90th percentiles, consistency with its bands, per group."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy.special import gammaincinv
+
+from slam.app.report_table import mm_text, share_text
+from slam.app.stress import CLEAN
+from slam.app.summary import ratio
+from slam.app.sweep_run import SweepRun
+
+_POSE_DOF = 3
+
+
+def summarise_groups(runs: Sequence[SweepRun]) -> list[dict[str, Any]]:
+    """Return the statistics of each cell but its seeds, in the order they first appear.
+
+    A cell is scene, preset, settings and stress. Every group has its number of runs, how many beat
+    odometry, `median` and `p90` of the errors, medians of the landmarks' scores, the share of runs
+    without a duplicate, false landmarks (per run, and how many were claimed to be known), the mean
+    NEES over runs (ANEES) and the mean NIS per degree of freedom at each of the ten times with
+    their 95 % bands, and the same errors of the known-association bound where it was computed.
+    """
+    keys = list(dict.fromkeys(run.key[:-1] for run in runs))
+    return [_group([run for run in runs if run.key[:-1] == key]) for key in keys]
+
+
+def group_name(group: dict[str, Any]) -> str:
+    """Return what a group is called: scene, preset, settings and stress if there are any."""
+    settings = "".join(f", {key}={value}" for key, value in group["settings"].items())
+    stress = f", stress {group['stress']}" if group["stress"] != CLEAN else ""
+    return f"{group['scene']}, preset {group['preset']}{settings}{stress}"
+
+
+def group_line(group: dict[str, Any]) -> str:
+    """Return what a person wants to know of a group, in a line."""
+    estimate, wheels, found = (
+        group[key] for key in ("ate_rmse_m", "odometry_ate_rmse_m", "landmark_medians")
+    )
+    low, high = group["anees_band_95"]
+    inside = sum(low <= value <= high for _, value in group["anees_pose"])
+    beside = ""
+    if group["bound"] is not None:
+        medians = [
+            mm_text(group["bound"][f"{path}_ate_rmse_m"]["median"])
+            for path in ("filtered", "smoothed")
+        ]
+        beside = f"; known association: filtered median {medians[0]}, smoothed {medians[1]}"
+    return (
+        f"{group_name(group)}, {group['runs']} seeds (simulated): "
+        f"SLAM ATE median {mm_text(estimate['median'])} "
+        f"({ratio(estimate['median'], wheels['median']):.2f} of odometry's), "
+        f"p90 {mm_text(estimate['p90'])}; odometry median {mm_text(wheels['median'])}{beside}; "
+        f"landmark medians: precision {share_text(found['precision'])}, "
+        f"recall {share_text(found['recall'])}, rmse {mm_text(found['rmse_m'])}; "
+        f"no duplicate in {group['without_duplicates']:.0%}, "
+        f"{group['confident_false']} confident false landmarks; "
+        f"ANEES in band at {inside} of {len(group['anees_pose'])} times"
+    )
+
+
+def _group(runs: Sequence[SweepRun]) -> dict[str, Any]:
+    first = runs[0]
+    nis = [run.nis_mean for run in runs if run.nis_mean is not None]
+    return {
+        "scene": first.scene,
+        "preset": first.preset,
+        "settings": first.settings,
+        "stress": first.stress,
+        "runs": len(runs),
+        "runs_below_odometry": sum(run.ate_ratio < 1.0 for run in runs),
+        **{
+            name: spread([getattr(run, name) for run in runs])
+            for name in ("ate_rmse_m", "ate_icp_rmse_m", "odometry_ate_rmse_m", "final_error_m")
+        },
+        "landmark_medians": {
+            name: _median_of_known([getattr(run.landmarks, name) for run in runs])
+            for name in ("precision", "recall", "rmse_m")
+        },
+        "without_duplicates": statistics.fmean(run.landmarks.duplicates == 0 for run in runs),
+        "false_per_run": statistics.fmean(run.false for run in runs),
+        "confident_false": sum(run.confident_false for run in runs),
+        "realtime_factor": spread([run.realtime_factor for run in runs]),
+        **_anees([run.nees_pose for run in runs]),
+        "nis_mean": statistics.fmean(nis) if nis else None,
+        "nis_times": _nis_times(runs),
+        "bound": _bound(runs),
+    }
+
+
+def _anees(values: Sequence[tuple[tuple[float, float], ...]]) -> dict[str, Any]:
+    """Return [time, mean over runs] at each of the ten times, and where 95 % of them belong."""
+    anees = [
+        [statistics.fmean(pair[0] for pair in pairs), statistics.fmean(pair[1] for pair in pairs)]
+        for pairs in zip(*values, strict=True)
+    ]
+    return {"anees_pose": anees, "anees_band_95": _band(_POSE_DOF * len(values), len(values))}
+
+
+def _nis_times(runs: Sequence[SweepRun]) -> list[list[float | None]]:
+    """Return [time, NIS per degree of freedom over runs, its band] at each of the ten times.
+
+    None where no run associated anything truly.
+    """
+    rows: list[list[float | None]] = []
+    for cells in zip(*(run.nis_times for run in runs), strict=True):
+        time_s = statistics.fmean(cell[0] for cell in cells)
+        dof = sum(cell[2] for cell in cells)
+        if dof:
+            total = sum(cell[1] for cell in cells)
+            rows.append([time_s, total / dof, *_band(dof, dof)])
+        else:
+            rows.append([time_s, None, None, None])
+    return rows
+
+
+def _bound(runs: Sequence[SweepRun]) -> dict[str, Any] | None:
+    bounds = [run.bound for run in runs if run.bound is not None]
+    if not bounds:
+        return None
+    return {
+        "filtered_ate_rmse_m": spread([bound.filtered_ate_rmse_m for bound in bounds]),
+        "smoothed_ate_rmse_m": spread([bound.smoothed_ate_rmse_m for bound in bounds]),
+        **_anees([bound.nees_pose for bound in bounds]),
+    }
+
+
+def spread(values: Sequence[float]) -> dict[str, float]:
+    """Return median and 90th percentile."""
+    return {"median": float(np.median(values)), "p90": float(np.quantile(values, 0.9))}
+
+
+def _band(dof: int, parts: int) -> list[float]:
+    """Return where 95 % of the means over ``parts`` of a chi-square of ``dof`` in all lie.
+
+    The quantile is that of a gamma distribution; scipy.stats would take a second to import.
+    """
+    return [2.0 * float(gammaincinv(dof / 2, tail)) / parts for tail in (0.025, 0.975)]
+
+
+def _median_of_known(values: Sequence[float | None]) -> float | None:
+    """Return the median of the runs that have the number; None where no run has it."""
+    known = [value for value in values if value is not None]
+    return statistics.median(known) if known else None
