@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from slam.robust.existence import Existence
 from slam.robust.parameters import MapRule
@@ -93,22 +94,43 @@ def find_merge(state: State, existence: Existence, rule: MapRule) -> Merge | Non
 
 
 def _candidates(state: State, existence: Existence, rule: MapRule) -> list[Merge]:
-    """Return all merges of two landmarks within reach that pass the gate."""
-    n = len(state.landmark_ids)
-    if n < 2:
+    """Return all merges of two landmarks within reach that pass the gate.
+
+    Only pairs that are near touch the covariance, all of them at once.
+    """
+    if len(state.landmark_ids) < 2:
         return []
-    first, second = np.triu_indices(n, 1)
-    apart = state.landmarks_m[first] - state.landmarks_m[second]
-    near = np.flatnonzero(np.hypot(apart[:, 0], apart[:, 1]) <= rule.merge_reach_m)
+    near = cKDTree(state.landmarks_m).query_pairs(rule.merge_reach_m, output_type="ndarray")
+    near = near[np.lexsort((near[:, 1], near[:, 0]))].astype(np.intp)
+    distances = _distances_sq(state, near, rule.merge_sigma_m)
+    # The last word is the judge's: here, rounding must not leave out what it would accept.
     found = []
-    for place in near:
-        i, j = int(first[place]), int(second[place])
-        if existence.are_apart(state.landmark_ids[i], state.landmark_ids[j]):
+    for first, second in near[distances <= (1.0 + 1e-6) * rule.merge_gate].tolist():
+        if existence.are_apart(state.landmark_ids[first], state.landmark_ids[second]):
             continue
-        merge = judge(state, ((i, j),), rule.merge_sigma_m)
+        merge = judge(state, ((first, second),), rule.merge_sigma_m)
         if merge.mahalanobis_sq <= rule.merge_gate:
             found.append(merge)
     return found
+
+
+def _distances_sq(state: State, pairs: Indices, sigma_m: float) -> Array:
+    """Return d^2 of the statement that pairs of rows, shape (k, 2), are one landmark each."""
+    start = state.landmark_columns(np.zeros(1, dtype=np.intp))[0]
+    i, j = start + 2 * pairs[:, 0], start + 2 * pairs[:, 1]
+
+    def spread(a: int, b: int) -> Array:
+        entries = state.P.entries
+        own = entries(i + a, i + b) + entries(j + a, j + b)
+        return np.asarray(own - entries(i + a, j + b) - entries(j + a, i + b))
+
+    xx, yy, xy = spread(0, 0) + sigma_m**2, spread(1, 1) + sigma_m**2, spread(0, 1)
+    apart = state.landmarks_m[pairs[:, 0]] - state.landmarks_m[pairs[:, 1]]
+    x, y = apart[:, 0], apart[:, 1]
+    # Where rounding has left no spread at all, nothing is ruled out here.
+    determinant = np.maximum(xx * yy - xy**2, 0.0)
+    numerator = yy * x**2 - 2.0 * xy * x * y + xx * y**2
+    return np.where(determinant > 1e-12 * xx * yy, numerator / np.maximum(determinant, 1e-300), 0.0)
 
 
 def _joint_merge(state: State, fair: list[Merge], floor: float, rule: MapRule) -> Merge | None:

@@ -16,10 +16,13 @@ from hil_tests.unit.slam.robust.range_world import LAB, parameters_for, simulate
 from slam.geometry import paper_rig
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.condensed import Condensed
-from slam.robust.parameters import RelinearisationRule
-from slam.robust.prior import first_values, prior_cost
+from slam.robust.motion import calibrated_motion, predict
+from slam.robust.parameters import RelinearisationRule, WheelNoise
+from slam.robust.prior import first_values, prior_cost, prior_terms
 from slam.robust.problem import Estimate, Prior, Problem, start_prior
+from slam.robust.run_log import RunLog
 from slam.robust.smoother import Smoother
+from slam.robust.state import State
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -292,6 +295,44 @@ def test_a_merge_states_that_two_points_are_one_and_a_drop_marginalises() -> Non
     assert not left.information[size - 2 :].any(), "nothing is known of the landmark it lacks"
     with pytest.raises(ValueError, match=r"lacks: \[3, 9\]"):
         known().of([7, 11])
+
+
+def test_a_prior_pulls_as_its_cost_falls() -> None:
+    """Far from where it was taken too: the gradient is half the derivative of the cost."""
+    problem, start = short_run(7, 0.0)
+    prior = Smoother(problem, RULE).condensed(start, N_GONE, math.inf)
+    rng = np.random.default_rng(8)
+    values = prior.mean + 0.1 * rng.standard_normal(len(prior.mean))
+    terms = prior_terms(prior, values, N_RADARS)
+    assert terms.cost == pytest.approx(prior_cost(prior, values, N_RADARS), rel=1e-12)
+
+    def cost(x: Complex) -> Complex:
+        e = invariant_errors(prior.mean, x)
+        return np.atleast_1d(e @ (prior.information @ e + 2.0 * prior.gradient))
+
+    slope = derivative(cost, values)[0]
+    assert terms.cost == pytest.approx(float(cost(values.astype(np.complex128))[0].real), rel=1e-9)
+    assert np.abs(2.0 * terms.gradient - slope).max() <= 1e-9 * np.abs(slope).max()
+    K = derivative(lambda y: invariant_errors(prior.mean, y), values)
+    wanted = K.T @ prior.information @ K
+    assert np.abs(terms.information - wanted).max() <= 1e-9 * np.abs(wanted).max()
+
+
+def test_both_starts_of_a_solution_begin_at_the_first_pose_kept() -> None:
+    wheels = WheelNoise()
+    log, state = RunLog(wheels), State(wheels.calibration_sigmas, (0.0,) * N_RADARS)
+    step = np.array([0.1, 0.0, 0.1])
+    for _ in range(30):
+        predict(state, calibrated_motion(step, np.zeros(3), wheels), wheels)
+        log.add_motion(step, 1e-4 * np.eye(3), 0.0, np.zeros(3))
+        log.set_causal(state.pose)
+    before = log.problem(state, start_prior((0.01,) * 3, (0.0,) * N_RADARS, 0), 0.01)
+    prior = Smoother(before, RULE).condensed(log.starts(state, before)[0], 20, math.inf)
+    log.condense(prior, [], 20)
+    assert (log.n_poses, log.n_kept) == (31, 11)
+    causal, chained = log.starts(state, log.problem(state, prior, 0.01))
+    assert causal.poses[0] == pytest.approx(prior.mean[:3], abs=1e-12)
+    assert chained.poses == pytest.approx(causal.poses, abs=1e-9)
 
 
 def test_the_first_pose_is_where_the_first_values_are() -> None:
