@@ -1,0 +1,36 @@
+"""Made-up results of a sweep, for tests of what becomes of them."""
+
+from __future__ import annotations
+
+from slam.app.known_bound import BoundSummary
+from slam.app.summary import LandmarkSummary
+from slam.app.sweep_run import Case, SweepRun
+
+
+def run_of(case: Case) -> SweepRun:
+    """Return numbers that depend on the case alone, every field set."""
+    return SweepRun(
+        scene=case.scene.name,
+        preset=case.preset,
+        seed=case.seed,
+        settings=dict(case.settings),
+        stress=case.stress,
+        frames=100,
+        duration_s=10.0,
+        realtime_factor=50.0,
+        ate_rmse_m=0.01 + 0.001 * case.seed + 0.1 / 3,
+        ate_icp_rmse_m=0.005,
+        odometry_ate_rmse_m=0.04,
+        final_error_m=0.02,
+        landmarks=LandmarkSummary(
+            true=4, estimated=4, precision=None, recall=1.0, duplicates=case.seed % 2, rmse_m=0.01
+        ),
+        nees_pose=((1.0, 2.0), (9.9, 1.0)),
+        nis_mean=None,
+        nis_times=((1.0, 2.5, 2), (9.9, 0.0, 0)),
+        false=2,
+        confident_false=1,
+        bound=BoundSummary(
+            filtered_ate_rmse_m=0.1 / 7, smoothed_ate_rmse_m=0.003, nees_pose=((1.0, 3.0),)
+        ),
+    )
