@@ -302,10 +302,11 @@ class RobustBackEnd:
                 guesses = pair_guesses(frames[0], noise, rule)
             if not guesses:
                 continue
-            for wall in self._walls.find(frames) if len(radars) > 1 else ():
-                wall_id, is_new = self._walls.place(wall)
-                self._use(wall_id, wall.members)
-                (born if is_new else again).append(wall_id)
+            for wall in self._walls.find(self._leftovers, radars):
+                placed = self._walls.place(wall)
+                if placed is not None:
+                    self._use(placed[0], wall.members)
+                    (born if placed[1] else again).append(placed[0])
             offsets = np.arange(state.offsets.start, state.offsets.stop)
             tracker = Tracker(noise, rule, state.offsets_m, state.P.block(offsets))
             n_radars = min(len(radars), 2)

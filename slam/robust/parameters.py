@@ -203,6 +203,8 @@ class WallRule:
 
     Attributes
     ----------
+    window, min_frames, min_way_m
+        Frames looked back, fewest that hit, and how far the echo must have moved along the wall.
     wall_lead, point_lead
         By how much chi-square must be less under a law for a wall, or a point, to be believed.
     match_gate, match_lead
@@ -212,15 +214,23 @@ class WallRule:
         Density of walls not yet in the map: the likelihood of a match must exceed it.
     cell_m, reach_m
         Walls are known in cells of this length; how far from one of them a wall may answer.
+    resolution_m, resolution_rad
+        A wall as near as this to a mapped one, and not it, is its echo merged with another: a
+        pulse is longer than that.
     """
 
-    wall_lead: float = 12.0
+    window: int = 40
+    min_frames: int = 25
+    min_way_m: float = 0.25
+    wall_lead: float = 30.0
     point_lead: float = 0.0
     match_gate: float = 13.8
     match_lead: float = 6.0
     unmapped_per_rad_m: float = 0.3
     cell_m: float = 0.1
     reach_m: float = 1.0
+    resolution_m: float = 0.05
+    resolution_rad: float = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.robust.continuation import Continuation
-from slam.robust.leftovers import Slot
+from slam.robust.leftovers import Leftovers
 from slam.robust.parameters import BackEndParameters, WallRule
 from slam.robust.ranges import Antennas, View
 from slam.robust.reports import MapWall
@@ -28,6 +28,7 @@ from slam.robust.walls import (
     foot_points,
     give_birth_to_wall,
     hide_unreached,
+    is_unresolved,
     match_wall,
     update_with_wall,
 )
@@ -89,15 +90,19 @@ class WallKeeper:
         offsets = np.arange(state.offsets.start, state.offsets.stop)
         return WallTracker(self._parameters, self._rule, state.offsets_m, state.P.block(offsets))
 
-    def find(self, frames: Sequence[Sequence[Slot]]) -> list[WallTracklet]:
-        """Return the walls in the unused ranges of the last frames, which they use up."""
-        if self._parameters.walls is None:
+    def find(self, leftovers: Leftovers, radars: Sequence[int]) -> list[WallTracklet]:
+        """Return the walls in what some radars of a side have not used, and use that up."""
+        if self._parameters.walls is None or len(radars) < 2:
             return []
+        frames = leftovers.slots(radars, self._rule.window)
         guesses = wall_guesses(frames[0], self._parameters.ranges)
         return find_wall_tracklets(self._tracker(), guesses, frames) if guesses else []
 
-    def place(self, tracklet: WallTracklet) -> tuple[int, bool]:
-        """Bring a wall into the map; return its id and whether it is new."""
+    def place(self, tracklet: WallTracklet) -> tuple[int, bool] | None:
+        """Bring a wall into the map; return its id and whether it is new.
+
+        None: it is too near to a mapped one to be another.
+        """
         state = self._state
         phi, d = tracklet.wall
         n = np.array([np.cos(phi), np.sin(phi)])
@@ -110,6 +115,8 @@ class WallKeeper:
         )
         row = match_wall(state, seen, self.cells, self._rule)
         is_new = row is None
+        if row is None and is_unresolved(state, seen, self.cells, self._rule):
+            return None
         if row is None:
             wall_id = give_birth_to_wall(state, seen)
             row = len(state.wall_ids) - 1

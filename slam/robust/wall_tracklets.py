@@ -171,10 +171,21 @@ class WallTracker:
         way = math.hypot(last.x_m - first.x_m, last.y_m - first.y_m)
         return self._heading_rad_per_sqrt_m**2 * way / 3.0
 
+    def _way_m(self, tracklet: WallTracklet) -> float:
+        """Return how far the echo moved along the wall."""
+        phi = float(tracklet.wall[0])
+        along = [math.cos(phi) * m.slot.y_m - math.sin(phi) * m.slot.x_m for m in tracklet.members]
+        of_radar: dict[int, list[float]] = {}
+        for member, place in zip(tracklet.members, along, strict=True):
+            of_radar.setdefault(member.slot.radar, []).append(place)
+        return max(max(places) - min(places) for places in of_radar.values())
+
     def is_wall(self, tracklet: WallTracklet) -> bool:
         """Tell whether a tracklet is evidence of a wall and not of a point."""
         rule, members = self._rule, tracklet.members
-        if len({member.slot.back for member in members}) < rule.min_frames:
+        if len({member.slot.back for member in members}) < self._walls.min_frames:
+            return False
+        if self._way_m(tracklet) < self._walls.min_way_m:
             return False
         hits: dict[int, int] = {}
         for member in members:
@@ -187,7 +198,7 @@ class WallTracker:
         verdict = compare(self.sightings(members), float(tracklet.wall[0]))
         return verdict.law(self._walls.wall_lead) is Law.WALL
 
-    def may_be_point(self, tracklet: Tracklet) -> bool:
+    def is_point(self, tracklet: Tracklet) -> bool:
         """Tell whether the ranges of a tracklet follow a point's law rather than a wall's."""
         members = tracklet.members
         middle = np.mean([(m.slot.x_m, m.slot.y_m) for m in members], axis=0)

@@ -167,6 +167,22 @@ def match_wall(state: State, seen: BodyWall, cells: WallCells, rule: WallRule) -
     return best
 
 
+def is_unresolved(state: State, seen: BodyWall, cells: WallCells, rule: WallRule) -> bool:
+    """Tell whether a wall seen is nearer to a mapped one than radars tell two walls apart."""
+    feet = seen.in_map(state)
+    phi_seen = float(seen.wall[0]) + state.heading_rad
+    for row, wall_id in enumerate(state.wall_ids):
+        phi, d = (float(value) for value in state.walls[row])
+        if abs(wrap_angle(phi_seen - phi)) > rule.resolution_rad:
+            continue
+        apart = np.abs(feet @ np.array([math.cos(phi), math.sin(phi)]) - d)
+        along = along_wall(state, row, feet)
+        near = [cells.distance_m(wall_id, float(place)) <= rule.reach_m for place in along]
+        if float(apart.max()) <= rule.resolution_m and any(near):
+            return True
+    return False
+
+
 def update_with_wall(state: State, wall_row: int, seen: BodyWall) -> float:
     """Correct the state with a wall seen that is a mapped one; return the NIS (2 dof)."""
     rows = wall_rows(state, wall_row, seen)
