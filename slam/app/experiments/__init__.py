@@ -73,6 +73,11 @@ _ROWS: tuple[Experiment, ...] = (
         module="slam.app.experiments.recording",
     ),
     Experiment(
+        name="step-cost",
+        help="what a step of the robust filter costs against the size of the map",
+        module="slam.app.experiments.step_cost",
+    ),
+    Experiment(
         name="consistency",
         help="mean NEES and NIS of a sweep at ten times, against their bands",
         module="slam.app.experiments.consistency",

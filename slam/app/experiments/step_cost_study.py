@@ -1,0 +1,229 @@
+"""Times one step of the robust filter: the work behind the experiment `step-cost`.
+
+Time is CPU time of this thread with one BLAS thread, so that a loaded machine changes little but
+the caches. Every step of a cycle is timed again and again and its least counts; the mean over the
+cycle is the cost of a step, the passes over the covariance that many steps share among them.
+"""
+
+from __future__ import annotations
+
+import math
+import platform
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import scipy
+from scipy.linalg.blas import dsyr2, dsyrk
+from threadpoolctl import threadpool_limits
+
+from slam.geometry import paper_rig
+from slam.robust.continuation import sure_landmarks
+from slam.robust.motion import Motion, calibrated_motion, predict
+from slam.robust.parameters import ContinuationRule, RangeNoise, WheelNoise
+from slam.robust.ranges import antennas_of, rows_of, sides_of, view
+from slam.robust.state import State
+from slam.robust.symmetric import SymmetricMatrix
+
+N_UPDATES = 4
+BAR_MS, BAR_LANDMARKS = 4.0, 1000
+SLOPE_FROM = 200
+
+# Sixteen steps between two passes over a large covariance: three whole cycles.
+_CYCLE = 48
+_DENSITY_PER_M2 = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reference:
+    """A number somebody else's code takes at 1000 landmarks, as quoted: low and high [ms]."""
+
+    name: str
+    low_ms: float
+    high_ms: float
+
+
+REFERENCES = (
+    Reference(name="PythonRobotics, one update", low_ms=1604.0, high_ms=1604.0),
+    Reference(name="naive numpy, one update", low_ms=29.0, high_ms=29.0),
+    Reference(name="in-place dsyrk, one update", low_ms=0.4, high_ms=0.7),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StepCost:
+    """What a step costs at one size of the map, CPU time in milliseconds.
+
+    Attributes
+    ----------
+    n_landmarks, size
+        Landmarks, and rows of the covariance.
+    step_ms, slowest_ms
+        Mean over a cycle, and the slowest of it: the one that carries out what others put off.
+    at_once_ms
+        The two passes that a step would make if it put nothing off: ``dsyr2`` and ``dsyrk`` of
+        rank 4, in place, nothing else.
+    triangle_ms, triangle_gb_per_s
+        Reading and writing as many bytes as the triangle has, in order: what memory allows.
+    """
+
+    n_landmarks: int
+    size: int
+    step_ms: float
+    slowest_ms: float
+    at_once_ms: float
+    triangle_ms: float
+    triangle_gb_per_s: float
+
+
+def mapped_state(n: int) -> State:
+    """Return a state amid n landmarks, one per square metre, known to millimetres, correlated.
+
+    The first two lie abreast of the robot, one on each side, in view of both radars there.
+    """
+    rng = np.random.default_rng(n)
+    wheels = WheelNoise()
+    state = State(wheels.calibration_sigmas, (0.0,) * len(paper_rig().mounts))
+    size = state.P.size + 2 * n
+    root = 1e-3 * rng.standard_normal((size, 40)) / math.sqrt(40)
+    state.P = SymmetricMatrix(root @ root.T + 1e-7 * np.eye(size))
+    half = 0.5 * math.sqrt(n / _DENSITY_PER_M2)
+    state.landmarks_m = rng.uniform(-half, half, (n, 2))
+    state.landmarks_m[:2] = [[0.0, 1.0], [0.0, -1.0]]
+    state.landmark_ids = list(range(n))
+    state.next_id = n
+    return state
+
+
+def stepper(state: State) -> Callable[[], None]:
+    """Return a function that takes one step: predict, view, gate, update with four ranges.
+
+    The robot goes to and fro, so that what it sees stays the same.
+    """
+    rig, wheels, noise, rule = paper_rig(), WheelNoise(), RangeNoise(), ContinuationRule()
+    sides = sides_of(rig)
+    radars = np.array([radar for side in sides for radar in side], dtype=np.intp)
+    R = np.full(N_UPDATES, noise.sigma_m**2)
+    mounts = antennas_of(rig, (), _at_rest())
+    seen = view(state, mounts)
+    nearest = [int(np.argmin(seen.ranges_m[radar, :2])) for radar in radars]
+    landmarks = np.array(nearest, dtype=np.intp)
+    taken = 0
+
+    def step() -> None:
+        nonlocal taken
+        taken += 1
+        increment = np.array([0.01 if taken % 2 else -0.01, 0.0, 0.0])
+        predict(state, calibrated_motion(increment, state.calibration, wheels), wheels)
+        seen = view(state, mounts)
+        for side in sides:
+            sure_landmarks(state, seen, side, noise, rule)
+        rows = rows_of(state, seen, radars, landmarks)
+        state.update(rows.at, rows.H, np.zeros(N_UPDATES), R)
+
+    return step
+
+
+def study(
+    sizes: Sequence[int], *, repetitions: int, check: Callable[[], None]
+) -> tuple[StepCost, ...]:
+    """Return the cost of a step at each number of landmarks; ``check`` may raise in between."""
+    costs = []
+    with threadpool_limits(1):
+        for n in sizes:
+            check()
+            state = mapped_state(n)
+            per_step = _least_of_cycle(stepper(state), repetitions, check)
+            size = state.P.size
+            check()
+            at_once_ms = _passes_ms(size, repetitions)
+            triangle_ms = _triangle_ms(size, repetitions)
+            n_bytes = 2 * 8 * size * (size + 1) / 2
+            costs.append(
+                StepCost(
+                    n_landmarks=n,
+                    size=size,
+                    step_ms=float(np.mean(per_step)),
+                    slowest_ms=float(np.max(per_step)),
+                    at_once_ms=at_once_ms,
+                    triangle_ms=triangle_ms,
+                    triangle_gb_per_s=n_bytes / (1e6 * triangle_ms),
+                )
+            )
+    return tuple(costs)
+
+
+def slope_of(costs: Sequence[StepCost]) -> float | None:
+    """Return d ln(step) / d ln(n) from 200 landmarks on, by least squares; None for one size."""
+    large = [cost for cost in costs if cost.n_landmarks >= SLOPE_FROM]
+    if len(large) < 2:
+        return None
+    n = np.log([cost.n_landmarks for cost in large])
+    ms = np.log([cost.step_ms for cost in large])
+    return float(np.polyfit(n, ms, 1)[0])
+
+
+def numbers_of(costs: Sequence[StepCost], *, repetitions: int) -> dict[str, object]:
+    """Return what goes into the JSON file."""
+    return {
+        "measured": "CPU time of one thread, one BLAS thread, the least of the repetitions of "
+        "every step; mean and slowest over a cycle of steps",
+        "step": f"predict, view of all landmarks, gate, {N_UPDATES} range updates; P is dense",
+        "repetitions": repetitions,
+        "cycle_steps": _CYCLE,
+        "machine": platform.machine(),
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "bar": {"landmarks": BAR_LANDMARKS, "step_ms": BAR_MS, "slope": 2.0},
+        "slope": slope_of(costs),
+        "slope_from_landmarks": SLOPE_FROM,
+        "steps": [asdict(cost) for cost in costs],
+        "quoted": [{"landmarks": BAR_LANDMARKS} | asdict(row) for row in REFERENCES],
+    }
+
+
+def _least_of_cycle(
+    step: Callable[[], None], repetitions: int, check: Callable[[], None]
+) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """Return the least time [ms] of each step of a cycle, shape (steps,)."""
+    least = np.full(_CYCLE, np.inf)
+    for _ in range(_CYCLE):  # warm, and at the beginning of a cycle
+        step()
+    for _ in range(repetitions):
+        check()
+        for place in range(_CYCLE):
+            began = time.thread_time_ns()
+            step()
+            least[place] = min(least[place], 1e-6 * (time.thread_time_ns() - began))
+    return least
+
+
+def _passes_ms(size: int, repetitions: int) -> float:
+    P = np.asfortranarray(np.eye(size))
+    a, W = np.full(size, 1e-9), np.full((size, N_UPDATES), 1e-9, order="F")
+
+    def passes() -> None:
+        dsyr2(1.0, a, a, a=P, lower=1, overwrite_a=1)
+        dsyrk(-1.0, W, beta=1.0, c=P, lower=1, overwrite_c=1)
+
+    return _least_ms(passes, repetitions)
+
+
+def _triangle_ms(size: int, repetitions: int) -> float:
+    entries = np.ones(size * (size + 1) // 2)
+    return _least_ms(lambda: np.add(entries, 1e-9, out=entries), repetitions)
+
+
+def _least_ms(work: Callable[[], object], repetitions: int) -> float:
+    least = math.inf
+    for _ in range(2 + repetitions):
+        began = time.thread_time_ns()
+        work()
+        least = min(least, 1e-6 * (time.thread_time_ns() - began))
+    return least
+
+
+def _at_rest() -> Motion:
+    return Motion(step_m=np.zeros(2), turn_rad=0.0, covariance=np.zeros((3, 3)), walk_variance=0.0)
