@@ -122,11 +122,9 @@ class RobustSlam:
         if not has_moved(self._pose, pose, self.config.window):
             return ()
         detections = detect()
-        sigmas_m = tuple(self._sigma_m(detection) for detection in detections)
         back_end = self.back_end
         back_end.predict(between(self._pose, pose))
-        fit = [d for d, sigma_m in zip(detections, sigmas_m, strict=True) if sigma_m < math.inf]
-        report = back_end.update(self._scans(fit, stamps_ns, t_ns))
+        report = back_end.update(self._scans(detections, stamps_ns, t_ns))
         self._pose, self._t_ns = pose, t_ns
         return (
             StepResult(
@@ -135,19 +133,8 @@ class RobustSlam:
                 belief=belief_of(back_end),
                 detections=detections,
                 report=report,
-                range_sigmas_m=sigmas_m,
             ),
         )
-
-    def _sigma_m(self, detection: Detection) -> float:
-        """Return the standard deviation of a range; infinite for one to be left out.
-
-        A front end that predicts nothing (NaN) is taken at its word.
-        """
-        told = self.config.robust
-        unfit = detection.misfit > told.max_misfit
-        unfit |= detection.sigma_m > told.max_predicted_sigma_m
-        return math.inf if unfit else told.range_sigma_m
 
     def _scans(
         self, detections: Sequence[Detection], stamps_ns: dict[int, int], t_ns: int
@@ -179,7 +166,7 @@ def back_end_parameters(config: SlamConfig, wheels: WheelNoise) -> BackEndParame
     return BackEndParameters(
         wheels=wheels,
         ranges=RangeNoise(
-            sigma_m=told.range_sigma_m,
+            sigma_m=math.hypot(told.range_sigma_m, told.range_floor_m),
             offset_sigma_m=told.offset_sigma_m,
             detection_probability=told.detection_probability,
             clutter_per_m=told.false_ranges_per_frame / reach_m,

@@ -199,7 +199,7 @@ def small_problem(seed: int) -> tuple[Problem, Estimate]:
         range_landmarks=np.array([0, 1, 0, 1]),
         range_antennas=rng.uniform(-0.2, 0.2, (4, 2)),
         ranges_m=rng.uniform(0.5, 1.5, 4),
-        range_sigma_m=0.01,
+        range_sigmas_m=np.full(4, 0.01),
         point_poses=np.array([3, 4]),
         point_landmarks=np.array([1, 0]),
         points=np.array([[1.0, 0.2], [1.2, -0.4]]),

@@ -274,7 +274,7 @@ def wandering(seed: int, walk: float) -> tuple[Problem, Estimate]:
         range_landmarks=marks,
         range_antennas=m,
         ranges_m=z + 2e-3 * rng.standard_normal(len(z)),
-        range_sigma_m=5e-3,
+        range_sigmas_m=np.full(len(z), 5e-3),
         point_poses=np.zeros(0, dtype=np.intp),
         point_landmarks=np.zeros(0, dtype=np.intp),
         points=np.zeros((0, 2)),
@@ -326,7 +326,7 @@ def test_the_smoother_is_least_squares_and_its_complement_the_marginal(walk: flo
         )
         expected = np.linalg.norm(marks[problem.range_landmarks] - antenna, axis=1)
         expected = expected + offsets[problem.range_radars]
-        result.append((expected - problem.ranges_m) / problem.range_sigma_m)
+        result.append((expected - problem.ranges_m) / problem.range_sigmas_m)
         first = np.concatenate([poses[0], calibration[0], offsets])
         result.append(first / prior_sigmas)
         return np.concatenate(result)

@@ -11,7 +11,7 @@ from slam.robust.births import BodyPoint, give_birth, match, update_with_point
 from slam.robust.continuation import (
     Continuation,
     continue_tracks,
-    sure_landmarks,
+    landmarks_in_view,
 )
 from slam.robust.existence import Existence
 from slam.robust.expected import expected_ranges
@@ -25,6 +25,7 @@ from slam.robust.relinearisation import is_due, relinearise
 from slam.robust.reports import ExpectedRange, MapLandmark, MapWall, UpdateReport
 from slam.robust.run_log import RunLog
 from slam.robust.state import State
+from slam.robust.surprise import Trial, trials
 from slam.robust.symmetric import Array
 from slam.robust.tracklets import (
     Member,
@@ -35,6 +36,7 @@ from slam.robust.tracklets import (
     single_guesses,
 )
 from slam.robust.wall_keeper import WallKeeper
+from slam.robust.whereabouts import Whereabouts, forget
 
 
 class RobustBackEnd:
@@ -61,7 +63,10 @@ class RobustBackEnd:
         rule = parameters.tracklets
         scale = rule.drift_share * parameters.wheels.scale_sigma
         self._leftovers = Leftovers(
-            max(rule.window, rule.single_window), scale, scale * rule.lever_m
+            max(rule.window, rule.single_window),
+            parameters.ranges.sigma_m,
+            scale,
+            scale * rule.lever_m,
         )
         self._existence = Existence(parameters.map)
         self._log = RunLog(parameters.wheels)
@@ -71,6 +76,8 @@ class RobustBackEnd:
         self._landmark_of_label: dict[int, int] = {}
         self._n_updates = 0
         self._expected: list[ExpectedRange] = []
+        self._trials: list[Trial] = []
+        self._whereabouts = Whereabouts(parameters)
 
     @property
     def pose(self) -> Array:
@@ -80,6 +87,8 @@ class RobustBackEnd:
     @property
     def pose_covariance(self) -> Array:
         """Return the covariance of the pose, shape (3, 3)."""
+        if self._whereabouts.is_lost:
+            return self._whereabouts.lost_covariance
         return self.state.pose_covariance()
 
     def landmarks(self) -> tuple[MapLandmark, ...]:
@@ -95,11 +104,12 @@ class RobustBackEnd:
         )
 
     def reported_rows(self) -> list[int]:
-        """Return the rows of the state whose landmarks were hit often enough to be reported."""
+        """Return the rows of landmarks hit often enough to be reported; of an island, none."""
+        elsewhere, lost = self._whereabouts.elsewhere, self._whereabouts.is_lost
         return [
             row
             for row, id_ in enumerate(self.state.landmark_ids)
-            if self._existence.is_reported(id_)
+            if self._existence.is_reported(id_) and (id_ in elsewhere or not lost)
         ]
 
     def walls(self) -> tuple[MapWall, ...]:
@@ -131,17 +141,24 @@ class RobustBackEnd:
 
     def update(self, scans: Sequence[RangeScan]) -> UpdateReport:
         """Take in what the radars saw; a radar without a frame is absent, not empty."""
-        antennas = antennas_of(self.rig, scans, self._motion)
+        antennas = antennas_of(self.rig, scans, self._motion, self.state.calibration)
         self._silent = np.where(antennas.heard, 0, self._silent + 1)
-        self._expected = []
+        self._expected, self._trials = [], []
+        was_lost = self._whereabouts.is_lost
         continued, nis = self._continue_tracks(scans, antennas)
+        carried = self._whereabouts.is_carried
+        if carried:
+            continued, nis = (), 0.0
+            self._whereabouts.set_down(self.state, self._existence, self._log)
+            self._leftovers.clear()
         used = {(radar, index) for radar, index, _ in continued}
         self._leftovers.keep(self._log.n_poses - 1, antennas, scans, used)
         born, seen_again = self._raise_tracklets()
         deleted = self._delete_lost()
         self._n_updates += 1
         merged = self._merge()
-        relinearised = is_due(self._log, self.state, self.parameters) and self.relinearise()
+        lost = self._whereabouts.is_lost
+        relinearised = self._is_due() and self.relinearise()
         self._log.set_causal(self.state.pose)
         return UpdateReport(
             continued=continued,
@@ -153,6 +170,9 @@ class RobustBackEnd:
             dof=len(continued),
             relinearised=relinearised,
             expected=tuple(self._expected),
+            carried=carried,
+            lost=lost,
+            relocated=was_lost and not lost,
         )
 
     def update_points(
@@ -182,7 +202,7 @@ class RobustBackEnd:
         for point, row in zip(points, rows, strict=True):
             landmark_id = None if row is None else self._see_point(point, row)
             found.append(landmark_id)
-        if is_due(self._log, state, self.parameters):
+        if self._is_due():
             self.relinearise()
         self._log.set_causal(state.pose)
         return tuple(found)
@@ -203,8 +223,18 @@ class RobustBackEnd:
         return landmark_id
 
     def relinearise(self) -> bool:
-        """Solve for all poses and replace the belief; tell whether that worked."""
+        """Solve for all poses and replace the belief; tell whether that worked.
+
+        Not while the robot is lost or something speaks against its pose: a wrong measurement
+        would be spread over the whole run.
+        """
+        if self._whereabouts.is_lost or self._whereabouts.is_suspicious:
+            return False
         return relinearise(self._log, self.state, self.parameters)
+
+    def _is_due(self) -> bool:
+        """Tell whether all poses should be solved for."""
+        return is_due(self._log, self.state, self.parameters)
 
     def _continue_tracks(
         self, scans: Sequence[RangeScan], antennas: Antennas
@@ -213,22 +243,30 @@ class RobustBackEnd:
         state = self.state
         if not state.feature_ids:
             return (), 0.0
-        seen = self._walls.look(view(state, antennas), antennas)
+        seen = self._walls.look(view(state, antennas), antennas).without(self._rows_elsewhere())
         found: list[Continuation] = []
         for side in self._sides:
             found += self._continue_side([s for s in scans if s.radar in side], seen, antennas)
         if any(scan.labels is not None for scan in scans):
             found = self._labelled(scans)
-        if not found:
+        else:
+            self._whereabouts.look(self._trials, state, self._log)
+        if not found or self._whereabouts.is_carried:
             return (), 0.0
         ids = state.feature_ids
         continued = tuple((c.radar, c.index, ids[c.row]) for c in found)
-        ranges = {scan.radar: scan.ranges_m for scan in scans}
-        z = np.array([ranges[c.radar][c.index] for c in found])
-        for radar, index, landmark_id in continued:
+        of_radar, noise = {scan.radar: scan for scan in scans}, self.parameters.ranges
+        z = np.array([of_radar[c.radar].ranges_m[c.index] for c in found])
+        sigmas = [of_radar[c.radar].sigma(c.index, noise.sigma_m) for c in found]
+        for (radar, _, landmark_id), range_m, sigma_m in zip(continued, z, sigmas, strict=True):
             x, y = antennas.position_m[radar].tolist()
             self._log.add_range(
-                self._log.n_poses - 1, radar, landmark_id, (x, y), ranges[radar][index]
+                self._log.n_poses - 1,
+                radar,
+                landmark_id,
+                antenna=(x, y),
+                range_m=float(range_m),
+                sigma_m=sigma_m,
             )
         rows = rows_of(
             state,
@@ -236,9 +274,8 @@ class RobustBackEnd:
             np.array([c.radar for c in found], dtype=np.intp),
             np.array([c.row for c in found], dtype=np.intp),
         )
-        R = np.full(len(z), self.parameters.ranges.sigma_m**2)
         self._walls.note(found)
-        nis, _ = state.update(rows.at, rows.H, z - rows.predicted_m, R)
+        nis, _ = state.update(rows.at, rows.H, z - rows.predicted_m, np.square(sigmas))
         return continued, nis
 
     def _continue_side(
@@ -251,7 +288,11 @@ class RobustBackEnd:
             self.parameters.map,
         )
         radars = [scan.radar for scan in scans]
-        sure = sure_landmarks(self.state, seen, radars, noise, rule) if radars else None
+        near = landmarks_in_view(self.state, seen, radars, noise, rule) if radars else None
+        if near is None:
+            return []
+        self._trials += trials(near, seen, scans, self.state, self.parameters)
+        sure = near.surer_than(rule.tight_sigmas * noise.sigma_m)
         if sure is None:
             return []
         self._expected += expected_ranges(self.state, sure, antennas, self._walls.feet_m)
@@ -271,6 +312,10 @@ class RobustBackEnd:
         whole = max(len(scans), 2)
         self._existence.seen_whole(ids[row] for row, n in count.items() if n >= whole)
         return found
+
+    def _rows_elsewhere(self) -> list[int]:
+        elsewhere = self._whereabouts.elsewhere
+        return [row for row, id_ in enumerate(self.state.feature_ids) if id_ in elsewhere]
 
     def _labelled(self, scans: Sequence[RangeScan]) -> list[Continuation]:
         """Return the associations that labels tell."""
@@ -302,7 +347,8 @@ class RobustBackEnd:
                 guesses = pair_guesses(frames[0], noise, rule)
             if not guesses:
                 continue
-            for wall in self._walls.find(self._leftovers, radars):
+            lost = self._whereabouts.is_lost
+            for wall in () if lost else self._walls.find(self._leftovers, radars):
                 placed = self._walls.place(wall)
                 if placed is not None:
                     self._use(placed[0], wall.members)
@@ -335,7 +381,7 @@ class RobustBackEnd:
             known = self._landmark_of_label.get(tracklet.label)
             row = None if known is None else state.landmark_ids.index(known)
         else:
-            row = match(state, point, self.parameters.map)
+            row = match(state, point, self.parameters.map, self._whereabouts.elsewhere)
         if row is None:
             landmark_id = give_birth(state, point)
             if tracklet.label is not None:
@@ -355,24 +401,31 @@ class RobustBackEnd:
                 self._leftovers.pose_index(slot.back),
                 slot.radar,
                 landmark_id,
-                slot.antenna_then,
-                member.leftover.range_m,
+                antenna=slot.antenna_then,
+                range_m=member.leftover.range_m,
+                sigma_m=member.leftover.sigma_m,
             )
 
     def _delete_lost(self) -> tuple[int, ...]:
+        if self._whereabouts.is_suspicious:
+            return ()
         lost = self._existence.lost()
         for landmark_id in lost:
-            self.state.remove(self.state.feature_ids.index(landmark_id))
             self._walls.cells.forget(landmark_id)
-            self._existence.forget(landmark_id)
-            self._log.drop(landmark_id)
+            forget(landmark_id, self.state, self._existence, self._log)
         return tuple(lost)
 
     def _merge(self) -> tuple[tuple[int, int], ...]:
         rule = self.parameters.map
         if self._landmark_of_label or self._n_updates % rule.merge_every:
             return ()
-        merge = find_merge(self.state, self._existence, rule)
+        whereabouts = self._whereabouts
+        if whereabouts.is_lost and (
+            joined := whereabouts.find(self.state, self._existence, self._log)
+        ):
+            self.relinearise()
+            return joined
+        merge = find_merge(self.state, self._existence, rule, whereabouts.elsewhere)
         if merge is None:
             return ()
         ids = [

@@ -11,6 +11,7 @@ pose is correlated with. (In right-invariant errors the heading enters neither.)
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,14 +76,19 @@ def near_rows(state: State, point: BodyPoint, reach_m: float) -> NDArray[np.intp
     return np.flatnonzero(np.hypot(away[:, 0], away[:, 1]) <= reach_m)
 
 
-def match(state: State, point: BodyPoint, rule: MapRule) -> int | None:
+def match(
+    state: State, point: BodyPoint, rule: MapRule, elsewhere: Collection[int] = ()
+) -> int | None:
     """Return the row of the landmark that a point is, or None where none stands out.
 
     A match must pass the gate, be likelier than a landmark not yet in the map,
-    ``N(residual; 0, S) > beta``, and beat the next best in ``d^2 + ln det S``.
+    ``N(residual; 0, S) > beta``, and beat the next best in ``d^2 + ln det S``. Landmarks whose ids
+    are ``elsewhere`` are out of reach.
     """
     scored = []
     for row in near_rows(state, point, rule.merge_reach_m):
+        if state.landmark_ids[row] in elsewhere:
+            continue
         rows = point_rows(state, int(row), point)
         scored.append((rows.mahalanobis_sq + rows.log_det, rows.mahalanobis_sq, int(row)))
     if not scored:

@@ -49,7 +49,7 @@ NOTHING = Option((), 0.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SureLandmarks:
-    """The landmarks that may be continued from one side of the robot.
+    """Landmarks that one side of the robot may see, or those of them that may be continued.
 
     Attributes
     ----------
@@ -65,15 +65,34 @@ class SureLandmarks:
     rows: Rows
     prior: Array
 
+    def surer_than(self, limit_m: float) -> SureLandmarks | None:
+        """Return those all of whose ranges have a smaller standard deviation; None without any."""
+        per_landmark = len(self.rows.radars) // len(self.landmarks)
+        variances = self.prior.diagonal().reshape(-1, per_landmark)
+        sure = (variances <= limit_m**2).all(axis=1)
+        if not sure.any():
+            return None
+        keep = np.flatnonzero(np.repeat(sure, per_landmark))
+        rows = Rows(
+            radars=self.rows.radars[keep],
+            landmarks=self.rows.landmarks[keep],
+            at=self.rows.at,
+            H=self.rows.H[keep],
+            predicted_m=self.rows.predicted_m[keep],
+        )
+        return SureLandmarks(
+            landmarks=self.landmarks[sure], rows=rows, prior=self.prior[np.ix_(keep, keep)]
+        )
 
-def sure_landmarks(
+
+def landmarks_in_view(
     state: State,
     seen: View,
     radars: Sequence[int],
     noise: RangeNoise,
     rule: ContinuationRule,
 ) -> SureLandmarks | None:
-    """Return the landmarks that radars of one side, all heard, may continue; None without any."""
+    """Return the landmarks that any of some radars, all heard, may see; None without any."""
     looking = np.array(radars, dtype=np.intp)
     margin_m = 5.0 * noise.sigma_m
     inside = seen.inside(noise, rule.view_margin_rad, margin_m)[looking]
@@ -84,19 +103,19 @@ def sure_landmarks(
         state, seen, np.tile(looking, len(landmarks)), np.repeat(landmarks, len(looking))
     )
     prior = rows.H @ state.P.block(rows.at) @ rows.H.T
-    limit = (rule.tight_sigmas * noise.sigma_m) ** 2
-    sure = (prior.diagonal().reshape(len(landmarks), len(looking)) <= limit).all(axis=1)
-    if not sure.any():
-        return None
-    keep = np.flatnonzero(np.repeat(sure, len(looking)))
-    rows = Rows(
-        radars=rows.radars[keep],
-        landmarks=rows.landmarks[keep],
-        at=rows.at,
-        H=rows.H[keep],
-        predicted_m=rows.predicted_m[keep],
-    )
-    return SureLandmarks(landmarks=landmarks[sure], rows=rows, prior=prior[np.ix_(keep, keep)])
+    return SureLandmarks(landmarks=landmarks, rows=rows, prior=prior)
+
+
+def sure_landmarks(
+    state: State,
+    seen: View,
+    radars: Sequence[int],
+    noise: RangeNoise,
+    rule: ContinuationRule,
+) -> SureLandmarks | None:
+    """Return the landmarks that radars of one side, all heard, may continue; None without any."""
+    near = landmarks_in_view(state, seen, radars, noise, rule)
+    return None if near is None else near.surer_than(rule.tight_sigmas * noise.sigma_m)
 
 
 def continue_tracks(
@@ -132,18 +151,14 @@ def options_of(
     rule: ContinuationRule,
 ) -> list[Option]:
     """Return the options of one landmark that beat none, cheapest first, none last."""
-    variance = noise.sigma_m**2
-    gate = rule.gates[0]
-    near: list[list[tuple[int, float] | None]] = []
+    near: list[list[tuple[int, float, float] | None]] = []
     for place, scan in enumerate(scans):
-        reach = math.sqrt(rule.gates[-1] * (float(prior[place, place]) + variance))
-        centre = float(predicted_m[place])
-        found: list[tuple[int, float] | None] = [None]
-        found += [
-            (index, range_m - centre)
-            for index, range_m in enumerate(scan.ranges_m)
-            if abs(range_m - centre) <= reach
-        ]
+        centre, spread = float(predicted_m[place]), float(prior[place, place])
+        found: list[tuple[int, float, float] | None] = [None]
+        for index, range_m in enumerate(scan.ranges_m):
+            variance = scan.sigma(index, noise.sigma_m) ** 2
+            if (range_m - centre) ** 2 <= rule.gates[-1] * (spread + variance):
+                found.append((index, range_m - centre, variance))
         near.append(found)
     odds = noise.detection_probability / (1.0 - noise.detection_probability)
     per_range = 2.0 * math.log(noise.clutter_per_m / odds) + math.log(math.tau)
@@ -153,8 +168,9 @@ def options_of(
         if not places:
             continue
         nu = [taken[1] for taken in choice if taken is not None]
+        variances = [taken[2] for taken in choice if taken is not None]
         gate = rule.gates[min(len(places), len(rule.gates)) - 1]
-        distance, log_det = _distance(nu, places, prior, variance)
+        distance, log_det = _distance(nu, places, prior, variances)
         cost = distance + log_det + len(places) * per_range
         if distance <= gate and cost < 0.0:
             used = tuple(
@@ -168,20 +184,20 @@ def options_of(
 
 
 def _distance(
-    nu: list[float], places: list[int], prior: Array, variance: float
+    nu: list[float], places: list[int], prior: Array, variances: list[float]
 ) -> tuple[float, float]:
     """Return nu^T S^-1 nu and ln det S."""
     if len(places) == 1:
-        s = float(prior[places[0], places[0]]) + variance
+        s = float(prior[places[0], places[0]]) + variances[0]
         return nu[0] ** 2 / s, math.log(s)
     if len(places) == 2:
         i, j = places
-        a, b = float(prior[i, i]) + variance, float(prior[j, j]) + variance
+        a, b = float(prior[i, i]) + variances[0], float(prior[j, j]) + variances[1]
         c = float(prior[i, j])
         det = a * b - c * c
         squared = b * nu[0] ** 2 - 2.0 * c * nu[0] * nu[1] + a * nu[1] ** 2
         return squared / det, math.log(det)
-    S = prior[np.ix_(places, places)] + variance * np.eye(len(places))
+    S = prior[np.ix_(places, places)] + np.diag(variances)
     return float(nu @ np.linalg.solve(S, nu)), float(np.linalg.slogdet(S)[1])
 
 

@@ -15,17 +15,18 @@ import numpy as np
 
 from slam.geometry import compose
 from slam.robust.motion import Motion
-from slam.robust.ranges import Antennas, RangeScan
+from slam.robust.ranges import LONGEST_M, Antennas, RangeScan
 from slam.robust.state import rotation
 from slam.robust.symmetric import Array
 
 
 @dataclass(frozen=True, slots=True)
 class Leftover:
-    """One unused range: as measured, with its target's label where that is known."""
+    """One unused range: as measured, its target's label where known, its standard deviation."""
 
     range_m: float
     label: int | None
+    sigma_m: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -79,11 +80,16 @@ class Leftovers:
     ----------
     capacity
         Number of frames kept.
+    sigma_m
+        Standard deviation of a range whose scan tells none.
     drift_per_m, drift_per_rad_m
         Standard deviation a range gains per metre of way back, and per radian of turn.
     """
 
-    def __init__(self, capacity: int, drift_per_m: float, drift_per_rad_m: float) -> None:
+    def __init__(
+        self, capacity: int, sigma_m: float, drift_per_m: float, drift_per_rad_m: float
+    ) -> None:
+        self._sigma_m = sigma_m
         self._frames: deque[SeenFrame] = deque(maxlen=capacity)
         self._bodies: deque[Antennas] = deque(maxlen=capacity)
         self._drift_per_m = drift_per_m
@@ -99,6 +105,11 @@ class Leftovers:
         self._path_m += motion.distance_m
         self._turned_rad += abs(motion.turn_rad)
 
+    def clear(self) -> None:
+        """Forget all frames: what they held was seen from another place."""
+        self._frames.clear()
+        self._bodies.clear()
+
     def keep(
         self,
         pose_index: int,
@@ -110,9 +121,9 @@ class Leftovers:
         unused: tuple[list[Leftover], ...] = tuple([] for _ in antennas.yaw_rad)
         for scan in scans:
             unused[scan.radar].extend(
-                Leftover(range_m, scan.label(index))
+                Leftover(range_m, scan.label(index), scan.sigma(index, self._sigma_m))
                 for index, range_m in enumerate(scan.ranges_m)
-                if (scan.radar, index) not in used
+                if (scan.radar, index) not in used and 0.0 < range_m < LONGEST_M
             )
         turn = rotation(self._pose[2])
         self._bodies.append(antennas)

@@ -8,6 +8,7 @@ made late, when one merge, or two disjoint ones together, stand out from all com
 from __future__ import annotations
 
 import math
+from collections.abc import Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,9 +74,14 @@ def apply_merge(state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float
         state.remove(row)
 
 
-def find_merge(state: State, existence: Existence, rule: MapRule) -> Merge | None:
-    """Return the merge to be made now, one or two disjoint ones, or None."""
-    candidates = _candidates(state, existence, rule)
+def find_merge(
+    state: State, existence: Existence, rule: MapRule, elsewhere: Set[int] = frozenset()
+) -> Merge | None:
+    """Return the merge to be made now, one or two disjoint ones, or None.
+
+    A landmark whose id is ``elsewhere`` is merged with none.
+    """
+    candidates = _candidates(state, existence, rule, elsewhere)
     floor = math.log(rule.unmapped_per_m2)
     fair = [merge for merge in candidates if merge.log_likelihood > floor]
     best: Merge | None = None
@@ -93,7 +99,9 @@ def find_merge(state: State, existence: Existence, rule: MapRule) -> Merge | Non
     return _joint_merge(state, fair, 2.0 * floor, rule)
 
 
-def _candidates(state: State, existence: Existence, rule: MapRule) -> list[Merge]:
+def _candidates(
+    state: State, existence: Existence, rule: MapRule, elsewhere: Set[int]
+) -> list[Merge]:
     """Return all merges of two landmarks within reach that pass the gate.
 
     Only pairs that are near touch the covariance, all of them at once.
@@ -106,7 +114,8 @@ def _candidates(state: State, existence: Existence, rule: MapRule) -> list[Merge
     # The last word is the judge's: here, rounding must not leave out what it would accept.
     found = []
     for first, second in near[distances <= (1.0 + 1e-6) * rule.merge_gate].tolist():
-        if existence.are_apart(state.landmark_ids[first], state.landmark_ids[second]):
+        ids = state.landmark_ids[first], state.landmark_ids[second]
+        if existence.are_apart(*ids) or not elsewhere.isdisjoint(ids):
             continue
         merge = judge(state, ((first, second),), rule.merge_sigma_m)
         if merge.mahalanobis_sq <= rule.merge_gate:

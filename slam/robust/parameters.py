@@ -262,6 +262,70 @@ class RelinearisationRule:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SurpriseRule:
+    """When the robot is not where the map has it.
+
+    Attributes
+    ----------
+    gate_sigmas, most_sigma_m
+        A range is near a prediction within so many standard deviations; predictions less sure than
+        that are no trials.
+    view_inset_rad, view_inset_m
+        How far inside a radar's limits a landmark must lie to be a trial.
+    least_chance
+        Least probability that a range lies near a prediction it has nothing to do with.
+    most_against, most_for
+        Most evidence [nats] that one landmark gives against the pose (it may have been taken away)
+        and for it (other ranges may lie near its prediction for long).
+    every, hypotheses
+        Frames between two moments at which the robot may have been carried; how many are tested.
+    suspicious, carried
+        Evidence from which on nothing is undone for good, and from which on the robot is elsewhere.
+    """
+
+    gate_sigmas: float = 3.0
+    most_sigma_m: float = 0.05
+    view_inset_rad: float = 0.15
+    view_inset_m: float = 0.1
+    least_chance: float = 0.05
+    most_against: float = 12.0
+    most_for: float = 8.0
+    every: int = 10
+    hypotheses: int = 40
+    suspicious: float = 2.0
+    carried: float = 25.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RelocationRule:
+    """When a constellation of landmarks tells where on the map a robot was set down.
+
+    Attributes
+    ----------
+    least_landmarks
+        Fewest landmarks a join rests on.
+    evidence, lead
+        Least evidence [nats] of a join against all new landmarks, and over every other join.
+    least_base_m, reach_m, turn_rad
+        Least distance of two landmarks that a guess is made from, how far lengths and places may
+        differ in a guess, and by how much two joins differ at least.
+    most_tried
+        Most guesses judged at a time.
+    lost_position_m
+        Standard deviation that is stated of the position while it is not known.
+    """
+
+    least_landmarks: int = 3
+    evidence: float = 8.0
+    lead: float = 8.0
+    least_base_m: float = 0.3
+    reach_m: float = 0.2
+    turn_rad: float = 0.2
+    most_tried: int = 200
+    lost_position_m: float = 5.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PointRule:
     """How points with range and bearing find their landmarks.
 
@@ -283,5 +347,7 @@ class BackEndParameters:
     continuation: ContinuationRule = field(default_factory=ContinuationRule)
     tracklets: TrackletRule = field(default_factory=TrackletRule)
     map: MapRule = field(default_factory=MapRule)
+    surprise: SurpriseRule = field(default_factory=SurpriseRule)
+    relocation: RelocationRule = field(default_factory=RelocationRule)
     walls: WallRule | None = field(default_factory=WallRule)
     relinearisation: RelinearisationRule | None = field(default_factory=RelinearisationRule)

@@ -64,8 +64,8 @@ class Problem:
         shape (m,) each: which pose, radar and landmark a range belongs to.
     range_antennas, ranges_m
         shapes (m, 2) and (m,): antenna in the body frame of the pose.
-    range_sigma_m
-        Noise of a range.
+    range_sigmas_m
+        shape (m,), noise of the ranges.
     point_poses, point_landmarks, points, point_roots
         shapes (q,), (q,), (q, 2), (q, 2, 2): range and bearing seen from the body's origin,
         and a matrix that makes their noise white.
@@ -82,7 +82,7 @@ class Problem:
     range_landmarks: Indices
     range_antennas: Array
     ranges_m: Array
-    range_sigma_m: float
+    range_sigmas_m: Array
     point_poses: Indices
     point_landmarks: Indices
     points: Array
@@ -108,7 +108,7 @@ class Problem:
             range_landmarks=self.range_landmarks[ranges],
             range_antennas=self.range_antennas[ranges],
             ranges_m=self.ranges_m[ranges],
-            range_sigma_m=self.range_sigma_m,
+            range_sigmas_m=self.range_sigmas_m[ranges],
             point_poses=self.point_poses[points],
             point_landmarks=self.point_landmarks[points],
             points=self.points[points],

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,9 @@ from slam.robust.motion import Motion
 from slam.robust.parameters import RangeNoise
 from slam.robust.state import State, quarter_turn, rotation
 from slam.robust.symmetric import Array, Indices
+
+# No radar ranges as far; keeps squares finite whatever a front end says.
+LONGEST_M = 1e6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,16 +45,27 @@ class RangeScan:
         When it sampled, in steps after the pose: 0 with it, -0.5 half a step before it.
     labels
         Which target each range is of, where that is known; then nothing is left to association.
+    sigmas_m
+        Standard deviation of each range, where the front end tells it.
+    moved
+        Reported motion from the pose to the sample, (dx, dy) [m] and turn [rad] in the body frame
+        of the pose. Where given it is used instead of ``sampled_after``, which knows one step only.
     """
 
     radar: int
     ranges_m: tuple[float, ...]
     sampled_after: float = 0.0
     labels: tuple[int, ...] | None = None
+    sigmas_m: tuple[float, ...] | None = None
+    moved: tuple[float, float, float] | None = None
 
     def label(self, index: int) -> int | None:
         """Return the label of one range, None where unknown."""
         return None if self.labels is None else self.labels[index]
+
+    def sigma(self, index: int, otherwise_m: float) -> float:
+        """Return the standard deviation [m] of one range, if it is not told the other one."""
+        return otherwise_m if self.sigmas_m is None else self.sigmas_m[index]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -66,8 +80,15 @@ class Antennas:
     heard: NDArray[np.bool_]
 
 
-def antennas_of(rig: Rig, scans: Sequence[RangeScan], motion: Motion) -> Antennas:
-    """Return where the antennas were; a radar without a scan stays at its mount, unheard."""
+def antennas_of(
+    rig: Rig, scans: Sequence[RangeScan], motion: Motion, calibration: Array | None = None
+) -> Antennas:
+    """Return where the antennas were; a radar without a scan stays at its mount, unheard.
+
+    ``calibration`` (3,), s, w and kappa, frees reported motions of the wheels' scale; over less
+    than a step the curvature is nothing.
+    """
+    s, w = (0.0, 0.0) if calibration is None else calibration[:2].tolist()
     mounts = rig.mounts
     position = np.array([[mount.x_m, mount.y_m] for mount in mounts])
     yaw = np.array([mount.yaw_rad for mount in mounts])
@@ -75,7 +96,12 @@ def antennas_of(rig: Rig, scans: Sequence[RangeScan], motion: Motion) -> Antenna
     for scan in scans:
         heard[scan.radar] = True
         f = scan.sampled_after
-        if f != 0.0:
+        if scan.moved is not None:
+            turn = scan.moved[2] / (1.0 + w)
+            way = np.array(scan.moved[:2]) / (1.0 + s)
+            position[scan.radar] = way + rotation(turn) @ position[scan.radar]
+            yaw[scan.radar] += turn
+        elif f != 0.0:
             # The part of the step before a pose ends there: go back along it from its end.
             turn = f * motion.turn_rad
             forward = motion.step_m if f > 0 else rotation(-motion.turn_rad) @ motion.step_m
@@ -114,6 +140,14 @@ class View:
             & (self.ranges_m >= noise.min_range_m - widen_m)
             & (self.ranges_m <= noise.max_range_m + widen_m)
         )
+
+    def without(self, rows: Sequence[int]) -> View:
+        """Return a view in which some landmarks are out of everyone's reach."""
+        if not rows:
+            return self
+        ranges = self.ranges_m.copy()
+        ranges[:, rows] = math.inf
+        return replace(self, ranges_m=ranges)
 
 
 def view(state: State, antennas: Antennas) -> View:
@@ -214,6 +248,8 @@ def fix_of_pair(
 
     Body frame, shapes (2,); paper eq. 1 with the arcs' angles as arccos.
     """
+    if not (0.0 < range_first_m < LONGEST_M and 0.0 < range_second_m < LONGEST_M):
+        return None
     base = second_m - first_m
     length = math.hypot(base[0], base[1])
     if length == 0.0:

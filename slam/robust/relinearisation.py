@@ -41,7 +41,7 @@ def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> boo
         (parameters.ranges.offset_sigma_m,) * len(state.offsets_m),
         len(state.feature_ids),
     )
-    problem = log.problem(state, prior, parameters.ranges.sigma_m)
+    problem = log.problem(state, prior)
     smoother = Smoother(problem, rule)
     start = min(log.starts(state, problem), key=smoother.cost)
     solution = smoother.solve(start)

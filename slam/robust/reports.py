@@ -86,6 +86,9 @@ class UpdateReport:
         Whether all poses were solved for.
     expected
         Every range of a landmark that took part, measured or not.
+    carried, lost, relocated
+        Whether it was found now that the robot was carried away; whether its place on the map is
+        unknown, so that pose and covariance say nothing but that; whether it was found again now.
     """
 
     continued: tuple[tuple[int, int, int], ...]
@@ -97,3 +100,6 @@ class UpdateReport:
     dof: int
     relinearised: bool
     expected: tuple[ExpectedRange, ...] = ()
+    carried: bool = False
+    lost: bool = False
+    relocated: bool = False

@@ -102,7 +102,8 @@ def _range_rows(problem: Problem, estimate: Estimate) -> Rows:
     landmarks = estimate.landmarks_m[problem.range_landmarks]
     away = landmarks - places
     distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-9)
-    u = away / distance[:, None] / problem.range_sigma_m
+    sigmas = problem.range_sigmas_m
+    u = away / (distance * sigmas)[:, None]
     by_landmark = u
     n_points = len(estimate.landmarks_m) - problem.n_walls
     walls = np.flatnonzero(problem.range_landmarks >= n_points)
@@ -111,20 +112,20 @@ def _range_rows(problem: Problem, estimate: Estimate) -> Rows:
         c, s = np.cos(landmarks[walls, 0]), np.sin(landmarks[walls, 0])
         qx, qy = places[walls].T
         distance[walls] = landmarks[walls, 1] - c * qx - s * qy
-        u[walls] = np.column_stack([c, s]) / problem.range_sigma_m
+        u[walls] = np.column_stack([c, s]) / sigmas[walls, None]
         by_landmark = u.copy()
         by_wall = np.column_stack([s * qx - c * qy, np.ones(len(walls))])
-        by_landmark[walls] = by_wall / problem.range_sigma_m
+        by_landmark[walls] = by_wall / sigmas[walls, None]
     by_pose = np.column_stack([-u, u[:, 0] * arm[:, 1] - u[:, 1] * arm[:, 0]])
     predicted = distance + estimate.offsets_m[problem.range_radars]
     return Rows(
         poses=problem.range_poses,
         landmarks=problem.range_landmarks,
-        residual=(predicted - problem.ranges_m) / problem.range_sigma_m,
+        residual=(predicted - problem.ranges_m) / sigmas,
         by_pose=by_pose,
         by_landmark=by_landmark,
         radars=problem.range_radars,
-        by_offset=np.full(len(distance), 1.0 / problem.range_sigma_m),
+        by_offset=1.0 / sigmas,
     )
 
 

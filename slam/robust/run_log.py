@@ -11,13 +11,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from slam.geometry import wrap_angle
+from slam.geometry import compose, wrap_angle
 from slam.robust.condensed import Condensed
 from slam.robust.motion import calibrated_motion
 from slam.robust.parameters import WheelNoise
 from slam.robust.problem import Estimate, Prior, Problem
 from slam.robust.state import State, rotation
 from slam.robust.symmetric import Array
+
+# Standard deviations of a step that someone else made the robot take.
+_CARRIED_M, _CARRIED_RAD = 100.0, 10.0
 
 
 @dataclass(slots=True)
@@ -27,6 +30,7 @@ class _Ranges:
     landmarks: list[int] = field(default_factory=list)
     antennas: list[tuple[float, float]] = field(default_factory=list)
     ranges_m: list[float] = field(default_factory=list)
+    sigmas_m: list[float] = field(default_factory=list)
 
     def keep(self, at: Sequence[int]) -> None:
         """Drop all rows but some."""
@@ -35,6 +39,7 @@ class _Ranges:
         self.landmarks = [self.landmarks[i] for i in at]
         self.antennas = [self.antennas[i] for i in at]
         self.ranges_m = [self.ranges_m[i] for i in at]
+        self.sigmas_m = [self.sigmas_m[i] for i in at]
 
 
 @dataclass(slots=True)
@@ -117,8 +122,32 @@ class RunLog:
         """Start counting anew without a solution."""
         self._since_solved = 0
 
+    def forget_from(self, pose: int) -> None:
+        """Forget what was measured from a pose on; the steps stay."""
+        for table in (self._ranges, self._points):
+            table.keep(np.flatnonzero(np.array(table.poses) < pose).tolist())
+
+    def carried(self, pose: Array) -> None:
+        """Say that the last step tells nothing, and that the newest pose is another one."""
+        self._covariances[-1] = np.diag([_CARRIED_M**2, _CARRIED_M**2, _CARRIED_RAD**2])
+        self._causal[-1] = pose
+        self._stored_pose = pose
+
+    def lay(self, first: int, motion: Array) -> None:
+        """Apply a motion (3,) from the left to all poses from one on."""
+        for k in range(max(first - self._first, 0), len(self._causal)):
+            self._causal[k] = compose(motion, self._causal[k])
+        self._stored_pose = self._causal[-1]
+
     def add_range(
-        self, pose: int, radar: int, landmark_id: int, antenna: tuple[float, float], range_m: float
+        self,
+        pose: int,
+        radar: int,
+        landmark_id: int,
+        *,
+        antenna: tuple[float, float],
+        range_m: float,
+        sigma_m: float,
     ) -> None:
         """Append a range used; ``antenna`` is in the body frame of the pose, which is kept."""
         ranges = self._ranges
@@ -127,6 +156,7 @@ class RunLog:
         ranges.landmarks.append(landmark_id)
         ranges.antennas.append(antenna)
         ranges.ranges_m.append(range_m)
+        ranges.sigmas_m.append(sigma_m)
 
     def add_point(self, landmark_id: int, point: Array, covariance: Array) -> None:
         """Append a range and bearing of the newest pose with its covariance."""
@@ -151,7 +181,7 @@ class RunLog:
         if self._condensed is not None:
             self._condensed.drop(landmark_id)
 
-    def problem(self, state: State, prior: Prior, range_sigma_m: float) -> Problem:
+    def problem(self, state: State, prior: Prior) -> Problem:
         """Return all that was measured of the landmarks the state has now.
 
         ``prior`` is that of the start, which condensed poses have in them already.
@@ -174,7 +204,7 @@ class RunLog:
             range_landmarks=of_range[used],
             range_antennas=np.array(ranges.antennas).reshape(-1, 2)[used],
             ranges_m=np.array(ranges.ranges_m)[used],
-            range_sigma_m=range_sigma_m,
+            range_sigmas_m=np.array(ranges.sigmas_m)[used],
             point_poses=np.array(points.poses, dtype=np.intp)[used_points] - self._first,
             point_landmarks=of_point[used_points],
             points=np.array(points.points).reshape(-1, 2)[used_points],

@@ -156,7 +156,7 @@ class Tracker:
         cxx, cxy, cyy = (float(guess.covariance[i]) for i in ((0, 0), (0, 1), (1, 1)))
         noise, rule = self._noise, self._rule
         half_view = noise.field_of_view_rad / 2
-        variance, gate_sq = noise.sigma_m**2, rule.gate_sigmas**2
+        gate_sq = rule.gate_sigmas**2
         n_radars = len(self._offsets)
         dx_do, dy_do = [0.0] * n_radars, [0.0] * n_radars
         members: list[Member] = []
@@ -183,7 +183,8 @@ class Tracker:
                     continue
                 ux, uy = dx / distance, dy / distance
                 px, py = cxx * ux + cxy * uy, cxy * ux + cyy * uy
-                s = ux * px + uy * py + variance + slot.drift + self._doubt[radar]
+                variance = nearest.sigma_m**2 + slot.drift
+                s = ux * px + uy * py + variance + self._doubt[radar]
                 if nu * nu > gate_sq * s:
                     continue
                 kx, ky = px / s, py / s
@@ -222,7 +223,7 @@ class Tracker:
         place = np.array([radars.index(member.slot.radar) for member in walked.members])
         antennas = np.array([[m.slot.x_m, m.slot.y_m] for m in walked.members])
         z = np.array([m.leftover.range_m - self._offsets[m.slot.radar] for m in walked.members])
-        variance = self._noise.sigma_m**2 + np.array([m.slot.drift for m in walked.members])
+        variance = np.array([m.leftover.sigma_m**2 + m.slot.drift for m in walked.members])
         offset_part = np.zeros((len(z), len(radars)))
         offset_part[np.arange(len(z)), place] = 1.0
         prior = self._offset_covariance[np.ix_(radars, radars)]

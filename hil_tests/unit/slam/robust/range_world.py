@@ -68,7 +68,8 @@ class Stress:
     are lost, radar by radar; ``sampled_after`` gives each radar's sample time in steps after the
     pose; ``offset_m`` is the standard deviation of each radar's constant offset; ``dead`` radars
     send nothing; ``silent_share`` of the run, in one piece, no radar does; ``walk`` is how far the
-    calibration errors wander over the whole run, in their own standard deviations.
+    calibration errors wander over the whole run, in their own standard deviations; after a share
+    ``carried_at`` of the run the robot is carried on by ``carried_laps``, unknown to the wheels.
     """
 
     random_share: float = 0.0
@@ -78,6 +79,8 @@ class Stress:
     dead: tuple[int, ...] = ()
     silent_share: float = 0.0
     walk: float = 0.0
+    carried_at: float = 1.0
+    carried_laps: float = 0.37
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -129,7 +132,10 @@ def simulate(
     rng = np.random.default_rng(seed)
     poses = true_path(room)
     landmarks = place_landmarks(room, rng)
-    increments = reported(poses, room, rng, stress.walk)
+    cut = round(stress.carried_at * len(poses))
+    if cut < len(poses):
+        poses = np.delete(poses, np.s_[cut : cut + carried_steps(room, stress)], axis=0)
+    increments = reported(poses, room, rng, stress.walk, unaware=cut)
     return Run(
         poses=poses,
         landmarks=landmarks,
@@ -138,8 +144,18 @@ def simulate(
     )
 
 
-def reported(poses: Array, room: Room, rng: np.random.Generator, walk: float) -> Array:
-    """Return what the wheels report of each step, shape (k - 1, 3)."""
+def carried_steps(room: Room, stress: Stress) -> int:
+    """Return how many steps of the path a carried robot leaves out."""
+    return round(stress.carried_laps * 4 * (room.side_m / STEP_M + TURN_STEPS))
+
+
+def reported(
+    poses: Array, room: Room, rng: np.random.Generator, walk: float, unaware: int | None = None
+) -> Array:
+    """Return what the wheels report of each step, shape (k - 1, 3).
+
+    They do not notice the step that leads to pose ``unaware``.
+    """
     n = len(poses) - 1
     sigmas = np.array([room.scale_sigma, room.scale_sigma, room.curvature_sigma])
     biases = sigmas * rng.standard_normal(3)
@@ -147,6 +163,8 @@ def reported(poses: Array, room: Room, rng: np.random.Generator, walk: float) ->
     s, w, kappa = (biases + sigmas * wandered).T
     heading = poses[:-1, 2]
     gone = np.diff(poses, axis=0)
+    if unaware is not None and unaware < len(poses):
+        gone[unaware - 1] = 0.0
     dx = np.cos(heading) * gone[:, 0] + np.sin(heading) * gone[:, 1]
     dy = -np.sin(heading) * gone[:, 0] + np.cos(heading) * gone[:, 1]
     a, D = gone[:, 2], np.hypot(dx, dy)
@@ -337,6 +355,7 @@ STRESSES = {
     "dead": Stress(dead=(1,)),
     "silent10": Stress(silent_share=0.1),
     "walk": Stress(walk=1.0),
+    "carried": Stress(carried_at=0.6),
     "all": Stress(
         random_share=0.2,
         dropped_share=0.1,

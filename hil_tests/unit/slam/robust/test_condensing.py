@@ -54,7 +54,7 @@ def short_run(seed: int, walk: float) -> tuple[Problem, Estimate]:
         range_landmarks=seen,
         range_antennas=m,
         ranges_m=z + 2e-3 * rng.standard_normal(len(z)),
-        range_sigma_m=5e-3,
+        range_sigmas_m=np.full(len(z), 5e-3),
         point_poses=np.array([2, 9], dtype=np.intp),
         point_landmarks=np.array([0, 2], dtype=np.intp),
         points=np.array([[0.95, 1.2], [1.1, 0.7]]),
@@ -83,6 +83,7 @@ def rest_of(problem: Problem, prior: Prior, gone: int) -> Problem:
         range_landmarks=problem.range_landmarks[ranges],
         range_antennas=problem.range_antennas[ranges],
         ranges_m=problem.ranges_m[ranges],
+        range_sigmas_m=problem.range_sigmas_m[ranges],
         point_poses=problem.point_poses[points] - gone,
         point_landmarks=problem.point_landmarks[points],
         points=problem.points[points],
@@ -130,19 +131,20 @@ def white_beginning(problem: Problem, gone: int, n_cal: int, x: Complex) -> Comp
         result.append(step / np.sqrt(np.diag(problem.covariances[k])))
         if n_cal > 1:
             result.append((calibration[k + 1] - calibration[k]) / np.sqrt(problem.walks[k]))
-    for k, radar, mark, m, z in zip(
+    for k, radar, mark, m, z, sigma in zip(
         problem.range_poses,
         problem.range_radars,
         problem.range_landmarks,
         problem.range_antennas,
         problem.ranges_m,
+        problem.range_sigmas_m,
         strict=True,
     ):
         if k < gone:
             c, sn = np.cos(poses[k, 2]), np.sin(poses[k, 2])
             away = marks[mark] - poses[k, :2] - np.array([[c, -sn], [sn, c]]) @ m
             miss = np.sqrt(away @ away) + offsets[radar] - z
-            result.append(np.atleast_1d(miss / problem.range_sigma_m))
+            result.append(np.atleast_1d(miss / sigma))
     for k, mark, point, root in zip(
         problem.point_poses,
         problem.point_landmarks,
@@ -326,11 +328,11 @@ def test_both_starts_of_a_solution_begin_at_the_first_pose_kept() -> None:
         predict(state, calibrated_motion(step, np.zeros(3), wheels), wheels)
         log.add_motion(step, 1e-4 * np.eye(3), 0.0, np.zeros(3))
         log.set_causal(state.pose)
-    before = log.problem(state, start_prior((0.01,) * 3, (0.0,) * N_RADARS, 0), 0.01)
+    before = log.problem(state, start_prior((0.01,) * 3, (0.0,) * N_RADARS, 0))
     prior = Smoother(before, RULE).condensed(log.starts(state, before)[0], 20, math.inf)
     log.condense(prior, [], 20)
     assert (log.n_poses, log.n_kept) == (31, 11)
-    causal, chained = log.starts(state, log.problem(state, prior, 0.01))
+    causal, chained = log.starts(state, log.problem(state, prior))
     assert causal.poses[0] == pytest.approx(prior.mean[:3], abs=1e-12)
     assert chained.poses == pytest.approx(causal.poses, abs=1e-9)
 
