@@ -105,10 +105,11 @@ def _anees(values: Sequence[tuple[tuple[float, float], ...]]) -> dict[str, Any]:
 def _nis_times(runs: Sequence[SweepRun]) -> list[list[float | None]]:
     """Return [time, NIS per degree of freedom over runs, its band] at each of the ten times.
 
-    None where no run associated anything truly.
+    None where no run associated anything truly until then.
     """
     rows: list[list[float | None]] = []
-    for cells in zip(*(run.nis_times for run in runs), strict=True):
+    judged = [run.nis_times for run in runs if run.nis_times]
+    for cells in zip(*judged, strict=True):
         time_s = statistics.fmean(cell[0] for cell in cells)
         dof = sum(cell[2] for cell in cells)
         if dof:

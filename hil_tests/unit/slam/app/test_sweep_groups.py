@@ -100,6 +100,7 @@ def test_nis_is_averaged_over_seeds_by_degrees_of_freedom() -> None:
     runs = [
         dataclasses.replace(RUN, nis_times=((1.0, 2.0, 2), (2.0, 0.0, 0))),
         dataclasses.replace(RUN, seed=1, nis_times=((3.0, 10.0, 8), (2.0, 0.0, 0))),
+        dataclasses.replace(RUN, seed=2, nis_times=()),
     ]
     (group,) = summarise_groups(runs)
     first, second = group["nis_times"]
