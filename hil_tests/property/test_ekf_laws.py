@@ -7,6 +7,7 @@ form, and the limit of a boundless prior; none of them is the code under test.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pytest
@@ -204,8 +205,8 @@ def test_jacobians_of_a_landmark_straight_behind() -> None:
             landmark = pose[:2] - np.array([c + aside * s, s - aside * c])
             H_pose, H_landmark = ekf_slam.observation_jacobians(pose, landmark[None])
             fixed = pose.astype(np.complex128), landmark.astype(np.complex128)
-            by_pose = complex_step(lambda p, at=fixed[1]: observe(p, at), pose)
-            by_landmark = complex_step(lambda m, at=fixed[0]: observe(at, m), landmark)
+            by_pose = complex_step(partial(observe, landmark=fixed[1]), pose)
+            by_landmark = complex_step(partial(observe, fixed[0]), landmark)
             assert np.abs(H_pose[0] - by_pose).max() <= 1e-10
             assert np.abs(H_landmark[0] - by_landmark).max() <= 1e-10
 

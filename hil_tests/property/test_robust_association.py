@@ -309,7 +309,7 @@ LONE = lone_landmark()
 def test_ranges_of_nothing_known_alter_no_landmark(ranges: list[float], left: bool) -> None:
     back_end = deepcopy(LONE)
     report = back_end.update([RangeScan(radar=0 if left else 2, ranges_m=tuple(ranges))])
-    assert report.continued == report.born == report.seen_again == ()
+    assert len(report.continued) == len(report.born) == len(report.seen_again) == 0
     assert np.array_equal(values(back_end.state), values(LONE.state))
     assert np.array_equal(back_end.state.P.full(), LONE.state.P.full())
 
@@ -323,8 +323,8 @@ HERE, THERE, AHEAD = np.array([-0.1, 0.2]), np.array([0.1, 0.2]), np.array([0.0,
 def test_fix_of_two_ranges_is_where_they_were_measured_to(x: float, y: float, turn: float) -> None:
     R = rotation(turn)
     target = np.array([x, y])
-    ranges = [float(np.hypot(*(target - antenna))) for antenna in (HERE, THERE)]
-    found = fix_of_pair(R @ HERE, R @ THERE, *ranges, R @ AHEAD)
+    first_m, second_m = (float(np.hypot(*(target - antenna))) for antenna in (HERE, THERE))
+    found = fix_of_pair(R @ HERE, R @ THERE, first_m, second_m, R @ AHEAD)
     # Beside the antennas, where the circles almost touch, digits are lost.
     square = (y - 0.2) ** 2
     if found is None:
