@@ -22,7 +22,9 @@ Indices = NDArray[np.intp]
 
 # Up to this size the triangle lies in a core's cache: a pass is cheaper than putting it off.
 _PROMPT_SIZE = 500
-_MOST_GRAMS, _MOST_PAIRS = 64, 16
+# How much is put off of either kind: so little that carrying it out takes no longer than a step
+# may (n = 1000), and with four updates a step both fall due together in one step of 165.
+_MOST_GRAMS, _MOST_PAIRS = 44, 15
 # Large matrices grow within spare rows. Not a power of two, columns would share cache sets.
 _SPARE, _ODD = 128, 8
 
@@ -122,7 +124,7 @@ class SymmetricMatrix:
             self._subtract_now(np.asfortranarray(W))
             return
         if self._n_grams + k > _MOST_GRAMS:
-            self._carry_out()
+            self._carry_out_grams()
         if k > _MOST_GRAMS:
             tall = np.zeros((len(self._lower), k), order="F")
             tall[: self._size] = W
@@ -182,18 +184,25 @@ class SymmetricMatrix:
 
     def _put_off_pairs(self, a: Array, b: Array) -> None:
         if self._n_pairs == _MOST_PAIRS:
-            self._carry_out()
+            self._carry_out_pairs()
         self._first[: self._size, self._n_pairs] = a
         self._second[: self._size, self._n_pairs] = b
         self._n_pairs += 1
 
     def _carry_out(self) -> None:
         """Make the stored triangle the matrix."""
+        self._carry_out_grams()
+        self._carry_out_pairs()
+
+    def _carry_out_grams(self) -> None:
         if self._n_grams:
             self._subtract_now(self._grams[:, : self._n_grams])
+        self._n_grams = 0
+
+    def _carry_out_pairs(self) -> None:
         if self._n_pairs:
             self._add_pairs_now(self._first[:, : self._n_pairs], self._second[:, : self._n_pairs])
-        self._n_grams = self._n_pairs = 0
+        self._n_pairs = 0
 
     def _subtract_now(self, W: Array) -> None:
         self._lower = dsyrk(-1.0, W, beta=1.0, c=self._lower, lower=1, overwrite_c=1)

@@ -36,7 +36,12 @@ def draw_step_cost(path: Path, costs: Sequence[StepCost]) -> None:
         axes.set_yscale("log")
         series = (
             ("step_ms", ESTIMATE, "o-", f"measured: predict, view, gate, 4 updates{fitted}"),
-            ("slowest_ms", LANDMARK, "v:", "measured: slowest step, changes of 16 carried out"),
+            (
+                "slowest_ms",
+                LANDMARK,
+                "v:",
+                "measured: slowest step, which carries out what others put off",
+            ),
             ("at_once_ms", ODOMETRY, "s--", "measured: dsyr2 + dsyrk, if nothing were put off"),
             ("triangle_ms", TRUTH, "-", "measured: triangle of P read and written once"),
         )
@@ -52,9 +57,10 @@ def draw_step_cost(path: Path, costs: Sequence[StepCost]) -> None:
                 text += f" - {reference.high_ms:g}"
             axes.annotate(
                 f"{reference.name}, n = {BAR_LANDMARKS}: {text} ms (quoted)",
-                (left, reference.high_ms),
-                xytext=(0, 3),
+                (left, reference.low_ms),
+                xytext=(0, -4),
                 textcoords="offset points",
+                va="top",
                 fontsize=8,
                 color=PALE_INK,
             )

@@ -30,8 +30,8 @@ N_UPDATES = 4
 BAR_MS, BAR_LANDMARKS = 4.0, 1000
 SLOPE_FROM = 200
 
-# Sixteen steps between two passes over a large covariance: three whole cycles.
-_CYCLE = 48
+# A large covariance is passed over every 11th step for the updates, every 15th for the motions.
+_CYCLE = 165
 _DENSITY_PER_M2 = 1.0
 
 
@@ -60,7 +60,7 @@ class StepCost:
     n_landmarks, size
         Landmarks, and rows of the covariance.
     step_ms, slowest_ms
-        Mean over a cycle, and the slowest of it: the one that carries out what others put off.
+        Mean over a cycle, and the slowest of it: one that carries out what others put off.
     at_once_ms
         The two passes that a step would make if it put nothing off: ``dsyr2`` and ``dsyrk`` of
         rank 4, in place, nothing else.
