@@ -27,7 +27,7 @@ from slam.app.emulated_rig import (
 from slam.app.errors import AppError, UsageError
 from slam.app.evaluation import summarise
 from slam.app.false_landmarks import false_landmarks
-from slam.app.known_bound import BoundSummary
+from slam.app.known_bound import BoundSummary, bound_of
 from slam.app.odometry import OdometryTrack
 from slam.app.runner import RunRecord, run_slam
 from slam.app.stress import CLEAN, STRESSES, Stress
@@ -90,7 +90,6 @@ class SweepRun(Summary):
 
     settings: dict[str, str] = field(default_factory=dict)
     stress: str = CLEAN
-    nis_times: tuple[tuple[float, float, int], ...] = ()
     false: int = 0
     confident_false: int = 0
     bound: BoundSummary | None = None
@@ -216,6 +215,7 @@ def run_case(
         stress=case.stress,
         false=false,
         confident_false=confident,
+        bound=bound_of(record, case.scene, case.config) if case.bound else None,
     )
 
 
