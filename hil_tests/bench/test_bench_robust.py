@@ -1,48 +1,70 @@
-"""One step of the robust filter against the size of the map."""
+"""One step of the robust filter against the size of the map, and what it does now and then.
+
+CPU time of the thread, so that a loaded machine changes little but the caches.
+"""
+
+import copy
+import time
 
 import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 from threadpoolctl import threadpool_limits
 
-from slam.robust.motion import calibrated_motion, predict
-from slam.robust.parameters import WheelNoise
-from slam.robust.ranges import Antennas, rows_of, view
-from slam.robust.state import State
-from slam.robust.symmetric import SymmetricMatrix
+from hil_tests.unit.slam.robust.range_world import LAB, parameters_for, simulate
+from slam.app.experiments.step_cost_study import mapped_state, stepper
+from slam.geometry import paper_rig
+from slam.robust.back_end import RobustBackEnd
+from slam.robust.existence import Existence
+from slam.robust.merging import find_merge
+from slam.robust.parameters import MapRule
 
-N_RADARS = 4
 SIGMA_M = 7.4e-3
 
-
-def large_state(n: int) -> State:
-    """Return n landmarks around the pose with a full covariance."""
-    rng = np.random.default_rng(n)
-    state = State((0.007, 0.007, 0.0042), (0.0,) * N_RADARS)
-    size = state.P.size + 2 * n
-    root = 0.1 * rng.standard_normal((size, 40)) / np.sqrt(40)
-    state.P = SymmetricMatrix(root @ root.T + 1e-3 * np.eye(size))
-    state.landmarks_m = rng.uniform(-20, 20, (n, 2))
-    state.landmark_ids = list(range(n))
-    return state
+# Large maps share passes over the covariance among 11 and 15 steps; this many hold whole cycles.
+STEPS = 165
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [10, 100, 300, 1000, 2000])
-@pytest.mark.benchmark(group="robust SLAM step: predict, view of all, 4 range updates")
-def test_robust_step(benchmark: BenchmarkFixture, n: int) -> None:
-    state, wheels = large_state(n), WheelNoise()
-    antennas = Antennas(
-        position_m=np.array([[-0.1, 0.2], [0.1, 0.2], [0.1, -0.2], [-0.1, -0.2]]),
-        yaw_rad=np.zeros(N_RADARS),
-        heard=np.ones(N_RADARS, dtype=bool),
-    )
-    increment = np.array([0.01, 0.0, 0.01])
+@pytest.mark.benchmark(
+    group=f"{STEPS} robust SLAM steps: predict, view, gate, 4 range updates",
+    timer=time.thread_time,
+)
+def test_robust_steps(benchmark: BenchmarkFixture, n: int) -> None:
+    state = mapped_state(n)
+    step = stepper(state)
 
-    def step() -> State:
-        predict(state, calibrated_motion(increment, state.calibration, wheels), wheels)
-        rows = rows_of(state, view(state, antennas), np.arange(4), np.array([0, 0, 1, 1]))
-        state.update(rows.at, rows.H, np.full(4, 1e-3), np.full(4, SIGMA_M**2))
-        return state
+    def steps() -> None:
+        for _ in range(STEPS):
+            step()
 
     with threadpool_limits(1):
-        assert np.isfinite(benchmark(step).position_m).all()
+        benchmark.pedantic(steps, rounds=4, warmup_rounds=1)  # type: ignore[no-untyped-call]
+    benchmark.extra_info["frames"] = STEPS
+    assert np.isfinite(state.position_m).all()
+
+
+@pytest.mark.parametrize("n", [14, 100, 1000])
+@pytest.mark.benchmark(group="search for merges, one in five steps", timer=time.thread_time)
+def test_merge_search(benchmark: BenchmarkFixture, n: int) -> None:
+    state, rule = mapped_state(n), MapRule()
+    with threadpool_limits(1):
+        benchmark(find_merge, state, Existence(rule), rule)
+
+
+@pytest.mark.slow
+@pytest.mark.benchmark(group="solution over the poses kept", timer=time.thread_time)
+def test_relinearisation_of_3000_poses(benchmark: BenchmarkFixture) -> None:
+    """As many poses as are ever kept, the lab's map in them."""
+    back_end = RobustBackEnd(paper_rig(), parameters_for(LAB, SIGMA_M))
+    run = simulate(LAB, 0, SIGMA_M, labelled=True)
+    with threadpool_limits(1):
+        for increment, scans in zip(run.increments[:2990], run.scans[:2990], strict=True):
+            back_end.predict(increment)
+            back_end.update(scans)
+        benchmark.pedantic(  # type: ignore[no-untyped-call]
+            lambda twin: twin.relinearise(),
+            setup=lambda: ((copy.deepcopy(back_end),), {}),
+            rounds=7,
+        )
