@@ -31,7 +31,7 @@ from slam.robust.motion import calibrated_motion, predict
 from slam.robust.parameters import WheelNoise
 from slam.robust.points import RangeBearing, range_bearing_rows
 from slam.robust.problem import Estimate, Problem, start_prior
-from slam.robust.ranges import antennas_of, rows_of, view
+from slam.robust.ranges import RangeScan, antennas_of, rows_of, view
 from slam.robust.residuals import measurement_residuals, motion_residuals
 from slam.robust.state import State, left_jacobian, rotation
 
@@ -71,7 +71,12 @@ def test_range_rows_are_derivatives_by_the_invariant_error(
     seed: int, heading: float, sampled_after: float
 ) -> None:
     state = random_state(seed, 3, heading)
-    antennas = antennas_of(paper_rig(), (), calibrated_motion(np.zeros(3), np.zeros(3), WHEELS))
+    motion = calibrated_motion(np.array([0.05, 0.01, 0.3]), np.zeros(3), WHEELS)
+    scans = [
+        RangeScan(radar=radar, ranges_m=(), sampled_after=sampled_after)
+        for radar in range(N_RADARS)
+    ]
+    antennas = antennas_of(paper_rig(), scans, motion)
     radars = np.repeat(np.arange(N_RADARS), 3)
     landmarks = np.tile(np.arange(3), N_RADARS)
     rows = rows_of(state, view(state, antennas), radars, landmarks)

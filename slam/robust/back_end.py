@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
 
 from slam.geometry import Rig
-from slam.robust.births import BodyPoint, give_birth, match, update_with_point
+from slam.robust.births import give_birth, match, update_with_point
 from slam.robust.continuation import (
     Continuation,
     continue_tracks,
+    labelled,
     landmarks_in_view,
 )
 from slam.robust.existence import Existence
 from slam.robust.expected import expected_ranges
 from slam.robust.leftovers import Leftovers
-from slam.robust.merging import apply_merge, find_merge
-from slam.robust.motion import Motion, calibrated_motion, predict
+from slam.robust.motion import at_rest, calibrated_motion, predict
 from slam.robust.parameters import BackEndParameters, PointRule
-from slam.robust.points import RangeBearing, assign, range_bearing_rows
+from slam.robust.points import RangeBearing, assign, named_rows, range_bearing_rows
 from slam.robust.ranges import Antennas, RangeScan, View, antennas_of, rows_of, sides_of, view
 from slam.robust.relinearisation import is_due, relinearise
 from slam.robust.reports import ExpectedRange, MapLandmark, MapWall, UpdateReport
@@ -32,11 +33,10 @@ from slam.robust.tracklets import (
     Tracker,
     Tracklet,
     find_tracklets,
-    pair_guesses,
-    single_guesses,
+    guesses_of,
 )
 from slam.robust.wall_keeper import WallKeeper
-from slam.robust.whereabouts import Whereabouts, forget
+from slam.robust.whereabouts import Whereabouts, forget, merge_landmarks
 
 
 class RobustBackEnd:
@@ -58,7 +58,6 @@ class RobustBackEnd:
         self.parameters = parameters
         offsets = (parameters.ranges.offset_sigma_m,) * len(rig.mounts)
         self.state = State(parameters.wheels.calibration_sigmas, offsets)
-        self._offset_sigmas = offsets
         self._sides = sides_of(rig)
         rule = parameters.tracklets
         scale = rule.drift_share * parameters.wheels.scale_sigma
@@ -70,7 +69,7 @@ class RobustBackEnd:
         )
         self._existence = Existence(parameters.map)
         self._log = RunLog(parameters.wheels)
-        self._motion = _at_rest()
+        self._motion = at_rest()
         self._walls = WallKeeper(self.state, parameters)
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
         self._landmark_of_label: dict[int, int] = {}
@@ -190,14 +189,9 @@ class RobustBackEnd:
         """
         rule = rule or PointRule()
         state = self.state
-        named = [point.label is not None for point in points]
-        rows: list[int | None] = []
-        if not all(named):
+        rows = named_rows(state, points, self._landmark_of_label)
+        if rows is None:
             rows = assign(state, points, rule.gate, rule.new_gate, rule.reach_m)
-        else:
-            known = {id_: row for row, id_ in enumerate(state.landmark_ids)}
-            labels = [point.label for point in points if point.label is not None]
-            rows = [known.get(self._landmark_of_label.get(label, -1), -1) for label in labels]
         found: list[int | None] = []
         for point, row in zip(points, rows, strict=True):
             landmark_id = None if row is None else self._see_point(point, row)
@@ -243,12 +237,13 @@ class RobustBackEnd:
         state = self.state
         if not state.feature_ids:
             return (), 0.0
-        seen = self._walls.look(view(state, antennas), antennas).without(self._rows_elsewhere())
+        seen = self._walls.look(view(state, antennas), antennas)
+        seen = self._whereabouts.seen_from_here(seen, state)
         found: list[Continuation] = []
         for side in self._sides:
             found += self._continue_side([s for s in scans if s.radar in side], seen, antennas)
         if any(scan.labels is not None for scan in scans):
-            found = self._labelled(scans)
+            found = labelled(scans, state, self._landmark_of_label)
         else:
             self._whereabouts.look(self._trials, state, self._log)
         if not found or self._whereabouts.is_carried:
@@ -298,9 +293,7 @@ class RobustBackEnd:
         self._expected += expected_ranges(self.state, sure, antennas, self._walls.feet_m)
         found = continue_tracks(sure, scans, noise, rule)
         ids = self.state.feature_ids
-        count: dict[int, int] = {}
-        for continuation in found:
-            count[continuation.row] = count.get(continuation.row, 0) + 1
+        count = Counter(continuation.row for continuation in found)
         for row in count:
             self._existence.hit(ids[row])
         inside = seen.inside(noise, -limits.view_inset_rad, -limits.view_inset_m)
@@ -313,20 +306,6 @@ class RobustBackEnd:
         self._existence.seen_whole(ids[row] for row, n in count.items() if n >= whole)
         return found
 
-    def _rows_elsewhere(self) -> list[int]:
-        elsewhere = self._whereabouts.elsewhere
-        return [row for row, id_ in enumerate(self.state.feature_ids) if id_ in elsewhere]
-
-    def _labelled(self, scans: Sequence[RangeScan]) -> list[Continuation]:
-        """Return the associations that labels tell."""
-        rows = {id_: row for row, id_ in enumerate(self.state.landmark_ids)}
-        return [
-            Continuation(row=rows[self._landmark_of_label[label]], radar=scan.radar, index=index)
-            for scan in scans
-            for index in range(len(scan.ranges_m))
-            if (label := scan.label(index)) in self._landmark_of_label and label is not None
-        ]
-
     def _raise_tracklets(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Make tracklets of what is left over; each updates a landmark or becomes one."""
         state, rule = self.state, self.parameters.tracklets
@@ -334,17 +313,13 @@ class RobustBackEnd:
         born: list[int] = []
         again: list[int] = []
         for side in self._sides:
-            radars, window = self._alive(side), rule.window
+            radars = self._alive(side)
             if not radars or not all(newest.unused[radar] for radar in radars):
                 continue
-            if len(radars) == 1:
-                window = rule.single_window
+            window = rule.window if len(radars) > 1 else rule.single_window
             frames = self._leftovers.slots(radars, window)
             noise = self.parameters.ranges
-            if len(radars) == 1:
-                guesses = single_guesses(frames[0])
-            else:
-                guesses = pair_guesses(frames[0], noise, rule)
+            guesses = guesses_of(frames[0], radars, noise, rule)
             if not guesses:
                 continue
             lost = self._whereabouts.is_lost
@@ -372,11 +347,7 @@ class RobustBackEnd:
     def _place(self, tracklet: Tracklet) -> tuple[int, bool]:
         """Bring a tracklet into the map; return the landmark's id and whether it is new."""
         state = self.state
-        point = BodyPoint(
-            point_m=tracklet.point_m,
-            covariance=tracklet.covariance,
-            by_offsets=tracklet.by_offsets,
-        )
+        point = tracklet.body_point()
         if tracklet.label is not None:
             known = self._landmark_of_label.get(tracklet.label)
             row = None if known is None else state.landmark_ids.index(known)
@@ -425,19 +396,4 @@ class RobustBackEnd:
         ):
             self.relinearise()
             return joined
-        merge = find_merge(self.state, self._existence, rule, whereabouts.elsewhere)
-        if merge is None:
-            return ()
-        ids = [
-            (self.state.landmark_ids[kept], self.state.landmark_ids[gone])
-            for kept, gone in merge.pairs
-        ]
-        apply_merge(self.state, merge.pairs, rule.merge_sigma_m)
-        for kept, gone in ids:
-            self._existence.merge(kept, gone)
-            self._log.rename(gone, kept)
-        return tuple(ids)
-
-
-def _at_rest() -> Motion:
-    return Motion(step_m=np.zeros(2), turn_rad=0.0, covariance=np.zeros((3, 3)), walk_variance=0.0)
+        return merge_landmarks(self.state, self._existence, self._log, rule, whereabouts.elsewhere)

@@ -15,7 +15,7 @@ least sum is found by branch and bound, as joint compatibility is (Neira and Tar
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -140,6 +140,19 @@ def continue_tracks(
         Continuation(row=int(sure.landmarks[place]), radar=radar, index=index)
         for place, option in enumerate(cheapest(options))
         for radar, index in option.used
+    ]
+
+
+def labelled(
+    scans: Sequence[RangeScan], state: State, landmark_of_label: Mapping[int, int]
+) -> list[Continuation]:
+    """Return the associations that labels tell; ids of landmarks by label are given."""
+    rows = {id_: row for row, id_ in enumerate(state.landmark_ids)}
+    return [
+        Continuation(row=rows[landmark_of_label[label]], radar=scan.radar, index=index)
+        for scan in scans
+        for index in range(len(scan.ranges_m))
+        if (label := scan.label(index)) in landmark_of_label and label is not None
     ]
 
 

@@ -44,6 +44,11 @@ class Motion:
         return math.hypot(self.step_m[0], self.step_m[1])
 
 
+def at_rest() -> Motion:
+    """Return no motion at all."""
+    return Motion(step_m=np.zeros(2), turn_rad=0.0, covariance=np.zeros((3, 3)), walk_variance=0.0)
+
+
 def calibrated_motion(
     increment: Array, calibration: Array, wheels: WheelNoise, covariance: Array | None = None
 ) -> Motion:

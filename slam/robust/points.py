@@ -11,7 +11,7 @@ and no landmark twice, or named by whoever knows.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,6 +66,17 @@ def range_bearing_rows(state: State, row: int, seen: RangeBearing) -> PointRows:
     residual = seen.values - np.array([r, math.atan2(b[1], b[0])])
     residual[1] = wrap_angle(float(residual[1]))
     return PointRows(residual=residual, at=at, H=H, S=(S + S.T) / 2)
+
+
+def named_rows(
+    state: State, points: Sequence[RangeBearing], landmark_of_label: Mapping[int, int]
+) -> list[int | None] | None:
+    """Return the rows that labels name, -1 for new ones; None if not every point has a label."""
+    labels = [point.label for point in points if point.label is not None]
+    if len(labels) < len(points):
+        return None
+    known = {id_: row for row, id_ in enumerate(state.landmark_ids)}
+    return [known.get(landmark_of_label.get(label, -1), -1) for label in labels]
 
 
 def assign(

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slam.robust.births import BodyPoint
 from slam.robust.leftovers import Leftover, Slot
 from slam.robust.parameters import RangeNoise, TrackletRule
 from slam.robust.ranges import fix_of_pair
@@ -71,10 +72,23 @@ class Tracklet:
     share: float
     label: int | None
 
+    def body_point(self) -> BodyPoint:
+        """Return it as a point seen from the body of now."""
+        return BodyPoint(
+            point_m=self.point_m, covariance=self.covariance, by_offsets=self.by_offsets
+        )
+
     @property
     def score(self) -> float:
         """Return 4 dof - chi-square, by which tracklets compete for ranges."""
         return 4.0 * self.dof - self.chi_square
+
+
+def guesses_of(
+    newest: Sequence[Slot], radars: Sequence[int], noise: RangeNoise, rule: TrackletRule
+) -> list[Guess]:
+    """Return the guesses of what radars of one side saw in the newest frame."""
+    return single_guesses(newest) if len(radars) == 1 else pair_guesses(newest, noise, rule)
 
 
 def pair_guesses(newest: Sequence[Slot], noise: RangeNoise, rule: TrackletRule) -> list[Guess]:

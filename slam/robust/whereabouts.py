@@ -13,7 +13,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from slam.robust.existence import Existence
-from slam.robust.parameters import BackEndParameters
+from slam.robust.merging import apply_merge, find_merge
+from slam.robust.parameters import BackEndParameters, MapRule
+from slam.robust.ranges import View
 from slam.robust.relinearisation import relinearise
 from slam.robust.relocation import apply_join, find_join, set_down
 from slam.robust.run_log import RunLog
@@ -57,6 +59,11 @@ class Whereabouts:
         """Return the covariance of a pose of which nothing is known, shape (3, 3)."""
         sigma_m = self._parameters.relocation.lost_position_m
         return np.diag([sigma_m**2, sigma_m**2, math.pi**2 / 3.0])
+
+    def seen_from_here(self, seen: View, state: State) -> View:
+        """Return a view without what is elsewhere."""
+        ids = enumerate(state.feature_ids)
+        return seen.without([row for row, id_ in ids if id_ in self.elsewhere])
 
     def look(self, trials: Sequence[Trial], state: State, log: RunLog) -> None:
         """Judge one frame; to be called before anything is learned from it."""
@@ -109,3 +116,18 @@ def forget(id_: int, state: State, existence: Existence, log: RunLog) -> None:
     state.remove(state.feature_ids.index(id_))
     existence.forget(id_)
     log.drop(id_)
+
+
+def merge_landmarks(
+    state: State, existence: Existence, log: RunLog, rule: MapRule, elsewhere: frozenset[int]
+) -> tuple[tuple[int, int], ...]:
+    """Make the merge that is certain enough now, if any; return (kept, gone) ids."""
+    merge = find_merge(state, existence, rule, elsewhere)
+    if merge is None:
+        return ()
+    ids = tuple((state.landmark_ids[kept], state.landmark_ids[gone]) for kept, gone in merge.pairs)
+    apply_merge(state, merge.pairs, rule.merge_sigma_m)
+    for kept, gone in ids:
+        existence.merge(kept, gone)
+        log.rename(gone, kept)
+    return ids
