@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PYTEST := $(BIN)/python -m pytest
 
-.PHONY: demo test check bench clean
+.PHONY: demo test check bench sweep clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed-demo
@@ -24,6 +24,12 @@ check: $(VENV)/installed-dev
 bench: $(VENV)/installed-bench
 	$(PYTEST) hil_tests/bench -p no:xdist --benchmark-columns=min,median,max,rounds
 
+# 100 seeds of lab and classroom under both presets, with the known-association bound; stopped, it
+# goes on where it was.
+sweep: $(VENV)/installed-sweep
+	$(BIN)/uwb-slam sweep --scene lab classroom --preset paper robust --seeds 100 --bound --json out/sweep.json
+	$(BIN)/uwb-slam experiment consistency --sweep out/sweep.json --out out
+
 $(VENV)/bin/python:
 	@test -n "$(PYTHON)" || { echo "no Python >= 3.11 found; set PYTHON=/path/to/python3" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
@@ -32,6 +38,7 @@ $(VENV)/installed-demo: EXTRA =
 $(VENV)/installed-test: EXTRA = [test]
 $(VENV)/installed-bench: EXTRA = [bench]
 $(VENV)/installed-dev: EXTRA = [dev]
+$(VENV)/installed-sweep: EXTRA = [gtsam]
 $(VENV)/installed-%: pyproject.toml $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.$(EXTRA)'
 	@touch $@
