@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from slam.app.gtsam_door import load_gtsam
 from slam.app.gtsam_motion import wheel_factor
-from slam.app.known_ranges import GATE_SIGMAS, KnownRun, known_run
+from slam.app.known_ranges import GATE_SIGMAS, KnownRange, KnownRun, known_run
 from slam.app.known_start import SeenFrom, first_position
 from slam.app.runner import RunRecord
 from slam.geometry import Rig, mount_at, wrap_angle
@@ -71,7 +71,6 @@ def known_association_paths(
     true_landmarks_m: Array,
     *,
     range_sigma_m: float,
-    range_floor_m: float = 0.0,
     offset_sigma_m: float = 0.0,
     gate_sigmas: float = GATE_SIGMAS,
 ) -> KnownAssociation:
@@ -89,9 +88,7 @@ def known_association_paths(
     true_landmarks_m
         Shape (n, 2), world frame.
     range_sigma_m
-        Standard deviation of a range whose detection predicts none.
-    range_floor_m
-        What a detection's prediction does not know of; added in squares.
+        Standard deviation of a range, as SLAM was told it.
     offset_sigma_m
         Standard deviation of each radar's unknown range offset; zero: calibrated.
     gate_sigmas
@@ -107,7 +104,6 @@ def known_association_paths(
         rig,
         true_landmarks_m,
         range_sigma_m=range_sigma_m,
-        range_floor_m=range_floor_m,
         offset_sigma_m=offset_sigma_m,
         gate_sigmas=gate_sigmas,
     )
@@ -166,7 +162,7 @@ class _Estimator:
                 noise = gtsam.noiseModel.Isotropic.Sigma(1, offset_sigma_m)
                 self._graph.add(gtsam.PriorFactorDouble(self._B(radar), 0.0, noise))
 
-    def step(self, increment: Array, ranges: tuple[Any, ...]) -> tuple[Array, Array]:
+    def step(self, increment: Array, ranges: tuple[KnownRange, ...]) -> tuple[Array, Array]:
         """Take in one step; return the newest pose (3,) and its covariance (3, 3)."""
         gtsam, step = self._gtsam, len(self._poses)
         self._walk(increment)
@@ -236,7 +232,7 @@ class _Estimator:
         self._n_calibrations += 1
         self._walked = 0.0
 
-    def _take_ranges(self, step: int, ranges: tuple[Any, ...]) -> None:
+    def _take_ranges(self, step: int, ranges: tuple[KnownRange, ...]) -> None:
         for known in ranges:
             motion = calibrated_motion(known.motion, self._calibration, self._wheels)
             antenna = mount_at(

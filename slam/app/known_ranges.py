@@ -7,6 +7,7 @@ fits none is clutter to the bound. Nothing else of the truth gets in.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -54,7 +55,6 @@ def known_run(
     true_landmarks_m: Array,
     *,
     range_sigma_m: float,
-    range_floor_m: float = 0.0,
     offset_sigma_m: float = 0.0,
     gate_sigmas: float = GATE_SIGMAS,
 ) -> KnownRun:
@@ -69,9 +69,7 @@ def known_run(
     true_landmarks_m
         Shape (n, 2), world frame.
     range_sigma_m
-        Standard deviation of a range whose detection predicts none.
-    range_floor_m
-        What no detection's prediction knows of; added in squares.
+        Standard deviation of a range, as SLAM was told it.
     offset_sigma_m
         Standard deviation of each radar's unknown range offset; widens the gate.
     gate_sigmas
@@ -92,10 +90,9 @@ def known_run(
         of_state: list[KnownRange] = []
         for (radar, t_ns), detections in by_frame.items():
             motion = between(odometry.poses[row], odometry.at(t_ns))
-            sigmas = np.array([_sigma(d, range_sigma_m, range_floor_m) for d in detections])
             ids = true_ids(
                 np.array([detection.range_m for detection in detections]),
-                gate_sigmas * np.hypot(sigmas, offset_sigma_m),
+                gate_sigmas * math.hypot(range_sigma_m, offset_sigma_m),
                 rig.mounts[radar],
                 truth.at(t_ns),
                 true_landmarks_m,
@@ -105,10 +102,10 @@ def known_run(
                     radar=radar,
                     landmark=id_,
                     range_m=detection.range_m,
-                    sigma_m=float(sigma),
+                    sigma_m=range_sigma_m,
                     motion=motion,
                 )
-                for detection, sigma, id_ in zip(detections, sigmas, ids, strict=True)
+                for detection, id_ in zip(detections, ids, strict=True)
                 if id_ is not None
             ]
         ranges.append(tuple(of_state))
@@ -116,14 +113,16 @@ def known_run(
 
 
 def true_ids(
-    ranges_m: Array, gates_m: Array, mount: Mount, true_pose: Array, landmarks_m: Array
+    ranges_m: Array, gate_m: float, mount: Mount, true_pose: Array, landmarks_m: Array
 ) -> Sequence[int | None]:
     """Return for each range of one frame the row of its true landmark, None for clutter.
 
     Parameters
     ----------
-    ranges_m, gates_m
-        Shape (m,): what was measured, and how far from the truth it may lie.
+    ranges_m
+        Shape (m,): what was measured.
+    gate_m
+        How far from the true range it may lie.
     mount
         Where the radar sits on the robot.
     true_pose
@@ -137,7 +136,7 @@ def true_ids(
     away = landmarks_m - np.array([antenna.x_m, antenna.y_m])
     off = wrap_angles(np.arctan2(away[:, 1], away[:, 0]) - antenna.yaw_rad)
     errors = np.abs(ranges_m[:, None] - np.hypot(away[:, 0], away[:, 1]))
-    allowed = (errors <= gates_m[:, None]) & (np.abs(off) <= VIEW_HALF_ANGLE_RAD)
+    allowed = (errors <= gate_m) & (np.abs(off) <= VIEW_HALF_ANGLE_RAD)
     ids: list[int | None] = [None] * len(ranges_m)
     for i, landmark in zip(*linear_sum_assignment(np.where(allowed, errors, 1e3)), strict=True):
         if allowed[i, landmark]:
@@ -159,8 +158,3 @@ class _Track:
             for values in (self.poses[:, 0], self.poses[:, 1], self._heading)
         )
         return np.array([x, y, wrap_angle(heading)])
-
-
-def _sigma(detection: Detection, otherwise_m: float, floor_m: float) -> float:
-    told = detection.sigma_m if np.isfinite(detection.sigma_m) else otherwise_m
-    return float(np.hypot(told, floor_m))
