@@ -302,10 +302,12 @@ class RobustConfig(_Model):
 
     # Full opening angle within which the front end finds what is there, wider than -3 dB.
     field_of_view_deg: Annotated[float, Field(gt=0, lt=180)] = 65.0
-    # Standard deviation of a range; 0 takes what the front end predicts for each echo.
-    range_sigma_m: NonNegative = 0.0
-    # What the front end's own prediction leaves out, added in squares: aspect, clutter, timing.
-    range_floor_m: NonNegative = 2.5e-3
+    # Standard deviation of a range of the kind that the two limits below let pass.
+    range_sigma_m: Positive = 2.8e-3
+    # What the front end says of its own ranges, if anything: an echo that one pulse does not
+    # explain is of several targets, and lies between them.
+    max_misfit: Positive = 1.5
+    max_predicted_sigma_m: Positive = 8e-3
     # Standard deviation of each radar's unknown constant range offset.
     offset_sigma_m: NonNegative = 0.0
     detection_probability: Annotated[float, Field(gt=0, lt=1)] = 0.95

@@ -14,6 +14,60 @@ from slam.pipeline import StepResult
 
 Array = NDArray[np.float64]
 
+ECHO_LENGTH_M = 0.06
+"""Half of a pulse's width at half height: what lies farther from a target is no echo of it."""
+
+
+def true_range_nis(result: StepResult, true_pose: Array, true_xy: Array) -> tuple[float, ...]:
+    """Return the NIS (1 dof) of every range of the robust pipeline that is truly of a landmark.
+
+    The back end tells which ranges it expected, before it looked at any. Ground truth tells the
+    rest: a landmark of the map belongs to the true one nearest to it as seen from the robot,
+    within 0.15 m; of the detections the one nearest to that target's true range is of it, if no
+    farther than half a pulse, and if no other expected target is nearer to it. Gates play no part.
+    Ranges that the front end itself called unfit for the back end are not judged.
+
+    Parameters
+    ----------
+    result
+        With a report.
+    true_pose
+        shape (3,), world frame, at ``result.t_ns``.
+    true_xy
+        shape (m, 2) [m], all true landmarks, world frame.
+    """
+    if result.report is None or not result.report.expected or not len(true_xy):
+        return ()
+    expected = result.report.expected
+    points = transform(true_pose, np.array([each.point_m for each in expected]))
+    antennas = transform(true_pose, np.array([each.antenna_m for each in expected]))
+    gaps = np.linalg.norm(points[:, None] - true_xy[None], axis=2)
+    origins = np.argmin(gaps, axis=1)
+    known = gaps[np.arange(len(expected)), origins] <= LANDMARK_MATCH_M
+    true_ranges = np.linalg.norm(true_xy[origins] - antennas, axis=1)
+    # By radar and detection: how far it is from the nearest target, and that target's row.
+    owners: dict[int, tuple[float, int]] = {}
+    detections = result.detections
+    for row in np.flatnonzero(known).tolist():
+        radar, range_m = expected[row].radar, float(true_ranges[row])
+        found = min(
+            (
+                (abs(detection.range_m - range_m), index)
+                for index, detection in enumerate(detections)
+                if detection.radar == radar
+            ),
+            default=None,
+        )
+        if found is not None and found[0] <= ECHO_LENGTH_M:
+            owners[found[1]] = min(owners.get(found[1], (np.inf, -1)), (found[0], row))
+    values = []
+    for index, (_, row) in owners.items():
+        sigma_m = result.range_sigmas_m[index]
+        if np.isfinite(sigma_m):
+            innovation = detections[index].range_m - expected[row].range_m
+            values.append(innovation**2 / (expected[row].variance + sigma_m**2))
+    return tuple(values)
+
 
 class TrueAssociationNis:
     """Collects the NIS of every observation against the landmark it is truly of, before gating.

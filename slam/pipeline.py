@@ -50,6 +50,9 @@ class StepResult:
         Fixes of this state that no cluster confirmed.
     report
         What the robust back end made of the detections; it has no fixes nor observations.
+    range_sigmas_m
+        Standard deviation of every detection as the robust back end was told it; infinite for one
+        that it was not given.
     """
 
     t_ns: int
@@ -61,6 +64,7 @@ class StepResult:
     associations: tuple[Association, ...] = ()
     rejected: tuple[Fix, ...] = ()
     report: UpdateReport | None = None
+    range_sigmas_m: tuple[float, ...] = ()
 
     @property
     def nis(self) -> tuple[float, ...]:

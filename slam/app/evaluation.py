@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from slam.app.runner import RunRecord
 from slam.app.summary import LandmarkSummary, Summary
 from slam.app.tum import NS_PER_S
-from slam.consistency import TrueAssociationNis
+from slam.consistency import TrueAssociationNis, true_range_nis
 from slam.geometry import Rig, between
 from slam.metrics import (
     align_se2,
@@ -24,7 +24,10 @@ from slam.visibility import observable_landmarks
 NEES_AT = (0.1, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.9, 1.0)
 """Parts of the run at which consistency is judged; the quarters are the ends of four laps."""
 
-_NIS_DOF = 2
+_FIX_DOF = 2
+
+Nis = tuple[float, int]
+"""Summed NIS of one state's true associations, and its degrees of freedom."""
 
 
 def summarise(
@@ -80,7 +83,8 @@ def summarise(
             rmse_m=score.rmse_m,
         ),
         nees_pose=_nees(record, truth_in_map),
-        nis_mean=float(np.mean(nis)) / _NIS_DOF if nis else None,
+        nis_mean=sum(value for value, _ in nis) / dof if (dof := sum(n for _, n in nis)) else None,
+        nis_times=_nis_times(record, nis),
     )
 
 
@@ -97,12 +101,29 @@ def _nees(record: RunRecord, truth_in_map: NDArray[np.float64]) -> tuple[tuple[f
     return tuple(values)
 
 
-def _true_nis(record: RunRecord, true_landmarks_m: NDArray[np.float64]) -> list[float]:
-    """Return the NIS of every observation against the landmark it is truly of, before gates."""
+def _true_nis(record: RunRecord, true_landmarks_m: NDArray[np.float64]) -> list[Nis]:
+    """Return the NIS of each state's measurements of what they are truly of, before gates."""
     collector = TrueAssociationNis(true_landmarks_m)
-    return [
-        value
-        for result, truth in zip(record.results, record.truth, strict=True)
-        for value in collector.add(result, truth)
-        if math.isfinite(value)
-    ]
+    nis = []
+    for result, truth in zip(record.results, record.truth, strict=True):
+        if result.report is None:
+            fixes = [value for value in collector.add(result, truth) if math.isfinite(value)]
+            nis.append((sum(fixes), _FIX_DOF * len(fixes)))
+        else:
+            ranges = true_range_nis(result, truth, true_landmarks_m)
+            nis.append((sum(ranges), len(ranges)))
+    return nis
+
+
+def _nis_times(record: RunRecord, nis: list[Nis]) -> tuple[tuple[float, float, int], ...]:
+    """Return (time [s], NIS, dof) of the last state at or before each time that has any."""
+    judged = [row for row, (_, dof) in enumerate(nis) if dof]
+    if not judged:
+        return ()
+    stamps_ns = np.array([record.results[row].t_ns for row in judged])
+    values = []
+    for part in NEES_AT:
+        t_ns = round(part * record.duration_ns)
+        place = max(int(np.searchsorted(stamps_ns, t_ns, side="right")) - 1, 0)
+        values.append((int(stamps_ns[place]) / NS_PER_S, *nis[judged[place]]))
+    return tuple(values)

@@ -54,6 +54,9 @@ class Summary:
     nees_pose: tuple[tuple[float, float], ...]
     nis_mean: float | None
     """None where nothing was associated."""
+    nis_times: tuple[tuple[float, float, int], ...] = ()
+    """(time of the state [s], summed NIS, degrees of freedom) of the last state at or before each
+    of the ten times that has a true association; for groups of runs, not part of summary.json."""
 
     @property
     def ate_ratio(self) -> float:
@@ -62,4 +65,6 @@ class Summary:
 
     def to_json(self) -> str:
         """Return the text of summary.json: exactly these fields, no NaN."""
-        return json.dumps(asdict(self), indent=2, allow_nan=False)
+        fields = asdict(self)
+        del fields["nis_times"]
+        return json.dumps(fields, indent=2, allow_nan=False)
