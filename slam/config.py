@@ -302,8 +302,11 @@ class RobustConfig(_Model):
 
     # Full opening angle within which the front end finds what is there, wider than -3 dB.
     field_of_view_deg: Annotated[float, Field(gt=0, lt=180)] = 65.0
-    # Standard deviation of a range of the kind that the two limits below let pass.
+    # Typical standard deviation of a range: how sure a prediction must be to continue a track,
+    # and that of every range of a front end that predicts none.
     range_sigma_m: Positive = 2.8e-3
+    # What the front end's own prediction leaves out, added to it in squares.
+    range_floor_m: NonNegative = 2e-3
     # What the front end says of its own ranges, if anything: an echo that one pulse does not
     # explain is of several targets, and lies between them.
     max_misfit: Positive = 1.5

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,7 +72,6 @@ class RobustSlam:
         self.back_end = RobustBackEnd(rig, back_end_parameters(config, wheels))
         self._detector = detector or make_detector(config)
         self._pose: Array | None = None  # odometry at the last state
-        self._t_ns = 0
 
     def step(
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
@@ -85,7 +84,7 @@ class RobustSlam:
             At most one frame per radar, each with the time it was taken at; a radar whose frame
             was lost is simply absent, and none at all leaves odometry alone.
         pose_at
-            Odometry, asked for the pose at ``t_ns``.
+            Odometry, asked for the pose at ``t_ns`` and at the time of every frame.
         t_ns
             Session time of the state.
         """
@@ -116,16 +115,21 @@ class RobustSlam:
     ) -> tuple[StepResult, ...]:
         pose = np.array(pose_at(t_ns), dtype=np.float64)
         if self._pose is None:
-            self._pose, self._t_ns = pose, t_ns
+            self._pose = pose
             return ()
         # What is seen again from one place is no new evidence: clutter and aspect stay the same.
         if not has_moved(self._pose, pose, self.config.window):
             return ()
         detections = detect()
+        sigmas_m = tuple(self._sigma_m(detection) for detection in detections)
+        moved = {
+            radar: None if stamp_ns == t_ns else between(pose, pose_at(stamp_ns))
+            for radar, stamp_ns in stamps_ns.items()
+        }
         back_end = self.back_end
         back_end.predict(between(self._pose, pose))
-        report = back_end.update(self._scans(detections, stamps_ns, t_ns))
-        self._pose, self._t_ns = pose, t_ns
+        report = back_end.update(self._scans(detections, sigmas_m, moved))
+        self._pose = pose
         return (
             StepResult(
                 t_ns=t_ns,
@@ -133,24 +137,44 @@ class RobustSlam:
                 belief=belief_of(back_end),
                 detections=detections,
                 report=report,
+                range_sigmas_m=sigmas_m,
             ),
         )
 
+    def _sigma_m(self, detection: Detection) -> float:
+        """Return the standard deviation of a range; infinite for one to be left out.
+
+        A front end that predicts nothing is taken to be as good as ``range_sigma_m``.
+        """
+        told = self.config.robust
+        if math.isnan(detection.sigma_m):
+            return told.range_sigma_m
+        if detection.misfit > told.max_misfit or detection.sigma_m > told.max_predicted_sigma_m:
+            return math.inf
+        return math.hypot(told.range_floor_m, detection.sigma_m)
+
     def _scans(
-        self, detections: Sequence[Detection], stamps_ns: dict[int, int], t_ns: int
+        self,
+        detections: Sequence[Detection],
+        sigmas_m: Sequence[float],
+        moved: Mapping[int, Array | None],
     ) -> list[RangeScan]:
-        """Return the scan of every radar heard, empty where it saw nothing."""
-        period_ns = t_ns - self._t_ns
-        ranges: dict[int, list[float]] = {radar: [] for radar in stamps_ns}
-        for detection in detections:
-            ranges[detection.radar].append(detection.range_m)
+        """Return the scan of every radar heard with the ranges that are fit, empty without any.
+
+        ``moved`` tells how the robot moved from the state to each radar's own sample.
+        """
+        fit: dict[int, list[tuple[float, float]]] = {radar: [] for radar in moved}
+        for detection, sigma_m in zip(detections, sigmas_m, strict=True):
+            if sigma_m < math.inf:
+                fit[detection.radar].append((detection.range_m, sigma_m))
         return [
             RangeScan(
                 radar=radar,
-                ranges_m=tuple(of_radar),
-                sampled_after=(stamps_ns[radar] - t_ns) / period_ns,
+                ranges_m=tuple(range_m for range_m, _ in fit[radar]),
+                sigmas_m=tuple(sigma_m for _, sigma_m in fit[radar]),
+                moved=None if motion is None else (motion[0], motion[1], motion[2]),
             )
-            for radar, of_radar in ranges.items()
+            for radar, motion in moved.items()
         ]
 
     def _detect(self, frames: Sequence[RadarFrame]) -> tuple[Detection, ...]:
@@ -166,7 +190,7 @@ def back_end_parameters(config: SlamConfig, wheels: WheelNoise) -> BackEndParame
     return BackEndParameters(
         wheels=wheels,
         ranges=RangeNoise(
-            sigma_m=math.hypot(told.range_sigma_m, told.range_floor_m),
+            sigma_m=told.range_sigma_m,
             offset_sigma_m=told.offset_sigma_m,
             detection_probability=told.detection_probability,
             clutter_per_m=told.false_ranges_per_frame / reach_m,
