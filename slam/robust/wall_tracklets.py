@@ -114,7 +114,6 @@ class WallTracker:
         """Filter the line backwards; plain floats, the loop is short and runs often."""
         noise, rule = self._noise, self._rule
         half_view, gate_sq = noise.field_of_view_rad / 2, rule.gate_sigmas**2
-        variance = noise.sigma_m**2
         cpp, cpd, cdd = _PRIOR_RAD**2, 0.0, rule.prior_sigma_m**2
         n_radars = len(self._offsets)
         dp_do, dd_do = [0.0] * n_radars, [0.0] * n_radars
@@ -137,7 +136,8 @@ class WallTracker:
                 nu = nearest.range_m - expected
                 h = sine * slot.x_m - cosine * slot.y_m
                 pp, pd = cpp * h + cpd, cpd * h + cdd
-                s = h * pp + pd + variance + slot.drift + self._doubt[radar]
+                variance = nearest.sigma_m**2 + slot.drift
+                s = h * pp + pd + variance + self._doubt[radar]
                 if nearest.label is not None or nu * nu > gate_sq * s:
                     continue
                 kp, kd = pp / s, pd / s
@@ -209,11 +209,10 @@ class WallTracker:
     def sightings(self, members: Sequence[Member]) -> Sightings:
         """Return members as ranges from places in the body frame of now."""
         offsets = np.array([self._offsets[member.slot.radar] for member in members])
-        variance = self._noise.sigma_m**2
         return Sightings(
             antennas_m=np.array([(m.slot.x_m, m.slot.y_m) for m in members]),
             ranges_m=np.array([m.leftover.range_m for m in members]) - offsets,
-            variances=np.array([variance + m.slot.drift for m in members]),
+            variances=np.array([m.leftover.sigma_m**2 + m.slot.drift for m in members]),
             radars=np.array([m.slot.radar for m in members]),
             offset_covariance=self._offset_covariance,
         )

@@ -1,0 +1,279 @@
+"""Walls in the robust filter and smoother: derivatives, invariance, birth, and a bare room."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hil_tests.unit.slam.robust.range_world import LAB, odometry_path, reported, true_path
+from slam.geometry import paper_rig
+from slam.metrics import nees_pose
+from slam.robust.back_end import RobustBackEnd
+from slam.robust.motion import calibrated_motion, predict
+from slam.robust.parameters import BackEndParameters, RangeNoise, WallRule, WheelNoise
+from slam.robust.prior import prior_about, prior_cost, prior_terms
+from slam.robust.problem import Estimate, start_prior
+from slam.robust.ranges import Antennas, RangeScan, antennas_of, rows_of, view
+from slam.robust.residuals import measurement_residuals
+from slam.robust.run_log import RunLog
+from slam.robust.state import State
+from slam.robust.symmetric import Array, SymmetricMatrix
+from slam.robust.walls import (
+    BodyWall,
+    WallCells,
+    give_birth_to_wall,
+    is_unresolved,
+    match_wall,
+    update_with_wall,
+)
+
+OFFSETS = (0.01, 0.01, 0.01, 0.01)
+SIGMA_M = 2e-3
+
+
+def state_with_map(seed: int = 0) -> State:
+    """Return a state with two landmarks and two walls, everything correlated."""
+    rng = np.random.default_rng(seed)
+    state = State((0.01, 0.01, 0.005), OFFSETS)
+    state.heading_rad, state.position_m = 0.7, np.array([0.4, -0.3])
+    state.calibration = np.array([0.01, -0.02, 0.004])
+    state.landmarks_m = np.array([[1.0, 0.5], [-0.4, 0.6]])
+    state.walls = np.array([[1.9, 1.1], [-2.6, 1.4]])
+    state.landmark_ids, state.wall_ids, state.next_id = [0, 2], [1, 3], 4
+    root = 1e-2 * rng.standard_normal((6 + 4 + 8, 30))
+    state.P = SymmetricMatrix(root @ root.T)
+    return state
+
+
+def copy_of(state: State) -> State:
+    other = State((0.01, 0.01, 0.005), OFFSETS)
+    for name in ("heading_rad", "position_m", "calibration", "offsets_m", "landmarks_m", "walls"):
+        setattr(other, name, np.copy(getattr(state, name)))
+    other.heading_rad = state.heading_rad
+    other.landmark_ids, other.wall_ids = state.landmark_ids.copy(), state.wall_ids.copy()
+    other.next_id, other.P = state.next_id, SymmetricMatrix(state.P.full())
+    return other
+
+
+def antennas() -> Antennas:
+    rest = calibrated_motion(np.zeros(3), np.zeros(3), WheelNoise())
+    return antennas_of(paper_rig(), [RangeScan(radar=r, ranges_m=()) for r in range(4)], rest)
+
+
+def test_range_rows_of_walls_are_derivatives_of_the_range() -> None:
+    state = state_with_map()
+    radars, features = np.repeat(np.arange(4), 4), np.tile(np.arange(4), 4)
+    rows = rows_of(state, view(state, antennas()), radars, features)
+    H = np.zeros((16, state.P.size))
+    H[:, rows.at] = rows.H
+    for column in range(state.P.size):
+        step = np.zeros(state.P.size)
+        step[column] = 1e-6
+        ahead, behind = copy_of(state), copy_of(state)
+        ahead.correct(step)
+        behind.correct(-step)
+        difference = (
+            view(ahead, antennas()).ranges_m - view(behind, antennas()).ranges_m
+        ).T.reshape(4, 4)
+        expected = difference.T.ravel() / 2e-6
+        assert H[:, column] == pytest.approx(expected, abs=1e-8)
+
+
+def test_turning_robot_and_map_together_changes_no_range() -> None:
+    state = state_with_map()
+    before = view(state, antennas()).ranges_m
+    step = np.zeros(state.P.size)
+    step[0] = 0.9
+    state.correct(step)
+    assert view(state, antennas()).ranges_m == pytest.approx(before, abs=1e-12)
+
+
+def test_prediction_carries_errors_of_walls_as_two_motions_do() -> None:
+    """With P = e e^T and wheels without noise, P afterwards is that of the moved difference."""
+    wheels = WheelNoise(
+        along_m_per_sqrt_m=0, across_m_per_sqrt_m=0, heading_rad_per_sqrt_m=0,
+        heading_rad_per_rad=0, floor_m=0, floor_rad=0,
+    )  # fmt: skip
+    state = state_with_map()
+    error = 1e-6 * np.random.default_rng(1).standard_normal(state.P.size)
+    state.P = SymmetricMatrix(np.outer(error, error))
+    truth = copy_of(state)
+    truth.correct(error)
+    for increment in np.array([[0.1, 0.02, 0.3], [0.2, -0.01, -0.5], [0.0, 0.0, 0.4]]):
+        for each in (state, truth):
+            predict(each, calibrated_motion(increment, each.calibration, wheels), wheels)
+    e_th = truth.heading_rad - state.heading_rad
+    walls = np.column_stack(
+        [truth.walls[:, 0] - state.walls[:, 0] - e_th, truth.walls[:, 1] - state.walls[:, 1]]
+    ).ravel()
+    first = state.P.size - 4
+    heading = state.P.columns(np.array([0]))[first:, 0]
+    assert heading == pytest.approx(walls * e_th, rel=1e-4, abs=1e-18)
+    assert state.P.block(np.arange(first, first + 4)) == pytest.approx(
+        np.outer(walls, walls), rel=1e-4, abs=1e-18
+    )
+
+
+def seen_wall() -> BodyWall:
+    return BodyWall(
+        wall=np.array([1.2, 1.5]),
+        covariance=np.array([[4e-4, 1e-5], [1e-5, 9e-6]]),
+        by_offsets=np.random.default_rng(2).standard_normal((2, 4)),
+        feet_m=np.array([[0.5, 1.4], [0.6, 1.35]]),
+    )
+
+
+def test_birth_of_a_wall_is_the_limit_of_an_unknown_wall_seen() -> None:
+    born, seen = state_with_map(), seen_wall()
+    born.remove(3)
+    other = copy_of(born)
+    wall_id = give_birth_to_wall(born, seen)
+    assert born.feature_ids[-1] == wall_id
+    other.augment_wall(born.walls[-1], np.zeros((other.P.size, 2)), 1e6 * np.eye(2))
+    update_with_wall(other, 1, seen)
+    assert other.walls == pytest.approx(born.walls, abs=1e-9)
+    assert other.P.full() == pytest.approx(born.P.full(), rel=1e-5, abs=1e-9)
+
+
+def test_a_landmark_born_later_goes_before_the_walls() -> None:
+    state = state_with_map()
+    P, cross = state.P.full(), np.random.default_rng(3).standard_normal((18, 2)) * 1e-3
+    new = state.augment(np.array([9.0, 9.0]), cross, np.eye(2))
+    assert state.feature_ids == [0, 2, new, 1, 3]
+    old = np.r_[0:14, 16:20]
+    full = state.P.full()
+    assert full[np.ix_(old, old)] == pytest.approx(P)
+    assert full[np.ix_(old, [14, 15])] == pytest.approx(cross)
+    state.remove(2)
+    assert state.P.full() == pytest.approx(P)
+    state.remove(3)
+    assert state.wall_ids == [1]
+    assert state.P.size == 16
+
+
+def test_walls_match_only_where_they_were_seen() -> None:
+    state, seen, cells, rule = state_with_map(), seen_wall(), WallCells(0.1), WallRule()
+    wall_id = give_birth_to_wall(state, seen)
+    row = state.wall_ids.index(wall_id)
+    along = seen.in_map(state) @ np.array([-math.sin(1.9), math.cos(1.9)])
+    cells.add(wall_id, along)
+    assert match_wall(state, seen, cells, rule) == row
+    elsewhere = WallCells(0.1)
+    elsewhere.add(wall_id, along + 5.0)
+    assert match_wall(state, seen, elsewhere, rule) is None
+    beside = replace(seen, wall=np.add(seen.wall, [0.02, 0.03]), feet_m=1.02 * seen.feet_m)
+    sure = replace(beside, covariance=1e-8 * np.eye(2))
+    assert is_unresolved(state, sure, cells, rule)
+    assert not is_unresolved(state, sure, elsewhere, rule)
+    other = replace(seen, wall=np.add(seen.wall, [0.02, 0.3]), feet_m=1.3 * seen.feet_m)
+    assert not is_unresolved(state, other, cells, rule)
+
+
+def test_cells_tell_where_a_wall_answered() -> None:
+    cells = WallCells(0.1)
+    cells.add(7, np.array([-0.05, 0.05, 0.15, 0.95]))
+    assert cells.surrounds(7, 0.02)
+    assert not cells.surrounds(7, 0.12)
+    assert cells.distance_m(7, 0.52) == pytest.approx(0.4)
+    assert cells.distance_m(8, 0.0) == math.inf
+    assert np.array(cells.spans_m(7)) == pytest.approx(np.array([[-0.1, 0.2], [0.9, 1.0]]))
+    cells.merge(8, 7)
+    assert cells.surrounds(8, 0.02)
+    assert cells.spans_m(7) == []
+
+
+def test_wall_rows_of_the_smoother_are_derivatives() -> None:
+    state = state_with_map()
+    log = RunLog(WheelNoise())
+    log.add_motion(np.array([0.1, 0.0, 0.2]), np.eye(3), 0.0, np.zeros(3))
+    for landmark_id in (0, 1, 2, 3):
+        log.add_range(
+            1, landmark_id, landmark_id, antenna=(0.1, -0.2), range_m=1.0, sigma_m=SIGMA_M
+        )
+    problem = log.problem(state, start_prior((0.1, 0.1, 0.1), OFFSETS, 4))
+    assert problem.n_walls == 2
+    start = Estimate(
+        poses=np.array([[0.0, 0.0, 0.0], [0.3, -0.2, 0.6]]),
+        calibration=np.zeros((1, 3)),
+        offsets_m=np.zeros(4),
+        landmarks_m=state.features,
+    )
+    rows = measurement_residuals(problem, start)
+    for i in range(3):
+        poses = [start.poses.copy(), start.poses.copy()]
+        poses[0][1, i] += 1e-6
+        poses[1][1, i] -= 1e-6
+        ahead, behind = (measurement_residuals(problem, replace(start, poses=p)) for p in poses)
+        slope = (ahead.residual - behind.residual) / 2e-6
+        assert rows.by_pose[:, i] == pytest.approx(slope, rel=1e-6, abs=1e-3)
+    for i in range(2):
+        shift = np.zeros_like(start.landmarks_m)
+        shift[:, i] = 1e-6
+        ahead, behind = (
+            measurement_residuals(problem, replace(start, landmarks_m=start.landmarks_m + sign))
+            for sign in (shift, -shift)
+        )
+        slope = (ahead.residual - behind.residual) / 2e-6
+        assert rows.by_landmark[:, i] == pytest.approx(slope, rel=1e-6, abs=1e-3)
+
+
+def test_a_prior_with_walls_feels_no_turn_and_pulls_as_its_cost_falls() -> None:
+    rng = np.random.default_rng(4)
+    values = rng.standard_normal(6 + 4 + 8)
+    root = rng.standard_normal((18, 18))
+    prior = prior_about(root @ root.T, rng.standard_normal(18), values, 4, n_walls=2)
+    apart = values + 0.1 * rng.standard_normal(18)
+    terms = prior_terms(prior, apart, 4)
+    for i in range(18):
+        step = np.zeros(18)
+        step[i] = 1e-6
+        slope = (prior_cost(prior, apart + step, 4) - prior_cost(prior, apart - step, 4)) / 2e-6
+        assert 2.0 * terms.gradient[i] == pytest.approx(slope, rel=1e-6, abs=1e-5)
+
+
+def bare_room(path: Array, rng: np.random.Generator) -> list[list[RangeScan]]:
+    """Return what four radars hear of four walls 1 m beyond the path's square, and nothing else."""
+    walls = np.array([[0.0, 3.0], [math.pi / 2, 3.0], [math.pi, 1.0], [-math.pi / 2, 1.0]])
+    n = np.column_stack([np.cos(walls[:, 0]), np.sin(walls[:, 0])])
+    frames = []
+    for x, y, heading in path[1:]:
+        c, s = math.cos(heading), math.sin(heading)
+        scans = []
+        for radar, mount in enumerate(paper_rig().mounts):
+            q = np.array([x + c * mount.x_m - s * mount.y_m, y + s * mount.x_m + c * mount.y_m])
+            ranges = walls[:, 1] - n @ q
+            off = np.abs((walls[:, 0] - heading - mount.yaw_rad + math.pi) % math.tau - math.pi)
+            heard = ranges[(off < math.radians(32.5)) & (ranges < 1.5) & (ranges > 0.2)]
+            noisy = heard + SIGMA_M * rng.standard_normal(len(heard))
+            scans.append(RangeScan(radar=radar, ranges_m=tuple(noisy.tolist())))
+        frames.append(scans)
+    return frames
+
+
+def test_four_bare_walls_hold_the_robot_and_become_no_points() -> None:
+    rng = np.random.default_rng(5)
+    path = true_path(LAB)[:1064:2]  # a lap and the first wall again
+    increments = reported(path, LAB, rng, walk=0.0)
+    parameters = BackEndParameters(
+        ranges=RangeNoise(sigma_m=SIGMA_M, detection_probability=0.98, clutter_per_m=0.02)
+    )
+    back_end = RobustBackEnd(paper_rig(), parameters)
+    for increment, scans in zip(increments, bare_room(path, rng), strict=True):
+        back_end.predict(increment)
+        back_end.update(scans)
+    assert back_end.landmarks() == ()
+    true_d_m = {0: 3.0, 1: 3.0, 2: 1.0, 3: 1.0}
+    for wall in back_end.walls():
+        quarter = round(wall.phi_rad / (math.pi / 2))
+        away = np.array([wall.phi_rad - quarter * math.pi / 2, wall.d_m - true_d_m[quarter % 4]])
+        assert away @ np.linalg.solve(wall.covariance, away) < 18.4  # 99.99 %, 2 dof
+        del true_d_m[quarter % 4]
+    assert not true_d_m
+    blind_m = odometry_path(increments)[-1, :2] - path[-1, :2]
+    assert np.hypot(*(back_end.pose - path[-1])[:2]) < 0.3 * np.hypot(*blind_m)
+    assert nees_pose(back_end.pose, back_end.pose_covariance, path[-1]) < 16.3  # 99.9 %, 3 dof
+    before = back_end.pose
+    assert back_end.relinearise()
+    assert back_end.pose == pytest.approx(before, abs=0.01)
+    assert nees_pose(back_end.pose, back_end.pose_covariance, path[-1]) < 16.3
