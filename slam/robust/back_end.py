@@ -68,7 +68,8 @@ class RobustBackEnd:
             scale * rule.lever_m,
         )
         self._existence = Existence(parameters.map)
-        self._log = RunLog(parameters.wheels)
+        window = max(rule.window, rule.single_window)
+        self._log = RunLog(parameters.wheels, None if parameters.relinearisation else window)
         self._motion = at_rest()
         self._walls = WallKeeper(self.state, parameters)
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
@@ -384,6 +385,9 @@ class RobustBackEnd:
         for landmark_id in lost:
             self._walls.cells.forget(landmark_id)
             forget(landmark_id, self.state, self._existence, self._log)
+        if lost:
+            kept = self._landmark_of_label.items()
+            self._landmark_of_label = {label: id_ for label, id_ in kept if id_ not in lost}
         return tuple(lost)
 
     def _merge(self) -> tuple[tuple[int, int], ...]:

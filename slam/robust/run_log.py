@@ -66,10 +66,13 @@ class RunLog:
     ----------
     wheels
         Noise of the increments.
+    most_unsolved
+        Where nobody solves for the poses, only the last so many are kept; None: all.
     """
 
-    def __init__(self, wheels: WheelNoise) -> None:
+    def __init__(self, wheels: WheelNoise, most_unsolved: int | None = None) -> None:
         self._wheels = wheels
+        self._most_unsolved = most_unsolved
         self._first = 0
         self._condensed: Condensed | None = None
         self._increments: list[Array] = []
@@ -79,7 +82,6 @@ class RunLog:
         self._ranges = _Ranges()
         self._points = _Points()
         self._names: dict[int, int | None] = {}
-        self._solved: Array = np.zeros((1, 3))
         self._since_solved = 0
         self._stored_pose: Array = np.zeros(3)
 
@@ -103,6 +105,9 @@ class RunLog:
         self._stored_pose = _step(self._stored_pose, increment, calibration, self._wheels)
         self._causal.append(self._stored_pose)
         self._since_solved += 1
+        if self._most_unsolved is not None and self.n_kept > 2 * self._most_unsolved:
+            self._forget_to(self.n_poses - self._most_unsolved)
+            self._names.clear()
 
     def set_causal(self, pose: Array) -> None:
         """Note what the filter thinks of the newest pose, its measurements included."""
@@ -246,16 +251,21 @@ class RunLog:
         are gone go with it, and so do old names.
         """
         self._condensed = Condensed(prior, landmark_ids)
-        self._first += n_steps
-        for kept in (self._increments, self._covariances, self._walks, self._causal):
-            del kept[:n_steps]
         rows = {id_: id_ for id_ in landmark_ids}
         for table in (self._ranges, self._points):
             names = self._rows_of(table.landmarks, rows)
-            stay = np.flatnonzero((names >= 0) & (np.array(table.poses) >= self._first)).tolist()
             table.landmarks = names.tolist()
-            table.keep(stay)
+            table.keep(np.flatnonzero(names >= 0).tolist())
         self._names.clear()
+        self._forget_to(self._first + n_steps)
+
+    def _forget_to(self, pose: int) -> None:
+        """Let a pose be the first one kept."""
+        for kept in (self._increments, self._covariances, self._walks, self._causal):
+            del kept[: pose - self._first]
+        self._first = pose
+        for table in (self._ranges, self._points):
+            table.keep(np.flatnonzero(np.array(table.poses) >= pose).tolist())
 
     def _rows_of(
         self, ids: list[int], rows: dict[int, int]

@@ -18,8 +18,10 @@ from slam.robust.back_end import RobustBackEnd
 from slam.robust.condensed import Condensed
 from slam.robust.motion import calibrated_motion, predict
 from slam.robust.parameters import RelinearisationRule, WheelNoise
+from slam.robust.points import RangeBearing
 from slam.robust.prior import first_values, prior_cost, prior_terms
 from slam.robust.problem import Estimate, Prior, Problem, start_prior
+from slam.robust.ranges import RangeScan
 from slam.robust.run_log import RunLog
 from slam.robust.smoother import Smoother
 from slam.robust.state import State
@@ -342,6 +344,33 @@ def test_the_first_pose_is_where_the_first_values_are() -> None:
     values = first_values(start)
     assert np.array_equal(values[:3], start.poses[0])
     assert np.array_equal(values[3:6], start.calibration[0])
+
+
+def test_a_log_that_nobody_solves_stays_short() -> None:
+    log = RunLog(WheelNoise(), most_unsolved=10)
+    for k in range(1, 200):
+        log.add_motion(np.array([0.1, 0.0, 0.1]), 1e-4 * np.eye(3), 0.0, np.zeros(3))
+        log.add_range(k, 0, 5, antenna=(0.1, 0.2), range_m=1.0, sigma_m=0.01)
+        log.rename(k + 10, 5)
+        assert log.n_poses == k + 1
+        assert min(k + 1, 10) <= log.n_kept <= 20
+    assert len(pickle.dumps(log)) < 20_000
+
+
+def test_labels_of_landmarks_that_are_gone_are_forgotten() -> None:
+    """A target that comes back is a new landmark, not one that the map lacks."""
+    parameters = parameters_for(LAB, 7.4e-3)
+    back_end = RobustBackEnd(paper_rig(), parameters)
+    seen = RangeBearing(range_m=1.0, bearing_rad=1.5, covariance=1e-6 * np.eye(2), label=3)
+    first = back_end.update_points([seen])
+    silent = [RangeScan(radar=radar, ranges_m=(), labels=()) for radar in range(N_RADARS)]
+    deleted: tuple[int, ...] = ()
+    for _ in range(40):
+        deleted += back_end.update(silent).deleted
+    assert deleted == first
+    again = back_end.update_points([seen])
+    assert again != first
+    assert len(back_end.state.landmark_ids) == 1
 
 
 def test_a_long_run_keeps_its_belief_and_forgets_its_rows() -> None:
