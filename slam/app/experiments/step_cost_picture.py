@@ -70,9 +70,9 @@ def draw_step_cost(path: Path, costs: Sequence[StepCost]) -> None:
         axes.annotate(
             f"bar: {BAR_MS:g} ms",
             (BAR_LANDMARKS, BAR_MS),
-            xytext=(0, 5),
+            xytext=(16, 0),
             textcoords="offset points",
-            ha="center",
+            va="center",
             fontsize=8,
             color=INK,
         )
