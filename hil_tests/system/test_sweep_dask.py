@@ -43,10 +43,10 @@ def scheduler_address(scheduler: subprocess.Popen[str]) -> str:
 
 def sweep(scene: Path, out: Path, where: Sequence[str]) -> dict[str, Any]:
     command = [sys.executable, "-m", "slam.app.cli", "sweep", "--scene", str(scene)]
-    command += ["--seeds", "2", "--stress", "dropped", "--json", str(out), *where]
-    run = subprocess.run(command, capture_output=True, text=True, check=False, timeout=100)
+    command += ["--seeds", "1", "--stress", "dropped", "--json", str(out), *where]
+    run = subprocess.run(command, capture_output=True, text=True, check=False, timeout=110)
     assert run.returncode == 0, run.stderr
-    assert run.stderr.count(" elapsed, ") == run.stderr.count("\n") == 4
+    assert run.stderr.count(" elapsed, ") == run.stderr.count("\n") == 2
     result: dict[str, Any] = json.loads(out.read_text())
     for row in (*result["runs"], *result["groups"]):
         del row["realtime_factor"]  # of the wall clock
@@ -65,9 +65,4 @@ def test_a_cluster_gives_what_one_machine_gives(tmp_path: Path) -> None:
             stack.enter_context(dask(*worker, "--name", name, "--local-directory", folder))
         clustered = sweep(scene, tmp_path / "cluster.json", ["--dask", address])
     assert clustered == sweep(scene, tmp_path / "alone.json", ["--jobs", "1"])
-    assert [(run["stress"], run["seed"]) for run in clustered["runs"]] == [
-        ("clean", 0),
-        ("clean", 1),
-        ("dropped", 0),
-        ("dropped", 1),
-    ]
+    assert [run["stress"] for run in clustered["runs"]] == ["clean", "dropped"]
