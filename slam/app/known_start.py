@@ -71,10 +71,13 @@ def _from_many(seen: Sequence[SeenFrom], poses: Sequence[Array]) -> Array | None
     middle = antennas[len(antennas) // 2]
     ahead = np.array([math.cos(middle.yaw_rad), math.sin(middle.yaw_rad)])
     start = at[len(at) // 2] + ranges[len(ranges) // 2] * ahead
-    fit = least_squares(
-        lambda point: (np.hypot(*(point - at).T) - ranges) / sigmas, start, method="lm"
-    )
-    weakest = float(np.linalg.svd(fit.jac, compute_uv=False)[-1])
+
+    def residual(point: Array) -> Array:
+        away = point - at
+        return np.asarray((np.hypot(away[:, 0], away[:, 1]) - ranges) / sigmas)
+
+    fit = least_squares(residual, start, method="lm")
+    weakest = float(np.linalg.svd(np.asarray(fit.jac), compute_uv=False)[-1])
     if weakest * ALONE_SIGMA_M < 1.0 or (fit.x - at[len(at) // 2]) @ ahead <= 0.0:
         return None
     return np.asarray(fit.x)

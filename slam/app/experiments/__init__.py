@@ -87,6 +87,11 @@ _ROWS: tuple[Experiment, ...] = (
         help="what each hardship of a sweep costs, in units of its clean runs",
         module="slam.app.experiments.stress",
     ),
+    Experiment(
+        name="victoria-park",
+        help="the robust back end on real data, a car among trees, against GTSAM's batch solution",
+        module="slam.app.experiments.victoria_park",
+    ),
 )
 
 EXPERIMENTS: Mapping[str, Experiment] = MappingProxyType({row.name: row for row in _ROWS})
