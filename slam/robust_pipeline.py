@@ -218,7 +218,7 @@ def belief_of(back_end: RobustBackEnd) -> Belief:
     along = np.outer(turned, P[2] + 0.5 * P[2, 2] * turned)
     return Belief(
         mean=np.concatenate([state.pose, landmarks.ravel()]),
-        covariance=P + along + along.T,
+        covariance=P + (along + along.T),
         landmark_ids=tuple(state.landmark_ids[row] for row in rows),
         next_id=state.next_id,
     )

@@ -56,7 +56,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Finished:
 
 def test_stdout_is_one_table_of_simulated_numbers(demo: Finished) -> None:
     lines = demo.process.stdout.splitlines()
-    assert lines[0] == f"short, preset paper, seed {SEED}: simulated numbers"
+    assert lines[0] == f"short, preset robust, seed {SEED}: simulated numbers"
     assert [line.split("  ")[0] for line in lines[2:-1]] == [
         "odometry ATE",
         "SLAM ATE",
@@ -140,7 +140,7 @@ def test_the_link_log_tells_how_the_radars_were_set_up(demo: Finished) -> None:
 
 
 def loopback_scans(scene: Path) -> Iterator[Scan]:
-    loaded, _ = scene_and_config(str(scene), "paper")
+    loaded, _ = scene_and_config(str(scene), "robust")
     with open_loopback(loaded, SEED) as source:
         source.start(RAW_CONFIG, FRAME_RATE_HZ)
         yield from source.scans(end_counter(loaded.trajectory().duration_ns), lambda: None)
@@ -165,13 +165,13 @@ def test_frames_through_ports_and_in_process_are_bit_identical(demo: Finished) -
 
 
 def test_ports_and_in_process_give_the_same_belief_bit_for_bit(demo: Finished) -> None:
-    record = run_in_process(str(demo.scene), "paper", SEED)
+    record = run_in_process(str(demo.scene), "robust", SEED)
     estimate = read_tum(demo.out / "estimate.tum")
     np.testing.assert_array_equal(estimate.stamps_ns, [row.t_ns for row in record.results])
     positions = np.array([row.belief.pose[:2] for row in record.results])
     assert estimate.poses[:, :2].tobytes() == positions.tobytes()
     summary = json.loads((demo.out / "summary.json").read_text())
-    again = json.loads(run_one(str(demo.scene), "paper", SEED).to_json())
+    again = json.loads(run_one(str(demo.scene), "robust", SEED).to_json())
     # covariances, landmarks and innovations all enter here
     for numbers in (summary, again):
         del numbers["realtime_factor"]
@@ -179,7 +179,7 @@ def test_ports_and_in_process_give_the_same_belief_bit_for_bit(demo: Finished) -
 
 
 def test_seeds_differ(demo: Finished) -> None:
-    other = run_in_process(str(demo.scene), "paper", SEED + 1)
+    other = run_in_process(str(demo.scene), "robust", SEED + 1)
     assert (
         other.results[-1].belief.pose.tolist()
         != read_tum(demo.out / "estimate.tum").poses[-1].tolist()

@@ -84,7 +84,7 @@ def _parser() -> argparse.ArgumentParser:
         help="seed of noise and odometry drift (default: %(default)s, a typical run)",
     )
     demo.add_argument("--scene", default="lab", help="name of a scene, or a scene file")
-    demo.add_argument("--preset", default="paper", help="settings of SLAM")
+    demo.add_argument("--preset", default="robust", help="settings of SLAM (default: %(default)s)")
     demo.set_defaults(command=_demo)
 
     evaluate = commands.add_parser(
@@ -155,7 +155,7 @@ def _setting(text: str) -> tuple[str, tuple[str, ...]]:
 def _add_sweep(sweep: argparse.ArgumentParser) -> None:
     sweep.add_argument("--scene", nargs="+", action="extend", help="names or files (default: lab)")
     sweep.add_argument(
-        "--preset", nargs="+", action="extend", help="settings of SLAM (default: paper)"
+        "--preset", nargs="+", action="extend", help="settings of SLAM (default: robust)"
     )
     sweep.add_argument("--seeds", type=count, default=20, help="number of seeds, from 0")
     sweep.add_argument(
@@ -240,7 +240,7 @@ def _sweep(arguments: argparse.Namespace, stop: StopFlag) -> None:
 
     options = SweepOptions(
         scenes=tuple(arguments.scene or ["lab"]),
-        presets=tuple(arguments.preset or ["paper"]),
+        presets=tuple(arguments.preset or ["robust"]),
         n_seeds=arguments.seeds,
         jobs=arguments.jobs or cpu_count(),
         out=arguments.json,

@@ -43,7 +43,7 @@ def test_defaults_are_the_preset_paper() -> None:
 @pytest.mark.parametrize(
     ("preset", "environment", "message"),
     [
-        ("papier", "lab", "unknown preset 'papier'; known: paper"),
+        ("papier", "lab", "unknown preset 'papier'; known: paper, robust"),
         ("paper", "moon", "no environment 'moon'; known: lab, classroom"),
     ],
 )
