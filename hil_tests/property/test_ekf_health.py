@@ -28,7 +28,7 @@ from slam.map_edits import merge, remove
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_covariance_stays_symmetric_and_positive_over_ten_thousand_random_steps(seed: int) -> None:
     rng = np.random.default_rng(seed)
     belief = random_belief(rng, 3, np.zeros(3))

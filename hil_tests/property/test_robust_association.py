@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from hil_tests.property.robust_oracles import N_RADARS, random_state, seeds, values
+from hil_tests.property.trilateration_oracles import NO_RANGES
 from slam.geometry import paper_rig
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.births import BodyPoint, match, point_rows
@@ -331,3 +332,37 @@ def test_fix_of_two_ranges_is_where_they_were_measured_to(x: float, y: float, tu
         assert square < 1e-12
     else:
         assert math.dist(found, R @ target) <= 1e-12 / max(y - 0.2, 1e-3)
+
+
+NONSENSE = st.one_of(NO_RANGES, st.floats(max_value=0.0), st.floats(min_value=1e150))
+
+
+@given(st.one_of(NONSENSE, st.floats()), st.one_of(NONSENSE, st.floats(0.2, 1.5)))
+def test_impossible_ranges_have_no_fix(first_m: float, second_m: float) -> None:
+    possible = 0 < first_m < 1e150 and 0 < second_m < 1e150
+    if possible and abs(first_m - second_m) <= 0.2 <= first_m + second_m:
+        return
+    assert fix_of_pair(HERE, THERE, first_m, second_m, AHEAD) is None
+    assert fix_of_pair(HERE, THERE, second_m, first_m, AHEAD) is None
+
+
+@few
+@given(
+    st.lists(NONSENSE.filter(lambda x: not 1e150 < abs(x) < math.inf), min_size=1, max_size=4),
+    st.integers(0, 3),
+)
+def test_impossible_ranges_change_nothing(nonsense: list[float], radar: int) -> None:
+    """Neither a landmark nor a tracklet comes of them, and good ranges beside them count."""
+    back_end = deepcopy(LONE)
+    good = [
+        float(np.hypot(0.0 - mount.x_m - back_end.state.position_m[0], 1.0 - mount.y_m))
+        for mount in paper_rig().mounts[:2]
+    ]
+    clean, spoilt = deepcopy(back_end), deepcopy(back_end)
+    scans = [RangeScan(radar=k, ranges_m=(good[k],) if k < 2 else ()) for k in range(4)]
+    clean.update(scans)
+    bad = replace(scans[radar], ranges_m=(*scans[radar].ranges_m, *nonsense))
+    report = spoilt.update([bad if k == radar else scans[k] for k in range(4)])
+    assert len(report.continued) == 2
+    assert np.array_equal(values(spoilt.state), values(clean.state))
+    assert np.array_equal(spoilt.state.P.full(), clean.state.P.full())

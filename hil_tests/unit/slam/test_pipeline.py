@@ -204,22 +204,15 @@ def test_the_rule_of_sample_times_changes_no_bit_where_it_must_not(sample_time: 
     assert bytes_of(results) == bytes_of(run(world, paper))
 
 
-def test_same_input_gives_the_same_bytes() -> None:
-    world = simulate(LAB, paper_rig(), 5, laps=1)
-    one, two = (run(world, load_preset("paper"))[-1].belief for _ in range(2))
-    assert one.mean.tobytes() == two.mean.tobytes()
-    assert one.covariance.tobytes() == two.covariance.tobytes()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("room", "environment"), [(LAB, "lab"), (CLASSROOM, "classroom")])
 def test_slam_beats_the_odometry_it_is_given(room: Room, environment: str) -> None:
-    """Drive four laps, both ways round, on five seeds.
+    """Drive four laps, both ways round, on three seeds; `uwb-slam sweep` has the statistics.
 
     Over 20 seeds the medians of SLAM and odometry are 29 and 51 mm (lab), 79 and 352 (classroom).
     """
     errors = []
-    for seed in range(5):
+    for seed in range(3):
         world = simulate(room, paper_rig(), seed)
         results = run(world, load_preset("paper", environment))
         odometry_ate = ate_rmse_m(world.odometry[:, :2], world.truth[:, :2])
