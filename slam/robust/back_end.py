@@ -18,6 +18,7 @@ from slam.robust.continuation import (
 from slam.robust.existence import Existence
 from slam.robust.expected import expected_ranges
 from slam.robust.leftovers import Leftovers
+from slam.robust.map_report import report_landmarks
 from slam.robust.motion import at_rest, calibrated_motion, predict
 from slam.robust.parameters import BackEndParameters, PointRule
 from slam.robust.points import RangeBearing, assign, named_rows, range_bearing_rows
@@ -93,15 +94,7 @@ class RobustBackEnd:
 
     def landmarks(self) -> tuple[MapLandmark, ...]:
         """Return the landmarks hit often enough to be reported."""
-        return tuple(
-            MapLandmark(
-                landmark_id=(id_ := self.state.landmark_ids[row]),
-                position_m=self.state.landmarks_m[row].copy(),
-                covariance=self.state.landmark_covariance(row),
-                hits=self._existence.hits(id_),
-            )
-            for row in self.reported_rows()
-        )
+        return report_landmarks(self.state, self.reported_rows(), self._existence.hits)
 
     def reported_rows(self) -> list[int]:
         """Return the rows of landmarks hit often enough to be reported; of an island, none."""
@@ -301,7 +294,8 @@ class RobustBackEnd:
         expected = inside[radars][:, sure.landmarks].all(axis=0)
         expected &= self._walls.certain[sure.landmarks]
         for row in sure.landmarks[expected].tolist():
-            if row not in count:
+            hidden = any(scan.may_hide(float(seen.ranges_m[scan.radar, row])) for scan in scans)
+            if row not in count and not hidden:
                 self._existence.miss(ids[row])
         whole = max(len(scans), 2)
         self._existence.seen_whole(ids[row] for row, n in count.items() if n >= whole)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from slam.robust.classification import Law, Sightings, compare, corners, wall_crossings
+from slam.robust.classification import Kind, Law, Sightings, compare, kinds, wall_crossings
 from slam.robust.symmetric import Array
 
 SIGMA_M = 1e-3
@@ -101,4 +101,17 @@ def test_points_at_crossings_of_walls_are_corners() -> None:
     assert len(wall_crossings(walls)) == 2  # nearly parallel walls cross anywhere
     points = np.array([[2.01, 1.0], [2.2, 1.0]])
     covariances = np.tile(1e-4 * np.eye(2), (2, 1, 1))
-    assert corners(points, covariances, walls, gate=9.21, floor_m=0.01) == [True, False]
+    assert kinds(points, covariances, walls, floor_m=0.01) == [Kind.CORNER, Kind.POINT]
+
+
+def test_the_image_of_a_point_behind_a_wall_is_its_ghost() -> None:
+    """By way of the wall to and fro, target t is as far as its image: 2 |p - t'| in all."""
+    wall = np.array([[math.pi / 2, 1.0]])
+    target, image = np.array([0.3, 0.4]), np.array([0.3, 1.6])
+    antenna = np.array([-0.2, 0.0])
+    way = np.hypot(*(antenna - [0.3, 1.6]))
+    bounce = antenna + (image - antenna) * (1.0 - antenna[1]) / (image[1] - antenna[1])
+    assert np.hypot(*(bounce - antenna)) + np.hypot(*(target - bounce)) == pytest.approx(way)
+    points = np.array([target, image, [0.9, 1.6]])
+    covariances = np.tile(1e-5 * np.eye(2), (3, 1, 1))
+    assert kinds(points, covariances, wall) == [Kind.POINT, Kind.GHOST, Kind.POINT]
