@@ -134,7 +134,7 @@ class RobustSlam:
             StepResult(
                 t_ns=t_ns,
                 odometry_pose=pose,
-                belief=belief_of(back_end),
+                belief=belief_of(back_end, is_lost=report.lost),
                 detections=detections,
                 report=report,
                 range_sigmas_m=sigmas_m,
@@ -159,20 +159,24 @@ class RobustSlam:
         sigmas_m: Sequence[float],
         moved: Mapping[int, Array | None],
     ) -> list[RangeScan]:
-        """Return the scan of every radar heard with the ranges that are fit, empty without any.
+        """Return the scan of every radar heard, the ranges that are unfit as blurred.
 
         ``moved`` tells how the robot moved from the state to each radar's own sample.
         """
         fit: dict[int, list[tuple[float, float]]] = {radar: [] for radar in moved}
+        blurred: dict[int, list[float]] = {radar: [] for radar in moved}
         for detection, sigma_m in zip(detections, sigmas_m, strict=True):
             if sigma_m < math.inf:
                 fit[detection.radar].append((detection.range_m, sigma_m))
+            else:
+                blurred[detection.radar].append(detection.range_m)
         return [
             RangeScan(
                 radar=radar,
                 ranges_m=tuple(range_m for range_m, _ in fit[radar]),
                 sigmas_m=tuple(sigma_m for _, sigma_m in fit[radar]),
                 moved=None if motion is None else (motion[0], motion[1], motion[2]),
+                blurred_m=tuple(blurred[radar]),
             )
             for radar, motion in moved.items()
         ]
@@ -201,8 +205,10 @@ def back_end_parameters(config: SlamConfig, wheels: WheelNoise) -> BackEndParame
     )
 
 
-def belief_of(back_end: RobustBackEnd) -> Belief:
+def belief_of(back_end: RobustBackEnd, *, is_lost: bool = False) -> Belief:
     """Return pose and reported landmarks with additive errors, as a belief of its own.
+
+    While the robot is lost the map is as it was, and the pose on it is unknown.
 
     With e_add = e + t e_th, t = J x for every point x (``State.additive_transform``), the
     covariance is P + t p_th^T + p_th t^T + P_thth t t^T: O(m^2), not a product of matrices.
@@ -216,9 +222,13 @@ def belief_of(back_end: RobustBackEnd) -> Belief:
         [quarter_turn(state.position_m), [0.0], quarter_turn(landmarks).ravel()]
     )
     along = np.outer(turned, P[2] + 0.5 * P[2, 2] * turned)
+    covariance = P + (along + along.T)
+    if is_lost:
+        covariance[:3], covariance[:, :3] = 0.0, 0.0
+        covariance[:3, :3] = back_end.pose_covariance
     return Belief(
         mean=np.concatenate([state.pose, landmarks.ravel()]),
-        covariance=P + (along + along.T),
+        covariance=covariance,
         landmark_ids=tuple(state.landmark_ids[row] for row in rows),
         next_id=state.next_id,
     )

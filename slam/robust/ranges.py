@@ -29,6 +29,8 @@ from slam.robust.symmetric import Array, Indices
 
 # No radar ranges as far; keeps squares finite whatever a front end says.
 LONGEST_M = 1e6
+# Two pulses closer than this in range are hard to tell apart: the width of one at half height.
+BLUR_M = 0.12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,6 +52,9 @@ class RangeScan:
     moved
         Reported motion from the pose to the sample, (dx, dy) [m] and turn [rad] in the body frame
         of the pose. Where given it is used instead of ``sampled_after``, which knows one step only.
+    blurred_m
+        Ranges of echoes that several targets may share: no evidence of where anything is, nor that
+        nothing is there.
     """
 
     radar: int
@@ -58,6 +63,7 @@ class RangeScan:
     labels: tuple[int, ...] | None = None
     sigmas_m: tuple[float, ...] | None = None
     moved: tuple[float, float, float] | None = None
+    blurred_m: tuple[float, ...] = ()
 
     def label(self, index: int) -> int | None:
         """Return the label of one range, None where unknown."""
@@ -66,6 +72,10 @@ class RangeScan:
     def sigma(self, index: int, otherwise_m: float) -> float:
         """Return the standard deviation [m] of one range, if it is not told the other one."""
         return otherwise_m if self.sigmas_m is None else self.sigmas_m[index]
+
+    def may_hide(self, range_m: float) -> bool:
+        """Tell whether an echo at a range may be part of a blurred one."""
+        return any(abs(blurred_m - range_m) <= BLUR_M for blurred_m in self.blurred_m)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -64,6 +64,8 @@ def trials(
     found = []
     for k in np.flatnonzero(counts).tolist():
         scan = by_radar[int(rows.radars[k])]
+        if scan.may_hide(float(rows.predicted_m[k])):
+            continue
         sigmas = np.array([scan.sigma(i, noise.sigma_m) for i in range(len(scan.ranges_m))])
         gates_m = rule.gate_sigmas * np.sqrt(float(variances[k]) + sigmas**2)
         chance = 1.0 - math.exp(-2.0 * float(gates_m.sum()) / span_m)
