@@ -88,7 +88,8 @@ def known_association_paths(
     true_landmarks_m
         Shape (n, 2), world frame.
     range_sigma_m
-        Standard deviation of a range, as SLAM was told it.
+        Standard deviation of a range where the results do not tell what SLAM was told of each;
+        those it was not given the bound does not use either.
     offset_sigma_m
         Standard deviation of each radar's unknown range offset; zero: calibrated.
     gate_sigmas

@@ -69,7 +69,7 @@ def known_run(
     true_landmarks_m
         Shape (n, 2), world frame.
     range_sigma_m
-        Standard deviation of a range, as SLAM was told it.
+        Standard deviation of a range in results that do not tell it (``range_sigmas_m``).
     offset_sigma_m
         Standard deviation of each radar's unknown range offset; widens the gate.
     gate_sigmas
@@ -84,15 +84,19 @@ def known_run(
         pose = result.odometry_pose
         increments.append(between(last, pose))
         last = pose
-        by_frame: dict[tuple[int, int], list[Detection]] = {}
-        for detection in result.detections:
-            by_frame.setdefault((detection.radar, detection.t_ns), []).append(detection)
+        told = result.range_sigmas_m or (range_sigma_m,) * len(result.detections)
+        by_frame: dict[tuple[int, int], list[tuple[Detection, float]]] = {}
+        for detection, sigma in zip(result.detections, told, strict=True):
+            if sigma < math.inf:  # else SLAM was not given it
+                frame = by_frame.setdefault((detection.radar, detection.t_ns), [])
+                frame.append((detection, sigma))
         of_state: list[KnownRange] = []
-        for (radar, t_ns), detections in by_frame.items():
+        for (radar, t_ns), frame in by_frame.items():
             motion = between(odometry.poses[row], odometry.at(t_ns))
+            sigmas = np.array([sigma for _, sigma in frame])
             ids = true_ids(
-                np.array([detection.range_m for detection in detections]),
-                gate_sigmas * math.hypot(range_sigma_m, offset_sigma_m),
+                np.array([detection.range_m for detection, _ in frame]),
+                gate_sigmas * np.hypot(sigmas, offset_sigma_m),
                 rig.mounts[radar],
                 truth.at(t_ns),
                 true_landmarks_m,
@@ -102,10 +106,10 @@ def known_run(
                     radar=radar,
                     landmark=id_,
                     range_m=detection.range_m,
-                    sigma_m=range_sigma_m,
+                    sigma_m=sigma,
                     motion=motion,
                 )
-                for detection, id_ in zip(detections, ids, strict=True)
+                for (detection, sigma), id_ in zip(frame, ids, strict=True)
                 if id_ is not None
             ]
         ranges.append(tuple(of_state))
@@ -113,7 +117,7 @@ def known_run(
 
 
 def true_ids(
-    ranges_m: Array, gate_m: float, mount: Mount, true_pose: Array, landmarks_m: Array
+    ranges_m: Array, gate_m: Array | float, mount: Mount, true_pose: Array, landmarks_m: Array
 ) -> Sequence[int | None]:
     """Return for each range of one frame the row of its true landmark, None for clutter.
 
@@ -122,7 +126,7 @@ def true_ids(
     ranges_m
         Shape (m,): what was measured.
     gate_m
-        How far from the true range it may lie.
+        How far from the true range it may lie, shape (m,) or one for all.
     mount
         Where the radar sits on the robot.
     true_pose
@@ -136,7 +140,9 @@ def true_ids(
     away = landmarks_m - np.array([antenna.x_m, antenna.y_m])
     off = wrap_angles(np.arctan2(away[:, 1], away[:, 0]) - antenna.yaw_rad)
     errors = np.abs(ranges_m[:, None] - np.hypot(away[:, 0], away[:, 1]))
-    allowed = (errors <= gate_m) & (np.abs(off) <= VIEW_HALF_ANGLE_RAD)
+    allowed = (errors <= np.broadcast_to(gate_m, len(ranges_m))[:, None]) & (
+        np.abs(off) <= VIEW_HALF_ANGLE_RAD
+    )
     ids: list[int | None] = [None] * len(ranges_m)
     for i, landmark in zip(*linear_sum_assignment(np.where(allowed, errors, 1e3)), strict=True):
         if allowed[i, landmark]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
@@ -290,6 +291,16 @@ def test_a_record_becomes_increments_and_ranges_at_their_own_times() -> None:
         record, Rig(mounts=(MOUNT,)), landmark, range_sigma_m=5e-4, offset_sigma_m=2e-2
     )
     assert len(unsure.ranges[0]) == 1
+    told = tuple(replace(r, range_sigmas_m=(3e-3, math.inf)[: len(r.detections)]) for r in results)
+    by_detection = known_run(
+        replace(record, results=told), Rig(mounts=(MOUNT,)), landmark, range_sigma_m=2e-3
+    )
+    assert [known.sigma_m for known in by_detection.ranges[0]] == [3e-3]
+    left_out = (replace(results[0], range_sigmas_m=(math.inf, 3e-3)), *results[1:])
+    nothing = known_run(
+        replace(record, results=left_out), Rig(mounts=(MOUNT,)), landmark, range_sigma_m=2e-3
+    )
+    assert nothing.ranges == ((), (), ())
 
 
 def test_ranges_of_one_radar_place_a_landmark_once_they_tell_it() -> None:
