@@ -347,14 +347,26 @@ def test_the_first_pose_is_where_the_first_values_are() -> None:
 
 
 def test_a_log_that_nobody_solves_stays_short() -> None:
-    log = RunLog(WheelNoise(), most_unsolved=10)
+    log, sizes = RunLog(WheelNoise(), most_unsolved=10), []
     for k in range(1, 200):
         log.add_motion(np.array([0.1, 0.0, 0.1]), 1e-4 * np.eye(3), 0.0, np.zeros(3))
         log.add_range(k, 0, 5, antenna=(0.1, 0.2), range_m=1.0, sigma_m=0.01)
         log.rename(k + 10, 5)
         assert log.n_poses == k + 1
         assert min(k + 1, 10) <= log.n_kept <= 20
-    assert len(pickle.dumps(log)) < 20_000
+        sizes.append(len(pickle.dumps(log)))
+    assert max(sizes[100:]) <= max(sizes[:100]) + 100
+
+
+def test_a_back_end_that_never_solves_forgets_its_way() -> None:
+    back_end = RobustBackEnd(
+        paper_rig(), replace(parameters_for(LAB, 7.4e-3), relinearisation=None)
+    )
+    sizes = []
+    for _ in range(400):
+        back_end.predict(np.array([0.01, 0.0, 0.0]))
+        sizes.append(len(pickle.dumps(back_end)))
+    assert max(sizes[200:]) <= max(sizes[:200]) + 100
 
 
 def test_labels_of_landmarks_that_are_gone_are_forgotten() -> None:
@@ -368,6 +380,8 @@ def test_labels_of_landmarks_that_are_gone_are_forgotten() -> None:
     for _ in range(40):
         deleted += back_end.update(silent).deleted
     assert deleted == first
+    heard = replace(silent[0], ranges_m=(1.0,), labels=(3,))
+    assert back_end.update([heard, *silent[1:]]).continued == ()
     again = back_end.update_points([seen])
     assert again != first
     assert len(back_end.state.landmark_ids) == 1
