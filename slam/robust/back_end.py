@@ -20,6 +20,7 @@ from slam.robust.expected import expected_ranges
 from slam.robust.leftovers import Leftovers
 from slam.robust.map_report import report_landmarks
 from slam.robust.motion import at_rest, calibrated_motion, predict
+from slam.robust.offsets import judged
 from slam.robust.parameters import BackEndParameters, PointRule
 from slam.robust.points import RangeBearing, assign, named_rows, range_bearing_rows
 from slam.robust.ranges import Antennas, RangeScan, View, antennas_of, rows_of, sides_of, view
@@ -141,7 +142,6 @@ class RobustBackEnd:
         continued, nis = self._continue_tracks(scans, antennas)
         carried = self._whereabouts.is_carried
         if carried:
-            continued, nis = (), 0.0
             self._whereabouts.set_down(self.state, self._existence, self._log)
             self._leftovers.clear()
         used = {(radar, index) for radar, index, _ in continued}
@@ -150,7 +150,9 @@ class RobustBackEnd:
         deleted = self._delete_lost()
         self._n_updates += 1
         merged = self._merge()
-        lost = self._whereabouts.is_lost
+        whereabouts = self._whereabouts
+        self.parameters = whereabouts.parameters = judged(self.state, self._log, self.parameters)
+        lost = whereabouts.is_lost
         relinearised = self._is_due() and self.relinearise()
         self._log.set_causal(self.state.pose)
         return UpdateReport(

@@ -34,7 +34,7 @@ class Whereabouts:
     """
 
     def __init__(self, parameters: BackEndParameters) -> None:
-        self._parameters = parameters
+        self.parameters = parameters
         self._surprise = Surprise(parameters.surprise)
         self._first_pose = 0
         self.elsewhere: frozenset[int] = frozenset()
@@ -57,7 +57,7 @@ class Whereabouts:
     @property
     def lost_covariance(self) -> Array:
         """Return the covariance of a pose of which nothing is known, shape (3, 3)."""
-        sigma_m = self._parameters.relocation.lost_position_m
+        sigma_m = self.parameters.relocation.lost_position_m
         return np.diag([sigma_m**2, sigma_m**2, math.pi**2 / 3.0])
 
     def seen_from_here(self, seen: View, state: State) -> View:
@@ -83,7 +83,7 @@ class Whereabouts:
                 forget(id_, state, existence, log)
         pose = state.pose
         if not self.is_lost:
-            relinearise(log, state, self._parameters)
+            relinearise(log, state, self.parameters)
         set_down(state, pose)
         log.carried(pose)
         self.elsewhere = frozenset(state.feature_ids)
@@ -92,7 +92,7 @@ class Whereabouts:
 
     def find(self, state: State, existence: Existence, log: RunLog) -> tuple[tuple[int, int], ...]:
         """Join the island with the map if it is certain how; return (kept, gone) ids."""
-        rules = self._parameters
+        rules = self.parameters
         rows = [r for r, id_ in enumerate(state.landmark_ids) if existence.is_reported(id_)]
         island = [r for r in rows if state.landmark_ids[r] not in self.elsewhere]
         old = [r for r in rows if state.landmark_ids[r] in self.elsewhere]

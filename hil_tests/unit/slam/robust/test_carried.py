@@ -123,11 +123,11 @@ def test_several_must_be_missing_and_nothing_speak_for_the_map() -> None:
 def test_what_was_mapped_after_the_robot_was_carried_is_no_witness() -> None:
     surprise = looked(100, (), (1, 2, 3, 4))
     for pose in range(100, 140):
-        frame = [Trial(id_, MISSED) for id_ in (2, 3, 4)] + [Trial(9, SEEN)]
-        surprise.look(frame, pose, (1, 2, 3, 4) if pose < 115 else (1, 2, 3, 4, 9))
+        frame = [Trial(id_, MISSED) for id_ in (2, 3, 4)] + [Trial(id_, SEEN) for id_ in (8, 9)]
+        surprise.look(frame, pose, (1, 2, 3, 4) if pose < 115 else (1, 2, 3, 4, 8, 9))
     assert surprise.is_carried
     assert 100 <= surprise.first_pose <= 110
-    assert 9 not in surprise.witnesses
+    assert surprise.witnesses == {1, 2, 3, 4}
 
 
 def carried_run(seed: int) -> tuple[Run, int]:
