@@ -43,6 +43,7 @@ def scheduler_address(scheduler: subprocess.Popen[str]) -> str:
 
 def sweep(scene: Path, out: Path, where: Sequence[str]) -> dict[str, Any]:
     command = [sys.executable, "-m", "slam.app.cli", "sweep", "--scene", str(scene)]
+    command += ["--preset", "paper"]
     command += ["--seeds", "1", "--stress", "dropped", "--json", str(out), *where]
     run = subprocess.run(command, capture_output=True, text=True, check=False, timeout=110)
     assert run.returncode == 0, run.stderr

@@ -6,11 +6,9 @@ import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
-import emulator
-import slam
-import xethru_protocol
 from emulator.odometry import scene_odometry
 from emulator.scene import Scene
 from slam.app.emulated_rig import (
@@ -223,9 +221,11 @@ def run_case(
 def program_version() -> str:
     """Return a digest of our own sources and of the versions of what they build on."""
     digest = hashlib.sha256(repr(sorted(versions().items())).encode())
-    for package in (xethru_protocol, emulator, slam):
-        assert package.__file__ is not None
-        folder = Path(package.__file__).parent
+    for package in ("xethru_protocol", "emulator", "slam"):
+        found = find_spec(package)
+        assert found is not None
+        assert found.origin is not None
+        folder = Path(found.origin).parent
         for path in sorted(folder.rglob("*.py")):
             digest.update(str(path.relative_to(folder)).encode() + path.read_bytes())
     return digest.hexdigest()
