@@ -47,8 +47,9 @@ def dask_results(
         See there; while results are awaited.
     """
     client = _connect(address)
+    futures: list[Any] = []
     try:
-        futures = [client.submit(function, *task, pure=False) for task in tasks]
+        futures += [client.submit(function, *task, pure=False) for task in tasks]
         yield _in_order(futures, address)
     finally:
         client.cancel(futures, force=True)
