@@ -374,17 +374,17 @@ def test_labels_of_landmarks_that_are_gone_are_forgotten() -> None:
     parameters = parameters_for(LAB, 7.4e-3)
     back_end = RobustBackEnd(paper_rig(), parameters)
     seen = RangeBearing(range_m=1.0, bearing_rad=1.5, covariance=1e-6 * np.eye(2), label=3)
-    first = back_end.update_points([seen])
+    far = RangeBearing(range_m=5.0, bearing_rad=0.0, covariance=1e-6 * np.eye(2), label=4)
+    first, _ = back_end.update_points([seen, far])
     silent = [RangeScan(radar=radar, ranges_m=(), labels=()) for radar in range(N_RADARS)]
     deleted: tuple[int, ...] = ()
     for _ in range(40):
         deleted += back_end.update(silent).deleted
-    assert deleted == first
+    assert deleted == (first,)
     heard = replace(silent[0], ranges_m=(1.0,), labels=(3,))
     assert back_end.update([heard, *silent[1:]]).continued == ()
-    again = back_end.update_points([seen])
-    assert again != first
-    assert len(back_end.state.landmark_ids) == 1
+    assert back_end.update_points([seen]) != (first,)
+    assert len(back_end.state.landmark_ids) == 2
 
 
 def test_a_long_run_keeps_its_belief_and_forgets_its_rows() -> None:
