@@ -139,6 +139,28 @@ def test_echoes_of_several_targets_are_left_out_and_told() -> None:
     assert result.range_sigmas_m == pytest.approx(told)
 
 
+def test_a_blurred_echo_is_no_miss_of_what_it_may_hide_and_an_empty_frame_is() -> None:
+    """Echoes of all rods run together for 6 s, or nothing is heard: only the latter is strange."""
+    hidden, gone = robust(), robust()
+    for slam in (hidden, gone):
+        drive(slam, 60, straight)
+    assert hidden.back_end.reported_rows()
+    known, carried = len(hidden.back_end.landmarks()), 0
+    for tick in range(60, 90):
+        t_ns = tick * TICK_NS
+        blurred = [
+            found for radar in range(4) for found in echoes(straight(t_ns), radar, t_ns, misfit=9.0)
+        ]
+        (result,) = hidden.step_detections(blurred, straight, t_ns)
+        (unheard,) = gone.step_detections((), straight, t_ns)
+        assert result.report is not None
+        assert unheard.report is not None
+        assert not result.report.carried
+        carried += unheard.report.carried
+    assert len(hidden.back_end.landmarks()) == known
+    assert carried == 1
+
+
 def test_a_front_end_that_predicts_nothing_is_taken_as_the_table_says() -> None:
     slam = robust(override(ROBUST, {"robust.range_sigma_m": 5e-3}))
     seen = [Detection(radar=0, t_ns=0, range_m=1.0, amplitude=0.01)]
