@@ -286,7 +286,7 @@ class RobustBackEnd:
         sure = near.surer_than(rule.tight_sigmas * noise.sigma_m)
         if sure is None:
             return []
-        self._expected += expected_ranges(self.state, sure, antennas, self._walls.feet_m)
+        self._expected += expected_ranges(self.state, sure, antennas)
         found = continue_tracks(sure, scans, noise, rule)
         ids = self.state.feature_ids
         count = Counter(continuation.row for continuation in found)

@@ -91,7 +91,7 @@ class UpdateReport:
     relinearised
         Whether all poses were solved for.
     expected
-        Every range of a landmark that took part, measured or not.
+        Every range of a landmark, not of walls, that took part, measured or not.
     carried, lost, relocated
         Whether it was found now that the robot was carried away; whether its place on the map is
         unknown, so that pose and covariance say nothing but that; whether it was found again now.
