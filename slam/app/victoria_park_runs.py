@@ -16,14 +16,21 @@ from slam.app.victoria_park import Drive
 from slam.geometry import Rig, compose, wrap_angle
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.parameters import BackEndParameters, RelinearisationRule, WheelNoise
+from slam.robust.state import CALIBRATION
 
 Array = NDArray[np.float64]
+
+_CALIBRATION_COLUMNS = np.arange(CALIBRATION.start, CALIBRATION.stop)
 
 # A park is a hundred times wider than a room, and its trees are known to half a metre.
 # Nothing is left out as an outlier: a tree seen twice would be left without a place.
 PARK_RULE = RelinearisationRule(
     turn_rad=0.02, shift_m=0.5, every=100, most_poses=10_000, outlier_sigmas=math.inf
 )
+
+# Wheels of which nothing is known: a tenth in distance and turn, a degree per two metres.
+UNKNOWN_WHEELS = WheelNoise(scale_sigma=0.1, turn_scale_sigma=0.1, curvature_sigma_rad_per_m=0.01)
+PERFECT_WHEELS = WheelNoise(scale_sigma=0.0, turn_scale_sigma=0.0, curvature_sigma_rad_per_m=0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -38,12 +45,16 @@ class ParkRun:
         shape (n, 2).
     given
         One entry per observation: (true id, id it was given, or None where left out).
+    calibration, calibration_sigmas
+        shape (3,): scale, turn scale and curvature errors of the wheels at the end.
     seconds
         Processor time.
     """
 
     poses: Array
     landmarks_m: Array
+    calibration: Array
+    calibration_sigmas: Array
     given: tuple[tuple[int, int | None], ...]
     seconds: float
 
@@ -52,15 +63,26 @@ def drive_back_end(
     drive: Drive,
     *,
     with_ids: bool,
+    wheels: WheelNoise = PERFECT_WHEELS,
     rule: RelinearisationRule = PARK_RULE,
     check: Callable[[], None] = lambda: None,
 ) -> ParkRun:
     """Run a drive through the robust back end's public interface.
 
-    The wheels have no calibration errors here: the reference's model knows none either.
+    Parameters
+    ----------
+    drive
+        The data; the noise of each step is in it.
+    with_ids
+        Whether the back end is told which tree each observation is of.
+    wheels
+        Standard deviations of the wheels' calibration errors; the reference's model has none.
+    rule
+        When all poses are solved for again.
+    check
+        Called once per step; may raise to stop.
     """
     began = time.process_time()
-    wheels = WheelNoise(scale_sigma=0.0, turn_scale_sigma=0.0, curvature_sigma_rad_per_m=0.0)
     back_end = RobustBackEnd(Rig(mounts=()), BackEndParameters(wheels=wheels, relinearisation=rule))
     given: list[tuple[int, int | None]] = []
     path = [back_end.pose]
@@ -80,6 +102,8 @@ def drive_back_end(
     return ParkRun(
         poses=np.array(path),
         landmarks_m=back_end.state.landmarks_m.copy(),
+        calibration=back_end.state.calibration.copy(),
+        calibration_sigmas=np.sqrt(np.diag(back_end.state.P.block(_CALIBRATION_COLUMNS))),
         given=tuple(given),
         seconds=time.process_time() - began,
     )

@@ -14,6 +14,7 @@ from slam.app.victoria_park import Drive
 from slam.app.victoria_park_runs import ParkRun, Reference
 
 _ISAM = "#2f9e44"
+_MAPS = ("true ids", "unknown ids")
 
 
 def draw_park(
@@ -36,7 +37,8 @@ def draw_park(
             ha="left",
         )
         grid = figure.add_gridspec(2, 2, height_ratios=(2.4, 1.0))
-        for column, (name, run) in enumerate(runs.items()):
+        for column, name in enumerate(_MAPS):
+            run = runs[name]
             axes = figure.add_subplot(grid[0, column])
             _map(axes, odometry, reference, run)
             label(
@@ -53,7 +55,7 @@ def draw_park(
             [[0.0], np.cumsum(np.hypot(*np.diff(reference.poses[:, :2], axis=0).T))]
         )
         paths = {"ISAM2, true ids": reference.causal} | {
-            f"robust, {name}": run.poses for name, run in runs.items()
+            f"robust, {name}": runs[name].poses for name in _MAPS
         }
         for (name, poses), colour in zip(paths.items(), (_ISAM, ESTIMATE, LANDMARK), strict=True):
             away = np.hypot(*(poses - reference.poses)[:, :2].T)
