@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -192,10 +193,11 @@ def back_end_parameters(config: SlamConfig, wheels: WheelNoise) -> BackEndParame
     told, limits = config.robust, config.detection
     reach_m = limits.max_range_m - limits.min_range_m
     return BackEndParameters(
-        wheels=wheels,
+        wheels=replace(wheels, walk_per_sqrt_m=told.wheel_walk_per_sqrt_m),
         ranges=RangeNoise(
             sigma_m=told.range_sigma_m,
             offset_sigma_m=told.offset_sigma_m,
+            calibrated_sigma_m=told.calibrated_offset_sigma_m or None,
             detection_probability=told.detection_probability,
             clutter_per_m=told.false_ranges_per_frame / reach_m,
             field_of_view_rad=told.field_of_view_rad,

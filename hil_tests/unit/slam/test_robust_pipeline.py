@@ -17,7 +17,7 @@ from slam.metrics import nees_pose
 from slam.pipeline import PoseAt, UwbRadarSlam
 from slam.presets import load_preset, override
 from slam.robust.parameters import WheelNoise
-from slam.robust_pipeline import RobustSlam, belief_of, make_slam
+from slam.robust_pipeline import RobustSlam, back_end_parameters, belief_of, make_slam
 
 Array = NDArray[np.float64]
 
@@ -243,6 +243,29 @@ def test_another_front_end_can_be_brought() -> None:
     slam.step([frame(0)], straight, 0)
     (result,) = slam.step([frame(TICK_NS)], straight, TICK_NS)
     assert [(found.radar, found.range_m) for found in result.detections] == [(2, 0.7)]
+
+
+def test_every_key_of_the_table_reaches_the_back_end() -> None:
+    settings = {
+        "robust.field_of_view_deg": 50.0,
+        "robust.range_sigma_m": 4e-3,
+        "robust.offset_sigma_m": 0.02,
+        "robust.calibrated_offset_sigma_m": 1e-3,
+        "robust.detection_probability": 0.7,
+        "robust.false_ranges_per_frame": 0.26,
+        "robust.wheel_walk_per_sqrt_m": 0.15,
+        "detection.min_range_m": 0.2,
+        "detection.max_range_m": 1.5,
+    }
+    told = back_end_parameters(override(ROBUST, settings), WheelNoise(scale_sigma=0.01))
+    ranges = told.ranges
+    assert ranges.field_of_view_rad == math.radians(50.0)
+    assert (ranges.sigma_m, ranges.offset_sigma_m, ranges.calibrated_sigma_m) == (4e-3, 0.02, 1e-3)
+    assert ranges.detection_probability == 0.7
+    assert ranges.clutter_per_m == pytest.approx(0.2)
+    assert (ranges.min_range_m, ranges.max_range_m) == (0.2, 1.5)
+    assert (told.wheels.scale_sigma, told.wheels.walk_per_sqrt_m) == (0.01, 0.15)
+    assert back_end_parameters(ROBUST, WheelNoise()).ranges.calibrated_sigma_m is None
 
 
 def test_the_table_refuses_what_makes_no_sense() -> None:
