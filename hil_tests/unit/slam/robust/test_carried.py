@@ -19,7 +19,14 @@ from slam.geometry import between, compose, paper_rig, transform
 from slam.metrics import nees_pose
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.births import BodyPoint, give_birth
-from slam.robust.parameters import BackEndParameters, MapRule, RelocationRule, SurpriseRule
+from slam.robust.motion import calibrated_motion, predict
+from slam.robust.parameters import (
+    BackEndParameters,
+    MapRule,
+    RelocationRule,
+    SurpriseRule,
+    WheelNoise,
+)
 from slam.robust.relocation import apply_join, find_join, set_down
 from slam.robust.state import State
 from slam.robust.surprise import Surprise, Trial
@@ -86,6 +93,7 @@ def test_a_constellation_tells_where_the_robot_is() -> None:
         assert np.trace(state.landmark_covariance(row)) < 0.8 * doubt[row]
     sigmas = np.sqrt(np.diag(state.pose_covariance()))
     assert (sigmas[:2] < 0.015).all()
+    assert (sigmas[:2] > 0.002).all()
     assert sigmas[2] < 0.02
     assert np.linalg.eigvalsh(state.P.full())[0] > -1e-12
 
@@ -185,3 +193,25 @@ def test_islands_turn_with_the_motion_that_joins_them() -> None:
     apply_join(state, join, range(7, 11), 1e-5)
     again = transform(between(state.pose, np.zeros(3)), state.landmarks_m[:4])
     assert again == pytest.approx(seen, abs=1e-6)
+
+
+def test_where_the_island_was_begun_does_not_matter() -> None:
+    """Pose, map and their covariances after a join are the same for any place of the island."""
+    truth, wheels = np.array([0.2, -0.1, 0.7]), WheelNoise()
+    after = []
+    for begun in (np.zeros(3), np.array([3.0, -2.0, 2.5])):
+        state = mapped(PLACES)
+        set_down(state, begun)
+        for _ in range(5):
+            step = calibrated_motion(np.array([0.1, 0.0, 0.2]), state.calibration, wheels)
+            predict(state, step, wheels)
+        see(state, transform(between(truth, np.zeros(3)), PLACES[:4]))
+        join = find_join(state, range(7, 11), range(7), MapRule(), RelocationRule())
+        assert join is not None
+        apply_join(state, join, range(7, 11), 1e-5)
+        after.append(state)
+    one, other = after
+    assert one.pose == pytest.approx(truth, abs=1e-6)
+    assert other.pose == pytest.approx(truth, abs=1e-6)
+    scale = np.sqrt(np.outer(one.P.diagonal(), one.P.diagonal()))
+    assert (np.abs(one.P.full() - other.P.full()) <= 1e-3 * scale + 1e-12).all()
