@@ -154,7 +154,15 @@ class RunLog:
         range_m: float,
         sigma_m: float,
     ) -> None:
-        """Append a range used; ``antenna`` is in the body frame of the pose, which is kept."""
+        """Append a range used; ``antenna`` is in the body frame of the pose.
+
+        Raises
+        ------
+        ValueError
+            The pose is kept no longer: fewer are kept than tracklets look back.
+        """
+        if pose < self._first:
+            raise ValueError(f"pose {pose} is kept no longer, the first one is {self._first}")
         ranges = self._ranges
         ranges.poses.append(pose)
         ranges.radars.append(radar)

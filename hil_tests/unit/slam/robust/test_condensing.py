@@ -356,6 +356,8 @@ def test_a_log_that_nobody_solves_stays_short() -> None:
         assert min(k + 1, 10) <= log.n_kept <= 20
         sizes.append(len(pickle.dumps(log)))
     assert max(sizes[100:]) <= max(sizes[:100]) + 100
+    with pytest.raises(ValueError, match="pose 3 is kept no longer"):
+        log.add_range(3, 0, 5, antenna=(0.1, 0.2), range_m=1.0, sigma_m=0.01)
 
 
 def test_a_back_end_that_never_solves_forgets_its_way() -> None:
