@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -36,6 +37,9 @@ from slam.detection import make_detector
 from slam.pipeline import Slam
 from slam.presets import ConfigError, override
 from slam.robust_pipeline import make_slam
+
+LARGEST = 1e12
+"""What stands for an infinite NEES or NIS."""
 
 Key = tuple[str, str, tuple[tuple[str, str], ...], str, int]
 """Scene, preset, settings, stress, seed."""
@@ -207,7 +211,7 @@ def run_case(
     record = record_of(case, check=check)
     summary = _summary(case, record)
     false, confident = false_landmarks(record, case.scene)
-    return SweepRun(
+    run = SweepRun(
         **{row.name: getattr(summary, row.name) for row in fields(summary)},
         settings=dict(case.settings),
         stress=case.stress,
@@ -215,6 +219,37 @@ def run_case(
         confident_false=confident,
         bound=bound_of(record, case.scene, case.config) if case.bound else None,
     )
+    return finite(run)
+
+
+def finite(run: SweepRun) -> SweepRun:
+    """Return the run with NEES and NIS of a state that is certain and wrong, infinite, at 1e12.
+
+    JSON has no infinity, and one such run must neither end a sweep nor go unseen in its means.
+
+    Raises
+    ------
+    AppError
+        Another number is not finite: SLAM has diverged.
+    """
+    nis_mean = None if run.nis_mean is None else min(run.nis_mean, LARGEST)
+    capped = replace(
+        run,
+        nees_pose=tuple((t_s, min(nees, LARGEST)) for t_s, nees in run.nees_pose),
+        nis_mean=nis_mean,
+        nis_times=tuple((t_s, min(nis, LARGEST), dof) for t_s, nis, dof in run.nis_times),
+    )
+    try:
+        json.dumps(asdict(capped), allow_nan=False)
+    except ValueError:
+        wrong = [
+            row.name for row in fields(capped) if "nan" in repr(getattr(capped, row.name)).lower()
+        ]
+        raise AppError(
+            f"{run.scene}, {run.preset}, stress {run.stress}, seed {run.seed}: SLAM diverged, "
+            f"not finite: {', '.join(wrong) or 'an error'}; leave this preset or stress out"
+        ) from None
+    return capped
 
 
 @cache

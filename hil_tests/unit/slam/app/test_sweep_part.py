@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,7 +13,7 @@ import pytest
 from hil_tests.unit.slam.app.sweep_runs import run_of
 from slam.app.errors import AppError
 from slam.app.sweep_part import PartFile
-from slam.app.sweep_run import SweepRun, make_case
+from slam.app.sweep_run import SweepRun, finite, make_case
 
 COMMAND = {"seeds": "3", "scene file lab": "12ab"}
 
@@ -91,3 +93,12 @@ def test_a_damaged_file_is_one_line_and_stays_as_it_is(
         PartFile(path, COMMAND)
     assert "\n" not in str(caught.value)
     assert path.read_bytes() == before
+
+
+def test_an_infinite_nees_is_kept_as_a_huge_one_and_a_diverged_run_is_named() -> None:
+    run = runs()[1]
+    certain_and_wrong = replace(run, nees_pose=((1.0, math.inf), (2.0, 3.0)))
+    assert finite(certain_and_wrong).nees_pose == ((1.0, 1e12), (2.0, 3.0))
+    assert finite(run) == run
+    with pytest.raises(AppError, match=r"lab, paper, stress skew, seed 1: .* finite: ate_rmse_m"):
+        finite(replace(run, ate_rmse_m=math.nan))
