@@ -253,7 +253,7 @@ def bare_room(path: Array, rng: np.random.Generator) -> list[list[RangeScan]]:
 
 def test_four_bare_walls_hold_the_robot_and_become_no_points() -> None:
     rng = np.random.default_rng(5)
-    path = true_path(LAB)[:1064:2]  # a lap and the first wall again
+    path = true_path(LAB)[:1064:3]  # a lap and the first wall again
     increments = reported(path, LAB, rng, walk=0.0)
     parameters = BackEndParameters(
         ranges=RangeNoise(sigma_m=SIGMA_M, detection_probability=0.98, clutter_per_m=0.02)
@@ -271,7 +271,8 @@ def test_four_bare_walls_hold_the_robot_and_become_no_points() -> None:
         del true_d_m[quarter % 4]
     assert not true_d_m
     blind_m = odometry_path(increments)[-1, :2] - path[-1, :2]
-    assert np.hypot(*(back_end.pose - path[-1])[:2]) < 0.3 * np.hypot(*blind_m)
+    # The first wall, seen again, holds the way across it; along it, only wheels count by then.
+    assert abs(back_end.pose[1] - path[-1, 1]) < 0.1 * abs(blind_m[1])
     assert nees_pose(back_end.pose, back_end.pose_covariance, path[-1]) < 16.3  # 99.9 %, 3 dof
     before = back_end.pose
     assert back_end.relinearise()
