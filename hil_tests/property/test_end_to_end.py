@@ -46,12 +46,16 @@ def cut(world: World, n: int) -> World:
 
 
 def run(world: World, preset: str) -> list[StepResult]:
+    def pose_at(t_ns: int) -> Array:
+        k, rest = divmod(t_ns, FRAME_NS)
+        here, there = world.odometry[k], world.odometry[min(k + 1, len(world.odometry) - 1)]
+        pose: Array = here + rest / FRAME_NS * (there - here)
+        return pose
+
     slam = make_slam(load_preset(preset), paper_rig(), WHEELS)
     results: list[StepResult] = []
-    for t_ns, detections, pose in zip(
-        world.stamps(), world.detections, world.odometry, strict=True
-    ):
-        results += slam.step_detections(detections, at_rest(pose), t_ns)
+    for t_ns, detections in zip(world.stamps(), world.detections, strict=True):
+        results += slam.step_detections(detections, pose_at, t_ns)
     return results + list(slam.flush())
 
 
