@@ -2,8 +2,8 @@
 
 Echoes are the local maxima of the magnitude of y, the frame correlated with the pulse
 (:mod:`slam.pulse_filter`), above its threshold. The logarithm of the magnitude is a parabola around
-an echo: the vertex through three of its values is the position, and its scatter is the Cramer-Rao bound of
-the position with unknown amplitude and phase (``PulseModel.position_bound_bins``).
+an echo: the vertex through three of its values is the position, and its scatter is the Cramer-Rao
+bound of the position with unknown amplitude and phase (``PulseModel.position_bound_bins``).
 
 Misfit
     Energy of y minus the fitted pulse at nine points within 2 s of the peak (s the envelope's

