@@ -49,7 +49,7 @@ def draw_smoke(path: Path, runs: Sequence[ObservedRun], *, seed: int) -> None:
             loc="outside lower center",
             ncols=5,
             frameon=False,
-            title="off: root mean square distance to the nearest landmark, placed from the true pose",
+            title="off: root mean square distance to the nearest landmark, seen from the true pose",
             title_fontsize=9,
         )
 
