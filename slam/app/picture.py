@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import matplotlib
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -47,13 +47,14 @@ def picture(path: Path, *, width_in: float, height_in: float, dpi: int = 100) ->
         figure = Figure(
             figsize=(width_in, height_in), dpi=dpi, layout="constrained", facecolor="white"
         )
-        canvas = FigureCanvasAgg(figure)
+        FigureCanvasAgg(figure)
         yield figure
-        canvas.draw()
-        colours = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-        few = colours.quantize(_PALETTE, dither=Image.Dither.NONE)
+        drawn = io.BytesIO()
+        figure.savefig(drawn, format="png")
+        with Image.open(drawn) as colours:
+            few = colours.convert("RGB").quantize(_PALETTE, dither=Image.Dither.NONE)
         with naming(path):
-            few.save(path, optimize=True)
+            few.save(path, format="png", optimize=True)
 
 
 def label(axes: Axes, title: str, x_label: str, y_label: str) -> None:
