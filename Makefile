@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PYTEST := $(BIN)/python -m pytest
 
-.PHONY: demo test check bench sweep clean
+.PHONY: demo test check bench sweep pictures clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed-demo
@@ -29,6 +29,20 @@ bench: $(VENV)/installed-bench
 sweep: $(VENV)/installed-sweep
 	$(BIN)/uwb-slam sweep --scene lab classroom --preset paper robust --seeds 100 --bound --json out/sweep.json
 	$(BIN)/uwb-slam experiment consistency --sweep out/sweep.json --out out
+
+# The pictures of fixtures/pictures but the screenshot of Rerun, and the numbers of `limits`: about
+# a quarter of an hour of one core. RECORDING names the real recording that `recording` compares with.
+pictures: $(VENV)/installed-test
+	$(BIN)/uwb-slam demo --out out/pictures/demo
+	cp out/pictures/demo/map.png fixtures/pictures/lab_map.png
+	$(BIN)/uwb-slam experiment figure7 --out out/pictures
+	$(BIN)/uwb-slam experiment smoke --out out/pictures
+	$(BIN)/uwb-slam experiment filter --scene lab two_rooms --out out/pictures
+	$(BIN)/uwb-slam experiment limits --out out/pictures
+	$(if $(RECORDING),$(BIN)/uwb-slam experiment recording --recording '$(RECORDING)' --out out/pictures)
+	cp out/pictures/*.png fixtures/pictures
+	cp out/pictures/limits.json fixtures/baselines/front_end.json
+	$(BIN)/python -m hil_tests.golden.update_manifest
 
 $(VENV)/bin/python:
 	@test -n "$(PYTHON)" || { echo "no Python >= 3.11 found; set PYTHON=/path/to/python3" >&2; exit 1; }

@@ -87,7 +87,6 @@ from numpy.typing import NDArray
 
 from emulator.echo_source import CaptureSettings, EchoSource
 from emulator.jitter import CarrierJitter
-from emulator.module_clock import ModuleClock
 from emulator.paths import ScenePaths
 from emulator.pulse import sum_of_pulses
 from emulator.receiver import Receiver, one_count
@@ -129,7 +128,7 @@ class SceneEcho:
     def __init__(self, scene: Scene, radar: RadarSpec, seed: int) -> None:
         self._radar = radar
         self._paths = ScenePaths(scene, radar)
-        self._clock = ModuleClock(skew_ns=round(radar.start_skew_ms * 1e6), ppm=radar.clock_ppm)
+        self._clock = radar.clock
         self._gain = 10.0 ** (radar.gain_db / 20)
         self._jitter = CarrierJitter(scene.jitter, seed=seed, serial=int(radar.serial))
         self._receiver = Receiver(scene, radar, seed)

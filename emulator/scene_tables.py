@@ -22,6 +22,7 @@ from pydantic import (
     model_validator,
 )
 
+from emulator.module_clock import ModuleClock
 from emulator.people import AMPLITUDE_OF_1_M2
 
 __all__ = [
@@ -89,6 +90,11 @@ class RadarSpec(Table):
     gain_db: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-40, le=40)] = 0.0
     start_skew_ms: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=10_000)] = 0.0
     clock_ppm: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-1000, le=1000)] = 0.0
+
+    @property
+    def clock(self) -> ModuleClock:
+        """Return the clock that this module's skew and error make."""
+        return ModuleClock(skew_ns=round(self.start_skew_ms * 1e6), ppm=self.clock_ppm)
 
 
 class TargetSpec(Table):

@@ -19,7 +19,6 @@ from emulator.faults.plan import FaultPlanError, load_plan
 from emulator.identity import Identity
 from emulator.link import LinkError
 from emulator.link_folder import link_folder, socket_path
-from emulator.module_clock import ModuleClock
 from emulator.odometry import scene_odometry
 from emulator.odometry_feed import OdometryFeed
 from emulator.options import DeviceOptions
@@ -36,7 +35,6 @@ from xethru_protocol.recordings.wire_capture import Way, WireCapture
 
 __all__ = ["CannotServeError", "play", "proxy", "serve"]
 
-NS_PER_MS = 1_000_000
 SOCKET_NAME = "odometry.sock"
 CONTROL_NAME = "control.sock"
 PROXY_NAME = "proxy"
@@ -272,13 +270,12 @@ def _radar_devices(  # noqa: PLR0917 - what makes a radar
 ) -> list[NamedDevice]:
     made = []
     for index, radar in enumerate(scene.radars):
-        clock = ModuleClock(skew_ns=round(radar.start_skew_ms * NS_PER_MS), ppm=radar.clock_ppm)
         device = radar_device(
             Identity(serial=radar.serial),
             echo_source(scene, index, seed),
             pace,
             scene_time_zero_ns=zero_ns,
-            clock=clock,
+            clock=radar.clock,
             options=options,
             memory=None if memory is None else memory(radar.serial),
         )
@@ -288,7 +285,7 @@ def _radar_devices(  # noqa: PLR0917 - what makes a radar
                 name=radar.name,
                 serial=radar.serial,
                 device=faulty,
-                start_skew_ns=clock.skew_ns,
+                start_skew_ns=radar.clock.skew_ns,
                 present=faulty.port_present,
                 uart_baud=partial(_uart_baud, device),
             )

@@ -40,12 +40,15 @@ class WeakDirection:
     direction
         Shape (3 r,), unit vector: offset, mount x, mount y of each radar.
     words
-        One sentence with the remedy.
+        What cannot be told from what, in one sentence.
+    remedy
+        A drive that would tell it.
     """
 
     sigma_m: float
     direction: Array
     words: str
+    remedy: str
 
 
 def weak_directions(
@@ -59,15 +62,14 @@ def weak_directions(
         if sigma_m <= limit_m:
             break
         direction: Array = vectors[:, index]
+        words, remedy = _words(direction, names, sigma_m)
         found.append(
-            WeakDirection(
-                sigma_m=sigma_m, direction=direction, words=_words(direction, names, sigma_m)
-            )
+            WeakDirection(sigma_m=sigma_m, direction=direction, words=words, remedy=remedy)
         )
     return tuple(found)
 
 
-def _words(direction: Array, names: Sequence[str], sigma_m: float) -> str:
+def _words(direction: Array, names: Sequence[str], sigma_m: float) -> tuple[str, str]:
     share = np.abs(direction).reshape(-1, 3)
     parts = share >= _TAKES_PART * share.max()
     by_kind = {
@@ -79,12 +81,11 @@ def _words(direction: Array, names: Sequence[str], sigma_m: float) -> str:
     mounts = [kind for kind in ("mount y", "mount x") if by_kind[kind]]
     remedy = _REMEDY[mounts[0] if mounts else "offset"]
     if len(present) == 1 and int(parts.sum()) == 1:
-        return f"this drive does not tell the {present[0]} {size}: {remedy}"
+        return f"the drive does not tell the {present[0]} {size}", remedy
     if len(present) == 1:
-        return f"this drive tells only combinations of the {present[0]} {size}: {remedy}"
-    return (
-        f"this drive cannot tell the {present[0]} from the {_joined(present[1:])} {size}: {remedy}"
-    )
+        return f"the drive tells only combinations of the {present[0]} {size}", remedy
+    words = f"the drive cannot tell the {present[0]} from the {_joined(present[1:])} {size}"
+    return words, remedy
 
 
 def _joined(words: Sequence[str]) -> str:

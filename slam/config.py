@@ -214,9 +214,8 @@ class TrilaterationConfig(_Model):
 
     field_of_view_deg: Annotated[float, Field(gt=0, lt=180)] = 65.0
     pairing: Pairing = Pairing.ALL
-    # As printed the stamps of a pair are not compared; infinity keeps that. Frames stamped by
-    # their counters carry equal stamps where the counters are equal, so a limit acts only where
-    # frames are stamped by their arrival.
+    # As printed the stamps of a pair are not compared; infinity keeps that. A frame's stamp is its
+    # own radar's, so the start skew of unsynchronised radars counts, too.
     max_stamp_difference_s: Annotated[float, Field(ge=0, allow_inf_nan=True)] = math.inf
     sample_time: SampleTime = SampleTime.NOMINAL
     bearing: PairBearing = PairBearing.RANGES

@@ -2,8 +2,8 @@
 
 Echoes are the local maxima of the magnitude of y, the frame correlated with the pulse
 (:mod:`slam.pulse_filter`), above its threshold. The logarithm of the magnitude is a parabola around
-an echo: the vertex through three bins is the position, and its scatter is the Cramer-Rao bound of
-the position with unknown amplitude and phase (``PulseModel.position_bound_bins``).
+an echo: the vertex through three of its values is the position, and its scatter is the Cramer-Rao
+bound of the position with unknown amplitude and phase (``PulseModel.position_bound_bins``).
 
 Misfit
     Energy of y minus the fitted pulse at nine points within 2 s of the peak (s the envelope's
@@ -29,7 +29,7 @@ from slam.close_echoes import SplitTest
 from slam.config import FrontEnd, SlamConfig
 from slam.detector import Detection, reaches_limits, usable_samples
 from slam.frames import RadarFrame
-from slam.pulse_filter import PulseFilter
+from slam.pulse_filter import BINS_PER_STEP, PulseFilter
 from slam.pulse_model import PulseModel
 from slam.pulse_refit import Filtered, Peaks, cut_pulses, refit
 
@@ -159,10 +159,12 @@ def _single_pulses(filtered: Filtered) -> tuple[Peaks, Array]:
     """Return every peak as if it were one pulse, and the part of its energy that is none."""
     y, power, sigma_y = filtered.y, filtered.power, filtered.sigma_y
     pulse_filter = filtered.pulse_filter
-    at = np.flatnonzero(power[1:-1] > (pulse_filter.threshold * sigma_y) ** 2) + 1
-    at = at[(power[at] > power[at - 1]) & (power[at] >= power[at + 1])]
-    before, middle, after = np.log(power[at + _NEIGHBOURS])
-    offset = 0.5 * (before - after) / (before - 2 * middle + after)
+    at = (power[1:-1] > (pulse_filter.threshold * sigma_y) ** 2).nonzero()[0] + 1
+    near = power.take(at + _NEIGHBOURS)
+    highest = (near[1] > near[0]) & (near[1] >= near[2])
+    at = at[highest]
+    before, middle, after = np.log(near[:, highest])
+    offset = 0.5 * BINS_PER_STEP * (before - after) / (before - 2 * middle + after)
     s, kappa = pulse_filter.sigma_bins, pulse_filter.carrier_rad
     at_peak = y[at]
     height = np.abs(at_peak)
@@ -172,12 +174,11 @@ def _single_pulses(filtered: Filtered) -> tuple[Peaks, Array]:
     around = y.take(at[:, np.newaxis] + pulse_filter.probes, mode="clip")
     around *= pulse_filter.probe_turns
     around *= (at_peak.conj() / height)[:, np.newaxis]
-    pulse = np.exp(-(((pulse_filter.probes - offset[:, np.newaxis]) / (2 * s)) ** 2))
-    pulse *= amplitude[:, np.newaxis]
-    around -= pulse
+    away = pulse_filter.probe_sigmas - (offset / s)[:, np.newaxis]
+    around -= amplitude[:, np.newaxis] * np.exp(-0.25 * (away * away))
     left = np.vecdot(around, around).real
     peaks = Peaks(
-        position_bins=at + offset,
+        position_bins=BINS_PER_STEP * at + offset,
         amplitude=amplitude,
         phase_rad=np.arctan2(at_peak.imag, at_peak.real) + kappa * offset,
         sigma_bins=math.sqrt(2) * s * sigma_y / amplitude,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.close_echoes import KnownPulse, SplitTest, fit_echoes
-from slam.pulse_filter import PulseFilter
+from slam.pulse_filter import BINS_PER_STEP, PulseFilter
 from slam.pulse_model import ComplexArray
 
 Array = NDArray[np.float64]
@@ -70,9 +70,9 @@ class Filtered:
     usable
         shape (n_bins,): samples that are known and not at a limit of the sampler; None: all.
     y
-        shape (n_bins,), complex: correlation with the pulse.
+        shape (n_steps,), complex: correlation with the pulse, at every second bin.
     power
-        shape (n_bins,): squared magnitude of y.
+        shape (n_steps,): squared magnitude of y.
     sigma_y
         Standard deviation of its noise, per quadrature.
     pulse_filter
@@ -208,7 +208,7 @@ def _misfit(table: Array, filtered: Filtered) -> Array:
     residual = filtered.samples - _render(table, pulse_filter)
     if filtered.usable is not None:
         residual *= filtered.usable
-    nearest = np.rint(table[:, _POSITION]).astype(np.intp)
+    nearest = np.rint(table[:, _POSITION] / BINS_PER_STEP).astype(np.intp)
     left = pulse_filter.apply(residual).take(
         nearest[:, np.newaxis] + pulse_filter.probes, mode="clip"
     )

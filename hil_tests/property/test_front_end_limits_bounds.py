@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.special import eval_genlaguerre
 
 from slam.app.cli import main
 from slam.app.experiments.echo_separators import SEPARATORS
@@ -20,6 +21,7 @@ from slam.app.experiments.limit_bounds import (
 from slam.app.experiments.limit_cells import ranging, resolution
 from slam.app.experiments.limit_frames import BIN_LENGTH_M
 from slam.close_echoes import SplitTest
+from slam.pulse_filter import _MEDIAN_EFFICIENCY
 
 Array = NDArray[np.float64]
 
@@ -116,3 +118,22 @@ def test_the_command_writes_table_picture_and_numbers(
     out, err = capsys.readouterr()
     assert "share of pairs of equal echoes resolved" in out
     assert "6/6 saturation" in err
+
+
+def test_the_scatter_of_the_estimated_noise_is_that_of_a_median_of_correlated_powers() -> None:
+    """Powers of complex noise that correlate by q have joint density sum q**k L_k L_k exp exp.
+
+    So do the indicators of being above the median m = ln 2, with coefficients
+    c_k = int_m^inf L_k(p) exp(-p) dp = m exp(-m) L^1_(k-1)(m) / k, and a median varies by the sum
+    of their covariances over the squared density there, 1/2.
+    """
+    spacing = 0.75  # of the cells that are looked at, in envelope sigmas
+    median = math.log(2)
+    k = np.arange(1, 2001)
+    c = median * math.exp(-median) * eval_genlaguerre(k - 1, 1, median) / k
+    lags = spacing * np.arange(-30, 31)
+    covariances = np.sum(c**2 @ np.exp(-0.5 * np.outer(k, lags**2)))
+    covariances += 0.25 - np.sum(c**2)  # higher orders: lag 0 alone
+    cells = 4 * covariances / median**2  # relative variance of the estimate, times their number
+    mean = math.sqrt(math.tau) / spacing  # the same of a mean of powers
+    assert mean / cells == pytest.approx(_MEDIAN_EFFICIENCY, abs=2e-3)

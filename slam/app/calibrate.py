@@ -269,7 +269,12 @@ def _facts(report: CalibrationReport, planted: Mapping[str, tuple[float, float]]
         "residual_rms_m": None if math.isnan(calibration.sigma_m) else calibration.sigma_m,
         "limit_m": OFFSET_LIMIT_M,
         "weak_directions": [
-            {"sigma_m": weak.sigma_m, "direction": weak.direction.tolist(), "words": weak.words}
+            {
+                "sigma_m": weak.sigma_m,
+                "direction": weak.direction.tolist(),
+                "words": weak.words,
+                "remedy": weak.remedy,
+            }
             for weak in report.weak
         ],
         "poor_drive": list(report.poor),
@@ -283,7 +288,13 @@ def _used(report: CalibrationReport) -> int:
 def _lines(report: CalibrationReport, scene: Scene | None) -> Iterable[str]:
     calibration, gains = report.calibration, report.gains
     planted = _planted(report.drive.rig, scene)
-    head = f"{'radar':<14}{'offset mm':>16}{'mount dx, dy mm':>26}{'gain dB':>16}{'yaw deg':>16}"
+    fit = "" if math.isnan(calibration.sigma_m) else f", to {1e3 * calibration.sigma_m:.2f} mm rms"
+    yield (
+        f"{_used(report)} of {len(report.drive.ranges)} ranges fit to "
+        f"{len(calibration.landmarks_m)} reflectors{fit}; beside each value its standard deviation"
+    )
+    head = f"{'radar':<14}{'offset mm':>16}{'mount moved x, y mm':>26}{'gain dB':>16}"
+    head += f"{'turned deg':>16}"
     yield head + (f"{'planted mm':>12}{'error mm':>10}" if planted else "")
     for index, mount in enumerate(report.drive.rig.mounts):
         offset, sigma = 1e3 * calibration.offsets_m[index], 1e3 * calibration.offset_sigmas_m[index]
@@ -303,18 +314,19 @@ def _lines(report: CalibrationReport, scene: Scene | None) -> Iterable[str]:
             truth_mm = 1e3 * planted[mount.name][0]
             line += f"{truth_mm:+12.2f}{offset - truth_mm:+10.2f}"
         yield line
-    yield (
-        f"{len(calibration.landmarks_m)} reflectors, {_used(report)} of "
-        f"{len(report.drive.ranges)} ranges used"
-        + ("" if math.isnan(calibration.sigma_m) else f", rms {1e3 * calibration.sigma_m:.2f} mm")
-        + "; gains are relative to their mean, yaw is seen through the beam only"
-    )
+    yield "offset: added to every range; moved, turned: off the nominal rig, the turn as amplitudes"
+    yield "show it; gain: over the mean of all radars"
     marked = bool(np.any(calibration.offset_sigmas_m > OFFSET_LIMIT_M))
     if marked:
-        yield f"? known to no better than {1e3 * OFFSET_LIMIT_M:g} mm (1 sigma); not in --rig"
+        yield (
+            f"? not told to {1e3 * OFFSET_LIMIT_M:g} mm (one standard deviation): a rig file keeps "
+            "the nominal offset and mount"
+        )
     yield from report.poor
     if marked:
         yield from dict.fromkeys(weak.words for weak in report.weak)
+        for remedy in dict.fromkeys(weak.remedy for weak in report.weak):
+            yield f"remedy: {remedy}"
 
 
 def _told(value: float, sigma: float, limit: float) -> str:

@@ -14,7 +14,6 @@ from emulator.device import radar_device
 from emulator.echo import echo_source
 from emulator.identity import Identity
 from emulator.loopback import LoopbackTransport
-from emulator.module_clock import ModuleClock
 from emulator.pace import Pace
 from emulator.scene import Scene, SceneError, UnknownSceneError, load_scene
 from slam.app.emulator_process import EmulatedDevice
@@ -136,12 +135,11 @@ def open_loopback(scene: Scene, seed: int) -> RigSource:
     """Open the same emulated modules in this process: same driver, no ports, no waiting."""
     links = []
     for index, (radar, mount) in enumerate(zip(scene.radars, rig_of(scene).mounts, strict=True)):
-        clock = ModuleClock(skew_ns=round(radar.start_skew_ms * 1e6), ppm=radar.clock_ppm)
         device = radar_device(
             Identity(serial=radar.serial),
             echo_source(scene, index, seed),
             Pace.ASAP,
-            clock=clock,
+            clock=radar.clock,
         )
         transport = LoopbackTransport(device, name=f"in process: {radar.name}")
         driver = X4M300(transport, clock=transport.clock_ns)
@@ -151,7 +149,7 @@ def open_loopback(scene: Scene, seed: int) -> RigSource:
                 port=transport.name,
                 serial=radar.serial,
                 driver=driver,
-                start_skew_ns=clock.skew_ns,
+                start_skew_ns=radar.clock.skew_ns,
             )
         )
     return RigSource(links)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,11 +12,13 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from PIL import Image
 
 from slam.app.errors import naming
 
 TRUTH, ODOMETRY, ESTIMATE, LANDMARK = "#8a8f98", "#e08a2c", "#1f6fd0", "#c2255c"
 INK, PALE_INK, GRID = "#20242a", "#6a707a", "#eceef1"
+_PALETTE = 256
 
 # The same picture on every machine: no user style, no font that may be missing.
 STYLE: dict[Any, Any] = {
@@ -32,7 +35,8 @@ STYLE: dict[Any, Any] = {
 def picture(path: Path, *, width_in: float, height_in: float, dpi: int = 100) -> Iterator[Figure]:
     """Give a figure to draw in, and write it as a PNG file at the end.
 
-    No software version or date goes into the file: the same figure gives the same bytes.
+    Its colours are cut to a palette of 256, which makes the file a third of the size. No software
+    version or date goes into it: the same figure gives the same bytes.
 
     Raises
     ------
@@ -45,8 +49,12 @@ def picture(path: Path, *, width_in: float, height_in: float, dpi: int = 100) ->
         )
         FigureCanvasAgg(figure)
         yield figure
+        drawn = io.BytesIO()
+        figure.savefig(drawn, format="png")
+        with Image.open(drawn) as colours:
+            few = colours.convert("RGB").quantize(_PALETTE, dither=Image.Dither.NONE)
         with naming(path):
-            figure.savefig(path, metadata={"Software": None}, pil_kwargs={"optimize": True})
+            few.save(path, format="png", optimize=True)
 
 
 def label(axes: Axes, title: str, x_label: str, y_label: str) -> None:

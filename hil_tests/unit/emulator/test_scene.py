@@ -140,7 +140,8 @@ def test_a_bad_scene_is_one_clear_line(tmp_path: Path, text: str, words: list[st
 
 
 def test_an_unknown_name_lists_the_known_ones() -> None:
-    with pytest.raises(SceneError, match=r"labb: no such scene; known are .*classroom, .*lab, "):
+    message = r"labb: no such scene; known are .*classroom, .*lab, .*or give the path of"
+    with pytest.raises(SceneError, match=message):
         load_scene("labb")
 
 

@@ -57,9 +57,9 @@ def _draw_raw(axes: Axes, frame: RadarFrame, true_m: float) -> None:
     axes.plot(_ranges_m(frame), _MILLI * magnitude, color=ESTIMATE, linewidth=0.8)
     axes.axhline(_MILLI * magnitude.mean(), color=ODOMETRY, linewidth=1.0, linestyle="--")
     axes.annotate(
-        "mean: samples below it are set to 0",
+        "dashed: mean,\nless is set to 0",
         (_SHOWN_TO_M, _MILLI * magnitude.mean()),
-        xytext=(-4, 16),
+        xytext=(-4, 24),
         textcoords="offset points",
         ha="right",
         fontsize=8.5,
@@ -170,11 +170,14 @@ def _draw_residuals(axes: Axes, steps: Steps, errors: Mapping[str, RangeErrors])
             markersize=2.0,
             alpha=0.25,
             color=_COLOURS[name],
+            zorder=1,
         )
         axes.plot(
             steps.ranges_m,
             _MILLI * error.position_means_m,
-            linewidth=1.0,
+            # on a single echo the joint fit is the matched filter: the first line is wide
+            linewidth=4.0 if name == FrontEnd.MATCHED_FILTER else 1.0,
+            alpha=0.4 if name == FrontEnd.MATCHED_FILTER else 1.0,
             color=_COLOURS[name],
             label=f"{name}: {spread}",
         )

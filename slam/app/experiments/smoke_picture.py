@@ -38,8 +38,8 @@ def draw_smoke(path: Path, runs: Sequence[ObservedRun], *, seed: int) -> None:
                 label(
                     axes,
                     f"{run.name}: {len(points)} {what}, {mm_text(error_m)} off",
-                    "x [m]",
-                    "y [m]",
+                    "x [m]" if axes is column[1] else "",
+                    "y [m]" if run is shown[0] else "",
                 )
         handles = [*panels[0, 0].get_legend_handles_labels()[0]]
         handles.append(panels[1, 0].get_lines()[-1])
@@ -49,14 +49,13 @@ def draw_smoke(path: Path, runs: Sequence[ObservedRun], *, seed: int) -> None:
             loc="outside lower center",
             ncols=5,
             frameon=False,
-            markerscale=1.8,
-            title="off: root mean square distance to the nearest landmark, on true poses",
+            title="off: root mean square distance to the nearest landmark, seen from the true pose",
             title_fontsize=9,
         )
 
 
 def _draw(axes: Axes, run: ObservedRun, points: NDArray[np.float64], colour: str) -> None:
-    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_aspect("equal", adjustable="box")
     axes.plot(*run.odometry_m.T, color=ODOMETRY, linewidth=0.8, label="odometry")
     axes.plot(*run.truth_m.T, color=TRUTH, linewidth=2.4, alpha=0.5, label="truth")
     axes.plot(

@@ -1,0 +1,30 @@
+"""Write the hash of every listed file into fixtures/MANIFEST.toml: `python -m` this, then commit.
+
+Files that are not listed, and rows without a file, are left for `test_manifest` to tell of.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from pathlib import Path
+
+FIXTURES = Path(__file__).parents[2] / "fixtures"
+
+
+def with_hashes(manifest: str, folder: Path) -> str:
+    """Return the manifest with the hash of what each of its files holds now."""
+
+    def row(found: re.Match[str]) -> str:
+        path = folder / found["path"]
+        if not path.is_file():
+            return found[0]
+        return found["before"] + hashlib.sha256(path.read_bytes()).hexdigest() + '"'
+
+    pattern = r'(?P<before>path = "(?P<path>[^"]+)"\n(?:[a-z]+ = .*\n)*?sha256 = ")[0-9a-f]*"'
+    return re.sub(pattern, row, manifest)
+
+
+if __name__ == "__main__":
+    listing = FIXTURES / "MANIFEST.toml"
+    listing.write_text(with_hashes(listing.read_text(), FIXTURES))
