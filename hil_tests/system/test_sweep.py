@@ -27,7 +27,7 @@ def sweep(tmp_path: Path, jobs: int) -> dict[str, Any]:
     command += ["--preset", "paper"]
     command += ["--seeds", "3", "--jobs", str(jobs), "--json", str(out)]
     run = subprocess.run(command, capture_output=True, text=True, check=True, timeout=100)
-    assert run.stdout.startswith("short, preset robust, 3 seeds (simulated): SLAM ATE median")
+    assert run.stdout.startswith("short, preset paper, 3 seeds (simulated): SLAM ATE median")
     result: dict[str, Any] = json.loads(out.read_text())
     return result
 
