@@ -105,6 +105,17 @@ def test_the_echo_is_half_at_the_edge_and_never_jumps() -> None:
     assert abs(fields[-1]) < 0.15 * full
 
 
+def test_a_corner_seen_from_outside_ends_like_any_wall() -> None:
+    """Behind an L the other wall is not heard: it closes the end on the inner side alone."""
+    long_wall = wall((0.0, 0.0), (FAR, 0.0), reflection=1.0)
+    silent = wall((0.0, 0.0), (0.0, FAR), reflection=0.0, name="upright")
+    for x in (-0.05, -1e-6, 1e-6, 0.05, 0.3):
+        radar = radar_at(x, -1.0, 90.0)
+        alone = heard(radar, walls=(long_wall,)).field()
+        behind = heard(radar, walls=(long_wall, silent)).field()
+        assert behind == pytest.approx(alone, abs=1e-4)
+
+
 def test_what_passes_an_edge_is_fresnels() -> None:
     """Half at the boundary; Babinet; far in the dark 1 / (sqrt(2) pi v) at minus 45 degrees."""
     zero = np.zeros(1)
