@@ -242,6 +242,15 @@ def test_a_radar_places_an_echo_it_followed() -> None:
     assert place(sights, ranges + np.linspace(0, 0.4, 30) ** 2 * 4) is None  # no still point
 
 
-def test_mounts_with_new_numbers_keep_their_names_and_order() -> None:
-    rig: Rig = calibrate(drive(World())).rig(paper_rig())
-    assert [mount.name for mount in rig.mounts] == [m.name for m in paper_rig().mounts]
+def test_mounts_with_new_numbers_keep_their_names_order_and_phases() -> None:
+    nominal = Rig(
+        mounts=tuple(
+            replace(mount, phase_offset_rad=0.1 * number)
+            for number, mount in enumerate(paper_rig().mounts)
+        )
+    )
+    rig = calibrate(drive(World())).rig(nominal)
+    assert [mount.name for mount in rig.mounts] == [mount.name for mount in nominal.mounts]
+    assert [mount.phase_offset_rad for mount in rig.mounts] == [
+        mount.phase_offset_rad for mount in nominal.mounts
+    ]
