@@ -27,7 +27,13 @@ from slam.calibration import Calibration, Drive, calibrate, make_drive
 from slam.calibration_association import UNASSIGNED
 from slam.calibration_gains import GainEstimate, estimate_gains
 from slam.calibration_tracks import RangeSet
-from slam.calibration_words import OFFSET_LIMIT_M, WeakDirection, poor_drive, weak_directions
+from slam.calibration_words import (
+    OFFSET_LIMIT_M,
+    WeakDirection,
+    poor_drive,
+    unseen_reflectors,
+    weak_directions,
+)
 from slam.config import FrontEnd, SlamConfig
 from slam.detection import make_detector
 from slam.detector import Detection
@@ -160,7 +166,8 @@ def report_of(drive: Drive, known_m: Array | None) -> CalibrationReport:
             calibration=calibration,
             gains=estimate_gains(drive, calibration),
             weak=weak_directions(calibration, names),
-            poor=poor_drive(drive, calibration),
+            poor=poor_drive(drive, calibration)
+            + unseen_reflectors(calibration, 0 if known_m is None else len(known_m)),
         )
 
 
@@ -217,6 +224,7 @@ def rig_file(info: SessionInfo, report: CalibrationReport) -> RigFile:
                 range_offset_m=float(report.calibration.offsets_m[index])
                 if told[index]
                 else radar.range_offset_m,
+                phase_offset_deg=math.degrees(radar.phase_offset_rad),
                 gain_db=float(report.gains.gains_db[index]) if heard else 0.0,
             )
         )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from slam.calibration import Calibration, CalibrationPriors, Drive, calibrate, make_drive
 from slam.calibration_gains import estimate_gains
 from slam.calibration_tracks import RangeSet, place
-from slam.calibration_words import poor_drive, weak_directions
+from slam.calibration_words import poor_drive, unseen_reflectors, weak_directions
 from slam.geometry import Rig, paper_rig
 
 Array = NDArray[np.float64]
@@ -162,6 +162,14 @@ def test_known_reflectors_fix_the_map_and_tell_more() -> None:
     assert np.all(known.offset_sigmas_m < jointly.offset_sigmas_m)
     np.testing.assert_allclose(known.landmarks_m[: len(RODS)], RODS, atol=4e-3)
     assert np.abs(known.offsets_m - OFFSETS_M).max() < 4 * known.offset_sigmas_m.max()
+
+
+def test_reflectors_of_another_room_are_told() -> None:
+    noisy = drive(World(sigma_m=1.5e-3, wheel_noise=1.0), 3)
+    elsewhere = RODS + 500.0
+    found = calibrate(noisy, known_m=elsewhere)
+    assert f"only 0 of {len(RODS)} known" in unseen_reflectors(found, len(elsewhere))[0]
+    assert unseen_reflectors(calibrate(noisy, known_m=RODS), len(RODS)) == ()
 
 
 def test_a_few_wrong_ranges_do_no_harm() -> None:
