@@ -91,29 +91,11 @@ from emulator.jitter import CarrierJitter
 from emulator.paths import ScenePaths
 from emulator.pulse import sum_of_pulses
 from emulator.receiver import Receiver, one_count
-from emulator.reflections import (
-    BEAM_EXPONENT,
-    Reflections,
-    beam_gain,
-    person_reflections,
-    reflection_phase_rad,
-    target_reflections,
-)
 from emulator.scene import Scene
 from emulator.scene_tables import RadarSpec
 from xethru_protocol import x4
 
-__all__ = [
-    "BEAM_EXPONENT",
-    "SPEED_OF_LIGHT_MPS",
-    "Reflections",
-    "SceneEcho",
-    "beam_gain",
-    "echo_source",
-    "person_reflections",
-    "reflection_phase_rad",
-    "target_reflections",
-]
+__all__ = ["SPEED_OF_LIGHT_MPS", "SceneEcho", "echo_source"]
 
 SPEED_OF_LIGHT_MPS = 299_792_458.0
 _SAMPLES_PER_M = 2 * x4.SAMPLING_RATE_HZ / SPEED_OF_LIGHT_MPS

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from emulator.diffraction import edge_wave, past_edge
-from emulator.echo import BEAM_EXPONENT, SceneEcho
+from emulator.echo import SceneEcho
 from emulator.echo_source import CaptureSettings
+from emulator.reflections import BEAM_EXPONENT
 from emulator.scene_tables import MIRROR_AMPLITUDE_1M
 from emulator.walls import faces_of, passing
 from hil_tests.unit.emulator.rooms import (
