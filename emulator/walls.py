@@ -23,6 +23,7 @@ __all__ = [
     "Faces",
     "closed_ends",
     "faces_of",
+    "length",
     "passing",
 ]
 
@@ -191,7 +192,7 @@ def _with_closures(faces: Faces) -> Faces:
     for end, (x, y) in enumerate(ends):
         along = faces.along(x, y)
         beside = np.maximum(np.maximum(-along, along - faces.length_m), 0.0)
-        touches = meets & (_length(beside, faces.height(x, y)) <= TOUCHING_M)
+        touches = meets & (length(beside, faces.height(x, y)) <= TOUCHING_M)
         other_end = faces.height(*ends[1 - end])
         found.extend(
             Closure(
@@ -275,9 +276,9 @@ def passing(
         height0, height1 = h0[leg, face], h1[leg, face]
         start, stop = one.along(x0, y0), one.along(x1, y1)
         at = start + (stop - start) * (height0 / (height0 - height1))
-        way = _length(x1 - x0, y1 - y0)
-        over_a = _length(one.a_x - x0, one.a_y - y0) + _length(x1 - one.a_x, y1 - one.a_y)
-        over_b = _length(one.b_x - x0, one.b_y - y0) + _length(x1 - one.b_x, y1 - one.b_y)
+        way = length(x1 - x0, y1 - y0)
+        over_a = length(one.a_x - x0, one.a_y - y0) + length(x1 - one.a_x, y1 - one.a_y)
+        over_b = length(one.b_x - x0, one.b_y - y0) + length(x1 - one.b_x, y1 - one.b_y)
         lit = past_edge(over_a - way, at < 0, wavelength_m)
         lit += past_edge(over_b - way, at > one.length_m, wavelength_m)
         factor = np.abs(one.transmission + (1 - one.transmission) * lit)
@@ -285,5 +286,6 @@ def passing(
     return share
 
 
-def _length(dx: Array, dy: Array) -> Array:
+def length(dx: Array, dy: Array) -> Array:
+    """Return lengths of vectors, any shape; not ``hypot``, whose last bit is the platform's."""
     return np.sqrt(dx * dx + dy * dy)
