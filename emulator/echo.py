@@ -37,7 +37,7 @@ Wall, face of a box (``emulator.wall_echoes``)
 Edge of a wall (``emulator.diffraction``)
     Kirchhoff's half-plane at the carrier (Born and Wolf, Principles of Optics, 8.7): the echo fades
     over the first Fresnel zone as the mirror point leaves the wall, and half of it is left where
-    that point is the end.
+    that point is the end. The edge's wave is weakened by the cosine of its angle off the normal.
 Corner
     Image of image in two walls, both orders of bouncing. At 90 degrees each passes half of the
     aperture, so together they are one image at the apex.
@@ -71,8 +71,9 @@ Count q = 2**dac_step / (iterations pulses_per_step) / 1024, N = dac_max - dac_m
     Protocol reference 9.7; outside the DAC window the counter saturates.
 Smoke
     Nothing. Particles far smaller than the wavelength absorb by their volume (Bohren and Huffman,
-    chapter 5): (6 pi / wavelength) (mass per m**3 / density) Im((m**2 - 1) / (m**2 + 2)), for 1
-    g/m**3 and water's density at most 4.6e-4 of the power per metre, 0.002 dB.
+    chapter 5): (6 pi / wavelength) (mass per m**3 / density) Im((m**2 - 1) / (m**2 + 2)), whose
+    last factor is 1/2 at most; for 1 g/m**3 and water's density 2.3e-4 of the power per metre,
+    0.001 dB.
 
 Determinism: float64 throughout, no BLAS, no float32 function. A last-bit difference of a cosine
 or a power moves an echo by 1e-11 counts before it is rounded to an integer.
@@ -90,29 +91,11 @@ from emulator.jitter import CarrierJitter
 from emulator.paths import ScenePaths
 from emulator.pulse import sum_of_pulses
 from emulator.receiver import Receiver, one_count
-from emulator.reflections import (
-    BEAM_EXPONENT,
-    Reflections,
-    beam_gain,
-    person_reflections,
-    reflection_phase_rad,
-    target_reflections,
-)
 from emulator.scene import Scene
 from emulator.scene_tables import RadarSpec
 from xethru_protocol import x4
 
-__all__ = [
-    "BEAM_EXPONENT",
-    "SPEED_OF_LIGHT_MPS",
-    "Reflections",
-    "SceneEcho",
-    "beam_gain",
-    "echo_source",
-    "person_reflections",
-    "reflection_phase_rad",
-    "target_reflections",
-]
+__all__ = ["SPEED_OF_LIGHT_MPS", "SceneEcho", "echo_source"]
 
 SPEED_OF_LIGHT_MPS = 299_792_458.0
 _SAMPLES_PER_M = 2 * x4.SAMPLING_RATE_HZ / SPEED_OF_LIGHT_MPS
@@ -194,6 +177,6 @@ def echo_source(scene: Scene, radar_index: int, seed: int) -> EchoSource:
     radar_index
         Index into ``scene.radars``.
     seed
-        0 ... 2**64 - 1; selects the receiver noise.
+        0 ... 2**64 - 1; selects receiver noise, clutter and jitter.
     """
     return SceneEcho(scene, scene.radars[radar_index], seed)

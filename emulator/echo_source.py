@@ -77,8 +77,8 @@ class EchoSource(Protocol):
         frame_counters
             Shape (n_frames,), the frames' counters; they select the noise.
         scene_times_ns
-            Shape (n_frames,), scene time of each counter in ns, without the
-            radar's start skew (which the source adds itself).
+            Shape (n_frames,), int64, [ns]: nominal scene time of each counter, without the
+            radar's start skew and clock error (which the source adds itself).
 
         Returns
         -------

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from emulator.diffraction import past_edge
 from emulator.reflections import NEAREST_M, Reflections, Scatterers, Viewpoint, beam_gain
-from emulator.walls import ON_THE_FACE_M, Faces, closed_ends, passing
+from emulator.walls import ON_THE_FACE_M, Faces, closed_ends, length, passing
 
 __all__ = ["direct_share", "ghost_reflections", "spread"]
 
@@ -135,7 +135,7 @@ def _legs(
 ) -> _Legs:
     x, y = _targets(scatterers, view)
     straight_x, straight_y = view.x_m - x, view.y_m - y
-    straight_m = np.maximum(_length(straight_x, straight_y), NEAREST_M)
+    straight_m = np.maximum(length(straight_x, straight_y), NEAREST_M)
     straight_cos = -(straight_x * view.boresight_x + straight_y * view.boresight_y) / straight_m
     straight_gain = share * np.sqrt(beam_gain(straight_cos))
 
@@ -156,23 +156,23 @@ def _legs(
     target_x, target_y = x[frame, target], y[frame, target]
     image_x, image_y = face.mirrored(radar_x, radar_y)
     to_x, to_y = image_x - target_x, image_y - target_y
-    length_m = _length(to_x, to_y)
+    length_m = length(to_x, to_y)
 
     height_r = np.abs(radar_height[frame, number])
     height_t = np.abs(target_height[frame, target, number])
     start = face.along(radar_x, radar_y)
     bounce = start + (face.along(target_x, target_y) - start) * height_r / (height_r + height_t)
     closed = closed_ends(faces, radar_height)[frame, number]
-    over_a = _length(face.a_x - radar_x, face.a_y - radar_y)
-    over_a += _length(face.a_x - target_x, face.a_y - target_y)
-    over_b = _length(face.b_x - radar_x, face.b_y - radar_y)
-    over_b += _length(face.b_x - target_x, face.b_y - target_y)
+    over_a = length(face.a_x - radar_x, face.a_y - radar_y)
+    over_a += length(face.a_x - target_x, face.a_y - target_y)
+    over_b = length(face.b_x - radar_x, face.b_y - radar_y)
+    over_b += length(face.b_x - target_x, face.b_y - target_y)
     lost = past_edge(over_a - length_m, bounce < 0, wavelength_m) * ~closed[:, 0]
     lost += past_edge(over_b - length_m, bounce > face.length_m, wavelength_m) * ~closed[:, 1]
     bounce_x, bounce_y = face.at(np.clip(bounce, 0.0, face.length_m))
     dx, dy = bounce_x - radar_x, bounce_y - radar_y
     cos_angle = dx * view.boresight_x[frame, 0] + dy * view.boresight_y[frame, 0]
-    cos_angle /= np.maximum(_length(dx, dy), NEAREST_M)
+    cos_angle /= np.maximum(length(dx, dy), NEAREST_M)
     gain = face.reflection * np.abs(1 - lost) * np.sqrt(beam_gain(cos_angle))
 
     kept = np.flatnonzero(gain > WEAKEST_LEG)
@@ -212,7 +212,3 @@ def _targets(scatterers: Scatterers, view: Viewpoint) -> tuple[Array, Array]:
     """Return positions of shape (n_frames, k), moving or not."""
     shape = (len(view.x_m), scatterers.x_m.shape[-1])
     return np.broadcast_to(scatterers.x_m, shape), np.broadcast_to(scatterers.y_m, shape)
-
-
-def _length(dx: Array, dy: Array) -> Array:
-    return np.sqrt(dx * dx + dy * dy)

@@ -62,7 +62,6 @@ class Purpose(IntEnum):
     JITTER_WHITE = 1
     JITTER_SLOW = 2
     CLUTTER = 3
-    CLUTTER_INSTANTS = 4
 
 
 def stream_of(serial: int, purpose: Purpose, part: int = 0) -> int:

@@ -29,10 +29,8 @@ __all__ = [
     "Viewpoint",
     "beam_gain",
     "direct_reflections",
-    "person_reflections",
     "person_scatterer",
     "reflection_phase_rad",
-    "target_reflections",
     "target_scatterers",
     "viewpoint",
 ]
@@ -172,7 +170,15 @@ def person_scatterer(person: PersonSpec, t_ns: NDArray[np.int64]) -> Scatterers:
 
 
 def direct_reflections(scatterers: Scatterers, view: Viewpoint) -> Reflections:
-    """Return the echoes by the straight way there and back; nothing stands in between."""
+    """Return the echoes by the straight way there and back; nothing stands in between.
+
+    Parameters
+    ----------
+    scatterers
+        Targets or a person, k of them.
+    view
+        The radar in n_frames frames.
+    """
     dx = scatterers.x_m - view.x_m
     dy = scatterers.y_m - view.y_m
     range_m = np.sqrt(dx * dx + dy * dy)
@@ -192,30 +198,3 @@ def direct_reflections(scatterers: Scatterers, view: Viewpoint) -> Reflections:
         amplitude=strength * surface_m**-scatterers.exponent * beam_gain(cos_angle),
         phase_rad=scatterers.phase_rad,
     )
-
-
-def target_reflections(
-    targets: tuple[TargetSpec, ...], radar: RadarSpec, robot_poses: NDArray[np.float64]
-) -> Reflections:
-    """Return the direct echoes of targets.
-
-    Parameters
-    ----------
-    targets
-        Reflectors in the world frame, k of them.
-    radar
-        The mount.
-    robot_poses
-        Shape (n_frames, 3), float64: true x [m], y [m], heading [rad] at each sample time.
-    """
-    return direct_reflections(target_scatterers(targets), viewpoint(radar, robot_poses))
-
-
-def person_reflections(
-    person: PersonSpec,
-    radar: RadarSpec,
-    robot_poses: NDArray[np.float64],
-    t_ns: NDArray[np.int64],
-) -> Reflections:
-    """Return the echo of a person, k = 1, at scene times of shape (n_frames,), int64."""
-    return direct_reflections(person_scatterer(person, t_ns), viewpoint(radar, robot_poses))

@@ -204,7 +204,10 @@ def load_scene(path_or_name: str | Path) -> Scene:
 
 def _one_line(error: ValidationError) -> str:
     """Say the first problem in one line, and how many more there are."""
-    problems = error.errors(include_url=False)
+    found = error.errors(include_url=False)
+    # A refused row makes its list too short as well: that is no problem of its own.
+    refused = {each["loc"][:depth] for each in found for depth in range(len(each["loc"]))}
+    problems = [e for e in found if e["type"] != "too_short" or e["loc"] not in refused]
     first = problems[0]
     location = first["loc"]
     key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
@@ -212,6 +215,9 @@ def _one_line(error: ValidationError) -> str:
         case "extra_forbidden":
             allowed = ", ".join(_allowed_keys(location[:-1]))
             said = f"unknown key; allowed are {allowed}"
+        case "tuple_type" if isinstance(first["input"], dict):
+            name = location[-1]
+            said = f"must be a list of tables; begin each with [[{name}]], not [{name}]"
         case "missing":
             said = "missing; this key is required"
         case "value_error":

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from emulator.diffraction import edge_wave, past_edge
 from emulator.reflections import NEAREST_M, Reflections, Viewpoint, beam_gain
 from emulator.scene_tables import MIRROR_AMPLITUDE_1M
-from emulator.walls import ON_THE_FACE_M, TOUCHING_M, Faces, closed_ends, passing
+from emulator.walls import ON_THE_FACE_M, TOUCHING_M, Faces, closed_ends, length, passing
 
 __all__ = ["CornerPairs", "corner_pairs", "corner_reflections", "face_reflections"]
 
@@ -46,7 +46,7 @@ def face_reflections(faces: Faces, view: Viewpoint, wavelength_m: float) -> Refl
         (0, faces.a_x, faces.a_y, along < 0),
         (1, faces.b_x, faces.b_y, along > faces.length_m),
     ):
-        end_m = _length(end_x - view.x_m, end_y - view.y_m)
+        end_m = length(end_x - view.x_m, end_y - view.y_m)
         size, lag_rad = edge_wave(2 * (end_m - mirror_m), wavelength_m)
         obliquity = mirror_m / np.maximum(end_m, NEAREST_M)
         range_m.append(end_m)
@@ -124,7 +124,7 @@ def corner_reflections(
     once_x, once_y = one.mirrored(x, y)
     height_once = two.height(once_x, once_y)
     twice_x, twice_y = two.mirrored(once_x, once_y)
-    path_m = _length(twice_x - x, twice_y - y)
+    path_m = length(twice_x - x, twice_y - y)
 
     open1, open2 = ~one.outward_only | (height1 > 0), ~two.outward_only | (height2 > 0)
     near1, far1, apex1 = _seen_part(one, pairs.meet_first_m, two, height2)
@@ -161,7 +161,7 @@ def corner_reflections(
         ),
     ):
         edge_x, edge_y = face.at(edge)
-        over_m = _length(edge_x - start[0], edge_y - start[1]) + _length(
+        over_m = length(edge_x - start[0], edge_y - start[1]) + length(
             stop[0] - edge_x, stop[1] - edge_y
         )
         passes = np.abs(past_edge(over_m - path_m, inwards > 0, wavelength_m))
@@ -213,10 +213,6 @@ def _between(value: Array, one: Array, other: Array) -> Array:
 
 def _cos_angle(view: Viewpoint, x: Array, y: Array) -> Array:
     dx, dy = x - view.x_m, y - view.y_m
-    range_m = np.maximum(_length(dx, dy), NEAREST_M)
+    range_m = np.maximum(length(dx, dy), NEAREST_M)
     cosine: Array = (dx * view.boresight_x + dy * view.boresight_y) / range_m
     return cosine
-
-
-def _length(dx: Array, dy: Array) -> Array:
-    return np.sqrt(dx * dx + dy * dy)

@@ -23,6 +23,7 @@ __all__ = [
     "Faces",
     "closed_ends",
     "faces_of",
+    "length",
     "passing",
 ]
 
@@ -40,8 +41,8 @@ _LEGS_TIMES_FACES = 200_000  # of one block of `passing`: bounds its memory
 class Closure:
     """An end of a face that stands on another one at a right angle.
 
-    For a radar on the same side of the other as the face itself the two are an inner corner: with
-    the corner's mirror image the field is complete, and there is no edge to be heard.
+    For a radar in the quarter between the two they are an inner corner: with the corner's mirror
+    image the field is complete, and there is no edge to be heard. From behind an L it is one.
 
     Attributes
     ----------
@@ -51,12 +52,15 @@ class Closure:
         The face it stands on.
     side
         +1.0 or -1.0: sign of the height over ``other`` where the corner is an inner one.
+    own_sides
+        Signs of the height over ``face`` where it is: both if the other goes on beyond the end.
     """
 
     face: int
     end: int
     other: int
     side: float
+    own_sides: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -182,15 +186,25 @@ def _with_closures(faces: Faces) -> Faces:
     meets = (upright < _RIGHT_ANGLE_TOLERANCE) & (faces.body[:, np.newaxis] != faces.body)
     ends = [(faces.a_x[:, np.newaxis], faces.a_y[:, np.newaxis])]
     ends.append((faces.b_x[:, np.newaxis], faces.b_y[:, np.newaxis]))
+    # Heights of other faces' ends over a face: [other, face, end].
+    reaches = np.stack([faces.height(x, y) for x, y in ends], axis=-1)
     found: list[Closure] = []
     for end, (x, y) in enumerate(ends):
         along = faces.along(x, y)
         beside = np.maximum(np.maximum(-along, along - faces.length_m), 0.0)
-        touches = meets & (_length(beside, faces.height(x, y)) <= TOUCHING_M)
+        touches = meets & (length(beside, faces.height(x, y)) <= TOUCHING_M)
         other_end = faces.height(*ends[1 - end])
         found.extend(
             Closure(
-                face=face, end=end, other=other, side=math.copysign(1.0, other_end[face, other])
+                face=face,
+                end=end,
+                other=other,
+                side=math.copysign(1.0, other_end[face, other]),
+                own_sides=tuple(
+                    own
+                    for own in (1.0, -1.0)
+                    if float((own * reaches[other, face]).max()) > TOUCHING_M
+                ),
             )
             for face, other in np.argwhere(touches).tolist()
         )
@@ -214,7 +228,9 @@ def closed_ends(faces: Faces, height_m: Array) -> NDArray[np.bool_]:
     closed = np.zeros((*height_m.shape, 2), dtype=np.bool_)
     for closure in faces.closures:
         inside = height_m[:, closure.other] * closure.side > 0
-        closed[:, closure.face, closure.end] |= inside
+        for own in closure.own_sides:
+            before = height_m[:, closure.face] * own > 0
+            closed[:, closure.face, closure.end] |= inside & before
     return closed
 
 
@@ -260,9 +276,9 @@ def passing(
         height0, height1 = h0[leg, face], h1[leg, face]
         start, stop = one.along(x0, y0), one.along(x1, y1)
         at = start + (stop - start) * (height0 / (height0 - height1))
-        way = _length(x1 - x0, y1 - y0)
-        over_a = _length(one.a_x - x0, one.a_y - y0) + _length(x1 - one.a_x, y1 - one.a_y)
-        over_b = _length(one.b_x - x0, one.b_y - y0) + _length(x1 - one.b_x, y1 - one.b_y)
+        way = length(x1 - x0, y1 - y0)
+        over_a = length(one.a_x - x0, one.a_y - y0) + length(x1 - one.a_x, y1 - one.a_y)
+        over_b = length(one.b_x - x0, one.b_y - y0) + length(x1 - one.b_x, y1 - one.b_y)
         lit = past_edge(over_a - way, at < 0, wavelength_m)
         lit += past_edge(over_b - way, at > one.length_m, wavelength_m)
         factor = np.abs(one.transmission + (1 - one.transmission) * lit)
@@ -270,5 +286,6 @@ def passing(
     return share
 
 
-def _length(dx: Array, dy: Array) -> Array:
+def length(dx: Array, dy: Array) -> Array:
+    """Return lengths of vectors, any shape; not ``hypot``, whose last bit is the platform's."""
     return np.sqrt(dx * dx + dy * dy)

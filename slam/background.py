@@ -29,8 +29,9 @@ leakage stays short of the range limits (0.06 or 0.5 at 0.05 m: 0 false detectio
 end without the filter), nor for ``matched_filter``, which finds nothing false here without it.
 Hence off by default.
 
-It costs noise, sigma sqrt(1 + 1 / memory), the zone of each radar's first frame, and echoes nearer
-than the limit while the robot stands still - of which the pipeline takes no frames.
+It costs noise, sigma sqrt(1 + 1 / (2 memory - 1)) with the mean's own, the zone of each radar's
+first frame, and echoes nearer than the limit while the robot stands still - of which the pipeline
+takes no frames.
 """
 
 from __future__ import annotations

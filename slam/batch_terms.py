@@ -74,7 +74,10 @@ class WheelModel:
     heading_rad_per_rad: float = 0.01
 
     def sigmas(self, steps: Array) -> Array:
-        """Return standard deviations along, across and of the turn; shapes (n, 3) and (n, 3)."""
+        """Return standard deviations along [m], across [m] and of the turn [rad], shape (n, 3).
+
+        ``steps`` of shape (n, 3): ux [m], uy [m], ua [rad], body frame at the start of each.
+        """
         distance = np.sqrt(steps[:, 0] ** 2 + steps[:, 1] ** 2)
         root = np.sqrt(distance)
         turn = self.heading_rad_per_sqrt_m * root + self.heading_rad_per_rad * np.abs(steps[:, 2])
@@ -127,7 +130,7 @@ class OdometryTerm:
     steps
         Shape (n_poses - 1, 3): reported ux [m], uy [m], ua [rad].
     sigmas
-        Shape (n_poses - 1, 3).
+        Shape (n_poses - 1, 3), standard deviations in the same units.
     """
 
     layout: Layout
@@ -211,7 +214,7 @@ class RangeTerm:
     landmark, radar
         Shape (m,), indices.
     range_m, sigma_m
-        Shape (m,).
+        Shape (m,), true metres, no offset removed; and its standard deviation.
     """
 
     layout: Layout

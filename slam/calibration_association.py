@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.calibration_tracks import RangeSet, Track
+from slam.calibration_tracks import HALF_VIEW_RAD, RangeSet, Track
 from slam.pulse_model import PulseModel
 
 Array = NDArray[np.float64]
@@ -27,7 +27,7 @@ _LEAST_PER_RADAR = 12
 _LEAST_RANGES = 30
 _LEAST_SHARE = 0.2
 
-_HALF_VIEW_COS = math.cos(math.radians(60))
+_HALF_VIEW_COS = math.cos(HALF_VIEW_RAD)
 _PULSE_SIGMA_M = PulseModel().sigma_m
 _MOST_BEND_M = 0.004
 BEAM_EXPONENT = math.log(math.sqrt(0.5)) / math.log(math.cos(math.radians(65 / 2)))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.batch_terms import WheelModel
 from slam.calibration_tracks import PathNodes, RangeSet
-from slam.geometry import Mount, Rig
+from slam.geometry import Rig
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -52,7 +52,8 @@ class Drive:
     path
         What the wheels said, odometry frame.
     step_sigmas
-        Shape (n_nodes - 1, 3): white noise of each step, along, across, turn.
+        Shape (n_nodes - 1, 3), standard deviation of each step's white noise in the body frame:
+        along [m], across [m], turn [rad].
     ranges
         All single ranges.
     """
@@ -70,9 +71,10 @@ class Calibration:
     Attributes
     ----------
     offsets_m, mount_shifts_m
-        Shapes (r,) and (r, 2): offset of each radar, and how far its mount is from nominal.
+        Shapes (r,) and (r, 2): offset of each radar, and how far its mount is from nominal, x and
+        y, body frame.
     covariance_m2
-        Shape (3 r, 3 r): for each radar its offset, mount x, mount y.
+        Shape (3 r, 3 r), [m2]: for each radar its offset, mount x, mount y.
     landmarks_m
         Shape (k, 2), map frame: the body frame at the start, or the frame of known reflectors.
     path
@@ -111,17 +113,16 @@ class Calibration:
         return result
 
     def rig(self, nominal: Rig) -> Rig:
-        """Return the rig with offsets and mounts corrected."""
+        """Return the rig with offsets and mount positions corrected, all else as it was."""
         shifts = zip(
             nominal.mounts, self.offsets_m.tolist(), self.mount_shifts_m.tolist(), strict=True
         )
         return Rig(
             mounts=tuple(
-                Mount(
-                    name=mount.name,
+                replace(
+                    mount,
                     x_m=mount.x_m + shift_x,
                     y_m=mount.y_m + shift_y,
-                    yaw_rad=mount.yaw_rad,
                     range_offset_m=offset,
                 )
                 for mount, offset, (shift_x, shift_y) in shifts
@@ -145,7 +146,8 @@ def make_drive(
     rig
         Nominal mounts.
     stamps_ns, poses
-        Shapes (n,) and (n, 3): odometry samples; headings in any turn.
+        Shapes (n,) and (n, 3): odometry samples, x [m], y [m], heading [rad] in any turn,
+        odometry frame.
     ranges
         All single ranges.
     wheels
@@ -172,7 +174,7 @@ def make_drive(
 
 
 def steps_of(poses: Array) -> Array:
-    """Return each step in the body frame at its start, shape (n - 1, 3)."""
+    """Return each step in the body frame at its start, shape (n - 1, 3): [m], [m], [rad]."""
     step_x, step_y, turn = np.diff(poses, axis=0).T
     cosine, sine = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
     return np.column_stack([cosine * step_x + sine * step_y, cosine * step_y - sine * step_x, turn])

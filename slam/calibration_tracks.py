@@ -31,7 +31,7 @@ _LEAST_RANGES = 12
 _TRACK_SIGMA_M = 0.003
 _MOST_RMS_M = 0.008
 _MOST_SPREAD_M = 0.2
-_HALF_VIEW_RAD = math.radians(60)
+HALF_VIEW_RAD = math.radians(60)
 _OFFSET_SIGMA_M = 0.03
 
 
@@ -80,7 +80,8 @@ class PathNodes:
     t_ns
         Shape (n,), ascending, int64.
     poses
-        Shape (n, 3), heading continuous.
+        Shape (n, 3), x [m], y [m], heading [rad], continuous; odometry frame as measured, map frame
+        as estimated.
     """
 
     t_ns: NDArray[np.int64]
@@ -114,7 +115,8 @@ class Track:
     rows
         Shape (m,), rows of the RangeSet.
     point_m, covariance_m2
-        Shapes (2,) and (2, 2), frame of the path; the radar's unknown offset is in the covariance.
+        Shapes (2,) [m] and (2, 2) [m2], frame of the path; the radar's unknown offset is in
+        the covariance.
     """
 
     radar: int
@@ -224,7 +226,7 @@ def place(sights: Array, range_m: Array) -> tuple[Array, Array] | None:
     leaves it open along an arc.
     """
     middle = len(range_m) // 2
-    bearing = sights[middle, 2] + np.linspace(-_HALF_VIEW_RAD, _HALF_VIEW_RAD, 61)
+    bearing = sights[middle, 2] + np.linspace(-HALF_VIEW_RAD, HALF_VIEW_RAD, 61)
     points = sights[middle, :2] + range_m[middle] * np.column_stack(
         [np.cos(bearing), np.sin(bearing)]
     )
@@ -250,6 +252,6 @@ def place(sights: Array, range_m: Array) -> tuple[Array, Array] | None:
     off_axis = float(wrap_angles(math.atan2(away[1], away[0]) - sights[middle, 2]))
     fits = float(np.median(np.abs(residual))) <= _MOST_RMS_M
     known = float(np.linalg.eigvalsh(covariance)[-1]) <= _MOST_SPREAD_M**2
-    if not (fits and known and abs(off_axis) <= _HALF_VIEW_RAD + 0.1):
+    if not (fits and known and abs(off_axis) <= HALF_VIEW_RAD + 0.1):
         return None
     return unknown[:2], covariance

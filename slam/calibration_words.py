@@ -111,3 +111,14 @@ def poor_drive(drive: Drive, calibration: Calibration) -> tuple[str, ...]:
             if not np.any(used == radar)
         ]
     return tuple(said)
+
+
+def unseen_reflectors(calibration: Calibration, n_known: int) -> tuple[str, ...]:
+    """Return what is wrong with known reflectors, the first ``n_known`` landmarks, in words."""
+    seen = len(set(calibration.landmark.tolist()) & set(range(n_known)))
+    if 2 * seen >= n_known:
+        return ()
+    return (
+        f"only {seen} of {n_known} known reflectors are heard: do their places belong to this "
+        "drive, in a frame in which it starts at the origin and looks along x?",
+    )

@@ -16,7 +16,8 @@ What has to hold, or this is worse than the ranges alone:
 - One reflector with one reflection phase for both aspects. A point, a sphere, a rod do; an
   extended or composite target turns its phase with the aspect.
 - One pulse: overlapping echoes pull the phase (``Detection.misfit``).
-- The constant c of each pair, calibrated to some degrees: 10 degrees are 0.6 mm.
+- The constant c of each pair, known to some degrees: 10 degrees are 0.6 mm. Nothing here estimates
+  it: ``Mount.phase_offset_rad`` is 0 unless somebody measured it.
 - The ranges' sigma: a pair whose predicted scatter could wrap wrongly is left as it is.
 """
 

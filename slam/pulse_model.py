@@ -8,8 +8,8 @@ with s the envelope's standard deviation and kappa the carrier's phase per bin. 
 two-way delay 2 R / c, so everything follows from two frequencies and the length of a bin.
 
 Cramer-Rao bound of the position, A and phi unknown, white noise of standard deviation sigma per
-sample (Kay 1993, Fundamentals of Statistical Signal Processing vol. 1: eq. 3.21, and section 3.7
-for more than one parameter). Amplitude and phase enter the pulse linearly as a complex number, so
+sample (Kay 1993, Fundamentals of Statistical Signal Processing vol. 1: section 3.5, and 3.7 for
+more than one parameter). Amplitude and phase enter the pulse linearly as a complex number, so
 what counts is the part of the derivative that they do not explain: the carrier's share of dp/du
 is a turn of the phase, the envelope's share remains. With the sums over n as integrals,
 

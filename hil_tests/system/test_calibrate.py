@@ -7,8 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from hil_tests.unit.slam.app.sessions import session_info
 from slam.app.cli import main
+from slam.app.odometry import OdometryTrack
 from slam.app.rig_file import load_rig
+from slam.app.session_log import SessionLog
+from slam.app.tum import TumSample
 
 SCENES = Path(__file__).parents[2] / "fixtures" / "scenes"
 
@@ -65,6 +69,36 @@ def test_what_cannot_be_used_is_one_line(
     error = capsys.readouterr().err
     assert said in error
     assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--rig", "{folder}/none/rig.toml"], "--rig: there is no folder {folder}/none"),
+        (["--rig", "{folder}"], "--rig: {folder} is a folder"),
+        (["--rig", "{session}"], "--rig: {session} is the session itself"),
+        (["--truth", "visitor"], "--truth: scene visitor has no radar radar0"),
+    ],
+)
+def test_what_will_be_refused_is_refused_before_the_work(
+    arguments: list[str],
+    said: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The session holds no frame: that is found out by reading it."""
+    session = tmp_path / "session.mcap"
+    start = TumSample(t_ns=0, x_m=0.0, y_m=0.0, qz=0.0, qw=1.0)
+    log = SessionLog(session, session_info(), OdometryTrack([start]))
+    log.close()
+    before = session.read_bytes()
+    filled = [text.format(folder=tmp_path, session=session) for text in arguments]
+    assert main(["calibrate", str(session), *filled]) == 2
+    error = capsys.readouterr().err
+    assert said.format(folder=tmp_path, session=session) in error
+    assert error.count("\n") == 1
+    assert session.read_bytes() == before
 
 
 def test_a_reflector_without_a_place_is_named(

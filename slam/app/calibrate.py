@@ -27,7 +27,13 @@ from slam.calibration import Calibration, Drive, calibrate, make_drive
 from slam.calibration_association import UNASSIGNED
 from slam.calibration_gains import GainEstimate, estimate_gains
 from slam.calibration_tracks import RangeSet
-from slam.calibration_words import OFFSET_LIMIT_M, WeakDirection, poor_drive, weak_directions
+from slam.calibration_words import (
+    OFFSET_LIMIT_M,
+    WeakDirection,
+    poor_drive,
+    unseen_reflectors,
+    weak_directions,
+)
 from slam.config import FrontEnd, SlamConfig
 from slam.detection import make_detector
 from slam.detector import Detection
@@ -87,16 +93,20 @@ def run_calibrate(options: CalibrateOptions, stop: StopFlag) -> None:
     known = None if options.reflectors is None else read_reflectors(options.reflectors)
     planted = None if options.truth is None else _scene(options.truth)
     session = open_session(options.session)
+    # minutes of work: what can be refused is refused before
+    _planted(session.rig, planted)
+    if options.rig is not None:
+        _check_rig_place(options.rig, options.session)
     report = report_of(drive_of(session, stop.check), known)
     if session.cut_at_byte is not None:
         sys.stderr.write(f"{session.path}: cut at byte {session.cut_at_byte}; read up to there\n")
-    if options.rig is not None:
-        write_rig(options.rig, rig_file(session.info, report))
     if options.as_json:
         facts = _facts(report, _planted(report.drive.rig, planted))
         sys.stdout.write(json.dumps(facts, indent=2, allow_nan=False) + "\n")
     else:
         sys.stdout.write("".join(f"{line}\n" for line in _lines(report, planted)))
+    if options.rig is not None:
+        write_rig(options.rig, rig_file(session.info, report))
 
 
 def drive_of(session: RecordedSession, check: Callable[[], None]) -> Drive:
@@ -156,7 +166,8 @@ def report_of(drive: Drive, known_m: Array | None) -> CalibrationReport:
             calibration=calibration,
             gains=estimate_gains(drive, calibration),
             weak=weak_directions(calibration, names),
-            poor=poor_drive(drive, calibration),
+            poor=poor_drive(drive, calibration)
+            + unseen_reflectors(calibration, 0 if known_m is None else len(known_m)),
         )
 
 
@@ -213,10 +224,21 @@ def rig_file(info: SessionInfo, report: CalibrationReport) -> RigFile:
                 range_offset_m=float(report.calibration.offsets_m[index])
                 if told[index]
                 else radar.range_offset_m,
+                phase_offset_deg=math.degrees(radar.phase_offset_rad),
                 gain_db=float(report.gains.gains_db[index]) if heard else 0.0,
             )
         )
     return RigFile(radars=tuple(radars))
+
+
+def _check_rig_place(rig: Path, session: Path) -> None:
+    """Refuse a rig file that cannot be written, or that would replace the session."""
+    if rig.exists() and rig.samefile(session):
+        raise UsageError(f"--rig: {rig} is the session itself; name another file")
+    if rig.is_dir():
+        raise UsageError(f"--rig: {rig} is a folder; name a file")
+    if not rig.parent.is_dir():
+        raise UsageError(f"--rig: there is no folder {rig.parent} to write into")
 
 
 def _scene(name: str) -> Scene:

@@ -1,8 +1,10 @@
 """Rig files: the radars of a robot with mounts, range offsets and gains, as TOML.
 
-What `uwb-slam calibrate --rig` writes and later runs read. Lengths in true metres, body frame x
-forward and y left, yaw in degrees counter-clockwise from forward; `range_offset_m` is what the
-module measures too long, `gain_db` how much louder it hears than the mean of the rig.
+What `uwb-slam calibrate --rig` writes and `load_rig` reads back. Lengths in true metres, body frame
+x forward and y left, yaw in degrees counter-clockwise from forward; `range_offset_m` is what the
+module measures too long, `phase_offset_deg` what it adds to an echo's carrier phase
+(`Mount.phase_offset_rad`; no command estimates it), `gain_db` how much louder it hears than the
+mean of the rig.
 """
 
 from __future__ import annotations
@@ -32,6 +34,7 @@ class RigRadar(BaseModel):
     y_m: _Number
     yaw_deg: _Number
     range_offset_m: _Number = 0.0
+    phase_offset_deg: _Number = 0.0
     gain_db: _Number = 0.0
 
 
@@ -53,6 +56,7 @@ class RigFile(BaseModel):
                     y_m=float(radar.y_m),
                     yaw_rad=math.radians(radar.yaw_deg),
                     range_offset_m=float(radar.range_offset_m),
+                    phase_offset_rad=math.radians(radar.phase_offset_deg),
                 )
                 for radar in self.radars
             )

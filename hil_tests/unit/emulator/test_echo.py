@@ -10,15 +10,16 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import hilbert
 
-from emulator.echo import (
-    BEAM_EXPONENT,
-    SceneEcho,
-    beam_gain,
-    echo_source,
-    reflection_phase_rad,
-    target_reflections,
-)
+from emulator.echo import SceneEcho, echo_source
 from emulator.echo_source import CaptureSettings
+from emulator.reflections import (
+    BEAM_EXPONENT,
+    beam_gain,
+    direct_reflections,
+    reflection_phase_rad,
+    target_scatterers,
+    viewpoint,
+)
 from emulator.scene import (
     LeakageSpec,
     NoiseSpec,
@@ -277,7 +278,8 @@ def test_the_amplitude_law_is_held_at_5_cm(kind: str, exponent: float) -> None:
     here = np.zeros((1, 3))
 
     def strength(range_m: float) -> float:
-        reflections = target_reflections((target(range_m, kind=kind),), FORWARD, here)
+        scatterers = target_scatterers((target(range_m, kind=kind),))
+        reflections = direct_reflections(scatterers, viewpoint(FORWARD, here))
         assert reflections.range_m[0, 0] == pytest.approx(range_m)
         return float(reflections.amplitude[0, 0])
 

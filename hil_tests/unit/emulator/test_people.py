@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from emulator.echo import person_reflections
 from emulator.people import PersonSpec, chest_displacement_m, positions_m
+from emulator.reflections import direct_reflections, person_scatterer, viewpoint
 from emulator.scene import RadarSpec, SceneError, load_scene
 
 SECOND = 1_000_000_000
@@ -64,7 +64,8 @@ def test_the_echo_of_a_person() -> None:
         waypoints_m=((2.0, 0.0),), rcs_m2=0.25, enters_s=1.0, leaves_s=10.0, breaths_per_min=15.0
     )
     t_ns = times(0.5, 1, 2, 10)
-    echo = person_reflections(stands, FORWARD, np.zeros((4, 3)), t_ns)
+    view = viewpoint(FORWARD, np.zeros((4, 3)))
+    echo = direct_reflections(person_scatterer(stands, t_ns), view)
     assert echo.amplitude[:, 0] == pytest.approx([0, *([0.06 * 0.5 / 4] * 2), 0])
     chest_m = 0.004 * np.sin(math.tau * 0.25 * np.array([0.5, 1, 2, 10]))
     assert echo.range_m[:, 0] == pytest.approx(2.0 - chest_m)

@@ -126,6 +126,7 @@ def test_a_scene_is_frozen() -> None:
         ("a = " + "[" * 100_000, ["brackets are nested too deep"]),
         ("radars = 3\n" + HEAD, ["radars", "tuple", "got 3"]),
         ("", ["missing", "(and 3 more)"]),
+        (GOOD + '[walls]\nname = "w"\n', ["walls: must be a list", "begin each with [[walls]]"]),
     ],
 )
 def test_a_bad_scene_is_one_clear_line(tmp_path: Path, text: str, words: list[str]) -> None:
@@ -137,6 +138,14 @@ def test_a_bad_scene_is_one_clear_line(tmp_path: Path, text: str, words: list[st
     assert "\n" not in message
     for word in words:
         assert word in message, message
+
+
+def test_one_bad_value_is_one_problem(tmp_path: Path) -> None:
+    """That the only radar is refused is no second problem of the list of radars."""
+    path = write(tmp_path, GOOD.replace("000000000001", "1"))
+    with pytest.raises(SceneError) as caught:
+        load_scene(path)
+    assert str(caught.value).endswith("got '1'")
 
 
 def test_an_unknown_name_lists_the_known_ones() -> None:

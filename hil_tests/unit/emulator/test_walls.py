@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from emulator.diffraction import edge_wave, past_edge
-from emulator.echo import BEAM_EXPONENT, SceneEcho
+from emulator.echo import SceneEcho
 from emulator.echo_source import CaptureSettings
+from emulator.reflections import BEAM_EXPONENT
 from emulator.scene_tables import MIRROR_AMPLITUDE_1M
 from emulator.walls import faces_of, passing
 from hil_tests.unit.emulator.rooms import (
@@ -103,6 +104,17 @@ def test_the_echo_is_half_at_the_edge_and_never_jumps() -> None:
     assert np.abs(np.diff(fields)).max() < 1.1 * full * step_v / math.sqrt(2)
     assert abs(fields[0]) > 0.85 * full
     assert abs(fields[-1]) < 0.15 * full
+
+
+def test_a_corner_seen_from_outside_ends_like_any_wall() -> None:
+    """Behind an L the other wall is not heard: it closes the end on the inner side alone."""
+    long_wall = wall((0.0, 0.0), (FAR, 0.0), reflection=1.0)
+    silent = wall((0.0, 0.0), (0.0, FAR), reflection=0.0, name="upright")
+    for x in (-0.05, -1e-6, 1e-6, 0.05, 0.3):
+        radar = radar_at(x, -1.0, 90.0)
+        alone = heard(radar, walls=(long_wall,)).field()
+        behind = heard(radar, walls=(long_wall, silent)).field()
+        assert behind == pytest.approx(alone, abs=1e-4)
 
 
 def test_what_passes_an_edge_is_fresnels() -> None:

@@ -53,6 +53,20 @@ def test_old_leakage_is_forgotten_to_1_over_e_in_its_memory(memory: float) -> No
     assert remembered == pytest.approx(share * near_zone(frame(LEAKAGE).samples), abs=1e-7)
 
 
+@pytest.mark.parametrize("memory", [2.0, 5.0])
+def test_it_adds_the_noise_of_an_exponential_mean(memory: float) -> None:
+    """Weights a (1 - a)**k, a = 1 / memory: their squares add up to a / (2 - a)."""
+    rng = np.random.default_rng(3)
+    remover = LeakageRemover(LeakageConfig(memory_frames=memory, max_range_m=LIMIT_M))
+    left = [
+        near_zone(remover.remove(frame(rng.standard_normal(LEAKAGE.size))).samples)
+        for _ in range(1500)
+    ]
+    # 10 500 samples tell a standard deviation to 0.7 %, and neighbours in time correlate a little
+    expected = np.sqrt(1 + 1 / (2 * memory - 1))
+    assert np.std(left[50:]) == pytest.approx(expected, rel=0.025)
+
+
 def test_radars_and_grids_are_remembered_apart() -> None:
     remover = LeakageRemover(LeakageConfig(max_range_m=LIMIT_M))
     learnt(remover, LEAKAGE, 3)

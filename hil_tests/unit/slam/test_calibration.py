@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from slam.calibration import Calibration, CalibrationPriors, Drive, calibrate, make_drive
 from slam.calibration_gains import estimate_gains
 from slam.calibration_tracks import RangeSet, place
-from slam.calibration_words import poor_drive, weak_directions
+from slam.calibration_words import poor_drive, unseen_reflectors, weak_directions
 from slam.geometry import Rig, paper_rig
 
 Array = NDArray[np.float64]
@@ -164,6 +164,14 @@ def test_known_reflectors_fix_the_map_and_tell_more() -> None:
     assert np.abs(known.offsets_m - OFFSETS_M).max() < 4 * known.offset_sigmas_m.max()
 
 
+def test_reflectors_of_another_room_are_told() -> None:
+    noisy = drive(World(sigma_m=1.5e-3, wheel_noise=1.0), 3)
+    elsewhere = RODS + 500.0
+    found = calibrate(noisy, known_m=elsewhere)
+    assert f"only 0 of {len(RODS)} known" in unseen_reflectors(found, len(elsewhere))[0]
+    assert unseen_reflectors(calibrate(noisy, known_m=RODS), len(RODS)) == ()
+
+
 def test_a_few_wrong_ranges_do_no_harm() -> None:
     noisy = drive(World(sigma_m=1e-3, wheel_noise=1.0), 1)
     random = np.random.default_rng(5)
@@ -242,6 +250,15 @@ def test_a_radar_places_an_echo_it_followed() -> None:
     assert place(sights, ranges + np.linspace(0, 0.4, 30) ** 2 * 4) is None  # no still point
 
 
-def test_mounts_with_new_numbers_keep_their_names_and_order() -> None:
-    rig: Rig = calibrate(drive(World())).rig(paper_rig())
-    assert [mount.name for mount in rig.mounts] == [m.name for m in paper_rig().mounts]
+def test_mounts_with_new_numbers_keep_their_names_order_and_phases() -> None:
+    nominal = Rig(
+        mounts=tuple(
+            replace(mount, phase_offset_rad=0.1 * number)
+            for number, mount in enumerate(paper_rig().mounts)
+        )
+    )
+    rig = calibrate(drive(World())).rig(nominal)
+    assert [mount.name for mount in rig.mounts] == [mount.name for mount in nominal.mounts]
+    assert [mount.phase_offset_rad for mount in rig.mounts] == [
+        mount.phase_offset_rad for mount in nominal.mounts
+    ]

@@ -32,11 +32,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
     """Drive one lap per scene and filter what was seen with every setting."""
     # heavy, see module text
+    from slam.app.emulated_rig import scene_and_config
     from slam.app.experiments.filter_picture import draw_filter
     from slam.app.experiments.filter_study import drive, outcomes
     from slam.app.experiments.results import print_table, write_json
     from slam.app.report_table import share_text
 
+    for scene in arguments.scene:
+        scene_and_config(scene, "paper")  # a bad one is refused before the first is driven
     studies = []
     for scene in arguments.scene:
         run_seen = drive(scene, seed=arguments.seed, check=stop.check)

@@ -30,14 +30,14 @@ def pair_covariance(
     """Return the Cramer-Rao bound of the positions of two echoes, amplitudes and phases unknown.
 
     With d the distance, r = exp(-d**2 / (4 s**2)) the overlap of the pulses, a complex amplitude c
-    per echo (that of its envelope on a common carrier) and <g', g> etc. integrals over Gaussians,
-    the Fisher matrix of the positions once b and c are fitted is
+    per echo (that of its envelope on a common carrier) and sums over n taken as integrals over
+    Gaussians, the Fisher matrix of the positions once both amplitudes are fitted is
 
         J_kl = E / sigma**2 Re(conj(c_k) c_l) (M_kl - m_k^T R^-1 m_l),   E = s sqrt(pi) / 2
         M_11 = M_22 = 1 / (2 s**2),   M_12 = r (1 / (2 s**2) - d**2 / (4 s**4))
-        R = [[1, r], [r, 1]],   m_1 = (0, -q),  m_2 = (q, 0),   q = r d / (2 s**2)
+        R = [[1, r], [r, 1]],   m_1 = (0, q),  m_2 = (-q, 0),   q = r d / (2 s**2)
 
-    with m_k the correlations of the derivative of pulse k with both pulses.
+    with m_k the correlations of the derivative of pulse k by its position with both pulses.
 
     Parameters
     ----------

@@ -8,14 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.app.experiments.limit_bounds import detection_probability, known_pulse
-from slam.app.experiments.limit_cells import front_end, ranges_of, ranging, single_echoes
+from slam.app.experiments.limit_cells import (
+    NOISE_SIGMA,
+    front_end,
+    ranges_of,
+    ranging,
+    single_echoes,
+)
 from slam.app.experiments.limit_frames import BIN_LENGTH_M, N_BINS, chip_frames
 from slam.config import MatchedFilterConfig
 from slam.pulse_filter import threshold_sigmas
 
 Array = NDArray[np.float64]
 
-NOISE_SIGMA = 5e-4
 SNRS_DB = (0, 2, 3, 4, 5, 6, 7, 8, 10, 12, 16, 20, 22, 23, 24, 25, 26, 28)
 FALSE_ALARMS = (1e-3, 1e-2, 1e-1)
 _WHOLE_FRAME: Mapping[str, object] = {"detection.min_range_m": 0.0, "detection.max_range_m": 100.0}

@@ -51,8 +51,8 @@ JITTER = JitterSpec(white_rad=0.0056, slow_rad=0.032, slow_correlation_s=4.0)
 _SERIAL = "201709131504"
 
 
-def read_slow_time(path: Path) -> SlowTime:
-    """Return the baseband frames of a recording.
+def read_slow_time(path: Path, radar: str | None = None) -> SlowTime:
+    """Return the baseband frames of a recording; of several radars, the named one.
 
     Raises
     ------
@@ -60,7 +60,8 @@ def read_slow_time(path: Path) -> SlowTime:
         There is no such recording, or it holds too few baseband frames of one shape; one line.
     """
     try:
-        found = [(one, t_ns) for one, t_ns in read_recording(path) if isinstance(one, BasebandIq)]
+        records = read_recording(path, radar=radar)
+        found = [(one, t_ns) for one, t_ns in records if isinstance(one, BasebandIq)]
     except RecordingError as error:
         raise AppError(str(error)) from None
     n_bins = {message.num_bins for message, _ in found}

@@ -24,6 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="recording of a standing module's baseband frames, in any format `xethru dump` reads",
     )
+    parser.add_argument("--radar", metavar="NAME", help="which radar of a recording of several")
     parser.add_argument(
         "--seed", type=seed, default=0, help="seed of the run drawn in full (default: %(default)s)"
     )
@@ -43,7 +44,7 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
     from slam.app.experiments.results import print_table, write_json
     from slam.app.experiments.slow_time import TITLES, spread_of
 
-    recorded = read_slow_time(arguments.recording)
+    recorded = read_slow_time(arguments.recording, arguments.radar)
     scene = equivalent_scene(recorded)
     emulated = []
     for one in range(arguments.seed, arguments.seed + arguments.runs):

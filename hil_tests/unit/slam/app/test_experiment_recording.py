@@ -11,9 +11,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from hil_tests.unit.slam.app.sessions import session_info
 from slam.app.cli import main
 from slam.app.experiments.recorded_room import emulate, equivalent_scene, read_slow_time
 from slam.app.experiments.slow_time import FAR_BINS, SlowTime, spread_of
+from slam.app.odometry import OdometryTrack
+from slam.app.session_log import SessionLog
+from slam.app.tum import TumSample
 
 REPOSITORY = Path(__file__).resolve().parents[4]
 SIGMA = 3e-5
@@ -39,6 +43,20 @@ def white() -> SlowTime:
     iq = SIGMA * (rng.normal(size=(4000, 40)) + 1j * rng.normal(size=(4000, 40)))
     iq[:, 4] += 0.02
     return frames_of(iq)
+
+
+def test_of_a_session_of_several_radars_one_is_chosen(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The remedy that is offered works: what is missing then are frames."""
+    session = tmp_path / "session.mcap"
+    start = TumSample(t_ns=0, x_m=0.0, y_m=0.0, qz=0.0, qw=1.0)
+    SessionLog(session, session_info(), OdometryTrack([start])).close()
+    command = ["experiment", "recording", "--out", str(tmp_path), "--recording", str(session)]
+    assert main(command) == 1
+    assert "choose one: --radar NAME" in capsys.readouterr().err
+    assert main([*command, "--radar", "radar0"]) == 1
+    assert "0 baseband frames" in capsys.readouterr().err
 
 
 def test_white_noise_is_its_own_floor_and_all_new_with_every_frame(white: SlowTime) -> None:

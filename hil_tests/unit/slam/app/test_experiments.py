@@ -138,3 +138,17 @@ def test_a_picture_is_the_same_file_each_time(tmp_path: Path) -> None:
         with picture(tmp_path / name, width_in=2, height_in=2) as figure:
             figure.subplots().plot([0, 1, 2], [1, 0, 1], color="#1f6fd0")
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+
+
+def test_a_scene_that_is_not_there_is_told_before_the_first_is_driven(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*_: object, **__: object) -> Seen:
+        raise AssertionError("driven")
+
+    monkeypatch.setattr("slam.app.experiments.filter_study.drive", never)
+    command = ["experiment", "filter", "--out", str(tmp_path), "--scene", "lab", "nowhere"]
+    assert main(command) == 2
+    error = capsys.readouterr().err
+    assert "nowhere: no such scene" in error
+    assert error.count("\n") == 1

@@ -30,6 +30,7 @@ def test_a_rig_comes_back_with_the_same_floats(tmp_path: Path) -> None:
                 y_m=1e-17,
                 yaw_deg=90.0,
                 range_offset_m=0.1 + 0.2,
+                phase_offset_deg=100 / 3,
                 gain_db=-1.5,
             ),
         )
@@ -40,9 +41,10 @@ def test_a_rig_comes_back_with_the_same_floats(tmp_path: Path) -> None:
 
 def test_a_rig_file_gives_mounts_in_radians(tmp_path: Path) -> None:
     path = tmp_path / "rig.toml"
-    path.write_text(RADAR + "range_offset_m = 0.02\n")
+    path.write_text(RADAR + "range_offset_m = 0.02\nphase_offset_deg = -45\n")
     (mount,) = load_rig(path).rig.mounts
     assert mount.yaw_rad == pytest.approx(math.pi / 2)
+    assert mount.phase_offset_rad == pytest.approx(-math.pi / 4)
     assert (mount.name, mount.x_m, mount.y_m, mount.range_offset_m) == ("left", 0.1, 0.0, 0.02)
 
 
