@@ -100,7 +100,8 @@ def test_ranges_correct_wheels_that_report_too_much() -> None:
     def odometry(t_ns: int) -> Array:
         return straight(t_ns) * 1.02
 
-    beliefs = drive(robust(), 130, odometry)
+    calibrated = override(ROBUST, {"robust.offset_sigma_m": "0"})  # or offsets may explain it
+    beliefs = drive(robust(calibrated), 130, odometry)
     assert len(beliefs) == 129
     end = straight(129 * TICK_NS)
     assert abs(beliefs[-1].pose[0] - end[0]) < 0.1 * abs(odometry(129 * TICK_NS)[0] - end[0])
