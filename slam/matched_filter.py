@@ -31,7 +31,7 @@ from slam.detector import Detection, reaches_limits, usable_samples
 from slam.frames import RadarFrame
 from slam.pulse_filter import BINS_PER_STEP, PulseFilter
 from slam.pulse_model import PulseModel
-from slam.pulse_refit import Filtered, Peaks, cut_pulses, refit
+from slam.pulse_refit import OVERLAP, Filtered, Peaks, cut_pulses, refit
 
 Array = NDArray[np.float64]
 
@@ -65,9 +65,10 @@ class MatchedFilterDetector:
 
     def detect(self, frame: RadarFrame, range_offset_m: float = 0.0) -> tuple[Detection, ...]:
         """Return the echoes of one frame inside the range limits; see ``Detector``."""
-        peaks = self.peaks(frame)
-        ranges_m = frame.range_start_m + peaks.position_bins * frame.bin_length_m - range_offset_m
         limits = self.config.detection
+        start_m = frame.range_start_m - range_offset_m
+        peaks = self.peaks(frame, (limits.min_range_m - start_m, limits.max_range_m - start_m))
+        ranges_m = start_m + peaks.position_bins * frame.bin_length_m
         columns = zip(
             ranges_m.tolist(),
             peaks.amplitude.tolist(),
@@ -98,10 +99,14 @@ class MatchedFilterDetector:
         """Return the echoes of each frame; see ``Detector``."""
         return [self.detect(*each) for each in zip(frames, offsets_m, strict=True)]
 
-    def peaks(self, frame: RadarFrame) -> Peaks:
+    def peaks(
+        self, frame: RadarFrame, within_m: tuple[float, float] = (-math.inf, math.inf)
+    ) -> Peaks:
         """Return every echo of a frame, whatever its range.
 
-        Samples that are NaN or lie at one of the frame's limits are not used.
+        Samples that are NaN or lie at one of the frame's limits are not used. A second look is
+        taken only at echoes that lie ``within_m``, from the first bin on [m], or overlap with one
+        that may.
         """
         filtered = self._filtered(frame)
         found, unexplained = _single_pulses(filtered)
@@ -111,7 +116,12 @@ class MatchedFilterDetector:
             several = found.misfit > settings.max_single_misfit
             several &= unexplained > (_SUSPICIOUS * settings.model_error) ** 2
             again = several if again is None else again | several
-        if again is None or not again.any():
+        if again is None:
+            return found
+        reach = OVERLAP * filtered.pulse_filter.sigma_bins
+        again &= found.position_bins > within_m[0] / frame.bin_length_m - reach
+        again &= found.position_bins < within_m[1] / frame.bin_length_m + reach
+        if not again.any():
             return found
         return refit(found, again, filtered, self._split)
 

@@ -20,7 +20,7 @@ BoolArray = NDArray[np.bool_]
 # Samples this far from a peak, in envelope sigmas, belong to it: beyond, 1 % of its height.
 _REACH = 3.0
 # Peaks closer than this, in envelope sigmas, overlap: rho there is 1 %.
-_OVERLAP = 4.3
+OVERLAP = 4.3
 # Samples fitted on either side of a group, also beyond an end of the frame, in envelope sigmas. A
 # weak echo nearer than that to a strong one makes no peak of its own.
 _MARGIN = 5.0
@@ -129,7 +129,7 @@ def refit(peaks: Peaks, again: BoolArray, filtered: Filtered, split: SplitTest) 
         [peaks.position_bins, peaks.amplitude, peaks.phase_rad, peaks.sigma_bins]
     )
     every_pulse = _render(table, pulse_filter)
-    linked = _OVERLAP * pulse_filter.sigma_bins if split.max_echoes > 1 else 0.0
+    linked = OVERLAP * pulse_filter.sigma_bins if split.max_echoes > 1 else 0.0
     starts = np.flatnonzero(np.diff(peaks.position_bins) > linked) + 1
     groups = []
     for members in np.split(np.arange(len(table)), starts):
