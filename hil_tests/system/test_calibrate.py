@@ -38,7 +38,10 @@ def test_a_recorded_drive_gives_back_what_the_scene_planted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scene = short_drive(tmp_path)
-    assert main(["demo", "--scene", scene, "--seed", "0", "--out", str(tmp_path)]) == 0
+    assert (
+        main(["demo", "--preset", "paper", "--scene", scene, "--seed", "0", "--out", str(tmp_path)])
+        == 0
+    )
     capsys.readouterr()
     session, rig = str(tmp_path / "session.mcap"), tmp_path / "rig.toml"
     command = ["calibrate", session, "--truth", "calibration", "--json", "--rig", str(rig)]

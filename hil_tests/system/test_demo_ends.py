@@ -34,7 +34,7 @@ def running_demo(
     """Run a demo of the long lab scene; with `progressed`, yield when frames are on disk."""
     temporary.mkdir()
     demo = subprocess.Popen(
-        [sys.executable, "-m", "slam.app.cli", "demo", "--out", str(out)],
+        [sys.executable, "-m", "slam.app.cli", "demo", "--preset", "paper", "--out", str(out)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -152,7 +152,15 @@ def test_a_signal_after_the_last_scan(
 
     monkeypatch.setattr(demo_module, step, interrupted)
     out = tmp_path / "out"
-    command = ["demo", "--scene", str(write_short_scene(tmp_path)), "--out", str(out)]
+    command = [
+        "demo",
+        "--preset",
+        "paper",
+        "--scene",
+        str(write_short_scene(tmp_path)),
+        "--out",
+        str(out),
+    ]
     assert main(command) == 143
     assert capsys.readouterr().err.splitlines()[-1].startswith("uwb-slam: stopped by SIGTERM")
     assert (out / "map.png").exists() == (step == "print_table")
