@@ -9,8 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
-from sklearn import config_context
-from sklearn.cluster import DBSCAN
 
 from slam.config import ClusterCount, ClusteringConfig, Emission, Evidence
 from slam.geometry import between, transform
@@ -87,6 +85,10 @@ def cluster_labels(points: Array, config: ClusteringConfig) -> NDArray[np.int64]
     labels
         shape (n,), clusters numbered from 0 by first appearance.
     """
+    # Here, since it takes a second, for which every command would wait.
+    from sklearn import config_context
+    from sklearn.cluster import DBSCAN
+
     if len(points) < config.min_observations:
         return np.full(len(points), NOISE, dtype=np.int64)
     # Distances of tens of points are quicker computed here than by a tree, and without the thread

@@ -23,7 +23,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from slam.geometry import between, compose, transform
 from slam.robust.merging import apply_merge
@@ -154,7 +154,7 @@ def _judged(
         motion, residual, S, N = _aligned(state, pairs)
         S_inverse = np.linalg.inv(S)
         distance = float(residual @ S_inverse @ residual)
-        if distance <= chi2.ppf(0.999, max(2 * len(pairs) - 3, 1)):
+        if distance <= chdtri(max(2 * len(pairs) - 3, 1), 0.001):
             information = N.T @ S_inverse @ N
             log_det = float(np.linalg.slogdet(math.tau * S)[1])
             log_det += float(np.linalg.slogdet(information / math.tau)[1])
