@@ -48,7 +48,9 @@ Ghosts (``emulator.ghosts``)
 Shadow and transmission (``emulator.walls``)
     Each leg is multiplied, per face it crosses, by |t + (1 - t) (E_a + E_b)|: what passes through
     and what bends round both ends (single knife edge, ITU-R P.526). The bent way's own delay is
-    left out; people, rods and cylinders cast no shadow.
+    left out; people, rods and cylinders cast no shadow. Ends count as free edges also where two
+    walls meet, so an opaque joint lets some -12 dB past it; and where a leg's end crosses the line
+    of a wall beyond its end, what bends round that end appears at once, by up to -6 dB.
 Phase
     Each reflector's is fixed by its name (SHA-256), for every radar, aspect and seed.
 Phase jitter j
