@@ -99,9 +99,7 @@ class MatchedFilterDetector:
         """Return the echoes of each frame; see ``Detector``."""
         return [self.detect(*each) for each in zip(frames, offsets_m, strict=True)]
 
-    def peaks(
-        self, frame: RadarFrame, within_m: tuple[float, float] = (-math.inf, math.inf)
-    ) -> Peaks:
+    def peaks(self, frame: RadarFrame, within_m: tuple[float, float]) -> Peaks:
         """Return every echo of a frame, whatever its range.
 
         Samples that are NaN or lie at one of the frame's limits are not used. A second look is

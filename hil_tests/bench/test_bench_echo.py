@@ -13,18 +13,8 @@ from emulator.echo_source import CaptureSettings
 from emulator.noise import frame_noise_units
 from emulator.odometry import scene_odometry
 from emulator.scene import load_scene
+from hil_tests.captures import PAPER
 
-PAPER = CaptureSettings(
-    first_sample_m=0.19929,
-    n_samples=1431,
-    iterations=16,
-    pulses_per_step=300,
-    dac_min=949,
-    dac_max=1100,
-    dac_step=0,
-    tx_power=2,
-    tx_center_frequency=3,
-)
 FAST = replace(PAPER, pulses_per_step=10)  # the settings of 400 frames/s
 BLOCK = 32
 

@@ -16,18 +16,9 @@ from emulator.echo_source import CaptureSettings
 from emulator.pulse import sum_of_pulses
 from emulator.scene import LeakageSpec, Scene, load_scene
 from emulator.scene_tables import ClutterSpec
+from hil_tests.captures import PAPER
 
-CAPTURE = CaptureSettings(
-    first_sample_m=0.19929,
-    n_samples=400,
-    iterations=16,
-    pulses_per_step=300,
-    dac_min=949,
-    dac_max=1100,
-    dac_step=0,
-    tx_power=2,
-    tx_center_frequency=3,
-)
+CAPTURE = replace(PAPER, n_samples=400)
 LAB = load_scene("lab")
 COUNT = 1 / (16 * 300) / 1024
 STEP_NS = 200_000_000

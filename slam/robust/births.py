@@ -35,8 +35,8 @@ class BodyPoint:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PointRows:
-    """A point against one landmark: residual (2,), H (2, c) on columns ``at``, S (2, 2)."""
+class FeatureRows:
+    """What is seen against one of the map: residual (2,), H (2, c) on columns ``at``, S (2, 2)."""
 
     residual: Array
     at: Indices
@@ -54,14 +54,14 @@ class PointRows:
         return math.log(float(np.linalg.det(self.S)))
 
 
-def point_rows(state: State, row: int, point: BodyPoint) -> PointRows:
+def point_rows(state: State, row: int, point: BodyPoint) -> FeatureRows:
     """Return residual, H and S of a point that would be the landmark in ``row``."""
     R = rotation(state.heading_rad)
     offsets = np.arange(state.offsets.start, state.offsets.stop)
     at = np.concatenate([np.array([1, 2]), offsets, state.landmark_columns(np.array([row]))])
     H = np.hstack([-R.T, -point.by_offsets, R.T])
     S = H @ state.P.block(at) @ H.T + point.covariance
-    return PointRows(
+    return FeatureRows(
         residual=point.point_m - R.T @ (state.landmarks_m[row] - state.position_m),
         at=at,
         H=H,

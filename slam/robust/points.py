@@ -18,7 +18,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from slam.geometry import wrap_angle
-from slam.robust.births import BodyPoint, PointRows
+from slam.robust.births import BodyPoint, FeatureRows
 from slam.robust.state import State, rotation
 from slam.robust.symmetric import Array
 
@@ -53,7 +53,7 @@ class RangeBearing:
         )
 
 
-def range_bearing_rows(state: State, row: int, seen: RangeBearing) -> PointRows:
+def range_bearing_rows(state: State, row: int, seen: RangeBearing) -> FeatureRows:
     """Return residual, H and S of a point that would be the landmark in ``row``."""
     R = rotation(state.heading_rad)
     b = R.T @ (state.landmarks_m[row] - state.position_m)
@@ -65,7 +65,7 @@ def range_bearing_rows(state: State, row: int, seen: RangeBearing) -> PointRows:
     S = H @ state.P.block(at) @ H.T + seen.covariance
     residual = seen.values - np.array([r, math.atan2(b[1], b[0])])
     residual[1] = wrap_angle(float(residual[1]))
-    return PointRows(residual=residual, at=at, H=H, S=(S + S.T) / 2)
+    return FeatureRows(residual=residual, at=at, H=H, S=(S + S.T) / 2)
 
 
 def named_rows(

@@ -20,10 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.geometry import wrap_angle
+from slam.robust.births import FeatureRows
 from slam.robust.parameters import WallRule
 from slam.robust.ranges import Antennas, View
 from slam.robust.state import State, rotation
-from slam.robust.symmetric import Array, Indices
+from slam.robust.symmetric import Array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -42,26 +43,6 @@ class BodyWall:
     def in_map(self, state: State) -> Array:
         """Return the places that answered in the map frame, shape (k, 2)."""
         return np.asarray(state.position_m + self.feet_m @ rotation(state.heading_rad).T)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class WallRows:
-    """A wall seen against one of the map: residual (2,), H (2, c) on columns ``at``, S (2, 2)."""
-
-    residual: Array
-    at: Indices
-    H: Array
-    S: Array
-
-    @property
-    def mahalanobis_sq(self) -> float:
-        """Return the squared Mahalanobis distance (2 dof)."""
-        return float(self.residual @ np.linalg.solve(self.S, self.residual))
-
-    @property
-    def log_det(self) -> float:
-        """Return ln det S."""
-        return math.log(float(np.linalg.det(self.S)))
 
 
 class WallCells:
@@ -122,7 +103,7 @@ def along_wall(state: State, wall_row: int, places_m: Array) -> Array:
     return np.asarray(places_m @ np.array([-math.sin(phi), math.cos(phi)]))
 
 
-def wall_rows(state: State, wall_row: int, seen: BodyWall) -> WallRows:
+def wall_rows(state: State, wall_row: int, seen: BodyWall) -> FeatureRows:
     """Return residual, H and S of a wall seen that would be the mapped one."""
     phi, d = (float(value) for value in state.walls[wall_row])
     n = np.array([math.cos(phi), math.sin(phi)])
@@ -137,7 +118,7 @@ def wall_rows(state: State, wall_row: int, seen: BodyWall) -> WallRows:
     expected = np.array([phi - state.heading_rad, d - float(n @ state.position_m)])
     residual = seen.wall - expected
     residual[0] = wrap_angle(float(residual[0]))
-    return WallRows(residual=residual, at=at, H=H, S=(S + S.T) / 2)
+    return FeatureRows(residual=residual, at=at, H=H, S=(S + S.T) / 2)
 
 
 def match_wall(state: State, seen: BodyWall, cells: WallCells, rule: WallRule) -> int | None:

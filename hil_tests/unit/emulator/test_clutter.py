@@ -14,19 +14,10 @@ from emulator.clutter import GRIDS, ClutterField
 from emulator.downconversion import CHANNELS, TAP_COUNT, downconvert
 from emulator.echo_source import CaptureSettings
 from emulator.scene_tables import ClutterSpec
+from hil_tests.captures import PAPER
 from xethru_protocol.x4 import BASEBAND_DECIMATION, CARRIER_HZ, RF_BIN_M, SAMPLING_RATE_HZ
 
-CAPTURE = CaptureSettings(
-    first_sample_m=0.19929,
-    n_samples=1431,
-    iterations=16,
-    pulses_per_step=300,
-    dac_min=949,
-    dac_max=1100,
-    dac_step=0,
-    tx_power=2,
-    tx_center_frequency=3,
-)
+CAPTURE = PAPER
 CORRELATION_S = 4.8
 FAR_APART_NS = 30_000_000_000
 SERIAL = 202305070101

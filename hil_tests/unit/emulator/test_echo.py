@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scipy.signal import hilbert
 
 from emulator.echo import SceneEcho, echo_source
-from emulator.echo_source import CaptureSettings
 from emulator.reflections import (
     BEAM_EXPONENT,
     beam_gain,
@@ -30,21 +29,12 @@ from emulator.scene import (
     empty_room,
     load_scene,
 )
+from hil_tests.captures import PAPER
 
 BIN_M = 1.5e8 / 23.328e9
 C_MPS = 299_792_458.0
 NOW = np.array([0])
-CAPTURE = CaptureSettings(
-    first_sample_m=0.18 + 3 * BIN_M,
-    n_samples=1431,
-    iterations=16,
-    pulses_per_step=300,
-    dac_min=949,
-    dac_max=1100,
-    dac_step=0,
-    tx_power=2,
-    tx_center_frequency=3,
-)
+CAPTURE = replace(PAPER, first_sample_m=0.18 + 3 * BIN_M)
 FORWARD = RadarSpec(name="only", serial="000000000007", x_m=0.0, y_m=0.0, yaw_deg=0.0)
 
 

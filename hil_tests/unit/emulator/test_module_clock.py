@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -11,23 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emulator.echo import SceneEcho
-from emulator.echo_source import CaptureSettings
 from emulator.module_clock import ModuleClock
 from emulator.scene import LeakageSpec, NoiseSpec, PathSpec, RadarSpec, Scene
+from hil_tests.captures import PAPER
 from hil_tests.unit.emulator.rooms import radar_at, room, target
 
 DAY_NS = 86_400_000_000_000
-CAPTURE = CaptureSettings(
-    first_sample_m=0.0,
-    n_samples=1400,
-    iterations=16,
-    pulses_per_step=300,
-    dac_min=0,
-    dac_max=2047,
-    dac_step=0,
-    tx_power=2,
-    tx_center_frequency=3,
-)
+CAPTURE = replace(PAPER, first_sample_m=0.0, n_samples=1400, dac_min=0, dac_max=2047)
 
 
 @given(

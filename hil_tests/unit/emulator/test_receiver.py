@@ -11,18 +11,9 @@ from emulator.echo_source import CaptureSettings
 from emulator.receiver import Receiver, one_count
 from emulator.scene import Scene
 from emulator.scene_tables import ClutterSpec, NoiseSpec, RadarSpec
+from hil_tests.captures import PAPER
 
-CAPTURE = CaptureSettings(
-    first_sample_m=0.19929,
-    n_samples=1431,
-    iterations=16,
-    pulses_per_step=300,
-    dac_min=0,
-    dac_max=2047,
-    dac_step=0,
-    tx_power=2,
-    tx_center_frequency=3,
-)
+CAPTURE = replace(PAPER, dac_min=0, dac_max=2047)
 RADAR = RadarSpec(name="radar", serial="202305070101", x_m=0.0, y_m=0.0, yaw_deg=0.0)
 
 

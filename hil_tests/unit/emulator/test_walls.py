@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from emulator.diffraction import edge_wave, past_edge
 from emulator.echo import SceneEcho
-from emulator.echo_source import CaptureSettings
 from emulator.reflections import BEAM_EXPONENT
 from emulator.scene_tables import MIRROR_AMPLITUDE_1M
 from emulator.walls import faces_of, passing
+from hil_tests.captures import PAPER
 from hil_tests.unit.emulator.rooms import (
     WAVELENGTH_M,
     WAVENUMBER,
@@ -248,17 +249,7 @@ def test_a_thin_cylinder_is_a_rod_and_a_thick_one_a_wall() -> None:
         assert ratio == pytest.approx(1, abs=0.11)
 
 
-CAPTURE = CaptureSettings(
-    first_sample_m=0.0,
-    n_samples=400,
-    iterations=16,
-    pulses_per_step=300,
-    dac_min=949,
-    dac_max=1100,
-    dac_step=0,
-    tx_power=2,
-    tx_center_frequency=3,
-)
+CAPTURE = replace(PAPER, first_sample_m=0.0, n_samples=400)
 
 
 def test_a_near_wall_saturates_and_a_far_one_does_not() -> None:
