@@ -1,6 +1,8 @@
 """Second look at echoes that are not one whole pulse: overlapping, saturated, or cut by an end.
 
-Groups of such peaks go to :mod:`slam.close_echoes` with all other echoes of the frame subtracted.
+Groups of such peaks are fitted with all other echoes of the frame subtracted: behind the filter, by
+:mod:`slam.whole_echoes`, where every sample around them is known; sample by sample, by
+:mod:`slam.close_echoes`, where some are not.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from numpy.typing import NDArray
 from slam.close_echoes import KnownPulse, SplitTest, fit_echoes
 from slam.pulse_filter import BINS_PER_STEP, PulseFilter
 from slam.pulse_model import ComplexArray
+from slam.whole_echoes import Correlation, fit_whole_echoes
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -27,6 +30,8 @@ _MARGIN = 5.0
 _SEARCH = 3.5
 # With fewer usable samples than this many envelope sigmas a fit says nothing.
 _LEAST_SAMPLES = 2.0
+# Behind the filter an echo is wider: beyond, 1e-7 of its height.
+_FILTERED_REACH = 8.0
 # Columns of a table of echoes.
 _POSITION, _AMPLITUDE, _PHASE, _SIGMA = range(4)
 
@@ -128,15 +133,14 @@ def refit(peaks: Peaks, again: BoolArray, filtered: Filtered, split: SplitTest) 
     table = np.column_stack(
         [peaks.position_bins, peaks.amplitude, peaks.phase_rad, peaks.sigma_bins]
     )
-    every_pulse = _render(table, pulse_filter)
     linked = OVERLAP * pulse_filter.sigma_bins if split.max_echoes > 1 else 0.0
     starts = np.flatnonzero(np.diff(peaks.position_bins) > linked) + 1
     groups = []
     for members in np.split(np.arange(len(table)), starts):
         group = table[members]
         if again[members].any():
-            others = every_pulse - _render(group, pulse_filter)
-            group = _fitted(group, filtered.samples - others, filtered, split)
+            others = np.delete(table, members, axis=0)
+            group = _fitted(group, others, filtered, split)
         groups.append(group)
     table = np.concatenate(groups)
     inside = (table[:, _POSITION] >= -0.5) & (table[:, _POSITION] < pulse_filter.n_bins - 0.5)
@@ -152,20 +156,22 @@ def refit(peaks: Peaks, again: BoolArray, filtered: Filtered, split: SplitTest) 
     )
 
 
-def _fitted(group: Array, samples: Array, filtered: Filtered, split: SplitTest) -> Array:
+def _fitted(group: Array, others: Array, filtered: Filtered, split: SplitTest) -> Array:
     """Return the echoes of a frame near a group of peaks; the group where nothing is to be seen."""
     pulse_filter = filtered.pulse_filter
     margin = _MARGIN * pulse_filter.sigma_bins
     first = int(np.floor(group[0, _POSITION] - margin))
     last = int(np.ceil(group[-1, _POSITION] + margin))
     inside = slice(max(first, 0), min(last + 1, pulse_filter.n_bins))
-    window = np.zeros(last + 1 - first)
-    usable = np.zeros(window.size, dtype=np.bool_)
+    usable = np.zeros(last + 1 - first, dtype=np.bool_)
     known = slice(inside.start - first, inside.stop - first)
-    window[known] = samples[inside]
     usable[known] = True if filtered.usable is None else filtered.usable[inside]
+    if usable.all():
+        return _fitted_whole(group, others, filtered, split)
     if np.count_nonzero(usable) < _LEAST_SAMPLES * pulse_filter.sigma_bins:
         return group
+    window = np.zeros(usable.size)
+    window[known] = filtered.samples[inside] - _render(others, pulse_filter)[inside]
     # Echoes are looked for near the peaks, and as far beyond an end of the frame as it was cut.
     edge = margin - _SEARCH * pulse_filter.sigma_bins
     search_bins = (
@@ -188,6 +194,48 @@ def _fitted(group: Array, samples: Array, filtered: Filtered, split: SplitTest) 
     )
 
 
+def _fitted_whole(group: Array, others: Array, filtered: Filtered, split: SplitTest) -> Array:
+    """Return the echoes near a group of peaks around which every sample is known."""
+    pulse_filter = filtered.pulse_filter
+    search = _SEARCH * pulse_filter.sigma_bins
+    # a few steps more, from which z is interpolated
+    first = int((group[0, _POSITION] - search) / BINS_PER_STEP) - 4
+    last = int((group[-1, _POSITION] + search) / BINS_PER_STEP) + 5
+    steps = np.arange(max(first, 0), min(last + 1, filtered.y.size))
+    begin = BINS_PER_STEP * float(steps[0])
+    z = filtered.y[steps] - _correlated(others, steps, pulse_filter)
+    z *= np.exp(-1j * pulse_filter.carrier_rad * (BINS_PER_STEP * steps - begin))
+    fits = fit_whole_echoes(
+        Correlation(
+            z,
+            step_bins=BINS_PER_STEP,
+            sigma_bins=pulse_filter.sigma_bins,
+            sigma_y=filtered.sigma_y,
+        ),
+        group[0, _POSITION] - search - begin,
+        group[-1, _POSITION] + search - begin,
+        split,
+    )
+    table = np.array([(f.position_bins, f.amplitude, f.phase_rad, f.sigma_bins) for f in fits])
+    table[:, _PHASE] += pulse_filter.carrier_rad * table[:, _POSITION]
+    table[:, _POSITION] += begin
+    return table
+
+
+def _correlated(table: Array, steps: NDArray[np.intp], pulse_filter: PulseFilter) -> ComplexArray:
+    """Return what whole echoes are behind the filter, at steps of y; the shape of the steps."""
+    reach = _FILTERED_REACH * pulse_filter.sigma_bins
+    begin, end = BINS_PER_STEP * steps[0] - reach, BINS_PER_STEP * steps[-1] + reach
+    near = table[(table[:, _POSITION] > begin) & (table[:, _POSITION] < end)]
+    away = BINS_PER_STEP * steps - near[:, _POSITION, np.newaxis]
+    pulses = np.exp(
+        -0.25 * (away / pulse_filter.sigma_bins) ** 2
+        + 1j * (pulse_filter.carrier_rad * away + near[:, _PHASE, np.newaxis])
+    )
+    summed: ComplexArray = near[:, _AMPLITUDE] @ pulses
+    return summed
+
+
 def _render(table: Array, pulse_filter: PulseFilter) -> Array:
     """Return the sum of echoes, shape (n_bins,)."""
     nearest = np.rint(table[:, _POSITION])
@@ -205,12 +253,18 @@ def _render(table: Array, pulse_filter: PulseFilter) -> Array:
 def _misfit(table: Array, filtered: Filtered) -> Array:
     """Return the misfit of each echo where all echoes together are the model."""
     pulse_filter = filtered.pulse_filter
-    residual = filtered.samples - _render(table, pulse_filter)
-    if filtered.usable is not None:
-        residual *= filtered.usable
     nearest = np.rint(table[:, _POSITION] / BINS_PER_STEP).astype(np.intp)
-    left = pulse_filter.apply(residual).take(
-        nearest[:, np.newaxis] + pulse_filter.probes, mode="clip"
-    )
+    steps = nearest[:, np.newaxis] + pulse_filter.probes
+    reach = pulse_filter.pulse.half_length(pulse_filter.bin_length_m)
+    first, last = table[[0, -1], _POSITION] if len(table) else (0.0, 0.0)
+    if filtered.usable is None and first >= reach and last < pulse_filter.n_bins - reach:
+        steps = steps.ravel()
+        left = filtered.y[steps] - _correlated(table, steps, pulse_filter)
+        left = left.reshape(len(table), -1)
+    else:
+        residual = filtered.samples - _render(table, pulse_filter)
+        if filtered.usable is not None:
+            residual *= filtered.usable
+        left = pulse_filter.apply(residual).take(steps, mode="clip")
     energy: Array = np.sum(left.real**2 + left.imag**2, axis=1)
     return energy / (filtered.sigma_y**2 * pulse_filter.probe_noise)
