@@ -11,8 +11,9 @@ PYTEST := $(BIN)/python -m pytest
 demo: $(VENV)/installed-demo
 	$(BIN)/uwb-slam demo --out out/demo
 
+# One process more than cores: many tests wait for a pty.
 test: $(VENV)/installed-test
-	$(PYTEST) -n auto
+	$(PYTEST) -n $$($(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 1)') --dist worksteal
 
 check: $(VENV)/installed-dev
 	$(BIN)/ruff format --no-cache --check .
