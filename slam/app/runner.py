@@ -120,4 +120,5 @@ def make_snapshot(
             -1, 2, 2
         ),
         nis_per_dof=result.nis_per_dof,
+        step=result,
     )

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import RadarFrame
+from slam.pipeline import StepResult
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,6 +89,8 @@ class Snapshot:
         Shape (m, 2) and (m, 2, 2), map frame.
     nis_per_dof
         One value per observation that was associated with a landmark at this state.
+    step
+        Everything that led to the state, for views; None where it came from a file.
     """
 
     counter: int
@@ -101,6 +104,7 @@ class Snapshot:
     landmarks_m: NDArray[np.float64]
     landmark_covariances_m2: NDArray[np.float64]
     nis_per_dof: tuple[float, ...]
+    step: StepResult | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
