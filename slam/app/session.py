@@ -7,7 +7,7 @@ robot's first pose; `odom` is the wheel odometry's own.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -43,15 +43,41 @@ class RadarInfo:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SessionInfo:
-    """What a run is: enough to name it, to repeat it and to read its frames."""
+    """What a run is: enough to name it, to repeat it and to read its frames.
+
+    Attributes
+    ----------
+    scene, preset, seed
+        Its names; seed None on real modules.
+    radars
+        In the order of the rig.
+    true_landmarks_m
+        Shape (n, 2), world frame; (0, 2) where nobody knows.
+    versions
+        Of what the numbers depend on.
+    config_json
+        SLAM's settings, a `SlamConfig` as JSON; "" where they are not told.
+    wheels
+        Fields of `WheelNoise`: how SLAM was told the wheels err.
+    outlines_m
+        Lines of walls and boxes for pictures, shape (k, 2) each, world frame.
+    simulated
+        Whether radars and world are emulated.
+    started_unix_ns
+        Time of day at session time 0; None where it means nothing.
+    """
 
     scene: str
     preset: str
-    seed: int
+    seed: int | None
     radars: tuple[RadarInfo, ...]
     true_landmarks_m: NDArray[np.float64]
-    """Shape (n, 2), world frame; (0, 2) where nobody knows."""
     versions: Mapping[str, str]
+    config_json: str = ""
+    wheels: Mapping[str, float] = field(default_factory=dict)
+    outlines_m: tuple[NDArray[np.float64], ...] = ()
+    simulated: bool = True
+    started_unix_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,11 +88,13 @@ class Scan:
     radar without start skew samples, whether there is one or not. Every frame has its own stamp,
     in the period that begins with `t_ns`. The counters of the frames are that of the tick, less
     the whole periods that their radar started late (none, unless it started more than one late).
+    `host_ns` holds for each frame when it arrived, nanoseconds since 1970; () where nobody noted.
     """
 
     counter: int
     t_ns: int
     frames: tuple[RadarFrame, ...]
+    host_ns: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
