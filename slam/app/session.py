@@ -89,12 +89,14 @@ class Scan:
     in the period that begins with `t_ns`. The counters of the frames are that of the tick, less
     the whole periods that their radar started late (none, unless it started more than one late).
     `host_ns` holds for each frame when it arrived, nanoseconds since 1970; () where nobody noted.
+    One that is not `used` is recorded only: SLAM was not stepped with it, as odometry was missing.
     """
 
     counter: int
     t_ns: int
     frames: tuple[RadarFrame, ...]
     host_ns: tuple[int, ...] = ()
+    used: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

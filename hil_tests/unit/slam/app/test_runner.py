@@ -1,6 +1,7 @@
 """The runner hands every state on with its own counter, its truth and the place of the map."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -8,7 +9,7 @@ from numpy.typing import NDArray
 
 from hil_tests.unit.slam.app.sessions import FRAME_NS, scan
 from slam.app.odometry import OdometryTrack
-from slam.app.runner import run_slam
+from slam.app.runner import nobody_knows, run_slam
 from slam.app.session import LogLine, Scan, Snapshot
 from slam.app.tum import TumSample
 from slam.ekf_slam import Belief
@@ -93,4 +94,18 @@ def test_every_state_comes_with_its_own_counter_truth_and_place() -> None:
         np.testing.assert_array_equal(snapshot.world_from_map, record.world_from_map)
         np.testing.assert_array_equal(truth, snapshot.truth)
     assert record.n_frames == 2 * len(COUNTERS)
-    assert record.duration_ns == COUNTERS[-1] * FRAME_NS
+    assert record.start_ns == COUNTERS[0] * FRAME_NS
+    assert record.start_ns + record.duration_ns == COUNTERS[-1] * FRAME_NS
+
+
+def test_an_unused_scan_is_told_and_not_stepped() -> None:
+    ends = [TumSample(t_ns=t_ns, x_m=0.0, y_m=0.0, qz=0.0, qw=1.0) for t_ns in (0, 20 * FRAME_NS)]
+    listener = Listener()
+    scans = [replace(scan(counter), used=counter not in (5, 8)) for counter in COUNTERS]
+    slam = cast(UwbRadarSlam, LateSlam())
+    record = run_slam(scans, OdometryTrack(ends), slam, nobody_knows, [listener])
+    assert tuple(listener.scans) == COUNTERS
+    assert [snapshot.counter for snapshot in listener.snapshots] == [6, 11, 12]
+    assert record.n_frames == 2 * 3
+    np.testing.assert_array_equal(record.world_from_map, np.zeros(3))
+    assert np.isnan(record.truth).all()
