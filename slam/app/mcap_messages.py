@@ -47,6 +47,7 @@ class RawMessage:
     message_type: str
     sequence: int
     t_ns: int
+    publish_ns: int
     data: bytes
 
 
@@ -119,7 +120,7 @@ class _Entries:
             _start, _end, size, checksum = _CHUNK.unpack_from(body)
             compression, at = _text(body, _CHUNK.size)
             packed = body[at + 8 :]
-        except (struct.error, UnicodeDecodeError):
+        except (struct.error, ValueError):
             if is_whole:
                 raise
             return  # cut within the chunk's own head
@@ -149,13 +150,14 @@ class _Entries:
 
     def _record(self, code: int, body: bytes) -> Iterator[Entry]:
         if code == _MESSAGE_CODE:
-            channel, sequence, t_ns, _ = _MESSAGE.unpack_from(body)
+            channel, sequence, t_ns, publish_ns = _MESSAGE.unpack_from(body)
             topic, message_type = self._channels[channel]
             yield RawMessage(
                 topic=topic,
                 message_type=message_type,
                 sequence=sequence,
                 t_ns=t_ns,
+                publish_ns=publish_ns,
                 data=body[_MESSAGE.size :],
             )
         elif code == _SCHEMA:

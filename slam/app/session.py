@@ -63,6 +63,8 @@ class SessionInfo:
         Lines of walls and boxes for pictures, shape (k, 2) each, world frame.
     simulated
         Whether radars and world are emulated.
+    time_base
+        What the frames' stamps come from: "counter" or "arrival".
     started_unix_ns
         Time of day at session time 0; None where it means nothing.
     """
@@ -77,6 +79,7 @@ class SessionInfo:
     wheels: Mapping[str, float] = field(default_factory=dict)
     outlines_m: tuple[NDArray[np.float64], ...] = ()
     simulated: bool = True
+    time_base: str = "counter"
     started_unix_ns: int | None = None
 
 
