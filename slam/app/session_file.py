@@ -100,11 +100,15 @@ class SessionFile:
 
     def add_metadata(self, name: str, table: Mapping[str, str]) -> None:
         """Write a named table."""
+        if self._disk.gave_up:
+            return
         with self._giving_up():
             self._writer.add_metadata(name, dict(table))
 
     def channel(self, topic: str, message_type: str, *, latched: bool = False) -> int:
         """Return the number of a new channel; a latched one keeps its last message for all."""
+        if self._disk.gave_up:
+            return 0
         with self._giving_up():
             if message_type not in self._schemas:
                 self._schemas[message_type] = self._writer.register_schema(
@@ -129,8 +133,11 @@ class SessionFile:
         Raises
         ------
         CannotWriteError
-            The disk takes no more. The file is closed, whole chunks stay; write no more.
+            The disk takes no more. The file is closed, whole chunks stay; what is written from
+            then on goes nowhere.
         """
+        if self._disk.gave_up:
+            return
         # The writer only concatenates, so the serialiser's memoryview needs no copy.
         data = ros.serialise(message)
         size = len(data) + _RECORD_OVERHEAD_BYTES
@@ -150,6 +157,8 @@ class SessionFile:
 
     def cut_chunk(self) -> None:
         """End the chunk here and hand it to the operating system."""
+        if self._disk.gave_up:
+            return
         with self._giving_up():
             # A private method: mcap's writer closes a chunk by size only and offers no public way
             # to close it by time. pyproject pins the minor version of mcap for this line; before

@@ -9,8 +9,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from types import TracebackType
-from typing import Self, cast
+from typing import Literal, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -145,6 +146,11 @@ class RigSource:
         open_links, self._open_links = self._open_links, ()
         for link in open_links:
             link.driver.close()
+
+    def listen(self, listener: Callable[[str, Literal["rx", "tx"], bytes, int], None]) -> None:
+        """Hand on the bytes of every port: radar, way, bytes, time of the driver's clock [ns]."""
+        for link in self._links:
+            link.driver.raw_listener = partial(listener, link.mount.name)
 
     def start(self, config: RawConfig, fps: int) -> None:
         """Configure raw RF on every radar and start all streams.

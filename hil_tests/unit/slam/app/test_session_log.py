@@ -296,6 +296,8 @@ try:
     feed(log, 300)
 except CannotWriteError as error:
     print(error)
+feed(log, 3)  # goes nowhere
+log.on_wire("radar0", "rx", b"7", 0)
 log.close()
 log.close()
 """
