@@ -56,7 +56,7 @@ class SessionInfo:
     versions
         Of what the numbers depend on.
     config_json
-        SLAM's settings, a `SlamConfig` as JSON; "" where they are not told.
+        SLAM's settings, by `session_head.settings_text`; "" where they are not told.
     wheels
         Fields of `WheelNoise`: how SLAM was told the wheels err.
     outlines_m

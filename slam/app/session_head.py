@@ -11,6 +11,7 @@ import numpy as np
 
 from slam.app.errors import AppError
 from slam.app.session import RadarInfo, SessionInfo
+from slam.config import SlamConfig
 
 METADATA_NAME = "xethru-hil session"
 """Of the table in the file."""
@@ -38,6 +39,15 @@ def session_table(info: SessionInfo) -> dict[str, str]:
         "wheels": json.dumps(dict(info.wheels)),
         "versions": json.dumps(dict(info.versions)),
     }
+
+
+def settings_text(config: SlamConfig) -> str:
+    """Return SLAM's settings for `SessionInfo.config_json`.
+
+    `SlamConfig.model_validate_json` reads them back the same; pydantic's own text has null for
+    infinity, which is not.
+    """
+    return json.dumps(config.model_dump(mode="json"))
 
 
 def radar_text(radar: RadarInfo) -> str:

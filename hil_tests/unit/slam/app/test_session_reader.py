@@ -16,12 +16,14 @@ from hil_tests.unit.slam.app.sessions import FRAME_NS, feed, scan, session_info,
 from slam.app.errors import AppError
 from slam.app.odometry import OdometryTrack
 from slam.app.session import LogLine, Scan, Snapshot
-from slam.app.session_head import METADATA_NAME, session_table
+from slam.app.session_head import METADATA_NAME, session_table, settings_text
 from slam.app.session_log import SessionLog
 from slam.app.session_reader import TruthPose, open_session, scans
 from slam.app.session_states import snapshot_of, state_row
 from slam.app.tum import TumSample, format_tum_line
+from slam.config import SlamConfig
 from slam.frames import RadarFrame
+from slam.presets import load_preset
 
 N_SCANS = 60
 LIGHT_OVER_MODULE = 299_792_458.0 / 3.0e8
@@ -236,6 +238,12 @@ def test_a_session_of_a_later_version_is_named(tmp_path: Path) -> None:
         writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
     with pytest.raises(AppError, match="format 3; this version reads up to 2, a newer"):
         open_session(path)
+
+
+@pytest.mark.parametrize("preset", ["paper", "robust"])
+def test_settings_of_every_preset_come_back_the_same(preset: str) -> None:
+    config = load_preset(preset, "lab")
+    assert SlamConfig.model_validate_json(settings_text(config)) == config
 
 
 @pytest.mark.parametrize("share", [0.3, 0.5, 0.77, 0.9])
