@@ -24,7 +24,7 @@ from slam.app.emulated_rig import (
     scene_and_config,
 )
 from slam.app.evaluate import evaluate
-from slam.app.rerun_view import count_rows
+from slam.app.rerun_recording import count_rows
 from slam.app.session import Scan
 from slam.app.sweep import run_in_process, run_one
 from slam.app.tum import read_tum
