@@ -85,7 +85,23 @@ def _parser() -> argparse.ArgumentParser:
     )
     demo.add_argument("--scene", default="lab", help="name of a scene, or a scene file")
     demo.add_argument("--preset", default="robust", help="settings of SLAM (default: %(default)s)")
+    demo.add_argument(
+        "--wire", action="store_true", help="keep the raw bytes of all ports in the session, too"
+    )
     demo.set_defaults(command=_demo)
+
+    replay = commands.add_parser(
+        "replay",
+        help="run SLAM again on a recorded session",
+        description="Steps SLAM through a session.mcap as the run did, with its settings, and "
+        "writes map, trajectories and numbers: the run's own, but for the speed. What is left of "
+        "a cut file is replayed to its last whole scan.",
+    )
+    replay.add_argument("session", type=Path, metavar="SESSION", help="a session.mcap")
+    replay.add_argument(
+        "--out", type=folder, default=Path("out/replay"), help="folder for the results"
+    )
+    replay.set_defaults(command=_replay)
 
     evaluate = commands.add_parser(
         "evaluate",
@@ -210,8 +226,15 @@ def _demo(arguments: argparse.Namespace, stop: StopFlag) -> None:
         seed=arguments.seed,
         scene=arguments.scene,
         preset=arguments.preset,
+        wire=arguments.wire,
     )
     run_demo(options, stop)
+
+
+def _replay(arguments: argparse.Namespace, stop: StopFlag) -> None:
+    from slam.app.replay import ReplayOptions, run_replay  # heavy, see module text
+
+    run_replay(ReplayOptions(session=arguments.session, out=arguments.out), stop)
 
 
 def _evaluate(arguments: argparse.Namespace, stop: StopFlag) -> None:

@@ -17,7 +17,7 @@ from slam.app.runner import RunRecord
 from slam.app.session import SessionInfo
 from slam.app.summary import Summary
 from slam.ekf_slam import Belief
-from slam.geometry import transform
+from slam.geometry import compose, transform
 
 _MARGIN_M = 0.25
 
@@ -26,11 +26,12 @@ def draw_map(
     path: Path,
     info: SessionInfo,
     record: RunRecord,
-    summary: Summary,
+    summary: Summary | None,
     outlines_m: Sequence[NDArray[np.float64]] = (),
 ) -> None:
-    """Draw the map of a simulated run into a PNG file.
+    """Draw the map of a run into a PNG file.
 
+    Without `summary` nothing true is known, and nothing true is drawn: a drive in the real world.
     `outlines_m` are lines of shape (k, 2), world frame: walls and boxes, where there are any.
     Estimate and odometry are drawn where they began, at the robot's first pose, without the
     alignment that the ATE uses: drift is seen as it is.
@@ -48,9 +49,10 @@ def draw_map(
             name = "wall or box" if number == 0 else None
             axes.plot(*line.T, color=INK, linewidth=1.6, alpha=0.45, label=name)
         axes.plot(*odometry.T, color=ODOMETRY, linewidth=0.9, alpha=0.9, label="wheel odometry")
-        axes.plot(*truth[:, :2].T, color=TRUTH, linewidth=3.2, alpha=0.55, label="true path")
+        if summary is not None:
+            axes.plot(*truth[:, :2].T, color=TRUTH, linewidth=3.2, alpha=0.55, label="true path")
         axes.plot(*estimate.T, color=ESTIMATE, linewidth=1.0, label="radar SLAM")
-        _draw_start(axes, truth[0])
+        _draw_start(axes, truth[0] if summary is not None else _first_pose(record))
         if len(info.true_landmarks_m):
             axes.plot(
                 *info.true_landmarks_m.T,
@@ -67,7 +69,10 @@ def draw_map(
         axes.set_ylabel("y [m]")
         axes.margins(0.06)
         axes.tick_params(length=0)
-        _write_title(axes, summary)
+        if summary is None:
+            _write_plain_title(axes, info, estimate)
+        else:
+            _write_title(axes, summary)
         figure.legend(loc="outside right upper", frameon=False, handlelength=1.6)
 
 
@@ -110,6 +115,31 @@ def _draw_landmarks(axes: Axes, belief: Belief, place: NDArray[np.float64]) -> N
         color=LANDMARK,
         label="estimated landmark",
         zorder=6,
+    )
+
+
+def _first_pose(record: RunRecord) -> NDArray[np.float64]:
+    pose: NDArray[np.float64] = record.results[0].belief.pose
+    return compose(record.world_from_map, pose)
+
+
+def _write_plain_title(axes: Axes, info: SessionInfo, estimate: NDArray[np.float64]) -> None:
+    length_m = float(np.linalg.norm(np.diff(estimate, axis=0), axis=1).sum())
+    axes.set_title(
+        f"{info.scene}, preset {info.preset}: {length_m:.1f} m driven, nothing true is known",
+        loc="left",
+        fontsize=11,
+        color=INK,
+        pad=24,
+    )
+    axes.annotate(
+        "map frame: the origin is the robot's first pose",
+        xy=(0.0, 1.0),
+        xytext=(0.0, 8.0),
+        xycoords="axes fraction",
+        textcoords="offset points",
+        fontsize=8.5,
+        color=PALE_INK,
     )
 
 

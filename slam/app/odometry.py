@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import socket
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterable
 
 import numpy as np
@@ -48,9 +48,31 @@ class OdometryTrack:
         return tuple(self._samples)
 
     @property
+    def last(self) -> TumSample:
+        """The newest sample."""
+        return self._samples[-1]
+
+    @property
+    def first_ns(self) -> int:
+        """Time of the oldest sample."""
+        return self._stamps_ns[0]
+
+    @property
     def last_ns(self) -> int:
         """Time of the newest sample."""
         return self._stamps_ns[-1]
+
+    def gap_ns(self, t_ns: int) -> float:
+        """Return how far apart the two samples around a time are; infinite outside of all.
+
+        At a sample's own time there is no gap.
+        """
+        after = bisect_left(self._stamps_ns, t_ns)
+        if after == len(self._stamps_ns) or (after == 0 and self._stamps_ns[0] != t_ns):
+            return math.inf
+        if self._stamps_ns[after] == t_ns:
+            return 0.0
+        return self._stamps_ns[after] - self._stamps_ns[after - 1]
 
     def append(self, sample: TumSample) -> None:
         """Take a sample later than all before it.
