@@ -314,5 +314,5 @@ def test_what_is_no_session_is_one_line(session_file: Path, tmp_path: Path) -> N
     foreign(tmp_path / "foreign.mcap")
     with pytest.raises(AppError, match="no session of"):
         open_session(tmp_path / "foreign.mcap")
-    with pytest.raises(AppError, match="cannot read: Is a directory"):
+    with pytest.raises(AppError, match="is a directory; give the session.mcap"):
         open_session(tmp_path)
