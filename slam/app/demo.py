@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -33,9 +33,11 @@ from slam.app.progress import Progress
 from slam.app.report_table import print_table
 from slam.app.runner import RunRecord, run_slam
 from slam.app.session import SessionInfo, SessionObserver
+from slam.app.session_head import settings_text
 from slam.app.session_log import SessionLog
 from slam.app.stop import StopFlag, StopRequestedError
 from slam.app.tum import Trajectory, write_tum
+from slam.app.wire_tap import WireTap
 from slam.config import SlamConfig
 from slam.robust_pipeline import make_slam
 
@@ -52,12 +54,13 @@ OUTPUTS = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DemoOptions:
-    """What the command line of `uwb-slam demo` says."""
+    """What the command line of `uwb-slam demo` says; `wire`: the ports' raw bytes are kept."""
 
     out: Path
     seed: int
     scene: str
     preset: str
+    wire: bool = False
 
 
 def run_demo(options: DemoOptions, stop: StopFlag) -> None:
@@ -100,6 +103,7 @@ def _run(options: DemoOptions, scene: Scene, config: SlamConfig, stop: StopFlag)
         odometry = read_odometry_socket(emulator.odometry_socket)
         link_log = LinkLog()
         source = stack.enter_context(open_ports(emulator.devices, rig, link_log.on_record))
+        tap = WireTap(source) if options.wire else None
         source.start(RAW_CONFIG, FRAME_RATE_HZ)
         info = SessionInfo(
             scene=scene.name,
@@ -108,17 +112,22 @@ def _run(options: DemoOptions, scene: Scene, config: SlamConfig, stop: StopFlag)
             radars=source.radars,
             true_landmarks_m=landmarks_m,
             versions=versions(),
+            config_json=settings_text(config),
+            wheels=asdict(wheels_of(scene)),
+            outlines_m=outlines_m(scene),
         )
         observers: list[SessionObserver] = [link_log]
-        log = SessionLog(options.out / "session.mcap", info, odometry)
+        log = SessionLog(options.out / "session.mcap", info, odometry, truth_at=trajectory.poses)
         stack.callback(log.close)
-        view = RerunView(options.out / "session.rrd", info, simulated=True)
+        view = RerunView(options.out / "session.rrd", info)
         stack.callback(view.close)
         stack.callback(log.close)  # first: the record must not wait for the view
         progress = Progress(info, trajectory.duration_ns, lambda: source.lost_frames)
         stack.callback(progress.close)
         observers += [log, view, progress]
         link_log.attach(log, view, progress)
+        if tap is not None:
+            tap.attach(log)
         slam = make_slam(config, rig, wheels_of(scene))
         with _saying_what_is_left(kept), source:  # closed before the logs, for its last words
             scans = source.scans(end_counter(trajectory.duration_ns), stop.check)
