@@ -25,6 +25,8 @@ class Served:
     serials: tuple[str, ...]
     odometry: str | None
     scene_time_zero_ns: int
+    control: str | None = None
+    tcp_ports: tuple[int | None, ...] = ()
 
     def end(self, number: signal.Signals = signal.SIGTERM) -> int:
         """Send a signal; return the exit code."""
@@ -57,6 +59,8 @@ def emulator(
             serials=tuple(device["serial"] for device in devices),
             odometry=ready["odometry"],
             scene_time_zero_ns=ready["scene_time_zero_ns"],
+            control=ready["control"],
+            tcp_ports=tuple(device["tcp"] for device in devices),
         )
     finally:
         process.kill()
