@@ -113,7 +113,7 @@ def test_the_rrd_holds_every_frame_and_a_blueprint(demo: Finished) -> None:
     summary = json.loads((demo.out / "summary.json").read_text())
     rows = count_rows(demo.out / "session.rrd")
     assert sum(rows[f"/radar/{name}/frame"] for name in RADARS) == summary["frames"]
-    assert rows["/link/front_left"] > 10
+    assert rows["/link/log/front_left"] > 10
     assert len(RrdReader(demo.out / "session.rrd").blueprints()) == 1
 
 

@@ -27,12 +27,13 @@ from slam.app.emulator_process import EmulatorProcess
 from slam.app.errors import AppError, EmulatorError, RadarSilentError, naming
 from slam.app.evaluation import summarise
 from slam.app.link_log import LinkLog
+from slam.app.live_view import LiveView
 from slam.app.odometry import read_odometry_socket
 from slam.app.outlines import outlines_m
 from slam.app.progress import Progress
 from slam.app.report_table import print_table
 from slam.app.runner import RunRecord, run_slam
-from slam.app.session import SessionInfo, SessionObserver
+from slam.app.session import RadarInfo, SessionInfo, SessionObserver
 from slam.app.session_head import settings_text
 from slam.app.session_log import SessionLog
 from slam.app.stop import StopFlag, StopRequestedError
@@ -54,13 +55,17 @@ OUTPUTS = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DemoOptions:
-    """What the command line of `uwb-slam demo` says; `wire`: the ports' raw bytes are kept."""
+    """What the command line of `uwb-slam demo` says.
+
+    `wire`: the ports' raw bytes are kept; `rerun`: where the run is watched live, see `LiveView`.
+    """
 
     out: Path
     seed: int
     scene: str
     preset: str
     wire: bool = False
+    rerun: str | None = None
 
 
 def run_demo(options: DemoOptions, stop: StopFlag) -> None:
@@ -85,12 +90,19 @@ def run_demo(options: DemoOptions, stop: StopFlag) -> None:
     scene, config = scene_and_config(options.scene, options.preset)
     with ExitStack() as held:
         _prepare(options.out, held)
-        _run(options, scene, config, stop)
+        live = None
+        if options.rerun is not None:
+            live = held.enter_context(LiveView(options.rerun, stop.check))
+        _run(options, scene, config, stop, live)
+        if live is not None:
+            sys.stdout.flush()
+            live.keep_serving()
 
 
-def _run(options: DemoOptions, scene: Scene, config: SlamConfig, stop: StopFlag) -> None:
+def _run(
+    options: DemoOptions, scene: Scene, config: SlamConfig, stop: StopFlag, live: LiveView | None
+) -> None:
     rig = rig_of(scene)
-    landmarks_m = true_landmarks_m(scene)
     trajectory = scene.trajectory()
     kept = f"; what was recorded is in {options.out}"
     with ExitStack() as stack:
@@ -105,27 +117,19 @@ def _run(options: DemoOptions, scene: Scene, config: SlamConfig, stop: StopFlag)
         source = stack.enter_context(open_ports(emulator.devices, rig, link_log.on_record))
         tap = WireTap(source) if options.wire else None
         source.start(RAW_CONFIG, FRAME_RATE_HZ)
-        info = SessionInfo(
-            scene=scene.name,
-            preset=options.preset,
-            seed=options.seed,
-            radars=source.radars,
-            true_landmarks_m=landmarks_m,
-            versions=versions(),
-            config_json=settings_text(config),
-            wheels=asdict(wheels_of(scene)),
-            outlines_m=outlines_m(scene),
-        )
-        observers: list[SessionObserver] = [link_log]
+        info = _session_info(options, scene, config, source.radars)
         log = SessionLog(options.out / "session.mcap", info, odometry, truth_at=trajectory.poses)
         stack.callback(log.close)
         view = RerunView(options.out / "session.rrd", info)
         stack.callback(view.close)
+        watchers = [live.observer(info)] if live is not None else []
+        for watcher in watchers:
+            stack.callback(watcher.close)
         stack.callback(log.close)  # first: the record must not wait for the view
         progress = Progress(info, trajectory.duration_ns, lambda: source.lost_frames)
         stack.callback(progress.close)
-        observers += [log, view, progress]
-        link_log.attach(log, view, progress)
+        observers: list[SessionObserver] = [link_log, log, view, progress, *watchers]
+        link_log.attach(log, view, progress, *watchers)
         if tap is not None:
             tap.attach(log)
         slam = make_slam(config, rig, wheels_of(scene))
@@ -146,7 +150,7 @@ def _run(options: DemoOptions, scene: Scene, config: SlamConfig, stop: StopFlag)
             preset=options.preset,
             seed=options.seed,
             rig=rig,
-            true_landmarks_m=landmarks_m,
+            true_landmarks_m=info.true_landmarks_m,
         )
         if summary is None:
             raise AppError(f"{options.scene}: too short for SLAM, no state was estimated{kept}")
@@ -156,7 +160,7 @@ def _run(options: DemoOptions, scene: Scene, config: SlamConfig, stop: StopFlag)
             path.write_text(summary.to_json() + "\n", encoding="ascii")
         stop.check()
         with naming(path := options.out / "map.png"):
-            draw_map(path, info, record, summary, outlines_m(scene))
+            draw_map(path, info, record, summary, info.outlines_m)
         stop.check()
     print_table(
         summary,
@@ -164,6 +168,22 @@ def _run(options: DemoOptions, scene: Scene, config: SlamConfig, stop: StopFlag)
         wall_s=record.wall_s,
         lost_frames=source.lost_frames,
         stream=sys.stdout,
+    )
+
+
+def _session_info(
+    options: DemoOptions, scene: Scene, config: SlamConfig, radars: tuple[RadarInfo, ...]
+) -> SessionInfo:
+    return SessionInfo(
+        scene=scene.name,
+        preset=options.preset,
+        seed=options.seed,
+        radars=radars,
+        true_landmarks_m=true_landmarks_m(scene),
+        versions=versions(),
+        config_json=settings_text(config),
+        wheels=asdict(wheels_of(scene)),
+        outlines_m=outlines_m(scene),
     )
 
 

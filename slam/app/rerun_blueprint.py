@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import rerun.blueprint as rrb
 
 from slam.app.rerun_recording import DEVICE_TIME, screen
+from slam.app.rerun_sdk import rrb
 from slam.app.session import SessionInfo
 
 _MAP_MARGIN_M = 0.6

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import pyarrow as pa
-import rerun as rr
 from numpy.typing import NDArray
 
 from slam.app.bscan import bscan_picture
 from slam.app.rerun_recording import Recording, Stamps
+from slam.app.rerun_sdk import rr
 from slam.app.session import RadarInfo, Scan, Snapshot
 from slam.app.view_style import FAULT_RGB, RADAR_RGB, Rgb
 from slam.detector import Detection

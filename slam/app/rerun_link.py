@@ -6,10 +6,10 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-import rerun as rr
 
 from slam.app.link_lanes import LinkChange, LinkLanes, LinkState
 from slam.app.rerun_recording import Recording, Stamps
+from slam.app.rerun_sdk import rr
 from slam.app.session import LogLine, RadarInfo, Scan
 from slam.app.view_style import FAULT_RGB, RADAR_RGB
 

@@ -6,11 +6,11 @@ from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
-import rerun as rr
 from numpy.typing import NDArray
 
 from slam.app.ellipse import ellipse_95, rotate_covariances
 from slam.app.rerun_recording import Recording, Stamps, lengths, screen
+from slam.app.rerun_sdk import rr
 from slam.app.session import RadarInfo, SessionInfo, Snapshot
 from slam.app.tum import NS_PER_S
 from slam.app.view_echoes import Beams, used_detections

@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import rerun as rr
 
 from slam.app.rerun_recording import Recording, Stamps
+from slam.app.rerun_sdk import rr
 from slam.app.session import Snapshot
 from slam.app.view_numbers import POSE_DOF, band_95, nis_dof, pose_nees, position_errors_m
 from slam.app.view_style import BAND_RGB, ESTIMATE_RGB, LANDMARK_RGB, ODOMETRY_RGB, Rgb

@@ -1,13 +1,10 @@
 """One Rerun recording being written to a file or a viewer: rows counted, never waited for long.
 
-This file and the other `rerun_*` modules are the only ones that know Rerun. Whoever needs a view
-imports them at that moment, since it costs half a second. Rerun's 2D views have y downwards and
-ours upwards: `screen` is the one place that negates it.
+Rerun's 2D views have y downwards and ours upwards: `screen` is the one place that negates it.
 """
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -16,22 +13,20 @@ from pathlib import Path
 from threading import Thread
 
 import numpy as np
-
-# Rerun tells of a full disk in lines of its own, from its own threads; `finish` says it in one.
-os.environ.setdefault("RUST_LOG", "off")
-
-import rerun as rr
-import rerun.blueprint as rrb
 from numpy.typing import NDArray
-from rerun.chunk import RrdReader
 
 from slam.app.errors import AppError
+from slam.app.rerun_sdk import RerunWarning, RrdReader, rr, rrb
 
 DEVICE_TIME, HOST_TIME, FRAME = "device_time", "host_time", "frame"
 """The timelines: session time of the radars, time of day of arrival, frame counter."""
 
-_CLOSE_LIMIT_S = 20.0
-"""Longest wait for Rerun to finish the file, or to hand the last rows to a viewer."""
+_STATIC = " (static)"
+
+_FILE_CLOSE_LIMIT_S = 20.0
+"""Longest wait for Rerun to finish the file."""
+_VIEWER_CLOSE_LIMIT_S = 5.0
+"""Longest wait for a viewer to take the last rows; one that hangs takes none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -157,7 +152,7 @@ class Recording:
     ) -> None:
         """Send what holds at all times."""
         self._open().log(entity, what, static=True)
-        self.sent[f"/{entity}"] += 1
+        self.sent[f"/{entity}{_STATIC}"] += 1
 
     def rows(
         self, entity: str, stamps: Stamps, columns: Iterable[rr.ComponentColumn] | None
@@ -179,11 +174,6 @@ class Recording:
         stream.reset_time()
         self.sent[f"/{entity}"] += 1
 
-    def push(self) -> None:
-        """Hand what was sent to a viewer now, without waiting for it."""
-        if isinstance(self._target, ViewerTarget):
-            self._open().flush(timeout_sec=0.0)
-
     def finish(self) -> None:
         """Send what is left; count the rows of a file."""
         if self._stream is None:
@@ -192,7 +182,8 @@ class Recording:
         # On a full disk Rerun's writer is gone and disconnect may wait for it without end.
         closing = Thread(target=stream.disconnect, daemon=True)
         closing.start()
-        closing.join(_CLOSE_LIMIT_S)
+        is_file = isinstance(self._target, FileTarget)
+        closing.join(_FILE_CLOSE_LIMIT_S if is_file else _VIEWER_CLOSE_LIMIT_S)
         if closing.is_alive():
             rr.unregister_shutdown()  # or it waits once more when the interpreter ends
             if isinstance(self._target, FileTarget):
@@ -228,13 +219,14 @@ def check_rows(path: Path, sent: dict[str, int]) -> None:
 
 
 def count_rows(path: Path) -> dict[str, int]:
-    """Count the rows of every entity of an .rrd file."""
+    """Count the rows of every entity of an .rrd file, static ones under a name of their own."""
     rows: dict[str, int] = defaultdict(int)
     with warnings.catch_warnings():
         # of a file without its footer; what is missing then is found by counting
-        warnings.simplefilter("ignore", rr.error_utils.RerunWarning)
+        warnings.simplefilter("ignore", RerunWarning)
         for chunk in RrdReader(path).stream():
-            rows[str(chunk.entity_path)] += chunk.num_rows
+            kind = _STATIC if chunk.is_static else ""
+            rows[f"{chunk.entity_path}{kind}"] += chunk.num_rows
     return dict(rows)
 
 

@@ -12,14 +12,13 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
-import rerun as rr
-
 from slam.app.rerun_blueprint import blueprint
 from slam.app.rerun_frames import BLOCK_FRAMES, FrameLayer
 from slam.app.rerun_link import LinkLayer
 from slam.app.rerun_map import MapLayer
 from slam.app.rerun_numbers import NumberLayer
 from slam.app.rerun_recording import FileTarget, Recording, ViewerTarget
+from slam.app.rerun_sdk import rr
 from slam.app.session import LogLine, Scan, SessionInfo, Snapshot
 from slam.app.view_echoes import beams_of
 from slam.app.view_guide import about
@@ -90,7 +89,6 @@ class RerunView:
         self._link.on_scan(scan, self._host_ns)
         if self._flush_s is not None and self._clock_s() - self._flushed_s >= self._flush_s:
             self._send()
-            self._recording.push()
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         """Take a state of SLAM: poses and scalars in blocks, the map once per second."""
