@@ -16,6 +16,8 @@ from slam.geometry import transform
 
 _LIVE_PERIOD_S = 0.2
 _PLAIN_PERIOD_S = 10.0
+_NO_RADARS = frozenset({"odometry", "run"})
+"""Who else log lines are about."""
 
 
 class Progress:
@@ -73,7 +75,8 @@ class Progress:
     def on_log(self, line: LogLine) -> None:
         """Show warnings about the link at once."""
         if line.warning:
-            self._write(f"warning: radar {line.radar}: {line.text}\n")
+            who = line.radar if line.radar in _NO_RADARS else f"radar {line.radar}"
+            self._write(f"warning: {who}: {line.text}\n")
 
     def close(self) -> None:
         """Show the last line and leave it standing."""

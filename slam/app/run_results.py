@@ -27,9 +27,7 @@ def has_truth(record: RunRecord) -> bool:
     return len(record.truth) > 0 and bool(np.isfinite(record.truth).all())
 
 
-def write_results(
-    out: Path, info: SessionInfo, record: RunRecord, rig: Rig, *, time_is_asked: bool = True
-) -> Summary | None:
+def write_results(out: Path, info: SessionInfo, record: RunRecord, rig: Rig) -> Summary | None:
     """Write trajectories, summary.json and map.png; return the numbers where truth is known.
 
     Parameters
@@ -38,9 +36,6 @@ def write_results(
         An existing folder.
     info, record, rig
         The run.
-    time_is_asked
-        Whether the time that the run took says anything about SLAM's speed; else
-        `realtime_factor` is null, as of a robot that drives in real time.
     """
     summary = None
     if has_truth(record) and info.seed is not None:
@@ -52,7 +47,7 @@ def write_results(
             rig=rig,
             true_landmarks_m=info.true_landmarks_m,
         )
-    text = summary.to_json() if summary else _summary_without_truth(info, record, time_is_asked)
+    text = summary.to_json() if summary else _summary_without_truth(info, record)
     with naming(path := out / "summary.json"):
         path.write_text(text + "\n", encoding="ascii")
     write_trajectories(out, record)
@@ -78,7 +73,7 @@ def write_trajectories(out: Path, record: RunRecord) -> None:
             write_tum(path, Trajectory(stamps_ns=stamps_ns, poses=poses.reshape(-1, 3)))
 
 
-def _summary_without_truth(info: SessionInfo, record: RunRecord, time_is_asked: bool) -> str:
+def _summary_without_truth(info: SessionInfo, record: RunRecord) -> str:
     """Return the text of summary.json with null for everything that needs the truth."""
     duration_s = record.duration_ns / NS_PER_S
     n_landmarks = len(record.results[-1].belief.landmark_ids) if record.results else 0
@@ -88,7 +83,7 @@ def _summary_without_truth(info: SessionInfo, record: RunRecord, time_is_asked: 
         "seed": info.seed,
         "frames": record.n_frames,
         "duration_s": duration_s,
-        "realtime_factor": duration_s / record.wall_s if time_is_asked else None,
+        "realtime_factor": duration_s / record.wall_s,
         "ate_rmse_m": None,
         "ate_icp_rmse_m": None,
         "odometry_ate_rmse_m": None,
