@@ -96,6 +96,12 @@ class RadarAtPlace:
         self.drivers.append(radar)
         return radar
 
+    def take_line(self) -> Transport:
+        """Return the open line itself, for who speaks without a driver; closed with the test."""
+        if self._line is None:
+            self._line = self.tap.around(self.place.open_line())
+        return self._line
+
     def end_test(self) -> None:
         """Close what the test opened."""
         while self.drivers:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -77,7 +78,7 @@ def add_options(parser: pytest.Parser) -> None:
     group.addoption(
         "--rig",
         metavar="FILE",
-        help="rig file: the modules of radar_rig, by serial number "
+        help="rig file: names the modules of radar_rig by serial number; alone, those are tested "
         f"(environment {RIG_ENVIRONMENT}, ini {RIG_INI})",
     )
     for name, text in (
@@ -118,13 +119,14 @@ def choose(config: pytest.Config) -> Choices:
     pytest.UsageError
         If it makes no sense; one line with the remedy.
     """
-    texts = (
-        config.getoption("radar")
-        or _words(os.environ.get(ENVIRONMENT, ""))
-        or config.getini(INI)
-        or ["emu"]
-    )
+    rig = config.getoption("rig") or os.environ.get(RIG_ENVIRONMENT) or config.getini(RIG_INI)
     try:
+        texts = (
+            config.getoption("radar")
+            or _words(os.environ.get(ENVIRONMENT, ""))
+            or config.getini(INI)
+            or (_modules_of(Path(rig)) if rig else ["emu"])
+        )
         specs = parse_specs(texts)
         if not hasattr(config, "workerinput"):
             specs = _found(specs)
@@ -132,7 +134,6 @@ def choose(config: pytest.Config) -> Choices:
         _check_workers(config, specs)
     except SpecError as error:
         raise pytest.UsageError(str(error)) from None
-    rig = config.getoption("rig") or os.environ.get(RIG_ENVIRONMENT) or config.getini(RIG_INI)
     cassette, report = config.getoption("hil_cassette"), config.getoption("hil_json")
     if cassette and not config.getoption("hil_diff"):
         raise pytest.UsageError("--hil-cassette needs --hil-diff")
@@ -149,6 +150,17 @@ def choose(config: pytest.Config) -> Choices:
         artifacts=Path(config.invocation_params.dir, config.getoption("hil_artifacts")),
         json=Path(config.invocation_params.dir, report) if report else None,
     )
+
+
+def _modules_of(rig: Path) -> list[str]:
+    """Return specs of the modules of a rig file; what else is wrong with it, `radar_rig` tells."""
+    try:
+        radars = tomllib.loads(rig.read_text("utf-8"))["radars"]
+        return [f"serial={radar['serial']}" for radar in radars]
+    except OSError as error:
+        raise SpecError(f"--rig {rig}: {error.strerror}") from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise SpecError(f"--rig {rig}: no rig file with serial numbers: {error!r}") from None
 
 
 def _words(text: str) -> list[str]:

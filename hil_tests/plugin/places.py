@@ -294,9 +294,16 @@ def place_of(spec: RadarSpec) -> Place:
 
 
 def ports_that_answer() -> tuple[tuple[str, str], ...]:
-    """Return path and serial number of every port where a module answers."""
+    """Return path and serial number of every port where a module answers.
+
+    A port that some program has open is left alone: opening it would take bytes from that program.
+    """
+    from xethru_protocol.cli.port_users import port_users
+
     found = []
     for port in find_ports():
+        if port_users(port.path):
+            continue
         with contextlib.suppress(PortUnavailable), X4M300.open(port.path) as radar:
             serial = _serial_number(radar)
             if serial is not None:
@@ -305,6 +312,9 @@ def ports_that_answer() -> tuple[tuple[str, str], ...]:
 
 
 def _port_of(serial: str) -> str:
+    for port in find_ports():
+        if port.kind == "emulated" and port.serial == serial:
+            return port.path  # its emulator says so: nobody needs to be asked
     found = ports_that_answer()
     for path, number in found:
         if number == serial:
