@@ -9,6 +9,7 @@ import matplotlib.colors
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from slam.app.ellipse import ellipse_95, rotate_covariances
@@ -29,7 +30,19 @@ def draw_map(
     summary: Summary | None,
     outlines_m: Sequence[NDArray[np.float64]] = (),
 ) -> None:
-    """Draw the map of a run into a PNG file.
+    """Draw the map of a run into a PNG file; see `map_figure`."""
+    with picture(path, width_in=9.0, height_in=6.6, dpi=150) as figure:
+        map_figure(figure, info, record, summary, outlines_m)
+
+
+def map_figure(
+    figure: Figure,
+    info: SessionInfo,
+    record: RunRecord,
+    summary: Summary | None,
+    outlines_m: Sequence[NDArray[np.float64]] = (),
+) -> None:
+    """Draw the map of a run.
 
     Without `summary` nothing true is known, and nothing true is drawn: a drive in the real world.
     `outlines_m` are lines of shape (k, 2), world frame: walls and boxes, where there are any.
@@ -40,40 +53,39 @@ def draw_map(
     truth = record.truth
     estimate = transform(place, np.array([row.belief.pose[:2] for row in record.results]))
     odometry = transform(place, np.array([row.odometry_pose[:2] for row in record.results]))
-    with picture(path, width_in=9.0, height_in=6.6, dpi=150) as figure:
-        axes = figure.add_subplot()
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.grid(color=GRID, linewidth=0.8)
-        axes.set_axisbelow(True)
-        for number, line in enumerate(outlines_m):
-            name = "wall or box" if number == 0 else None
-            axes.plot(*line.T, color=INK, linewidth=1.6, alpha=0.45, label=name)
-        axes.plot(*odometry.T, color=ODOMETRY, linewidth=0.9, alpha=0.9, label="wheel odometry")
-        if summary is not None:
-            axes.plot(*truth[:, :2].T, color=TRUTH, linewidth=3.2, alpha=0.55, label="true path")
-        axes.plot(*estimate.T, color=ESTIMATE, linewidth=1.0, label="radar SLAM")
-        _draw_start(axes, truth[0] if summary is not None else _first_pose(record))
-        if len(info.true_landmarks_m):
-            axes.plot(
-                *info.true_landmarks_m.T,
-                linestyle="none",
-                marker="+",
-                markersize=11,
-                markeredgewidth=1.4,
-                color="#30343b",
-                label="true landmark",
-                zorder=4,
-            )
-        _draw_landmarks(axes, record.results[-1].belief, place)
-        axes.set_xlabel("x [m]")
-        axes.set_ylabel("y [m]")
-        axes.margins(0.06)
-        axes.tick_params(length=0)
-        if summary is None:
-            _write_plain_title(axes, info, estimate)
-        else:
-            _write_title(axes, summary)
-        figure.legend(loc="outside right upper", frameon=False, handlelength=1.6)
+    axes = figure.add_subplot()
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(color=GRID, linewidth=0.8)
+    axes.set_axisbelow(True)
+    for number, line in enumerate(outlines_m):
+        name = "wall or box" if number == 0 else None
+        axes.plot(*line.T, color=INK, linewidth=1.6, alpha=0.45, label=name)
+    axes.plot(*odometry.T, color=ODOMETRY, linewidth=0.9, alpha=0.9, label="wheel odometry")
+    if summary is not None:
+        axes.plot(*truth[:, :2].T, color=TRUTH, linewidth=3.2, alpha=0.55, label="true path")
+    axes.plot(*estimate.T, color=ESTIMATE, linewidth=1.0, label="radar SLAM")
+    _draw_start(axes, truth[0] if summary is not None else _first_pose(record))
+    if len(info.true_landmarks_m):
+        axes.plot(
+            *info.true_landmarks_m.T,
+            linestyle="none",
+            marker="+",
+            markersize=11,
+            markeredgewidth=1.4,
+            color="#30343b",
+            label="true landmark",
+            zorder=4,
+        )
+    _draw_landmarks(axes, record.results[-1].belief, place)
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
+    axes.margins(0.06)
+    axes.tick_params(length=0)
+    if summary is None:
+        _write_plain_title(axes, info, estimate)
+    else:
+        _write_title(axes, summary)
+    figure.legend(loc="outside right upper", frameon=False, handlelength=1.6)
 
 
 def _draw_start(axes: Axes, pose: NDArray[np.float64]) -> None:

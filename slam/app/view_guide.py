@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 from slam.app.session import SessionInfo
 
 _ABOUT = """\
@@ -37,11 +39,12 @@ _POINTS = (
 
 def about(info: SessionInfo, block: int) -> str:
     """Return the guide for a run; `block` is the number of frames in a B-scan."""
+    settings = json.loads(info.config_json or "{}")
     known = bool(len(info.true_landmarks_m)) or info.simulated
     return _ABOUT.format(
         n_radars=len(info.radars),
         block=block,
         data="**All data here are simulated.**" if info.simulated else "All data are measured.",
         truth=_TRUTH if known else "",
-        points="" if '"back_end":"robust"' in info.config_json else _POINTS,
+        points="" if settings.get("back_end") == "robust" else _POINTS,
     )
