@@ -10,6 +10,7 @@ The smallest delay itself cannot be told from the module's own time; it stays in
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 from itertools import pairwise
@@ -23,6 +24,7 @@ DRIFT_SIGMA = 30e-6
 """Crystals are off by tens of millionths; this is known of one before its first frame."""
 KNOWN_DRIFT_SIGMA = 5e-6
 """How much a drift that was known may change across a restart of the counter."""
+_HALVINGS = 40
 LEAST_DELAY_NS = 20_000.0
 """Mean delay below which a host does not keep time itself; keeps the sums finite."""
 _KNOWN_AFTER_NS = 30 * NS_PER_S
@@ -89,8 +91,10 @@ class LowerEnvelope:
         # Of each second: (second, nominal, arrival - nominal), relative to the first reading.
         self._soonest: deque[tuple[int, int, int]] = deque(maxlen=window_s)
         self._first: tuple[int, int] | None = None
+        self._judged = _Likelihood(
+            hull=((0, 0),), mean_x=0.0, mean_y=0.0, weight=0.0, prior=drift, variance=drift_sigma**2
+        )
         self.line = ClockLine(origin_ns=0)
-        self.slope_sigma = drift_sigma
 
     @property
     def baseline_ns(self) -> int:
@@ -124,26 +128,70 @@ class LowerEnvelope:
         n = len(points)
         mean_x, mean_y = (sum(values) / n for values in zip(*points, strict=True))
         edges = [(y_1 - y_0) / (x_1 - x_0) for (x_0, y_0), (x_1, y_1) in pairwise(hull)]
-        steepest = next((e for e, (x, _) in zip(edges, hull[1:], strict=True) if mean_x <= x), 0.0)
-        delay_ns = mean_y - steepest * mean_x - min(y - steepest * x for x, y in hull)
-        weight = n / max(delay_ns, LEAST_DELAY_NS)
-        variance = self._drift_sigma**2
-        slope = self._drift
-        # The likelihood's slope is constant while one corner carries the line, and grows from
-        # corner to corner; the root of it with the prior's is in such a range or at its end.
-        for index, (x, _) in enumerate(hull):
-            slope = self._drift - variance * weight * (x - mean_x)
-            if index > 0:
-                slope = max(slope, edges[index - 1])
-            if index == len(edges) or slope <= edges[index]:
-                break
-        arm_ns = min(abs(x - mean_x) for x, _ in hull)
-        self.slope_sigma = 1.0 / max(weight * arm_ns, 1.0 / self._drift_sigma)
+        best = next((e for e, (x, _) in zip(edges, hull[1:], strict=True) if mean_x <= x), 0.0)
+        delay_ns = mean_y - best * mean_x - min(y - best * x for x, y in hull)
+        judged = self._judged = _Likelihood(
+            hull=tuple(hull),
+            mean_x=mean_x,
+            mean_y=mean_y,
+            weight=n / max(delay_ns, LEAST_DELAY_NS),
+            prior=self._drift,
+            variance=self._drift_sigma**2,
+        )
+        slope = judged.most_likely(edges)
         base_ns = min(y - slope * x for x, y in hull)
         first_nominal_ns, first_offset_ns = self._first
         self.line = ClockLine(
             origin_ns=first_offset_ns + round(base_ns - slope * first_nominal_ns), slope=slope
         )
+
+    @property
+    def slope_sigma(self) -> float:
+        """How far off the slope may be: where it is e times less likely, the farther side."""
+        return self._judged.half_width(self.line.slope)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Likelihood:
+    """How well a slope fits: minus its logarithm, from the delays' mean and the prior."""
+
+    hull: tuple[tuple[int, int], ...]
+    mean_x: float
+    mean_y: float
+    weight: float
+    prior: float
+    variance: float
+
+    def cost(self, slope: float) -> float:
+        delay_ns = self.mean_y - slope * self.mean_x - min(y - slope * x for x, y in self.hull)
+        return self.weight * delay_ns + (slope - self.prior) ** 2 / (2.0 * self.variance)
+
+    def most_likely(self, edges: list[float]) -> float:
+        """Return the slope of least cost; `edges` are those of the hull.
+
+        The first term's derivative is constant while one corner carries the line, and grows from
+        corner to corner; the root of it with the prior's lies in such a range or at its end.
+        """
+        for index, (x, _) in enumerate(self.hull):
+            slope = self.prior - self.variance * self.weight * (x - self.mean_x)
+            if index > 0:
+                slope = max(slope, edges[index - 1])
+            if index == len(edges) or slope <= edges[index]:
+                return slope
+        raise AssertionError  # the last corner has no edge after it
+
+    def half_width(self, slope: float) -> float:
+        limit = self.cost(slope) + 1.0
+        widths = []
+        for side in (-1.0, 1.0):
+            near, far = 0.0, 2.0 * math.sqrt(self.variance)  # there the prior alone costs enough
+            for _ in range(_HALVINGS):
+                middle = (near + far) / 2.0
+                near, far = (
+                    (near, middle) if self.cost(slope + side * middle) > limit else (middle, far)
+                )
+            widths.append(far)
+        return max(widths)
 
 
 def _lower_hull(points: list[tuple[int, int]]) -> list[tuple[int, int]]:

@@ -15,6 +15,7 @@ import numpy as np
 from slam.app.emulated_rig import RAW_CONFIG, versions
 from slam.app.errors import AppError, UsageError
 from slam.app.link_log import LinkLog
+from slam.app.live_view import LiveView
 from slam.app.odometry_live import FixedClock, LiveOdometry
 from slam.app.odometry_source import LineSource, parse_source
 from slam.app.progress import Progress
@@ -53,7 +54,8 @@ class RunOptions:
     fps: int
     clock: str
     duration_s: float | None
-    wire: bool
+    wire: bool = False
+    rerun: str | None = None
 
 
 def run_rig(options: RunOptions, stop: StopFlag) -> None:
@@ -78,6 +80,9 @@ def run_rig(options: RunOptions, stop: StopFlag) -> None:
     inbox: Inbox = SimpleQueue()
     with ExitStack() as held:
         prepare_folder(options.out, OUTPUTS, held)
+        live = None
+        if options.rerun is not None:
+            live = held.enter_context(LiveView(options.rerun, stop.check))
         links = open_rig(
             rig_file,
             options.rig,
@@ -122,17 +127,19 @@ def run_rig(options: RunOptions, stop: StopFlag) -> None:
             progress = Progress(
                 info, None, lambda: source.lost_frames, also=lambda: _lag_text(source)
             )
+            watchers = [live.observer(info)] if live is not None else []
+            observers: list[SessionObserver] = [listener.link_log, listener, progress, *watchers]
+            listener.attach(log, progress, *watchers)
             with ExitStack() as shown:
+                for watcher in watchers:
+                    shown.callback(watcher.close)
                 shown.callback(progress.close)
-                record = run_slam(
-                    source.scans(),
-                    odometry,
-                    slam,
-                    nobody_knows,
-                    [listener.link_log, listener.attach(log, progress), progress],
-                )
+                record = run_slam(source.scans(), odometry, slam, nobody_knows, observers)
         log.close()
         _finish(options, info, record, rig_file.rig, source, listener)
+        if live is not None:
+            sys.stdout.flush()
+            live.keep_serving()
 
 
 def parse_clock(text: str, source: LineSource) -> FixedClock | None:
@@ -182,13 +189,12 @@ class _Listener:
         self._log: SessionLog | None = None
         self._early: list[TumSample] = []
 
-    def attach(self, log: SessionLog, progress: Progress) -> SessionObserver:
-        """Begin to write; return what is to be told of scans and states."""
+    def attach(self, log: SessionLog, *others: SessionObserver) -> None:
+        """Begin to write; let the others hear what is said, too."""
         self._log = log
         for sample in self._early:
             self.on_odometry(sample)
-        self.link_log.attach(self, progress)
-        return self
+        self.link_log.attach(self, *others)
 
     def on_odometry(self, sample: TumSample) -> None:
         if self._log is None:
