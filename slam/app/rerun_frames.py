@@ -10,7 +10,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from slam.app.bscan import bscan_picture
-from slam.app.rerun_recording import Recording, Stamps
+from slam.app.rerun_recording import Recording, Stamps, arrow_column
 from slam.app.rerun_sdk import rr
 from slam.app.session import RadarInfo, Scan, Snapshot
 from slam.app.view_style import FAULT_RGB, RADAR_RGB, Rgb
@@ -129,19 +129,6 @@ class _FrameBlock:
         self.samples: list[NDArray[np.float32]] = []
 
 
-class _ArrowBatch:
-    """A ready arrow array in the shape that rr.ComponentColumn takes."""
-
-    def __init__(self, descriptor: rr.ComponentDescriptor, array: pa.Array) -> None:
-        self._descriptor, self._array = descriptor, array
-
-    def component_descriptor(self) -> rr.ComponentDescriptor:
-        return self._descriptor
-
-    def as_arrow_array(self) -> pa.Array:
-        return self._array
-
-
 def _chart_style(
     *,
     color: Rgb | None = None,
@@ -213,5 +200,4 @@ def _tensors(
         ],
         fields=[tensor.field(name) for name in ("shape", "names", "buffer")],
     )
-    descriptor = template.component_descriptor()
-    return rr.ComponentColumn(descriptor, _ArrowBatch(descriptor, column))
+    return arrow_column(template.component_descriptor(), column)

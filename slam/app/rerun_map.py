@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.app.ellipse import ellipse_95, rotate_covariances
-from slam.app.rerun_recording import Recording, Stamps, lengths, screen
+from slam.app.rerun_recording import Recording, Stamps, lengths, screen, strips_column
 from slam.app.rerun_sdk import rr
 from slam.app.session import RadarInfo, SessionInfo, Snapshot
 from slam.app.tum import NS_PER_S
@@ -108,9 +108,9 @@ class MapLayer:
                 row.world_from_map[2], row.pose_covariance[None, :2, :2]
             )
         ]
-        self._recording.rows(
-            "map/estimate/ellipse", stamps, rr.LineStrips2D.columns(strips=screen(np.array(spread)))
-        )
+        ellipses = strips_column(screen(np.array(spread)))
+        one_each = np.ones(len(rows), dtype=np.int64)
+        self._recording.rows("map/estimate/ellipse", stamps, [ellipses.partition(one_each)])
         told = [k for k, row in enumerate(rows) if row.step is not None]
         if told:
             self._send_echoes([rows[k] for k in told], stamps.at(told), world[told])
@@ -194,10 +194,9 @@ class MapLayer:
     def _send_arcs(
         self, entity: str, stamps: Stamps, radar: RadarInfo, ranges_m: Sequence[Sequence[float]]
     ) -> None:
-        arcs = [self._beams.arc(radar, range_m) for row in ranges_m for range_m in row]
-        strips = screen(np.array(arcs).reshape(-1, self._beams.n_points, 2))
-        columns = rr.LineStrips2D.columns(strips=list(strips))
-        self._recording.rows(entity, stamps, columns.partition(lengths(ranges_m)))
+        every_m = np.array([range_m for row in ranges_m for range_m in row], dtype=np.float64)
+        arcs = strips_column(screen(self._beams.arcs(radar, every_m)))
+        self._recording.rows(entity, stamps, [arcs.partition(lengths(ranges_m))])
 
     def _send_landmarks(self, snapshot: Snapshot, host_ns: int | None) -> None:
         stamps = Stamps.none()

@@ -13,6 +13,7 @@ from pathlib import Path
 from threading import Thread
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from slam.app.errors import AppError
@@ -234,6 +235,38 @@ def screen(points: NDArray[np.float64]) -> NDArray[np.float32]:
     """Turn points or vectors, shape (..., 2), y up, into Rerun's 2D views, y down."""
     flipped: NDArray[np.float32] = (points * np.array([1.0, -1.0])).astype(np.float32)
     return flipped
+
+
+class _ArrowBatch:
+    """A ready arrow array in the shape that rr.ComponentColumn takes."""
+
+    def __init__(self, descriptor: rr.ComponentDescriptor, array: pa.Array) -> None:
+        self._descriptor, self._array = descriptor, array
+
+    def component_descriptor(self) -> rr.ComponentDescriptor:
+        return self._descriptor
+
+    def as_arrow_array(self) -> pa.Array:
+        return self._array
+
+
+def arrow_column(descriptor: rr.ComponentDescriptor, array: pa.Array) -> rr.ComponentColumn:
+    """Return a column of a ready arrow array, one element per row."""
+    return rr.ComponentColumn(descriptor, _ArrowBatch(descriptor, array))
+
+
+def strips_column(strips: NDArray[np.float32]) -> rr.ComponentColumn:
+    """Return lines of equally many points, shape (n, n_points, 2), as a column of one line a row.
+
+    Rerun's own conversion looks at every point in Python, which would be most of a view's cost.
+    """
+    (template,) = rr.LineStrips2D(np.zeros((1, 2, 2), dtype=np.float32)).as_component_batches()
+    kind = template.as_arrow_array().type
+    n_points = strips.shape[1]
+    ends = np.arange(0, (len(strips) + 1) * n_points, n_points, dtype=np.int32)
+    points = pa.FixedSizeListArray.from_arrays(pa.array(strips.ravel()), type=kind.value_type)
+    lines = pa.ListArray.from_arrays(pa.array(ends), points, type=kind)
+    return arrow_column(template.component_descriptor(), lines)
 
 
 def lengths(rows: Sequence[Sequence[object]]) -> NDArray[np.int64]:

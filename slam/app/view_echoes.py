@@ -34,17 +34,18 @@ class Beams:
     reach_m: float
     n_points: int = 17
 
-    def arc(self, radar: RadarInfo, range_m: float) -> NDArray[np.float64]:
-        """Return where an echo of this range may come from, shape (n_points, 2), body frame."""
+    def arcs(self, radar: RadarInfo, ranges_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where echoes of these ranges (n,) may come from: (n, n_points, 2), body frame."""
         half = self.field_of_view_rad / 2
         angles_rad = radar.yaw_rad + np.linspace(-half, half, self.n_points)
         ray = np.stack([np.cos(angles_rad), np.sin(angles_rad)], axis=-1)
-        return np.array([radar.x_m, radar.y_m]) + range_m * ray
+        return np.array([radar.x_m, radar.y_m]) + ranges_m[:, None, None] * ray
 
     def wedge(self, radar: RadarInfo) -> NDArray[np.float64]:
         """Return the closed outline of the beam, shape (n_points + 2, 2), body frame."""
         antenna = np.array([[radar.x_m, radar.y_m]])
-        return np.concatenate([antenna, self.arc(radar, self.reach_m), antenna])
+        (rim,) = self.arcs(radar, np.array([self.reach_m]))
+        return np.concatenate([antenna, rim, antenna])
 
 
 def beams_of(config_json: str) -> Beams:
