@@ -120,7 +120,8 @@ class SessionLog:
                 publish_ns=host_ns,
             )
         truth = np.zeros(0) if self._truth_at is None else self._truth_at(np.array([scan.t_ns]))[0]
-        mark = ros.double_array("true_x_y_heading", truth)
+        known = truth if np.all(np.isfinite(truth)) else np.zeros(0)
+        mark = ros.double_array("true_x_y_heading", known)
         topic = self._scans if scan.used else self._unused_scans
         self._file.write(topic, scan.t_ns, mark, sequence=scan.counter)
 
