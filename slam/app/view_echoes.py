@@ -39,7 +39,9 @@ class Beams:
         half = self.field_of_view_rad / 2
         angles_rad = radar.yaw_rad + np.linspace(-half, half, self.n_points)
         ray = np.stack([np.cos(angles_rad), np.sin(angles_rad)], axis=-1)
-        return np.array([radar.x_m, radar.y_m]) + ranges_m[:, None, None] * ray
+        antenna = np.array([radar.x_m, radar.y_m])
+        arcs: NDArray[np.float64] = antenna + ranges_m[:, None, None] * ray
+        return arcs
 
     def wedge(self, radar: RadarInfo) -> NDArray[np.float64]:
         """Return the closed outline of the beam, shape (n_points + 2, 2), body frame."""
