@@ -14,9 +14,11 @@ from pathlib import Path
 from slam.app.arguments import count, folder, seed
 from slam.app.errors import EXIT_FAILED, AppError, naming
 from slam.app.experiments import EXPERIMENTS, Experiment, ExperimentModule
+from slam.app.run_arguments import add_run
 from slam.app.standard_streams import drop_what_cannot_be_said, open_closed_streams
 from slam.app.stop import StopFlag, StopRequestedError
 from slam.app.stress import STRESSES
+from slam.app.view_arguments import add_report, add_rerun, add_view
 
 _TYPICAL_SEED = 19
 """Of seeds 0-19 in the lab, the one whose errors lie nearest the medians; see DECISIONS."""
@@ -88,7 +90,35 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument(
         "--wire", action="store_true", help="keep the raw bytes of all ports in the session, too"
     )
+    add_rerun(demo)
     demo.set_defaults(command=_demo)
+
+    view = commands.add_parser(
+        "view",
+        help="show a session in Rerun: window, browser, file or picture",
+        description="Replays a session into a Rerun view. Without an option a window opens.",
+    )
+    add_view(view)
+    view.set_defaults(command=_view)
+
+    report = commands.add_parser(
+        "report",
+        help="write a session's report as one HTML page",
+        description="Replays a session and writes map, trajectory, errors, consistency, link "
+        "statistics and parameters into one page that any browser opens without a network.",
+    )
+    add_report(report)
+    report.set_defaults(command=_report)
+
+    add_run(
+        commands.add_parser(
+            "run",
+            help="map with real modules, or a running emulator, in real time",
+            description="Opens the modules that a rig file names by their serial numbers, follows "
+            "the robot's odometry, and runs SLAM while frames arrive. Ends with the odometry, "
+            "after --duration, or by Ctrl-C; writes session, map, trajectories and numbers.",
+        )
+    ).set_defaults(command=_run_rig)
 
     replay = commands.add_parser(
         "replay",
@@ -113,6 +143,27 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("reference", type=Path, metavar="REF", help="TUM file to judge by")
     evaluate.add_argument("--json", action="store_true", help="print one JSON object")
     evaluate.set_defaults(command=_evaluate)
+
+    repair = commands.add_parser(
+        "repair",
+        help="make a recording whole that was cut or damaged",
+        description="Writes everything that is whole of a session, or of any MCAP file, anew with "
+        "an index, so that every program opens it again. The file as it was is kept as "
+        "SESSION.unrepaired.",
+    )
+    repair.add_argument("session", type=Path, metavar="SESSION", help="an MCAP file")
+    repair.add_argument("--out", type=Path, metavar="FILE", help="write there, touch nothing else")
+    repair.set_defaults(command=_repair)
+
+    _add_convert(
+        commands.add_parser(
+            "convert",
+            help="sessions from and to rosbags, in the layout of the paper's data set",
+            description="IN is a session, then OUT is a bag of ROS 1 if its name ends in .bag, or "
+            "a new folder with a bag of ROS 2; or IN is such a bag, then OUT is a session, which "
+            "replay, view and report take.",
+        )
+    )
 
     calibrate = commands.add_parser(
         "calibrate",
@@ -158,6 +209,28 @@ def _parser() -> argparse.ArgumentParser:
             "--out", type=folder, default=Path("out/experiments"), help="folder for the results"
         )
     return parser
+
+
+def _add_convert(convert: argparse.ArgumentParser) -> None:
+    convert.add_argument("source", type=Path, metavar="IN", help="session.mcap, *.bag or a folder")
+    convert.add_argument("out", type=Path, metavar="OUT", help="must not exist")
+    convert.add_argument(
+        "--rig", type=Path, help="where the radars of a bag sit, named UWBradar1 and so on"
+    )
+    convert.add_argument(
+        "--frame-area",
+        type=float,
+        nargs=2,
+        metavar=("START", "END"),
+        help="what the modules of a bag were asked for, module metres (default: 0.2 9.4)",
+    )
+    convert.add_argument(
+        "--truth", default="/slam_out_pose", metavar="TOPIC", help="default: %(default)s"
+    )
+    convert.add_argument(
+        "--preset", default="robust", help="settings of SLAM for a bag (default: %(default)s)"
+    )
+    convert.set_defaults(command=_convert)
 
 
 def _setting(text: str) -> tuple[str, tuple[str, ...]]:
@@ -227,8 +300,27 @@ def _demo(arguments: argparse.Namespace, stop: StopFlag) -> None:
         scene=arguments.scene,
         preset=arguments.preset,
         wire=arguments.wire,
+        rerun=arguments.rerun,
     )
     run_demo(options, stop)
+
+
+def _run_rig(arguments: argparse.Namespace, stop: StopFlag) -> None:
+    from slam.app.run import RunOptions, run_rig  # heavy, see module text
+
+    options = RunOptions(
+        rig=arguments.rig,
+        odometry=arguments.odometry,
+        ports=tuple(arguments.ports) if arguments.ports else None,
+        out=arguments.out,
+        preset=arguments.preset,
+        fps=arguments.fps,
+        clock=arguments.odometry_clock,
+        duration_s=arguments.duration,
+        wire=arguments.wire,
+        rerun=arguments.rerun,
+    )
+    run_rig(options, stop)
 
 
 def _replay(arguments: argparse.Namespace, stop: StopFlag) -> None:
@@ -237,10 +329,49 @@ def _replay(arguments: argparse.Namespace, stop: StopFlag) -> None:
     run_replay(ReplayOptions(session=arguments.session, out=arguments.out), stop)
 
 
+def _view(arguments: argparse.Namespace, stop: StopFlag) -> None:
+    from slam.app.view import ViewOptions, run_view  # heavy, see module text
+
+    options = ViewOptions(
+        session=arguments.session,
+        web=arguments.web,
+        out=arguments.out,
+        screenshot=arguments.screenshot,
+        at_s=arguments.at,
+    )
+    run_view(options, stop)
+
+
+def _report(arguments: argparse.Namespace, stop: StopFlag) -> None:
+    from slam.app.report import ReportOptions, run_report  # heavy, see module text
+
+    run_report(ReportOptions(session=arguments.session, out=arguments.out), stop)
+
+
 def _evaluate(arguments: argparse.Namespace, stop: StopFlag) -> None:
     from slam.app.evaluate import run_evaluate  # heavy, see module text
 
     run_evaluate(arguments.estimate, arguments.reference, as_json=arguments.json)
+
+
+def _repair(arguments: argparse.Namespace, stop: StopFlag) -> None:
+    from slam.app.repair import repair  # heavy, see module text
+
+    print(repair(arguments.session, arguments.out, stop.check))  # noqa: T201 - the result
+
+
+def _convert(arguments: argparse.Namespace, stop: StopFlag) -> None:
+    from slam.app.convert import ConvertOptions, run_convert  # heavy, see module text
+
+    options = ConvertOptions(
+        source=arguments.source,
+        out=arguments.out,
+        rig=arguments.rig,
+        area_m=tuple(arguments.frame_area) if arguments.frame_area else None,
+        truth_topic=arguments.truth,
+        preset=arguments.preset,
+    )
+    run_convert(options, stop.check)
 
 
 def _calibrate(arguments: argparse.Namespace, stop: StopFlag) -> None:
