@@ -35,7 +35,7 @@ def summarise(
     *,
     scene: str,
     preset: str,
-    seed: int,
+    seed: int | None,
     rig: Rig,
     true_landmarks_m: NDArray[np.float64],
 ) -> Summary | None:

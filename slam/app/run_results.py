@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +39,7 @@ def write_results(out: Path, info: SessionInfo, record: RunRecord, rig: Rig) -> 
         The run.
     """
     summary = None
-    if has_truth(record) and info.seed is not None:
+    if has_truth(record):
         summary = summarise(
             record,
             scene=info.scene,
@@ -47,6 +48,9 @@ def write_results(out: Path, info: SessionInfo, record: RunRecord, rig: Rig) -> 
             rig=rig,
             true_landmarks_m=info.true_landmarks_m,
         )
+        if summary is not None and not info.simulated and not len(info.true_landmarks_m):
+            unknown = replace(summary.landmarks, true=None, precision=None, recall=None)
+            summary = replace(summary, landmarks=unknown)
     text = summary.to_json() if summary else _summary_without_truth(info, record)
     with naming(path := out / "summary.json"):
         path.write_text(text + "\n", encoding="ascii")

@@ -11,14 +11,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
-from rosbags.rosbag1 import Writer as Rosbag1Writer
-from rosbags.rosbag2 import Writer as Rosbag2Writer
-from rosbags.typesys import Stores, get_typestore
 
+from hil_tests.unit.slam.app.authors_bag import AuthorsBag
 from hil_tests.unit.slam.app.sessions import FRAME_NS, feed, scan, session_info, snapshot
 from slam.app.cli import main
 from slam.app.odometry import OdometryTrack
-from slam.app.ros_messages import Message
 from slam.app.session import Scan
 from slam.app.session_log import SessionLog
 from slam.app.session_reader import RecordedSession, open_session
@@ -125,64 +122,19 @@ def authors_bag(
     jump_back: bool = False,
     truth: bool = True,
 ) -> Path:
-    """Write a bag as the authors' recorder would have, by nothing but the rosbags library."""
-    is_ros1 = path.suffix == ".bag"
-    store: Any = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
-    types = store.types
-    rows: list[tuple[int, str, Any]] = []
+    """Write a bag of noise and a straight drive as the authors' recorder would have."""
+    bag = AuthorsBag(path, topics)
     for number in range(N_SCANS):
         for radar in range(4):
-            array = types["std_msgs/msg/Float32MultiArray"](
-                layout=types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0),
-                data=samples(radar, number, n_bins),
-            )
-            rows.append((jittered_ns(radar, number), topics.format(radar + 1), array))
-
-    def header(t_ns: int, frame: str) -> Message:
-        seconds, rest = divmod(t_ns, 10**9)
-        stamp = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=rest)
-        extra = {"seq": 0} if is_ros1 else {}
-        return types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame, **extra)
-
-    def pose(x_m: float) -> Message:
-        return types["geometry_msgs/msg/Pose"](
-            position=types["geometry_msgs/msg/Point"](x=x_m, y=-0.5, z=0.0),
-            orientation=types["geometry_msgs/msg/Quaternion"](
-                x=0.0, y=0.0, z=math.sin(0.1), w=math.cos(0.1)
-            ),
-        )
-
-    zero = types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
-    for k in range(30 * N_SCANS // 5):
+            bag.add_frame(jittered_ns(radar, number), radar + 1, samples(radar, number, n_bins))
+    for k in range(6 * N_SCANS):
         t_ns = START_NS - 300_000_000 + k * STEP_NS // 5
         stamp_ns = t_ns - 300_000_000 if jump_back and k == 20 else t_ns
-        message = types["nav_msgs/msg/Odometry"](
-            header=header(stamp_ns, "odom"),
-            child_frame_id="base_link",
-            pose=types["geometry_msgs/msg/PoseWithCovariance"](
-                pose=pose(0.01 * k), covariance=np.zeros(36)
-            ),
-            twist=types["geometry_msgs/msg/TwistWithCovariance"](
-                twist=types["geometry_msgs/msg/Twist"](linear=zero, angular=zero),
-                covariance=np.zeros(36),
-            ),
-        )
         if odometry:
-            rows.append((t_ns + 3_000_000, "/odom", message))
-        stamped = types["geometry_msgs/msg/PoseStamped"](
-            header=header(t_ns, "map"), pose=pose(0.01 * k + 2.0)
-        )
+            bag.add_odometry(t_ns + 3_000_000, stamp_ns, (0.01 * k, -0.5, 0.2))
         if truth:
-            rows.append((t_ns + 9_000_000, "/slam_out_pose", stamped))
-    writer: Any = Rosbag1Writer(path) if is_ros1 else Rosbag2Writer(path, version=8)
-    with writer:
-        connections: dict[str, Any] = {}
-        for t_ns, topic, message in sorted(rows, key=lambda row: row[0]):
-            name = message.__msgtype__
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, name, typestore=store)
-            serialise = store.serialize_ros1 if is_ros1 else store.serialize_cdr
-            writer.write(connections[topic], t_ns, serialise(message, name))
+            bag.add_truth(t_ns + 9_000_000, t_ns, (0.01 * k + 2.0, -0.5, 0.2))
+    bag.write()
     return path
 
 
