@@ -33,10 +33,15 @@ class LiveView:
         Called again and again while waiting; may raise to stop.
     files
         Recordings that a viewer of our own opens at once.
+    is_replay
+        What is shown happened before: when it comes says nothing.
     """
 
-    def __init__(self, where: str, check: Callable[[], None], *files: Path) -> None:
+    def __init__(
+        self, where: str, check: Callable[[], None], *files: Path, is_replay: bool = False
+    ) -> None:
         self._where, self._check, self._files = where, check, files
+        self._is_replay = is_replay
         self._stack = ExitStack()
         self._url, self._web_url = where, ""
         self._has_ended: Callable[[], bool] = lambda: False
@@ -77,7 +82,12 @@ class LiveView:
         from slam.app.rerun_recording import ViewerTarget  # half a second, as in the run
         from slam.app.rerun_view import RerunView
 
-        view = RerunView(ViewerTarget(url=self._url), info, flush_s=_FLUSH_S)
+        view = RerunView(
+            ViewerTarget(url=self._url),
+            info,
+            flush_s=_FLUSH_S,
+            time_of_day_ns=None if self._is_replay else time.time_ns,
+        )
         return _WhileWatched(view, self._has_ended)
 
     def keep_serving(self) -> None:

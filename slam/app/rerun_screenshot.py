@@ -24,9 +24,7 @@ _MENU_PIXELS = 36
 """The viewer's own bar on top, which says what machine drew it."""
 
 
-def take_screenshot(
-    rrd: Path, out: Path, *, at_s: float | None, check: Callable[[], None], width: int = 1600
-) -> None:
+def take_screenshot(rrd: Path, out: Path, *, at_s: float | None, check: Callable[[], None]) -> None:
     """Open a recording in a viewer that draws in memory, and write what it shows as PNG.
 
     Parameters
@@ -39,8 +37,6 @@ def take_screenshot(
         Where the cursor of `device_time` stands; None for the end.
     check
         Called again and again; may raise to stop.
-    width
-        Of the picture in pixels; the viewer's is made smaller.
 
     Raises
     ------
@@ -57,9 +53,8 @@ def take_screenshot(
             raise AppError(f"{rrd}: the viewer gave no picture: {said.splitlines()[0]}") from None
     with Image.open(io.BytesIO(picture)) as full:
         shown = full.convert("RGB").crop((0, _MENU_PIXELS, full.width, full.height))
-        height = round(shown.height * width / shown.width)
-        small = shown.resize((width, height), Image.Resampling.LANCZOS)
-        few = small.quantize(_PALETTE, dither=Image.Dither.NONE)
+        # An octree keeps colours that few points have, like landmarks; a median cut does not.
+        few = shown.quantize(_PALETTE, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
     with naming(out):
         few.save(out, format="png", optimize=True)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from slam.app.rerun_blueprint import blueprint
@@ -41,6 +41,8 @@ class RerunView:
         Live: longest time that a row waits before it is sent; None for full blocks only.
     clock_s
         Monotonic, for `flush_s`.
+    time_of_day_ns
+        Live: tells when a scan arrived that does not say so itself; None leaves it unknown.
 
     Raises
     ------
@@ -55,8 +57,10 @@ class RerunView:
         *,
         flush_s: float | None = None,
         clock_s: Callable[[], float] = time.monotonic,
+        time_of_day_ns: Callable[[], int] | None = None,
     ) -> None:
         self._clock_s, self._flush_s = clock_s, flush_s
+        self._time_of_day_ns = time_of_day_ns
         self._flushed_s = clock_s()
         self._n_waiting = 0
         self._host_ns: int | None = None
@@ -84,6 +88,8 @@ class RerunView:
             self._began = True
             if scan.t_ns > _TIME_OF_DAY_NS:
                 self._recording.epoch_ns = scan.t_ns
+        if not scan.host_ns and self._time_of_day_ns is not None:
+            scan = replace(scan, host_ns=(self._time_of_day_ns(),) * len(scan.frames))
         self._host_ns = scan.host_ns[-1] if scan.host_ns else None
         self._frames.on_scan(scan)
         self._link.on_scan(scan, self._host_ns)

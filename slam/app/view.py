@@ -108,7 +108,7 @@ def write_view(session: RecordedSession, path: Path, stop: StopFlag) -> None:
 
 
 def _show_replay(session: RecordedSession, options: ViewOptions, stop: StopFlag) -> None:
-    with LiveView(SERVE_WEB if options.web else SPAWN, stop.check) as live:
+    with LiveView(SERVE_WEB if options.web else SPAWN, stop.check, is_replay=True) as live:
         with ExitStack() as stack:
             view = live.observer(session.info)
             stack.callback(view.close)

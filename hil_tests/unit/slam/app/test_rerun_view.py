@@ -157,21 +157,39 @@ def test_a_followed_view_sends_what_waited_too_long(tmp_path: Path) -> None:
     assert [(frame, picture[0]["shape"][0]) for frame, picture in pictures] == [(0, 6), (6, 10)]
 
 
+def arrivals(path: Path, entity: str) -> list[int]:
+    """Return an entity's stamps on `host_time`, nanoseconds since 1970."""
+    return [
+        stamp.value
+        for chunk in RrdReader(path).stream()
+        if str(chunk.entity_path) == entity
+        for batch in [chunk.to_record_batch()]
+        if "host_time" in batch.schema.names
+        for stamp in batch["host_time"]
+    ]
+
+
 def test_host_time_is_a_timeline_where_arrival_is_known(tmp_path: Path) -> None:
     view = RerunView(tmp_path / "s.rrd", session_info())
     day_ns = 1_790_000_000_000_000_000
     for counter in range(3):
         view.on_scan(replace(scan(counter), host_ns=(day_ns + counter, day_ns + 10 + counter)))
     view.close()
-    stamps = [
-        stamp.value
-        for chunk in RrdReader(tmp_path / "s.rrd").stream()
-        if str(chunk.entity_path) == "/radar/radar1/frame"
-        for batch in [chunk.to_record_batch()]
-        if "host_time" in batch.schema.names
-        for stamp in batch["host_time"]
-    ]
+    stamps = arrivals(tmp_path / "s.rrd", "/radar/radar1/frame")
     assert stamps == [day_ns + 10, day_ns + 11, day_ns + 12]
+
+
+def test_a_live_view_notes_arrival_itself(tmp_path: Path) -> None:
+    day_ns = iter(range(1_790_000_000_000_000_000, 2_000_000_000_000_000_000))
+    view = RerunView(tmp_path / "s.rrd", session_info(), time_of_day_ns=lambda: next(day_ns))
+    for counter in range(2):
+        view.on_scan(scan(counter))
+    view.close()
+    for name in ("radar0", "radar1"):  # one arrival per scan
+        assert arrivals(tmp_path / "s.rrd", f"/radar/{name}/frame") == [
+            1_790_000_000_000_000_000,
+            1_790_000_000_000_000_001,
+        ]
 
 
 def test_a_session_in_time_of_day_is_counted_from_its_first_scan(tmp_path: Path) -> None:
