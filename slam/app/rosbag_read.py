@@ -275,19 +275,15 @@ def _session_info(
 
 
 def _poses_of(track: OdometryTrack) -> Callable[[NDArray[np.int64]], NDArray[np.float64]]:
-    """Return the true poses at times [ns]; NaN where the truth does not reach."""
+    """Return the true poses at times [ns]; NaN further outside the truth than it is held."""
 
-    def poses_at(stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        return np.array(
-            [
-                track.pose_at(int(t_ns))
-                if track.first_ns <= t_ns <= track.last_ns
-                else np.full(3, math.nan)
-                for t_ns in stamps_ns
-            ]
-        )
+    def pose_at(t_ns: int) -> NDArray[np.float64]:
+        try:
+            return track.pose_at(t_ns)
+        except OdometryError:
+            return np.full(3, math.nan)
 
-    return poses_at
+    return lambda stamps_ns: np.array([pose_at(int(t_ns)) for t_ns in stamps_ns])
 
 
 def _frames(
