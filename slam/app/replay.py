@@ -156,6 +156,7 @@ def replay_session(
         make_slam(config, session.rig, wheels),
         truth.at,
         observers,
+        gains_db=[radar.gain_db for radar in session.info.radars],
     )
 
 

@@ -142,7 +142,13 @@ def _match(
         module.label.name = radar.name
         note(f"radar {radar.name}: serial number {radar.serial}, at {module.port}")
         links.append(
-            RadarLink(mount=mount, port=module.port, serial=radar.serial, driver=module.driver)
+            RadarLink(
+                mount=mount,
+                port=module.port,
+                serial=radar.serial,
+                driver=module.driver,
+                gain_db=float(radar.gain_db),
+            )
         )
     return tuple(links)
 

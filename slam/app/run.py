@@ -134,7 +134,14 @@ def run_rig(options: RunOptions, stop: StopFlag) -> None:
                 for watcher in watchers:
                     shown.callback(watcher.close)
                 shown.callback(progress.close)
-                record = run_slam(source.scans(), odometry, slam, nobody_knows, observers)
+                record = run_slam(
+                    source.scans(),
+                    odometry,
+                    slam,
+                    nobody_knows,
+                    observers,
+                    gains_db=[radar.gain_db for radar in info.radars],
+                )
         log.close()
         _finish(options, info, record, rig_file.rig, source, listener)
         if live is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from slam.app.session import Scan, SessionObserver, Snapshot
+from slam.frames import RadarFrame
 from slam.pipeline import Slam, StepResult
 
 TruthAt = Callable[[NDArray[np.int64]], NDArray[np.float64]]
@@ -65,11 +66,14 @@ def run_slam(
     slam: Slam,
     truth_at: TruthAt,
     observers: Sequence[SessionObserver] = (),
+    *,
+    gains_db: Sequence[float] = (),
 ) -> RunRecord:
     """Feed scans to SLAM as they come and tell the observers about scans and states.
 
     A scan that is not `used` is told, and not stepped. BLAS runs on one thread, here as in every
-    other path, so that results are the same bits. Truth goes to the observers only.
+    other path, so that results are the same bits. Truth goes to the observers only; they see
+    frames as they came, SLAM sees them less each radar's gain, where `gains_db` tells any.
 
     Raises
     ------
@@ -106,7 +110,8 @@ def run_slam(
                 world_from_map = np.nan_to_num(truth_at(np.array([scan.t_ns]))[0])
             counter_at[scan.t_ns] = scan.counter
             n_frames += len(scan.frames)
-            take(slam.step(scan.frames, odometry.pose_at, scan.t_ns))
+            frames = [less_gain(f, gains_db[f.radar]) if gains_db else f for f in scan.frames]
+            take(slam.step(frames, odometry.pose_at, scan.t_ns))
         take(slam.flush())
     return RunRecord(
         results=tuple(results),
@@ -117,6 +122,18 @@ def run_slam(
         start_ns=start_ns or 0,
         wall_s=time.monotonic() - started,
     )
+
+
+def less_gain(frame: RadarFrame, gain_db: float) -> RadarFrame:
+    """Return a frame as a radar of no gain would have heard it, cut off where it was cut off."""
+    if gain_db == 0.0:
+        return frame
+    scale = np.float32(10.0 ** (-gain_db / 20.0))
+    limits = frame.limits
+    if limits is not None:  # as float32, for samples at a limit are compared with it exactly
+        low, high = (float(np.float32(limit) * scale) for limit in limits)
+        limits = (low, high)
+    return replace(frame, samples=frame.samples * scale, limits=limits)
 
 
 def make_snapshot(

@@ -23,6 +23,8 @@ class RadarInfo:
 
     `range_start_m` and `bin_length_m` are module metres, as FRAMEAREA was read back; the same in
     true metres are in every RadarFrame. `start_skew_ns` is the session time of counter 0.
+    `gain_db` is how much louder it hears than the mean of the rig: SLAM is given its samples less
+    that, the session holds them as they came.
     """
 
     name: str
@@ -39,6 +41,7 @@ class RadarInfo:
     settings: Mapping[str, object]
     start_skew_ns: int = 0
     phase_offset_rad: float = 0.0
+    gain_db: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -36,7 +36,7 @@ _POLL_S = 0.25
 class RadarLink:
     """An open driver and what it is called: its mount on the robot, its port, its serial number.
 
-    `start_skew_ns` is the session time of its counter 0, 0 or later.
+    `start_skew_ns` is the session time of its counter 0, 0 or later; `gain_db` as in `RadarInfo`.
     """
 
     mount: Mount
@@ -44,6 +44,7 @@ class RadarLink:
     serial: str
     driver: X4M300
     start_skew_ns: int = 0
+    gain_db: float = 0.0
 
 
 def sampler_limits(config: RawConfig) -> tuple[float, float]:
@@ -189,6 +190,7 @@ class RigSource:
                     settings=asdict(config),
                     start_skew_ns=link.start_skew_ns,
                     phase_offset_rad=link.mount.phase_offset_rad,
+                    gain_db=link.gain_db,
                 )
             )
         self.radars = tuple(radars)

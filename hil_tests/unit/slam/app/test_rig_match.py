@@ -59,7 +59,15 @@ def robot() -> RigFile:
     mounts = {"left": (LEFT, 0.2, 90.0), "right": (RIGHT, -0.2, -90.0)}
     return RigFile(
         radars=tuple(
-            RigRadar(name=name, serial=serial, x_m=0.0, y_m=y_m, yaw_deg=yaw, range_offset_m=0.01)
+            RigRadar(
+                name=name,
+                serial=serial,
+                x_m=0.0,
+                y_m=y_m,
+                yaw_deg=yaw,
+                range_offset_m=0.01,
+                gain_db=1.5,
+            )
             for name, (serial, y_m, yaw) in mounts.items()
         )
     )
@@ -84,6 +92,7 @@ def test_mounts_follow_serial_numbers_whichever_cable_is_where(
         ("right", "a", RIGHT),
     ]
     assert [link.mount.range_offset_m for link in links] == [0.01, 0.01]
+    assert [link.gain_db for link in links] == [1.5, 1.5]
     assert "radar left: serial number 000000000001, at b" in bench.notes
     links[0].driver.ping()
     assert bench.heard[-1][0] == "left"
