@@ -114,9 +114,6 @@ def _parser() -> argparse.ArgumentParser:
         commands.add_parser(
             "run",
             help="map with real modules, or a running emulator, in real time",
-            description="Opens the modules that a rig file names by their serial numbers, follows "
-            "the robot's odometry, and runs SLAM while frames arrive. Ends with the odometry, "
-            "after --duration, or by Ctrl-C; writes session, map, trajectories and numbers.",
         )
     ).set_defaults(command=_run_rig)
 

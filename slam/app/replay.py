@@ -259,6 +259,8 @@ class Comparison:
 
     def verdict(self) -> str:
         """Return what to tell the user."""
+        if not self._expected:
+            return "no states are recorded, so there are none to compare with"
         if self.is_same:
             return f"all {self._n_same} recorded states came again, to the last bit"
         where = ""
