@@ -17,6 +17,7 @@ __all__ = ["CHOICES", "Choices", "add_options", "choose"]
 
 ENVIRONMENT = "XETHRU_RADARS"
 INI = "xethru_radars"
+WORKER_KEY = "xethru_radars"
 RIG_ENVIRONMENT, RIG_INI = "XETHRU_RIG", "xethru_rig"
 
 
@@ -120,18 +121,19 @@ def choose(config: pytest.Config) -> Choices:
         If it makes no sense; one line with the remedy.
     """
     rig = config.getoption("rig") or os.environ.get(RIG_ENVIRONMENT) or config.getini(RIG_INI)
+    worker: dict[str, list[str]] = getattr(config, "workerinput", {})
     try:
         texts = (
-            config.getoption("radar")
+            worker.get(WORKER_KEY)  # what the first process found
+            or config.getoption("radar")
             or _words(os.environ.get(ENVIRONMENT, ""))
             or config.getini(INI)
             or (_modules_of(Path(rig)) if rig else ["emu"])
         )
         specs = parse_specs(texts)
-        if not hasattr(config, "workerinput"):
+        if not worker:
             specs = _found(specs)
-            config.option.radar = [spec.text for spec in specs]  # workers find the same
-        _check_workers(config, specs)
+            _check_workers(config, specs)
     except SpecError as error:
         raise pytest.UsageError(str(error)) from None
     cassette, report = config.getoption("hil_cassette"), config.getoption("hil_json")
@@ -187,13 +189,12 @@ def _found(specs: tuple[RadarSpec, ...]) -> tuple[RadarSpec, ...]:
 
 
 def _check_workers(config: pytest.Config, specs: tuple[RadarSpec, ...]) -> None:
-    """Refuse to let several workers take turns at one real radar."""
-    if not config.pluginmanager.hasplugin("xdist") or hasattr(config, "workerinput"):
+    """Refuse to let every worker test the same real radar."""
+    if not config.pluginmanager.hasplugin("xdist"):
         return
     shared = next((spec for spec in specs if spec.shared), None)
-    spreads = config.getoption("dist", "no") not in {"no", "loadgroup"}
-    if shared is not None and spreads and config.getoption("tx", None):
+    if shared is not None and config.getoption("dist", "no") == "each":
         raise SpecError(
-            f"--radar {shared.text}: several workers cannot share one radar; "
-            "add --dist loadgroup, or leave -n out"
+            f"--radar {shared.text}: with --dist each all workers want this radar at once; "
+            "leave that out: its tests go to one worker"
         )

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Generator
+from typing import Any
 
 import pytest
 
-from hil_tests.plugin.choices import CHOICES, add_options, choose
+from hil_tests.plugin.choices import CHOICES, WORKER_KEY, add_options, choose
 from hil_tests.plugin.fixtures import (
     frame_rate_hz,
     hil_bench,
@@ -58,6 +59,12 @@ def pytest_configure(config: pytest.Config) -> None:
     config.pluginmanager.register(summary, "xethru-hil-summary")
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_configure_node(node: Any) -> None:  # noqa: ANN401 - xdist's, which need not be there
+    """Tell a worker which radars there are: it must not look for them itself."""
+    node.workerinput[WORKER_KEY] = [spec.text for spec in node.config.stash[CHOICES].specs]
+
+
 def pytest_report_header(config: pytest.Config) -> str:
     """Say which radars are tested."""
     choices = config.stash[CHOICES]
@@ -85,18 +92,15 @@ def _rigs(specs: tuple[RadarSpec, ...]) -> list[tuple[str, ...]]:
     return [*([real] if real else []), *rigs]
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Keep the tests of a real radar on one worker."""
-    if not config.pluginmanager.hasplugin("xdist"):
-        return
-    shared = {spec.name for spec in config.stash[CHOICES].specs if spec.shared}
-    for item in items:
-        parameters = getattr(getattr(item, "callspec", None), "params", {})
-        names = {parameters.get("radar_name"), *parameters.get("rig_name", ())}
-        if names & shared:
-            # one group for all: a rig ties its radars together
-            item.add_marker(pytest.mark.xdist_group("real radars"))
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object | None:  # noqa: ANN401 - as above
+    """Keep the tests of real radars on one worker, however the others are spread."""
+    shared = [spec.name for spec in config.stash[CHOICES].specs if spec.shared]
+    if not shared:
+        return None
+    from hil_tests.plugin.scheduling import RealRadarScheduling
+
+    return RealRadarScheduling(config, log, shared)
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
@@ -143,8 +147,8 @@ def _keep(item: pytest.Item, findings: Findings, report: pytest.TestReport) -> N
             failure="\n\n".join(findings.failures) or "none",
             measurements=findings.measure.taken if findings.measure else (),
         )
-    except OSError as error:
-        report.sections.append(("radar artefacts", f"not kept: {error}"))
+    except Exception as error:  # whatever it is: the failure of the test must be told
+        report.sections.append(("radar artefacts", f"{folder}: not kept whole: {error!r}"))
         return
     if findings.bundle is None:
         item.user_properties.append(("artefacts", str(folder)))

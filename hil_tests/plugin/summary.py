@@ -59,7 +59,9 @@ class Summary:
             terminal.line(f"{count:4} x {reason}")
 
     def _what(self, name: str) -> str:
-        return self._said.get(name, f"{name.count('+') + 1} radars together")
+        together = name.count("+") + 1
+        unknown = "could not be had" if together == 1 else f"{together} radars together"
+        return self._said.get(name, unknown)
 
     def write_json(self, path: Path) -> None:
         """Write every test with its radars, outcome and measurements."""

@@ -13,6 +13,8 @@ import pytest
 
 from hil_tests.device.serving import emulator
 
+pytestmark = pytest.mark.slow  # each run of pytest takes seconds to start on a busy machine
+
 LIMIT_S = 60
 
 # What CONTRIBUTING shows as a test of one's own.
@@ -57,7 +59,7 @@ def address() -> Iterator[str]:
 
 def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:xdist", *arguments],
+        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *arguments],
         cwd=folder,
         capture_output=True,
         text=True,
@@ -179,6 +181,39 @@ def test_the_modules_of_a_rig_file_are_found_by_number(
         done = run(tmp_path, "--rig", "rig.toml")
     assert done.returncode == 0, done.stdout
     assert "202305070102+202305070104" in done.stdout
+
+
+def test_workers_share_emulated_radars_and_leave_real_ones_to_one_of_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    suite = ("--pyargs", device("test_identity"), "--radar", "auto", "--radar", "emu")
+    nobody = run(tmp_path, *suite)
+    assert nobody.returncode == 4
+    assert "--radar auto: no module answers; 'xethru doctor' says why" in nobody.stderr
+    with emulator("serve", "--bare"):
+        done = run(tmp_path, *suite, "-n", "2", "-v")
+        refused = run(tmp_path, *suite, "-n", "2", "--dist", "each")
+    assert done.returncode == 0, done.stdout
+    ran = [line for line in done.stdout.splitlines() if line.startswith("[gw")]
+    assert len(ran) == 20
+    assert len({line[:5] for line in ran if "[radar_1" in line}) == 1
+    assert {line[:5] for line in ran if "[emu" in line} == {"[gw0]", "[gw1]"}
+    assert refused.returncode == 4
+    assert "all workers want this radar at once" in refused.stderr
+
+
+def test_artefacts_of_all_tests_where_asked(tmp_path: Path) -> None:
+    (tmp_path / "test_mine.py").write_text(OWN_TEST)
+    done = run(tmp_path, "--radar", "emu:lab?seed=3", "--hil-keep", "all", "--hil-artifacts", "a")
+    assert done.returncode == 0, done.stdout
+    (folder,) = (tmp_path / "a").iterdir()
+    names = {path.name for path in folder.iterdir()}
+    assert names == {"log.txt", "wire.mcap", "about.json", "scene.toml", "session.rrd"}
+    about = json.loads((folder / "about.json").read_text())
+    assert about["radars"][0]["seed"] == 3
+    assert about["measurements"][0]["unit"] == "of full scale"
+    assert 'name = "lab"' in (folder / "scene.toml").read_text()
 
 
 def test_the_answers_of_a_module_become_a_cassette(tmp_path: Path, address: str) -> None:

@@ -8,10 +8,19 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.plugin.cassette import Cassette, CassetteError, Exchange, differences
+from emulator.device import radar_device
+from emulator.echo import echo_source
+from emulator.identity import Identity
+from emulator.options import DeviceOptions
+from emulator.pace import Pace
+from emulator.scene import empty_room
+from hil_tests.faulty import PATH, FaultyLine
+from hil_tests.golden.vectors import FIXTURES
+from hil_tests.plugin.cassette import Cassette, CassetteError, Exchange, ask_all, differences
 from hil_tests.plugin.transactions import TRANSACTIONS
 from xethru_protocol.codec import encode
-from xethru_protocol.messages import Ack, Error, ReplyString, SystemGetInfo
+from xethru_protocol.codes import SensorMode
+from xethru_protocol.messages import Ack, Error, ReplyString, SetMode, SystemGetInfo
 
 
 def info(text: str, pattern: str | None = r"[0-9]{12}") -> Exchange:
@@ -64,6 +73,23 @@ def test_other_files_are_named(tmp_path: Path, content: str) -> None:
     path.write_text(content, "latin-1")
     with pytest.raises(CassetteError, match=r"other\.json"):
         Cassette.read(path)
+
+
+def test_an_emulator_that_changed_its_mind_is_caught() -> None:
+    """Protocol reference 4.4: without a profile some GETs get no answer at all; here, ERROR 1."""
+    recorded = Cassette.read(FIXTURES / "cassettes" / "emulated.json")
+    device = radar_device(
+        Identity(serial="100000000000"),
+        echo_source(empty_room(), 0, 0),
+        Pace.REALTIME,
+        options=DeviceOptions(get_without_profile="error"),
+    )
+    line = FaultyLine(device)
+    with line.radar() as radar:
+        radar.request(SetMode(mode=SensorMode.XTID_SM_STOP))
+    port = line.open(PATH, 115200)
+    (found,) = differences(recorded.exchanges, ask_all(port, line.clock_ns, recorded.transactions))
+    assert found.startswith("zone without profile: module nothing, emulator ERROR")
 
 
 def test_transactions_have_names_of_their_own_and_write_no_flash() -> None:
