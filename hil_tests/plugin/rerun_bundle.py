@@ -41,7 +41,9 @@ def write_rrd(
 
 
 def _blueprint(names: Sequence[str]) -> rrb.Blueprint:
-    scans = [rrb.TensorView(name=name, origin=f"/radar/{name}/bscan") for name in names]
+    scans = [
+        rrb.TensorView(name=name, origin=f"/radar/{name}/bscan", view_fit="fill") for name in names
+    ]
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(*scans) if scans else rrb.TextLogView(origin="/log"),
