@@ -8,6 +8,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from PIL import Image
+
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 _LIMIT_S = 60.0
 
@@ -17,7 +19,7 @@ def find_browser() -> str | None:
     return next((found for name in _NAMES if (found := shutil.which(name))), None)
 
 
-def photograph(page: Path, out: Path, *, width: int = 1000, height: int = 1500) -> None:
+def photograph(page: Path, out: Path, *, width: int = 1000, height: int = 1240) -> None:
     """Let a browser without network open a page and write what it shows as PNG.
 
     Raises
@@ -45,5 +47,15 @@ def photograph(page: Path, out: Path, *, width: int = 1000, height: int = 1500) 
         raise RuntimeError(f"{browser} made no picture: {run.stderr[-500:]}")
 
 
+def squeeze(png: Path) -> None:
+    """Cut a picture's colours to a palette: a third of the size, the same to the eye."""
+    with Image.open(png) as full:
+        few = full.convert("RGB").quantize(
+            method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
+        )
+    few.save(png, format="png", optimize=True)
+
+
 if __name__ == "__main__":
     photograph(Path(sys.argv[1]), Path(sys.argv[2]))
+    squeeze(Path(sys.argv[2]))

@@ -6,6 +6,9 @@ from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from emulator.odometry import scene_odometry
 from hil_tests.system.short_scene import write_short_scene
 from slam.app.emulated_rig import (
@@ -27,14 +30,18 @@ from slam.app.session_head import settings_text
 from slam.app.session_log import SessionLog
 from slam.robust_pipeline import make_slam
 
+STARTED_UNIX_NS = 1_790_000_000_000_000_000
 LOST_RADAR, LOST_COUNTER = 1, 40
 FAULT = "fault CRC of 5731 bytes <does not fit>"
 
 _SHORTER = ("waypoints_m = [[0.0, 0.0], [0.5, 0.0]]", "waypoints_m = [[0.0, 0.0], [0.2, 0.0]]")
 
 
-def record_session(path: Path, preset: str, seed: int = 5) -> RunRecord:
-    """Record 0.2 m there and back, with one frame lost and one fault on the links."""
+def record_session(path: Path, preset: str, seed: int = 5, *, has_truth: bool = True) -> RunRecord:
+    """Record 0.2 m there and back, with one frame lost and one fault on the links.
+
+    Without truth it is as a drive in the real world.
+    """
     file = write_short_scene(path.parent)
     file.write_text(file.read_text().replace(*_SHORTER))
     scene, config = scene_and_config(str(file), preset)
@@ -45,20 +52,27 @@ def record_session(path: Path, preset: str, seed: int = 5) -> RunRecord:
         info = SessionInfo(
             scene=scene.name,
             preset=preset,
-            seed=seed,
+            seed=seed if has_truth else None,
             radars=source.radars,
-            true_landmarks_m=true_landmarks_m(scene),
+            true_landmarks_m=true_landmarks_m(scene)[: None if has_truth else 0],
             versions=versions(),
             config_json=settings_text(config),
             wheels=asdict(wheels_of(scene)),
             outlines_m=outlines_m(scene),
+            simulated=has_truth,
+            started_unix_ns=None if has_truth else STARTED_UNIX_NS,
         )
-        log = SessionLog(path, info, odometry, truth_at=trajectory.poses)
+        truth = trajectory.poses if has_truth else _unknown
+        log = SessionLog(path, info, odometry, truth_at=truth if has_truth else None)
         scans = source.scans(end_counter(trajectory.duration_ns), lambda: None)
         slam = make_slam(config, rig_of(scene), wheels_of(scene))
-        record = run_slam(_damaged(scans, log, info), odometry, slam, trajectory.poses, [log])
+        record = run_slam(_damaged(scans, log, info), odometry, slam, truth, [log])
         log.close()
     return record
+
+
+def _unknown(stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    return np.full((len(stamps_ns), 3), np.nan)
 
 
 def _damaged(scans: Iterator[Scan], log: SessionLog, info: SessionInfo) -> Iterator[Scan]:

@@ -12,6 +12,7 @@ from PIL import Image
 from hil_tests.browser import find_browser, photograph
 from hil_tests.system.recorded_session import record_session
 from slam.app.cli import main
+from slam.app.rerun_recording import count_rows
 
 pytestmark = pytest.mark.slow
 
@@ -107,6 +108,24 @@ def test_a_browser_without_network_shows_it(reported: Reported, tmp_path: Path) 
     seen = {colour for _, colour in colours}
     # ground of the "simulated" mark, the estimate's blue and the landmarks' red of the map
     assert {(255, 243, 214), (31, 111, 208), (194, 37, 92)} <= seen
+
+
+def test_of_a_real_drive_it_tells_no_error(tmp_path: Path) -> None:
+    record_session(tmp_path / "session.mcap", "robust", has_truth=False)
+    assert main(["report", str(tmp_path)]) == 0
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "measured data" in page
+    assert "simulated" not in page
+    assert "Nothing true is known of this drive" in page
+    assert "begun 2026-09-21 14:13:20 UTC" in page
+    assert "ATE" not in page
+    assert "nearest truth" not in page
+    pictures = [base64.b64decode(data).decode() for data in re.findall(r'base64,([^"]*)"', page)]
+    assert len(pictures) == 4
+    assert main(["view", str(tmp_path / "session.mcap"), "--out", str(tmp_path / "v.rrd")]) == 0
+    rows = count_rows(tmp_path / "v.rrd")
+    assert rows["/map/estimate/path"] > 0
+    assert {"/map/truth/path", "/map/truth/robot", "/error/slam"}.isdisjoint(rows)
 
 
 def test_what_cannot_be_reported_is_one_line(

@@ -1,4 +1,4 @@
-"""How the view is laid out: map left, echoes and numbers in the middle, guide and links right."""
+"""How the view is laid out: map and numbers left, echoes in the middle, guide and links right."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from slam.app.rerun_sdk import rrb
 from slam.app.session import SessionInfo
 
 _MAP_MARGIN_M = 0.6
-_TRAIL_S = 20.0
-"""How long trilaterated points stay on the map."""
 
 
 def blueprint(info: SessionInfo, *, is_followed: bool) -> rrb.Blueprint:
@@ -20,10 +18,10 @@ def blueprint(info: SessionInfo, *, is_followed: bool) -> rrb.Blueprint:
     names = [radar.name for radar in info.radars]
     return rrb.Blueprint(
         rrb.Horizontal(
-            _map_view(info),
-            rrb.Vertical(_echoes(names), _numbers(), row_shares=[5, 3]),
-            rrb.Vertical(_texts(), _links(), row_shares=[5, 3]),
-            column_shares=[4, 4, 3],
+            rrb.Vertical(_map_view(info), _numbers(), row_shares=[5, 2]),
+            _echoes(names),
+            rrb.Vertical(_texts(), _links(), row_shares=[5, 2]),
+            column_shares=[4, 3, 3],
         ),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
@@ -75,12 +73,26 @@ def _echoes(names: Sequence[str]) -> rrb.Tabs:
 
 
 def _numbers() -> rrb.Tabs:
+    origins = {
+        "Position error": "/error",
+        "NIS": "/consistency/nis",
+        "NEES": "/consistency/nees",
+        "Landmarks": "/landmarks",
+    }
     return rrb.Tabs(
-        rrb.TimeSeriesView(name="Position error", origin="/error"),
-        rrb.TimeSeriesView(name="NIS", origin="/consistency/nis"),
-        rrb.TimeSeriesView(name="NEES", origin="/consistency/nees"),
-        rrb.TimeSeriesView(name="Landmarks", origin="/landmarks"),
+        *(
+            rrb.TimeSeriesView(name=name, origin=origin, axis_x=_whole_run())
+            for name, origin in origins.items()
+        )
     )
+
+
+def _whole_run() -> rrb.TimeAxis:
+    """Return an axis from the first to the newest moment; Rerun's own shows one minute."""
+    everything = rrb.TimeRange(
+        start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite()
+    )
+    return rrb.TimeAxis(view_range=everything)
 
 
 def _texts() -> rrb.Tabs:
@@ -93,10 +105,11 @@ def _texts() -> rrb.Tabs:
 
 def _links() -> rrb.Tabs:
     return rrb.Tabs(
-        rrb.StateTimelineView(name="Links", origin="/link/state"),
+        rrb.StateTimelineView(name="Links", origin="/link/state", time_view=_whole_run()),
         rrb.TimeSeriesView(
             name="Lost frames, faults",
             origin="/link",
             contents=["$origin/lost/**", "$origin/faults/**"],
+            axis_x=_whole_run(),
         ),
     )

@@ -20,7 +20,7 @@ only. {data}
 * **B-scan** (middle, a tab per radar): echoes of up to {block} frames, time downwards, range to
   the right, constant part removed. A landmark that the robot passes is a curved line.
 * **Frame**: the newest raw frame, amplitude over range in metres; red bars are detections.
-* **Position error**: distance to the truth, which SLAM never sees. **NIS**, **NEES**: how
+* **Position error** (below the map): distance to the truth, which SLAM never sees. **NIS**, **NEES**: how
   surprised the filter is by echoes, and how wrong by its own measure; an honest filter stays
   inside the grey 95 % band most of the time. Below it is too modest, above too sure.
 * **Links** (right, below): the state of each serial link; losses and faults in the next tab,
