@@ -184,7 +184,7 @@ class _Likelihood:
         limit = self.cost(slope) + 1.0
         widths = []
         for side in (-1.0, 1.0):
-            near, far = 0.0, 2.0 * math.sqrt(self.variance)  # there the prior alone costs enough
+            near, far = 0.0, math.sqrt(self.variance)  # no less is known than before
             for _ in range(_HALVINGS):
                 middle = (near + far) / 2.0
                 near, far = (

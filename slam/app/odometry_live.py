@@ -162,7 +162,7 @@ class LiveOdometry:
     def _refuse(self, trouble: str) -> str:
         self.n_refused += 1
         is_news = not self._trouble
-        self._trouble = trouble
+        self._trouble = self._trouble or trouble
         self._complaints += 1
         if is_news:
             return f"{trouble}; such lines are passed over"

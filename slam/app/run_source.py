@@ -187,9 +187,9 @@ class LiveSource:
             start_ns = max(self._odometry.session_ns(now_ns), self._odometry.first_ns)
             if self._odometry.ended and not self._odometry.covers(start_ns):
                 raise AppError(
-                    f"odometry: its last pose, at {self._odometry.last_ns / NS_PER_S:.3f} s, is "
-                    f"past: it is {start_ns / NS_PER_S:.3f} s by its clock; "
-                    "see --odometry-clock"
+                    f"odometry: its last pose is of {self._odometry.last_ns / NS_PER_S:.3f} s, and "
+                    f"by its clock it is {start_ns / NS_PER_S:.3f} s: it ended before the run "
+                    "could begin, or --odometry-clock is another"
                 )
             self._assembler.begin(start_ns)
             return start_ns
