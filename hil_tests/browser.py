@@ -19,7 +19,7 @@ def find_browser() -> str | None:
     return next((found for name in _NAMES if (found := shutil.which(name))), None)
 
 
-def photograph(page: Path, out: Path, *, width: int = 1000, height: int = 1240) -> None:
+def photograph(page: Path, out: Path, *, width: int = 1000, height: int = 1640) -> None:
     """Let a browser without network open a page and write what it shows as PNG.
 
     Raises
@@ -57,5 +57,8 @@ def squeeze(png: Path) -> None:
 
 
 if __name__ == "__main__":
-    photograph(Path(sys.argv[1]), Path(sys.argv[2]))
+    try:
+        photograph(Path(sys.argv[1]), Path(sys.argv[2]))
+    except (FileNotFoundError, RuntimeError) as error:
+        sys.exit(f"{sys.argv[1]}: {error}")
     squeeze(Path(sys.argv[2]))

@@ -84,7 +84,7 @@ def test_a_picture_needs_no_window(viewed: Viewed, tmp_path: Path) -> None:
     picture = tmp_path / "view.png"
     assert main(["view", str(viewed.rrd), "--screenshot", str(picture), "--at", "12"]) == 0
     with Image.open(picture) as shown:
-        assert shown.width == 1440
+        assert shown.width == 1360
         brightness = np.asarray(shown.convert("RGB")).max(axis=2)
     # a dark page with a map, echoes, curves and text on it; of a session without any 2 %
     assert np.mean(brightness > 100) > 0.05

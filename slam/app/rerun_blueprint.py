@@ -13,8 +13,8 @@ from slam.app.session import SessionInfo
 _MAP_MARGIN_M = 0.6
 
 
-def blueprint(info: SessionInfo, *, is_followed: bool) -> rrb.Blueprint:
-    """Return the layout; `is_followed` lets the cursor keep to the newest data."""
+def blueprint(info: SessionInfo) -> rrb.Blueprint:
+    """Return the layout; the cursor keeps to the newest data: a file opens with its whole map."""
     names = [radar.name for radar in info.radars]
     return rrb.Blueprint(
         rrb.Horizontal(
@@ -25,11 +25,7 @@ def blueprint(info: SessionInfo, *, is_followed: bool) -> rrb.Blueprint:
         ),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(
-            state="collapsed",
-            timeline=DEVICE_TIME,
-            play_state="following" if is_followed else "paused",
-        ),
+        rrb.TimePanel(state="collapsed", timeline=DEVICE_TIME, play_state="following"),
         auto_views=False,
     )
 

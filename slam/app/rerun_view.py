@@ -68,7 +68,7 @@ class RerunView:
         seed = "" if info.seed is None else f"-{info.seed}"
         self._recording = Recording(
             FileTarget(path=target) if isinstance(target, Path) else target,
-            blueprint(info, is_followed=flush_s is not None),
+            blueprint(info),
             recording_id=f"{info.scene}-{info.preset}{seed}",
         )
         of_seed = "" if info.seed is None else f", seed {info.seed}"

@@ -40,7 +40,7 @@ class ViewerKind(Enum):
 
     WINDOW = ("--hide-welcome-screen", "--expect-data-soon")
     WEB = ("--serve-web",)
-    HEADLESS = ("--headless", "--hide-welcome-screen", "--window-size", "1440x860")
+    HEADLESS = ("--headless", "--hide-welcome-screen", "--window-size", "1360x812")
 
 
 class ViewerProcess:
