@@ -14,19 +14,26 @@ from xethru_protocol.errors import DeviceError
 pytestmark = pytest.mark.requires("settings")
 
 
-def test_it_answers_and_says_what_it_is(radar: X4M300) -> None:
-    """Protocol reference 4.10."""
+def test_it_answers_and_says_its_firmware(radar: X4M300) -> None:
+    """Protocol reference 4.10; the base firmware says as much."""
     assert radar.ping() is PongCode.XTS_SPRP_READY
+    info = radar.info()
+    assert info.firmware_id
+    assert info.version is not None
+    assert re.match(r"[0-9]+\.[0-9]+\.[0-9]+", info.version)
+    assert info.version_list is not None
+    assert "XEP:" in info.version_list
+
+
+@pytest.mark.requires("profiles")
+def test_it_says_what_product_it_is(radar: X4M300) -> None:
+    """Protocol reference 4.10."""
     info = radar.info()
     assert info.order_code == "X4M300"
     assert info.serial_number is not None
     assert re.fullmatch(r"[0-9]{12}", info.serial_number)
     assert info.item_number is not None
     assert re.fullmatch(r"[0-9]{6}-[0-9]{3}", info.item_number)
-    assert info.version is not None
-    assert re.match(r"[0-9]+\.[0-9]+\.[0-9]+", info.version)
-    assert info.version_list is not None
-    assert "XEP:" in info.version_list
 
 
 def test_it_says_the_same_every_time(radar: X4M300) -> None:
@@ -65,13 +72,12 @@ def test_it_starts_a_test_stopped(radar: X4M300) -> None:
 
 def test_a_hundred_questions_are_answered_in_order(radar: X4M300) -> None:
     """No sequence numbers: replies are matched by order (Protocol reference 3)."""
-    serial = radar.request(m.SystemGetInfo(item=InfoItem.XTID_SSIC_SERIALNUMBER)).text
+    firmware = m.SystemGetInfo(item=InfoItem.XTID_SSIC_FIRMWAREID)
+    version = m.SystemGetInfo(item=InfoItem.XTID_SSIC_VERSION)
+    said = radar.request(firmware).text, radar.request(version).text
     for _ in range(25):
         assert radar.ping() is PongCode.XTS_SPRP_READY
-        item = m.SystemGetInfo(item=InfoItem.XTID_SSIC_SERIALNUMBER)
-        assert radar.request(item).text == serial
-        order_code = m.SystemGetInfo(item=InfoItem.XTID_SSIC_ORDERCODE)
-        assert radar.request(order_code).text == "X4M300"
+        assert (radar.request(firmware).text, radar.request(version).text) == said
         with pytest.raises(DeviceError):
             radar.request(m.SystemGetInfo(item=0x55))
     assert radar.stray_count == 0

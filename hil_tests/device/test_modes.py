@@ -64,6 +64,14 @@ def test_profiles_of_other_products_are_refused(radar: X4M300) -> None:
     assert radar.presence.profile_id() == 0
 
 
+def test_frames_that_stop_leave_it_in_manual(radar: X4M300, frame_rate_hz: float) -> None:
+    radar.configure_raw()
+    radar.start(frame_rate_hz)
+    radar.read_frame()
+    radar.stop()
+    assert mode(radar) is SensorMode.XTID_SM_MANUAL
+
+
 def test_x4_settings_work_without_a_profile(radar: X4M300) -> None:
     """Protocol reference 8.3: in STOP and in MANUAL."""
     for wanted in (SensorMode.XTID_SM_STOP, SensorMode.XTID_SM_MANUAL):

@@ -12,6 +12,7 @@ from hil_tests.plugin.specs import Kind, RadarSpec
 from hil_tests.plugin.tap import WireTap
 from xethru_protocol import messages as m
 from xethru_protocol.codes import PongCode, SensorMode, X4Setting
+from xethru_protocol.core import POWER_UP_BAUD
 from xethru_protocol.driver import X4M300
 from xethru_protocol.errors import (
     DeviceError,
@@ -21,14 +22,13 @@ from xethru_protocol.errors import (
     XeThruError,
 )
 from xethru_protocol.procedures import BAUD_RATES
-from xethru_protocol.transport import Transport
+from xethru_protocol.transport import Transport, set_rate
 
 __all__ = ["Bench", "BrokenRadarError", "RadarAtPlace"]
 
 _PATIENCE_NS = 10_000_000_000  # a restart takes 2 ... 9 s (Protocol reference 8.1)
 _QUIET_S = 0.05
 _LATE_READS = 10_000
-_POWER_UP_BAUD = 115200
 
 
 class BrokenRadarError(Exception):
@@ -129,10 +129,10 @@ class RadarAtPlace:
                 continue
             try:
                 radar = self.place.driver(line, self.tap)
-                self._wait_until_ready(radar, deadline_ns)
+                self._wait_until_ready(radar, line, deadline_ns)
                 _stop(radar)
                 if not self.identity:
-                    self.identity = _identity(radar)
+                    self._ask_who_it_is(radar)
             except Disconnected:  # an adapter that has not noticed yet that the last client left
                 line.close()
                 if self.place.clock_ns() > deadline_ns:
@@ -145,32 +145,35 @@ class RadarAtPlace:
                 self._line = line
                 return
 
-    def _wait_until_ready(self, radar: X4M300, deadline_ns: int) -> None:
+    def _ask_who_it_is(self, radar: X4M300) -> None:
+        info = radar.info()
+        if info.order_code is None:  # the base firmware knows no product, and has no profiles
+            self.place.capabilities -= {"profiles"}
+        said = (info.order_code or "bare", info.serial_number, info.firmware_id, info.version)
+        self.identity = " ".join(part for part in said if part)
+
+    def _wait_until_ready(self, radar: X4M300, line: Transport, deadline_ns: int) -> None:
         while True:
             try:
                 if radar.ping(1.0) is not PongCode.XTS_SPRP_NOTREADY:
                     return
             except ResponseTimeout:
-                if "uart" in self.place.capabilities and self._found_at_another_rate():
+                if "uart" in self.place.capabilities and self._found_at_another_rate(line):
                     continue
                 if self.place.clock_ns() > deadline_ns:
                     raise
             self.place.sleep(_QUIET_S)
 
-    def _found_at_another_rate(self) -> bool:
+    def _found_at_another_rate(self, line: Transport) -> bool:
         """Whether the module was at another baud rate, where a test left it; it is back now."""
         for baudrate in reversed(BAUD_RATES):
-            if baudrate == _POWER_UP_BAUD:
-                continue
-            with contextlib.suppress(PortUnavailable, ResponseTimeout):
-                line = self.place.open_line(None, baudrate)
-                try:
-                    stray = X4M300(line)
-                    stray.ping(0.3)
-                    stray.request(m.SetBaudRate(baudrate=_POWER_UP_BAUD))
-                    return True
-                finally:
-                    line.close()
+            set_rate(line, baudrate)
+            stray = self.place.driver(line, self.tap)  # that what came at a wrong rate is forgotten
+            with contextlib.suppress(ResponseTimeout):
+                stray.ping(0.3)
+                stray.set_baud_rate(POWER_UP_BAUD)
+                return True
+        set_rate(line, POWER_UP_BAUD)
         return False
 
 
@@ -241,9 +244,3 @@ def _stop(radar: X4M300) -> None:
         before = radar.statistics.bytes
         with contextlib.suppress(ResponseTimeout):
             radar.read_frame(_QUIET_S)
-
-
-def _identity(radar: X4M300) -> str:
-    info = radar.info()
-    said = (info.order_code or "bare XEP", info.serial_number, info.firmware_id, info.version)
-    return " ".join(part for part in said if part)

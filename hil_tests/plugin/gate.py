@@ -107,6 +107,7 @@ def gate(
             _check_capabilities(request, radar)
             _check_permissions(request, radar)
             radar.begin_test()
+            _check_capabilities(request, radar)  # which firmware it has is known only now
         except (BrokenRadarError, PlaceError, PortBusyError, XeThruError) as error:
             problem = error
         if isinstance(problem, BrokenRadarError):

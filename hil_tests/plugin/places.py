@@ -145,6 +145,7 @@ class MemoryPlace(Place):
         from emulator.device import radar_device
         from emulator.echo import echo_source
         from emulator.identity import Identity
+        from emulator.options import DeviceOptions
         from emulator.pace import Pace
         from hil_tests.faulty import FaultyLine
 
@@ -153,6 +154,7 @@ class MemoryPlace(Place):
             Identity(serial=radar.serial),
             echo_source(self._scene, self._index, self.spec.seed),
             Pace.REALTIME,
+            options=DeviceOptions(firmware=self.spec.firmware),
         )
         self._line = FaultyLine(device)
         self.clock_ns = self._line.clock_ns

@@ -5,11 +5,12 @@
 | `emu` | emulated in this process, in virtual time |
 | `emu:SCENE?seed=3&fps=17&radar=NAME` | the same in a scene: a name or a .toml file |
 | `emu:?line=pty`, `uart`, `tcp` | an emulator in a process of its own behind such a line |
+| `emu:?firmware=xep` | in this process, with the bare base firmware |
 | `/dev/ttyACM0` | a module at a port; `?line=uart`: a UART that does not look like one |
 | `serial=202611210001` | a module by its own serial number, wherever it is plugged in |
 | `auto` | every module that answers; at least one must |
 | `tcp://HOST:PORT` | a module behind a serial-to-network adapter, or `xethru-emulator --tcp` |
-| `replay:RECORDING` | a recording at the port of an emulated module |
+| `replay:RECORDING?radar=NAME` | a recording at the port of an emulated module |
 
 Any of them takes ``?has=NAME,NAME``: capabilities that only the user knows of, such as a reflector
 on a stage, for tests that ask for them with ``@pytest.mark.requires``.
@@ -22,6 +23,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
+from typing import Literal
 
 __all__ = ["Kind", "RadarSpec", "SpecError", "parse_specs"]
 
@@ -41,13 +43,14 @@ class Kind(Enum):
     AUTO = "auto"
 
 
+_FIRMWARE = ("sensor", "xep")
 _LINES = ("memory", "pty", "uart", "tcp")
 _OPTIONS: dict[Kind, tuple[str, ...]] = {
-    Kind.EMULATED: ("fps", "has", "line", "radar", "seed"),
+    Kind.EMULATED: ("firmware", "fps", "has", "line", "radar", "seed"),
     Kind.PORT: ("fps", "has", "line"),
     Kind.SERIAL_NUMBER: ("fps", "has"),
     Kind.TCP: ("fps", "has"),
-    Kind.REPLAY: ("has",),
+    Kind.REPLAY: ("has", "radar"),
     Kind.AUTO: ("fps", "has"),
 }
 DEFAULT_FPS = 17.0
@@ -91,6 +94,11 @@ class RadarSpec:
     def line(self) -> str:
         """What leads to an emulated radar: memory, pty, uart or tcp."""
         return self.options.get("line", "memory")
+
+    @property
+    def firmware(self) -> Literal["sensor", "xep"]:
+        """Firmware of an emulated radar."""
+        return "xep" if self.options.get("firmware") == "xep" else "sensor"
 
     @property
     def seed(self) -> int:
@@ -188,6 +196,13 @@ def _check(text: str, kind: Kind, options: Mapping[str, str]) -> None:
     lines = _LINES if kind is Kind.EMULATED else ("uart",)
     if line is not None and line not in lines:
         raise SpecError(f"--radar {text}: line={line}: must be {' or '.join(lines)}")
+    firmware = options.get("firmware", "sensor")
+    if firmware not in _FIRMWARE or (
+        firmware == "xep" and options.get("line", "memory") != "memory"
+    ):
+        raise SpecError(
+            f"--radar {text}: firmware={firmware}: must be sensor, or xep without line="
+        )
     seed = options.get("seed", "0")
     if not seed.isdigit() or int(seed) >= 2**63:
         raise SpecError(f"--radar {text}: seed={seed}: must be a whole number of 0...2**63 - 1")
@@ -204,6 +219,7 @@ def _name(kind: Kind, target: str, options: Mapping[str, str]) -> str:
         parts = ["emu", Path(target).stem, options.get("radar", "")]
         line = options.get("line", "memory")
         parts.append("" if line == "memory" else line)
+        parts.append("xep" if options.get("firmware") == "xep" else "")
         return "-".join(filter(None, parts))
     if kind is Kind.SERIAL_NUMBER:
         return target

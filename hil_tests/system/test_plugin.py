@@ -80,7 +80,7 @@ def test_the_suite_runs_on_a_module_of_another_process(tmp_path: Path, address: 
     )
     assert done.returncode == 0, done.stdout
     name = address.replace("://", "-").replace(":", "-")
-    assert f"{name}      47       0        0  X4M300 100000000000 Annapurna 1.6.8" in done.stdout
+    assert f"{name}      48       0        0  X4M300 100000000000 Annapurna 1.6.8" in done.stdout
     ran = json.loads((tmp_path / "ran.json").read_text())
     assert {one["names"][0] for one in ran["tests"]} == {name, "emu"}
     assert {one["outcome"] for one in ran["tests"]} == {"passed"}
@@ -142,9 +142,11 @@ def test_radars_that_cannot_be_had_are_one_line(tmp_path: Path) -> None:
     unknown = run(tmp_path, "--radar", "ttyACM0")
     assert unknown.returncode == 4
     assert "names no radar; allowed are emu" in unknown.stderr
+    (tmp_path / "test_other.py").write_text(OWN_TEST)
     gone = run(tmp_path, "--radar", "/dev/no-such-port")
     assert gone.returncode == 1
     assert "there is no port /dev/no-such-port; 'xethru list' shows the ports" in gone.stdout
+    assert "1 x no-such-port could not be opened in an earlier test" in gone.stdout
     assert "Traceback" not in gone.stdout
     elsewhere = run(tmp_path, "--radar", "emu:atlantis")
     assert elsewhere.returncode == 1
@@ -196,11 +198,27 @@ def test_workers_share_emulated_radars_and_leave_real_ones_to_one_of_them(
         refused = run(tmp_path, *suite, "-n", "2", "--dist", "each")
     assert done.returncode == 0, done.stdout
     ran = [line for line in done.stdout.splitlines() if line.startswith("[gw")]
-    assert len(ran) == 20
+    assert len(ran) == 22
     assert len({line[:5] for line in ran if "[radar_1" in line}) == 1
     assert {line[:5] for line in ran if "[emu" in line} == {"[gw0]", "[gw1]"}
     assert refused.returncode == 4
     assert "all workers want this radar at once" in refused.stderr
+
+
+def test_recordings_are_played(tmp_path: Path) -> None:
+    recording = Path(__file__).parents[2] / "fixtures" / "recordings" / "float"
+    done = run(tmp_path, "--pyargs", device("test_stream"), "--radar", f"replay:{recording}")
+    assert done.returncode == 0, done.stdout
+    assert "replay-float       1       0        0" in done.stdout
+
+
+def test_a_uart_left_at_another_rate_is_found_again(tmp_path: Path) -> None:
+    (tmp_path / "test_mine.py").write_text(
+        "def test_leaves_it(radar):\n    radar.set_baud_rate(921600)\n\n"
+        "def test_finds_it(radar):\n    radar.ping()\n"
+    )
+    done = run(tmp_path, "--radar", "emu:?line=uart")
+    assert done.returncode == 0, done.stdout
 
 
 def test_artefacts_of_all_tests_where_asked(tmp_path: Path) -> None:
