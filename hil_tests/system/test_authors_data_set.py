@@ -13,6 +13,7 @@ from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.authors_bag import AuthorsBag
 from slam.app.cli import main
 from slam.app.emulated_rig import FRAME_RATE_HZ, RAW_CONFIG, open_loopback, scene_and_config
+from slam.app.evaluate import evaluate
 from slam.app.odometry import OdometryTrack
 
 pytestmark = pytest.mark.slow
@@ -56,3 +57,14 @@ def test_whoever_downloads_it_can_run_it(
     assert summary["seed"] is None
     assert summary["ate_rmse_m"] < 0.005
     assert summary["ate_rmse_m"] < summary["odometry_ate_rmse_m"] * 1.5
+    # and once more as detections alone, the other file of the data set
+    detections, again = tmp_path / "dataset.mat", tmp_path / "again.mcap"
+    assert main(["convert", str(session), str(detections), "--preset", "paper"]) == 0
+    assert main(["convert", str(detections), str(again)]) == 0
+    assert main(["replay", str(again), "--out", str(tmp_path / "fixes")]) == 0
+    judged = evaluate(tmp_path / "fixes" / "estimate.tum", out / "truth.tum")
+    ate_m, pairs = judged["ate_rmse_m"], judged["pairs"]
+    assert isinstance(ate_m, float)
+    assert isinstance(pairs, int)
+    assert pairs > N_SCANS // 2
+    assert ate_m < 0.02

@@ -155,10 +155,10 @@ def _parser() -> argparse.ArgumentParser:
     _add_convert(
         commands.add_parser(
             "convert",
-            help="sessions from and to rosbags, in the layout of the paper's data set",
-            description="IN is a session, then OUT is a bag of ROS 1 if its name ends in .bag, or "
-            "a new folder with a bag of ROS 2; or IN is such a bag, then OUT is a session, which "
-            "replay, view and report take.",
+            help="sessions from and to rosbags and .mat, in the layout of the paper's data set",
+            description="IN is a session, then OUT is a MATLAB file of detections if its name "
+            "ends in .mat, a bag of ROS 1 if in .bag, or else a new folder with a bag of ROS 2; or "
+            "IN is one of these, then OUT is a session, which replay, view and report take.",
         )
     )
 
@@ -209,7 +209,9 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_convert(convert: argparse.ArgumentParser) -> None:
-    convert.add_argument("source", type=Path, metavar="IN", help="session.mcap, *.bag or a folder")
+    convert.add_argument(
+        "source", type=Path, metavar="IN", help="session.mcap, *.mat, *.bag or folder"
+    )
     convert.add_argument("out", type=Path, metavar="OUT", help="must not exist")
     convert.add_argument(
         "--rig", type=Path, help="where the radars of a bag sit, named UWBradar1 and so on"
@@ -225,7 +227,11 @@ def _add_convert(convert: argparse.ArgumentParser) -> None:
         "--truth", default="/slam_out_pose", metavar="TOPIC", help="default: %(default)s"
     )
     convert.add_argument(
-        "--preset", default="robust", help="settings of SLAM for a bag (default: %(default)s)"
+        "--rate", type=count, default=5, help="states/s of a .mat, which has no stamps (default: 5)"
+    )
+    convert.add_argument(
+        "--preset",
+        help="settings of SLAM (default: a session's own; for a bag robust, for a .mat paper)",
     )
     convert.set_defaults(command=_convert)
 
@@ -366,6 +372,7 @@ def _convert(arguments: argparse.Namespace, stop: StopFlag) -> None:
         rig=arguments.rig,
         area_m=tuple(arguments.frame_area) if arguments.frame_area else None,
         truth_topic=arguments.truth,
+        rate_hz=arguments.rate,
         preset=arguments.preset,
     )
     run_convert(options, stop.check)

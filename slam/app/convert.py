@@ -9,32 +9,36 @@ from pathlib import Path
 
 from slam.app import rosbag_layout as layout
 from slam.app.errors import AppError, UsageError
+from slam.app.mat_convert import MatOptions, convert_mat, write_detections
 from slam.app.rig_file import load_rig
 from slam.app.rosbag_read import BagOptions, convert_bag
 from slam.app.rosbag_write import write_bag
 from slam.app.session_head import settings_text
-from slam.app.session_reader import open_session
-from slam.geometry import Rig
+from slam.app.session_reader import RecordedSession, open_session
+from slam.config import SlamConfig
 from slam.presets import ConfigError, load_preset
 from slam.robust.parameters import WheelNoise
 
-SESSION_SUFFIX = ".mcap"
+SESSION_SUFFIX, MAT_SUFFIX = ".mcap", ".mat"
+_PRESET = "robust"
+_MAT_PRESET = "paper"  # whose front end such ranges are of: they scatter by a bin, 7 mm
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConvertOptions:
-    """What the command line of `uwb-slam convert` says."""
+    """What the command line of `uwb-slam convert` says; None where it does not."""
 
     source: Path
     out: Path
     rig: Path | None
     area_m: tuple[float, float] | None
     truth_topic: str
-    preset: str
+    rate_hz: int
+    preset: str | None
 
 
 def run_convert(options: ConvertOptions, check: Callable[[], None]) -> None:
-    """Convert a session to a bag, or a bag to a session; the names say which.
+    """Convert a session to a bag or MATLAB file, or such a file to a session; names say which.
 
     Raises
     ------
@@ -43,40 +47,66 @@ def run_convert(options: ConvertOptions, check: Callable[[], None]) -> None:
     """
     if options.out.exists():
         raise AppError(f"{options.out}: exists; choose another name")
-    if options.source.suffix == SESSION_SUFFIX and options.out.suffix != SESSION_SUFFIX:
-        _say(write_bag(open_session(options.source), options.out, check))
+    out_is_session = options.out.suffix == SESSION_SUFFIX
+    if options.source.suffix == SESSION_SUFFIX and not out_is_session:
+        _say(_from_session(open_session(options.source), options, check))
         return
-    if options.out.suffix != SESSION_SUFFIX:
+    if not out_is_session:
         raise UsageError(
-            f"{options.out}: of a bag a session is made; give a name that ends in .mcap"
+            f"{options.out}: of a bag or MATLAB file a session is made; give a name that ends in "
+            ".mcap"
         )
     try:
-        said, odd = convert_bag(options.source, options.out, _bag_options(options), check)
+        said, odd = _to_session(options, check)
     except BaseException:
         options.out.unlink(missing_ok=True)
         raise
     for line in odd:
-        print(f"uwb-slam: {options.source}: {line}", file=sys.stderr)  # noqa: T201 - a command line speaks
+        print(f"uwb-slam: {options.source}: {line}", file=sys.stderr)  # noqa: T201 - a warning
     _say(said)
 
 
-def _bag_options(options: ConvertOptions) -> BagOptions:
-    try:
-        config = load_preset(options.preset)
-    except ConfigError as error:
-        raise UsageError(str(error)) from None
-    return BagOptions(
-        rig=layout.AUTHORS_RIG if options.rig is None else _rig(options.rig),
+def _from_session(
+    session: RecordedSession, options: ConvertOptions, check: Callable[[], None]
+) -> str:
+    if options.out.suffix != MAT_SUFFIX:
+        return write_bag(session, options.out, check)
+    if options.preset is None and session.info.config_json:
+        config = SlamConfig.model_validate_json(session.info.config_json)
+    else:
+        config = _config(options.preset or _PRESET)
+    return write_detections(session, options.out, config, check)
+
+
+def _to_session(options: ConvertOptions, check: Callable[[], None]) -> tuple[str, list[str]]:
+    is_mat = options.source.suffix == MAT_SUFFIX
+    preset = options.preset or (_MAT_PRESET if is_mat else _PRESET)
+    config_json, wheels = settings_text(_config(preset)), asdict(WheelNoise())
+    if is_mat:
+        of_mat = MatOptions(
+            rig=None if options.rig is None else load_rig(options.rig).rig,
+            rate_hz=options.rate_hz,
+            preset=preset,
+            config_json=config_json,
+            wheels=wheels,
+        )
+        return convert_mat(options.source, options.out, of_mat, check), []
+    of_bag = BagOptions(
+        rig=layout.AUTHORS_RIG if options.rig is None else load_rig(options.rig).rig,
         area_m=options.area_m,
         truth_topic=options.truth_topic,
-        preset=options.preset,
-        config_json=settings_text(config),
-        wheels=asdict(WheelNoise()),
+        preset=preset,
+        config_json=config_json,
+        wheels=wheels,
     )
+    return convert_bag(options.source, options.out, of_bag, check)
 
 
-def _rig(path: Path) -> Rig:
-    return load_rig(path).rig
+def _config(preset: str) -> SlamConfig:
+    try:
+        return load_preset(preset)
+    except ConfigError as error:
+        raise UsageError(str(error)) from None
 
 
 def _say(line: str) -> None:

@@ -21,6 +21,7 @@ from pydantic import ValidationError
 from slam.app.errors import AppError, OdometryError
 from slam.app.odometry import OdometryTrack
 from slam.app.progress import Progress
+from slam.app.recorded_slam import RecordedSlam
 from slam.app.report_table import print_table
 from slam.app.run_results import RESULTS, prepare_folder, saying_what_is_left, write_results
 from slam.app.run_table import print_run_table
@@ -150,10 +151,13 @@ def replay_session(
     except OdometryError as error:
         raise AppError(f"{session.path}: {error}") from None
     truth = _Truth()
+    slam = make_slam(config, session.rig, wheels)
+    if session.info.has_detections:
+        slam = RecordedSlam(slam, session.detections())
     return run_slam(
         _scans(session, truth, lines, observers, check),
         odometry,
-        make_slam(config, session.rig, wheels),
+        slam,
         truth.at,
         observers,
         gains_db=[radar.gain_db for radar in session.info.radars],

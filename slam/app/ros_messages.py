@@ -205,7 +205,8 @@ def _array(message_type: str, label: str, values: NDArray[Any]) -> Message:
     size = len(values)
     dimension = _type("std_msgs/msg/MultiArrayDimension")(label=label, size=size, stride=size)
     layout = _type("std_msgs/msg/MultiArrayLayout")(dim=[dimension], data_offset=0)
-    return _type(message_type)(layout=layout, data=values)
+    # a row of an array in Fortran order is none that can be written as it lies
+    return _type(message_type)(layout=layout, data=np.ascontiguousarray(values))
 
 
 def _time(t_ns: int) -> Message:

@@ -68,6 +68,8 @@ class SessionInfo:
         Whether radars and world are emulated.
     time_base
         What the frames' stamps come from: "counter" or "arrival".
+    has_detections
+        Whether ranges were recorded that SLAM takes instead of what it finds in frames.
     started_unix_ns
         Time of day at session time 0; None where it means nothing.
     """
@@ -84,6 +86,7 @@ class SessionInfo:
     simulated: bool = True
     time_base: str = "counter"
     started_unix_ns: int | None = None
+    has_detections: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -32,6 +32,7 @@ def session_table(info: SessionInfo) -> dict[str, str]:
         "seed": "" if info.seed is None else str(info.seed),
         "simulated": json.dumps(info.simulated),
         "time_base": info.time_base,
+        "has_detections": json.dumps(info.has_detections),
         "started_unix_ns": "" if info.started_unix_ns is None else str(info.started_unix_ns),
         "true_landmarks_m": json.dumps(info.true_landmarks_m.tolist()),
         "outlines_m": json.dumps([line.tolist() for line in info.outlines_m]),
@@ -101,6 +102,7 @@ def read_session_table(
             ),
             simulated=bool(json.loads(table.get("simulated", "true"))),
             time_base=table.get("time_base", "counter"),
+            has_detections=bool(json.loads(table.get("has_detections", "false"))),
             started_unix_ns=int(started) if started else None,
         )
     except (KeyError, ValueError, TypeError) as error:

@@ -35,8 +35,9 @@ class SessionLog:
     Topics: `/radar/<name>/frame` with the frame counter in the record's sequence number and a
     latched `/radar/<name>/info` (JSON); `/scan` after the frames of each scan, with the true pose
     where it is known, or `/scan_unused`; `/odom`, `/truth`, `/estimate`, `/landmarks`, `/tf`,
-    `/tf_static`, `/log`; `/slam/state`, the same states to the last bit (`session_states`); raw
-    bytes in `/radar/<name>/rx` and `tx`. A metadata record names scene, preset, seed, settings,
+    `/tf_static`, `/log`; `/slam/state`, the same states to the last bit (`session_states`); where
+    there are such, raw bytes in `/radar/<name>/rx` and `tx`, and ranges that another program found
+    in `/radar/<name>/detections`. A metadata record names scene, preset, seed, settings,
     versions.
 
     Parameters
@@ -75,7 +76,8 @@ class SessionLog:
         self._odometry_ns = -1  # of the newest sample written
         self._truth_at = truth_at
         self._t_ns = start_ns
-        self._wire: dict[tuple[str, str], int] = {}
+        self._rare: dict[str, int] = {}
+        self._names = [radar.name for radar in info.radars]
         self._frame_channels: list[int] = []
         self._file.add_metadata(METADATA_NAME, session_table(info))
         for radar in info.radars:
@@ -125,6 +127,11 @@ class SessionLog:
         topic = self._scans if scan.used else self._unused_scans
         self._file.write(topic, scan.t_ns, mark, sequence=scan.counter)
 
+    def on_detections(self, radar: int, t_ns: int, ranges_m: NDArray[np.float64]) -> None:
+        """Write ranges of the scan that comes next, shape (n,) [m], of a radar by its index."""
+        channel = self._lazily(radar, "detections", ros.DOUBLE_ARRAY)
+        self._file.write(channel, t_ns, ros.double_array("range_m", ranges_m))
+
     def on_odometry(self, sample: TumSample) -> None:
         """Write a pose of the wheels as it comes."""
         self._file.write(self._odometry, sample.t_ns, ros.odometry(sample))
@@ -161,12 +168,17 @@ class SessionLog:
         """
         if not data:
             return
-        channel = self._wire.get((radar, way))
-        if channel is None:
-            channel = self._file.channel(f"/radar/{radar}/{way}", ros.BYTE_ARRAY)
-            self._wire[radar, way] = channel
+        channel = self._lazily(radar, way, ros.BYTE_ARRAY)
         message = ros.byte_array("byte", data)
         self._file.write(channel, self._t_ns, message, publish_ns=host_ns)
+
+    def _lazily(self, radar: int | str, part: str, message_type: str) -> int:
+        """Return the channel of a part that few sessions have, made when it is first needed."""
+        name = self._names[radar] if isinstance(radar, int) else radar
+        topic = f"/radar/{name}/{part}"
+        if topic not in self._rare:
+            self._rare[topic] = self._file.channel(topic, message_type)
+        return self._rare[topic]
 
     def close(self) -> None:
         """Write index and footer, and close the file; doing so again does nothing."""

@@ -32,6 +32,7 @@ from slam.app.session_head import (
 from slam.app.session_states import snapshot_of
 from slam.app.sources import TRUE_PER_MODULE_METRE, sampler_limits, whole_periods
 from slam.app.tum import TumSample
+from slam.detector import Detection
 from slam.frames import RadarFrame
 from slam.geometry import Mount, Rig
 from xethru_protocol.driver import RawConfig
@@ -162,6 +163,29 @@ class RecordedSession:
                     record.truth,
                 )
                 held = []
+
+    def detections(self) -> dict[int, tuple[Detection, ...]]:
+        """Return the recorded ranges by the time of their scan [ns]; amplitudes are unknown."""
+        index_of = {
+            f"/radar/{radar.name}/detections": index for index, radar in enumerate(self.info.radars)
+        }
+        of_scan: dict[int, tuple[Detection, ...]] = {}
+        held: list[Detection] = []
+        for entry in read_entries(self.path, self._on_cut):
+            if not isinstance(entry, RawMessage):
+                continue
+            if entry.topic in index_of:
+                with self._naming(entry):
+                    ranges_m = ros.deserialise(entry.data, ros.DOUBLE_ARRAY).data.tolist()
+                radar, t_ns = index_of[entry.topic], entry.t_ns
+                held += [
+                    Detection(radar=radar, t_ns=t_ns, range_m=range_m, amplitude=math.nan)
+                    for range_m in ranges_m
+                ]
+            elif entry.topic == "/scan":
+                of_scan[entry.t_ns] = tuple(held)
+                held = []
+        return of_scan
 
     def wire(self) -> Iterator[WireBytes]:
         """Yield the raw bytes of all ports in the order of the file; nothing if none are in it."""
