@@ -260,7 +260,7 @@ def test_wrong_names_are_one_line(
     bag = authors_bag(tmp_path / "a.bag")
     code, _, err = run(capsys, bag, tmp_path / "b.bag")
     assert code == 2
-    assert "of a bag a session is made; give a name that ends in .mcap" in err
+    assert "of a bag or MATLAB file a session is made; give a name that ends in .mcap" in err
     assert not (tmp_path / "b.bag").exists()
 
 
