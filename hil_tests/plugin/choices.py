@@ -29,6 +29,8 @@ class Choices:
     ----------
     specs
         The radars, each test runs on all of them.
+    chosen
+        Whether somebody asked for these radars; they are `emu` otherwise.
     rig
         Rig file that names modules by serial number; None: none.
     strict
@@ -50,6 +52,7 @@ class Choices:
     """
 
     specs: tuple[RadarSpec, ...]
+    chosen: bool
     rig: Path | None
     strict: bool
     slow: bool
@@ -123,14 +126,14 @@ def choose(config: pytest.Config) -> Choices:
     rig = config.getoption("rig") or os.environ.get(RIG_ENVIRONMENT) or config.getini(RIG_INI)
     worker: dict[str, list[str]] = getattr(config, "workerinput", {})
     try:
-        texts = (
+        chosen = (
             worker.get(WORKER_KEY)  # what the first process found
             or config.getoption("radar")
             or _words(os.environ.get(ENVIRONMENT, ""))
             or config.getini(INI)
-            or (_modules_of(Path(rig)) if rig else ["emu"])
+            or (_modules_of(Path(rig)) if rig else [])
         )
-        specs = parse_specs(texts)
+        specs = parse_specs(chosen or ["emu"])
         if not worker:
             specs = _found(specs)
             _check_workers(config, specs)
@@ -141,6 +144,7 @@ def choose(config: pytest.Config) -> Choices:
         raise pytest.UsageError("--hil-cassette needs --hil-diff")
     return Choices(
         specs=specs,
+        chosen=bool(chosen),
         rig=Path(rig) if rig else None,
         strict=config.getoption("hil_strict"),
         slow=config.getoption("hil_slow"),

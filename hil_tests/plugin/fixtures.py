@@ -88,9 +88,11 @@ def radar_pair(
     if len(names) < 2:
         lacking(request, names, f"{'+'.join(names)}: needs two radars; give --radar twice")
     found = gate(request, hil_bench, names[:2])
-    yield found[0].open(), found[1].open()
-    for place in found:
-        place.end_test()
+    try:
+        yield found[0].open(), found[1].open()
+    finally:
+        for place in found:
+            place.end_test()
 
 
 @pytest.fixture
@@ -104,9 +106,9 @@ def radar_rig(
     from hil_tests.plugin.rigs import matched
 
     found = gate(request, hil_bench, hil_bench.rig(rig_name))
-    drivers = {place.spec.name: place.open() for place in found}
     rig = request.config.stash[CHOICES].rig
     try:
+        drivers = {place.spec.name: place.open() for place in found}
         yield drivers if rig is None else matched(rig, drivers)
     finally:
         for place in found:

@@ -33,6 +33,8 @@ class Findings:
         Why it was not run; None: it was.
     bundle
         Folder of its artefacts, if they were kept.
+    failures
+        What went wrong, in order: setup, call, teardown.
     """
 
     radars: Sequence[RadarAtPlace] = ()

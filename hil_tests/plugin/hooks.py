@@ -65,9 +65,11 @@ def pytest_configure_node(node: Any) -> None:  # noqa: ANN401 - xdist's, which n
     node.workerinput[WORKER_KEY] = [spec.text for spec in node.config.stash[CHOICES].specs]
 
 
-def pytest_report_header(config: pytest.Config) -> str:
-    """Say which radars are tested."""
+def pytest_report_header(config: pytest.Config) -> str | None:
+    """Say which radars are tested, where somebody chose some: not every pytest is about radars."""
     choices = config.stash[CHOICES]
+    if not choices.chosen:
+        return None
     strict = ", strict" if choices.strict else ""
     return f"radars: {', '.join(spec.text for spec in choices.specs)}{strict}"
 
