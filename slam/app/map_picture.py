@@ -18,7 +18,7 @@ from slam.app.runner import RunRecord
 from slam.app.session import SessionInfo
 from slam.app.summary import Summary
 from slam.ekf_slam import Belief
-from slam.geometry import compose, transform
+from slam.geometry import between, compose, transform
 
 _MARGIN_M = 0.25
 
@@ -51,8 +51,9 @@ def map_figure(
     """
     place = record.world_from_map
     truth = record.truth
-    estimate = transform(place, np.array([row.belief.pose[:2] for row in record.results]))
-    odometry = transform(place, np.array([row.odometry_pose[:2] for row in record.results]))
+    estimate = transform(place, _xy_m([row.belief.pose for row in record.results]))
+    odom_place = place if summary is not None else _world_from_odom(record)
+    odometry = transform(odom_place, _xy_m([row.odometry_pose for row in record.results]))
     axes = figure.add_subplot()
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(color=GRID, linewidth=0.8)
@@ -130,6 +131,19 @@ def _draw_landmarks(axes: Axes, belief: Belief, place: NDArray[np.float64]) -> N
     )
 
 
+def _xy_m(poses: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    return np.array([pose[:2] for pose in poses])
+
+
+def _world_from_odom(record: RunRecord) -> NDArray[np.float64]:
+    """Return the place of odometry's frame such that it begins where SLAM does, shape (3,).
+
+    A robot's odometry begins anywhere, as it runs before we listen; that of a demo at its start.
+    """
+    odom_from_body = record.results[0].odometry_pose
+    return compose(_first_pose(record), between(odom_from_body, np.zeros(3)))
+
+
 def _first_pose(record: RunRecord) -> NDArray[np.float64]:
     pose: NDArray[np.float64] = record.results[0].belief.pose
     return compose(record.world_from_map, pose)
@@ -138,7 +152,7 @@ def _first_pose(record: RunRecord) -> NDArray[np.float64]:
 def _write_plain_title(axes: Axes, info: SessionInfo, estimate: NDArray[np.float64]) -> None:
     length_m = float(np.linalg.norm(np.diff(estimate, axis=0), axis=1).sum())
     axes.set_title(
-        f"{info.scene}, preset {info.preset}: {length_m:.1f} m driven, nothing true is known",
+        f"{info.scene}, preset {info.preset}: {length_m:.1f} m driven, no truth to compare it with",
         loc="left",
         fontsize=11,
         color=INK,

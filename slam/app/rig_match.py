@@ -20,7 +20,7 @@ from xethru_protocol.errors import XeThruError
 from xethru_protocol.messages import SystemGetInfo
 
 NamedObserver = Callable[[str, ProtocolRecord], None]
-"""Gets a radar's name, before it is known its port, and what happened on its link."""
+"""Gets a radar's name, and what happened on its link."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,14 +28,27 @@ class _Module:
     port: str
     serial: str
     driver: X4M300
-    label: _Label
+    link_log: _LinkLog
 
 
-@dataclass(slots=True)
-class _Label:
-    """What to call a link in the protocol log."""
+class _LinkLog:
+    """Passes on what happens on a link, once it is known whose it is."""
 
-    name: str
+    def __init__(self, observer: NamedObserver) -> None:
+        self._observer = observer
+        self._name: str | None = None
+        self._early: list[ProtocolRecord] = []
+
+    def take(self, record: ProtocolRecord) -> None:
+        if self._name is None:
+            self._early.append(record)
+        else:
+            self._observer(self._name, record)
+
+    def name(self, name: str) -> None:
+        self._name = name
+        for record in self._early:
+            self._observer(name, record)
 
 
 def open_rig(
@@ -96,16 +109,16 @@ def open_rig(
 
 def _ask(port: str, observer: NamedObserver, unless_it_works: ExitStack) -> _Module:
     """Open a port and ask the module behind it for its serial number."""
-    label = _Label(port)
+    link_log = _LinkLog(observer)
     try:
-        driver = X4M300.open(port, observer=lambda record: observer(label.name, record))
+        driver = X4M300.open(port, observer=link_log.take)
         unless_it_works.callback(driver.close)
         request = SystemGetInfo(item=InfoItem.XTID_SSIC_SERIALNUMBER)
         driver.ping()
         serial = driver.request(request).text
     except XeThruError as error:
         raise AppError(f"{port}: {error}") from None
-    return _Module(port=port, serial=serial, driver=driver, label=label)
+    return _Module(port=port, serial=serial, driver=driver, link_log=link_log)
 
 
 def _match(
@@ -139,7 +152,7 @@ def _match(
     links = []
     for radar, mount in zip(rig.radars, rig.rig.mounts, strict=True):
         module = by_serial[radar.serial]
-        module.label.name = radar.name
+        module.link_log.name(radar.name)
         note(f"radar {radar.name}: serial number {radar.serial}, at {module.port}")
         links.append(
             RadarLink(

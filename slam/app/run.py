@@ -249,7 +249,6 @@ def _finish(  # noqa: PLR0917 - everything a run ends with
     source: LiveSource,
     listener: _Listener,
 ) -> None:
-    write_results(options.out, info, record, rig)
     print_run_table(
         info,
         record,
@@ -257,6 +256,7 @@ def _finish(  # noqa: PLR0917 - everything a run ends with
         stream=sys.stdout,
         also=_rows(info.radars, record, source),
     )
+    write_results(options.out, info, record, rig)
     ended = source.ended
     assert ended is not None
     kept = f"; what was recorded is in {options.out}"

@@ -94,6 +94,8 @@ def test_mounts_follow_serial_numbers_whichever_cable_is_where(
     assert [link.mount.range_offset_m for link in links] == [0.01, 0.01]
     assert [link.gain_db for link in links] == [1.5, 1.5]
     assert "radar left: serial number 000000000001, at b" in bench.notes
+    asked = [(name, text) for name, text in bench.heard if "GET_INFO" in text]
+    assert [name for name, _ in asked] == ["left", "right"]
     links[0].driver.ping()
     assert bench.heard[-1][0] == "left"
     for link in links:
