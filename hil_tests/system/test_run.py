@@ -155,6 +155,13 @@ def test_a_signal_leaves_a_session_that_replays(
     again = replayed(out, tmp_path / "again", capsys)
     assert ("was cut at byte" in again) == (which is signal.SIGKILL)
     assert "recorded states came again, to the last bit" in again
+    if which is signal.SIGKILL:
+        assert main(["repair", str(out / "session.mcap")]) == 0
+        repaired = replayed(out, tmp_path / "repaired", capsys)
+        assert "was cut" not in repaired
+        assert (tmp_path / "repaired" / "estimate.tum").read_bytes() == (
+            tmp_path / "again" / "estimate.tum"
+        ).read_bytes()
     n_again = len((tmp_path / "again" / "estimate.tum").read_text().splitlines())
     assert n_again > 10
 

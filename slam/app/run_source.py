@@ -152,6 +152,11 @@ class LiveSource:
         """Scans recorded that SLAM did not use."""
         return self._assembler.n_unused
 
+    @property
+    def n_left_out(self) -> int:
+        """Frames that came too late for their scan and are not recorded."""
+        return self._assembler.n_left_out
+
     def settle(self) -> int:
         """Listen until every clock is known a little; return the session time of the first scan.
 

@@ -53,6 +53,8 @@ class TickAssembler:
         How long ago the newest tick given out was over.
     n_unused, n_late
         Scans given out that SLAM must not use; those among them for which it was too late.
+    n_left_out
+        Frames that are in no scan, as newer ones of their radar took their place.
     ended
         Whether odometry ended, and the ticks have come there.
     """
@@ -66,7 +68,7 @@ class TickAssembler:
         self._is_late = False
         self.start_ns: int | None = None
         self.lag_ns = 0
-        self.n_unused = self.n_late = 0
+        self.n_unused = self.n_late = self.n_left_out = 0
         self.ended = False
 
     @property
@@ -134,12 +136,14 @@ class TickAssembler:
         """Return the oldest frame of every radar, if it was taken before the tick's end.
 
         A radar whose clock is fast has two frames in a tick now and then; the second waits for the
-        next tick, and is left out once it is older than a whole period.
+        next tick, and is left out once it is older than a whole period, as is what arrives when
+        its tick is long over.
         """
         received = []
         for queue in self._waiting:
-            while len(queue) > 1 and queue[0].frame.t_ns < begin_ns - self._period_ns:
+            while queue and queue[0].frame.t_ns < begin_ns - self._period_ns:
                 queue.popleft()
+                self.n_left_out += 1
             if queue and queue[0].frame.t_ns < end_ns:
                 received.append(queue[0])
         return received
