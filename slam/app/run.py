@@ -275,9 +275,13 @@ def _rows(radars: tuple[RadarInfo, ...], record: RunRecord, source: LiveSource) 
         (
             "load",
             f"{100 * load:.0f} %",
-            f"of real time spent in SLAM and logs; at worst {source.worst_lag_s:.2f} s behind, "
-            f"{source.n_unused} scans recorded without SLAM, {source.n_left_out} frames came too late",
-        )
+            f"of real time spent in SLAM and logs; at worst {source.worst_lag_s:.2f} s behind",
+        ),
+        (
+            "left out",
+            f"{source.n_unused}",
+            f"scans recorded without SLAM; {source.n_left_out} frames came too late",
+        ),
     ]
     for radar, clock in zip(radars, source.clocks, strict=True):
         drift, _, rest = drift_text(clock).removeprefix("clock ").partition(" against")
