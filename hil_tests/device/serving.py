@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from slam.app.parent_death import signal_at_parents_death
+
 END_LIMIT_S = 10
 
 
@@ -44,6 +46,8 @@ def emulator(
         stdout=subprocess.PIPE,
         text=True,
         env={**os.environ, **(environment or {})},
+        # a test session that is killed leaves no emulator behind
+        preexec_fn=signal_at_parents_death(signal.SIGTERM),
     )
     assert process.stdout is not None
     try:

@@ -69,8 +69,8 @@ def test_rates_read_back_as_the_timer_runs(radar: X4M300, rate_hz: int) -> None:
 def test_frames_keep_their_pace(radar: X4M300, radar_place: RadarAtPlace, measure: Measure) -> None:
     """Protocol reference 9.6: 17 is 17.049379 Hz, 58.653 ms; short frames, so any line carries it.
 
-    The mean interval is the chip's, and may be off by what two arrivals at the ends are late:
-    a tenth of a second over these 40. Single intervals are measured and not judged.
+    Judged in virtual time; in real time, when 41 frames arrive says as much of a busy host as of
+    the module, so that is measured only.
     """
     radar.configure_raw(RawConfig(frame_area_m=(0.4, 1.0)))
     radar.start(17.0)
@@ -78,26 +78,32 @@ def test_frames_keep_their_pace(radar: X4M300, radar_place: RadarAtPlace, measur
     radar.stop()
     intervals_ms = np.diff(arrivals_ns) * 1e-6
     measure("frame_interval_p99", float(np.percentile(intervals_ms, 99)), unit="ms")
-    slack_ms = 1e-3 if radar_place.place.virtual else 100.0 / 40
-    measure(
-        "frame_interval_mean",
-        float(intervals_ms.mean()),
-        unit="ms",
-        limit=(58.653 - slack_ms, 58.653 + slack_ms),
-    )
+    mean_ms = float(intervals_ms.mean())
+    limit = (58.652, 58.654) if radar_place.place.virtual else (None, None)
+    measure("frame_interval_mean", mean_ms, unit="ms", limit=limit)
     measure("frames_lost", radar.frames_lost, limit=(None, 0))
 
 
 @pytest.mark.slow
 @pytest.mark.slow_hw(seconds=60)
 def test_a_minute_of_frames(radar: X4M300, frame_rate_hz: float, measure: Measure) -> None:
-    """Nothing is lost, damaged or off the chip's lattice over 60 s of 1431 bins."""
+    """Nothing is lost, damaged or off the chip's lattice over 60 s of 1431 bins, at the rate told.
+
+    A frame may be late, never early, so the rate is that of the most punctual frames of the first
+    and of the last quarter.
+    """
     radar.configure_raw()
     rate_hz = radar.start(frame_rate_hz)
     count = round(60 * rate_hz)
-    counters = [frame.counter for frame in radar.frames(count)]
+    frames = [(frame.counter, frame.arrival_ns) for frame in radar.frames(count)]
     radar.stop()
+    counters = [counter for counter, _ in frames]
     assert counters == list(range(counters[0], counters[0] + count))
+    late_s = np.array([t_ns - frames[0][1] for _, t_ns in frames]) * 1e-9
+    late_s -= np.arange(count) / rate_hz
+    quarter = count // 4
+    drift_s = late_s[-quarter:].min() - late_s[:quarter].min()
+    measure("rate_error", 100 * drift_s * rate_hz / count, unit="%", limit=(-0.5, 0.5))
     measure("frames_lost", radar.frames_lost, limit=(None, 0))
     measure("damaged_places", radar.fault_count, limit=(None, 0))
     measure("off_lattice_samples", radar.statistics.off_lattice_samples, limit=(None, 0))

@@ -30,7 +30,7 @@ def test_it_is_ready_again_after_a_reset(
     assert radar.request(m.X4DriverGet(setting=X4Setting.FPS)).values == (0.0,)
     radar.configure_raw()
     assert radar.x4_settings()[X4Setting.ITERATIONS] == 16
-    measure("reset_to_ready", ready_s, unit="s", limit=(2.0, 15.0))
+    measure("reset_to_ready", ready_s, unit="s", limit=(2.0, None))
 
 
 def test_frames_come_again_after_a_reset_in_a_stream(radar: X4M300, frame_rate_hz: float) -> None:
@@ -102,6 +102,6 @@ def test_rates_no_module_has_change_nothing(radar: X4M300) -> None:
     """Protocol reference 4.10: values outside 600 ... 10 000 000 are acknowledged and ignored."""
     radar.request(m.SetBaudRate(baudrate=300))
     try:
-        assert radar.ping(1.0) is PongCode.XTS_SPRP_READY
+        assert radar.ping(5.0) is PongCode.XTS_SPRP_READY
     except ResponseTimeout:  # say what happened, not that something was slow
         pytest.fail("it changed its rate to one that it does not have")

@@ -14,7 +14,7 @@ from hil_tests.plugin.measurements import Measure
 if TYPE_CHECKING:
     from hil_tests.plugin.bench import Bench, RadarAtPlace
 
-__all__ = ["FINDINGS", "Findings", "gate", "lacking"]
+__all__ = ["FINDINGS", "Findings", "gate", "lacking", "leave_out"]
 
 
 @dataclass(slots=True, kw_only=True)
@@ -130,7 +130,8 @@ def lacking(request: pytest.FixtureRequest, names: Sequence[str], reason: str) -
     pytest.skip(reason)
 
 
-def _not_meant(request: pytest.FixtureRequest, reason: str) -> NoReturn:
+def leave_out(request: pytest.FixtureRequest, reason: str) -> NoReturn:
+    """Skip a test that nobody asked for here; nothing is missing, so never a failure."""
     FINDINGS.of(request.node).reason = reason
     pytest.skip(reason)
 
@@ -139,9 +140,9 @@ def _check_kind(request: pytest.FixtureRequest, bench: Bench, name: str) -> None
     item: pytest.Item = request.node
     spec = bench.specs[name]
     if item.get_closest_marker("emulated_only") and not spec.emulated:
-        _not_meant(request, f"{name}: for emulated radars only")
+        leave_out(request, f"{name}: for emulated radars only")
     if item.get_closest_marker("real_only") and spec.emulated:
-        _not_meant(request, f"{name}: for real modules only; give --radar /dev/...")
+        leave_out(request, f"{name}: for real modules only; give --radar /dev/...")
 
 
 def _check_capabilities(request: pytest.FixtureRequest, radar: RadarAtPlace) -> None:
@@ -161,12 +162,12 @@ def _check_permissions(request: pytest.FixtureRequest, radar: RadarAtPlace) -> N
     name = radar.spec.name
     if not radar.spec.emulated:
         if item.get_closest_marker("writes_flash") and not choices.flash:
-            _not_meant(request, f"{name}: writes the module's flash; --allow-flash lets it")
+            leave_out(request, f"{name}: writes the module's flash; --allow-flash lets it")
         if item.get_closest_marker("writes_factory_settings") and not choices.factory:
-            _not_meant(
+            leave_out(
                 request, f"{name}: resets the module's settings; --allow-factory-reset lets it"
             )
     slow = item.get_closest_marker("slow_hw")
     if slow is not None and not radar.place.virtual and not choices.slow:
         seconds = slow.kwargs.get("seconds", "many")
-        _not_meant(request, f"{name}: takes {seconds} s in real time; --hil-slow runs it")
+        leave_out(request, f"{name}: takes {seconds} s in real time; --hil-slow runs it")
