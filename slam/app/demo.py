@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -121,7 +121,7 @@ def _run(
         log = SessionLog(options.out / "session.mcap", info, odometry, truth_at=trajectory.poses)
         stack.callback(log.close)
         view = RerunView(options.out / "session.rrd", info)
-        stack.callback(view.close)
+        stack.push(_closing(view))
         watchers = [live.observer(info)] if live is not None else []
         for watcher in watchers:
             stack.callback(watcher.close)
@@ -185,6 +185,20 @@ def _session_info(
         wheels=asdict(wheels_of(scene)),
         outlines_m=outlines_m(scene),
     )
+
+
+def _closing(view: SessionObserver) -> Callable[..., bool]:
+    """Close a view at the end of a run; what ended the run is told rather than what that did."""
+
+    def close(_kind: object, error: BaseException | None, _trace: object) -> bool:
+        try:
+            view.close()
+        except AppError:
+            if error is None:
+                raise
+        return False
+
+    return close
 
 
 @contextmanager

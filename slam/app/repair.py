@@ -144,7 +144,7 @@ def repair(path: Path, out: Path | None, check: Callable[[], None]) -> Repair:
         except OSError as error:
             raise AppError(
                 f"{error.filename or fresh}: cannot be written: {error.strerror or error}; "
-                f"{path} is as it was"
+                f"{path} is as it was; make room or give --out on another disk"
             ) from None
         finally:
             fresh.unlink(missing_ok=True)
