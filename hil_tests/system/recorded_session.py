@@ -37,14 +37,19 @@ FAULT = "fault CRC of 5731 bytes <does not fit>"
 _SHORTER = ("waypoints_m = [[0.0, 0.0], [0.5, 0.0]]", "waypoints_m = [[0.0, 0.0], [0.2, 0.0]]")
 
 
+def write_shorter_scene(folder: Path) -> Path:
+    """Write the short scene with 0.2 m to drive instead of 0.5."""
+    file = write_short_scene(folder)
+    file.write_text(file.read_text().replace(*_SHORTER))
+    return file
+
+
 def record_session(path: Path, preset: str, seed: int = 5, *, has_truth: bool = True) -> RunRecord:
     """Record 0.2 m there and back, with one frame lost and one fault on the links.
 
     Without truth it is as a drive in the real world.
     """
-    file = write_short_scene(path.parent)
-    file.write_text(file.read_text().replace(*_SHORTER))
-    scene, config = scene_and_config(str(file), preset)
+    scene, config = scene_and_config(str(write_shorter_scene(path.parent)), preset)
     trajectory = scene.trajectory()
     odometry = OdometryTrack.from_lines(scene_odometry(scene, seed))
     with open_loopback(scene, seed) as source:

@@ -1,12 +1,15 @@
 """`uwb-slam view`: sessions as files, pictures and pages; what cannot be shown is one line."""
 
 import os
+import re
 import signal
 import socket
 import subprocess
 import sys
+import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,11 +17,19 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hil_tests.system.recorded_session import FAULT, LOST_COUNTER, record_session
+from hil_tests.system.recorded_session import (
+    FAULT,
+    LOST_COUNTER,
+    record_session,
+    write_shorter_scene,
+)
 from slam.app.cli import main
+from slam.app.errors import AppError
 from slam.app.live_view import LiveView
+from slam.app.replay import replay_session
 from slam.app.rerun_recording import count_rows
 from slam.app.rerun_sdk import RrdReader
+from slam.app.rerun_viewer import executable
 from slam.app.session_reader import open_session
 
 pytestmark = pytest.mark.slow
@@ -122,6 +133,81 @@ def test_a_run_goes_on_when_its_viewer_is_killed(
     assert said.count("the viewer was closed; the run goes on without it") == 1
 
 
+def test_an_address_where_nobody_listens_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))  # bound and not listening: nobody else gets it meanwhile
+        url = f"rerun+http://127.0.0.1:{probe.getsockname()[1]}/proxy"
+        with pytest.raises(AppError, match=f"^{re.escape(url)}: no viewer listens there"):
+            LiveView(url, lambda: None).__enter__()
+    with pytest.raises(SystemExit) as usage:
+        main(["demo", "--rerun", "http://127.0.0.1:9876"])
+    assert usage.value.code == 2
+    assert "must be spawn, connect, serve-web, or an address like" in capsys.readouterr().err
+
+
+@contextmanager
+def saving_viewer(saved: Path) -> Iterator[str]:
+    """Give the address of a viewer of Rerun's own that saves what it is sent."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [str(executable()), "--save", str(saved), "--bind", "127.0.0.1", "--port", str(port)]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+        wait_until(lambda: connects(port))
+        yield f"rerun+http://127.0.0.1:{port}/proxy"
+        process.terminate()
+
+
+def test_a_viewer_gets_every_row_that_a_file_gets(viewed: Viewed, tmp_path: Path) -> None:
+    expected = without_pictures(viewed.rrd)
+    with saving_viewer(saved := tmp_path / "saved.rrd") as url:
+        session = open_session(viewed.session)
+        with LiveView(url, lambda: None, is_replay=True) as live:
+            view = live.observer(session.info)
+            replay_session(session, [view], lambda: None)
+            view.close()
+        wait_until(lambda: without_pictures(saved) == expected)
+    assert without_pictures(saved) == expected
+    assert sum(expected.values()) > 1000
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")  # of one that is still written
+def test_a_demo_is_watched_while_it_runs(tmp_path: Path) -> None:
+    scene, out = str(write_shorter_scene(tmp_path)), tmp_path / "out"
+    with saving_viewer(saved := tmp_path / "saved.rrd") as url:
+        options = ["--scene", scene, "--preset", "paper", "--out", str(out), "--rerun", url]
+        assert main(["demo", *options]) == 0
+        expected = without_pictures(out / "session.rrd")
+        wait_until(lambda: without_pictures(saved) == expected)
+    assert without_pictures(saved) == expected
+    hosts = {
+        "host_time" in chunk.timeline_names
+        for chunk in RrdReader(saved).stream()
+        if str(chunk.entity_path) == "/radar/front_left/frame" and not chunk.is_static
+    }
+    assert hosts == {True}  # a live view knows when frames arrived
+
+
+def without_pictures(path: Path) -> dict[str, int]:
+    """Count rows of all but B-scans: a live view sends those more often, as they fill."""
+    try:
+        rows = count_rows(path)
+    except (OSError, RuntimeError):  # the file is being written
+        return {}
+    return {name: n for name, n in rows.items() if not name.endswith("/bscan")}
+
+
+def connects(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def wait_until(is_true: Callable[[], bool], limit_s: float = 10.0) -> None:
+    give_up = time.monotonic() + limit_s
+    while not is_true() and time.monotonic() < give_up:
+        time.sleep(0.1)
+
+
 def kill_viewer() -> None:
     """Kill the one viewer that this process has started, and see it gone."""
     (viewer,) = (
@@ -138,6 +224,18 @@ def children(parent: int) -> Iterator[int]:
         fields = stat.read_text().rpartition(")")[2].split()
         if int(fields[1]) == parent:
             yield int(stat.parent.name)
+
+
+def test_what_is_left_of_a_cut_session_is_shown(
+    viewed: Viewed, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = viewed.session.read_bytes()
+    (cut := tmp_path / "cut.mcap").write_bytes(whole[: len(whole) // 2])
+    assert main(["view", str(cut), "--out", str(tmp_path / "v.rrd")]) == 0
+    assert f"{cut} was cut at byte" in capsys.readouterr().err
+    rows, all_rows = count_rows(tmp_path / "v.rrd"), count_rows(viewed.rrd)
+    share = rows["/radar/front_left/frame"] / all_rows["/radar/front_left/frame"]
+    assert 0.3 < share < 0.6
 
 
 def test_what_cannot_be_shown_is_one_line(

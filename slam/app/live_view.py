@@ -52,9 +52,13 @@ class LiveView:
         Raises
         ------
         AppError
-            It cannot be started.
+            It cannot be started, or nothing listens at the address given.
         """
-        from slam.app.rerun_viewer import ViewerKind, ViewerProcess  # late, see module text
+        from slam.app.rerun_viewer import (  # late, see module text
+            ViewerKind,
+            ViewerProcess,
+            require_listening,
+        )
 
         if self._where in {SPAWN, SERVE_WEB}:
             kind = ViewerKind.WEB if self._where == SERVE_WEB else ViewerKind.WINDOW
@@ -66,6 +70,8 @@ class LiveView:
             if kind is ViewerKind.WEB:
                 self._web_url = viewer.web_url
                 _say(f"watch at {self._web_url}")
+        else:
+            require_listening(self._url)
         return self
 
     def __exit__(

@@ -19,12 +19,14 @@ from enum import Enum
 from pathlib import Path
 from types import TracebackType
 from typing import Self
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
 from slam.app.errors import AppError
 from slam.app.parent_death import signal_at_parents_death
 
 _HERE = "127.0.0.1"
+_DEFAULT_PORT = 9876
+_CONNECT_LIMIT_S = 3.0
 _START_LIMIT_S = 20.0
 _SETTLE_S = 0.5
 """A viewer that cannot draw listens at first and ends a moment later."""
@@ -84,7 +86,7 @@ class ViewerProcess:
         """
         if self._kind is ViewerKind.WINDOW and sys.platform == "linux":
             _require_display()
-        command = [str(_executable()), "--bind", _HERE, "--port", str(self._port)]
+        command = [str(executable()), "--bind", _HERE, "--port", str(self._port)]
         command += self._kind.value
         if self._kind is ViewerKind.WEB:
             command += ["--web-viewer-port", str(self._web_port)]
@@ -161,7 +163,29 @@ class ViewerProcess:
             )
 
 
-def _executable() -> Path:
+def require_listening(url: str) -> None:
+    """See that somebody listens at the `rerun+http://` address of a viewer.
+
+    Raises
+    ------
+    AppError
+        Nobody does; names the remedy.
+    """
+    try:
+        parts = urlsplit(url)
+        host, port = parts.hostname or "", parts.port or _DEFAULT_PORT
+    except ValueError:
+        raise AppError(f"{url}: is no address of a viewer") from None
+    try:
+        socket.create_connection((host, port), timeout=_CONNECT_LIMIT_S).close()
+    except OSError as error:
+        raise AppError(
+            f"{url}: no viewer listens there ({error.strerror or error}); start one with "
+            f"`rerun --bind {_HERE}`, or let --rerun spawn do it"
+        ) from None
+
+
+def executable() -> Path:
     """Return the viewer that came with the SDK: the same version, whatever is on the path."""
     found = importlib.util.find_spec("rerun_cli")
     folder = Path(found.origin).parent if found is not None and found.origin else None

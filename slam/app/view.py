@@ -123,6 +123,15 @@ def _replay(
     progress = Progress(session.info, None, lambda: losses.count)
     stack.callback(progress.close)
     replay_session(session, [view, losses, progress], stop.check)
+    if session.cut_at_byte is not None:
+        stack.callback(_say_cut, session)
+
+
+def _say_cut(session: RecordedSession) -> None:
+    sys.stderr.write(
+        f"uwb-slam: {session.path} was cut at byte {session.cut_at_byte}; "
+        "the view shows what is left of it\n"
+    )
 
 
 def _show_file(path: Path, options: ViewOptions, stop: StopFlag) -> None:
