@@ -157,8 +157,9 @@ def _parser() -> argparse.ArgumentParser:
             "convert",
             help="sessions from and to rosbags and .mat, in the layout of the paper's data set",
             description="IN is a session, then OUT is a MATLAB file of detections if its name "
-            "ends in .mat, a bag of ROS 1 if in .bag, or else a new folder with a bag of ROS 2; or "
-            "IN is one of these, then OUT is a session, which replay, view and report take.",
+            "ends in .mat, the raw bytes of one port if in .xtwire, a bag of ROS 1 if in .bag, or "
+            "else a new folder with a bag of ROS 2; or IN is a .mat or a bag, then OUT is a "
+            "session, which replay, view and report take.",
         )
     )
 
@@ -233,6 +234,7 @@ def _add_convert(convert: argparse.ArgumentParser) -> None:
         "--preset",
         help="settings of SLAM (default: a session's own; for a bag robust, for a .mat paper)",
     )
+    convert.add_argument("--radar", metavar="NAME", help="whose raw bytes, for .xtwire")
     convert.set_defaults(command=_convert)
 
 
@@ -374,6 +376,7 @@ def _convert(arguments: argparse.Namespace, stop: StopFlag) -> None:
         truth_topic=arguments.truth,
         rate_hz=arguments.rate,
         preset=arguments.preset,
+        radar=arguments.radar,
     )
     run_convert(options, stop.check)
 

@@ -15,11 +15,12 @@ from slam.app.rosbag_read import BagOptions, convert_bag
 from slam.app.rosbag_write import write_bag
 from slam.app.session_head import settings_text
 from slam.app.session_reader import RecordedSession, open_session
+from slam.app.wire_export import write_wire
 from slam.config import SlamConfig
 from slam.presets import ConfigError, load_preset
 from slam.robust.parameters import WheelNoise
 
-SESSION_SUFFIX, MAT_SUFFIX = ".mcap", ".mat"
+SESSION_SUFFIX, MAT_SUFFIX, WIRE_SUFFIX = ".mcap", ".mat", ".xtwire"
 _PRESET = "robust"
 _MAT_PRESET = "paper"  # whose front end such ranges are of: they scatter by a bin, 7 mm
 
@@ -35,6 +36,7 @@ class ConvertOptions:
     truth_topic: str
     rate_hz: int
     preset: str | None
+    radar: str | None
 
 
 def run_convert(options: ConvertOptions, check: Callable[[], None]) -> None:
@@ -69,6 +71,8 @@ def run_convert(options: ConvertOptions, check: Callable[[], None]) -> None:
 def _from_session(
     session: RecordedSession, options: ConvertOptions, check: Callable[[], None]
 ) -> str:
+    if options.out.suffix == WIRE_SUFFIX:
+        return write_wire(session, options.out, options.radar, check)
     if options.out.suffix != MAT_SUFFIX:
         return write_bag(session, options.out, check)
     if options.preset is None and session.info.config_json:
