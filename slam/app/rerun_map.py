@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Sequence
 
 import numpy as np
@@ -40,6 +40,9 @@ _PATH_PERIOD_NS = 2 * NS_PER_S
 _PATH_STEP = 5
 """One point per five states is 5 cm of path: no corner is lost."""
 
+TRAIL_STATES = 40
+"""Of so many states trilaterated points stay on the map: the clouds that clusters are made of."""
+
 # Name, colour, half line width, draw order: the truth lies below, wide enough to be seen.
 _PATHS: tuple[tuple[str, Rgb, float, float], ...] = (
     ("truth", TRUTH_RGB, 0.02, 10.0),
@@ -49,9 +52,9 @@ _PATHS: tuple[tuple[str, Rgb, float, float], ...] = (
 
 # Name, colour, radius [m], draw order.
 _POINTS: tuple[tuple[str, Rgb, float, float], ...] = (
-    ("fixes/found", FIX_RGB, 0.012, 41.0),
-    ("fixes/rejected", REJECTED_RGB, 0.018, 42.0),
-    ("clusters/kept", KEPT_RGB, 0.03, 43.0),
+    ("clusters/kept", KEPT_RGB, 0.022, 41.0),
+    ("fixes/found", FIX_RGB, 0.012, 42.0),
+    ("fixes/rejected", REJECTED_RGB, 0.015, 43.0),
 )
 
 
@@ -65,6 +68,9 @@ class MapLayer:
         self._rows: list[Snapshot] = []
         self._stamps = Stamps.none()
         self._paths: dict[str, list[Array]] = defaultdict(list)
+        self._trails: dict[str, deque[Array]] = {
+            name: deque(maxlen=TRAIL_STATES) for name, *_ in _POINTS
+        }
         self._first_ns = self._next_map_ns = self._next_path_ns = 0
         self._last: tuple[Snapshot, int | None] | None = None
         self._send_statics(info)
@@ -184,12 +190,13 @@ class MapLayer:
             "clusters/kept": [step.observations for step in steps],
         }
         for name, points in found.items():
-            placed = [
-                transform(pose, np.array([(point.x_m, point.y_m) for point in row]).reshape(-1, 2))
-                for pose, row in zip(world, points, strict=True)
-            ]
-            columns = rr.Points2D.columns(positions=screen(np.concatenate(placed)))
-            self._recording.rows(f"map/{name}", stamps, columns.partition(lengths(points)))
+            shown = []
+            for pose, row in zip(world, points, strict=True):
+                own = np.array([(point.x_m, point.y_m) for point in row]).reshape(-1, 2)
+                self._trails[name].append(transform(pose, own))
+                shown.append(np.concatenate(self._trails[name]))
+            columns = rr.Points2D.columns(positions=screen(np.concatenate(shown)))
+            self._recording.rows(f"map/{name}", stamps, columns.partition(lengths(shown)))
 
     def _send_arcs(
         self, entity: str, stamps: Stamps, radar: RadarInfo, ranges_m: Sequence[Sequence[float]]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warnings
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Sequence, Sized
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
@@ -269,6 +269,6 @@ def strips_column(strips: NDArray[np.float32]) -> rr.ComponentColumn:
     return arrow_column(template.component_descriptor(), lines)
 
 
-def lengths(rows: Sequence[Sequence[object]]) -> NDArray[np.int64]:
+def lengths(rows: Sequence[Sized]) -> NDArray[np.int64]:
     """Return how many instances each row has, for `partition`."""
     return np.array([len(row) for row in rows], dtype=np.int64)

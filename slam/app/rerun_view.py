@@ -15,7 +15,7 @@ from pathlib import Path
 from slam.app.rerun_blueprint import blueprint
 from slam.app.rerun_frames import BLOCK_FRAMES, FrameLayer
 from slam.app.rerun_link import LinkLayer
-from slam.app.rerun_map import MapLayer
+from slam.app.rerun_map import TRAIL_STATES, MapLayer
 from slam.app.rerun_numbers import NumberLayer
 from slam.app.rerun_recording import FileTarget, Recording, ViewerTarget
 from slam.app.rerun_sdk import rr
@@ -73,7 +73,9 @@ class RerunView:
         )
         of_seed = "" if info.seed is None else f", seed {info.seed}"
         self._recording.name(f"{info.scene}, preset {info.preset}{of_seed}")
-        guide = rr.TextDocument(about(info, BLOCK_FRAMES), media_type=rr.MediaType.MARKDOWN)
+        guide = rr.TextDocument(
+            about(info, block=BLOCK_FRAMES, states=TRAIL_STATES), media_type=rr.MediaType.MARKDOWN
+        )
         self._recording.static("about", guide)
         settings = json.dumps([asdict(radar) for radar in info.radars], indent=1)
         self._recording.static("radars", rr.TextDocument(settings))

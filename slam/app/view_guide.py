@@ -20,9 +20,9 @@ only. {data}
 * **B-scan** (middle, a tab per radar): echoes of up to {block} frames, time downwards, range to
   the right, constant part removed. A landmark that the robot passes is a curved line.
 * **Frame**: the newest raw frame, amplitude over range in metres; red bars are detections.
-* **Position error** (below the map): distance to the truth, which SLAM never sees. **NIS**, **NEES**: how
-  surprised the filter is by echoes, and how wrong by its own measure; an honest filter stays
-  inside the grey 95 % band most of the time. Below it is too modest, above too sure.
+* **Position error** (below the map): distance to the truth, which SLAM never sees. **NIS**,
+  **NEES**: how surprised the filter is by echoes, and how wrong by its own measure; an honest
+  filter stays inside the grey 95 % band most of the time. Below it is too modest, above too sure.
 * **Links** (right, below): the state of each serial link; losses and faults in the next tab,
   every command and answer under *Log*.
 
@@ -32,13 +32,13 @@ frame counter, `host_time`, if there, when frames arrived.
 
 _TRUTH = "Grey: the *true* path, and crosses where the landmarks truly are. "
 _POINTS = (
-    "Yellow points are where two arcs cross (trilateration), red those that no cluster confirmed, "
-    "large green ones what the clusters pass on."
+    "Yellow points are where two arcs cross (trilateration), of the last {states} states; red "
+    "those that no cluster confirmed, large green ones what the clusters pass on."
 )
 
 
-def about(info: SessionInfo, block: int) -> str:
-    """Return the guide for a run; `block` is the number of frames in a B-scan."""
+def about(info: SessionInfo, *, block: int, states: int) -> str:
+    """Return the guide for a run: frames in a B-scan, states whose points are on the map."""
     settings = json.loads(info.config_json or "{}")
     known = bool(len(info.true_landmarks_m)) or info.simulated
     return _ABOUT.format(
@@ -46,5 +46,5 @@ def about(info: SessionInfo, block: int) -> str:
         block=block,
         data="**All data here are simulated.**" if info.simulated else "All data are measured.",
         truth=_TRUTH if known else "",
-        points="" if settings.get("back_end") == "robust" else _POINTS,
+        points="" if settings.get("back_end") == "robust" else _POINTS.format(states=states),
     )

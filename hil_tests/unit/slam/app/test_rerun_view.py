@@ -278,14 +278,16 @@ def test_echoes_are_arcs_of_the_body_and_bars_of_the_frame(tmp_path: Path, robus
 def test_fixes_and_clusters_lie_where_the_robot_saw_them(tmp_path: Path) -> None:
     path = tmp_path / "s.rrd"
     view = RerunView(path, session_info())
-    view.on_snapshot(replace(snapshot(0), step=step(robust=False)))
+    for counter in range(50):
+        view.on_snapshot(replace(snapshot(counter), step=step(robust=False)))
     view.close()
-    pose = snapshot(0).estimate
     for name, places in (
         ("fixes/found", [(0.3, 0.9), (0.1, 0.4)]),
         ("fixes/rejected", [(0.1, 0.4)]),
         ("clusters/kept", [(0.3, 0.9)]),
     ):
-        (points,) = [p for _, p in rows(path, f"/map/{name}", "Points2D:positions") if p]
-        expected = transform(pose, np.array(places)) * [1, -1]
-        np.testing.assert_allclose(points, expected, rtol=1e-5)
+        shown = [p for _, p in rows(path, f"/map/{name}", "Points2D:positions") if p]
+        assert [len(points) // len(places) for points in shown] == [*range(1, 40), *[40] * 11]
+        poses = [snapshot(counter).estimate for counter in range(10, 50)]
+        expected = np.concatenate([transform(pose, np.array(places)) for pose in poses])
+        np.testing.assert_allclose(shown[-1], expected * [1, -1], rtol=1e-5, atol=1e-6)
