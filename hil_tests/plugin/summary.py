@@ -39,7 +39,8 @@ class Summary:
         self._counts[name][outcome] += 1
         for radar in found["radars"]:
             if radar["identity"] or radar["name"] not in self._said:
-                who = radar["identity"] or "did not answer"
+                silent = "did not answer" if found["reason"] is None else "not asked"
+                who = radar["identity"] or silent
                 self._said[radar["name"]] = f"{who}; {radar['reached']}"
         if found["reason"] is not None:
             self._reasons[found["reason"]] += 1
