@@ -152,7 +152,8 @@ def _first_pose(record: RunRecord) -> NDArray[np.float64]:
 def _write_plain_title(axes: Axes, info: SessionInfo, estimate: NDArray[np.float64]) -> None:
     length_m = float(np.linalg.norm(np.diff(estimate, axis=0), axis=1).sum())
     axes.set_title(
-        f"{info.scene}, preset {info.preset}: {length_m:.1f} m driven, no truth to compare it with",
+        f"{info.scene}, preset {info.preset}{' (simulated)' if info.simulated else ''}: "
+        f"{length_m:.1f} m driven, no truth to compare with",
         loc="left",
         fontsize=11,
         color=INK,

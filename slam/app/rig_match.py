@@ -6,6 +6,7 @@ A module that is missing, foreign or there twice is refused by name before anyth
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from xethru_protocol.codes import InfoItem
 from xethru_protocol.driver import X4M300, ProtocolRecord, known_ports
 from xethru_protocol.errors import XeThruError
 from xethru_protocol.messages import SystemGetInfo
+from xethru_protocol.ports import find_ports
 
 NamedObserver = Callable[[str, ProtocolRecord], None]
 """Gets a radar's name, and what happened on its link."""
@@ -105,6 +107,12 @@ def open_rig(
                 module.driver.close()
         unless_it_works.pop_all()
     return links
+
+
+def are_emulated(links: Sequence[RadarLink]) -> bool:
+    """Return whether any of these modules is a running emulator's, as far as emulators tell."""
+    emulated = {os.path.realpath(port.path) for port in find_ports() if port.kind == "emulated"}
+    return any(os.path.realpath(link.port) in emulated for link in links)
 
 
 def _ask(port: str, observer: NamedObserver, unless_it_works: ExitStack) -> _Module:

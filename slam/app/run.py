@@ -20,7 +20,7 @@ from slam.app.odometry_live import FixedClock, LiveOdometry
 from slam.app.odometry_source import LineSource, parse_source
 from slam.app.progress import Progress
 from slam.app.rig_file import load_rig
-from slam.app.rig_match import open_rig
+from slam.app.rig_match import are_emulated, open_rig
 from slam.app.run_events import LinkSaid, WireCame
 from slam.app.run_readers import Inbox, Readers, tap_wire
 from slam.app.run_results import RESULTS, prepare_folder, write_results
@@ -106,7 +106,7 @@ def run_rig(options: RunOptions, stop: StopFlag) -> None:
             versions=versions(),
             config_json=settings_text(config),
             wheels=asdict(wheels),
-            simulated=False,
+            simulated=are_emulated(links),
             time_base=TIME_BASE,
         )
         slam = make_slam(config, rig_file.rig, wheels)

@@ -101,6 +101,14 @@ def tap_wire(link: RadarLink, inbox: Inbox) -> None:
 
 
 def _read_radar(radar: int, link: RadarLink, inbox: Inbox, stopped: threading.Event) -> None:
+    try:
+        _follow_radar(radar, link, inbox, stopped)
+    except Exception as error:  # a bug; the run must hear of it, not lose a radar without a word
+        inbox.put(RadarLost(radar=radar, text=f"its reader failed: {error!r}"))
+        raise
+
+
+def _follow_radar(radar: int, link: RadarLink, inbox: Inbox, stopped: threading.Event) -> None:
     heard = time.monotonic()
     while not stopped.is_set():
         trouble = ""
@@ -139,4 +147,7 @@ def _read_odometry(source: LineSource, inbox: Inbox, stopped: threading.Event) -
             inbox.put(OdometryLine(text=text, arrival_ns=arrival_ns))
     except OdometryError as error:
         trouble = str(error)
+    except Exception as error:  # a bug, as above
+        inbox.put(OdometryEnded(trouble=f"its reader failed: {error!r}"))
+        raise
     inbox.put(OdometryEnded(trouble=trouble))

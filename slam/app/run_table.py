@@ -24,7 +24,8 @@ def print_run_table(
 ) -> None:
     """Write what was driven, mapped and lost; `also` are more rows of name, value, note."""
     rows = [*run_rows(info, record, lost_frames), *also]
-    title = f"{info.scene}, preset {info.preset}: a real drive, with no truth to compare it with"
+    what = "emulated radars" if info.simulated else "a real drive"
+    title = f"{info.scene}, preset {info.preset}: {what}, with no truth to compare with"
     widths = [max(len(row[column]) for row in rows) for column in (0, 1)]
     rule = "-" * max(len(title), *(sum(widths) + 4 + len(row[2]) for row in rows))
     lines = [f"{name:<{widths[0]}}  {value:>{widths[1]}}  {note}" for name, value, note in rows]

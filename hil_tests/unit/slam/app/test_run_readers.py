@@ -109,3 +109,10 @@ def test_odometry_that_breaks_off_is_told_with_the_reason(tmp_path: Path) -> Non
     (event,) = told_until([], path, lambda events: len(events) == 1)
     assert isinstance(event, OdometryEnded)
     assert "without a line end" in event.trouble
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_reader_that_fails_is_told_of(silent_fifo: Path) -> None:
+    driver = ScriptedDriver(ZeroDivisionError("a bug"))
+    (event,) = told_until([link_of(driver)], silent_fifo, lambda events: len(events) == 1)
+    assert event == RadarLost(radar=0, text="its reader failed: ZeroDivisionError('a bug')")
