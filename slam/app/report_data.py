@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 from slam.app.link_lanes import LinkChange, LinkLanes
 from slam.app.session import LogLine, Scan, SessionInfo, Snapshot
 from slam.app.tum import NS_PER_S
-from slam.app.view_numbers import POSE_DOF, nis_dof, pose_nees, position_errors_m
+from slam.app.view_numbers import (
+    POSE_DOF,
+    nis_dof,
+    pose_nees,
+    position_errors_m,
+    world_from_odom,
+)
 
 _KEPT_WARNINGS = 200
 
@@ -65,6 +71,7 @@ class ReportData:
         self.start_ns: int | None = None
         self.end_ns = 0
         self._rows: list[tuple[float, ...]] = []
+        self._odom: NDArray[np.float64] | None = None
 
     @property
     def duration_s(self) -> float:
@@ -84,11 +91,13 @@ class ReportData:
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         """Keep the numbers of a state."""
+        if self._odom is None:
+            self._odom = world_from_odom(snapshot)
         nis = float(np.mean(snapshot.nis_per_dof)) if snapshot.nis_per_dof else math.nan
         self._rows.append(
             (
                 self.seconds(snapshot.t_ns),
-                *position_errors_m(snapshot),
+                *position_errors_m(snapshot, self._odom),
                 nis,
                 float(nis_dof(snapshot) or math.nan),
                 pose_nees(snapshot) / POSE_DOF,

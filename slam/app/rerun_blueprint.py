@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from slam.app.rerun_recording import DEVICE_TIME, screen
+from slam.app.rerun_recording import DEVICE_TIME, part, screen
 from slam.app.rerun_sdk import rrb
 from slam.app.session import SessionInfo
 
@@ -47,7 +47,7 @@ def _echoes(names: Sequence[str]) -> rrb.Tabs:
     bscans = [
         rrb.TensorView(
             name=f"B-scan {name}",
-            origin=f"/radar/{name}/bscan",
+            origin=f"/radar/{part(name)}/bscan",
             view_fit="fill",
             scalar_mapping=mapping,
         )
@@ -56,7 +56,7 @@ def _echoes(names: Sequence[str]) -> rrb.Tabs:
     frames = [
         rrb.BarChartView(
             name=f"Frame {name}",
-            origin=f"/radar/{name}",
+            origin=f"/radar/{part(name)}",
             contents=["$origin/frame", "$origin/detections"],
         )
         for name in names

@@ -10,7 +10,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from slam.app.bscan import bscan_picture
-from slam.app.rerun_recording import Recording, Stamps, arrow_column
+from slam.app.rerun_recording import Recording, Stamps, arrow_column, part
 from slam.app.rerun_sdk import rr
 from slam.app.session import RadarInfo, Scan, Snapshot
 from slam.app.view_style import FAULT_RGB, RADAR_RGB, Rgb
@@ -37,8 +37,8 @@ class FrameLayer:
         self._detected = Stamps.none()
         for index, radar in enumerate(radars):
             colour = RADAR_RGB[index % len(RADAR_RGB)]
-            recording.static(f"radar/{radar.name}/frame", _chart_style(color=colour))
-            recording.static(f"radar/{radar.name}/detections", _chart_style(color=FAULT_RGB))
+            recording.static(f"radar/{part(radar.name)}/frame", _chart_style(color=colour))
+            recording.static(f"radar/{part(radar.name)}/detections", _chart_style(color=FAULT_RGB))
 
     def on_scan(self, scan: Scan) -> None:
         """Take the frames of one tick; a full block goes out at once."""
@@ -81,7 +81,7 @@ class FrameLayer:
                 for row in of_radar
             ]
             widths = [np.full(len(row), _DETECTION_WIDTH_M, dtype=np.float32) for row in labels_m]
-            entity = f"radar/{radar.name}/detections"
+            entity = f"radar/{part(radar.name)}/detections"
             self._recording.rows(entity, stamps, _charts(heights, labels_m, widths))
 
     def _send_frames(self, block: _FrameBlock) -> None:
@@ -92,15 +92,15 @@ class FrameLayer:
             block.axis = axis
             labels_m = (axis[0] + axis[1] * np.arange(axis[2])).astype(np.float32)
             style = _chart_style(abscissa=labels_m, bar_m=block.bin_length_m)
-            self._recording.static(f"radar/{block.name}/frame", style)
-        self._recording.rows(f"radar/{block.name}/frame", block.stamps, [_bar_charts(frames)])
+            self._recording.static(f"radar/{part(block.name)}/frame", style)
+        self._recording.rows(f"radar/{part(block.name)}/frame", block.stamps, [_bar_charts(frames)])
         block.shown.extend(block.samples)
         # Stamped with its first frame, so that the cursor is inside the picture it shows; where
         # blocks come early, because someone watches, the picture is of the newest frames.
         shown = frames if len(frames) == BLOCK_FRAMES else np.stack(block.shown)
         picture = bscan_picture(shown, block.range_start_m, block.bin_length_m)
         self._recording.row(
-            f"radar/{block.name}/bscan",
+            f"radar/{part(block.name)}/bscan",
             block.stamps,
             rr.Tensor(picture, dim_names=("frame", "range_bin"), value_range=(0.0, 255.0)),
         )

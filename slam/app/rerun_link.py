@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from slam.app.link_lanes import LinkChange, LinkLanes, LinkState
-from slam.app.rerun_recording import Recording, Stamps
+from slam.app.rerun_recording import Recording, Stamps, part
 from slam.app.rerun_sdk import rr
 from slam.app.session import LogLine, RadarInfo, Scan
 from slam.app.view_style import FAULT_RGB, RADAR_RGB
@@ -44,15 +44,15 @@ class LinkLayer:
                 values=[str(state) for state in _STATE_COLOURS],
                 colors=list(_STATE_COLOURS.values()),
             )
-            recording.static(f"link/state/{radar.name}", states)
+            recording.static(f"link/state/{part(radar.name)}", states)
             line = rr.SeriesLines(
                 colors=RADAR_RGB[index % len(RADAR_RGB)], names=f"{radar.name}: lost", widths=1.5
             )
-            recording.static(f"link/lost/{radar.name}", line)
+            recording.static(f"link/lost/{part(radar.name)}", line)
             marker = rr.SeriesPoints(
                 colors=FAULT_RGB, markers="cross", names=f"{radar.name}: fault", marker_sizes=5.0
             )
-            recording.static(f"link/faults/{radar.name}", marker)
+            recording.static(f"link/faults/{part(radar.name)}", marker)
 
     def on_scan(self, scan: Scan, host_ns: int | None) -> None:
         """Take the frames of one tick: who sent, who lost."""
@@ -84,12 +84,12 @@ class LinkLayer:
                     states.append(str(change.state))
             if states:
                 columns = rr.StateChange.columns(state=states)
-                self._recording.rows(f"link/state/{radar.name}", stamps, columns)
+                self._recording.rows(f"link/state/{part(radar.name)}", stamps, columns)
             losses, values = self._losses[radar.name]
             self._losses[radar.name] = Stamps.none(), []
             if values:
                 scalars = rr.Scalars.columns(scalars=np.array(values, dtype=np.float64))
-                self._recording.rows(f"link/lost/{radar.name}", losses, scalars)
+                self._recording.rows(f"link/lost/{part(radar.name)}", losses, scalars)
 
     def finish(self) -> None:
         """Send what waits, and end every lane."""
@@ -120,14 +120,14 @@ class LinkLayer:
             text=[line.text for line in lines],
             level=["WARN" if line.warning else "INFO" for line in lines],
         )
-        self._recording.rows(f"link/log/{name}", stamps, columns)
+        self._recording.rows(f"link/log/{part(name)}", stamps, columns)
         faults = [line for line in lines if line.warning]
         if faults and name in self._lanes.counts:
             # The number of the fault, so that a burst of them is a steep stair.
             last = self._lanes.counts[name].faults
             numbers = np.arange(last - len(faults) + 1, last + 1, dtype=np.float64)
             scalars = rr.Scalars.columns(scalars=numbers)
-            self._recording.rows(f"link/faults/{name}", self._stamps_of(faults), scalars)
+            self._recording.rows(f"link/faults/{part(name)}", self._stamps_of(faults), scalars)
 
     def _stamps_of(self, lines: Sequence[LogLine]) -> Stamps:
         stamps = Stamps.none()

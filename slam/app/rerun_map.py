@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.app.ellipse import ellipse_95, rotate_covariances
-from slam.app.rerun_recording import Recording, Stamps, lengths, screen, strips_column
+from slam.app.rerun_recording import Recording, Stamps, lengths, part, screen, strips_column
 from slam.app.rerun_sdk import rr
 from slam.app.session import RadarInfo, SessionInfo, Snapshot
 from slam.app.tum import NS_PER_S
 from slam.app.view_echoes import Beams, used_detections
+from slam.app.view_numbers import world_from_odom
 from slam.app.view_style import (
     ARROW_M,
     ESTIMATE_RGB,
@@ -71,19 +72,20 @@ class MapLayer:
         self._trails: dict[str, deque[Array]] = {
             name: deque(maxlen=TRAIL_STATES) for name, *_ in _POINTS
         }
+        self._odom: Array | None = None
         self._first_ns = self._next_map_ns = self._next_path_ns = 0
         self._last: tuple[Snapshot, int | None] | None = None
         self._send_statics(info)
 
     def on_snapshot(self, snapshot: Snapshot, host_ns: int | None) -> None:
         """Take a state of SLAM."""
-        if self._last is None:
-            self._first_ns = snapshot.t_ns
+        if self._odom is None:
+            self._first_ns, self._odom = snapshot.t_ns, world_from_odom(snapshot)
         self._rows.append(snapshot)
         self._stamps.add(snapshot.t_ns, snapshot.counter, host_ns)
         self._last = snapshot, host_ns
         place = snapshot.world_from_map
-        self._paths["odometry"].append(transform(place, snapshot.odometry[:2]))
+        self._paths["odometry"].append(transform(self._odom, snapshot.odometry[:2]))
         self._paths["estimate"].append(transform(place, snapshot.estimate[:2]))
         if np.isfinite(snapshot.truth).all():
             self._paths["truth"].append(snapshot.truth[:2])
@@ -142,7 +144,7 @@ class MapLayer:
         for index, radar in enumerate(info.radars):
             wedge = [screen(self._beams.wedge(radar))]
             static(
-                f"map/robot/{radar.name}/wedge",
+                f"map/robot/{part(radar.name)}/wedge",
                 rr.LineStrips2D(wedge, colors=WEDGE_RGB, radii=0.003, draw_order=5.0),
             )
             for name, colour, radius_m in (
@@ -152,7 +154,7 @@ class MapLayer:
                 arcs = rr.LineStrips2D.from_fields(
                     colors=colour, radii=radius_m, draw_order=6.0 + index
                 )
-                static(f"map/robot/{radar.name}/{name}", arcs)
+                static(f"map/robot/{part(radar.name)}/{name}", arcs)
         for name, colour, radius_m, order in _POINTS:
             points = rr.Points2D.from_fields(colors=colour, radii=radius_m, draw_order=order)
             static(f"map/{name}", points)
@@ -181,7 +183,7 @@ class MapLayer:
                     ]
                     for step, flags in zip(steps, used, strict=True)
                 ]
-                self._send_arcs(f"map/robot/{radar.name}/{name}", stamps, radar, ranges_m)
+                self._send_arcs(f"map/robot/{part(radar.name)}/{name}", stamps, radar, ranges_m)
         if not any(step.fixes or step.observations for step in steps):
             return
         found: dict[str, list[Sequence[Fix | Observation]]] = {

@@ -6,11 +6,19 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam.app.rerun_recording import Recording, Stamps
 from slam.app.rerun_sdk import rr
 from slam.app.session import Snapshot
-from slam.app.view_numbers import POSE_DOF, band_95, nis_dof, pose_nees, position_errors_m
+from slam.app.view_numbers import (
+    POSE_DOF,
+    band_95,
+    nis_dof,
+    pose_nees,
+    position_errors_m,
+    world_from_odom,
+)
 from slam.app.view_style import BAND_RGB, ESTIMATE_RGB, LANDMARK_RGB, ODOMETRY_RGB, Rgb
 
 # Entity, name in the legend, colour, line width in points.
@@ -33,12 +41,15 @@ class NumberLayer:
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
         self._rows: list[Snapshot] = []
+        self._odom: NDArray[np.float64] | None = None
         self._stamps = Stamps.none()
         for entity, name, colour, width in _SERIES:
             recording.static(entity, rr.SeriesLines(colors=colour, names=name, widths=width))
 
     def on_snapshot(self, snapshot: Snapshot, host_ns: int | None) -> None:
         """Take a state of SLAM."""
+        if self._odom is None:
+            self._odom = world_from_odom(snapshot)
         self._rows.append(snapshot)
         self._stamps.add(snapshot.t_ns, snapshot.counter, host_ns)
 
@@ -46,9 +57,9 @@ class NumberLayer:
         """Send the states that wait."""
         rows, self._rows = self._rows, []
         stamps, self._stamps = self._stamps, Stamps.none()
-        if not rows:
+        if not rows or self._odom is None:
             return
-        errors_m = [position_errors_m(row) for row in rows]
+        errors_m = [position_errors_m(row, self._odom) for row in rows]
         self._send("error/slam", stamps, [slam_m for slam_m, _ in errors_m])
         self._send("error/odometry", stamps, [wheels_m for _, wheels_m in errors_m])
         self._send("landmarks/count", stamps, [float(len(row.landmark_ids)) for row in rows])

@@ -269,6 +269,11 @@ def strips_column(strips: NDArray[np.float32]) -> rr.ComponentColumn:
     return arrow_column(template.component_descriptor(), lines)
 
 
+def part(name: str) -> str:
+    """Return a user's name as one part of an entity's path, whatever characters are in it."""
+    return rr.escape_entity_path_part(name)
+
+
 def lengths(rows: Sequence[Sized]) -> NDArray[np.int64]:
     """Return how many instances each row has, for `partition`."""
     return np.array([len(row) for row in rows], dtype=np.int64)

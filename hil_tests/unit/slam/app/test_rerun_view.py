@@ -17,7 +17,7 @@ from slam.app.session import LogLine
 from slam.clustering import Observation
 from slam.detector import Detection
 from slam.ekf_slam import start
-from slam.geometry import transform
+from slam.geometry import compose, transform
 from slam.pipeline import StepResult
 from slam.robust.reports import UpdateReport
 from slam.trilateration import Fix
@@ -92,7 +92,7 @@ def test_scalars_and_log(finished: Path) -> None:
     errors = dict(rows(finished, "/error/slam", "Scalars:scalars"))
     assert errors[0] == [pytest.approx(0.01)]
     odometry = dict(rows(finished, "/error/odometry", "Scalars:scalars"))
-    assert odometry[0] == [pytest.approx(0.02)]
+    assert odometry[0] == [pytest.approx(0.01)]  # it begins elsewhere, so is placed at SLAM's start
 
 
 def test_nees_is_told_with_its_band(finished: Path) -> None:
@@ -221,6 +221,50 @@ def test_without_truth_there_is_no_error_to_show(tmp_path: Path) -> None:
     counted = count_rows(tmp_path / "s.rrd")
     assert {"/error/slam", "/consistency/nees/value", "/map/truth/path"}.isdisjoint(counted)
     assert counted["/map/estimate/path"] == 2  # first state, and last
+
+
+def test_odometry_that_began_with_slam_is_shown_as_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "s.rrd"
+    view = RerunView(path, session_info())
+    state = snapshot(0)
+    view.on_snapshot(replace(state, odometry=state.estimate + np.array([0.03, 0.0, 0.01])))
+    view.close()
+    (_, (error_m,)) = next(rows(path, "/error/odometry", "Scalars:scalars"))
+    assert error_m == pytest.approx(np.hypot(0.03, 0.01))  # the estimate itself is 0.01 m off
+
+
+def test_odometry_that_began_elsewhere_begins_where_slam_does(tmp_path: Path) -> None:
+    path = tmp_path / "s.rrd"
+    view = RerunView(path, session_info())
+    elsewhere = np.array([40.0, -7.0, 2.0])
+    for counter in range(3):
+        state = snapshot(counter)
+        driven = np.array([0.1 * counter, 0.0, 0.0])
+        view.on_snapshot(replace(state, odometry=compose(elsewhere, driven)))
+    view.close()
+    (strip,) = [s for _, s in rows(path, "/map/odometry/path", "LineStrips2D:strips")][-1]
+    start = snapshot(0).estimate
+    expected = transform(start, np.array([[0.0, 0.0], [0.2, 0.0]])) * [1, -1]
+    np.testing.assert_allclose(strip, expected, atol=1e-5)
+
+
+def test_names_may_hold_any_character(tmp_path: Path) -> None:
+    # closing compares the rows of every entity by its name
+    path = tmp_path / "s.rrd"
+    name = "left/rear 1.ä"
+    info = session_info()
+    radars = (replace(info.radars[0], name=name), info.radars[1])
+    view = RerunView(path, replace(info, radars=radars))
+    view.on_log(LogLine(t_ns=0, radar=name, warning=True, text="fault CRC"))
+    view.on_log(LogLine(t_ns=0, radar="tcp://127.0.0.1:3000", warning=False, text="tx Ping"))
+    for counter in range(3):
+        view.on_scan(scan(counter))
+        view.on_snapshot(replace(snapshot(counter), step=step(robust=True)))
+    view.close()
+    counted = count_rows(path)
+    assert counted["/radar/left\\/rear\\ 1.ä/frame"] == 3
+    assert counted["/link/faults/left\\/rear\\ 1.ä"] == 1
+    assert counted["/link/log/tcp\\:\\/\\/127.0.0.1\\:3000"] == 1
 
 
 def step(*, robust: bool) -> StepResult:
