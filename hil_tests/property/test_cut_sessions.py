@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from slam.app.mcap_records import CHUNK
 from slam.app.repair import KEPT_SUFFIX, repair
 from slam.app.session import Scan
 from slam.app.session_log import SessionLog
+from slam.app.session_reader import open_session
 from slam.frames import RadarFrame
 
 N_BINS = 32
@@ -242,3 +244,33 @@ def test_ros_types_survive(whole: bytes, tmp_path: Path) -> None:
         message = reader.deserialize(raw, connection.msgtype)
     assert connection.msgtype == ros.FLOAT_ARRAY
     assert (t_ns, len(message.data)) == (0, N_BINS)  # type: ignore[attr-defined]  # made at run time
+
+
+@settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(data=st.data())
+def test_any_bytes_are_one_line_or_messages(
+    whole: bytes, tmp_path: Path, data: st.DataObject
+) -> None:
+    """Garbage behind the magic, and damage anywhere, the first chunk and the index included."""
+    path, out = tmp_path / "any.mcap", tmp_path / "out.mcap"
+    out.unlink(missing_ok=True)
+    if data.draw(st.booleans()):
+        content = whole[:8] + data.draw(st.binary(max_size=300))
+    else:
+        mutable = bytearray(whole)
+        for _ in range(data.draw(st.integers(1, 4))):
+            mutable[data.draw(st.integers(8, len(whole) - 1))] = data.draw(st.integers(0, 255))
+        content = bytes(mutable)
+    path.write_bytes(content)
+    for read in (messages, lambda place: list(open_session(place).records())):
+        with suppress(AppError):
+            read(path)
+    try:
+        repair(path, out, lambda: None)
+    except AppError:
+        assert not out.exists()
+    else:
+        assert messages(out) == messages_by_mcap(out)
+    assert path.read_bytes() == content
