@@ -206,7 +206,7 @@ class LiveSource:
                 self._check()
             except StopRequestedError as stopped:
                 self.ended = Ended(text=str(stopped), stopped=stopped)
-                return
+                break
             self._drain(_POLL_S)
             while (scan := self._next_scan()) is not None:
                 started_ns = self._clock_ns()
@@ -214,6 +214,7 @@ class LiveSource:
                 self.busy_s += (self._clock_ns() - started_ns) / NS_PER_S
                 self._drain(0.0)
             self._judge()
+        self._tell_drifts()
 
     def _next_scan(self) -> Scan | None:
         if self.ended is not None:
@@ -304,8 +305,7 @@ class LiveSource:
         now_ns = self._clock_ns()
         if now_ns - self._drift_told_ns > _DRIFT_EVERY_S * NS_PER_S:
             self._drift_told_ns = now_ns
-            for info, clock in zip(self._radars, self.clocks, strict=True):
-                self._listener.say(info.name, drift_text(clock), warning=False)
+            self._tell_drifts()
         if self.ended is not None:
             return
         if self._assembler.ended:
@@ -320,6 +320,10 @@ class LiveSource:
             self._all_lost_ns = now_ns
         elif now_ns - self._all_lost_ns > SILENT_RIG_S * NS_PER_S:
             self.ended = Ended(text=f"no radar for {SILENT_RIG_S:g} s", failed=True)
+
+    def _tell_drifts(self) -> None:
+        for info, clock in zip(self._radars, self.clocks, strict=True):
+            self._listener.say(info.name, drift_text(clock), warning=False)
 
 
 def drift_text(clock: ArrivalClock) -> str:

@@ -111,7 +111,9 @@ def test_through_drift_and_jitter_the_map_is_as_good_as_with_perfect_clocks(driv
     record = run(drive, source, odometry, heard)
     assert source.ended is not None
     assert not source.ended.failed
-    assert words.said == [("odometry", "ended")]
+    assert words.said[0] == ("odometry", "ended")
+    assert [who for who, _ in words.said[1:]] == [info.name for info in drive.infos]
+    assert all(text.startswith("clock ") and " ppm against" in text for _, text in words.said[1:])
     assert source.lost_frames == source.n_unused == 0
 
     errors_ms: list[list[float]] = [[] for _ in PPM]
@@ -151,8 +153,8 @@ def test_a_dead_radar_is_told_and_the_others_go_on(drive: Drive) -> None:
     source.settle()
     heard = Heard()
     run(drive, source, odometry, heard)
-    assert words.about("front_right") == (
-        "no frame for 3 s; the run goes on with 3 of 4 radars | is back, at elsewhere"
+    assert words.about("front_right").startswith(
+        "no frame for 3 s; the run goes on with 3 of 4 radars | is back, at elsewhere | clock "
     )
     assert source.ended is not None
     assert source.ended.failed  # odometry fell silent at the end
