@@ -147,7 +147,7 @@ def _write_figures(
         ),
         "map with paths and landmarks",
     )
-    page.heading("Errors over time")
+    page.heading("Errors over time" if has_truth(record) else "Over time")
     page.picture(
         svg_of(lambda figure: draw_errors(figure, series), width_in=9.5, height_in=4.4),
         "position errors and number of landmarks over time",
@@ -260,7 +260,8 @@ def _what_it_is(session: RecordedSession, data: ReportData) -> str:
     if info.started_unix_ns is not None:
         began = datetime.fromtimestamp(info.started_unix_ns / NS_PER_S, UTC)
         words.append(f"begun {began:%Y-%m-%d %H:%M:%S} UTC")
-    words.append(f"xethru-hil {info.versions.get('xethru-hil', '?')}")
+    if "xethru-hil" in info.versions:
+        words.append(f"xethru-hil {info.versions['xethru-hil']}")
     if session.cut_at_byte is not None:
         words.append(f"cut at byte {session.cut_at_byte}: this is what is left of it")
     return "; ".join(words) + "."

@@ -18,7 +18,7 @@ def blueprint(info: SessionInfo) -> rrb.Blueprint:
     names = [radar.name for radar in info.radars]
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(_map_view(info), _numbers(), row_shares=[5, 2]),
+            rrb.Vertical(_map_view(info), _numbers(info), row_shares=[5, 2]),
             _echoes(names),
             rrb.Vertical(_texts(), _links(), row_shares=[5, 2]),
             column_shares=[4, 3, 3],
@@ -68,19 +68,19 @@ def _echoes(names: Sequence[str]) -> rrb.Tabs:
     return rrb.Tabs(*both)
 
 
-def _numbers() -> rrb.Tabs:
+def _numbers(info: SessionInfo) -> rrb.Tabs:
+    """Lay out the curves; in the world without known truth the first two stay empty."""
     origins = {
         "Position error": "/error",
-        "NIS": "/consistency/nis",
         "NEES": "/consistency/nees",
+        "NIS": "/consistency/nis",
         "Landmarks": "/landmarks",
     }
-    return rrb.Tabs(
-        *(
-            rrb.TimeSeriesView(name=name, origin=origin, axis_x=_whole_run())
-            for name, origin in origins.items()
-        )
-    )
+    views = [
+        rrb.TimeSeriesView(name=name, origin=origin, axis_x=_whole_run())
+        for name, origin in origins.items()
+    ]
+    return rrb.Tabs(*views, active_tab=0 if info.simulated else len(views) - 1)
 
 
 def _whole_run() -> rrb.TimeAxis:

@@ -88,6 +88,8 @@ class MapLayer:
         self._paths["odometry"].append(transform(self._odom, snapshot.odometry[:2]))
         self._paths["estimate"].append(transform(place, snapshot.estimate[:2]))
         if np.isfinite(snapshot.truth).all():
+            if not self._paths["truth"]:  # nobody shall see a robot where none was
+                self._recording.static("map/truth/robot", _arrow(TRUTH_RGB, 45.0))
             self._paths["truth"].append(snapshot.truth[:2])
         if snapshot.t_ns >= self._next_map_ns:
             self._next_map_ns = snapshot.t_ns + _MAP_PERIOD_NS
@@ -137,7 +139,6 @@ class MapLayer:
             static("map/walls", rr.LineStrips2D(walls, colors=WALL_RGB, radii=0.015))
         if len(info.true_landmarks_m):
             static("map/landmarks/true", _crosses(info.true_landmarks_m))
-        static("map/truth/robot", _arrow(TRUTH_RGB, 45.0))
         static("map/robot", _arrow(ESTIMATE_RGB, 50.0))
         style = rr.LineStrips2D.from_fields(colors=ESTIMATE_RGB, radii=0.004, draw_order=50.0)
         static("map/estimate/ellipse", style)
