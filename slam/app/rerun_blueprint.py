@@ -9,6 +9,7 @@ import numpy as np
 from slam.app.rerun_recording import DEVICE_TIME, part, screen
 from slam.app.rerun_sdk import rrb
 from slam.app.session import SessionInfo
+from slam.app.view_guide import is_world_known
 
 _MAP_MARGIN_M = 0.6
 
@@ -80,7 +81,7 @@ def _numbers(info: SessionInfo) -> rrb.Tabs:
         rrb.TimeSeriesView(name=name, origin=origin, axis_x=_whole_run())
         for name, origin in origins.items()
     ]
-    return rrb.Tabs(*views, active_tab=0 if info.simulated else len(views) - 1)
+    return rrb.Tabs(*views, active_tab=0 if is_world_known(info) else len(views) - 1)
 
 
 def _whole_run() -> rrb.TimeAxis:

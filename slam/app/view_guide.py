@@ -37,14 +37,18 @@ _POINTS = (
 )
 
 
+def is_world_known(info: SessionInfo) -> bool:
+    """Return whether a view may expect a true path: that of a scene, not of a robot's drive."""
+    return len(info.true_landmarks_m) > 0 or len(info.outlines_m) > 0
+
+
 def about(info: SessionInfo, *, block: int, states: int) -> str:
     """Return the guide for a run: frames in a B-scan, states whose points are on the map."""
     settings = json.loads(info.config_json or "{}")
-    known = bool(len(info.true_landmarks_m)) or info.simulated
     return _ABOUT.format(
         n_radars=len(info.radars),
         block=block,
         data="**All data here are simulated.**" if info.simulated else "All data are measured.",
-        truth=_TRUTH if known else "",
+        truth=_TRUTH if is_world_known(info) else "",
         points="" if settings.get("back_end") == "robust" else _POINTS.format(states=states),
     )

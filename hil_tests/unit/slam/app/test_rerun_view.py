@@ -115,6 +115,17 @@ def test_a_fault_is_a_marker_and_a_state_of_its_lane(finished: Path) -> None:
     assert states == ["setting up", "streaming", "ended"]
 
 
+@pytest.mark.parametrize("is_known", [True, False])
+def test_the_guide_speaks_of_truth_only_where_there_is_one(tmp_path: Path, is_known: bool) -> None:
+    info = session_info()
+    path = tmp_path / "s.rrd"
+    known = info if is_known else replace(info, true_landmarks_m=np.empty((0, 2)))
+    RerunView(path, known).close()
+    (_, (text,)) = next(rows(path, "/about", "TextDocument:text"))
+    assert ("*true* path" in text) is is_known
+    assert "2 short-range radars" in text
+
+
 def test_a_blueprint_is_embedded(finished: Path) -> None:
     assert len(RrdReader(finished).blueprints()) == 1
     (recording,) = RrdReader(finished).recordings()
