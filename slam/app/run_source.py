@@ -154,7 +154,7 @@ class LiveSource:
 
     @property
     def n_left_out(self) -> int:
-        """Frames that came too late for their scan and are not recorded."""
+        """Frames that came too late for SLAM and are only recorded."""
         return self._assembler.n_left_out
 
     def settle(self) -> int:

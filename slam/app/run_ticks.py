@@ -54,7 +54,7 @@ class TickAssembler:
     n_unused, n_late
         Scans given out that SLAM must not use; those among them for which it was too late.
     n_left_out
-        Frames that are in no scan, as newer ones of their radar took their place.
+        Frames that came too late for SLAM, given out in scans that it must not use.
     ended
         Whether odometry ended, and the ticks have come there.
     """
@@ -102,56 +102,68 @@ class TickAssembler:
         while True:
             begin_ns = self.start_ns + self._tick * self._period_ns
             end_ns = begin_ns + self._period_ns
-            if self._odometry.ended and not self._odometry.covers(begin_ns):
-                self.ended = True
-                return None
-            missing = [radar for radar in self._alive if not self._waiting[radar]]
-            if (missing or not self._alive) and now_ns < end_ns + GRACE_NS:
-                return None
-            received = self._of_tick(begin_ns, end_ns)
-            if not received:
-                if now_ns < end_ns:
-                    return None
-                self._tick += 1
-                continue
+            late = self._late(begin_ns, end_ns)
+            if late:
+                self.n_left_out += len(late)
+                return self._scan(late, begin_ns, used=False)
+            self.ended = self._odometry.ended and not self._odometry.covers(begin_ns)
+            received = self._of_tick(end_ns)
             stamps_ns = [begin_ns, *(row.frame.t_ns for row in received)]
-            if self._must_wait(max(stamps_ns), now_ns):
+            if self.ended or self._may_get_more(received, max(stamps_ns), end_ns, now_ns):
                 return None
-            for row in received:
-                self._waiting[row.frame.radar].popleft()
+            if received:
+                break
             self._tick += 1
-            self._note_lag(now_ns - end_ns)
-            used = not self._is_late and all(map(self._odometry.is_known, stamps_ns))
-            self.n_unused += not used
-            self.n_late += self._is_late
-            return Scan(
-                counter=self._tick - 1,
-                t_ns=begin_ns,
-                frames=tuple(row.frame for row in received),
-                host_ns=tuple(row.host_ns for row in received),
-                used=used,
-            )
+        for row in received:
+            self._waiting[row.frame.radar].popleft()
+        self._note_lag(now_ns - end_ns)
+        used = not self._is_late and all(map(self._odometry.is_known, stamps_ns))
+        self.n_late += self._is_late
+        scan = self._scan(received, begin_ns, used=used)
+        self._tick += 1
+        return scan
 
-    def _of_tick(self, begin_ns: int, end_ns: int) -> Sequence[ReceivedFrame]:
-        """Return the oldest frame of every radar, if it was taken before the tick's end.
-
-        A radar whose clock is fast has two frames in a tick now and then; the second waits for the
-        next tick, and is left out once it is older than a whole period, as is what arrives when
-        its tick is long over.
-        """
-        received = []
-        for queue in self._waiting:
-            while queue and queue[0].frame.t_ns < begin_ns - self._period_ns:
-                queue.popleft()
-                self.n_left_out += 1
-            if queue and queue[0].frame.t_ns < end_ns:
-                received.append(queue[0])
-        return received
-
-    def _must_wait(self, needed_ns: int, now_ns: int) -> bool:
+    def _may_get_more(
+        self, received: Sequence[ReceivedFrame], needed_ns: int, end_ns: int, now_ns: int
+    ) -> bool:
+        """Return whether waiting makes a tick more complete: by a radar, or by odometry."""
+        missing = not self._alive or any(not self._waiting[radar] for radar in self._alive)
+        if missing and now_ns < end_ns + GRACE_NS:
+            return True
+        if not received:
+            return now_ns < end_ns
         if self._odometry.covers(needed_ns) or self._odometry.ended:
             return False
         return now_ns < needed_ns + ODOMETRY_PATIENCE_NS
+
+    def _scan(self, received: Sequence[ReceivedFrame], t_ns: int, *, used: bool) -> Scan:
+        self.n_unused += not used
+        return Scan(
+            counter=self._tick,
+            t_ns=t_ns,
+            frames=tuple(row.frame for row in received),
+            host_ns=tuple(row.host_ns for row in received),
+            used=used,
+        )
+
+    def _late(self, begin_ns: int, end_ns: int) -> Sequence[ReceivedFrame]:
+        """Take the oldest frame of every radar that is too old for a tick.
+
+        It is, if it is older than a whole period, or than a quarter of one where a newer one of
+        the tick is there: after a stall of a line, or once in hours where a module's clock is
+        fast. By less, jitter about a tick's bounds makes frames old; they count.
+        """
+        late = []
+        for queue in self._waiting:
+            age_ns = begin_ns - queue[0].frame.t_ns if queue else 0
+            has_newer = len(queue) > 1 and queue[1].frame.t_ns < end_ns
+            if age_ns > (self._period_ns // 4 if has_newer else self._period_ns):
+                late.append(queue.popleft())
+        return late
+
+    def _of_tick(self, end_ns: int) -> Sequence[ReceivedFrame]:
+        """Return the oldest frame of every radar, if it was taken before the tick's end."""
+        return [q[0] for q in self._waiting if q and q[0].frame.t_ns < end_ns]
 
     def _note_lag(self, lag_ns: int) -> None:
         self.lag_ns = lag_ns

@@ -114,17 +114,38 @@ def test_a_lost_radar_is_not_waited_for_until_it_is_back() -> None:
     assert assembler.next_scan(START_NS + 4 * PERIOD_NS) is None
 
 
-def test_a_radar_whose_clock_is_fast_loses_a_frame_once_it_is_a_period_ahead() -> None:
-    """Of 0.6 s of frames in one tick of 0.2 s, the oldest are left out: newer tell more."""
+def test_of_too_many_frames_the_oldest_are_recorded_and_not_used() -> None:
     assembler = TickAssembler(1, PERIOD_NS, odometry_until(12.0))
     assembler.begin(START_NS)
     for number in range(12):  # twice as many as ticks
         assembler.take(frame(0, START_NS + number * PERIOD_NS // 2, counter=number))
     scans = scans_until(assembler, START_NS + 6 * PERIOD_NS)
-    assert all(scan.t_ns - scan.frames[0].t_ns <= PERIOD_NS for scan in scans)
-    got = [scan.frames[0].counter for scan in scans]
-    assert got == sorted(set(got))
-    assert assembler.n_left_out + len(got) == 12
+    assert [scan.frames[0].counter for scan in scans] == list(range(12))  # all, in order
+    used = [scan for scan in scans if scan.used]
+    assert all(0 <= scan.t_ns - scan.frames[0].t_ns <= PERIOD_NS for scan in used)
+    counters = [scan.counter for scan in used]
+    assert counters == sorted(set(counters))
+    assert assembler.n_left_out == assembler.n_unused == 12 - len(used)
+
+
+def test_a_burst_after_a_stall_is_recorded_and_the_run_is_not_held_up() -> None:
+    assembler = TickAssembler(2, PERIOD_NS, odometry_until(12.0))
+    assembler.begin(START_NS)
+    scans: list[Scan] = []
+    for tick in range(20):
+        now_ns = START_NS + (tick + 1) * PERIOD_NS
+        assembler.take(frame(0, now_ns - 1, counter=tick))
+        if tick == 15:  # everything at once
+            for missed in range(16):
+                assembler.take(frame(1, START_NS + missed * PERIOD_NS + 1, counter=missed))
+        elif tick > 15:
+            assembler.take(frame(1, now_ns - 1, counter=tick))
+        scans += scans_until(assembler, now_ns)
+    got = [f.counter for scan in scans for f in scan.frames if f.radar == 1]
+    assert got == list(range(20))
+    assert assembler.n_left_out in range(12, 16)
+    assert all(scan.t_ns <= scan.frames[1].t_ns for scan in scans[-4:])  # in step again
+    assert [scan.counter for scan in scans if scan.used] == list(range(20))
 
 
 def test_where_odometry_is_missing_frames_come_without_being_used() -> None:
