@@ -238,6 +238,16 @@ def test_what_is_left_of_a_cut_session_is_shown(
     assert 0.3 < share < 0.6
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full (Linux)")
+@pytest.mark.parametrize("command", ["view", "report"])
+def test_a_full_disk_is_one_line(
+    viewed: Viewed, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([command, str(viewed.session), "--out", "/dev/full"]) == 1
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("uwb-slam: /dev/full: cannot be written: No space left on device")
+
+
 def test_what_cannot_be_shown_is_one_line(
     viewed: Viewed,
     tmp_path: Path,

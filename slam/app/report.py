@@ -87,7 +87,7 @@ def report_text(session: RecordedSession, stop: StopFlag) -> str:
             record,
             scene=info.scene,
             preset=info.preset,
-            seed=info.seed or 0,
+            seed=info.seed,
             rig=session.rig,
             true_landmarks_m=info.true_landmarks_m,
         )

@@ -117,7 +117,7 @@ class Recording:
     Raises
     ------
     AppError
-        From `finish`, where the finished file does not hold every row that was sent.
+        The file cannot be begun; from `finish`: it does not hold every row that was sent.
     """
 
     def __init__(
@@ -134,7 +134,11 @@ class Recording:
         self._stream.set_log_time_enabled(False)
         self._stream.set_log_tick_enabled(False)
         if isinstance(target, FileTarget):
-            self._stream.save(target.path, default_blueprint=blueprint)
+            try:
+                self._stream.save(target.path, default_blueprint=blueprint)
+            except RuntimeError as error:  # Rerun's own, with the system's words at its end
+                reason = str(error).rpartition(": ")[2]
+                raise AppError(f"{target.path}: cannot be written: {reason}") from None
         else:
             self._stream.connect_grpc(target.url, default_blueprint=blueprint)
 
