@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -236,6 +237,23 @@ def test_what_is_left_of_a_cut_session_is_shown(
     rows, all_rows = count_rows(tmp_path / "v.rrd"), count_rows(viewed.rrd)
     share = rows["/radar/front_left/frame"] / all_rows["/radar/front_left/frame"]
     assert 0.3 < share < 0.6
+
+
+def test_a_result_never_takes_the_place_of_the_session(
+    viewed: Viewed, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = tmp_path / "session.mcap"
+    shutil.copy(viewed.session, session)
+    before = session.read_bytes()
+    (link := tmp_path / "link.rrd").symlink_to(session)
+    for arguments in (
+        ["view", str(session), "--out", str(link)],
+        ["view", str(session), "--screenshot", str(session)],
+        ["report", str(session), "--out", str(session)],
+    ):
+        assert main(arguments) == 2
+        assert "is the session itself; write to another file" in capsys.readouterr().err
+    assert session.read_bytes() == before
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full (Linux)")

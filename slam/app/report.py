@@ -27,7 +27,7 @@ from slam.app.session_reader import RecordedSession, open_session
 from slam.app.stop import StopFlag
 from slam.app.summary import Summary
 from slam.app.tum import NS_PER_S
-from slam.app.view import session_file
+from slam.app.view import refuse_overwriting, session_file
 from slam.geometry import transform
 
 REPORT_NAME = "report.html"
@@ -56,6 +56,7 @@ def run_report(options: ReportOptions, stop: StopFlag) -> None:
     """
     session = open_session(session_file(options.session))
     out = options.out or session.path.with_name(REPORT_NAME)
+    refuse_overwriting(session.path, out)
     text = report_text(session, stop)
     with naming(out):
         out.write_text(text, encoding="utf-8")

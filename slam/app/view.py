@@ -15,7 +15,7 @@ from pathlib import Path
 from slam.app.errors import AppError, UsageError, naming
 from slam.app.live_view import LiveView
 from slam.app.progress import Progress
-from slam.app.replay import LostFrames, replay_session
+from slam.app.replay import LostFrames, replay_session, settings_of
 from slam.app.rrd_file import require_readable
 from slam.app.session import SessionObserver
 from slam.app.session_reader import RecordedSession, open_session
@@ -49,6 +49,8 @@ def run_view(options: ViewOptions, stop: StopFlag) -> None:
     if options.at_s is not None and options.screenshot is None:
         raise UsageError("--at: says when a --screenshot is taken; name its file, too")
     path = session_file(options.session, allow_view=options.out is None)
+    for written in (options.out, options.screenshot):
+        refuse_overwriting(path, written)
     if path.suffix == ".rrd":
         if options.out is not None:
             raise UsageError(f"{path}: is an .rrd already; --out makes one of a session.mcap")
@@ -89,6 +91,18 @@ def session_file(given: Path, *, allow_view: bool = False) -> Path:
     raise AppError(f"{given}: holds no {' nor '.join(names)}; name a session.mcap")
 
 
+def refuse_overwriting(recorded: Path, out: Path | None) -> None:
+    """See that a result does not take the place of what it is made of.
+
+    Raises
+    ------
+    UsageError
+        It would.
+    """
+    if out is not None and out.exists() and out.samefile(recorded):
+        raise UsageError(f"{out}: is the session itself; write to another file")
+
+
 def write_view(session: RecordedSession, path: Path, stop: StopFlag) -> None:
     """Replay a session into an .rrd file.
 
@@ -99,6 +113,7 @@ def write_view(session: RecordedSession, path: Path, stop: StopFlag) -> None:
     """
     from slam.app.rerun_view import RerunView  # half a second, only where it is needed
 
+    settings_of(session)  # before a file that is there already is given up for this one
     with naming(path):
         path.open("wb").close()  # Rerun's own words on this would not name the remedy
     with ExitStack() as stack:
