@@ -19,8 +19,9 @@ import zstandard
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
-ATTACHMENT, METADATA, DATA_END = 9, 12, 15
-_LAST_CODE = 15
+MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END = 7, 9, 12, 15
+_OF_SUMMARY = (8, 10, 11, 13, 14)  # indexes and statistics, behind the data
+_LAST_CODE = 15  # private ones from 128 on are nobody's here, and more likely damage
 
 _HEAD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQI")
@@ -30,6 +31,7 @@ _MOST_BYTES = 1 << 28
 _NAMES = (b"\x04\0\0\0zstd", b"\x03\0\0\0lz4")
 _NAME_AT = _HEAD.size + _CHUNK.size
 _PIECE_BYTES = 1 << 20
+_FOOTER_BYTES, _DATA_END_BYTES = 20, 4
 
 DAMAGES = (struct.error, ValueError, RuntimeError, KeyError, zstandard.ZstdError)
 """What taking a damaged record apart may raise."""
@@ -76,6 +78,7 @@ class RecordReader:
 
     def __init__(self, stream: BinaryIO, size: int) -> None:
         self._stream, self._size = stream, size
+        self._is_data_over = False
 
     def read(self) -> Iterator[Found]:
         """Yield the records, those in chunks one by one, to the footer or as far as it goes."""
@@ -93,16 +96,44 @@ class RecordReader:
                 at = yield from self._last_or_damaged(at, code, length)
                 continue
             body = self._stream.read(length)
-            if code == CHUNK:
-                try:
+            try:
+                if code == CHUNK:
                     yield from _records_in(at, _content(body))
-                except DAMAGES as error:
-                    sound = self._is_head(end)
-                    at = yield from self._damaged(at, str(error), end if sound else None)
-                    continue
-            else:
-                yield Record(at, code, body)
+                else:
+                    self._check(at, code, body)
+                    yield Record(at, code, body)
+            except DAMAGES as error:
+                sound = self._is_head(end)
+                at = yield from self._damaged(at, str(error), end if sound else None)
+                continue
+            self._is_data_over |= code == DATA_END
             at = None if code == FOOTER else end
+
+    def _check(self, at: int, code: int, body: bytes) -> None:
+        """Raise ValueError where a record cannot be what its first byte says.
+
+        One flipped bit there would hide a chunk, or end the file.
+        """
+        end = at + _HEAD.size + len(body)
+        if code == HEADER:
+            fits = at == len(MAGIC)
+        elif code == FOOTER:
+            fits = len(body) == _FOOTER_BYTES and end + len(MAGIC) >= self._size
+        elif code == DATA_END:
+            fits = len(body) == _DATA_END_BYTES
+        elif code == MESSAGE_INDEX:
+            fits = len(body) >= 6 and struct.unpack_from("<I", body, 2)[0] == len(body) - 6
+        elif code == ATTACHMENT:
+            at_media = text_at(body, 16)[1]
+            at_data = text_at(body, at_media)[1]
+            (size,) = struct.unpack_from("<Q", body, at_data)
+            fits = len(body) == at_data + 8 + size + 4
+        elif code in _OF_SUMMARY:
+            fits = self._is_data_over
+        else:
+            fits = True
+        if not fits:
+            raise ValueError("the record there is not what it says")
 
     def _last_or_damaged(
         self, at: int, code: int, length: int
@@ -125,7 +156,7 @@ class RecordReader:
         return resume
 
     def _is_record(self, code: int, length: int) -> bool:
-        return 1 <= code < 128 and min(length, self._size) <= _MOST_BYTES
+        return _is_code(code) and min(length, self._size) <= _MOST_BYTES
 
     def _is_head(self, at: int) -> bool:
         """Whether a record of a known kind may begin at a place, or the file ends there."""
@@ -134,7 +165,7 @@ class RecordReader:
         if len(head) < _HEAD.size:
             return True
         code, length = _HEAD.unpack(head)
-        return 1 <= int(code) <= _LAST_CODE and at + _HEAD.size + int(length) <= self._size
+        return _is_code(code) and at + _HEAD.size + int(length) <= self._size
 
     def _is_zero_from(self, at: int) -> bool:
         """Whether nothing but zeros follows, as after a loss of power."""
@@ -168,6 +199,10 @@ class RecordReader:
         except DAMAGES:
             return False
         return True
+
+
+def _is_code(code: int) -> bool:
+    return 1 <= code <= _LAST_CODE
 
 
 def text_at(body: bytes, at: int) -> tuple[str, int]:
