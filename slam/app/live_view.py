@@ -80,8 +80,8 @@ class LiveView:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """End a viewer that serves a browser; a window stays open."""
-        self._stack.__exit__(kind, error, trace)
+        """End a viewer that serves a browser; a window stays open, however the run ended."""
+        self._stack.close()
 
     def observer(self, info: SessionInfo) -> SessionObserver:
         """Return what shows a run; to be closed like every other."""
