@@ -46,7 +46,10 @@ class LinkLayer:
             )
             recording.static(f"link/state/{part(radar.name)}", states)
             line = rr.SeriesLines(
-                colors=RADAR_RGB[index % len(RADAR_RGB)], names=f"{radar.name}: lost", widths=1.5
+                colors=RADAR_RGB[index % len(RADAR_RGB)],
+                names=f"{radar.name}: lost",
+                widths=1.5,
+                interpolation_mode=rr.components.InterpolationMode.StepAfter,
             )
             recording.static(f"link/lost/{part(radar.name)}", line)
             marker = rr.SeriesPoints(

@@ -44,7 +44,15 @@ class NumberLayer:
         self._odom: NDArray[np.float64] | None = None
         self._stamps = Stamps.none()
         for entity, name, colour, width in _SERIES:
-            recording.static(entity, rr.SeriesLines(colors=colour, names=name, widths=width))
+            line = rr.SeriesLines(
+                colors=colour,
+                names=name,
+                widths=width,
+                interpolation_mode=rr.components.InterpolationMode.StepAfter
+                if entity == "landmarks/count"
+                else None,
+            )
+            recording.static(entity, line)
 
     def on_snapshot(self, snapshot: Snapshot, host_ns: int | None) -> None:
         """Take a state of SLAM."""

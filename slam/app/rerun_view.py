@@ -72,7 +72,8 @@ class RerunView:
             recording_id=f"{info.scene}-{info.preset}{seed}",
         )
         of_seed = "" if info.seed is None else f", seed {info.seed}"
-        self._recording.name(f"{info.scene}, preset {info.preset}{of_seed}")
+        name = f"{info.scene}, preset {info.preset}{of_seed}"
+        self._recording.name(name, info.started_unix_ns or 0)
         guide = rr.TextDocument(
             about(info, block=BLOCK_FRAMES, states=TRAIL_STATES), media_type=rr.MediaType.MARKDOWN
         )
