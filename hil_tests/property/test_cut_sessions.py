@@ -179,6 +179,11 @@ def test_damage_in_the_middle_loses_the_chunk_it_is_in(
     assert count_by_rosbags(path) == len(found)
     kept = iter(everything)
     assert all(row in kept for row in found)  # in order, and nothing that was not there
+    for scan, _ in open_session(path).scans():  # whole ones, whatever is lost between them
+        assert [(frame.radar, frame.counter) for frame in scan.frames] == [
+            (0, scan.counter),
+            (1, scan.counter),
+        ]
     # 40 bytes touch two chunks at most, with eight messages each at most
     assert len(found) >= len(everything) - 2 * 8
 

@@ -18,7 +18,8 @@ from slam.app import ros_messages as ros
 from slam.app import rosbag_layout as layout
 from slam.app.errors import AppError
 from slam.app.session_head import radar_text, session_table
-from slam.app.session_reader import RecordedSession, ScanEnd
+from slam.app.session_reader import RecordedSession
+from slam.app.session_records import ScanEnd
 from slam.app.tum import TumSample
 from slam.frames import RadarFrame
 

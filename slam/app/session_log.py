@@ -33,12 +33,12 @@ class SessionLog:
     """Writes a session as it happens.
 
     Topics: `/radar/<name>/frame` with the frame counter in the record's sequence number and a
-    latched `/radar/<name>/info` (JSON); `/scan` after the frames of each scan, with the true pose
-    where it is known, or `/scan_unused`; `/odom`, `/truth`, `/estimate`, `/landmarks`, `/tf`,
-    `/tf_static`, `/log`; `/slam/state`, the same states to the last bit (`session_states`); where
-    there are such, raw bytes in `/radar/<name>/rx` and `tx`, and ranges that another program found
-    in `/radar/<name>/detections`. A metadata record names scene, preset, seed, settings,
-    versions.
+    latched `/radar/<name>/info` (JSON); `/scan` after the frames of each scan, with their counters
+    and the true pose where it is known, or `/scan_unused`; `/odom`, `/truth`, `/estimate`,
+    `/landmarks`, `/tf`, `/tf_static`, `/log`; `/slam/state`, the same states to the last bit
+    (`session_states`); where there are such, raw bytes in `/radar/<name>/rx` and `tx`, and ranges
+    that another program found in `/radar/<name>/detections`. A metadata record names scene, preset,
+    seed, settings, versions.
 
     Parameters
     ----------
@@ -123,7 +123,10 @@ class SessionLog:
             )
         truth = np.zeros(0) if self._truth_at is None else self._truth_at(np.array([scan.t_ns]))[0]
         known = truth if np.all(np.isfinite(truth)) else np.zeros(0)
-        mark = ros.double_array("true_x_y_heading", known)
+        # which frames they are, so that a reader of a damaged file knows what is missing
+        members = [number for frame in scan.frames for number in (frame.radar, frame.counter)]
+        row = np.array([len(scan.frames), *members, *known], dtype=np.float64)
+        mark = ros.double_array("n_frames_radars_counters_truth", row)
         topic = self._scans if scan.used else self._unused_scans
         self._file.write(topic, scan.t_ns, mark, sequence=scan.counter)
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -29,45 +29,20 @@ from slam.app.session_head import (
     read_session_table,
     session_format,
 )
-from slam.app.session_states import snapshot_of
-from slam.app.sources import TRUE_PER_MODULE_METRE, sampler_limits, whole_periods
+from slam.app.session_records import (
+    ReceivedFrame,
+    Recorded,
+    ScanEnd,
+    TruthPose,
+    limits_of,
+    read_record,
+)
+from slam.app.sources import whole_periods
 from slam.app.tum import TumSample
 from slam.detector import Detection
 from slam.frames import RadarFrame
 from slam.geometry import Mount, Rig
-from xethru_protocol.driver import RawConfig
 from xethru_protocol.x4 import frame_time_ns
-
-_LOG_WARN = 30
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class TruthPose:
-    """Where the robot really was; shape (3,), [x m, y m, heading rad], world frame."""
-
-    t_ns: int
-    pose: NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReceivedFrame:
-    """A frame and when it arrived at the host, nanoseconds since 1970; None where nobody noted."""
-
-    frame: RadarFrame
-    host_ns: int | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ScanEnd:
-    """The frames since the last one of these made a scan; see `Scan`.
-
-    ``truth`` has shape (3,), [x m, y m, heading rad], world frame; None where nobody knew.
-    """
-
-    counter: int
-    t_ns: int
-    used: bool
-    truth: NDArray[np.float64] | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,8 +115,8 @@ class RecordedSession:
     def scans(self) -> Iterator[tuple[Scan, NDArray[np.float64] | None]]:
         """Yield every scan as the run took it, and the true pose at it, shape (3,), if known.
 
-        A scan that the end of a cut file left incomplete is not among them. Files of the first
-        format have no marks: there the frames of one tick, which stand together, are a scan.
+        A scan that damage or the end of a cut file left incomplete is not among them. Files of the
+        first format have no marks: there the frames of one tick, which stand together, are a scan.
         """
         if not self.has_scan_marks:
             yield from ((scan, None) for scan in _scans_by_tick(self))
@@ -151,6 +126,11 @@ class RecordedSession:
             if isinstance(record, ReceivedFrame):
                 held.append(record)
             elif isinstance(record, ScanEnd):
+                # frames before them are of a scan whose mark is lost
+                held = held[max(len(held) - len(record.members), 0) :]
+                if tuple((row.frame.radar, row.frame.counter) for row in held) != record.members:
+                    held = []
+                    continue
                 arrivals = tuple(row.host_ns for row in held if row.host_ns is not None)
                 yield (
                     Scan(
@@ -183,7 +163,7 @@ class RecordedSession:
                     for range_m in ranges_m
                 ]
             elif entry.topic == "/scan":
-                of_scan[entry.t_ns] = tuple(held)
+                of_scan[entry.t_ns] = tuple(one for one in held if one.t_ns == entry.t_ns)
                 held = []
         return of_scan
 
@@ -219,16 +199,16 @@ class RecordedSession:
         except OdometryError as error:
             raise AppError(f"{self.path}: {error}") from None
 
-    def _received(self) -> Iterator[_Received]:
+    def _received(self) -> Iterator[Recorded]:
         frame_of = {
-            f"/radar/{radar.name}/frame": (index, radar, _limits(radar))
+            f"/radar/{radar.name}/frame": (index, radar, limits_of(radar))
             for index, radar in enumerate(self.info.radars)
         }
         for entry in read_entries(self.path, self._on_cut):
             if not isinstance(entry, RawMessage):
                 continue
             with self._naming(entry):
-                record = _record(entry, frame_of)
+                record = read_record(entry, frame_of)
             if record is not None:
                 yield record
 
@@ -244,10 +224,6 @@ class RecordedSession:
 
     def _on_cut(self, at_byte: int) -> None:
         self.cut_at_byte = at_byte
-
-
-_Received: TypeAlias = ReceivedFrame | TumSample | TruthPose | LogLine | ScanEnd | Snapshot
-_FrameTopics: TypeAlias = Mapping[str, tuple[int, RadarInfo, tuple[float, float] | None]]
 
 
 def open_session(path: Path) -> RecordedSession:
@@ -310,87 +286,6 @@ def _scan(frames: list[RadarFrame], radars: tuple[RadarInfo, ...], late: list[in
     radar = frames[0].radar
     tick = frames[0].counter + late[radar]
     return Scan(counter=tick, t_ns=frame_time_ns(tick, radars[radar].rate_hz), frames=tuple(frames))
-
-
-def _record(message: RawMessage, frame_of: _FrameTopics) -> _Received | None:
-    """Return what a message says; None for those that say nothing new."""
-    found = frame_of.get(message.topic)
-    if found is not None:
-        host_ns = None if message.publish_ns == message.t_ns else message.publish_ns
-        return ReceivedFrame(frame=_frame(message, *found), host_ns=host_ns)
-    read = _READERS.get(message.topic)
-    return None if read is None else read(message)
-
-
-def _frame(
-    message: RawMessage, index: int, radar: RadarInfo, limits: tuple[float, float] | None
-) -> RadarFrame:
-    samples = np.asarray(ros.deserialise(message.data, ros.FLOAT_ARRAY).data, dtype=np.float32)
-    if len(samples) != radar.n_bins:
-        raise ValueError(f"{len(samples)} samples, but the radar was set to {radar.n_bins}")
-    return RadarFrame(
-        radar=index,
-        t_ns=message.t_ns,
-        counter=message.sequence,
-        samples=samples,
-        range_start_m=radar.range_start_m * TRUE_PER_MODULE_METRE,
-        bin_length_m=radar.bin_length_m * TRUE_PER_MODULE_METRE,
-        limits=limits,
-    )
-
-
-def _limits(radar: RadarInfo) -> tuple[float, float] | None:
-    """Return the sampler's limits where the recorded settings are those of this driver."""
-    known = {field.name for field in fields(RawConfig)}
-    if set(radar.settings) != known:
-        return None
-    return sampler_limits(RawConfig(**dict(radar.settings)))  # type: ignore[arg-type]  # from JSON
-
-
-def _scan_end(message: RawMessage) -> ScanEnd:
-    values = ros.deserialise(message.data, ros.DOUBLE_ARRAY).data
-    if len(values) not in (0, 3):
-        raise ValueError(f"a pose of {len(values)} numbers")
-    return ScanEnd(
-        counter=message.sequence,
-        t_ns=message.t_ns,
-        used=message.topic == "/scan",
-        truth=values if len(values) else None,
-    )
-
-
-def _state(message: RawMessage) -> Snapshot:
-    row = ros.deserialise(message.data, ros.DOUBLE_ARRAY).data
-    return snapshot_of(message.sequence, message.t_ns, row)
-
-
-def _odometry(message: RawMessage) -> TumSample:
-    return ros.odometry_sample(ros.deserialise(message.data, ros.ODOMETRY))
-
-
-def _truth(message: RawMessage) -> TruthPose:
-    pose = ros.deserialise(message.data, ros.POSE).pose
-    heading_rad = 2.0 * math.atan2(pose.orientation.z, pose.orientation.w)
-    return TruthPose(
-        t_ns=message.t_ns, pose=np.array([pose.position.x, pose.position.y, heading_rad])
-    )
-
-
-def _log_line(message: RawMessage) -> LogLine:
-    line = ros.deserialise(message.data, ros.LOG)
-    return LogLine(
-        t_ns=message.t_ns, radar=line.name, warning=line.level >= _LOG_WARN, text=line.msg
-    )
-
-
-_READERS: Mapping[str, Callable[[RawMessage], _Received]] = {
-    "/scan": _scan_end,
-    "/scan_unused": _scan_end,
-    "/slam/state": _state,
-    "/odom": _odometry,
-    "/truth": _truth,
-    "/log": _log_line,
-}
 
 
 def _radar_info(path: Path, message: RawMessage) -> RadarInfo:

@@ -18,7 +18,8 @@ from slam.app.odometry import OdometryTrack
 from slam.app.session import LogLine, Scan, Snapshot
 from slam.app.session_head import METADATA_NAME, session_table, settings_text
 from slam.app.session_log import SessionLog
-from slam.app.session_reader import TruthPose, open_session, scans
+from slam.app.session_reader import open_session, scans
+from slam.app.session_records import TruthPose
 from slam.app.session_states import snapshot_of, state_row
 from slam.app.tum import TumSample, format_tum_line
 from slam.config import SlamConfig
@@ -314,5 +315,5 @@ def test_what_is_no_session_is_one_line(session_file: Path, tmp_path: Path) -> N
     foreign(tmp_path / "foreign.mcap")
     with pytest.raises(AppError, match="no session of"):
         open_session(tmp_path / "foreign.mcap")
-    with pytest.raises(AppError, match="is a directory; give the session.mcap"):
+    with pytest.raises(AppError, match="is a directory; give the session"):
         open_session(tmp_path)
