@@ -24,6 +24,9 @@ DRIFT_SIGMA = 30e-6
 """Crystals are off by tens of millionths; this is known of one before its first frame."""
 KNOWN_DRIFT_SIGMA = 5e-6
 """How much a drift that was known may change across a restart of the counter."""
+FLOOR_NS = 400_000.0
+"""By how much the least delay of a host wanders while other programs come and go: the root mean
+square over 20 clocks without drift, of runs of 12 to 77 s on a busy machine of two cores."""
 _HALVINGS = 40
 LEAST_DELAY_NS = 20_000.0
 """Mean delay below which a host does not keep time itself; keeps the sums finite."""
@@ -236,8 +239,15 @@ class ArrivalClock:
 
     @property
     def drift_sigma_ppm(self) -> float:
-        """How far off that may be, in millionths: where it would be e times less likely."""
-        return self._envelope.slope_sigma * 1e6
+        """How far off that may be, in millionths.
+
+        Where it would be e times less likely, and what a wandering least delay makes of it.
+        """
+        envelope = self._envelope
+        if envelope.baseline_ns <= 0:
+            return DRIFT_SIGMA * 1e6
+        wander = min(FLOOR_NS / envelope.baseline_ns, DRIFT_SIGMA)
+        return math.hypot(envelope.slope_sigma, wander) * 1e6
 
     @property
     def baseline_s(self) -> float:

@@ -62,7 +62,7 @@ def test_drift_is_found_and_jitter_gone(ppm: float, kind: str) -> None:
         true_ns = taken_ns(counter, ppm)
         errors_ms.append((clock.stamp_ns(counter, true_ns + int(delay)) - true_ns) * 1e-6)
     assert clock.drift_ppm == pytest.approx(ppm, abs=0.5)
-    assert clock.drift_sigma_ppm < 0.3
+    assert clock.drift_sigma_ppm < 1.5  # nearly all for a least delay that wanders, unlike here
     assert np.abs(errors_ms[25:]).max() < 2.0
     assert np.abs(errors_ms[300:]).max() < 0.6
 
@@ -73,14 +73,24 @@ def test_its_uncertainty_is_honest() -> None:
     for seed in range(100):
         generator = np.random.default_rng(seed)
         ppm = float(generator.normal(0, 20))
-        clock = ArrivalClock(RATE_HZ)
+        envelope = LowerEnvelope()
         for counter in range(300):
             delay_ns = int(generator.exponential(1.5e6))
-            clock.stamp_ns(counter, taken_ns(counter, ppm) + delay_ns)
-        inside += abs(clock.drift_ppm - ppm) < clock.drift_sigma_ppm
-        sigmas_ppm.append(clock.drift_sigma_ppm)
+            nominal_ns = frame_time_ns(counter, RATE_HZ)
+            envelope.take(nominal_ns, taken_ns(counter, ppm) + delay_ns)
+        inside += abs(envelope.line.drift_ppm - ppm) < envelope.slope_sigma * 1e6
+        sigmas_ppm.append(envelope.slope_sigma * 1e6)
     assert float(np.median(sigmas_ppm)) < 1.0
     assert 60 <= inside <= 95
+
+
+def test_a_least_delay_that_wanders_is_allowed_for() -> None:
+    """Half a minute in, a busy host delays everything by 0.4 ms: what is said holds that error."""
+    clock = ArrivalClock(RATE_HZ)
+    for counter in range(300):
+        clock.stamp_ns(counter, taken_ns(counter, 0.0) + (400_000 if counter >= 150 else 0))
+    assert abs(clock.drift_ppm) < 2.0 * clock.drift_sigma_ppm
+    assert clock.drift_sigma_ppm > 5.0
 
 
 def test_a_stalled_host_moves_no_stamp_backwards_or_far() -> None:
