@@ -61,6 +61,12 @@ class FrameLayer:
             self._send_frames(block)
         self.send_detections()
 
+    def send_older(self, t_ns: int) -> None:
+        """Send the frames of radars of which one from `t_ns` or before still waits."""
+        for block in self._blocks:
+            if len(block.stamps) and block.stamps.t_ns[0] <= t_ns:
+                self._send_frames(block)
+
     def send_detections(self) -> None:
         """Send the detections that wait."""
         rows, self._detections = self._detections, []

@@ -20,6 +20,7 @@ from slam.app.rerun_numbers import NumberLayer
 from slam.app.rerun_recording import FileTarget, Recording, ViewerTarget
 from slam.app.rerun_sdk import rr
 from slam.app.session import LogLine, Scan, SessionInfo, Snapshot
+from slam.app.tum import NS_PER_S
 from slam.app.view_echoes import beams_of
 from slam.app.view_guide import about
 
@@ -97,7 +98,7 @@ class RerunView:
         self._frames.on_scan(scan)
         self._link.on_scan(scan, self._host_ns)
         if self._flush_s is not None and self._clock_s() - self._flushed_s >= self._flush_s:
-            self._send()
+            self._send(scan.t_ns - round(self._flush_s * NS_PER_S))
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         """Take a state of SLAM: poses and scalars in blocks, the map once per second."""
@@ -124,9 +125,10 @@ class RerunView:
         self._link.finish()
         self._recording.finish()
 
-    def _send(self) -> None:
+    def _send(self, older_than_ns: int) -> None:
         self._flushed_s = self._clock_s()
-        self._frames.send()
+        # Of fast radars the next full block is never far; parts of blocks would cost twice.
+        self._frames.send_older(older_than_ns)
         self._link.send()
         self._send_states()
 

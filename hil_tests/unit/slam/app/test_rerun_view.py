@@ -168,6 +168,19 @@ def test_a_followed_view_sends_what_waited_too_long(tmp_path: Path) -> None:
     assert [(frame, picture[0]["shape"][0]) for frame, picture in pictures] == [(0, 6), (6, 10)]
 
 
+def test_a_followed_view_waits_for_the_next_block_of_a_fast_radar(tmp_path: Path) -> None:
+    now_s = 0.0
+    view = RerunView(tmp_path / "s.rrd", session_info(), flush_s=0.5, clock_s=lambda: now_s)
+    for counter in range(300):
+        now_s = 0.0025 * counter
+        one = scan(counter)
+        frames = tuple(replace(f, t_ns=round(1e9 * now_s)) for f in one.frames)
+        view.on_scan(replace(one, t_ns=round(1e9 * now_s), frames=frames))
+    view.close()
+    pictures = rows(tmp_path / "s.rrd", "/radar/radar0/bscan", "Tensor:data")
+    assert [frame for frame, _ in pictures] == [0, 128, 256]  # full blocks, though 0.5 s passed
+
+
 def arrivals(path: Path, entity: str) -> list[int]:
     """Return an entity's stamps on `host_time`, nanoseconds since 1970."""
     return [
