@@ -109,8 +109,8 @@ class Recording:
     Attributes
     ----------
     epoch_ns
-        Session time that `device_time` is counted from: 0, or the first scan's where session time
-        is a time of day. What was before it is shown at it.
+        Session time that `device_time` is counted from: the first scan's. What was before it is
+        shown at it.
     sent
         Rows sent, of every entity.
 

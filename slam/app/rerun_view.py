@@ -25,8 +25,6 @@ from slam.app.view_echoes import beams_of
 from slam.app.view_guide import about
 
 _BLOCK_STATES = 128
-_TIME_OF_DAY_NS = 10**17
-"""Session times beyond three years are times of day: a view counts from their first scan."""
 
 
 class RerunView:
@@ -89,9 +87,8 @@ class RerunView:
     def on_scan(self, scan: Scan) -> None:
         """Take the frames of one counter; a block of them goes out at once."""
         if not self._began:
-            self._began = True
-            if scan.t_ns > _TIME_OF_DAY_NS:
-                self._recording.epoch_ns = scan.t_ns
+            # Session time is the odometry's: that of a robot's drive begins anywhere.
+            self._began, self._recording.epoch_ns = True, scan.t_ns
         if not scan.host_ns and self._time_of_day_ns is not None:
             scan = replace(scan, host_ns=(self._time_of_day_ns(),) * len(scan.frames))
         self._host_ns = scan.host_ns[-1] if scan.host_ns else None

@@ -50,7 +50,10 @@ def add_view(parser: argparse.ArgumentParser) -> None:
         "--screenshot", type=folder, metavar="FILE.png", help="write a picture, no window needed"
     )
     parser.add_argument(
-        "--at", type=_seconds, metavar="S", help="time of the screenshot (default: the end)"
+        "--at",
+        type=_seconds,
+        metavar="S",
+        help="when the screenshot is taken, since the first scan (default: the end)",
     )
 
 

@@ -216,9 +216,9 @@ def test_a_live_view_notes_arrival_itself(tmp_path: Path) -> None:
         ]
 
 
-def test_a_session_in_time_of_day_is_counted_from_its_first_scan(tmp_path: Path) -> None:
+@pytest.mark.parametrize("day_ns", [1_790_000_000_000_000_000, 37_310_000_000_000])
+def test_time_is_counted_from_the_first_scan(tmp_path: Path, day_ns: int) -> None:
     view = RerunView(tmp_path / "s.rrd", session_info())
-    day_ns = 1_790_000_000_000_000_000
     view.on_log(LogLine(t_ns=0, radar="radar0", warning=False, text="tx Ping"))  # before any scan
     for counter in range(3):
         view.on_scan(replace(scan(counter), t_ns=day_ns + counter))
