@@ -95,7 +95,7 @@ def test_a_run_from_stdin_ends_when_it_is_told_to_and_replays_to_the_last_bit(
         [sys.executable, "-c", cat, robot.odometry], stdout=subprocess.PIPE
     ) as wheels:
         process = subprocess.run(
-            run_command(robot, out, "--odometry", "-", "--duration", "4", "--wire"),
+            run_command(robot, out, "--odometry", "-", "--duration", "3", "--wire"),
             stdin=wheels.stdout,
             capture_output=True,
             text=True,
@@ -105,7 +105,7 @@ def test_a_run_from_stdin_ends_when_it_is_told_to_and_replays_to_the_last_bit(
         wheels.terminate()
     assert process.returncode == 0, process.stderr
     assert "front_left: serial number 000000000100, at" in process.stderr
-    assert "the 4 s asked for are over" in process.stderr
+    assert "the 3 s asked for are over" in process.stderr
     rows = {line.split("  ")[0]: line for line in process.stdout.splitlines()}
     assert {"time", "driven", "landmarks", "load", "rear_left", "front_right"} <= set(rows)
     assert "ppm" in rows["rear_left"]
@@ -143,7 +143,7 @@ def test_a_signal_leaves_a_session_that_replays(
         stderr=subprocess.PIPE,
         text=True,
     ) as process:
-        wait_for_size(out / "session.mcap", 300_000)
+        wait_for_size(out / "session.mcap", 200_000)
         process.send_signal(which)
         said = process.communicate(timeout=30)[1]
     assert process.returncode == code
@@ -163,7 +163,7 @@ def test_a_signal_leaves_a_session_that_replays(
             tmp_path / "again" / "estimate.tum"
         ).read_bytes()
     n_again = len((tmp_path / "again" / "estimate.tum").read_text().splitlines())
-    assert n_again > 10
+    assert n_again > 5
 
 
 def wait_for_size(path: Path, size: int) -> None:
