@@ -9,6 +9,7 @@ from pathlib import Path
 
 from slam.app import rosbag_layout as layout
 from slam.app.errors import AppError, UsageError
+from slam.app.imported import SlamSettings
 from slam.app.mat_convert import MatOptions, convert_mat, write_detections
 from slam.app.rig_file import load_rig
 from slam.app.rosbag_read import BagOptions, convert_bag
@@ -85,23 +86,21 @@ def _from_session(
 def _to_session(options: ConvertOptions, check: Callable[[], None]) -> tuple[str, list[str]]:
     is_mat = options.source.suffix == MAT_SUFFIX
     preset = options.preset or (_MAT_PRESET if is_mat else _PRESET)
-    config_json, wheels = settings_text(_config(preset)), asdict(WheelNoise())
+    settings = SlamSettings(
+        preset=preset, config_json=settings_text(_config(preset)), wheels=asdict(WheelNoise())
+    )
     if is_mat:
         of_mat = MatOptions(
             rig=None if options.rig is None else load_rig(options.rig).rig,
             rate_hz=options.rate_hz,
-            preset=preset,
-            config_json=config_json,
-            wheels=wheels,
+            settings=settings,
         )
         return convert_mat(options.source, options.out, of_mat, check), []
     of_bag = BagOptions(
         rig=layout.AUTHORS_RIG if options.rig is None else load_rig(options.rig).rig,
         area_m=options.area_m,
         truth_topic=options.truth_topic,
-        preset=preset,
-        config_json=config_json,
-        wheels=wheels,
+        settings=settings,
     )
     return convert_bag(options.source, options.out, of_bag, check)
 

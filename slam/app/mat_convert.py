@@ -10,16 +10,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.app.errors import AppError, OdometryError
+from slam.app.imported import SlamSettings, imported_info, imported_radar
 from slam.app.mat_file import MatDrive, read_mat, write_mat
 from slam.app.odometry import OdometryTrack
-from slam.app.session import RadarInfo, Scan, SessionInfo
+from slam.app.session import RadarInfo, Scan
 from slam.app.session_log import SessionLog
 from slam.app.session_reader import RecordedSession
 from slam.app.sources import TRUE_PER_MODULE_METRE
@@ -57,9 +58,7 @@ class MatOptions:
 
     rig: Rig | None = None
     rate_hz: float = 5.0
-    preset: str = "paper"
-    config_json: str = ""
-    wheels: dict[str, float] = field(default_factory=dict)
+    settings: SlamSettings
 
 
 def convert_mat(mat: Path, out: Path, options: MatOptions, check: Callable[[], None]) -> str:
@@ -75,22 +74,17 @@ def convert_mat(mat: Path, out: Path, options: MatOptions, check: Callable[[], N
     pairs = _sides(mat, rig)
     stamps_ns = _stamps_ns(drive, options.rate_hz)
     radars = tuple(
-        _radar_info(mount, drive.frames.get(number), options.rate_hz)
+        imported_radar(
+            # whatever a module measures too long, it is in the fixes already
+            replace(mount, range_offset_m=0.0),
+            range_start_m=0.0,
+            bin_length_m=_BIN_M,
+            n_bins=drive.frames[number].shape[1] if number in drive.frames else 0,
+            rate_hz=options.rate_hz,
+        )
         for number, mount in enumerate(rig.mounts, start=1)
     )
-    info = SessionInfo(
-        scene=mat.resolve().stem,
-        preset=options.preset,
-        seed=None,
-        radars=radars,
-        true_landmarks_m=np.zeros((0, 2)),
-        versions={},
-        config_json=options.config_json,
-        wheels=options.wheels,
-        simulated=False,
-        time_base="states",
-        has_detections=True,
-    )
+    info = imported_info(mat, radars, options.settings, time_base="states", has_detections=True)
     poses = [
         TumSample(t_ns=t_ns, x_m=x, y_m=y, qz=math.sin(turn / 2), qw=math.cos(turn / 2))
         for t_ns, (x, y, turn) in zip(stamps_ns, drive.odometry.tolist(), strict=True)
@@ -215,23 +209,6 @@ def _stamps_ns(drive: MatDrive, rate_hz: float) -> list[int]:
     if drive.stamps_s is None:
         return [round(row * NS_PER_S / rate_hz) for row in range(len(drive.odometry))]
     return [round(stamp_s * NS_PER_S) for stamp_s in drive.stamps_s.tolist()]
-
-
-def _radar_info(mount: Mount, frames: NDArray[np.float32] | None, rate_hz: float) -> RadarInfo:
-    return RadarInfo(
-        name=mount.name,
-        serial="",
-        port="",
-        x_m=mount.x_m,
-        y_m=mount.y_m,
-        yaw_rad=mount.yaw_rad,
-        range_offset_m=0.0,  # whatever it is, it is in the fixes already
-        range_start_m=0.0,
-        bin_length_m=_BIN_M,
-        n_bins=0 if frames is None else frames.shape[1],
-        rate_hz=rate_hz,
-        settings={},
-    )
 
 
 def _frames(

@@ -22,18 +22,21 @@ from rosbags.typesys import Stores, get_typestore
 from slam.app import ros_messages as ros
 from slam.app import rosbag_layout as layout
 from slam.app.errors import AppError, OdometryError
+from slam.app.imported import SlamSettings, imported_info, imported_radar
 from slam.app.odometry import OdometryTrack
 from slam.app.session import RadarInfo, Scan, SessionInfo
 from slam.app.session_head import read_radar_text, read_session_table
 from slam.app.session_log import SessionLog
 from slam.app.sources import TRUE_PER_MODULE_METRE
+from slam.app.stop import StopRequestedError
 from slam.app.tum import NS_PER_S, TumSample
 from slam.frames import RadarFrame
-from slam.geometry import Mount, Rig
+from slam.geometry import Rig
 from xethru_protocol.x4 import frame_area
 
 # A header's stamp further from the time of recording is of another clock.
 _SAME_CLOCK_NS = NS_PER_S
+_TRUTH_TYPES = (ros.POSE, "geometry_msgs/msg/PoseWithCovarianceStamped", ros.ODOMETRY)
 _PAPER_BINS, _PAPER_AREA_M = 1431, (0.2, 9.4)
 
 
@@ -49,16 +52,14 @@ class BagOptions:
         Frame area that the modules were asked for, module metres; None: the paper's.
     truth_topic
         Of geometry_msgs/PoseStamped or PoseWithCovarianceStamped or nav_msgs/Odometry.
-    preset, config_json, wheels
-        How SLAM is to be set, for sessions that no run of this program recorded.
+    settings
+        For bags that no session of this program became.
     """
 
     rig: Rig = layout.AUTHORS_RIG
     area_m: tuple[float, float] | None = None
     truth_topic: str = layout.TRUTH_TOPIC
-    preset: str = "robust"
-    config_json: str = ""
-    wheels: dict[str, float] = field(default_factory=dict)
+    settings: SlamSettings
 
 
 @dataclass(slots=True, kw_only=True)
@@ -141,6 +142,8 @@ def convert_bag(
 def _look_through(bag: Path, truth_topic: str, check: Callable[[], None]) -> _Contents:
     contents = _Contents()
     with _open(bag) as reader:
+        for connection in reader.connections:
+            _check_type(bag, connection.topic, connection.msgtype, truth_topic)
         for connection, t_ns, raw in reader.messages():
             check()
             topic = connection.topic
@@ -170,6 +173,21 @@ def _look_through(bag: Path, truth_topic: str, check: Callable[[], None]) -> _Co
     return contents
 
 
+def _check_type(bag: Path, topic: str, message_type: str, truth_topic: str) -> None:
+    if layout.radar_of_frames(topic) is not None:
+        allowed: tuple[str, ...] = (ros.FLOAT_ARRAY,)
+    elif layout.radar_of_info(topic) is not None or topic == layout.SESSION_TOPIC:
+        allowed = (ros.STRING,)
+    elif topic == layout.ODOMETRY_TOPIC:
+        allowed = (ros.ODOMETRY,)
+    elif topic == truth_topic:
+        allowed = _TRUTH_TYPES
+    else:
+        return
+    if message_type not in allowed:
+        raise AppError(f"{bag}: {topic} is {message_type}, must be {' or '.join(allowed)}")
+
+
 @contextmanager
 def _open(bag: Path) -> Iterator[Any]:
     """Open a bag; whatever reading it raises becomes one line."""
@@ -178,7 +196,7 @@ def _open(bag: Path) -> Iterator[Any]:
     try:
         with AnyReader([folder], default_typestore=store) as reader:
             yield reader
-    except AppError:
+    except (AppError, StopRequestedError):
         raise
     except FileNotFoundError:
         raise AppError(f"{bag}: no bag is there") from None
@@ -228,27 +246,20 @@ def _radar_info(bag: Path, name: str, contents: _Contents, options: BagOptions) 
             f"{bag}: frames of {stream.n_bins} bins, but a frame area of {area_m[0]:g} to "
             f"{area_m[1]:g} m has {area.n_bins}; say another --frame-area"
         )
-    return _told_radar(mount, stream, area.start_m, (area.end_m - area.start_m) / area.n_bins)
+    return imported_radar(
+        mount,
+        range_start_m=area.start_m,
+        bin_length_m=(area.end_m - area.start_m) / area.n_bins,
+        n_bins=area.n_bins,
+        rate_hz=_rate_hz(stream),
+    )
 
 
-def _told_radar(mount: Mount, stream: _Stream, start_m: float, bin_m: float) -> RadarInfo:
+def _rate_hz(stream: _Stream) -> float:
+    """Return frames per second by the median of what lies between two; 1 for a single frame."""
     steps_ns = np.diff(stream.stamps_ns)
     period_ns = float(np.median(steps_ns)) if len(steps_ns) else 0.0
-    return RadarInfo(
-        name=mount.name,
-        serial="",
-        port="",
-        x_m=mount.x_m,
-        y_m=mount.y_m,
-        yaw_rad=mount.yaw_rad,
-        range_offset_m=mount.range_offset_m,
-        range_start_m=start_m,
-        bin_length_m=bin_m,
-        n_bins=stream.n_bins,
-        rate_hz=NS_PER_S / period_ns if period_ns > 0 else 1.0,
-        settings={},
-        phase_offset_rad=mount.phase_offset_rad,
-    )
+    return NS_PER_S / period_ns if period_ns > 0 else 1.0
 
 
 def _session_info(
@@ -260,18 +271,7 @@ def _session_info(
         except ValueError as error:
             raise AppError(f"{bag}: {layout.SESSION_TOPIC} cannot be read: {error}") from None
         return read_session_table(bag, table, radars)
-    return SessionInfo(
-        scene=bag.resolve().stem,
-        preset=options.preset,
-        seed=None,
-        radars=radars,
-        true_landmarks_m=np.zeros((0, 2)),
-        versions={},
-        config_json=options.config_json,
-        wheels=options.wheels,
-        simulated=False,
-        time_base="recording",
-    )
+    return imported_info(bag, radars, options.settings, time_base="recording")
 
 
 def _poses_of(track: OdometryTrack) -> Callable[[NDArray[np.int64]], NDArray[np.float64]]:

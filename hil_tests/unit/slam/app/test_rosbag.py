@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,14 @@ from rosbags.highlevel import AnyReader
 from hil_tests.unit.slam.app.authors_bag import AuthorsBag
 from hil_tests.unit.slam.app.sessions import FRAME_NS, feed, scan, session_info, snapshot
 from slam.app.cli import main
+from slam.app.imported import SlamSettings
 from slam.app.odometry import OdometryTrack
+from slam.app.rosbag_read import BagOptions, convert_bag
+from slam.app.rosbag_write import write_bag
 from slam.app.session import Scan
 from slam.app.session_log import SessionLog
 from slam.app.session_reader import RecordedSession, open_session
+from slam.app.stop import StopRequestedError
 from slam.app.tum import format_tum_line
 
 N_SCANS = 12
@@ -272,6 +277,33 @@ def test_a_session_without_frames_leaves_no_bag(
     assert code == 1
     assert "holds no frame" in err
     assert not (tmp_path / "bag").exists()
+
+
+def test_a_topic_of_another_type_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = AuthorsBag(tmp_path / "a.bag", topics="/odom{}")
+    bag.add_truth(START_NS, START_NS, (0.0, 0.0, 0.0))
+    bag.add_frame(START_NS, 1, samples(0, 0))
+    bag.write()
+    said = problem(capsys, bag.path, "--truth", "/odom1")
+    assert "/odom1 is std_msgs/msg/Float32MultiArray, must be geometry_msgs/msg/PoseSta" in said
+    plain = authors_bag(tmp_path / "b.bag", topics="/slam_out_pose{}")
+    assert "holds no frames" in problem(capsys, plain)
+
+
+def test_a_signal_stops_a_conversion_and_leaves_nothing(recorded: Path, tmp_path: Path) -> None:
+    bag = authors_bag(tmp_path / "a.bag")
+
+    def stop() -> None:
+        raise StopRequestedError(signal.SIGINT)
+
+    with pytest.raises(StopRequestedError):
+        convert_bag(bag, tmp_path / "s.mcap", BagOptions(settings=SlamSettings()), stop)
+    with pytest.raises(StopRequestedError):
+        write_bag(open_session(recorded), tmp_path / "out", stop)
+    assert not (tmp_path / "out").exists()
+    assert not (tmp_path / "s.mcap").exists()
 
 
 def test_frames_of_one_period_are_one_scan_even_if_one_is_lost(
