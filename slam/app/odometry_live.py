@@ -93,9 +93,9 @@ class LiveOdometry:
         return self._whole().last_ns
 
     @property
-    def drift_ppm(self) -> float:
-        """How fast its clock is against the host's, in millionths; 0 where that is not asked."""
-        return 0.0 if self._fixed else self._envelope.line.drift_ppm
+    def drift_ppm(self) -> float | None:
+        """How fast its clock is against the host's, in millionths; None where that is not asked."""
+        return None if self._fixed else self._envelope.line.drift_ppm
 
     def session_ns(self, host_ns: int) -> int:
         """Return the session time of a host time; needs a pose, unless the clock is known."""

@@ -39,6 +39,9 @@ from slam.presets import ConfigError, load_preset
 from slam.robust_pipeline import make_slam
 
 OUTPUTS = ("session.mcap", *RESULTS)
+"""What a run writes."""
+STALE = ("session.rrd", "report.html")
+"""What other commands make of a session; of an earlier one it would mislead."""
 TIME_BASE = "arrival"
 
 
@@ -79,7 +82,7 @@ def run_rig(options: RunOptions, stop: StopFlag) -> None:
     odometry = LiveOdometry(place.name, parse_clock(options.clock, place))
     inbox: Inbox = SimpleQueue()
     with ExitStack() as held:
-        prepare_folder(options.out, OUTPUTS, held)
+        prepare_folder(options.out, (*OUTPUTS, *STALE), held)
         live = None
         if options.rerun is not None:
             live = held.enter_context(LiveView(options.rerun, stop.check))
@@ -283,6 +286,8 @@ def _rows(radars: tuple[RadarInfo, ...], record: RunRecord, source: LiveSource) 
             f"scans recorded without SLAM; {source.n_left_out} frames came too late",
         ),
     ]
+    if (drift_ppm := source.odometry_drift_ppm) is not None:
+        rows.append(("odometry", f"{drift_ppm:+.2f} ppm", "clock against this machine's"))
     for radar, clock in zip(radars, source.clocks, strict=True):
         drift, _, rest = drift_text(clock).removeprefix("clock ").partition(" against")
         rows.append((radar.name, drift, f"clock against{rest}"))

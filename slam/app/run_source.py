@@ -157,6 +157,11 @@ class LiveSource:
         """Frames that came too late for SLAM and are only recorded."""
         return self._assembler.n_left_out
 
+    @property
+    def odometry_drift_ppm(self) -> float | None:
+        """How fast the odometry's clock is against the host's; None where it is told otherwise."""
+        return self._odometry.drift_ppm
+
     def settle(self) -> int:
         """Listen until every clock is known a little; return the session time of the first scan.
 
