@@ -251,7 +251,8 @@ def open_session(path: Path) -> RecordedSession:
             raise AppError(f"{path}: ends at byte {cut[0]}, before it says what run it is of")
         raise AppError(
             f"{path}: an MCAP file, but no session of `uwb-slam`: its metadata {METADATA_NAME!r} "
-            "is missing; of a bag in the layout of the paper's data set `uwb-slam convert` makes one"
+            "is missing; of a bag in the layout of the paper's data set `uwb-slam convert` makes a "
+            "session"
         )
     if not radars:
         raise AppError(f"{path}: ends before any radar is named; record the session again")
