@@ -176,6 +176,13 @@ def wait_for_size(path: Path, size: int) -> None:
 def test_what_cannot_begin_says_why_in_one_line(
     robot: Robot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    (kept := tmp_path / "kept").mkdir()
+    (kept / "session.mcap").write_bytes(b"of an earlier drive")
+    options = ["--rig", str(robot.rig), "--odometry", robot.odometry, "--out", str(kept)]
+    assert main(["run", *options]) == 1
+    assert "holds the session of an earlier drive" in capsys.readouterr().err
+    assert (kept / "session.mcap").read_bytes() == b"of an earlier drive"
+
     rig = tmp_path / "other.toml"
     rig.write_text(robot.rig.read_text().replace("000000000102", "000000000777"))
     (drive := tmp_path / "drive.tum").write_text("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")

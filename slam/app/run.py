@@ -38,8 +38,7 @@ from slam.geometry import Rig
 from slam.presets import ConfigError, load_preset
 from slam.robust_pipeline import make_slam
 
-OUTPUTS = ("session.mcap", *RESULTS)
-"""What a run writes."""
+SESSION = "session.mcap"
 STALE = ("session.rrd", "report.html")
 """What other commands make of a session; of an earlier one it would mislead."""
 TIME_BASE = "arrival"
@@ -82,7 +81,12 @@ def run_rig(options: RunOptions, stop: StopFlag) -> None:
     odometry = LiveOdometry(place.name, parse_clock(options.clock, place))
     inbox: Inbox = SimpleQueue()
     with ExitStack() as held:
-        prepare_folder(options.out, (*OUTPUTS, *STALE), held)
+        if (options.out / SESSION).exists():
+            raise AppError(
+                f"{options.out}: holds the session of an earlier drive, which cannot be repeated; "
+                "choose another --out, or move it away"
+            )
+        prepare_folder(options.out, (*RESULTS, *STALE), held)
         live = None
         if options.rerun is not None:
             live = held.enter_context(LiveView(options.rerun, stop.check))
@@ -125,7 +129,7 @@ def run_rig(options: RunOptions, stop: StopFlag) -> None:
         )
         with Readers(links, place, inbox):
             start_ns = source.settle()
-            log = SessionLog(options.out / "session.mcap", info, start_ns=start_ns)
+            log = SessionLog(options.out / SESSION, info, start_ns=start_ns)
             held.callback(log.close)
             progress = Progress(
                 info, None, lambda: source.lost_frames, also=lambda: _lag_text(source)
