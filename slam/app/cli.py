@@ -68,7 +68,7 @@ def _end(message: str, exit_code: int) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="uwb-slam", description="UWB-radar SLAM on emulated X4M300 radars."
+        prog="uwb-slam", description="UWB-radar SLAM on X4M300 radars, emulated or real."
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
