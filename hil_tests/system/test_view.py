@@ -31,7 +31,9 @@ from slam.app.replay import replay_session
 from slam.app.rerun_recording import count_rows
 from slam.app.rerun_sdk import RrdReader
 from slam.app.rerun_viewer import executable
+from slam.app.rrd_file import is_finished
 from slam.app.session_reader import open_session
+from slam.app.view import session_file
 
 pytestmark = pytest.mark.slow
 
@@ -239,6 +241,21 @@ def test_what_is_left_of_a_cut_session_is_shown(
     assert 0.3 < share < 0.6
 
 
+def test_of_a_killed_run_the_session_is_shown_not_its_unfinished_view(
+    viewed: Viewed, tmp_path: Path
+) -> None:
+    shutil.copy(viewed.session, tmp_path / "session.mcap")
+    shutil.copy(viewed.rrd, tmp_path / "session.rrd")
+    assert session_file(tmp_path, allow_view=True).name == "session.rrd"
+    (tmp_path / "session.rrd").write_bytes(viewed.rrd.read_bytes()[:-1000])
+    assert session_file(tmp_path, allow_view=True).name == "session.mcap"
+    (tmp_path / "session.mcap").unlink()
+    assert session_file(tmp_path, allow_view=True).name == "session.rrd"  # better than nothing
+    (tmp_path / "session.rrd").write_bytes(b"")
+    assert not is_finished(tmp_path / "session.rrd")
+    assert is_finished(viewed.rrd)
+
+
 def test_a_result_never_takes_the_place_of_the_session(
     viewed: Viewed, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -278,6 +295,7 @@ def test_what_cannot_be_shown_is_one_line(
     head = viewed.rrd.read_bytes()[:4]
     (future := tmp_path / "future.rrd").write_bytes(head + bytes((1, 2, 0, 0)) + b"\0" * 100)
     (old := tmp_path / "old.rrd").write_bytes(head + bytes((0, 20, 0, 0)) + b"\0" * 100)
+    (killed := tmp_path / "killed.rrd").write_bytes(viewed.rrd.read_bytes()[:-1000])
     (cut := tmp_path / "cut.mcap").write_bytes(viewed.session.read_bytes()[:100])
     out = str(tmp_path / "out.rrd")
     for arguments, code, expected in (
@@ -286,6 +304,7 @@ def test_what_cannot_be_shown_is_one_line(
         ([str(tmp_path)], 1, "holds no session.rrd nor session.mcap"),
         ([str(foreign)], 1, "is no Rerun recording"),
         ([str(future)], 1, "written by Rerun 1.2, newer than the 0.41 here can open"),
+        ([str(killed)], 1, "was never closed, its program was killed; make it again"),
         ([str(old)], 1, "written by Rerun 0.20, older than"),
         ([str(cut), "--out", out], 1, str(cut)),
         ([str(viewed.rrd), "--out", out], 2, "is an .rrd already"),

@@ -8,6 +8,8 @@ from pathlib import Path
 from slam.app.errors import AppError
 
 _MAGIC = b"RRF"
+_END = b"FOOT"
+"""Ends a finished file, with four bytes behind it."""
 _OLDEST = (0, 23)
 """Of files that later versions open."""
 
@@ -18,7 +20,8 @@ def require_readable(path: Path) -> None:
     Raises
     ------
     AppError
-        It is no recording, or one of a version that is too new or too old; names the remedy.
+        It is no recording, one of a version that is too new or too old, or one that was never
+        closed; names the remedy.
     """
     try:
         with path.open("rb") as stream:
@@ -37,3 +40,15 @@ def require_readable(path: Path) -> None:
             "here can open; make it again from its session: "
             f"uwb-slam view session.mcap --out {path.name}"
         )
+    if not is_finished(path):  # the viewer refuses it in many words, and only in its window
+        raise AppError(
+            f"{path}: was never closed, its program was killed; make it again from its session: "
+            f"uwb-slam view session.mcap --out {path.name}; or: rerun rrd merge {path.name} -o NEW"
+        )
+
+
+def is_finished(path: Path) -> bool:
+    """Return whether a recording was closed; of a killed program's the last rows are missing."""
+    with path.open("rb") as stream:
+        stream.seek(max(path.stat().st_size - len(_END) - 4, 0))
+        return stream.read().startswith(_END)

@@ -16,7 +16,7 @@ from slam.app.errors import AppError, UsageError, naming
 from slam.app.live_view import LiveView
 from slam.app.progress import Progress
 from slam.app.replay import LostFrames, replay_session, settings_of
-from slam.app.rrd_file import require_readable
+from slam.app.rrd_file import is_finished, require_readable
 from slam.app.session import SessionObserver
 from slam.app.session_reader import RecordedSession, open_session
 from slam.app.stop import StopFlag
@@ -73,7 +73,7 @@ def run_view(options: ViewOptions, stop: StopFlag) -> None:
 def session_file(given: Path, *, allow_view: bool = False) -> Path:
     """Return the file that a user means by a file or by the folder of a run.
 
-    `allow_view` prefers the .rrd of a folder, which needs no replay.
+    `allow_view` prefers the .rrd of a folder, which needs no replay, if its run lived to close it.
 
     Raises
     ------
@@ -84,11 +84,13 @@ def session_file(given: Path, *, allow_view: bool = False) -> Path:
         if not given.exists():
             raise AppError(f"{given}: no such file")
         return given
-    names = (VIEW_NAME, SESSION_NAME) if allow_view else (SESSION_NAME,)
-    for name in names:
-        if (given / name).is_file():
-            return given / name
-    raise AppError(f"{given}: holds no {' nor '.join(names)}; name a session.mcap")
+    session, view = given / SESSION_NAME, given / VIEW_NAME
+    if allow_view and view.is_file() and (is_finished(view) or not session.is_file()):
+        return view
+    if session.is_file():
+        return session
+    names = f"{VIEW_NAME} nor {SESSION_NAME}" if allow_view else SESSION_NAME
+    raise AppError(f"{given}: holds no {names}; name a session.mcap")
 
 
 def refuse_overwriting(recorded: Path, out: Path | None) -> None:
