@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer as Rosbag1Writer
+from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -21,8 +22,14 @@ Pose = tuple[float, float, float]
 class AuthorsBag:
     """Collects messages and writes them by the time of recording; `*.bag` is ROS 1."""
 
-    def __init__(self, path: Path, topics: str = "/UWBradar{}/readings") -> None:
+    def __init__(
+        self,
+        path: Path,
+        topics: str = "/UWBradar{}/readings",
+        storage: StoragePlugin = StoragePlugin.SQLITE3,
+    ) -> None:
         self.path = path
+        self._storage = storage
         self._topics = topics
         self._is_ros1 = path.suffix == ".bag"
         store = get_typestore(Stores.ROS1_NOETIC if self._is_ros1 else Stores.ROS2_HUMBLE)
@@ -63,7 +70,11 @@ class AuthorsBag:
 
     def write(self) -> None:
         path = self.path
-        writer: Any = Rosbag1Writer(path) if self._is_ros1 else Rosbag2Writer(path, version=8)
+        writer: Any = (
+            Rosbag1Writer(path)
+            if self._is_ros1
+            else Rosbag2Writer(path, version=8, storage_plugin=self._storage)
+        )
         serialise = self._store.serialize_ros1 if self._is_ros1 else self._store.serialize_cdr
         connections: dict[str, Any] = {}
         with writer:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -9,8 +10,10 @@ import pytest
 from emulator.path_lock import locked
 from hil_tests.unit.slam.app.sessions import feed, session_info
 from slam.app.cli import main
+from slam.app.repair import repair
 from slam.app.session_log import SessionLog
 from slam.app.session_reader import open_session
+from slam.app.stop import StopRequestedError
 
 
 @pytest.fixture
@@ -67,6 +70,19 @@ def test_a_folder_in_which_a_run_is_recording_is_left_alone(
         code, out, err = run(capsys, cut)
     assert (code, out) == (1, "")
     assert err == f"uwb-slam: {cut}: a run is still writing it; wait for its end\n"
+    assert cut.read_bytes() == before
+
+
+def test_a_signal_leaves_everything_as_it_was(cut: Path, tmp_path: Path) -> None:
+    before = cut.read_bytes()
+
+    def check() -> None:
+        if (tmp_path / f".{cut.name}.repairing").exists():  # while the new file is written
+            raise StopRequestedError(signal.SIGTERM)
+
+    with pytest.raises(StopRequestedError):
+        repair(cut, None, check)
+    assert list(tmp_path.iterdir()) == [cut]
     assert cut.read_bytes() == before
 
 

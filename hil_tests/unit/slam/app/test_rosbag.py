@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import StoragePlugin
 
 from hil_tests.unit.slam.app.authors_bag import AuthorsBag
 from hil_tests.unit.slam.app.sessions import FRAME_NS, feed, scan, session_info, snapshot
@@ -126,9 +127,10 @@ def authors_bag(
     odometry: bool = True,
     jump_back: bool = False,
     truth: bool = True,
+    storage: StoragePlugin = StoragePlugin.SQLITE3,
 ) -> Path:
     """Write a bag of noise and a straight drive as the authors' recorder would have."""
-    bag = AuthorsBag(path, topics)
+    bag = AuthorsBag(path, topics, storage)
     for number in range(N_SCANS):
         for radar in range(4):
             bag.add_frame(jittered_ns(radar, number), radar + 1, samples(radar, number, n_bins))
