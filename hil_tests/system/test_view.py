@@ -177,6 +177,8 @@ def test_a_viewer_gets_every_row_that_a_file_gets(viewed: Viewed, tmp_path: Path
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")  # of one that is still written
 def test_a_demo_is_watched_while_it_runs(tmp_path: Path) -> None:
     scene, out = str(write_shorter_scene(tmp_path)), tmp_path / "out"
+    out.mkdir()
+    (out / "report.html").write_text("of an earlier run")
     with saving_viewer(saved := tmp_path / "saved.rrd") as url:
         options = ["--scene", scene, "--preset", "paper", "--out", str(out), "--rerun", url]
         assert main(["demo", *options]) == 0
@@ -189,6 +191,18 @@ def test_a_demo_is_watched_while_it_runs(tmp_path: Path) -> None:
         if str(chunk.entity_path) == "/radar/front_left/frame" and not chunk.is_static
     }
     assert hosts == {True}  # a live view knows when frames arrived
+    assert not (out / "report.html").exists()
+
+
+def test_a_demo_that_cannot_be_watched_leaves_an_earlier_run_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    (tmp_path / "session.mcap").write_text("of an earlier run")
+    assert main(["demo", "--out", str(tmp_path), "--rerun", "spawn"]) == 1
+    assert "--rerun serve-web" in capsys.readouterr().err
+    assert (tmp_path / "session.mcap").read_text() == "of an earlier run"
 
 
 def without_pictures(path: Path) -> dict[str, int]:
@@ -299,7 +313,7 @@ def test_what_cannot_be_shown_is_one_line(
     (cut := tmp_path / "cut.mcap").write_bytes(viewed.session.read_bytes()[:100])
     out = str(tmp_path / "out.rrd")
     for arguments, code, expected in (
-        ([str(viewed.rrd)], 1, "no display for the viewer's window; use --web"),
+        ([str(viewed.rrd)], 1, "no display for the viewer's window; let a browser"),
         ([str(tmp_path / "none.mcap")], 1, "no such file"),
         ([str(tmp_path)], 1, "holds no session.rrd nor session.mcap"),
         ([str(foreign)], 1, "is no Rerun recording"),
