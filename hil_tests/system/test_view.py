@@ -81,6 +81,26 @@ def test_the_file_holds_every_frame_and_state(viewed: Viewed) -> None:
     assert len(RrdReader(viewed.rrd).blueprints()) == 1
 
 
+def test_every_view_has_something_to_show_and_everything_a_view(viewed: Viewed) -> None:
+    reader = RrdReader(viewed.rrd)
+    (blueprint,) = reader.blueprints()
+    origins = {
+        origin
+        for chunk in reader.stream(store=blueprint)
+        for batch in [chunk.to_record_batch()]
+        if "ViewBlueprint:space_origin" in batch.schema.names
+        for row in batch["ViewBlueprint:space_origin"].to_pylist()
+        for origin in row
+    }
+    assert len(origins) == 18  # two per radar, map, four curves, guide, log, settings, two of links
+    shown = {name for name in count_rows(viewed.rrd) if not name.endswith(" (static)")}
+    static = {"/about", "/radars"}
+    for origin in origins - static:
+        assert any(f"{name}/".startswith(f"{origin}/") for name in shown), origin
+    for name in shown - {"/__properties"}:
+        assert any(f"{name}/".startswith(f"{origin}/") for origin in origins), name
+
+
 def test_the_lost_frame_and_the_fault_are_in_lane_and_log(viewed: Viewed) -> None:
     states = texts(viewed.rrd, "/link/state/rear_left", "StateChange:state")
     assert states[:4] == ["streaming", "fault", "silent", "frames lost"]
