@@ -81,6 +81,26 @@ def test_the_file_holds_every_frame_and_state(viewed: Viewed) -> None:
     assert len(RrdReader(viewed.rrd).blueprints()) == 1
 
 
+def test_every_view_has_something_to_show_and_everything_a_view(viewed: Viewed) -> None:
+    reader = RrdReader(viewed.rrd)
+    (blueprint,) = reader.blueprints()
+    origins = {
+        origin
+        for chunk in reader.stream(store=blueprint)
+        for batch in [chunk.to_record_batch()]
+        if "ViewBlueprint:space_origin" in batch.schema.names
+        for row in batch["ViewBlueprint:space_origin"].to_pylist()
+        for origin in row
+    }
+    assert len(origins) == 18  # two per radar, map, four curves, guide, log, settings, two of links
+    shown = {name for name in count_rows(viewed.rrd) if not name.endswith(" (static)")}
+    static = {"/about", "/radars"}
+    for origin in origins - static:
+        assert any(f"{name}/".startswith(f"{origin}/") for name in shown), origin
+    for name in shown - {"/__properties"}:
+        assert any(f"{name}/".startswith(f"{origin}/") for origin in origins), name
+
+
 def test_the_lost_frame_and_the_fault_are_in_lane_and_log(viewed: Viewed) -> None:
     states = texts(viewed.rrd, "/link/state/rear_left", "StateChange:state")
     assert states[:4] == ["streaming", "fault", "silent", "frames lost"]
@@ -121,6 +141,7 @@ def test_a_page_is_served_here_until_a_signal(viewed: Viewed) -> None:
         assert probe.connect_ex(("127.0.0.1", port)) != 0  # the viewer has ended with it
 
 
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc (Linux)")
 def test_a_run_goes_on_when_its_viewer_is_killed(
     viewed: Viewed, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -177,6 +198,8 @@ def test_a_viewer_gets_every_row_that_a_file_gets(viewed: Viewed, tmp_path: Path
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")  # of one that is still written
 def test_a_demo_is_watched_while_it_runs(tmp_path: Path) -> None:
     scene, out = str(write_shorter_scene(tmp_path)), tmp_path / "out"
+    out.mkdir()
+    (out / "report.html").write_text("of an earlier run")
     with saving_viewer(saved := tmp_path / "saved.rrd") as url:
         options = ["--scene", scene, "--preset", "paper", "--out", str(out), "--rerun", url]
         assert main(["demo", *options]) == 0
@@ -189,6 +212,18 @@ def test_a_demo_is_watched_while_it_runs(tmp_path: Path) -> None:
         if str(chunk.entity_path) == "/radar/front_left/frame" and not chunk.is_static
     }
     assert hosts == {True}  # a live view knows when frames arrived
+    assert not (out / "report.html").exists()
+
+
+def test_a_demo_that_cannot_be_watched_leaves_an_earlier_run_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    (tmp_path / "session.mcap").write_text("of an earlier run")
+    assert main(["demo", "--out", str(tmp_path), "--rerun", "spawn"]) == 1
+    assert "--rerun serve-web" in capsys.readouterr().err
+    assert (tmp_path / "session.mcap").read_text() == "of an earlier run"
 
 
 def without_pictures(path: Path) -> dict[str, int]:
@@ -213,20 +248,14 @@ def wait_until(is_true: Callable[[], bool], limit_s: float = 10.0) -> None:
 
 def kill_viewer() -> None:
     """Kill the one viewer that this process has started, and see it gone."""
+    own = os.getpid()
     (viewer,) = (
         pid
-        for pid in children(os.getpid())
+        for pid in map(int, Path(f"/proc/{own}/task/{own}/children").read_text().split())
         if "rerun" in Path(f"/proc/{pid}/cmdline").read_text().split("\0")[0]
     )
     os.kill(viewer, signal.SIGKILL)
     os.waitid(os.P_PID, viewer, os.WEXITED | os.WNOWAIT)
-
-
-def children(parent: int) -> Iterator[int]:
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        fields = stat.read_text().rpartition(")")[2].split()
-        if int(fields[1]) == parent:
-            yield int(stat.parent.name)
 
 
 def test_what_is_left_of_a_cut_session_is_shown(
@@ -299,7 +328,7 @@ def test_what_cannot_be_shown_is_one_line(
     (cut := tmp_path / "cut.mcap").write_bytes(viewed.session.read_bytes()[:100])
     out = str(tmp_path / "out.rrd")
     for arguments, code, expected in (
-        ([str(viewed.rrd)], 1, "no display for the viewer's window; use --web"),
+        ([str(viewed.rrd)], 1, "no display for the viewer's window; let a browser"),
         ([str(tmp_path / "none.mcap")], 1, "no such file"),
         ([str(tmp_path)], 1, "holds no session.rrd nor session.mcap"),
         ([str(foreign)], 1, "is no Rerun recording"),

@@ -53,6 +53,10 @@ OUTPUTS = (
 )
 
 
+_STALE = ("report.html",)
+"""What `uwb-slam report` made of an earlier run."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DemoOptions:
     """What the command line of `uwb-slam demo` says.
@@ -89,10 +93,10 @@ def run_demo(options: DemoOptions, stop: StopFlag) -> None:
     """
     scene, config = scene_and_config(options.scene, options.preset)
     with ExitStack() as held:
-        _prepare(options.out, held)
         live = None
-        if options.rerun is not None:
+        if options.rerun is not None:  # before an earlier run's files are given up
             live = held.enter_context(LiveView(options.rerun, stop.check))
+        _prepare(options.out, held)
         _run(options, scene, config, stop, live)
         if live is not None:
             sys.stdout.flush()
@@ -220,7 +224,7 @@ def _prepare(out: Path, held: ExitStack) -> None:
             raise AppError(
                 f"{out}: another run is writing there; wait for its end or choose another --out"
             ) from None
-        for name in OUTPUTS:
+        for name in (*OUTPUTS, *_STALE):
             (out / name).unlink(missing_ok=True)
 
 

@@ -34,6 +34,8 @@ def describe_kind(path: Path) -> str:
         return " with a rosbag2 in it" if (path / "metadata.yaml").exists() else ""
     with path.open("rb") as stream:
         head = stream.read(32)
+    if not head:
+        return ", it is empty; whatever was to write it ended before it did"
     for magic, words in _KINDS.items():
         if head.startswith(magic):
             return f", it is {words}"

@@ -41,7 +41,7 @@ class LiveView:
         self, where: str, check: Callable[[], None], *files: Path, is_replay: bool = False
     ) -> None:
         self._where, self._check, self._files = where, check, files
-        self._is_replay = is_replay
+        self._is_replay, self._has_shown = is_replay, bool(files)
         self._stack = ExitStack()
         self._url, self._web_url = where, ""
         self._has_ended: Callable[[], bool] = lambda: False
@@ -80,14 +80,18 @@ class LiveView:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """End a viewer that serves a browser; a window stays open, however the run ended."""
-        self._stack.close()
+        """End a viewer that serves a browser; a window stays open, however what it shows ended."""
+        if self._has_shown:
+            self._stack.close()
+        else:
+            self._stack.__exit__(kind, error, trace)
 
     def observer(self, info: SessionInfo) -> SessionObserver:
         """Return what shows a run; to be closed like every other."""
         from slam.app.rerun_recording import ViewerTarget  # half a second, as in the run
         from slam.app.rerun_view import RerunView
 
+        self._has_shown = True
         view = RerunView(
             ViewerTarget(url=self._url),
             info,

@@ -159,7 +159,7 @@ class ViewerProcess:
             raise AppError(
                 "the Rerun viewer ended at once: it found no graphics driver; "
                 "install Vulkan's software driver (Debian: mesa-vulkan-drivers), "
-                "or look at it in a browser with --web"
+                "or let a browser show it (--rerun serve-web, view --web)"
             )
 
 
@@ -210,8 +210,8 @@ def _environment(kind: ViewerKind) -> dict[str, str]:
 def _require_display() -> None:
     if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise AppError(
-            "no display for the viewer's window; use --web and a browser, --out for an .rrd file "
-            "to open elsewhere, or --screenshot for a picture"
+            "no display for the viewer's window; let a browser show it (--rerun serve-web, or of a "
+            "recorded session view --web), or see view --out and view --screenshot"
         )
 
 

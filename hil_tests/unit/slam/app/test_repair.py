@@ -94,7 +94,7 @@ FOREIGN = {
     "found.mat": (b"MATLAB 5.0 MAT-file, Platform", "is a MATLAB file"),
     "packed.gz": (b"\x1f\x8b\x08", "is a gzip file; unpack it first"),
     "notes.txt": (b"hello", "give the session.mcap of a run"),
-    "empty": (b"", "is no MCAP file; give the session.mcap of a run"),
+    "empty": (b"", "is no MCAP file, it is empty; whatever"),
 }
 
 
