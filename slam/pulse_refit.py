@@ -199,8 +199,8 @@ def _fitted_whole(group: Array, others: Array, filtered: Filtered, split: SplitT
     pulse_filter = filtered.pulse_filter
     search = _SEARCH * pulse_filter.sigma_bins
     # a few steps more, from which z is interpolated
-    first = int((group[0, _POSITION] - search) / BINS_PER_STEP) - 4
-    last = int((group[-1, _POSITION] + search) / BINS_PER_STEP) + 5
+    first = int((group[0, _POSITION] - search) / BINS_PER_STEP) - 5
+    last = int((group[-1, _POSITION] + search) / BINS_PER_STEP) + 6
     steps = np.arange(max(first, 0), min(last + 1, filtered.y.size))
     begin = BINS_PER_STEP * float(steps[0])
     z = filtered.y[steps] - _correlated(others, steps, pulse_filter)

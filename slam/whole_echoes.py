@@ -48,10 +48,10 @@ _OPTIMISM = 10.0
 """How many times what it forecasts a search may gain, at most."""
 _COARSE, _FINE = 1.0, 1e-4
 """Gains of twice the log-likelihood too small to go on: while echoes are counted, and at last."""
-_REACH_STEPS = 3
+_REACH_STEPS = 4
 _WINDOW = np.arange(2 * _REACH_STEPS + 1)
 _TAYLOR = np.linalg.inv(np.vander(_WINDOW - _REACH_STEPS, increasing=True)).T + 0j
-"""From seven values of z to the polynomial through them; z is smooth over ten steps."""
+"""From nine values of z to the polynomial through them; z is smooth over ten steps."""
 
 
 class Correlation:
