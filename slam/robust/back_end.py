@@ -265,7 +265,6 @@ class RobustBackEnd:
             np.array([c.radar for c in found], dtype=np.intp),
             np.array([c.row for c in found], dtype=np.intp),
         )
-        self._walls.note(found)
         nis, _ = state.update(rows.at, rows.H, z - rows.predicted_m, np.square(sigmas))
         return continued, nis
 
@@ -294,7 +293,6 @@ class RobustBackEnd:
             self._existence.hit(ids[row])
         inside = seen.inside(noise, -limits.view_inset_rad, -limits.view_inset_m)
         expected = inside[radars][:, sure.landmarks].all(axis=0)
-        expected &= self._walls.certain[sure.landmarks]
         for row in sure.landmarks[expected].tolist():
             hidden = any(scan.may_hide(float(seen.ranges_m[scan.radar, row])) for scan in scans)
             if row not in count and not hidden:

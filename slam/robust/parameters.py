@@ -218,7 +218,8 @@ class WallRule:
     unmapped_per_rad_m
         Density of walls not yet in the map: the likelihood of a match must exceed it.
     cell_m, reach_m
-        Walls are known in cells of this length; how far from one of them a wall may answer.
+        Walls are known in cells of this length; how far from one of them what looks like the
+        same wall may be that.
     resolution_m, resolution_rad
         A wall as near as this to a mapped one, and not it, is its echo merged with another: a
         pulse is longer than that.
