@@ -70,6 +70,11 @@ def apply_merge(state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float
     K = np.asarray(np.linalg.solve(S, PHt.T).T, dtype=np.float64)
     state.P.subtract_gains(K, PHt, S)
     state.correct(K @ residual)
+    ids = state.landmark_ids
+    for kept, gone in pairs:
+        if ids[gone] in state.radii_m:
+            state.radii_m.setdefault(ids[kept], state.radii_m[ids[gone]])
+            state.radius_doubts_m.setdefault(ids[kept], state.radius_doubts_m.get(ids[gone], 0.0))
     for row in sorted((second for _, second in pairs), reverse=True):
         state.remove(row)
 

@@ -240,6 +240,40 @@ class WallRule:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RoundnessRule:
+    """When a landmark is a round target and no point.
+
+    Attributes
+    ----------
+    window, most_turn_rad
+        Frames looked back, fewer if the robot turned by more than that since.
+    min_ranges, min_way_m
+        Fewest ranges, and least way between the first and the last.
+    every
+        Frames that hit a landmark between two looks at it.
+    sigmas, largest_m
+        How many standard deviations a radius must be from zero to be likely, and what none exceeds.
+    lead
+        By how much the cost of the solution over all poses must fall for it to be believed.
+    sharper
+        Share of the standard deviation at the last look that is worth another one.
+    excess_sigmas
+        How far chi-square may exceed its degrees of freedom, in its standard deviations.
+    """
+
+    window: int = 120
+    most_turn_rad: float = 0.1
+    min_ranges: int = 60
+    min_way_m: float = 0.4
+    every: int = 10
+    sigmas: float = 3.0
+    largest_m: float = 0.5
+    lead: float = 9.0
+    sharper: float = 0.9
+    excess_sigmas: float = 3.1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RelinearisationRule:
     """When all poses that are kept are solved for again, and how.
 
@@ -356,4 +390,5 @@ class BackEndParameters:
     surprise: SurpriseRule = field(default_factory=SurpriseRule)
     relocation: RelocationRule = field(default_factory=RelocationRule)
     walls: WallRule | None = field(default_factory=WallRule)
+    roundness: RoundnessRule | None = field(default_factory=RoundnessRule)
     relinearisation: RelinearisationRule | None = field(default_factory=RelinearisationRule)
