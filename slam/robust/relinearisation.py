@@ -14,6 +14,8 @@ from slam.robust.smoother import Smoother, Solution
 from slam.robust.state import HEADING, State
 from slam.robust.symmetric import Array, SymmetricMatrix
 
+_UNKNOWN = 100.0
+
 
 def is_due(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
     """Tell whether the pose has parted too far from the stored trajectory, or that is too long."""
@@ -38,6 +40,8 @@ def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> boo
     log.tried()
     smoother, start = _all_poses(log, state, parameters, rule)
     solution = smoother.solve(start)
+    if solution is not None and not is_determined(solution.information):
+        solution = None
     if solution is not None:
         _replace(state, solution)
         log.solved(solution.estimate)
@@ -80,7 +84,8 @@ def give_radius(
         state.radii_m[id_] = radius_m
     smoother, start = _all_poses(log, state, parameters, rule)
     solution = smoother.solve(start)
-    if solution is not None and solution.cost <= least:
+    fits = solution is not None and solution.cost <= least
+    if solution is not None and fits and is_determined(solution.information):
         _replace(state, solution)
         log.solved(solution.estimate)
         return True
@@ -89,6 +94,16 @@ def give_radius(
     if before_m:
         state.radii_m[id_] = before_m
     return False
+
+
+def is_determined(information: Array) -> bool:
+    """Tell whether all unknowns of a solution are known to better than 100 m, rad or 1.
+
+    A landmark all of whose ranges were left out as too far off has no information but rounding;
+    its covariance would be of 1e14 m^2, and have negative eigenvalues.
+    """
+    variances = np.linalg.inv(information).diagonal()
+    return bool(np.all((variances > 0.0) & (variances < _UNKNOWN**2)))
 
 
 def _all_poses(
