@@ -11,8 +11,9 @@ PYTEST := $(BIN)/python -m pytest
 demo: $(VENV)/installed-demo
 	$(BIN)/uwb-slam demo --out out/demo
 
+# One process more than cores: many tests wait for a pty.
 test: $(VENV)/installed-test
-	$(PYTEST) -n auto
+	$(PYTEST) -n $$($(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 1)') --dist worksteal
 
 check: $(VENV)/installed-dev
 	$(BIN)/ruff format --no-cache --check .
@@ -30,11 +31,15 @@ sweep: $(VENV)/installed-sweep
 	$(BIN)/uwb-slam sweep --scene lab classroom --preset paper robust --seeds 100 --bound --json out/sweep.json
 	$(BIN)/uwb-slam experiment consistency --sweep out/sweep.json --out out
 
-# The pictures of fixtures/pictures but the screenshot of Rerun, and the numbers of `limits`: about
-# a quarter of an hour of one core. RECORDING names the real recording that `recording` compares with.
+# The pictures of fixtures/pictures, and the numbers of `limits`: about a quarter of an hour of one
+# core. Needs Mesa's lavapipe (Debian: mesa-vulkan-drivers) for the screenshot of Rerun and Chromium
+# for that of the report. RECORDING names the real recording that `recording` compares with.
 pictures: $(VENV)/installed-test
 	$(BIN)/uwb-slam demo --out out/pictures/demo
 	cp out/pictures/demo/map.png fixtures/pictures/lab_map.png
+	$(BIN)/uwb-slam view out/pictures/demo --screenshot fixtures/pictures/lab_rerun.png --at 330
+	$(BIN)/uwb-slam report out/pictures/demo
+	$(BIN)/python -m hil_tests.browser out/pictures/demo/report.html fixtures/pictures/lab_report.png
 	$(BIN)/uwb-slam experiment figure7 --out out/pictures
 	$(BIN)/uwb-slam experiment smoke --out out/pictures
 	$(BIN)/uwb-slam experiment filter --scene lab two_rooms --out out/pictures

@@ -112,6 +112,8 @@ def test_importing_the_protocol_loads_no_heavy_library() -> None:
         ("slam.app.cli", "demo"),
         ("slam.app.cli", "sweep"),
         ("slam.app.cli", "evaluate"),
+        ("slam.app.cli", "view"),
+        ("slam.app.cli", "report"),
     ],
 )
 def test_help_of_every_command_loads_no_heavy_library(module: str, command: str) -> None:

@@ -78,7 +78,7 @@ def test_logging_1024_frames(benchmark: BenchmarkFixture, tmp_path: Path, kind: 
                 OdometryTrack((TumSample(t_ns=0, x_m=0.0, y_m=0.0, qz=0.0, qw=1.0),)),
             )
             if kind == "mcap"
-            else RerunView(tmp_path / "s.rrd", session_info(), simulated=True)
+            else RerunView(tmp_path / "s.rrd", session_info())
         )
         for one in scans:
             observer.on_scan(one)

@@ -90,7 +90,7 @@ def test_trilateration_per_pose(benchmark: BenchmarkFixture) -> None:
         Trilaterator(TrilaterationConfig(), paper_rig()),
     )
     detections = [d for radar in range(4) for d in detector.detect(frame(radar))]
-    assert benchmark(trilaterator.locate, detections)
+    assert benchmark(trilaterator.locate, detections, 0)
 
 
 @pytest.mark.benchmark(group="outlier filter, one window")

@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from slam.app.parent_death import signal_at_parents_death
+
 END_LIMIT_S = 10
 
 
@@ -25,6 +27,8 @@ class Served:
     serials: tuple[str, ...]
     odometry: str | None
     scene_time_zero_ns: int
+    control: str | None = None
+    tcp_ports: tuple[int | None, ...] = ()
 
     def end(self, number: signal.Signals = signal.SIGTERM) -> int:
         """Send a signal; return the exit code."""
@@ -42,6 +46,8 @@ def emulator(
         stdout=subprocess.PIPE,
         text=True,
         env={**os.environ, **(environment or {})},
+        # a test session that is killed leaves no emulator behind
+        preexec_fn=signal_at_parents_death(signal.SIGTERM),
     )
     assert process.stdout is not None
     try:
@@ -57,6 +63,8 @@ def emulator(
             serials=tuple(device["serial"] for device in devices),
             odometry=ready["odometry"],
             scene_time_zero_ns=ready["scene_time_zero_ns"],
+            control=ready["control"],
+            tcp_ports=tuple(device["tcp"] for device in devices),
         )
     finally:
         process.kill()

@@ -24,7 +24,7 @@ from slam.app.emulated_rig import (
     scene_and_config,
 )
 from slam.app.evaluate import evaluate
-from slam.app.rerun_view import count_rows
+from slam.app.rerun_recording import count_rows
 from slam.app.session import Scan
 from slam.app.sweep import run_in_process, run_one
 from slam.app.tum import read_tum
@@ -113,7 +113,7 @@ def test_the_rrd_holds_every_frame_and_a_blueprint(demo: Finished) -> None:
     summary = json.loads((demo.out / "summary.json").read_text())
     rows = count_rows(demo.out / "session.rrd")
     assert sum(rows[f"/radar/{name}/frame"] for name in RADARS) == summary["frames"]
-    assert rows["/link/front_left"] > 10
+    assert rows["/link/log/front_left"] > 10
     assert len(RrdReader(demo.out / "session.rrd").blueprints()) == 1
 
 

@@ -17,7 +17,7 @@ from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.sessions import surviving_counters
 from slam.app import demo as demo_module
 from slam.app.cli import main
-from slam.app.rerun_view import count_rows
+from slam.app.rerun_recording import count_rows
 
 pytestmark = [
     pytest.mark.slow,

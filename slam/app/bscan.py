@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 _CARRIER_HZ = 7.29e9
 _LIGHT_MPS = 299_792_458.0
 
-# What the paper's front end looks at and a little beyond, from receiver noise to a near rod.
+# What the paper's front end looks at and a little beyond, from the receiver's noise (5.6e-4 per
+# sample, so an envelope of -62 dB) to a near rod.
 _SHOWN_RANGE_M = 3.0
-_FLOOR_DB, _TOP_DB = -75.0, -30.0
+_FLOOR_DB, _TOP_DB = -62.0, -30.0
 
 
 def bscan_picture(
@@ -27,7 +28,7 @@ def bscan_picture(
 
     Returns
     -------
-    Shape (n_frames, n_shown - 2), up to 3 m of range; 0 is -75 dB of full scale or less, 255 is
+    Shape (n_frames, n_shown - 2), up to 3 m of range; 0 is -62 dB of full scale or less, 255 is
     -30 dB or more. The quadrature of the pulse comes from the central difference of the samples,
     which for a carrier of w radians per sample is its Hilbert partner times 2 sin w.
     """

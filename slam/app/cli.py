@@ -14,9 +14,11 @@ from pathlib import Path
 from slam.app.arguments import count, folder, seed
 from slam.app.errors import EXIT_FAILED, AppError, naming
 from slam.app.experiments import EXPERIMENTS, Experiment, ExperimentModule
+from slam.app.run_arguments import add_run
 from slam.app.standard_streams import drop_what_cannot_be_said, open_closed_streams
 from slam.app.stop import StopFlag, StopRequestedError
 from slam.app.stress import STRESSES
+from slam.app.view_arguments import add_report, add_rerun, add_view
 
 _TYPICAL_SEED = 19
 """Of seeds 0-19 in the lab, the one whose errors lie nearest the medians; see DECISIONS."""
@@ -66,7 +68,7 @@ def _end(message: str, exit_code: int) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="uwb-slam", description="UWB-radar SLAM on emulated X4M300 radars."
+        prog="uwb-slam", description="UWB-radar SLAM on X4M300 radars, emulated or real."
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
@@ -85,7 +87,48 @@ def _parser() -> argparse.ArgumentParser:
     )
     demo.add_argument("--scene", default="lab", help="name of a scene, or a scene file")
     demo.add_argument("--preset", default="robust", help="settings of SLAM (default: %(default)s)")
+    demo.add_argument(
+        "--wire", action="store_true", help="keep the raw bytes of all ports in the session, too"
+    )
+    add_rerun(demo)
     demo.set_defaults(command=_demo)
+
+    view = commands.add_parser(
+        "view",
+        help="show a session in Rerun: window, browser, file or picture",
+        description="Replays a session into a Rerun view. Without an option a window opens.",
+    )
+    add_view(view)
+    view.set_defaults(command=_view)
+
+    report = commands.add_parser(
+        "report",
+        help="write a session's report as one HTML page",
+        description="Replays a session and writes map, trajectory, errors, consistency, link "
+        "statistics and parameters into one page that any browser opens without a network.",
+    )
+    add_report(report)
+    report.set_defaults(command=_report)
+
+    add_run(
+        commands.add_parser(
+            "run",
+            help="map with real modules, or a running emulator, in real time",
+        )
+    ).set_defaults(command=_run_rig)
+
+    replay = commands.add_parser(
+        "replay",
+        help="run SLAM again on a recorded session",
+        description="Steps SLAM through a session.mcap as the run did, with its settings, and "
+        "writes map, trajectories and numbers: the run's own, but for the speed. What is left of "
+        "a cut file is replayed to its last whole scan.",
+    )
+    replay.add_argument("session", type=Path, metavar="SESSION", help="a session.mcap")
+    replay.add_argument(
+        "--out", type=folder, default=Path("out/replay"), help="folder for the results"
+    )
+    replay.set_defaults(command=_replay)
 
     evaluate = commands.add_parser(
         "evaluate",
@@ -97,6 +140,28 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("reference", type=Path, metavar="REF", help="TUM file to judge by")
     evaluate.add_argument("--json", action="store_true", help="print one JSON object")
     evaluate.set_defaults(command=_evaluate)
+
+    repair = commands.add_parser(
+        "repair",
+        help="make a recording whole that was cut or damaged",
+        description="Writes everything that is whole of a session, or of any MCAP file, anew with "
+        "an index, so that every program opens it again. The file as it was is kept as "
+        "SESSION.unrepaired.",
+    )
+    repair.add_argument("session", type=Path, metavar="SESSION", help="an MCAP file")
+    repair.add_argument("--out", type=Path, metavar="FILE", help="write there, touch nothing else")
+    repair.set_defaults(command=_repair)
+
+    _add_convert(
+        commands.add_parser(
+            "convert",
+            help="sessions from and to rosbags and .mat, in the layout of the paper's data set",
+            description="IN is a session, then OUT is a MATLAB file of detections if its name "
+            "ends in .mat, the raw bytes of one port if in .xtwire, a bag of ROS 1 if in .bag, or "
+            "else a new folder with a bag of ROS 2; or IN is a .mat or a bag, then OUT is a "
+            "session, which replay, view and report take.",
+        )
+    )
 
     calibrate = commands.add_parser(
         "calibrate",
@@ -142,6 +207,35 @@ def _parser() -> argparse.ArgumentParser:
             "--out", type=folder, default=Path("out/experiments"), help="folder for the results"
         )
     return parser
+
+
+def _add_convert(convert: argparse.ArgumentParser) -> None:
+    convert.add_argument(
+        "source", type=Path, metavar="IN", help="session.mcap, *.mat, *.bag or folder"
+    )
+    convert.add_argument("out", type=Path, metavar="OUT", help="must not exist")
+    convert.add_argument(
+        "--rig", type=Path, help="where the radars of a bag sit, named UWBradar1 and so on"
+    )
+    convert.add_argument(
+        "--frame-area",
+        type=float,
+        nargs=2,
+        metavar=("START", "END"),
+        help="what the modules of a bag were asked for, module metres (default: 0.2 9.4)",
+    )
+    convert.add_argument(
+        "--truth", default="/slam_out_pose", metavar="TOPIC", help="default: %(default)s"
+    )
+    convert.add_argument(
+        "--rate", type=count, default=5, help="states/s of a .mat, which has no stamps (default: 5)"
+    )
+    convert.add_argument(
+        "--preset",
+        help="settings of SLAM (default: a session's own; for a bag robust, for a .mat paper)",
+    )
+    convert.add_argument("--radar", metavar="NAME", help="whose raw bytes, for .xtwire")
+    convert.set_defaults(command=_convert)
 
 
 def _setting(text: str) -> tuple[str, tuple[str, ...]]:
@@ -210,14 +304,81 @@ def _demo(arguments: argparse.Namespace, stop: StopFlag) -> None:
         seed=arguments.seed,
         scene=arguments.scene,
         preset=arguments.preset,
+        wire=arguments.wire,
+        rerun=arguments.rerun,
     )
     run_demo(options, stop)
+
+
+def _run_rig(arguments: argparse.Namespace, stop: StopFlag) -> None:
+    from slam.app.run import RunOptions, run_rig  # heavy, see module text
+
+    options = RunOptions(
+        rig=arguments.rig,
+        odometry=arguments.odometry,
+        ports=tuple(arguments.ports) if arguments.ports else None,
+        out=arguments.out,
+        preset=arguments.preset,
+        fps=arguments.fps,
+        clock=arguments.odometry_clock,
+        duration_s=arguments.duration,
+        wire=arguments.wire,
+        rerun=arguments.rerun,
+    )
+    run_rig(options, stop)
+
+
+def _replay(arguments: argparse.Namespace, stop: StopFlag) -> None:
+    from slam.app.replay import ReplayOptions, run_replay  # heavy, see module text
+
+    run_replay(ReplayOptions(session=arguments.session, out=arguments.out), stop)
+
+
+def _view(arguments: argparse.Namespace, stop: StopFlag) -> None:
+    from slam.app.view import ViewOptions, run_view  # heavy, see module text
+
+    options = ViewOptions(
+        session=arguments.session,
+        web=arguments.web,
+        out=arguments.out,
+        screenshot=arguments.screenshot,
+        at_s=arguments.at,
+    )
+    run_view(options, stop)
+
+
+def _report(arguments: argparse.Namespace, stop: StopFlag) -> None:
+    from slam.app.report import ReportOptions, run_report  # heavy, see module text
+
+    run_report(ReportOptions(session=arguments.session, out=arguments.out), stop)
 
 
 def _evaluate(arguments: argparse.Namespace, stop: StopFlag) -> None:
     from slam.app.evaluate import run_evaluate  # heavy, see module text
 
     run_evaluate(arguments.estimate, arguments.reference, as_json=arguments.json)
+
+
+def _repair(arguments: argparse.Namespace, stop: StopFlag) -> None:
+    from slam.app.repair import repair  # heavy, see module text
+
+    print(repair(arguments.session, arguments.out, stop.check))  # noqa: T201 - the result
+
+
+def _convert(arguments: argparse.Namespace, stop: StopFlag) -> None:
+    from slam.app.convert import ConvertOptions, run_convert  # heavy, see module text
+
+    options = ConvertOptions(
+        source=arguments.source,
+        out=arguments.out,
+        rig=arguments.rig,
+        area_m=tuple(arguments.frame_area) if arguments.frame_area else None,
+        truth_topic=arguments.truth,
+        rate_hz=arguments.rate,
+        preset=arguments.preset,
+        radar=arguments.radar,
+    )
+    run_convert(options, stop.check)
 
 
 def _calibrate(arguments: argparse.Namespace, stop: StopFlag) -> None:

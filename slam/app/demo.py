@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,15 +27,18 @@ from slam.app.emulator_process import EmulatorProcess
 from slam.app.errors import AppError, EmulatorError, RadarSilentError, naming
 from slam.app.evaluation import summarise
 from slam.app.link_log import LinkLog
+from slam.app.live_view import LiveView
 from slam.app.odometry import read_odometry_socket
 from slam.app.outlines import outlines_m
 from slam.app.progress import Progress
 from slam.app.report_table import print_table
 from slam.app.runner import RunRecord, run_slam
-from slam.app.session import SessionInfo, SessionObserver
+from slam.app.session import RadarInfo, SessionInfo, SessionObserver
+from slam.app.session_head import settings_text
 from slam.app.session_log import SessionLog
 from slam.app.stop import StopFlag, StopRequestedError
 from slam.app.tum import Trajectory, write_tum
+from slam.app.wire_tap import WireTap
 from slam.config import SlamConfig
 from slam.robust_pipeline import make_slam
 
@@ -52,12 +55,17 @@ OUTPUTS = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DemoOptions:
-    """What the command line of `uwb-slam demo` says."""
+    """What the command line of `uwb-slam demo` says.
+
+    `wire`: the ports' raw bytes are kept; `rerun`: where the run is watched live, see `LiveView`.
+    """
 
     out: Path
     seed: int
     scene: str
     preset: str
+    wire: bool = False
+    rerun: str | None = None
 
 
 def run_demo(options: DemoOptions, stop: StopFlag) -> None:
@@ -82,12 +90,19 @@ def run_demo(options: DemoOptions, stop: StopFlag) -> None:
     scene, config = scene_and_config(options.scene, options.preset)
     with ExitStack() as held:
         _prepare(options.out, held)
-        _run(options, scene, config, stop)
+        live = None
+        if options.rerun is not None:
+            live = held.enter_context(LiveView(options.rerun, stop.check))
+        _run(options, scene, config, stop, live)
+        if live is not None:
+            sys.stdout.flush()
+            live.keep_serving()
 
 
-def _run(options: DemoOptions, scene: Scene, config: SlamConfig, stop: StopFlag) -> None:
+def _run(
+    options: DemoOptions, scene: Scene, config: SlamConfig, stop: StopFlag, live: LiveView | None
+) -> None:
     rig = rig_of(scene)
-    landmarks_m = true_landmarks_m(scene)
     trajectory = scene.trajectory()
     kept = f"; what was recorded is in {options.out}"
     with ExitStack() as stack:
@@ -100,25 +115,23 @@ def _run(options: DemoOptions, scene: Scene, config: SlamConfig, stop: StopFlag)
         odometry = read_odometry_socket(emulator.odometry_socket)
         link_log = LinkLog()
         source = stack.enter_context(open_ports(emulator.devices, rig, link_log.on_record))
+        tap = WireTap(source) if options.wire else None
         source.start(RAW_CONFIG, FRAME_RATE_HZ)
-        info = SessionInfo(
-            scene=scene.name,
-            preset=options.preset,
-            seed=options.seed,
-            radars=source.radars,
-            true_landmarks_m=landmarks_m,
-            versions=versions(),
-        )
-        observers: list[SessionObserver] = [link_log]
-        log = SessionLog(options.out / "session.mcap", info, odometry)
+        info = _session_info(options, scene, config, source.radars)
+        log = SessionLog(options.out / "session.mcap", info, odometry, truth_at=trajectory.poses)
         stack.callback(log.close)
-        view = RerunView(options.out / "session.rrd", info, simulated=True)
-        stack.callback(view.close)
+        view = RerunView(options.out / "session.rrd", info)
+        stack.push(_closing(view))
+        watchers = [live.observer(info)] if live is not None else []
+        for watcher in watchers:
+            stack.callback(watcher.close)
         stack.callback(log.close)  # first: the record must not wait for the view
         progress = Progress(info, trajectory.duration_ns, lambda: source.lost_frames)
         stack.callback(progress.close)
-        observers += [log, view, progress]
-        link_log.attach(log, view, progress)
+        observers: list[SessionObserver] = [link_log, log, view, progress, *watchers]
+        link_log.attach(log, view, progress, *watchers)
+        if tap is not None:
+            tap.attach(log)
         slam = make_slam(config, rig, wheels_of(scene))
         with _saying_what_is_left(kept), source:  # closed before the logs, for its last words
             scans = source.scans(end_counter(trajectory.duration_ns), stop.check)
@@ -137,7 +150,7 @@ def _run(options: DemoOptions, scene: Scene, config: SlamConfig, stop: StopFlag)
             preset=options.preset,
             seed=options.seed,
             rig=rig,
-            true_landmarks_m=landmarks_m,
+            true_landmarks_m=info.true_landmarks_m,
         )
         if summary is None:
             raise AppError(f"{options.scene}: too short for SLAM, no state was estimated{kept}")
@@ -147,7 +160,7 @@ def _run(options: DemoOptions, scene: Scene, config: SlamConfig, stop: StopFlag)
             path.write_text(summary.to_json() + "\n", encoding="ascii")
         stop.check()
         with naming(path := options.out / "map.png"):
-            draw_map(path, info, record, summary, outlines_m(scene))
+            draw_map(path, info, record, summary, info.outlines_m)
         stop.check()
     print_table(
         summary,
@@ -156,6 +169,36 @@ def _run(options: DemoOptions, scene: Scene, config: SlamConfig, stop: StopFlag)
         lost_frames=source.lost_frames,
         stream=sys.stdout,
     )
+
+
+def _session_info(
+    options: DemoOptions, scene: Scene, config: SlamConfig, radars: tuple[RadarInfo, ...]
+) -> SessionInfo:
+    return SessionInfo(
+        scene=scene.name,
+        preset=options.preset,
+        seed=options.seed,
+        radars=radars,
+        true_landmarks_m=true_landmarks_m(scene),
+        versions=versions(),
+        config_json=settings_text(config),
+        wheels=asdict(wheels_of(scene)),
+        outlines_m=outlines_m(scene),
+    )
+
+
+def _closing(view: SessionObserver) -> Callable[..., bool]:
+    """Close a view at the end of a run; what ended the run is told rather than what that did."""
+
+    def close(_kind: object, error: BaseException | None, _trace: object) -> bool:
+        try:
+            view.close()
+        except AppError:
+            if error is None:
+                raise
+        return False
+
+    return close
 
 
 @contextmanager

@@ -35,7 +35,7 @@ def summarise(
     *,
     scene: str,
     preset: str,
-    seed: int,
+    seed: int | None,
     rig: Rig,
     true_landmarks_m: NDArray[np.float64],
 ) -> Summary | None:
@@ -93,7 +93,7 @@ def _nees(record: RunRecord, truth_in_map: NDArray[np.float64]) -> tuple[tuple[f
     stamps_ns = np.array([result.t_ns for result in record.results])
     values = []
     for part in NEES_AT:
-        t_ns = round(part * record.duration_ns)
+        t_ns = record.start_ns + round(part * record.duration_ns)
         row = max(int(np.searchsorted(stamps_ns, t_ns, side="right")) - 1, 0)
         belief = record.results[row].belief
         nees = nees_pose(belief.pose, belief.pose_covariance, truth_in_map[row])
@@ -123,7 +123,7 @@ def _nis_times(record: RunRecord, nis: list[Nis]) -> tuple[tuple[float, float, i
     stamps_ns = np.array([record.results[row].t_ns for row in judged])
     values = []
     for part in NEES_AT:
-        t_ns = round(part * record.duration_ns)
+        t_ns = record.start_ns + round(part * record.duration_ns)
         place = max(int(np.searchsorted(stamps_ns, t_ns, side="right")) - 1, 0)
         values.append((int(stamps_ns[place]) / NS_PER_S, *nis[judged[place]]))
     return tuple(values)

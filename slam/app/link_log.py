@@ -23,12 +23,12 @@ class LinkLog:
 
     def on_record(self, radar: str, record: ProtocolRecord) -> None:
         """Take one command, answer, SYSTEM message or fault of a radar's link."""
-        line = LogLine(
-            t_ns=self._t_ns,
-            radar=radar,
-            warning=record.direction == "fault",
-            text=f"{record.direction} {record.summary}",
-        )
+        text = f"{record.direction} {record.summary}"
+        self.say(radar, text, warning=record.direction == "fault")
+
+    def say(self, who: str, text: str, *, warning: bool) -> None:
+        """Pass on a line about a radar, the odometry or the run itself."""
+        line = LogLine(t_ns=self._t_ns, radar=who, warning=warning, text=text)
         if self._listeners:
             self._tell(line)
         else:

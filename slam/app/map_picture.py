@@ -9,6 +9,7 @@ import matplotlib.colors
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from slam.app.ellipse import ellipse_95, rotate_covariances
@@ -17,7 +18,7 @@ from slam.app.runner import RunRecord
 from slam.app.session import SessionInfo
 from slam.app.summary import Summary
 from slam.ekf_slam import Belief
-from slam.geometry import transform
+from slam.geometry import between, compose, transform
 
 _MARGIN_M = 0.25
 
@@ -26,49 +27,66 @@ def draw_map(
     path: Path,
     info: SessionInfo,
     record: RunRecord,
-    summary: Summary,
+    summary: Summary | None,
     outlines_m: Sequence[NDArray[np.float64]] = (),
 ) -> None:
-    """Draw the map of a simulated run into a PNG file.
+    """Draw the map of a run into a PNG file; see `map_figure`."""
+    with picture(path, width_in=9.0, height_in=6.6, dpi=150) as figure:
+        map_figure(figure, info, record, summary, outlines_m)
 
+
+def map_figure(
+    figure: Figure,
+    info: SessionInfo,
+    record: RunRecord,
+    summary: Summary | None,
+    outlines_m: Sequence[NDArray[np.float64]] = (),
+) -> None:
+    """Draw the map of a run.
+
+    Without `summary` nothing true is known, and nothing true is drawn: a drive in the real world.
     `outlines_m` are lines of shape (k, 2), world frame: walls and boxes, where there are any.
     Estimate and odometry are drawn where they began, at the robot's first pose, without the
     alignment that the ATE uses: drift is seen as it is.
     """
     place = record.world_from_map
     truth = record.truth
-    estimate = transform(place, np.array([row.belief.pose[:2] for row in record.results]))
-    odometry = transform(place, np.array([row.odometry_pose[:2] for row in record.results]))
-    with picture(path, width_in=9.0, height_in=6.6, dpi=150) as figure:
-        axes = figure.add_subplot()
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.grid(color=GRID, linewidth=0.8)
-        axes.set_axisbelow(True)
-        for number, line in enumerate(outlines_m):
-            name = "wall or box" if number == 0 else None
-            axes.plot(*line.T, color=INK, linewidth=1.6, alpha=0.45, label=name)
-        axes.plot(*odometry.T, color=ODOMETRY, linewidth=0.9, alpha=0.9, label="wheel odometry")
+    estimate = transform(place, _xy_m([row.belief.pose for row in record.results]))
+    odom_place = place if summary is not None else _world_from_odom(record)
+    odometry = transform(odom_place, _xy_m([row.odometry_pose for row in record.results]))
+    axes = figure.add_subplot()
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(color=GRID, linewidth=0.8)
+    axes.set_axisbelow(True)
+    for number, line in enumerate(outlines_m):
+        name = "wall or box" if number == 0 else None
+        axes.plot(*line.T, color=INK, linewidth=1.6, alpha=0.45, label=name)
+    axes.plot(*odometry.T, color=ODOMETRY, linewidth=0.9, alpha=0.9, label="wheel odometry")
+    if summary is not None:
         axes.plot(*truth[:, :2].T, color=TRUTH, linewidth=3.2, alpha=0.55, label="true path")
-        axes.plot(*estimate.T, color=ESTIMATE, linewidth=1.0, label="radar SLAM")
-        _draw_start(axes, truth[0])
-        if len(info.true_landmarks_m):
-            axes.plot(
-                *info.true_landmarks_m.T,
-                linestyle="none",
-                marker="+",
-                markersize=11,
-                markeredgewidth=1.4,
-                color="#30343b",
-                label="true landmark",
-                zorder=4,
-            )
-        _draw_landmarks(axes, record.results[-1].belief, place)
-        axes.set_xlabel("x [m]")
-        axes.set_ylabel("y [m]")
-        axes.margins(0.06)
-        axes.tick_params(length=0)
+    axes.plot(*estimate.T, color=ESTIMATE, linewidth=1.0, label="radar SLAM")
+    _draw_start(axes, truth[0] if summary is not None else _first_pose(record))
+    if len(info.true_landmarks_m):
+        axes.plot(
+            *info.true_landmarks_m.T,
+            linestyle="none",
+            marker="+",
+            markersize=11,
+            markeredgewidth=1.4,
+            color="#30343b",
+            label="true landmark",
+            zorder=4,
+        )
+    _draw_landmarks(axes, record.results[-1].belief, place)
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
+    axes.margins(0.06)
+    axes.tick_params(length=0)
+    if summary is None:
+        _write_plain_title(axes, info, estimate)
+    else:
         _write_title(axes, summary)
-        figure.legend(loc="outside right upper", frameon=False, handlelength=1.6)
+    figure.legend(loc="outside right upper", frameon=False, handlelength=1.6)
 
 
 def _draw_start(axes: Axes, pose: NDArray[np.float64]) -> None:
@@ -110,6 +128,45 @@ def _draw_landmarks(axes: Axes, belief: Belief, place: NDArray[np.float64]) -> N
         color=LANDMARK,
         label="estimated landmark",
         zorder=6,
+    )
+
+
+def _xy_m(poses: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    return np.array([pose[:2] for pose in poses])
+
+
+def _world_from_odom(record: RunRecord) -> NDArray[np.float64]:
+    """Return the place of odometry's frame such that it begins where SLAM does, shape (3,).
+
+    A robot's odometry begins anywhere, as it runs before we listen; that of a demo at its start.
+    """
+    odom_from_body = record.results[0].odometry_pose
+    return compose(_first_pose(record), between(odom_from_body, np.zeros(3)))
+
+
+def _first_pose(record: RunRecord) -> NDArray[np.float64]:
+    pose: NDArray[np.float64] = record.results[0].belief.pose
+    return compose(record.world_from_map, pose)
+
+
+def _write_plain_title(axes: Axes, info: SessionInfo, estimate: NDArray[np.float64]) -> None:
+    length_m = float(np.linalg.norm(np.diff(estimate, axis=0), axis=1).sum())
+    axes.set_title(
+        f"{info.scene}, preset {info.preset}{' (simulated)' if info.simulated else ''}: "
+        f"{length_m:.1f} m driven, no truth to compare with",
+        loc="left",
+        fontsize=11,
+        color=INK,
+        pad=24,
+    )
+    axes.annotate(
+        "map frame: the origin is the robot's first pose",
+        xy=(0.0, 1.0),
+        xytext=(0.0, 8.0),
+        xycoords="axes fraction",
+        textcoords="offset points",
+        fontsize=8.5,
+        color=PALE_INK,
     )
 
 

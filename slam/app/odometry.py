@@ -6,7 +6,9 @@ process, a recorded session) parses the same lines here, so all of them see the 
 
 from __future__ import annotations
 
+import math
 import socket
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterable
 
 import numpy as np
@@ -21,19 +23,72 @@ _HOLD_NS = NS_PER_S // 2
 
 
 class OdometryTrack:
-    """Odometry samples in time order, asked for the pose at any time between them."""
+    """Odometry samples in time order, asked for the pose at any time between them.
+
+    Later ones may be appended while a robot drives; what lies between earlier ones stays the same
+    to the last bit.
+    """
 
     def __init__(self, samples: Iterable[TumSample]) -> None:
-        self.samples = tuple(samples)
-        if not self.samples:
-            raise OdometryError("odometry: the source sent no pose")
-        self._stamps_ns = np.array([sample.t_ns for sample in self.samples], dtype=np.int64)
-        if np.any(np.diff(self._stamps_ns) <= 0):
-            late = int(np.argmax(np.diff(self._stamps_ns) <= 0)) + 1
-            raise OdometryError(f"odometry: line {late + 1} is not later than the line before")
-        self._xy_m = np.array([(sample.x_m, sample.y_m) for sample in self.samples])
+        self._samples: list[TumSample] = []
+        self._stamps_ns: list[int] = []
         # Unwrapped, so that interpolation across +-pi takes the short way round.
-        self._heading_rad = np.unwrap([sample.heading_rad for sample in self.samples])
+        self._heading_rad: list[float] = []
+        self._turns_rad = 0.0  # what unwrapping adds to the newest heading
+        for number, sample in enumerate(samples, start=1):
+            if self._stamps_ns and sample.t_ns <= self._stamps_ns[-1]:
+                raise OdometryError(f"odometry: line {number} is not later than the line before")
+            self.append(sample)
+        if not self._samples:
+            raise OdometryError("odometry: the source sent no pose")
+
+    @property
+    def samples(self) -> tuple[TumSample, ...]:
+        """All samples so far."""
+        return tuple(self._samples)
+
+    @property
+    def last(self) -> TumSample:
+        """The newest sample."""
+        return self._samples[-1]
+
+    @property
+    def first_ns(self) -> int:
+        """Time of the oldest sample."""
+        return self._stamps_ns[0]
+
+    @property
+    def last_ns(self) -> int:
+        """Time of the newest sample."""
+        return self._stamps_ns[-1]
+
+    def gap_ns(self, t_ns: int) -> float:
+        """Return how far apart the two samples around a time are; infinite outside of all.
+
+        At a sample's own time there is no gap.
+        """
+        after = bisect_left(self._stamps_ns, t_ns)
+        if after == len(self._stamps_ns) or (after == 0 and self._stamps_ns[0] != t_ns):
+            return math.inf
+        if self._stamps_ns[after] == t_ns:
+            return 0.0
+        return self._stamps_ns[after] - self._stamps_ns[after - 1]
+
+    def append(self, sample: TumSample) -> None:
+        """Take a sample later than all before it.
+
+        Raises
+        ------
+        OdometryError
+            It is not later.
+        """
+        if self._samples:
+            if sample.t_ns <= self._stamps_ns[-1]:
+                raise OdometryError("odometry: a pose is not later than the one before")
+            self._turns_rad += _unwrapping(self._samples[-1].heading_rad, sample.heading_rad)
+        self._samples.append(sample)
+        self._stamps_ns.append(sample.t_ns)
+        self._heading_rad.append(sample.heading_rad + self._turns_rad)
 
     @classmethod
     def from_lines(cls, lines: Iterable[str]) -> OdometryTrack:
@@ -73,24 +128,46 @@ class OdometryTrack:
         OdometryError
             The time is more than half a second outside the samples.
         """
-        first, last = int(self._stamps_ns[0]), int(self._stamps_ns[-1])
+        stamps_ns = self._stamps_ns
+        first, last = stamps_ns[0], stamps_ns[-1]
         if not first - _HOLD_NS <= t_ns <= last + _HOLD_NS:
             raise OdometryError(
                 f"odometry covers {first / NS_PER_S:.2f} .. {last / NS_PER_S:.2f} s, "
                 f"but a frame came at {t_ns / NS_PER_S:.2f} s"
             )
-        after = int(np.searchsorted(self._stamps_ns, t_ns, side="right"))
-        if after in (0, len(self._stamps_ns)):
-            row = min(after, len(self._stamps_ns) - 1)
-            (x_m, y_m), heading_rad = self._xy_m[row], self._heading_rad[row]
-        else:
-            before = after - 1
-            step_ns = int(self._stamps_ns[after]) - int(self._stamps_ns[before])
-            part = (t_ns - int(self._stamps_ns[before])) / step_ns
-            x_m, y_m = self._xy_m[before] + part * (self._xy_m[after] - self._xy_m[before])
-            turn_rad = self._heading_rad[after] - self._heading_rad[before]
-            heading_rad = self._heading_rad[before] + part * turn_rad
-        return np.array([x_m, y_m, wrap_angle(float(heading_rad))])
+        after = bisect_right(stamps_ns, t_ns)
+        if after in (0, len(stamps_ns)):
+            row = min(after, len(stamps_ns) - 1)
+            held = self._samples[row]
+            return np.array([held.x_m, held.y_m, wrap_angle(self._heading_rad[row])])
+        old, new = self._samples[after - 1], self._samples[after]
+        part = (t_ns - old.t_ns) / (new.t_ns - old.t_ns)
+        turn_rad = self._heading_rad[after] - self._heading_rad[after - 1]
+        heading_rad = self._heading_rad[after - 1] + part * turn_rad
+        return np.array(
+            [
+                old.x_m + part * (new.x_m - old.x_m),
+                old.y_m + part * (new.y_m - old.y_m),
+                wrap_angle(heading_rad),
+            ]
+        )
+
+
+def _unwrapping(before_rad: float, after_rad: float) -> float:
+    """Return what to add to a heading so that it follows on the one before the short way round.
+
+    One step of `numpy.unwrap`, to the last bit.
+
+    >>> _unwrapping(3.0, -3.0) == math.tau, _unwrapping(0.5, 0.25)
+    (True, 0.0)
+    """
+    turn_rad = after_rad - before_rad
+    if abs(turn_rad) < math.pi:
+        return 0.0
+    short_rad = (turn_rad + math.pi) % math.tau - math.pi
+    if short_rad == -math.pi and turn_rad > 0:
+        short_rad = math.pi
+    return short_rad - turn_rad
 
 
 def read_odometry_socket(path: str, timeout_s: float = 10.0) -> OdometryTrack:

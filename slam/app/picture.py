@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -55,6 +56,17 @@ def picture(path: Path, *, width_in: float, height_in: float, dpi: int = 100) ->
             few = colours.convert("RGB").quantize(_PALETTE, dither=Image.Dither.NONE)
         with naming(path):
             few.save(path, format="png", optimize=True)
+
+
+def svg_of(draw: Callable[[Figure], None], *, width_in: float, height_in: float) -> str:
+    """Return what `draw` puts on a figure as the text of an SVG, the same for the same figure."""
+    with matplotlib.rc_context(STYLE | {"svg.hashsalt": "xethru-hil"}):
+        figure = Figure(figsize=(width_in, height_in), layout="constrained", facecolor="white")
+        FigureCanvasSVG(figure)
+        draw(figure)
+        drawn = io.StringIO()
+        figure.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
+    return drawn.getvalue()
 
 
 def label(axes: Axes, title: str, x_label: str, y_label: str) -> None:

@@ -4,7 +4,7 @@ What `uwb-slam calibrate --rig` writes and `load_rig` reads back. Lengths in tru
 x forward and y left, yaw in degrees counter-clockwise from forward; `range_offset_m` is what the
 module measures too long, `phase_offset_deg` what it adds to an echo's carrier phase
 (`Mount.phase_offset_rad`; no command estimates it), `gain_db` how much louder it hears than the
-mean of the rig.
+mean of the rig. `uwb-slam run --rig` reads it and finds each radar by its module's serial number.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, Valid
 
 from slam.app.errors import AppError, naming
 from slam.geometry import Mount, Rig
+from slam.robust.parameters import WheelNoise
 
+_Sigma = Annotated[StrictFloat | StrictInt, Field(ge=0, le=10, allow_inf_nan=False)]
 _Number = Annotated[StrictFloat | StrictInt, Field(ge=-1000, le=1000, allow_inf_nan=False)]
 
 
@@ -38,12 +40,44 @@ class RigRadar(BaseModel):
     gain_db: _Number = 0.0
 
 
+class RigWheels(BaseModel):
+    """How the robot's odometry errs, as its data sheet or a test drive tells; see `WheelNoise`.
+
+    The keys are those of a scene's table ``odometry``. White noise grows with the square root of
+    the way and with the angle turned; the three other standard deviations are of errors that stay.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    along_sigma_m_per_sqrt_m: _Sigma = WheelNoise().along_m_per_sqrt_m
+    across_sigma_m_per_sqrt_m: _Sigma = WheelNoise().across_m_per_sqrt_m
+    heading_sigma_rad_per_sqrt_m: _Sigma = WheelNoise().heading_rad_per_sqrt_m
+    heading_sigma_rad_per_rad: _Sigma = WheelNoise().heading_rad_per_rad
+    scale_sigma: _Sigma = WheelNoise().scale_sigma
+    turn_scale_sigma: _Sigma = WheelNoise().turn_scale_sigma
+    curvature_sigma_rad_per_m: _Sigma = WheelNoise().curvature_sigma_rad_per_m
+
+    @property
+    def noise(self) -> WheelNoise:
+        """Return what SLAM is told."""
+        return WheelNoise(
+            along_m_per_sqrt_m=float(self.along_sigma_m_per_sqrt_m),
+            across_m_per_sqrt_m=float(self.across_sigma_m_per_sqrt_m),
+            heading_rad_per_sqrt_m=float(self.heading_sigma_rad_per_sqrt_m),
+            heading_rad_per_rad=float(self.heading_sigma_rad_per_rad),
+            scale_sigma=float(self.scale_sigma),
+            turn_scale_sigma=float(self.turn_scale_sigma),
+            curvature_sigma_rad_per_m=float(self.curvature_sigma_rad_per_m),
+        )
+
+
 class RigFile(BaseModel):
-    """The whole file: one `[[radars]]` table per radar."""
+    """The whole file: one `[[radars]]` table per radar, and `[wheels]` where more is known."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     radars: Annotated[tuple[RigRadar, ...], Field(min_length=1, max_length=64)]
+    wheels: RigWheels = RigWheels()
 
     @property
     def rig(self) -> Rig:
@@ -102,6 +136,9 @@ def write_rig(path: Path, rig: RigFile) -> None:
         # a JSON string of these names is a TOML string
         lines = [f"{key} = {json.dumps(value)}" for key, value in radar.model_dump().items()]
         tables.append("\n".join(["[[radars]]", *lines]))
+    if rig.wheels != RigWheels():
+        lines = [f"{key} = {json.dumps(value)}" for key, value in rig.wheels.model_dump().items()]
+        tables.append("\n".join(["[wheels]", *lines]))
     with naming(path):
         path.write_text("\n\n".join(tables) + "\n", encoding="utf-8")
 
@@ -114,7 +151,8 @@ def _one_line(error: ValidationError) -> str:
         if part not in ("float", "int")
     ).removeprefix(".")
     if first["type"] == "extra_forbidden":
-        model = RigRadar if "radars" in first["loc"] else RigFile
+        tables: dict[str, type[BaseModel]] = {"radars": RigRadar, "wheels": RigWheels}
+        model = tables[str(first["loc"][0])] if len(first["loc"]) > 1 else RigFile
         return f"{key}: unknown key; allowed are {', '.join(model.model_fields)}"
     if first["type"] == "missing":
         return f"{key}: missing; this key is required"

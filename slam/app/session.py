@@ -7,13 +7,14 @@ robot's first pose; `odom` is the wheel odometry's own.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import RadarFrame
+from slam.pipeline import StepResult
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,6 +23,8 @@ class RadarInfo:
 
     `range_start_m` and `bin_length_m` are module metres, as FRAMEAREA was read back; the same in
     true metres are in every RadarFrame. `start_skew_ns` is the session time of counter 0.
+    `gain_db` is how much louder it hears than the mean of the rig: SLAM is given its samples less
+    that, the session holds them as they came.
     """
 
     name: str
@@ -38,19 +41,52 @@ class RadarInfo:
     settings: Mapping[str, object]
     start_skew_ns: int = 0
     phase_offset_rad: float = 0.0
+    gain_db: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SessionInfo:
-    """What a run is: enough to name it, to repeat it and to read its frames."""
+    """What a run is: enough to name it, to repeat it and to read its frames.
+
+    Attributes
+    ----------
+    scene, preset, seed
+        Its names; seed None on real modules.
+    radars
+        In the order of the rig.
+    true_landmarks_m
+        Shape (n, 2), world frame; (0, 2) where nobody knows.
+    versions
+        Of what the numbers depend on.
+    config_json
+        SLAM's settings, by `session_head.settings_text`; "" where they are not told.
+    wheels
+        Fields of `WheelNoise`: how SLAM was told the wheels err.
+    outlines_m
+        Lines of walls and boxes for pictures, shape (k, 2) each, world frame.
+    simulated
+        Whether radars and world are emulated.
+    time_base
+        What the frames' stamps come from: "counter" or "arrival".
+    has_detections
+        Whether ranges were recorded that SLAM takes instead of what it finds in frames.
+    started_unix_ns
+        Time of day at session time 0; None where it means nothing.
+    """
 
     scene: str
     preset: str
-    seed: int
+    seed: int | None
     radars: tuple[RadarInfo, ...]
     true_landmarks_m: NDArray[np.float64]
-    """Shape (n, 2), world frame; (0, 2) where nobody knows."""
     versions: Mapping[str, str]
+    config_json: str = ""
+    wheels: Mapping[str, float] = field(default_factory=dict)
+    outlines_m: tuple[NDArray[np.float64], ...] = ()
+    simulated: bool = True
+    time_base: str = "counter"
+    started_unix_ns: int | None = None
+    has_detections: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,11 +97,15 @@ class Scan:
     radar without start skew samples, whether there is one or not. Every frame has its own stamp,
     in the period that begins with `t_ns`. The counters of the frames are that of the tick, less
     the whole periods that their radar started late (none, unless it started more than one late).
+    `host_ns` holds for each frame when it arrived, nanoseconds since 1970; () where nobody noted.
+    One that is not `used` is recorded only: SLAM was not stepped with it, as odometry was missing.
     """
 
     counter: int
     t_ns: int
     frames: tuple[RadarFrame, ...]
+    host_ns: tuple[int, ...] = ()
+    used: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,6 +128,8 @@ class Snapshot:
         Shape (m, 2) and (m, 2, 2), map frame.
     nis_per_dof
         One value per observation that was associated with a landmark at this state.
+    step
+        Everything that led to the state, for views; None where it came from a file.
     """
 
     counter: int
@@ -101,6 +143,7 @@ class Snapshot:
     landmarks_m: NDArray[np.float64]
     landmark_covariances_m2: NDArray[np.float64]
     nis_per_dof: tuple[float, ...]
+    step: StepResult | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,18 +1,19 @@
-"""A recorded session read back: what `uwb-slam demo` wrote, in the order it was written.
+"""A recorded session read back: what `SessionLog` wrote, in the order it was written.
 
 `open_session` reads who recorded what; `RecordedSession.records` streams frames (true metres, own
-stamps), odometry, truth and log lines with the same floats the run itself saw. Nothing is held
-but one chunk of the file, so a recording of hours costs no more memory than one of seconds.
+stamps), odometry, truth, states and log lines with the same floats the run itself saw. Nothing is
+held but one chunk of the file, so a recording of hours costs no more memory than one of seconds.
 """
 
 from __future__ import annotations
 
-import json
 import math
+import struct
 from collections.abc import Iterator
-from dataclasses import MISSING, dataclass, fields
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,27 +22,44 @@ from slam.app import ros_messages as ros
 from slam.app.errors import AppError, OdometryError
 from slam.app.mcap_messages import Metadata, RawMessage, read_entries
 from slam.app.odometry import OdometryTrack
-from slam.app.session import LogLine, RadarInfo, Scan, SessionInfo
-from slam.app.session_log import LENGTH_UNIT, METADATA_NAME
-from slam.app.sources import TRUE_PER_MODULE_METRE, sampler_limits, whole_periods
+from slam.app.session import LogLine, RadarInfo, Scan, SessionInfo, Snapshot
+from slam.app.session_head import (
+    METADATA_NAME,
+    read_radar_text,
+    read_session_table,
+    session_format,
+)
+from slam.app.session_records import (
+    ReceivedFrame,
+    Recorded,
+    ScanEnd,
+    TruthPose,
+    limits_of,
+    read_record,
+)
+from slam.app.sources import whole_periods
 from slam.app.tum import TumSample
+from slam.detector import Detection
 from slam.frames import RadarFrame
 from slam.geometry import Mount, Rig
-from xethru_protocol.driver import RawConfig
 from xethru_protocol.x4 import frame_time_ns
 
-_LOG_WARN = 30
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WireBytes:
+    """Bytes as a radar's port gave (rx) or took (tx) them.
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class TruthPose:
-    """Where the robot really was; shape (3,), [x m, y m, heading rad], world frame."""
+    ``t_ns`` is the session time of the newest scan then, ``host_ns`` the driver's own clock.
+    """
 
+    radar: str
+    way: Literal["rx", "tx"]
+    data: bytes
     t_ns: int
-    pose: NDArray[np.float64]
+    host_ns: int
 
 
-SessionRecord: TypeAlias = RadarFrame | TumSample | TruthPose | LogLine
+SessionRecord: TypeAlias = RadarFrame | TumSample | TruthPose | LogLine | ScanEnd | Snapshot
 """What a session is made of; a TumSample is odometry."""
 
 
@@ -53,14 +71,17 @@ class RecordedSession:
     path
         The file.
     info
-        Scene, preset, seed, radars and versions of the run.
+        Scene, preset, seed, settings, radars and versions of the run.
+    has_scan_marks
+        Whether `ScanEnd` records are in it; files of the first format have none.
     cut_at_byte
         Where the file ends too early, after `records` has come to its end; None where it is whole.
     """
 
-    def __init__(self, path: Path, info: SessionInfo) -> None:
+    def __init__(self, path: Path, info: SessionInfo, *, has_scan_marks: bool) -> None:
         self.path = path
         self.info = info
+        self.has_scan_marks = has_scan_marks
         self.cut_at_byte: int | None = None
 
     @property
@@ -88,27 +109,81 @@ class RecordedSession:
         AppError
             The file is damaged other than by being cut at its end.
         """
-        frame_of = {
-            f"/radar/{radar.name}/frame": (index, radar, _limits(radar))
-            for index, radar in enumerate(self.info.radars)
+        for record in self._received():
+            yield record.frame if isinstance(record, ReceivedFrame) else record
+
+    def scans(self) -> Iterator[tuple[Scan, NDArray[np.float64] | None]]:
+        """Yield every scan as the run took it, and the true pose at it, shape (3,), if known.
+
+        A scan that damage or the end of a cut file left incomplete is not among them. Files of the
+        first format have no marks: there the frames of one tick, which stand together, are a scan.
+        """
+        if not self.has_scan_marks:
+            yield from ((scan, None) for scan in _scans_by_tick(self))
+            return
+        held: list[ReceivedFrame] = []
+        for record in self._received():
+            if isinstance(record, ReceivedFrame):
+                held.append(record)
+            elif isinstance(record, ScanEnd):
+                # frames before them are of a scan whose mark is lost
+                held = held[max(len(held) - len(record.members), 0) :]
+                if tuple((row.frame.radar, row.frame.counter) for row in held) != record.members:
+                    held = []
+                    continue
+                arrivals = tuple(row.host_ns for row in held if row.host_ns is not None)
+                yield (
+                    Scan(
+                        counter=record.counter,
+                        t_ns=record.t_ns,
+                        frames=tuple(row.frame for row in held),
+                        host_ns=arrivals if len(arrivals) == len(held) else (),
+                        used=record.used,
+                    ),
+                    record.truth,
+                )
+                held = []
+
+    def detections(self) -> dict[int, tuple[Detection, ...]]:
+        """Return the recorded ranges by the time of their scan [ns]; amplitudes are unknown."""
+        index_of = {
+            f"/radar/{radar.name}/detections": index for index, radar in enumerate(self.info.radars)
         }
+        of_scan: dict[int, tuple[Detection, ...]] = {}
+        held: list[Detection] = []
         for entry in read_entries(self.path, self._on_cut):
             if not isinstance(entry, RawMessage):
                 continue
-            try:
-                if entry.topic in frame_of:
-                    yield _frame(entry, *frame_of[entry.topic])
-                elif entry.topic == "/odom":
-                    yield ros.odometry_sample(ros.deserialise(entry.data, ros.ODOMETRY))
-                elif entry.topic == "/truth":
-                    yield _truth(entry)
-                elif entry.topic == "/log":
-                    yield _log_line(entry)
-            except (ValueError, TypeError, AssertionError, IndexError) as error:
-                raise AppError(
-                    f"{self.path}: a message of {entry.topic} at "
-                    f"{entry.t_ns / 1e9:.3f} s cannot be read: {error}"
-                ) from None
+            if entry.topic in index_of:
+                with self._naming(entry):
+                    ranges_m = ros.deserialise(entry.data, ros.DOUBLE_ARRAY).data.tolist()
+                radar, t_ns = index_of[entry.topic], entry.t_ns
+                held += [
+                    Detection(radar=radar, t_ns=t_ns, range_m=range_m, amplitude=math.nan)
+                    for range_m in ranges_m
+                ]
+            elif entry.topic == "/scan":
+                of_scan[entry.t_ns] = tuple(one for one in held if one.t_ns == entry.t_ns)
+                held = []
+        return of_scan
+
+    def wire(self) -> Iterator[WireBytes]:
+        """Yield the raw bytes of all ports in the order of the file; nothing if none are in it."""
+        ways: dict[str, tuple[str, Literal["rx", "tx"]]] = {}
+        for radar in self.info.radars:
+            ways[f"/radar/{radar.name}/rx"] = (radar.name, "rx")
+            ways[f"/radar/{radar.name}/tx"] = (radar.name, "tx")
+        for entry in read_entries(self.path, self._on_cut):
+            if isinstance(entry, RawMessage) and (found := ways.get(entry.topic)):
+                with self._naming(entry):
+                    data = ros.deserialise(entry.data, ros.BYTE_ARRAY).data.tobytes()
+                yield WireBytes(
+                    radar=found[0],
+                    way=found[1],
+                    data=data,
+                    t_ns=entry.t_ns,
+                    host_ns=entry.publish_ns,
+                )
 
     def odometry(self) -> OdometryTrack:
         """Return the whole track of the wheels.
@@ -124,6 +199,29 @@ class RecordedSession:
         except OdometryError as error:
             raise AppError(f"{self.path}: {error}") from None
 
+    def _received(self) -> Iterator[Recorded]:
+        frame_of = {
+            f"/radar/{radar.name}/frame": (index, radar, limits_of(radar))
+            for index, radar in enumerate(self.info.radars)
+        }
+        for entry in read_entries(self.path, self._on_cut):
+            if not isinstance(entry, RawMessage):
+                continue
+            with self._naming(entry):
+                record = read_record(entry, frame_of)
+            if record is not None:
+                yield record
+
+    @contextmanager
+    def _naming(self, entry: RawMessage) -> Iterator[None]:
+        try:
+            yield
+        except (ValueError, TypeError, AssertionError, IndexError, struct.error) as error:
+            raise AppError(
+                f"{self.path}: a message of {entry.topic} at "
+                f"{entry.t_ns / 1e9:.3f} s cannot be read: {error}"
+            ) from None
+
     def _on_cut(self, at_byte: int) -> None:
         self.cut_at_byte = at_byte
 
@@ -137,30 +235,40 @@ def open_session(path: Path) -> RecordedSession:
         One line with the file: missing, foreign, damaged, or cut before the radars are named.
     """
     head: dict[str, str] | None = None
+    number = 0
     radars: list[RadarInfo] = []
-    for entry in read_entries(path, lambda _: None):
+    cut: list[int] = []
+    for entry in read_entries(path, cut.append):
         if isinstance(entry, Metadata):
             if entry.name == METADATA_NAME:
-                head = entry.values
+                head, number = entry.values, session_format(path, entry.values)
         elif entry.topic.startswith("/radar/") and entry.topic.endswith("/info"):
             radars.append(_radar_info(path, entry))
         else:
             break  # the infos come before everything else
     if head is None:
+        if cut:
+            raise AppError(f"{path}: ends at byte {cut[0]}, before it says what run it is of")
         raise AppError(
-            f"{path}: an MCAP file, but no session of `uwb-slam demo`; "
-            f"its metadata {METADATA_NAME!r} is missing"
+            f"{path}: an MCAP file, but no session of `uwb-slam`: its metadata {METADATA_NAME!r} "
+            "is missing; of a bag in the layout of the paper's data set `uwb-slam convert` makes a "
+            "session"
         )
     if not radars:
         raise AppError(f"{path}: ends before any radar is named; record the session again")
-    return RecordedSession(path, _session_info(path, head, tuple(radars)))
+    return RecordedSession(
+        path,
+        read_session_table(path, head, tuple(radars)),
+        has_scan_marks=number > 1,
+    )
 
 
 def scans(session: RecordedSession) -> Iterator[Scan]:
-    """Yield the frames of a session by tick, as a live source does; see `Scan`.
+    """Yield the scans of a session as the run took them, without the truth; see `Scan`."""
+    return (scan for scan, _ in session.scans())
 
-    The frames of one tick stand together in the file.
-    """
+
+def _scans_by_tick(session: RecordedSession) -> Iterator[Scan]:
     radars = session.info.radars
     late = [whole_periods(radar.start_skew_ns, radar.rate_hz) for radar in radars]
     held: list[RadarFrame] = []
@@ -181,79 +289,9 @@ def _scan(frames: list[RadarFrame], radars: tuple[RadarInfo, ...], late: list[in
     return Scan(counter=tick, t_ns=frame_time_ns(tick, radars[radar].rate_hz), frames=tuple(frames))
 
 
-def _frame(
-    message: RawMessage, index: int, radar: RadarInfo, limits: tuple[float, float] | None
-) -> RadarFrame:
-    samples = np.asarray(ros.deserialise(message.data, ros.FLOAT_ARRAY).data, dtype=np.float32)
-    if len(samples) != radar.n_bins:
-        raise ValueError(f"{len(samples)} samples, but the radar was set to {radar.n_bins}")
-    return RadarFrame(
-        radar=index,
-        t_ns=message.t_ns,
-        counter=message.sequence,
-        samples=samples,
-        range_start_m=radar.range_start_m * TRUE_PER_MODULE_METRE,
-        bin_length_m=radar.bin_length_m * TRUE_PER_MODULE_METRE,
-        limits=limits,
-    )
-
-
-def _limits(radar: RadarInfo) -> tuple[float, float] | None:
-    """Return the sampler's limits where the recorded settings are those of this driver."""
-    known = {field.name for field in fields(RawConfig)}
-    if set(radar.settings) != known:
-        return None
-    return sampler_limits(RawConfig(**dict(radar.settings)))  # type: ignore[arg-type]  # from JSON
-
-
-def _truth(message: RawMessage) -> TruthPose:
-    pose = ros.deserialise(message.data, ros.POSE).pose
-    heading_rad = 2.0 * math.atan2(pose.orientation.z, pose.orientation.w)
-    return TruthPose(
-        t_ns=message.t_ns, pose=np.array([pose.position.x, pose.position.y, heading_rad])
-    )
-
-
-def _log_line(message: RawMessage) -> LogLine:
-    line = ros.deserialise(message.data, ros.LOG)
-    return LogLine(
-        t_ns=message.t_ns, radar=line.name, warning=line.level >= _LOG_WARN, text=line.msg
-    )
-
-
 def _radar_info(path: Path, message: RawMessage) -> RadarInfo:
     try:
-        facts = json.loads(ros.deserialise(message.data, ros.STRING).data)
-        unit = facts["length_unit"]
-        known = {
-            field.name: facts[field.name] for field in fields(RadarInfo) if field.name in facts
-        }
-        missing = [
-            field.name
-            for field in fields(RadarInfo)
-            if field.name not in known
-            and field.default is MISSING
-            and field.default_factory is MISSING
-        ]
-    except (ValueError, TypeError, KeyError, AssertionError, IndexError) as error:
+        text = str(ros.deserialise(message.data, ros.STRING).data)
+    except (ValueError, TypeError, AssertionError, IndexError, struct.error) as error:
         raise AppError(f"{path}: {message.topic} cannot be read: {error!r}") from None
-    if missing:
-        raise AppError(f"{path}: {message.topic} does not tell {', '.join(missing)}")
-    if unit != LENGTH_UNIT:
-        raise AppError(f"{path}: {message.topic}: lengths in {unit!r}, expected {LENGTH_UNIT!r}")
-    return RadarInfo(**known)
-
-
-def _session_info(path: Path, head: dict[str, str], radars: tuple[RadarInfo, ...]) -> SessionInfo:
-    try:
-        landmarks = np.array(json.loads(head["true_landmarks_m"]), dtype=np.float64)
-        return SessionInfo(
-            scene=head["scene"],
-            preset=head["preset"],
-            seed=int(head["seed"]),
-            radars=radars,
-            true_landmarks_m=landmarks.reshape(-1, 2),
-            versions=json.loads(head["versions"]),
-        )
-    except (KeyError, ValueError) as error:
-        raise AppError(f"{path}: metadata {METADATA_NAME!r} cannot be read: {error!r}") from None
+    return read_radar_text(path, message.topic, text)

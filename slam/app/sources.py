@@ -9,8 +9,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from types import TracebackType
-from typing import Self, cast
+from typing import Literal, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +36,7 @@ _POLL_S = 0.25
 class RadarLink:
     """An open driver and what it is called: its mount on the robot, its port, its serial number.
 
-    `start_skew_ns` is the session time of its counter 0, 0 or later.
+    `start_skew_ns` is the session time of its counter 0, 0 or later; `gain_db` as in `RadarInfo`.
     """
 
     mount: Mount
@@ -43,6 +44,7 @@ class RadarLink:
     serial: str
     driver: X4M300
     start_skew_ns: int = 0
+    gain_db: float = 0.0
 
 
 def sampler_limits(config: RawConfig) -> tuple[float, float]:
@@ -146,6 +148,11 @@ class RigSource:
         for link in open_links:
             link.driver.close()
 
+    def listen(self, listener: Callable[[str, Literal["rx", "tx"], bytes, int], None]) -> None:
+        """Hand on the bytes of every port: radar, way, bytes, time of the driver's clock [ns]."""
+        for link in self._links:
+            link.driver.raw_listener = partial(listener, link.mount.name)
+
     def start(self, config: RawConfig, fps: int) -> None:
         """Configure raw RF on every radar and start all streams.
 
@@ -183,6 +190,7 @@ class RigSource:
                     settings=asdict(config),
                     start_skew_ns=link.start_skew_ns,
                     phase_offset_rad=link.mount.phase_offset_rad,
+                    gain_db=link.gain_db,
                 )
             )
         self.radars = tuple(radars)

@@ -20,7 +20,8 @@ def ratio(error_m: float, odometry_error_m: float) -> float:
 class LandmarkSummary:
     """Landmarks against the truth, matched within 0.15 m after the trajectory's alignment."""
 
-    true: int
+    true: int | None
+    """None where nobody knows what stands there; so are precision, recall and rmse_m then."""
     estimated: int
     precision: float | None
     recall: float | None
@@ -42,7 +43,8 @@ class Summary:
 
     scene: str
     preset: str
-    seed: int
+    seed: int | None
+    """None on real modules."""
     frames: int
     duration_s: float
     realtime_factor: float

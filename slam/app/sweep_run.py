@@ -41,7 +41,7 @@ from slam.robust_pipeline import make_slam
 LARGEST = 1e12
 """What stands for an infinite NEES or NIS."""
 
-Key = tuple[str, str, tuple[tuple[str, str], ...], str, int]
+Key = tuple[str, str, tuple[tuple[str, str], ...], str, int | None]
 """Scene, preset, settings, stress, seed."""
 
 

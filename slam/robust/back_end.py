@@ -6,11 +6,13 @@ from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam.geometry import Rig
 from slam.robust.births import give_birth, match, update_with_point
 from slam.robust.continuation import (
     Continuation,
+    SureLandmarks,
     continue_tracks,
     labelled,
     landmarks_in_view,
@@ -295,6 +297,8 @@ class RobustBackEnd:
         doubts_m = self.state.feature_doubts_m
         near = near.doubted(doubts_m)
         self._trials += trials(near, seen, scans, self.state, self.parameters)
+        inside = seen.inside(noise, -limits.view_inset_rad, -limits.view_inset_m)[radars]
+        self._miss_unsure(near, sure, inside, scans)
         if sure is None:
             return []
         self._expected += expected_ranges(self.state, sure, antennas)
@@ -303,8 +307,7 @@ class RobustBackEnd:
         count = Counter(continuation.row for continuation in found)
         for row in count:
             self._existence.hit(ids[row])
-        inside = seen.inside(noise, -limits.view_inset_rad, -limits.view_inset_m)
-        expected = inside[radars][:, sure.landmarks].all(axis=0)
+        expected = inside[:, sure.landmarks].all(axis=0)
         for row in sure.landmarks[expected].tolist():
             hidden = any(scan.may_hide(float(seen.ranges_m[scan.radar, row])) for scan in scans)
             if row not in count and not hidden:
@@ -312,6 +315,20 @@ class RobustBackEnd:
         whole = max(len(scans), 2)
         self._existence.seen_whole(ids[row] for row, n in count.items() if n >= whole)
         return found
+
+    def _miss_unsure(
+        self,
+        near: SureLandmarks,
+        sure: SureLandmarks | None,
+        inside: NDArray[np.bool_],
+        scans: list[RangeScan],
+    ) -> None:
+        """Count a miss of landmarks too unsure for single ranges, where nothing at all is heard."""
+        known = () if sure is None else sure.landmarks
+        silent = near.unanswered(scans, self.parameters.ranges, self.parameters.map.view_inset_m)
+        for row in np.setdiff1d(silent, known).tolist():
+            if inside[:, row].all():
+                self._existence.miss(self.state.feature_ids[row])
 
     def _raise_tracklets(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Make tracklets of what is left over; each updates a landmark or becomes one."""

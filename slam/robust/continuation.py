@@ -89,6 +89,22 @@ class SureLandmarks:
         added = np.square(doubts_m[self.rows.landmarks])
         return self if not added.any() else replace(self, prior=self.prior + np.diag(added))
 
+    def unanswered(self, scans: Sequence[RangeScan], noise: RangeNoise, within_m: float) -> Indices:
+        """Return the rows of those of which no radar hears anything where they would answer.
+
+        That is within four standard deviations, or ``BLUR_M`` more from a blurred echo. Those whose
+        ranges are less sure than ``within_m`` are left out: they may be out of view.
+        """
+        scan_of = {scan.radar: scan for scan in scans}
+        per_landmark = len(self.rows.radars) // len(self.landmarks)
+        variances = self.prior.diagonal()
+        silent = variances <= within_m**2
+        reaches_m = 4.0 * np.sqrt(variances + noise.sigma_m**2)
+        for k in np.flatnonzero(silent).tolist():
+            scan, range_m = scan_of[int(self.rows.radars[k])], self.rows.predicted_m[k]
+            silent[k] = not scan.answers(float(range_m), float(reaches_m[k]))
+        return self.landmarks[silent.reshape(-1, per_landmark).all(axis=1)]
+
 
 def landmarks_in_view(
     state: State,

@@ -82,6 +82,12 @@ class RangeScan:
         """Tell whether an echo at a range may be part of a blurred one."""
         return any(abs(blurred_m - range_m) <= BLUR_M for blurred_m in self.blurred_m)
 
+    def answers(self, range_m: float, reach_m: float) -> bool:
+        """Tell whether any echo, blurred ones too, may be that of a target at an unsure range."""
+        return any(abs(heard_m - range_m) <= reach_m for heard_m in self.ranges_m) or any(
+            abs(blurred_m - range_m) <= BLUR_M + reach_m for blurred_m in self.blurred_m
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Antennas:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from slam.app.errors import OdometryError
 from slam.app.odometry import OdometryTrack, read_odometry_socket
 from slam.app.tum import TumSample, format_tum_line
+from slam.geometry import wrap_angle
 
 
 def lines_of(rows: list[tuple[int, float, float, float]]) -> list[str]:
@@ -124,3 +125,19 @@ def test_a_missing_or_silent_socket_is_named(tmp_path: Path) -> None:
         server.listen()
         with pytest.raises(OdometryError, match=r"silent for 0\.1 s"):
             read_odometry_socket(str(tmp_path / "silent"), timeout_s=0.1)
+
+
+@given(st.lists(st.floats(-2 * math.pi, 2 * math.pi), min_size=2, max_size=30))
+def test_a_track_that_grows_unwraps_like_numpy_to_the_last_bit(headings: list[float]) -> None:
+    samples = [
+        TumSample(t_ns=t_ns, x_m=0.0, y_m=0.0, qz=math.sin(h / 2), qw=math.cos(h / 2))
+        for t_ns, h in enumerate(headings)
+    ]
+    track = OdometryTrack(samples[:1])
+    for sample in samples[1:]:
+        track.append(sample)
+    unwrapped = np.unwrap([sample.heading_rad for sample in samples])
+    for row, heading_rad in enumerate(unwrapped):
+        assert track.pose_at(row)[2] == wrap_angle(float(heading_rad))
+    with pytest.raises(OdometryError, match="not later"):
+        track.append(samples[-1])

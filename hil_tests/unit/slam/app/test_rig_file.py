@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from slam.app.errors import AppError
-from slam.app.rig_file import RigFile, RigRadar, load_rig, write_rig
+from slam.app.rig_file import RigFile, RigRadar, RigWheels, load_rig, write_rig
+from slam.robust.parameters import WheelNoise
 
 RADAR = """\
 [[radars]]
@@ -39,6 +40,20 @@ def test_a_rig_comes_back_with_the_same_floats(tmp_path: Path) -> None:
     assert load_rig(tmp_path / "rig.toml") == rig
 
 
+def test_wheels_come_back_and_tell_slam_how_they_err(tmp_path: Path) -> None:
+    rig = RigFile(
+        radars=(RigRadar(name="a", serial="000000000001", x_m=0, y_m=0, yaw_deg=0),),
+        wheels=RigWheels(scale_sigma=0.02, curvature_sigma_rad_per_m=0.001),
+    )
+    write_rig(tmp_path / "rig.toml", rig)
+    assert load_rig(tmp_path / "rig.toml") == rig
+    noise = rig.wheels.noise
+    assert (noise.scale_sigma, noise.curvature_sigma_rad_per_m) == (0.02, 0.001)
+    assert noise.turn_scale_sigma == WheelNoise().turn_scale_sigma
+    (path := tmp_path / "plain.toml").write_text(RADAR)
+    assert load_rig(path).wheels.noise == WheelNoise()
+
+
 def test_a_rig_file_gives_mounts_in_radians(tmp_path: Path) -> None:
     path = tmp_path / "rig.toml"
     path.write_text(RADAR + "range_offset_m = 0.02\nphase_offset_deg = -45\n")
@@ -51,6 +66,8 @@ def test_a_rig_file_gives_mounts_in_radians(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
+        (RADAR + "[wheels]\nslip = 1\n", r"wheels.slip: unknown key; allowed are along_sigma"),
+        (RADAR + "[wheels]\nscale_sigma = -1\n", r"wheels.scale_sigma: .*got -1"),
         (RADAR + "colour = 1\n", r"radars\[0\].colour: unknown key; allowed are name, serial, x_m"),
         ("radar = []\n" + RADAR, r"radar: unknown key; allowed are radars"),
         (RADAR.replace("x_m = 0.1\n", ""), r"radars\[0\].x_m: missing"),

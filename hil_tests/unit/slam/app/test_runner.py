@@ -1,6 +1,8 @@
 """The runner hands every state on with its own counter, its truth and the place of the map."""
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -8,7 +10,7 @@ from numpy.typing import NDArray
 
 from hil_tests.unit.slam.app.sessions import FRAME_NS, scan
 from slam.app.odometry import OdometryTrack
-from slam.app.runner import run_slam
+from slam.app.runner import nobody_knows, run_slam
 from slam.app.session import LogLine, Scan, Snapshot
 from slam.app.tum import TumSample
 from slam.ekf_slam import Belief
@@ -93,4 +95,49 @@ def test_every_state_comes_with_its_own_counter_truth_and_place() -> None:
         np.testing.assert_array_equal(snapshot.world_from_map, record.world_from_map)
         np.testing.assert_array_equal(truth, snapshot.truth)
     assert record.n_frames == 2 * len(COUNTERS)
-    assert record.duration_ns == COUNTERS[-1] * FRAME_NS
+    assert record.start_ns == COUNTERS[0] * FRAME_NS
+    assert record.start_ns + record.duration_ns == COUNTERS[-1] * FRAME_NS
+
+
+def test_an_unused_scan_is_told_and_not_stepped() -> None:
+    ends = [TumSample(t_ns=t_ns, x_m=0.0, y_m=0.0, qz=0.0, qw=1.0) for t_ns in (0, 20 * FRAME_NS)]
+    listener = Listener()
+    scans = [replace(scan(counter), used=counter not in (5, 8)) for counter in COUNTERS]
+    slam = cast(UwbRadarSlam, LateSlam())
+    record = run_slam(scans, OdometryTrack(ends), slam, nobody_knows, [listener])
+    assert tuple(listener.scans) == COUNTERS
+    assert [snapshot.counter for snapshot in listener.snapshots] == [6, 11, 12]
+    assert record.n_frames == 2 * 3
+    np.testing.assert_array_equal(record.world_from_map, np.zeros(3))
+    assert np.isnan(record.truth).all()
+
+
+def test_slam_hears_radars_less_their_gains_and_observers_as_they_are() -> None:
+    """6.02 dB are a factor of two, so the limits and what lies at them stay equal."""
+    heard: list[RadarFrame] = []
+
+    class Hearing(LateSlam):
+        def step(
+            self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
+        ) -> tuple[StepResult, ...]:
+            heard.extend(frames)
+            return super().step(frames, pose_at, t_ns)
+
+    ends = [TumSample(t_ns=t_ns, x_m=0.0, y_m=0.0, qz=0.0, qw=1.0) for t_ns in (0, FRAME_NS)]
+    made = scan(0)
+    low, high = (
+        float(limit) for limit in (made.frames[1].samples.min(), made.frames[1].samples.max())
+    )
+    made = replace(made, frames=(made.frames[0], replace(made.frames[1], limits=(low, high))))
+    run_slam(
+        [made],
+        OdometryTrack(ends),
+        cast(UwbRadarSlam, Hearing()),
+        nobody_knows,
+        gains_db=[0.0, 20.0 * math.log10(2.0)],
+    )
+    as_it_was, halved = heard
+    assert as_it_was is made.frames[0]
+    np.testing.assert_allclose(halved.samples, made.frames[1].samples / 2.0, rtol=1e-6)
+    assert halved.samples.dtype == np.float32
+    assert halved.limits == (float(halved.samples.min()), float(halved.samples.max()))

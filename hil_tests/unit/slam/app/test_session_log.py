@@ -3,6 +3,8 @@
 import cmath
 import dataclasses
 import json
+import subprocess
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -21,7 +23,10 @@ from hil_tests.unit.slam.app.sessions import (
 )
 from slam.app import ros_messages as ros
 from slam.app.odometry import OdometryTrack
-from slam.app.session_log import METADATA_NAME, SessionLog
+from slam.app.session_file import CannotWriteError
+from slam.app.session_head import METADATA_NAME
+from slam.app.session_log import SessionLog
+from slam.app.session_reader import open_session
 from slam.app.tum import format_tum_line
 
 N_SCANS = 300
@@ -271,7 +276,47 @@ def test_closing_twice_is_harmless(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full (Linux)")
-def test_a_full_disk_names_the_file() -> None:
-    with pytest.raises(OSError, match="No space left") as caught:
-        feed(SessionLog(Path("/dev/full"), session_info(), odometry()), 1)
-    assert caught.value.filename == Path("/dev/full")
+def test_a_disk_that_is_full_from_the_start_is_one_line() -> None:
+    with pytest.raises(CannotWriteError, match="/dev/full: cannot be written: No space") as caught:
+        SessionLog(Path("/dev/full"), session_info(), odometry())
+    assert "nothing was recorded" in str(caught.value)
+
+
+FULL_DISK = """
+import resource, sys
+from pathlib import Path
+from hil_tests.unit.slam.app.sessions import feed, session_info
+from slam.app.session_file import CannotWriteError
+from slam.app.session_log import SessionLog
+from slam.app.session_reader import open_session
+
+resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))  # as a disk with that much room
+log = SessionLog(Path(sys.argv[1]), session_info(), clock_ns=lambda: 0)
+try:
+    feed(log, 300)
+except CannotWriteError as error:
+    print(error)
+feed(log, 3)  # goes nowhere
+log.on_wire("radar0", "rx", b"7", 0)
+log.close()
+log.close()
+"""
+
+
+def test_a_disk_that_fills_up_keeps_every_whole_chunk(tmp_path: Path) -> None:
+    path = tmp_path / "s.mcap"
+    done = subprocess.run(
+        [sys.executable, "-c", FULL_DISK, str(path)], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    (line,) = done.stdout.splitlines()
+    assert str(path) in line
+    assert "File too large" in line
+    session = open_session(path)
+    taken = [one for one, _ in session.scans()]
+    # a chunk of 256 KiB did not fit into 1 MB any more; what stood before it is whole
+    assert 600_000 < path.stat().st_size <= 1_000_000
+    assert [one.counter for one in taken] == list(range(len(taken)))
+    assert len(taken) > 50
+    assert f"its first {taken[-1].t_ns / 1e9:.1f} s are kept" in line
+    assert session.cut_at_byte == path.stat().st_size  # not within a chunk: that room was freed

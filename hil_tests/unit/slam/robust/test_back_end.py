@@ -1,5 +1,6 @@
 """The robust back end in a world of ranges: it finds the map. Seeds are fixed."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -89,3 +90,32 @@ def test_an_empty_scan_and_no_scan_change_nothing() -> None:
 def test_radars_that_look_the_same_way_are_one_side() -> None:
     assert sides_of(paper_rig()) == ((0, 1), (2, 3))
     assert sides_of(Rig(mounts=(Mount(name="one", x_m=0.0, y_m=0.0, yaw_rad=0.0),))) == ((0,),)
+
+
+@pytest.mark.parametrize(
+    ("heard_m", "blurred_m", "stays"),
+    [((), (), False), ((0.7,), (), False), ((0.42,), (), True), ((), (0.5,), True)],
+    ids=["silence", "another echo", "an echo near it", "a blurred echo"],
+)
+def test_a_landmark_known_to_two_centimetres_is_given_up_where_nothing_answers(
+    heard_m: tuple[float, ...], blurred_m: tuple[float, ...], stays: bool
+) -> None:
+    back_end = RobustBackEnd(paper_rig(), BackEndParameters())
+    # 0.4 m straight in front of both left radars' middle; too unsure for single ranges
+    point = RangeBearing(range_m=0.6, bearing_rad=np.pi / 2, covariance=np.diag([4e-4, 4e-4]))
+    # others answer on the right, so the robot knows that it is where it thinks
+    known = [
+        RangeBearing(range_m=0.6, bearing_rad=bearing, covariance=np.diag([1e-6, 1e-6]))
+        for bearing in (-1.5, -1.7)
+    ]
+    assert back_end.update_points([point, *known]) == (0, 1, 2)
+    ranges_m = [
+        tuple(math.hypot(0.6 * math.cos(b) - x_m, 0.6 * math.sin(b) + 0.2) for b in (-1.5, -1.7))
+        for x_m in (0.1, -0.1)
+    ]
+    for _ in range(40):
+        back_end.predict(np.zeros(3))
+        left = [RangeScan(radar=r, ranges_m=heard_m, blurred_m=blurred_m) for r in range(2)]
+        right = [RangeScan(radar=2 + r, ranges_m=ranges_m[r]) for r in range(2)]
+        back_end.update(left + right)
+    assert (0 in back_end.state.landmark_ids) == stays

@@ -1,0 +1,60 @@
+"""The emulator answers as modules do: side by side with one, and from what one once answered.
+
+``--hil-diff`` asks a radar and the emulator the same questions and compares their answers, and
+``--hil-cassette FILE`` writes them down; each file in ``fixtures/cassettes`` binds the emulator.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from hil_tests.plugin.bench import RadarAtPlace
+from hil_tests.plugin.cassette import Cassette, ask_all, differences, today
+from hil_tests.plugin.choices import CHOICES
+from hil_tests.plugin.gate import leave_out
+from hil_tests.plugin.measurements import Measure
+from hil_tests.plugin.specs import parse_specs
+
+CASSETTES = Path(__file__).parents[2] / "fixtures" / "cassettes"
+
+
+def emulator() -> RadarAtPlace:
+    radar = RadarAtPlace(parse_specs(["emu"])[0])
+    radar.begin_test()
+    return radar
+
+
+@pytest.mark.requires("settings", "profiles", "files")
+def test_every_answer_is_the_emulators(
+    request: pytest.FixtureRequest, radar_place: RadarAtPlace, measure: Measure
+) -> None:
+    choices = request.config.stash[CHOICES]
+    if not choices.diff:
+        leave_out(request, f"{radar_place.spec.name}: asked and compared only with --hil-diff")
+    answers = ask_all(radar_place.take_line(), radar_place.place.clock_ns)
+    if choices.cassette is not None:
+        recorded = {
+            "identity": radar_place.identity,
+            "reached": radar_place.place.description,
+            "real_module": "hardware" in radar_place.place.capabilities,  # as the user says
+            "date": today(),
+        }
+        Cassette(recorded=recorded, exchanges=answers).write(choices.cassette)
+    emulated = emulator()
+    expected = ask_all(emulated.take_line(), emulated.place.clock_ns)
+    found = differences(answers, expected)
+    measure("answers_compared", len(answers))
+    measure("answers_that_differ", len(found))
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize("path", sorted(CASSETTES.glob("*.json")), ids=lambda path: path.stem)
+def test_the_emulator_answers_as_the_cassette(path: Path) -> None:
+    """Offline: what a module once answered, the emulator answers ever after."""
+    cassette = Cassette.read(path)
+    emulated = emulator()
+    now = ask_all(emulated.take_line(), emulated.place.clock_ns, cassette.transactions)
+    found = differences(cassette.exchanges, now)
+    assert not found, "\n".join(found)

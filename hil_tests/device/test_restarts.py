@@ -1,0 +1,107 @@
+"""A module that restarts, is unplugged, or changes its baud rate."""
+
+from __future__ import annotations
+
+import pytest
+
+from hil_tests.plugin.bench import RadarAtPlace
+from hil_tests.plugin.measurements import Measure
+from xethru_protocol import messages as m
+from xethru_protocol.codes import PongCode, X4Setting
+from xethru_protocol.driver import X4M300, RawConfig
+from xethru_protocol.errors import Disconnected, ResponseTimeout
+
+pytestmark = pytest.mark.requires("settings")
+
+SHORT = RawConfig(frame_area_m=(0.4, 1.0))
+
+
+def test_it_is_ready_again_after_a_reset(
+    radar: X4M300, radar_place: RadarAtPlace, measure: Measure
+) -> None:
+    """Protocol reference 8.1: ready again after 2 ... 9 s, X4 settings gone."""
+    radar.configure_raw(RawConfig(iterations=8))
+    serial = radar.info().serial_number
+    begin_ns = radar_place.place.clock_ns()
+    radar.reset(wait=True)
+    ready_s = (radar_place.place.clock_ns() - begin_ns) * 1e-9
+    assert radar.ping() is PongCode.XTS_SPRP_READY
+    assert radar.info().serial_number == serial
+    assert radar.request(m.X4DriverGet(setting=X4Setting.FPS)).values == (0.0,)
+    radar.configure_raw()
+    assert radar.x4_settings()[X4Setting.ITERATIONS] == 16
+    measure("reset_to_ready", ready_s, unit="s", limit=(2.0, None))
+
+
+def test_frames_come_again_after_a_reset_in_a_stream(radar: X4M300, frame_rate_hz: float) -> None:
+    """The module says nothing of the end of its stream: only who asked for the reset knows."""
+    radar.configure_raw(SHORT)
+    radar.start(frame_rate_hz)
+    list(radar.frames(2))
+    radar.reset(wait=True)
+    radar.configure_raw(SHORT)
+    radar.start(frame_rate_hz)
+    counters = [frame.counter for frame in radar.frames(3)]
+    assert counters == list(range(counters[0], counters[0] + 3))
+
+
+@pytest.mark.requires("unplug")
+def test_the_driver_goes_on_after_an_unplug(
+    radar_place: RadarAtPlace, frame_rate_hz: float
+) -> None:
+    """It finds the module by its own serial number and restores what was set."""
+    radar = radar_place.open(reconnect_s=15.0)
+    geometry = radar.configure_raw(SHORT)
+    radar.start(frame_rate_hz)
+    radar.read_frame()
+    radar_place.place.unplug(0.5)
+    while radar.reconnects == 0:
+        radar.read_frame(timeout_s=15.0)
+    frame = radar.read_frame(timeout_s=15.0)
+    assert frame.geometry == geometry
+    assert frame.samples.shape == (geometry.n_bins,)
+    assert radar.frames_lost == 0
+
+
+@pytest.mark.requires("unplug")
+def test_an_unplugged_module_is_said_to_be_gone(radar: X4M300, radar_place: RadarAtPlace) -> None:
+    radar.configure_raw(SHORT)
+    radar.start(17.0)
+    radar.read_frame()
+    radar_place.place.unplug(0.5)
+    with pytest.raises(Disconnected):
+        list(radar.frames(timeout_s=5.0))
+
+
+@pytest.mark.requires("uart")
+@pytest.mark.parametrize("baudrate", [921600, 230400])
+def test_baud_rates(radar: X4M300, baudrate: int) -> None:
+    """Protocol reference 4.10, 10: answered at the old rate, then both sides change."""
+    radar.set_baud_rate(baudrate)
+    assert radar.ping() is PongCode.XTS_SPRP_READY
+    radar.configure_raw(SHORT)
+    radar.start(5.0)
+    counters = [frame.counter for frame in radar.frames(5)]
+    radar.stop()
+    assert counters == list(range(counters[0], counters[0] + 5))
+    radar.set_baud_rate(115200)
+    assert radar.ping() is PongCode.XTS_SPRP_READY
+    assert radar.fault_count == 0
+
+
+@pytest.mark.requires("uart")
+def test_a_reset_takes_the_baud_rate_back(radar: X4M300) -> None:
+    """Protocol reference 10: it is not saved; the driver follows and sets it again."""
+    radar.set_baud_rate(921600)
+    radar.reset(wait=True)
+    assert radar.ping() is PongCode.XTS_SPRP_READY
+    radar.set_baud_rate(115200)
+
+
+def test_rates_no_module_has_change_nothing(radar: X4M300) -> None:
+    """Protocol reference 4.10: values outside 600 ... 10 000 000 are acknowledged and ignored."""
+    radar.request(m.SetBaudRate(baudrate=300))
+    try:
+        assert radar.ping(5.0) is PongCode.XTS_SPRP_READY
+    except ResponseTimeout:  # say what happened, not that something was slow
+        pytest.fail("it changed its rate to one that it does not have")

@@ -1,0 +1,184 @@
+"""What is kept of a test that failed, one folder per test: wire, log, scene, seeds, view.
+
+| file | what |
+|---|---|
+| `log.txt` | every packet both ways, decoded, and what nobody can read; why it failed |
+| `wire.mcap` | the bytes as they passed (`/radar/NAME/rx`, `/tx`), and the module's messages |
+| `about.json` | test, radar, identity, seeds, versions, link statistics, measurements |
+| `scene.toml` | the scene of an emulated radar, if it has one |
+| `session.rrd` | frames, messages and measurements for Rerun |
+
+`xethru dump wire.mcap` prints the module's messages.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import json
+import platform
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil_tests.plugin.bench import RadarAtPlace
+from hil_tests.plugin.measurements import Measurement
+from hil_tests.plugin.tap import WireBytes, WireTap
+from xethru_protocol.codec import describe, encode
+from xethru_protocol.connection import Connection, Role
+from xethru_protocol.messages import BasebandIq, Command, DataFloat, Message
+from xethru_protocol.packets import NEED_DATA, FramingFault
+from xethru_protocol.recordings.cdr import BYTE_ARRAY, SCHEMAS, pack_array
+
+__all__ = ["folder_name", "write_bundle"]
+
+_SHOWN_BYTES = 64
+_LONGEST_NAME = 150
+
+
+def folder_name(nodeid: str) -> str:
+    """Return the folder of a test: its id without what file systems dislike.
+
+    >>> folder_name("hil_tests/device/test_raw.py::test_frames[emu-lab]")
+    'hil_tests-device-test_raw.py-test_frames-emu-lab'
+    """
+    return re.sub(r"[^0-9A-Za-z._]+", "-", nodeid).strip("-")[-_LONGEST_NAME:]
+
+
+def write_bundle(
+    folder: Path,
+    radars: Sequence[RadarAtPlace],
+    *,
+    about: Mapping[str, Any],
+    failure: str,
+    measurements: Sequence[Measurement],
+) -> None:
+    """Write the folder of one test; what an earlier run left in it is replaced."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for old in ("log.txt", "wire.mcap", "about.json", "scene.toml", "session.rrd"):
+        (folder / old).unlink(missing_ok=True)
+    taps = {radar.spec.name: radar.tap for radar in radars}
+    (folder / "log.txt").write_text(_log(radars, failure), "utf-8")
+    (folder / "about.json").write_text(
+        json.dumps(_about(radars, about, measurements), indent=2) + "\n", "utf-8"
+    )
+    for radar in radars:
+        if radar.place.scene_text is not None:
+            (folder / "scene.toml").write_text(radar.place.scene_text, "utf-8")
+    _write_wire(folder / "wire.mcap", taps)
+    from hil_tests.plugin.rerun_bundle import write_rrd  # Rerun takes half a second to import
+
+    with contextlib.suppress(ImportError):  # the rest of the bundle does without
+        write_rrd(folder / "session.rrd", taps, measurements, failure)
+
+
+def decoded(tap: WireTap) -> Iterator[tuple[WireBytes, Sequence[Message | FramingFault]]]:
+    """Yield what passed with the messages and faults that each piece completed.
+
+    Commands are read as the module reads them, answers as the driver does.
+    """
+    ends = {"tx": Connection(Role.MODULE), "rx": Connection(Role.HOST)}
+    for passed in tap.passed:
+        end = ends[passed.way]
+        end.receive_data(passed.data)
+        events: list[Message | FramingFault] = []
+        while (event := end.next_event()) is not NEED_DATA:
+            if isinstance(event, Message | FramingFault):
+                events.append(event)
+        yield passed, events
+
+
+def _log(radars: Sequence[RadarAtPlace], failure: str) -> str:
+    lines = []
+    for radar in radars:
+        tap = radar.tap
+        lines.append(f"=== {radar.spec.name}: {radar.identity or 'never answered'}")
+        lines.append(f"    {radar.place.description}; --radar '{radar.spec.text}'")
+        if tap.forgotten_bytes:
+            lines.append(f"    the first {tap.forgotten_bytes} bytes were not kept")
+        for passed, events in decoded(tap):
+            time_s = (passed.t_ns - tap.started_ns) * 1e-9
+            shown = passed.data[:_SHOWN_BYTES].hex(" ").upper()
+            more = len(passed.data) - _SHOWN_BYTES
+            lines.append(
+                f"{time_s:12.6f} s  {passed.way}  {shown}" + (f" ... +{more}" if more > 0 else "")
+            )
+            who = "the module" if passed.way == "tx" else "the driver"
+            lines.extend(f"{'':20}{_event_text(event, who)}" for event in events)
+            if passed.way == "tx" and not any(isinstance(event, Command) for event in events):
+                lines.append(f"{'':20}!! no command that {who} can read ends here")
+        for driver in radar.drivers:
+            lines.extend(f"    driver's warning: {text}" for text in driver.warnings)
+            lines.append(f"    link statistics: {json.dumps(driver.statistics.summary())}")
+    return "\n".join([*lines, "", "=== failure", failure, ""])
+
+
+def _event_text(event: Message | FramingFault, who: str) -> str:
+    if isinstance(event, FramingFault):
+        return f"!! {who} cannot read this: {event.kind.value}, byte {event.offset} of the line"
+    if isinstance(event, DataFloat):
+        return f"frame {event.info}: {event.values.size} values, content {event.content_id}"
+    if isinstance(event, BasebandIq):
+        return f"baseband frame {event.counter}: {event.num_bins} bins"
+    name, fields = describe(event)
+    return f"{name} {json.dumps(fields)}" if fields else name
+
+
+def _about(
+    radars: Sequence[RadarAtPlace], about: Mapping[str, Any], measurements: Sequence[Measurement]
+) -> dict[str, Any]:
+    return {
+        **about,
+        "radars": [
+            {
+                "name": radar.spec.name,
+                "spec": radar.spec.text,
+                "reached": radar.place.description,
+                "identity": radar.identity,
+                "capabilities": sorted(radar.place.capabilities),
+                "seed": radar.spec.seed if radar.spec.emulated else None,
+                "started_unix_ns": radar.tap.started_unix_ns,
+                "forgotten_bytes": radar.tap.forgotten_bytes,
+                "statistics": [driver.statistics.summary() for driver in radar.drivers],
+                "warnings": [text for driver in radar.drivers for text in driver.warnings],
+            }
+            for radar in radars
+        ],
+        "measurements": [measurement.as_json() for measurement in measurements],
+        "versions": {
+            "python": platform.python_version(),
+            **{
+                name: importlib.metadata.version(name)
+                for name in ("xethru-hil", "pytest", "numpy", "pyserial")
+            },
+        },
+    }
+
+
+def _write_wire(path: Path, taps: Mapping[str, WireTap]) -> None:
+    from mcap.writer import CompressionType, Writer
+
+    with path.open("wb") as stream:
+        writer = Writer(stream, compression=CompressionType.ZSTD)
+        writer.start(profile="ros2", library="xethru-hil")
+        schema = writer.register_schema(BYTE_ARRAY, "ros2msg", SCHEMAS[BYTE_ARRAY].encode())
+        for name, tap in taps.items():
+            channels = {
+                topic: writer.register_channel(f"/radar/{name}/{topic}", "cdr", schema)
+                for topic in ("rx", "tx", "payload")
+            }
+            for passed, events in decoded(tap):
+                heard = [] if passed.way == "tx" else events
+                payloads = [encode(one) for one in heard if isinstance(one, Message)]
+                for topic, data in [(passed.way, passed.data), *(("payload", p) for p in payloads)]:
+                    writer.add_message(
+                        channel_id=channels[topic],
+                        log_time=tap.started_unix_ns + passed.t_ns - tap.started_ns,
+                        publish_time=passed.t_ns,
+                        sequence=0,
+                        data=pack_array(BYTE_ARRAY, np.frombuffer(data, np.uint8)),
+                    )
+        writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates in part

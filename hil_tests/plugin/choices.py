@@ -1,0 +1,204 @@
+"""What the user chose: command line before environment before ini file."""
+
+from __future__ import annotations
+
+import os
+import re
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import pytest
+
+from hil_tests.plugin.specs import Kind, RadarSpec, SpecError, parse_specs
+
+__all__ = ["CHOICES", "Choices", "add_options", "choose"]
+
+ENVIRONMENT = "XETHRU_RADARS"
+INI = "xethru_radars"
+WORKER_KEY = "xethru_radars"
+RIG_ENVIRONMENT, RIG_INI = "XETHRU_RIG", "xethru_rig"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Choices:
+    """Options of the session.
+
+    Attributes
+    ----------
+    specs
+        The radars, each test runs on all of them.
+    chosen
+        Whether somebody asked for these radars; they are `emu` otherwise.
+    rig
+        Rig file that names modules by serial number; None: none.
+    strict
+        Whether a missing capability fails a test in place of skipping it.
+    slow
+        Whether tests that take long on hardware run there.
+    flash, factory
+        Whether tests may write the flash and the factory settings of a real module.
+    diff
+        Whether the answers of each radar are compared with the emulator's.
+    cassette
+        Where those answers are written; None: nowhere.
+    keep
+        Of which tests artefacts are kept.
+    artifacts
+        In which folder.
+    json
+        Where to write what ran and what was measured; None: nowhere.
+    """
+
+    specs: tuple[RadarSpec, ...]
+    chosen: bool
+    rig: Path | None
+    strict: bool
+    slow: bool
+    flash: bool
+    factory: bool
+    diff: bool
+    cassette: Path | None
+    keep: Literal["failed", "all", "none"]
+    artifacts: Path
+    json: Path | None
+
+
+CHOICES: pytest.StashKey[Choices] = pytest.StashKey()
+
+
+def add_options(parser: pytest.Parser) -> None:
+    """Add the options and their equivalents in ini files."""
+    group = parser.getgroup("xethru-hil", "radars under test (xethru-hil)")
+    group.addoption(
+        "--radar",
+        action="append",
+        metavar="SPEC",
+        help="radar to test, repeatable: emu[:SCENE][?seed=S&fps=F&line=pty], /dev/ttyACM0, "
+        "serial=NUMBER, auto, tcp://HOST:PORT, replay:RECORDING "
+        f"(environment {ENVIRONMENT}, ini {INI}; default emu)",
+    )
+    group.addoption(
+        "--rig",
+        metavar="FILE",
+        help="rig file: names the modules of radar_rig by serial number; alone, those are tested "
+        f"(environment {RIG_ENVIRONMENT}, ini {RIG_INI})",
+    )
+    for name, text in (
+        ("--hil-strict", "a missing capability fails a test instead of skipping it"),
+        ("--hil-slow", "also run tests that take long on a radar in real time"),
+        ("--allow-flash", "let tests write the flash of real modules"),
+        ("--allow-factory-reset", "let tests set real modules to their factory settings"),
+        ("--hil-diff", "compare every answer with the emulator's"),
+    ):
+        group.addoption(name, action="store_true", help=text)
+    group.addoption(
+        "--hil-cassette",
+        metavar="FILE",
+        help="with --hil-diff: write the answers as a conformance cassette",
+    )
+    group.addoption(
+        "--hil-artifacts",
+        metavar="DIR",
+        default="hil-artifacts",
+        help="folder for wire, log, scene, seeds and view of a test (default %(default)s)",
+    )
+    group.addoption(
+        "--hil-keep",
+        choices=["failed", "all", "none"],
+        default="failed",
+        help="of which tests these are kept (default failed)",
+    )
+    group.addoption("--hil-json", metavar="FILE", help="write what ran where and what was measured")
+    parser.addini(INI, f"radars to test, as --radar; {ENVIRONMENT} and --radar win", "linelist")
+    parser.addini(RIG_INI, f"rig file, as --rig; {RIG_ENVIRONMENT} and --rig win")
+
+
+def choose(config: pytest.Config) -> Choices:
+    """Return what the user chose.
+
+    Raises
+    ------
+    pytest.UsageError
+        If it makes no sense; one line with the remedy.
+    """
+    rig = config.getoption("rig") or os.environ.get(RIG_ENVIRONMENT) or config.getini(RIG_INI)
+    worker: dict[str, list[str]] = getattr(config, "workerinput", {})
+    try:
+        chosen = (
+            worker.get(WORKER_KEY)  # what the first process found
+            or config.getoption("radar")
+            or _words(os.environ.get(ENVIRONMENT, ""))
+            or config.getini(INI)
+            or (_modules_of(Path(rig)) if rig else [])
+        )
+        specs = parse_specs(chosen or ["emu"])
+        if not worker:
+            specs = _found(specs)
+            _check_workers(config, specs)
+    except SpecError as error:
+        raise pytest.UsageError(str(error)) from None
+    cassette, report = config.getoption("hil_cassette"), config.getoption("hil_json")
+    if cassette and not config.getoption("hil_diff"):
+        raise pytest.UsageError("--hil-cassette needs --hil-diff")
+    return Choices(
+        specs=specs,
+        chosen=bool(chosen),
+        rig=Path(rig) if rig else None,
+        strict=config.getoption("hil_strict"),
+        slow=config.getoption("hil_slow"),
+        flash=config.getoption("allow_flash"),
+        factory=config.getoption("allow_factory_reset"),
+        diff=config.getoption("hil_diff"),
+        cassette=Path(cassette) if cassette else None,
+        keep=config.getoption("hil_keep"),
+        artifacts=Path(config.invocation_params.dir, config.getoption("hil_artifacts")),
+        json=Path(config.invocation_params.dir, report) if report else None,
+    )
+
+
+def _modules_of(rig: Path) -> list[str]:
+    """Return specs of the modules of a rig file; what else is wrong with it, `radar_rig` tells."""
+    try:
+        radars = tomllib.loads(rig.read_text("utf-8"))["radars"]
+        return [f"serial={radar['serial']}" for radar in radars]
+    except OSError as error:
+        raise SpecError(f"--rig {rig}: {error.strerror}") from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise SpecError(f"--rig {rig}: no rig file with serial numbers: {error!r}") from None
+
+
+def _words(text: str) -> list[str]:
+    return re.split(r"\s+", text.strip()) if text.strip() else []
+
+
+def _found(specs: tuple[RadarSpec, ...]) -> tuple[RadarSpec, ...]:
+    """Replace `auto` by the ports where modules answer."""
+    if not any(spec.kind is Kind.AUTO for spec in specs):
+        return specs
+    from hil_tests.plugin.places import ports_that_answer
+
+    texts: list[str] = []
+    for spec in specs:
+        if spec.kind is not Kind.AUTO:
+            texts.append(spec.text)
+            continue
+        paths = [path for path, _ in ports_that_answer()]
+        if not paths:
+            raise SpecError("--radar auto: no module answers; 'xethru doctor' says why")
+        query = spec.text.partition("?")[2]
+        texts.extend(f"{path}?{query}" if query else path for path in paths)
+    return parse_specs(texts)
+
+
+def _check_workers(config: pytest.Config, specs: tuple[RadarSpec, ...]) -> None:
+    """Refuse to let every worker test the same real radar."""
+    if not config.pluginmanager.hasplugin("xdist"):
+        return
+    shared = next((spec for spec in specs if spec.shared), None)
+    if shared is not None and config.getoption("dist", "no") == "each":
+        raise SpecError(
+            f"--radar {shared.text}: with --dist each all workers want this radar at once; "
+            "leave that out: its tests go to one worker"
+        )

@@ -1,0 +1,127 @@
+"""Fixtures for tests of radars; what opens radars is imported when a test asks for one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING
+
+import pytest
+
+from hil_tests.plugin.choices import CHOICES
+from hil_tests.plugin.gate import FINDINGS, gate, lacking
+from hil_tests.plugin.measurements import Measure
+from hil_tests.plugin.rates import carried_rate_hz
+
+if TYPE_CHECKING:
+    from hil_tests.plugin.bench import Bench, RadarAtPlace
+    from xethru_protocol.driver import X4M300
+
+__all__ = [
+    "frame_rate_hz",
+    "hil_bench",
+    "measure",
+    "radar",
+    "radar_name",
+    "radar_pair",
+    "radar_place",
+    "radar_rig",
+    "rig_name",
+]
+
+
+@pytest.fixture(scope="session")
+def hil_bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
+    """All radars of the session."""
+    from hil_tests.plugin.bench import Bench
+
+    bench = Bench(request.config.stash[CHOICES].specs)
+    yield bench
+    bench.close()
+
+
+@pytest.fixture(scope="session")
+def radar_name(request: pytest.FixtureRequest) -> str:
+    """Name of the radar a test runs on: each of ``--radar`` in turn."""
+    name: str = request.param
+    return name
+
+
+@pytest.fixture
+def radar_place(
+    request: pytest.FixtureRequest, radar_name: str, hil_bench: Bench
+) -> Iterator[RadarAtPlace]:
+    """Where the radar is, brought to a known state: stopped, no profile, nothing on the line.
+
+    ``radar_place.open()`` gives drivers, ``radar_place.place.unplug(seconds)`` unplugs it, where
+    that can be done.
+    """
+    found = gate(request, hil_bench, (radar_name,))
+    yield found[0]
+    found[0].end_test()
+
+
+@pytest.fixture
+def radar(radar_place: RadarAtPlace) -> X4M300:
+    """Return a driver of the radar, in its known state."""
+    return radar_place.open()
+
+
+@pytest.fixture
+def frame_rate_hz(radar_place: RadarAtPlace) -> float:
+    """Rate at which the line carries whole RF frames: the spec's, or less on a UART."""
+    return carried_rate_hz(radar_place.spec.fps, radar_place.place.bytes_per_s)
+
+
+@pytest.fixture(scope="session")
+def rig_name(request: pytest.FixtureRequest) -> tuple[str, ...]:
+    """Names of the radars of `radar_pair` and `radar_rig`."""
+    names: tuple[str, ...] = request.param
+    return names
+
+
+@pytest.fixture
+def radar_pair(
+    request: pytest.FixtureRequest, rig_name: tuple[str, ...], hil_bench: Bench
+) -> Iterator[tuple[X4M300, X4M300]]:
+    """Drivers of two radars, both in their known state."""
+    names = hil_bench.rig(rig_name)
+    if len(names) < 2:
+        lacking(request, names, f"{'+'.join(names)}: needs two radars; give --radar twice")
+    found = gate(request, hil_bench, names[:2])
+    try:
+        yield found[0].open(), found[1].open()
+    finally:
+        for place in found:
+            place.end_test()
+
+
+@pytest.fixture
+def radar_rig(
+    request: pytest.FixtureRequest, rig_name: tuple[str, ...], hil_bench: Bench
+) -> Iterator[Mapping[str, X4M300]]:
+    """Drivers of all radars by name: of the real ones together, or of an emulated scene.
+
+    With ``--rig`` by the names of its file; each module is found by its serial number there.
+    """
+    from hil_tests.plugin.rigs import matched
+
+    found = gate(request, hil_bench, hil_bench.rig(rig_name))
+    rig = request.config.stash[CHOICES].rig
+    try:
+        drivers = {place.spec.name: place.open() for place in found}
+        yield drivers if rig is None else matched(rig, drivers)
+    finally:
+        for place in found:
+            place.end_test()
+
+
+@pytest.fixture
+def measure(request: pytest.FixtureRequest) -> Measure:
+    """Take numbers with units and limits; they go into JUnit, JSON and the artefacts.
+
+    ``measure("frame_interval_p99", 61.2, unit="ms", limit=(None, 70))`` fails beyond its limit.
+    """
+    node: pytest.Item = request.node
+    taker = Measure(node.user_properties)
+    FINDINGS.of(node).measure = taker
+    return taker

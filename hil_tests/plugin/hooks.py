@@ -1,0 +1,172 @@
+"""What pytest calls. Nothing heavy is imported here: every pytest of the machine loads it."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import Any
+
+import pytest
+
+from hil_tests.plugin.choices import CHOICES, WORKER_KEY, add_options, choose
+from hil_tests.plugin.fixtures import (
+    frame_rate_hz,
+    hil_bench,
+    measure,
+    radar,
+    radar_name,
+    radar_pair,
+    radar_place,
+    radar_rig,
+    rig_name,
+)
+from hil_tests.plugin.gate import FINDINGS, Findings
+from hil_tests.plugin.specs import RadarSpec
+from hil_tests.plugin.summary import SUMMARY, Summary
+
+__all__ = [
+    "frame_rate_hz",
+    "hil_bench",
+    "measure",
+    "radar",
+    "radar_name",
+    "radar_pair",
+    "radar_place",
+    "radar_rig",
+    "rig_name",
+]
+
+MARKERS = (
+    "requires(name, ...): capabilities of the radar that this test needs, else it is skipped",
+    "emulated_only: not for real modules",
+    "real_only: not for emulated radars",
+    "writes_flash: changes what a module keeps; on real ones only with --allow-flash",
+    "writes_factory_settings: resets a module's settings; on real ones with --allow-factory-reset",
+    "slow_hw(seconds): takes long on a radar in real time; runs there with --hil-slow",
+)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the plugin's options."""
+    add_options(parser)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Register markers and read what the user chose."""
+    for marker in MARKERS:
+        config.addinivalue_line("markers", marker)
+    config.stash[CHOICES] = choose(config)
+    summary = config.stash[SUMMARY] = Summary()
+    config.pluginmanager.register(summary, "xethru-hil-summary")
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_configure_node(node: Any) -> None:  # noqa: ANN401 - xdist's, which need not be there
+    """Tell a worker which radars there are: it must not look for them itself."""
+    node.workerinput[WORKER_KEY] = [spec.text for spec in node.config.stash[CHOICES].specs]
+
+
+def pytest_report_header(config: pytest.Config) -> str | None:
+    """Say which radars are tested, where somebody chose some: not every pytest is about radars."""
+    choices = config.stash[CHOICES]
+    if not choices.chosen:
+        return None
+    strict = ", strict" if choices.strict else ""
+    return f"radars: {', '.join(spec.text for spec in choices.specs)}{strict}"
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run each test that asks for a radar on all of them."""
+    specs = metafunc.config.stash[CHOICES].specs
+    if "radar_name" in metafunc.fixturenames:
+        names = [spec.name for spec in specs]
+        metafunc.parametrize("radar_name", names, indirect=True, scope="session", ids=names)
+    if "rig_name" in metafunc.fixturenames:
+        rigs = _rigs(specs)
+        metafunc.parametrize(
+            "rig_name", rigs, indirect=True, scope="session", ids=["+".join(rig) for rig in rigs]
+        )
+
+
+def _rigs(specs: tuple[RadarSpec, ...]) -> list[tuple[str, ...]]:
+    """Return the radars that belong together: all real ones, and the scene of each emulated one."""
+    real = tuple(spec.name for spec in specs if spec.shared)
+    rigs = [(spec.name,) for spec in specs if spec.emulated]
+    return [*([real] if real else []), *rigs]
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object | None:  # noqa: ANN401 - as above
+    """Keep the tests of real radars on one worker, however the others are spread."""
+    shared = [spec.name for spec in config.stash[CHOICES].specs if spec.shared]
+    if not shared:
+        return None
+    from hil_tests.plugin.scheduling import RealRadarScheduling
+
+    return RealRadarScheduling(config, log, shared)
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Keep the artefacts of a test that failed, and let its report say what the plugin knows."""
+    report = yield
+    findings = FINDINGS.known(item)
+    if findings is None:
+        return report
+    if report.failed:
+        findings.failures.append(f"{call.when}: {report.longreprtext}")
+    keep = item.config.stash[CHOICES].keep
+    if findings.radars and findings.reason is None and keep != "none":
+        # after the call, while the drivers are open; after a teardown that fails, once more
+        last = report.when == "call" or (report.failed and report.when in {"setup", "teardown"})
+        if last and (keep == "all" or report.failed):
+            _keep(item, findings, report)
+    report.xethru_hil = findings.as_json()  # type: ignore[attr-defined]  # reports carry what is added
+    return report
+
+
+def _keep(item: pytest.Item, findings: Findings, report: pytest.TestReport) -> None:
+    from hil_tests.plugin.bundle import folder_name, write_bundle
+
+    folder = item.config.stash[CHOICES].artifacts / folder_name(item.nodeid)
+    about = {
+        "test": item.nodeid,
+        "outcome": report.outcome,
+        "repeat": "pytest "
+        + " ".join(
+            [
+                f"'{item.nodeid}'",
+                *(f"--radar '{radar.spec.text}'" for radar in findings.radars),
+            ]
+        ),
+    }
+    try:
+        write_bundle(
+            folder,
+            findings.radars,
+            about=about,
+            failure="\n\n".join(findings.failures) or "none",
+            measurements=findings.measure.taken if findings.measure else (),
+        )
+    except Exception as error:  # whatever it is: the failure of the test must be told
+        report.sections.append(("radar artefacts", f"{folder}: not kept whole: {error!r}"))
+        return
+    if findings.bundle is None:
+        item.user_properties.append(("artefacts", str(folder)))
+    findings.bundle = str(folder)
+    report.sections.append(("radar artefacts", f"{folder}: log.txt says what was on the wire"))
+
+
+def pytest_terminal_summary(
+    terminalreporter: pytest.TerminalReporter, config: pytest.Config
+) -> None:
+    """Print what ran where."""
+    config.stash[SUMMARY].write_terminal(terminalreporter)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Write the JSON report."""
+    path = session.config.stash[CHOICES].json
+    if path is not None and not hasattr(session.config, "workerinput"):
+        session.config.stash[SUMMARY].write_json(path)

@@ -1,0 +1,387 @@
+"""Where radars are: each place opens lines to one radar and says what can be done there."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import socket
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hil_tests.device.serving import Served, emulator
+from hil_tests.plugin.specs import Kind, RadarSpec
+from hil_tests.plugin.tap import WireTap
+from hil_tests.plugin.tcp_line import TcpTransport
+from xethru_protocol.driver import X4M300, known_ports
+from xethru_protocol.errors import PortUnavailable
+from xethru_protocol.ports import find_ports
+from xethru_protocol.transport import SerialTransport, Transport
+
+if TYPE_CHECKING:
+    from emulator.scene import Scene
+
+__all__ = [
+    "CAPABILITIES",
+    "Place",
+    "PlaceError",
+    "place_of",
+    "ports_that_answer",
+    "scene_radars",
+]
+
+CAPABILITIES: Mapping[str, str] = {
+    "settings": "a recording that is played takes none",
+    "profiles": "bare XEP firmware has none",
+    "files": "a file system that answers",
+    "unplug": "only emulated ones can be unplugged by a program",
+    "uart": "USB, TCP and pseudo-terminals have no baud rate",
+    "virtual_time": "waiting must cost nothing",
+}
+"""What a test may require of a radar, and why one may lack it; others come with ``?has=``."""
+
+_CONTROL_S = 5.0
+_BAUD = 115200
+_UART_BYTES_PER_S = _BAUD / 10
+_EMPTY_ROOM_RADARS = 4
+
+
+class PlaceError(Exception):
+    """A radar that cannot be had; the message is one line with the remedy."""
+
+
+class Place(ABC):
+    """One radar under test.
+
+    Attributes
+    ----------
+    spec
+        What the user asked for.
+    capabilities
+        What can be done there.
+    description
+        How it is reached, for reports.
+    bytes_per_s
+        What its line carries at most; infinite but on a UART.
+    """
+
+    def __init__(self, spec: RadarSpec, capabilities: frozenset[str], description: str) -> None:
+        self.spec = spec
+        self.capabilities = capabilities | spec.has
+        self.description = description
+        self.bytes_per_s = math.inf
+        self.clock_ns: Callable[[], int] = time.monotonic_ns
+        self.sleep: Callable[[float], None] = time.sleep
+
+    @property
+    def virtual(self) -> bool:
+        """Whether time passes only while somebody waits for the module."""
+        return "virtual_time" in self.capabilities
+
+    @property
+    def lock_target(self) -> str | None:
+        """Name of what must be locked against other sessions; None: nobody else can have it."""
+        return None
+
+    @property
+    def scene_text(self) -> str | None:
+        """The scene file of an emulated radar; None without one."""
+        return None
+
+    def begin_test(self) -> None:  # noqa: B027 - most places have nothing to do
+        """Do what must be done before each test."""
+
+    @abstractmethod
+    def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
+        """Return an open line; ``path`` is where a driver looks for a module that vanished."""
+
+    def candidates(self) -> Sequence[str]:
+        """Where a module that vanished may come back."""
+        return ()
+
+    def driver(self, line: Transport, tap: WireTap, *, reconnect_s: float = 0.0) -> X4M300:
+        """Return a driver on an open line, in the clock of the place; new lines are tapped."""
+        return X4M300(
+            line,
+            clock=self.clock_ns,
+            reconnect_s=reconnect_s,
+            open_port=lambda path, baudrate: tap.around(self.open_line(path, baudrate)),
+            candidates=self.candidates,
+            sleep=self.sleep,
+        )
+
+    def unplug(self, seconds: float) -> None:
+        """Take the port away and bring it back after ``seconds``; the module starts anew."""
+        raise PlaceError(f"{self.spec.name} cannot be unplugged by a program")
+
+    def close(self) -> None:  # noqa: B027 - most places hold nothing
+        """Release what the place holds."""
+
+
+class MemoryPlace(Place):
+    """A module in this process, in virtual time; a fresh one for every test."""
+
+    def __init__(self, spec: RadarSpec) -> None:
+        super().__init__(
+            spec,
+            frozenset(CAPABILITIES) - {"uart"},
+            f"emulated in this process, virtual time, {spec.target or 'an empty room'}",
+        )
+        self._scene = _scene(spec)
+        names = [radar.name for radar in self._scene.radars]
+        self._index = _index_of(spec, names)
+        self.begin_test()
+
+    @property
+    def scene_text(self) -> str | None:
+        """The scene as a file says it."""
+        return _scene_text(self.spec)
+
+    def begin_test(self) -> None:
+        """Make a fresh module: what a test leaves behind is gone."""
+        from emulator.device import radar_device
+        from emulator.echo import echo_source
+        from emulator.identity import Identity
+        from emulator.options import DeviceOptions
+        from emulator.pace import Pace
+        from hil_tests.faulty import FaultyLine
+
+        radar = self._scene.radars[self._index]
+        device = radar_device(
+            Identity(serial=radar.serial),
+            echo_source(self._scene, self._index, self.spec.seed),
+            Pace.REALTIME,
+            options=DeviceOptions(firmware=self.spec.firmware),
+        )
+        self._line = FaultyLine(device)
+        self.clock_ns = self._line.clock_ns
+        self.sleep = self._line.sleep
+
+    def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
+        """See `Place.open_line`."""
+        from hil_tests.faulty import PATH
+
+        return self._line.open(path or PATH, baudrate)
+
+    def candidates(self) -> Sequence[str]:
+        """See `Place.candidates`."""
+        return self._line.ports()
+
+    def unplug(self, seconds: float) -> None:
+        """See `Place.unplug`."""
+        self._line.device.unplug(self._line.clock_ns(), round(seconds * 1e9))
+
+
+class ProcessPlace(Place):
+    """A module of an emulator that runs in a process of its own, or a recording played there."""
+
+    def __init__(self, spec: RadarSpec) -> None:
+        played = spec.kind is Kind.REPLAY
+        able = {"settings", "profiles", "files", "unplug"}
+        if spec.line == "uart":
+            able.add("uart")
+        super().__init__(
+            spec,
+            frozenset() if played else frozenset(able),
+            f"recording {spec.target}, played at a pseudo-terminal"
+            if played
+            else f"emulated in its own process, {spec.line}, {spec.target or 'an empty room'}",
+        )
+        if spec.line == "uart":
+            self.bytes_per_s = _UART_BYTES_PER_S
+        self._cleanup = contextlib.ExitStack()
+        arguments = ["play", spec.target] if played else _serve_arguments(spec)
+        try:
+            self._served: Served = self._cleanup.enter_context(emulator(*arguments))
+            self._index = _index_of(spec, self._served.names)
+        except AssertionError as error:
+            raise PlaceError(f"--radar {spec.text}: the emulator did not start: {error}") from None
+        except PlaceError:
+            self._cleanup.close()
+            raise
+
+    @property
+    def scene_text(self) -> str | None:
+        """The scene as a file says it."""
+        return None if self.spec.kind is Kind.REPLAY else _scene_text(self.spec)
+
+    def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
+        """See `Place.open_line`."""
+        if self.spec.line == "tcp":
+            return TcpTransport(f"127.0.0.1:{self._served.tcp_ports[self._index]}")
+        return SerialTransport(path or self._served.paths[self._index], baudrate)
+
+    def unplug(self, seconds: float) -> None:
+        """See `Place.unplug`."""
+        assert self._served.control is not None
+        name = self._served.names[self._index]
+        _ask(self._served.control, {"verb": "unplug", "radar": name, "seconds": seconds})
+
+    def close(self) -> None:
+        """End the emulator."""
+        self._served.end()
+        self._cleanup.close()
+
+
+class PortPlace(Place):
+    """A module at a port of this machine, named or found by its serial number."""
+
+    def __init__(self, spec: RadarSpec) -> None:
+        path = spec.target
+        if spec.kind is Kind.SERIAL_NUMBER:
+            path = _port_of(spec.target)
+        able = {"settings", "profiles", "files"}
+        line = SerialTransport(path)
+        bytes_per_s = _UART_BYTES_PER_S if spec.line == "uart" else line.bytes_per_s
+        line.close()
+        if not math.isinf(bytes_per_s):
+            able.add("uart")
+        super().__init__(spec, frozenset(able), f"module at {path}")
+        self.bytes_per_s = bytes_per_s
+        self._path = path
+
+    @property
+    def lock_target(self) -> str | None:
+        """The port."""
+        return self._path
+
+    def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
+        """See `Place.open_line`."""
+        return SerialTransport(path or self._path, baudrate)
+
+    def candidates(self) -> Sequence[str]:
+        """See `Place.candidates`."""
+        return known_ports()
+
+
+class TcpPlace(Place):
+    """A module behind a TCP port, perhaps of another machine."""
+
+    def __init__(self, spec: RadarSpec) -> None:
+        super().__init__(
+            spec, frozenset({"settings", "profiles", "files"}), f"module at tcp://{spec.target}"
+        )
+
+    @property
+    def lock_target(self) -> str | None:
+        """The address."""
+        return self.spec.target
+
+    def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
+        """See `Place.open_line`."""
+        del path, baudrate
+        return TcpTransport(self.spec.target)
+
+
+def place_of(spec: RadarSpec) -> Place:
+    """Return the place that a spec names.
+
+    Raises
+    ------
+    PlaceError, PortUnavailable
+        If there is no radar to be had; one line with the remedy.
+    """
+    match spec.kind:
+        case Kind.EMULATED if spec.line == "memory":
+            return MemoryPlace(spec)
+        case Kind.EMULATED | Kind.REPLAY:
+            return ProcessPlace(spec)
+        case Kind.TCP:
+            return TcpPlace(spec)
+        case _:
+            return PortPlace(spec)
+
+
+def ports_that_answer() -> tuple[tuple[str, str], ...]:
+    """Return path and serial number of every port where a module answers.
+
+    A port that some program has open is left alone: opening it would take bytes from that program.
+    """
+    from xethru_protocol.cli.port_users import port_users
+
+    found = []
+    for port in find_ports():
+        if port_users(port.path):
+            continue
+        with contextlib.suppress(PortUnavailable), X4M300.open(port.path) as radar:
+            serial = _serial_number(radar)
+            if serial is not None:
+                found.append((port.path, serial))
+    return tuple(found)
+
+
+def _port_of(serial: str) -> str:
+    for port in find_ports():
+        if port.kind == "emulated" and port.serial == serial:
+            return port.path  # its emulator says so: nobody needs to be asked
+    found = ports_that_answer()
+    for path, number in found:
+        if number == serial:
+            return path
+    there = ", ".join(f"{number} at {path}" for path, number in found) or "none"
+    raise PlaceError(f"no module with serial number {serial} answers; those that do: {there}")
+
+
+def _serial_number(radar: X4M300) -> str | None:
+    from xethru_protocol.errors import XeThruError
+
+    try:
+        radar.ping(0.5)
+        return radar.info().serial_number
+    except XeThruError:
+        return None
+
+
+def _index_of(spec: RadarSpec, names: Sequence[str]) -> int:
+    wanted = spec.options.get("radar")
+    if wanted is None:
+        return 0
+    if wanted not in names:
+        raise PlaceError(
+            f"--radar {spec.text}: no radar is called {wanted!r}; there are {', '.join(names)}"
+        )
+    return names.index(wanted)
+
+
+def scene_radars(spec: RadarSpec) -> tuple[str, ...]:
+    """Return the names of the radars of an emulated spec's scene; an empty room has four."""
+    return tuple(radar.name for radar in _scene(spec).radars)
+
+
+def _scene(spec: RadarSpec) -> Scene:
+    from emulator.scene import SceneError, empty_room, load_scene
+
+    try:
+        return load_scene(spec.target) if spec.target else empty_room(_EMPTY_ROOM_RADARS)
+    except SceneError as error:
+        raise PlaceError(f"--radar {spec.text}: {error}") from None
+
+
+def _serve_arguments(spec: RadarSpec) -> list[str]:
+    scene = [spec.target] if spec.target else ["--bare", "--count", str(_EMPTY_ROOM_RADARS)]
+    line = {"uart": ["--link", "uart"], "tcp": ["--tcp", "0"]}.get(spec.line, [])
+    return ["serve", *scene, "--seed", str(spec.seed), *line]
+
+
+def _scene_text(spec: RadarSpec) -> str | None:
+    if not spec.target:
+        return None
+    path = Path(spec.target)
+    if path.suffix != ".toml":
+        path = Path(__file__).parents[2] / "fixtures" / "scenes" / f"{spec.target}.toml"
+    return path.read_text("utf-8")
+
+
+def _ask(control: str, request: Mapping[str, object]) -> None:
+    """Ask a running emulator for something; `PlaceError` if it refuses."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+        connection.settimeout(_CONTROL_S)
+        connection.connect(control)
+        connection.sendall(json.dumps(request).encode() + b"\n")
+        with connection.makefile() as answers:
+            answer = json.loads(answers.readline())
+    if not answer["ok"]:
+        raise PlaceError(str(answer["error"]))

@@ -1,0 +1,231 @@
+"""What a user writes behind ``--radar``, and what it names. Standard library only.
+
+| spec | radar |
+|---|---|
+| `emu` | emulated in this process, in virtual time |
+| `emu:SCENE?seed=3&fps=17&radar=NAME` | the same in a scene: a name or a .toml file |
+| `emu:?line=pty`, `uart`, `tcp` | an emulator in a process of its own behind such a line |
+| `emu:?firmware=xep` | in this process, with the bare base firmware |
+| `/dev/ttyACM0` | a module at a port; `?line=uart`: a UART that does not look like one |
+| `serial=202611210001` | a module by its own serial number, wherever it is plugged in |
+| `auto` | every module that answers; at least one must |
+| `tcp://HOST:PORT` | a module behind a serial-to-network adapter, or `xethru-emulator --tcp` |
+| `replay:RECORDING?radar=NAME` | a recording at the port of an emulated module |
+
+Any of them takes ``?has=NAME,NAME``: capabilities that only the user knows of, such as a reflector
+on a stage, for tests that ask for them with ``@pytest.mark.requires``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from pathlib import Path
+from typing import Literal
+
+__all__ = ["Kind", "RadarSpec", "SpecError", "parse_specs"]
+
+
+class SpecError(ValueError):
+    """A spec that names no radar; the message is one line with what is allowed."""
+
+
+class Kind(Enum):
+    """How a radar is reached."""
+
+    EMULATED = "emu"
+    PORT = "port"
+    SERIAL_NUMBER = "serial"
+    TCP = "tcp"
+    REPLAY = "replay"
+    AUTO = "auto"
+
+
+_FIRMWARE = ("sensor", "xep")
+_LINES = ("memory", "pty", "uart", "tcp")
+_OPTIONS: dict[Kind, tuple[str, ...]] = {
+    Kind.EMULATED: ("firmware", "fps", "has", "line", "radar", "seed"),
+    Kind.PORT: ("fps", "has", "line"),
+    Kind.SERIAL_NUMBER: ("fps", "has"),
+    Kind.TCP: ("fps", "has"),
+    Kind.REPLAY: ("has", "radar"),
+    Kind.AUTO: ("fps", "has"),
+}
+DEFAULT_FPS = 17.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RadarSpec:
+    """One radar to test.
+
+    Attributes
+    ----------
+    text
+        As the user wrote it.
+    kind
+        How it is reached.
+    target
+        Scene, port, serial number, ``host:port`` or recording; empty where there is none.
+    options
+        What stood behind the question mark.
+    name
+        What tests, reports and folders call it; unique within a run.
+    """
+
+    text: str
+    kind: Kind
+    target: str
+    options: Mapping[str, str] = field(default_factory=dict)
+    name: str
+
+    @property
+    def emulated(self) -> bool:
+        """Whether this program makes the radar itself."""
+        return self.kind in {Kind.EMULATED, Kind.REPLAY}
+
+    @property
+    def shared(self) -> bool:
+        """Whether other processes may want the same radar."""
+        return not self.emulated
+
+    @property
+    def line(self) -> str:
+        """What leads to an emulated radar: memory, pty, uart or tcp."""
+        return self.options.get("line", "memory")
+
+    @property
+    def firmware(self) -> Literal["sensor", "xep"]:
+        """Firmware of an emulated radar."""
+        return "xep" if self.options.get("firmware") == "xep" else "sensor"
+
+    @property
+    def seed(self) -> int:
+        """Seed of an emulated radar's noise."""
+        return int(self.options.get("seed", "0"))
+
+    @property
+    def fps(self) -> float:
+        """Frame rate that tests should ask for [Hz]."""
+        return float(self.options.get("fps", DEFAULT_FPS))
+
+    @property
+    def has(self) -> frozenset[str]:
+        """Capabilities the user vouches for."""
+        return frozenset(filter(None, self.options.get("has", "").split(",")))
+
+
+def parse_specs(texts: Iterable[str]) -> tuple[RadarSpec, ...]:
+    """Return the radars that specs name, each under a name of its own.
+
+    Raises
+    ------
+    SpecError
+        If one names no radar.
+
+    Examples
+    --------
+    >>> [spec.name for spec in parse_specs(["emu", "emu:lab?seed=3", "/dev/ttyACM0"])]
+    ['emu', 'emu-lab', 'ttyACM0']
+    """
+    specs: list[RadarSpec] = []
+    for text in texts:
+        spec = _parse(text)
+        taken = {other.name for other in specs}
+        name, number = spec.name, 2
+        while name in taken:
+            name, number = f"{spec.name}-{number}", number + 1
+        specs.append(replace(spec, name=name))
+    return tuple(specs)
+
+
+def _parse(text: str) -> RadarSpec:
+    body, _, query = text.strip().partition("?")
+    kind, target = _kind(body)
+    options = _query(text, query, _OPTIONS[kind])
+    _check(text, kind, options)
+    return RadarSpec(
+        text=text, kind=kind, target=target, options=options, name=_name(kind, target, options)
+    )
+
+
+def _kind(body: str) -> tuple[Kind, str]:
+    scheme, colon, rest = body.partition(":")
+    if scheme == "emu":
+        return Kind.EMULATED, rest
+    if body == "auto":
+        return Kind.AUTO, ""
+    if body.startswith("serial="):
+        number = body.removeprefix("serial=")
+        if not re.fullmatch(r"[0-9]{12}", number):
+            raise SpecError(f"--radar {body}: a serial number has 12 digits, as on the label")
+        return Kind.SERIAL_NUMBER, number
+    if body.startswith("tcp://"):
+        host, _, port = body.removeprefix("tcp://").rpartition(":")
+        if not host or not port.isdigit() or not 0 < int(port) < 65536:
+            raise SpecError(f"--radar {body}: must be tcp://HOST:PORT with a port of 1...65535")
+        return Kind.TCP, body.removeprefix("tcp://")
+    if scheme == "replay" and colon:
+        if not Path(rest).exists():
+            raise SpecError(f"--radar {body}: there is no recording {rest}")
+        return Kind.REPLAY, rest
+    if body.startswith(("/", "./", "../", "~")):
+        return Kind.PORT, str(Path(body).expanduser())
+    raise SpecError(
+        f"--radar {body}: names no radar; allowed are emu[:SCENE], a port such as /dev/ttyACM0, "
+        "serial=NUMBER, auto, tcp://HOST:PORT, replay:RECORDING"
+    )
+
+
+def _query(text: str, query: str, allowed: Sequence[str]) -> dict[str, str]:
+    options: dict[str, str] = {}
+    for part in filter(None, query.split("&")):
+        key, equals, value = part.partition("=")
+        if key not in allowed or not equals or not value:
+            raise SpecError(
+                f"--radar {text}: {part!r} is no option here; allowed are "
+                + ", ".join(f"{name}=..." for name in allowed)
+            )
+        options[key] = value
+    return options
+
+
+def _check(text: str, kind: Kind, options: Mapping[str, str]) -> None:
+    line = options.get("line")
+    lines = _LINES if kind is Kind.EMULATED else ("uart",)
+    if line is not None and line not in lines:
+        raise SpecError(f"--radar {text}: line={line}: must be {' or '.join(lines)}")
+    firmware = options.get("firmware", "sensor")
+    if firmware not in _FIRMWARE or (
+        firmware == "xep" and options.get("line", "memory") != "memory"
+    ):
+        raise SpecError(
+            f"--radar {text}: firmware={firmware}: must be sensor, or xep without line="
+        )
+    seed = options.get("seed", "0")
+    if not seed.isdigit() or int(seed) >= 2**63:
+        raise SpecError(f"--radar {text}: seed={seed}: must be a whole number of 0...2**63 - 1")
+    try:
+        fps = float(options.get("fps", DEFAULT_FPS))
+    except ValueError:
+        fps = 0.0
+    if not 0 < fps < 65536:
+        raise SpecError(f"--radar {text}: fps={options['fps']}: must be a rate of 1...65535 Hz")
+
+
+def _name(kind: Kind, target: str, options: Mapping[str, str]) -> str:
+    if kind is Kind.EMULATED:
+        parts = ["emu", Path(target).stem, options.get("radar", "")]
+        line = options.get("line", "memory")
+        parts.append("" if line == "memory" else line)
+        parts.append("xep" if options.get("firmware") == "xep" else "")
+        return "-".join(filter(None, parts))
+    if kind is Kind.SERIAL_NUMBER:
+        return target
+    if kind is Kind.AUTO:
+        return "auto"
+    if kind is Kind.TCP:
+        return "tcp-" + re.sub(r"[^0-9A-Za-z.]+", "-", target)
+    last = Path(target).name or target
+    return f"replay-{Path(last).stem}" if kind is Kind.REPLAY else last

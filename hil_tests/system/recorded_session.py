@@ -1,0 +1,91 @@
+"""A short recorded session without ports: the emulated robot in this process, in two seconds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.odometry import scene_odometry
+from hil_tests.system.short_scene import write_short_scene
+from slam.app.emulated_rig import (
+    FRAME_RATE_HZ,
+    RAW_CONFIG,
+    end_counter,
+    open_loopback,
+    rig_of,
+    scene_and_config,
+    true_landmarks_m,
+    versions,
+    wheels_of,
+)
+from slam.app.odometry import OdometryTrack
+from slam.app.outlines import outlines_m
+from slam.app.runner import RunRecord, run_slam
+from slam.app.session import LogLine, Scan, SessionInfo
+from slam.app.session_head import settings_text
+from slam.app.session_log import SessionLog
+from slam.robust_pipeline import make_slam
+
+STARTED_UNIX_NS = 1_790_000_000_000_000_000
+LOST_RADAR, LOST_COUNTER = 1, 40
+FAULT = "fault CRC of 5731 bytes <does not fit>"
+
+_SHORTER = ("waypoints_m = [[0.0, 0.0], [0.5, 0.0]]", "waypoints_m = [[0.0, 0.0], [0.2, 0.0]]")
+
+
+def write_shorter_scene(folder: Path) -> Path:
+    """Write the short scene with 0.2 m to drive instead of 0.5."""
+    file = write_short_scene(folder)
+    file.write_text(file.read_text().replace(*_SHORTER))
+    return file
+
+
+def record_session(path: Path, preset: str, seed: int = 5, *, has_truth: bool = True) -> RunRecord:
+    """Record 0.2 m there and back, with one frame lost and one fault on the links.
+
+    Without truth it is as a drive in the real world.
+    """
+    scene, config = scene_and_config(str(write_shorter_scene(path.parent)), preset)
+    trajectory = scene.trajectory()
+    odometry = OdometryTrack.from_lines(scene_odometry(scene, seed))
+    with open_loopback(scene, seed) as source:
+        source.start(RAW_CONFIG, FRAME_RATE_HZ)
+        info = SessionInfo(
+            scene=scene.name,
+            preset=preset,
+            seed=seed if has_truth else None,
+            radars=source.radars,
+            true_landmarks_m=true_landmarks_m(scene)[: None if has_truth else 0],
+            versions=versions(),
+            config_json=settings_text(config),
+            wheels=asdict(wheels_of(scene)),
+            outlines_m=outlines_m(scene),
+            simulated=has_truth,
+            started_unix_ns=None if has_truth else STARTED_UNIX_NS,
+        )
+        truth = trajectory.poses if has_truth else _unknown
+        log = SessionLog(path, info, odometry, truth_at=truth if has_truth else None)
+        scans = source.scans(end_counter(trajectory.duration_ns), lambda: None)
+        slam = make_slam(config, rig_of(scene), wheels_of(scene))
+        record = run_slam(_damaged(scans, log, info), odometry, slam, truth, [log])
+        log.close()
+    return record
+
+
+def _unknown(stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    return np.full((len(stamps_ns), 3), np.nan)
+
+
+def _damaged(scans: Iterator[Scan], log: SessionLog, info: SessionInfo) -> Iterator[Scan]:
+    name = info.radars[LOST_RADAR].name
+    for scan in scans:
+        if scan.counter == LOST_COUNTER:
+            log.on_log(LogLine(t_ns=scan.t_ns, radar=name, warning=True, text=FAULT))
+            kept = tuple(frame for frame in scan.frames if frame.radar != LOST_RADAR)
+            yield replace(scan, frames=kept)
+        else:
+            yield scan

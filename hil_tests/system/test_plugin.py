@@ -1,0 +1,246 @@
+"""The plugin as a user runs it: pytest in an empty folder, radars of another process."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from hil_tests.device.serving import emulator
+
+pytestmark = pytest.mark.slow  # each run of pytest takes seconds to start on a busy machine
+
+LIMIT_S = 60
+
+# What CONTRIBUTING shows as a test of one's own.
+OWN_TEST = """
+import numpy as np
+
+def test_my_reflector_is_there(radar, measure):
+    radar.configure_raw()
+    radar.start(5)
+    frames = np.stack([frame.samples for frame in radar.frames(4)])
+    measure("loudest_sample", np.abs(frames).max(), unit="of full scale", limit=(1e-4, 1.0))
+"""
+
+# A driver that forgets to escape 7F, and only that.
+PLANTED = """
+from xethru_protocol import connection
+
+def wrong(payload):
+    checksum = 0x7D
+    for byte in payload:
+        checksum ^= byte
+    out = bytearray(b"\\x7d")
+    for byte in payload + bytes([checksum]):
+        if byte in (0x7D, 0x7E):
+            out.append(0x7F)
+        out.append(byte)
+    return bytes(out) + b"\\x7e"
+
+connection.encode_normal = wrong
+"""
+
+
+LOUDEST = "measurement loudest_sample"
+RIG_RADAR = '[[radars]]\nname = "{}"\nserial = "{}"\nx_m = 0.1\ny_m = 0.2\nyaw_deg = 90\n'
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    with emulator("serve", "--bare", "--count", "2", "--tcp", "0") as served:
+        yield f"tcp://127.0.0.1:{served.tcp_ports[0]}"
+
+
+def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *arguments],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=LIMIT_S,
+        check=False,
+    )
+
+
+def device(name: str) -> str:
+    return f"hil_tests.device.{name}"
+
+
+def test_the_suite_runs_on_a_module_of_another_process(tmp_path: Path, address: str) -> None:
+    done = run(
+        tmp_path,
+        *("--pyargs", device("test_identity"), device("test_settings"), "--radar", address),
+        *("--hil-json", "ran.json", "--junitxml", "ran.xml", "--radar", "emu"),
+    )
+    assert done.returncode == 0, done.stdout
+    name = address.replace("://", "-").replace(":", "-")
+    assert f"{name}      48       0        0  X4M300 100000000000 Annapurna 1.6.8" in done.stdout
+    ran = json.loads((tmp_path / "ran.json").read_text())
+    assert {one["names"][0] for one in ran["tests"]} == {name, "emu"}
+    assert {one["outcome"] for one in ran["tests"]} == {"passed"}
+    assert not (tmp_path / "hil-artifacts").exists()
+
+
+def test_strict_fails_where_a_capability_is_missing(tmp_path: Path, address: str) -> None:
+    baud = ("--pyargs", device("test_restarts"), "-k", "baud", "--radar", address)
+    assert run(tmp_path, *baud).returncode == 0
+    done = run(tmp_path, *baud, "--hil-strict")
+    assert done.returncode == 1
+    assert "--hil-strict: tcp-127.0.0.1" in done.stdout
+    assert "needs uart (USB, TCP and pseudo-terminals have no baud rate)" in done.stdout
+
+
+def test_a_planted_bug_is_caught_and_its_artefacts_show_it(tmp_path: Path, address: str) -> None:
+    """7F without its escape: the checksum cannot fit, the module drops the command."""
+    (tmp_path / "planted.py").write_text(PLANTED)
+    done = run(
+        tmp_path,
+        *("-p", "planted", "--pyargs", device("test_settings"), "-k", "every_byte"),
+        *("--radar", address),
+    )
+    assert done.returncode == 1, done.stdout
+    (folder,) = (tmp_path / "hil-artifacts").iterdir()
+    assert str(folder) in done.stdout
+    log = (folder / "log.txt").read_text()
+    assert "!! no command that the module can read ends here" in log
+    unread = log.partition("!! no command that the module can read ends here")[0].splitlines()
+    sent = next(line for line in reversed(unread) if "  tx  " in line)
+    body = bytes.fromhex(sent.partition("  tx  ")[2])[1:-1]
+    assert body.count(0x7F) == 1, "the special byte went out alone"
+    assert "no answer to X4DRIVER_SET" in log
+    about = json.loads((folder / "about.json").read_text())
+    assert about["radars"][0]["spec"] == address
+    dumped = subprocess.run(
+        [sys.executable, "-m", "xethru_protocol.cli", "dump", str(folder / "wire.mcap")],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "REPLY INT" in dumped.stdout
+    assert (folder / "session.rrd").stat().st_size > 0
+
+
+def test_ones_own_test_on_any_radar(tmp_path: Path) -> None:
+    (tmp_path / "test_mine.py").write_text(OWN_TEST)
+    (tmp_path / "pytest.ini").write_text("[pytest]\nxethru_radars =\n    emu:lab?seed=3\n    emu\n")
+    done = run(tmp_path, "--junitxml", "ran.xml")
+    assert done.returncode == 0, done.stdout
+    properties = ElementTree.parse(tmp_path / "ran.xml").iter("property")
+    measured = [one.attrib["value"] for one in properties if one.attrib["name"] == LOUDEST]
+    assert len(measured) == 2
+    assert all("of full scale (at least 0.0001, at most 1)" in value for value in measured)
+
+
+def test_radars_that_cannot_be_had_are_one_line(tmp_path: Path) -> None:
+    (tmp_path / "test_mine.py").write_text(OWN_TEST)
+    unknown = run(tmp_path, "--radar", "ttyACM0")
+    assert unknown.returncode == 4
+    assert "names no radar; allowed are emu" in unknown.stderr
+    (tmp_path / "test_other.py").write_text(OWN_TEST)
+    gone = run(tmp_path, "--radar", "/dev/no-such-port")
+    assert gone.returncode == 1
+    assert "there is no port /dev/no-such-port; 'xethru list' shows the ports" in gone.stdout
+    assert "1 x no-such-port could not be opened in an earlier test" in gone.stdout
+    assert "Traceback" not in gone.stdout
+    elsewhere = run(tmp_path, "--radar", "emu:atlantis")
+    assert elsewhere.returncode == 1
+    assert "atlantis" in elsewhere.stdout
+
+
+def test_a_rig_file_names_the_modules_that_are_missing(tmp_path: Path) -> None:
+    (tmp_path / "test_mine.py").write_text(
+        "def test_rig(radar_rig):\n    assert set(radar_rig) == {'left', 'right'}\n"
+    )
+    rig = tmp_path / "rig.toml"
+    specs = ("--radar", "emu:lab?radar=left_front", "--rig", str(rig))
+    rig.write_text(
+        RIG_RADAR.format("left", "202305070102") + RIG_RADAR.format("right", "202305079999")
+    )
+    done = run(tmp_path, *specs)
+    assert done.returncode == 1
+    assert "missing right (202305079999); there are 202305070102 at emu-lab" in done.stdout
+
+
+def test_the_modules_of_a_rig_file_are_found_by_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    (tmp_path / "test_mine.py").write_text(
+        "def test_rig(radar_rig):\n"
+        "    told = {name: radar.info().serial_number for name, radar in radar_rig.items()}\n"
+        "    assert told == {'left': '202305070104', 'right': '202305070102'}\n"
+    )
+    (tmp_path / "rig.toml").write_text(
+        RIG_RADAR.format("right", "202305070102") + RIG_RADAR.format("left", "202305070104")
+    )
+    with emulator("serve", "lab"):
+        done = run(tmp_path, "--rig", "rig.toml")
+    assert done.returncode == 0, done.stdout
+    assert "202305070102+202305070104" in done.stdout
+
+
+def test_workers_share_emulated_radars_and_leave_real_ones_to_one_of_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    suite = ("--pyargs", device("test_identity"), "--radar", "auto", "--radar", "emu")
+    nobody = run(tmp_path, *suite)
+    assert nobody.returncode == 4
+    assert "--radar auto: no module answers; 'xethru doctor' says why" in nobody.stderr
+    with emulator("serve", "--bare"):
+        done = run(tmp_path, *suite, "-n", "2", "-v")
+        refused = run(tmp_path, *suite, "-n", "2", "--dist", "each")
+    assert done.returncode == 0, done.stdout
+    ran = [line for line in done.stdout.splitlines() if line.startswith("[gw")]
+    assert len(ran) == 22
+    assert len({line[:5] for line in ran if "[radar_1" in line}) == 1
+    assert {line[:5] for line in ran if "[emu" in line} == {"[gw0]", "[gw1]"}
+    assert refused.returncode == 4
+    assert "all workers want this radar at once" in refused.stderr
+
+
+def test_recordings_are_played(tmp_path: Path) -> None:
+    recording = Path(__file__).parents[2] / "fixtures" / "recordings" / "float"
+    done = run(tmp_path, "--pyargs", device("test_stream"), "--radar", f"replay:{recording}")
+    assert done.returncode == 0, done.stdout
+    assert "replay-float       1       0        0" in done.stdout
+
+
+def test_a_uart_left_at_another_rate_is_found_again(tmp_path: Path) -> None:
+    (tmp_path / "test_mine.py").write_text(
+        "def test_leaves_it(radar):\n    radar.set_baud_rate(921600)\n\n"
+        "def test_finds_it(radar):\n    radar.ping()\n"
+    )
+    done = run(tmp_path, "--radar", "emu:?line=uart")
+    assert done.returncode == 0, done.stdout
+
+
+def test_artefacts_of_all_tests_where_asked(tmp_path: Path) -> None:
+    (tmp_path / "test_mine.py").write_text(OWN_TEST)
+    done = run(tmp_path, "--radar", "emu:lab?seed=3", "--hil-keep", "all", "--hil-artifacts", "a")
+    assert done.returncode == 0, done.stdout
+    (folder,) = (tmp_path / "a").iterdir()
+    names = {path.name for path in folder.iterdir()}
+    assert names == {"log.txt", "wire.mcap", "about.json", "scene.toml", "session.rrd"}
+    about = json.loads((folder / "about.json").read_text())
+    assert about["radars"][0]["seed"] == 3
+    assert about["measurements"][0]["unit"] == "of full scale"
+    assert 'name = "lab"' in (folder / "scene.toml").read_text()
+
+
+def test_the_answers_of_a_module_become_a_cassette(tmp_path: Path, address: str) -> None:
+    done = run(
+        tmp_path,
+        *("--pyargs", device("test_conformance"), "-k", "emulators", "--radar", address),
+        *("--hil-diff", "--hil-cassette", "module.json"),
+    )
+    assert done.returncode == 0, done.stdout
+    cassette = json.loads((tmp_path / "module.json").read_text())
+    assert cassette["recorded"]["real_module"] is False
+    assert len(cassette["exchanges"]) > 100

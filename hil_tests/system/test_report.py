@@ -1,0 +1,145 @@
+"""`uwb-slam report`: one page with everything inside, the run's numbers, legible in a browser."""
+
+import base64
+import re
+from dataclasses import dataclass
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from hil_tests.browser import find_browser, photograph
+from hil_tests.system.recorded_session import record_session
+from slam.app.cli import main
+from slam.app.rerun_recording import count_rows
+
+pytestmark = pytest.mark.slow
+
+
+@dataclass(frozen=True)
+class Reported:
+    session: Path
+    page: Path
+    n_landmarks: int
+
+    @property
+    def text(self) -> str:
+        return self.page.read_text(encoding="utf-8")
+
+
+class Addresses(HTMLParser):
+    """Collects everything in a page that could make a browser ask somebody."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+        self.tags: set[str] = set()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        self.found += [v for k, v in attrs if k in {"src", "href", "srcset", "data"} and v]
+
+
+@pytest.fixture(scope="module")
+def reported(tmp_path_factory: pytest.TempPathFactory) -> Reported:
+    session = tmp_path_factory.mktemp("report") / "session.mcap"
+    record = record_session(session, "paper")
+    assert main(["report", str(session.parent)]) == 0
+    return Reported(
+        session=session,
+        page=session.with_name("report.html"),
+        n_landmarks=len(record.results[-1].belief.landmark_ids),
+    )
+
+
+def test_the_page_asks_nobody_for_anything(reported: Reported) -> None:
+    addresses = Addresses()
+    addresses.feed(reported.text)
+    assert addresses.tags.isdisjoint({"script", "link", "iframe", "object", "embed", "base"})
+    assert len(addresses.found) == 4  # map, errors, consistency, links
+    for address in addresses.found:
+        kind, _, data = address.partition(",")
+        assert kind == "data:image/svg+xml;base64"
+        svg = base64.b64decode(data).decode()
+        assert svg.startswith("<?xml")
+        # what it refers to lies in itself: the names of XML dialects are no addresses to ask
+        references = re.findall(r'(?:xlink:)?href="([^"]*)"|url\(([^)]*)\)', svg)
+        assert references
+        assert all((href or url).startswith("#") for href, url in references)
+    assert "@import" not in reported.text
+    assert "url(" not in reported.text
+
+
+def test_the_numbers_are_those_of_a_replay(reported: Reported, tmp_path: Path) -> None:
+    assert main(["replay", str(reported.session), "--out", str(tmp_path)]) == 0
+    told = (tmp_path / "summary.json").read_text()
+    ate_m = float(re.findall(r'"ate_rmse_m": ([0-9.e-]+)', told)[0])
+    shown = re.findall(r'<td>SLAM ATE</td><td class="value">([0-9.]+) mm</td>', reported.text)
+    assert shown == [f"{1e3 * ate_m:.1f}"]
+    assert f"{reported.n_landmarks} for " in reported.text
+    assert "simulated data" in reported.text
+
+
+def test_a_lost_frame_and_a_fault_are_told_and_escaped(reported: Reported) -> None:
+    row = re.findall(r"<tr><td>rear_left</td>(.*?)</tr>", reported.text)[0]
+    cells = re.findall(r"<td>(.*?)</td>", row)
+    assert cells[4].startswith("1 (")  # lost
+    assert cells[5:] == ["1", "1"]  # most in a row, faults
+    assert "Warnings: 1<" in reported.text
+    assert "CRC of 5731 bytes &lt;does not fit&gt;" in reported.text
+    others = re.findall(r"<tr><td>front_left</td>(.*?)</tr>", reported.text)[0]
+    assert re.findall(r"<td>(.*?)</td>", others)[4:] == ["0 (0.00 %)", "0", "0"]
+
+
+def test_the_same_session_gives_the_same_page(reported: Reported, tmp_path: Path) -> None:
+    again = tmp_path / "again.html"
+    assert main(["report", str(reported.session), "--out", str(again)]) == 0
+    assert again.read_bytes() == reported.page.read_bytes()
+
+
+@pytest.mark.skipif(find_browser() is None, reason="no Chromium is installed")
+def test_a_browser_without_network_shows_it(reported: Reported, tmp_path: Path) -> None:
+    photograph(reported.page, tmp_path / "page.png", width=1000, height=1200)
+    with Image.open(tmp_path / "page.png") as picture:
+        assert picture.size == (1000, 1200)
+        colours = picture.convert("RGB").getcolors(maxcolors=1 << 20)
+    assert colours is not None
+    seen = {colour for _, colour in colours}
+    # ground of the "simulated" mark, the estimate's blue and the landmarks' red of the map
+    assert {(255, 243, 214), (31, 111, 208), (194, 37, 92)} <= seen
+
+
+def test_of_a_real_drive_it_tells_no_error(tmp_path: Path) -> None:
+    record_session(tmp_path / "session.mcap", "robust", has_truth=False)
+    assert main(["report", str(tmp_path)]) == 0
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "measured data" in page
+    assert "simulated" not in page
+    assert "Nothing true is known of this drive" in page
+    assert "begun 2026-09-21 14:13:20 UTC" in page
+    assert "ATE" not in page
+    assert "nearest truth" not in page
+    assert "Errors over time" not in page
+    pictures = [base64.b64decode(data).decode() for data in re.findall(r'base64,([^"]*)"', page)]
+    assert len(pictures) == 4
+    assert main(["view", str(tmp_path / "session.mcap"), "--out", str(tmp_path / "v.rrd")]) == 0
+    rows = count_rows(tmp_path / "v.rrd")
+    assert rows["/map/estimate/path"] > 0
+    assert not [name for name in rows if name.startswith("/map/truth")]
+    assert "/error/slam" not in rows
+
+
+def test_what_cannot_be_reported_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (foreign := tmp_path / "notes.mcap").write_text("a list of things to buy")
+    for given, expected in (
+        (tmp_path / "none.mcap", "no such file"),
+        (tmp_path, "holds no session.mcap"),
+        (foreign, "is no MCAP file"),
+    ):
+        assert main(["report", str(given)]) == 1
+        said = capsys.readouterr().err
+        assert said.startswith(f"uwb-slam: {given}: {expected}")
+        assert said.count("\n") == 1

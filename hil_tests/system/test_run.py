@@ -1,0 +1,201 @@
+"""`uwb-slam run` as a user runs it: an emulator in real time, four ports, odometry beside them."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from emulator.scene import load_scene
+from hil_tests.system.short_scene import write_short_scene
+from slam.app.cli import main
+from slam.app.rig_file import RigFile, RigRadar, write_rig
+from slam.app.session_reader import open_session
+
+pytestmark = pytest.mark.slow
+
+COMMAND = [sys.executable, "-m", "slam.app.cli"]
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A running emulator and the rig file of its radars."""
+
+    rig: Path
+    odometry: str
+    ports: list[str]
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
+    folder = tmp_path_factory.mktemp("robot")
+    scene_path = write_short_scene(folder)
+    scene = load_scene(scene_path)
+    rig = folder / "robot.toml"
+    write_rig(
+        rig,
+        RigFile(
+            radars=tuple(
+                RigRadar(
+                    name=spec.name,
+                    serial=spec.serial,
+                    x_m=spec.x_m,
+                    y_m=spec.y_m,
+                    yaw_deg=spec.yaw_deg,
+                )
+                for spec in scene.radars
+            )
+        ),
+    )
+    command = [sys.executable, "-m", "emulator.cli", "serve", str(scene_path)]
+    with subprocess.Popen(
+        [*command, "--pace", "realtime", "--link-dir", str(folder / "ports")],
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as emulator:
+        assert emulator.stdout is not None
+        ready = json.loads(emulator.stdout.readline())
+        yield Robot(
+            rig=rig,
+            odometry=ready["odometry"],
+            ports=[device["path"] for device in reversed(ready["devices"])],
+        )
+        emulator.terminate()
+
+
+def run_command(robot: Robot, out: Path, *more: str) -> list[str]:
+    options = ["--rig", str(robot.rig), "--ports", *robot.ports, "--out", str(out)]
+    return [*COMMAND, "run", *options, *more]
+
+
+def replayed(out: Path, again: Path, said: pytest.CaptureFixture[str]) -> str:
+    """Replay a session in this process; return what was said."""
+    said.readouterr()
+    assert main(["replay", str(out / "session.mcap"), "--out", str(again)]) == 0
+    return said.readouterr().err
+
+
+def test_a_run_from_stdin_ends_when_it_is_told_to_and_replays_to_the_last_bit(
+    robot: Robot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Odometry comes through a pipe, as from `ros2 topic echo` and a filter."""
+    out = tmp_path / "out"
+    cat = (
+        "import socket, sys; s = socket.socket(socket.AF_UNIX); s.connect(sys.argv[1])\n"
+        "while d := s.recv(4096): sys.stdout.buffer.write(d); sys.stdout.flush()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", cat, robot.odometry], stdout=subprocess.PIPE
+    ) as wheels:
+        process = subprocess.run(
+            run_command(robot, out, "--odometry", "-", "--duration", "3", "--wire"),
+            stdin=wheels.stdout,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=60,
+        )
+        wheels.terminate()
+    assert process.returncode == 0, process.stderr
+    assert "front_left: serial number 000000000100, at" in process.stderr
+    assert "the 3 s asked for are over" in process.stderr
+    rows = {line.split("  ")[0]: line for line in process.stdout.splitlines()}
+    assert {"time", "driven", "landmarks", "load", "rear_left", "front_right"} <= set(rows)
+    assert "ppm" in rows["rear_left"]
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["ate_rmse_m"] is None
+    assert summary["seed"] is None
+    assert summary["frames"] > 30
+    assert (out / "map.png").stat().st_size > 10_000
+
+    replayed(out, tmp_path / "again", capsys)
+    again = json.loads((tmp_path / "again" / "summary.json").read_text())
+    assert again | {"realtime_factor": 0} == summary | {"realtime_factor": 0}
+    for name in ("estimate", "odometry"):
+        assert (tmp_path / "again" / f"{name}.tum").read_bytes() == (
+            out / f"{name}.tum"
+        ).read_bytes()
+    session = open_session(out / "session.mcap")
+    assert session.info.time_base == "arrival"
+    assert {row.radar for row in session.wire()} == {m.name for m in session.rig.mounts}
+
+
+@pytest.mark.parametrize(("which", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
+def test_a_signal_leaves_a_session_that_replays(
+    which: signal.Signals,
+    code: int,
+    robot: Robot,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """After SIGINT with map and numbers; after kill -9 all but the last second."""
+    out = tmp_path / "out"
+    with subprocess.Popen(
+        run_command(robot, out, "--odometry", robot.odometry),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        wait_for_size(out / "session.mcap", 200_000)
+        process.send_signal(which)
+        said = process.communicate(timeout=30)[1]
+    assert process.returncode == code
+    if which is not signal.SIGKILL:
+        last = said.splitlines()[-1]
+        assert last == f"uwb-slam: stopped by {which.name}; what was recorded is in {out}"
+        assert (out / "summary.json").exists()
+        assert (out / "map.png").exists()
+    again = replayed(out, tmp_path / "again", capsys)
+    assert ("was cut at byte" in again) == (which is signal.SIGKILL)
+    assert "recorded states came again, to the last bit" in again
+    if which is signal.SIGKILL:
+        assert main(["repair", str(out / "session.mcap")]) == 0
+        repaired = replayed(out, tmp_path / "repaired", capsys)
+        assert "was cut" not in repaired
+        assert (tmp_path / "repaired" / "estimate.tum").read_bytes() == (
+            tmp_path / "again" / "estimate.tum"
+        ).read_bytes()
+    n_again = len((tmp_path / "again" / "estimate.tum").read_text().splitlines())
+    assert n_again > 5
+
+
+def wait_for_size(path: Path, size: int) -> None:
+    give_up = time.monotonic() + 30.0
+    while not path.exists() or path.stat().st_size < size:
+        assert time.monotonic() < give_up, "no session grew"
+        time.sleep(0.05)
+
+
+def test_what_cannot_begin_says_why_in_one_line(
+    robot: Robot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (kept := tmp_path / "kept").mkdir()
+    (kept / "session.mcap").write_bytes(b"of an earlier drive")
+    options = ["--rig", str(robot.rig), "--odometry", robot.odometry, "--out", str(kept)]
+    assert main(["run", *options]) == 1
+    assert "holds the session of an earlier drive" in capsys.readouterr().err
+    assert (kept / "session.mcap").read_bytes() == b"of an earlier drive"
+
+    rig = tmp_path / "other.toml"
+    rig.write_text(robot.rig.read_text().replace("000000000102", "000000000777"))
+    (drive := tmp_path / "drive.tum").write_text("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
+    cases = [
+        (robot.rig, robot.ports[:3], robot.odometry, 1, "radar front_left (serial number"),
+        (rig, robot.ports, robot.odometry, 1, "if a module was replaced, write its serial"),
+        (tmp_path / "none.toml", robot.ports, robot.odometry, 1, "cannot read the rig file"),
+        (robot.rig, robot.ports, "nowhere", 2, "odometry nowhere: No such file"),
+        (robot.rig, robot.ports, str(drive), 2, "say what its stamps are with --odometry-clock"),
+    ]
+    for rig_path, ports, odometry, code, words in cases:
+        options = ["--rig", str(rig_path), "--odometry", odometry, "--out", str(tmp_path / "out")]
+        assert main(["run", *options, "--ports", *ports]) == code
+        said = capsys.readouterr()
+        assert said.out == ""
+        assert words in said.err.splitlines()[-1]

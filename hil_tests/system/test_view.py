@@ -1,0 +1,318 @@
+"""`uwb-slam view`: sessions as files, pictures and pages; what cannot be shown is one line."""
+
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hil_tests.system.recorded_session import (
+    FAULT,
+    LOST_COUNTER,
+    record_session,
+    write_shorter_scene,
+)
+from slam.app.cli import main
+from slam.app.errors import AppError
+from slam.app.live_view import LiveView
+from slam.app.replay import replay_session
+from slam.app.rerun_recording import count_rows
+from slam.app.rerun_sdk import RrdReader
+from slam.app.rerun_viewer import executable
+from slam.app.rrd_file import is_finished
+from slam.app.session_reader import open_session
+from slam.app.view import session_file
+
+pytestmark = pytest.mark.slow
+
+RADARS = ("front_left", "rear_left", "front_right", "rear_right")
+DRIVERS = (Path("/usr/share/vulkan/icd.d"), Path("/usr/local/share/vulkan/icd.d"))
+HAS_LAVAPIPE = any(True for folder in DRIVERS for _ in folder.glob("lvp_icd*.json"))
+
+
+@dataclass(frozen=True)
+class Viewed:
+    session: Path
+    rrd: Path
+    n_states: int
+
+
+@pytest.fixture(scope="module")
+def viewed(tmp_path_factory: pytest.TempPathFactory) -> Viewed:
+    session = tmp_path_factory.mktemp("view") / "session.mcap"
+    record = record_session(session, "paper")
+    rrd = session.with_name("made.rrd")
+    assert main(["view", str(session), "--out", str(rrd)]) == 0
+    return Viewed(session=session, rrd=rrd, n_states=len(record.results))
+
+
+def texts(path: Path, entity: str, component: str) -> list[str]:
+    return [
+        text
+        for chunk in RrdReader(path).stream()
+        if str(chunk.entity_path) == entity
+        for batch in [chunk.to_record_batch()]
+        if component in batch.schema.names
+        for row in batch[component].to_pylist()
+        for text in row or ()
+    ]
+
+
+def test_the_file_holds_every_frame_and_state(viewed: Viewed) -> None:
+    rows = count_rows(viewed.rrd)
+    n_frames = sum(len(scan.frames) for scan, _ in open_session(viewed.session).scans())
+    assert sum(rows[f"/radar/{name}/frame"] for name in RADARS) == n_frames
+    assert rows["/radar/rear_left/frame"] == rows["/radar/front_left/frame"] - 1
+    assert rows["/map/robot"] == rows["/error/slam"] == viewed.n_states
+    for entity in ("fixes/found", "clusters/kept", "robot/front_left/arcs_used"):
+        assert rows[f"/map/{entity}"] == viewed.n_states
+    assert len(RrdReader(viewed.rrd).blueprints()) == 1
+
+
+def test_the_lost_frame_and_the_fault_are_in_lane_and_log(viewed: Viewed) -> None:
+    states = texts(viewed.rrd, "/link/state/rear_left", "StateChange:state")
+    assert states[:4] == ["streaming", "fault", "silent", "frames lost"]
+    assert states[4:] == ["streaming", "ended"]
+    assert FAULT in texts(viewed.rrd, "/link/log/rear_left", "TextLog:text")
+    assert texts(viewed.rrd, "/link/state/front_left", "StateChange:state") == [
+        "streaming",
+        "ended",
+    ]
+    assert LOST_COUNTER > 0
+
+
+@pytest.mark.skipif(not HAS_LAVAPIPE, reason="Mesa's lavapipe (mesa-vulkan-drivers) is missing")
+def test_a_picture_needs_no_window(viewed: Viewed, tmp_path: Path) -> None:
+    picture = tmp_path / "view.png"
+    assert main(["view", str(viewed.rrd), "--screenshot", str(picture), "--at", "12"]) == 0
+    with Image.open(picture) as shown:
+        assert shown.width == 1360
+        brightness = np.asarray(shown.convert("RGB")).max(axis=2)
+    # a dark page with a map, echoes, curves and text on it; of a session without any 2 %
+    assert np.mean(brightness > 100) > 0.05
+
+
+def test_a_page_is_served_here_until_a_signal(viewed: Viewed) -> None:
+    command = [sys.executable, "-m", "slam.app.cli", "view", str(viewed.rrd), "--web"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        url = process.stderr.readline().split()[-1]
+        assert "stays at" in process.stderr.readline()
+        assert url.startswith("http://127.0.0.1:")
+        with urllib.request.urlopen(url, timeout=10) as page:
+            assert b"wasm" in page.read()
+        port = int(url.split(":")[2].split("/")[0])
+        process.send_signal(signal.SIGINT)
+        assert "stopped by SIGINT" in process.stderr.read()
+        assert process.wait(timeout=10) == 128 + signal.SIGINT
+    with socket.socket() as probe:
+        assert probe.connect_ex(("127.0.0.1", port)) != 0  # the viewer has ended with it
+
+
+def test_a_run_goes_on_when_its_viewer_is_killed(
+    viewed: Viewed, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = open_session(viewed.session)
+    with LiveView("serve-web", lambda: None) as live:
+        watcher = live.observer(session.info)
+        for number, (scan, _) in enumerate(session.scans()):
+            if number == 20:
+                kill_viewer()
+            watcher.on_scan(scan)
+        watcher.close()
+    said = capsys.readouterr().err
+    assert said.count("the viewer was closed; the run goes on without it") == 1
+
+
+def test_an_address_where_nobody_listens_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))  # bound and not listening: nobody else gets it meanwhile
+        url = f"rerun+http://127.0.0.1:{probe.getsockname()[1]}/proxy"
+        with pytest.raises(AppError, match=f"^{re.escape(url)}: no viewer listens there"):
+            LiveView(url, lambda: None).__enter__()
+    with pytest.raises(SystemExit) as usage:
+        main(["demo", "--rerun", "http://127.0.0.1:9876"])
+    assert usage.value.code == 2
+    assert "must be spawn, connect, serve-web, or an address like" in capsys.readouterr().err
+
+
+@contextmanager
+def saving_viewer(saved: Path) -> Iterator[str]:
+    """Give the address of a viewer of Rerun's own that saves what it is sent."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [str(executable()), "--save", str(saved), "--bind", "127.0.0.1", "--port", str(port)]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+        wait_until(lambda: connects(port))
+        yield f"rerun+http://127.0.0.1:{port}/proxy"
+        process.terminate()
+
+
+def test_a_viewer_gets_every_row_that_a_file_gets(viewed: Viewed, tmp_path: Path) -> None:
+    expected = without_pictures(viewed.rrd)
+    with saving_viewer(saved := tmp_path / "saved.rrd") as url:
+        session = open_session(viewed.session)
+        with LiveView(url, lambda: None, is_replay=True) as live:
+            view = live.observer(session.info)
+            replay_session(session, [view], lambda: None)
+            view.close()
+        wait_until(lambda: without_pictures(saved) == expected)
+    assert without_pictures(saved) == expected
+    assert sum(expected.values()) > 1000
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")  # of one that is still written
+def test_a_demo_is_watched_while_it_runs(tmp_path: Path) -> None:
+    scene, out = str(write_shorter_scene(tmp_path)), tmp_path / "out"
+    with saving_viewer(saved := tmp_path / "saved.rrd") as url:
+        options = ["--scene", scene, "--preset", "paper", "--out", str(out), "--rerun", url]
+        assert main(["demo", *options]) == 0
+        expected = without_pictures(out / "session.rrd")
+        wait_until(lambda: without_pictures(saved) == expected)
+    assert without_pictures(saved) == expected
+    hosts = {
+        "host_time" in chunk.timeline_names
+        for chunk in RrdReader(saved).stream()
+        if str(chunk.entity_path) == "/radar/front_left/frame" and not chunk.is_static
+    }
+    assert hosts == {True}  # a live view knows when frames arrived
+
+
+def without_pictures(path: Path) -> dict[str, int]:
+    """Count rows of all but B-scans: a live view sends those more often, as they fill."""
+    try:
+        rows = count_rows(path)
+    except (OSError, RuntimeError):  # the file is being written
+        return {}
+    return {name: n for name, n in rows.items() if not name.endswith("/bscan")}
+
+
+def connects(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def wait_until(is_true: Callable[[], bool], limit_s: float = 10.0) -> None:
+    give_up = time.monotonic() + limit_s
+    while not is_true() and time.monotonic() < give_up:
+        time.sleep(0.1)
+
+
+def kill_viewer() -> None:
+    """Kill the one viewer that this process has started, and see it gone."""
+    (viewer,) = (
+        pid
+        for pid in children(os.getpid())
+        if "rerun" in Path(f"/proc/{pid}/cmdline").read_text().split("\0")[0]
+    )
+    os.kill(viewer, signal.SIGKILL)
+    os.waitid(os.P_PID, viewer, os.WEXITED | os.WNOWAIT)
+
+
+def children(parent: int) -> Iterator[int]:
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        fields = stat.read_text().rpartition(")")[2].split()
+        if int(fields[1]) == parent:
+            yield int(stat.parent.name)
+
+
+def test_what_is_left_of_a_cut_session_is_shown(
+    viewed: Viewed, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = viewed.session.read_bytes()
+    (cut := tmp_path / "cut.mcap").write_bytes(whole[: len(whole) // 2])
+    assert main(["view", str(cut), "--out", str(tmp_path / "v.rrd")]) == 0
+    assert f"{cut} was cut at byte" in capsys.readouterr().err
+    rows, all_rows = count_rows(tmp_path / "v.rrd"), count_rows(viewed.rrd)
+    share = rows["/radar/front_left/frame"] / all_rows["/radar/front_left/frame"]
+    assert 0.3 < share < 0.6
+
+
+def test_of_a_killed_run_the_session_is_shown_not_its_unfinished_view(
+    viewed: Viewed, tmp_path: Path
+) -> None:
+    shutil.copy(viewed.session, tmp_path / "session.mcap")
+    shutil.copy(viewed.rrd, tmp_path / "session.rrd")
+    assert session_file(tmp_path, allow_view=True).name == "session.rrd"
+    (tmp_path / "session.rrd").write_bytes(viewed.rrd.read_bytes()[:-1000])
+    assert session_file(tmp_path, allow_view=True).name == "session.mcap"
+    (tmp_path / "session.mcap").unlink()
+    assert session_file(tmp_path, allow_view=True).name == "session.rrd"  # better than nothing
+    (tmp_path / "session.rrd").write_bytes(b"")
+    assert not is_finished(tmp_path / "session.rrd")
+    assert is_finished(viewed.rrd)
+
+
+def test_a_result_never_takes_the_place_of_the_session(
+    viewed: Viewed, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = tmp_path / "session.mcap"
+    shutil.copy(viewed.session, session)
+    before = session.read_bytes()
+    (link := tmp_path / "link.rrd").symlink_to(session)
+    for arguments in (
+        ["view", str(session), "--out", str(link)],
+        ["view", str(session), "--screenshot", str(session)],
+        ["report", str(session), "--out", str(session)],
+    ):
+        assert main(arguments) == 2
+        assert "is the session itself; write to another file" in capsys.readouterr().err
+    assert session.read_bytes() == before
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full (Linux)")
+@pytest.mark.parametrize("command", ["view", "report"])
+def test_a_full_disk_is_one_line(
+    viewed: Viewed, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([command, str(viewed.session), "--out", "/dev/full"]) == 1
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("uwb-slam: /dev/full: cannot be written: No space left on device")
+
+
+def test_what_cannot_be_shown_is_one_line(
+    viewed: Viewed,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    (foreign := tmp_path / "notes.rrd").write_text("a list of things to buy")
+    head = viewed.rrd.read_bytes()[:4]
+    (future := tmp_path / "future.rrd").write_bytes(head + bytes((1, 2, 0, 0)) + b"\0" * 100)
+    (old := tmp_path / "old.rrd").write_bytes(head + bytes((0, 20, 0, 0)) + b"\0" * 100)
+    (killed := tmp_path / "killed.rrd").write_bytes(viewed.rrd.read_bytes()[:-1000])
+    (cut := tmp_path / "cut.mcap").write_bytes(viewed.session.read_bytes()[:100])
+    out = str(tmp_path / "out.rrd")
+    for arguments, code, expected in (
+        ([str(viewed.rrd)], 1, "no display for the viewer's window; use --web"),
+        ([str(tmp_path / "none.mcap")], 1, "no such file"),
+        ([str(tmp_path)], 1, "holds no session.rrd nor session.mcap"),
+        ([str(foreign)], 1, "is no Rerun recording"),
+        ([str(future)], 1, "written by Rerun 1.2, newer than the 0.41 here can open"),
+        ([str(killed)], 1, "was never closed, its program was killed; make it again"),
+        ([str(old)], 1, "written by Rerun 0.20, older than"),
+        ([str(cut), "--out", out], 1, str(cut)),
+        ([str(viewed.rrd), "--out", out], 2, "is an .rrd already"),
+        ([str(viewed.session), "--out", str(tmp_path / "no" / "v.rrd")], 1, "cannot be written"),
+        ([str(viewed.session), "--at", "3"], 2, "--at: says when a --screenshot is taken"),
+    ):
+        assert main(["view", *arguments]) == code, arguments
+        said = capsys.readouterr().err
+        assert said.startswith("uwb-slam: ")
+        assert expected in said
+        assert said.count("\n") == 1, said

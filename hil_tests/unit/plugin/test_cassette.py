@@ -1,0 +1,100 @@
+"""Answers are compared byte for byte, but through masks; files that are no cassettes are named."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from emulator.device import radar_device
+from emulator.echo import echo_source
+from emulator.identity import Identity
+from emulator.options import DeviceOptions
+from emulator.pace import Pace
+from emulator.scene import empty_room
+from hil_tests.faulty import PATH, FaultyLine
+from hil_tests.golden.vectors import FIXTURES
+from hil_tests.plugin.cassette import Cassette, CassetteError, Exchange, ask_all, differences
+from hil_tests.plugin.transactions import TRANSACTIONS
+from xethru_protocol.codec import encode
+from xethru_protocol.codes import SensorMode
+from xethru_protocol.messages import Ack, Error, ReplyString, SetMode, SystemGetInfo
+
+
+def info(text: str, pattern: str | None = r"[0-9]{12}") -> Exchange:
+    return Exchange(
+        name="serial",
+        command=encode(SystemGetInfo(item=6)),
+        reply=encode(ReplyString(content_id=0x58, info=6, text=text)),
+        masks={} if pattern is None else {"value": pattern},
+    )
+
+
+def test_masked_fields_may_differ_within_their_pattern() -> None:
+    assert not differences([info("202611210001")], [info("100000000000")])
+    assert differences([info("202611210001")], [info("none")])
+    assert differences([info("202611210001", None)], [info("100000000000")])
+
+
+def test_everything_but_the_masked_field_counts() -> None:
+    other = replace(
+        info("1" * 12), reply=encode(ReplyString(content_id=0x58, info=7, text="1" * 12))
+    )
+    assert differences([info("1" * 12)], [other])
+
+
+def test_a_mask_of_a_field_that_is_not_there_hides_nothing() -> None:
+    wrong = replace(info("1" * 12), masks={"text": ".*"})
+    assert differences([wrong], [info("2" * 12)])
+
+
+@pytest.mark.parametrize("reply", [None, encode(Error(code=1)), encode(Ack())])
+def test_silence_and_errors_are_answers(reply: bytes | None) -> None:
+    (line,) = differences([info("1" * 12)], [replace(info("1" * 12), reply=reply)])
+    assert line.startswith("serial: module REPLY STRING")
+    assert not differences([replace(info("x"), reply=reply)], [replace(info("x"), reply=reply)])
+
+
+def test_a_cassette_reads_back(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "module.json"
+    silent = replace(info("1" * 12), reply=None)
+    Cassette(recorded={"identity": "X"}, exchanges=[info("1" * 12), silent]).write(path)
+    read = Cassette.read(path)
+    assert read.exchanges == [info("1" * 12), silent]
+    assert read.recorded == {"identity": "X"}
+    assert [one.command for one in read.transactions] == [SystemGetInfo(item=6)] * 2
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"format": 1}', '{"format": 2}', "\xff"])
+def test_other_files_are_named(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "other.json"
+    path.write_text(content, "latin-1")
+    with pytest.raises(CassetteError, match=r"other\.json"):
+        Cassette.read(path)
+
+
+def test_an_emulator_that_changed_its_mind_is_caught() -> None:
+    """Protocol reference 4.4: without a profile some GETs get no answer at all; here, ERROR 1."""
+    recorded = Cassette.read(FIXTURES / "cassettes" / "emulated.json")
+    device = radar_device(
+        Identity(serial="100000000000"),
+        echo_source(empty_room(), 0, 0),
+        Pace.REALTIME,
+        options=DeviceOptions(get_without_profile="error"),
+    )
+    line = FaultyLine(device)
+    with line.radar() as radar:
+        radar.request(SetMode(mode=SensorMode.XTID_SM_STOP))
+    port = line.open(PATH, 115200)
+    (found,) = differences(recorded.exchanges, ask_all(port, line.clock_ns, recorded.transactions))
+    assert found.startswith("zone without profile: module nothing, emulator ERROR")
+
+
+def test_transactions_have_names_of_their_own_and_write_no_flash() -> None:
+    names = [transaction.name for transaction in TRANSACTIONS]
+    assert len(set(names)) == len(names)
+    said = json.dumps([type(transaction.command).__name__ for transaction in TRANSACTIONS])
+    for forbidden in ("CreateFile", "SetFileData", "DeleteFile", "StoreNoiseMap", "FactoryPreset"):
+        assert forbidden not in said

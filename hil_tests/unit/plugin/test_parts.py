@@ -1,0 +1,83 @@
+"""Locks, taps, measurements and frame rates."""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from hil_tests.plugin import tap
+from hil_tests.plugin.locks import PortBusyError, PortLock
+from hil_tests.plugin.measurements import Measure
+from hil_tests.plugin.rates import carried_rate_hz
+from hil_tests.plugin.tap import WireTap
+
+
+def test_a_lock_is_for_one_process(tmp_path: Path) -> None:
+    port = tmp_path / "port"
+    port.touch()
+    link = tmp_path / "by-id"
+    link.symlink_to(port)
+    program = f"from hil_tests.plugin.locks import PortLock; PortLock({str(link)!r})"
+    lock = PortLock(str(port))
+    refused = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False
+    )
+    assert refused.returncode == 1
+    assert f"tested by another session (process {os.getpid()})" in refused.stderr
+    lock.release()
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_a_lock_is_not_given_twice(tmp_path: Path) -> None:
+    lock = PortLock(str(tmp_path))
+    with pytest.raises(PortBusyError, match="wait for it"):
+        PortLock(str(tmp_path))
+    lock.release()
+    PortLock(str(tmp_path)).release()
+
+
+def test_a_tap_forgets_the_oldest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tap, "MOST_BYTES", 10)
+    wire = WireTap(clock_ns=lambda: 5)
+    for data in (b"abcd", b"efgh", b"ijkl"):
+        wire.note("rx", data)
+    assert [passed.data for passed in wire.passed] == [b"efgh", b"ijkl"]
+    assert wire.forgotten_bytes == 4
+
+
+def test_measurements_reach_the_report() -> None:
+    properties: list[tuple[str, object]] = []
+    measure = Measure(properties)
+    measure("jitter", 4.5, unit="ms", limit=(None, 5.0))
+    assert properties == [("measurement jitter", "4.5 ms (at most 5)")]
+    (taken,) = measure.taken
+    assert taken.as_json() == {
+        "name": "jitter",
+        "value": 4.5,
+        "unit": "ms",
+        "low": None,
+        "high": 5.0,
+        "within": True,
+    }
+
+
+@pytest.mark.parametrize("value", [5.1, 0.9, math.nan])
+def test_measurements_beyond_their_limits_fail(value: float) -> None:
+    measure = Measure([])
+    with pytest.raises(pytest.fail.Exception, match=r"jitter is .* ms \(at least 1, at most 5\)"):
+        measure("jitter", value, unit="ms", limit=(1.0, 5.0))
+    assert len(measure.taken) == 1
+
+
+@pytest.mark.parametrize(
+    ("bytes_per_s", "rate_hz"),
+    # 80 % of the line over 5747 bytes, whole Hz, at least one
+    [(math.inf, 17.0), (92160.0, 12.0), (11520.0, 1.0), (960.0, 1.0)],
+)
+def test_rates_that_lines_carry(bytes_per_s: float, rate_hz: float) -> None:
+    assert carried_rate_hz(17.0, bytes_per_s) == rate_hz

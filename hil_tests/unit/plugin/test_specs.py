@@ -1,0 +1,86 @@
+"""What a user may write behind --radar, and what is said about everything else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from hil_tests.plugin.specs import Kind, RadarSpec, SpecError, parse_specs
+
+
+def one(text: str) -> RadarSpec:
+    (spec,) = parse_specs([text])
+    return spec
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "target", "name"),
+    [
+        ("emu", Kind.EMULATED, "", "emu"),
+        ("emu:lab", Kind.EMULATED, "lab", "emu-lab"),
+        ("emu:rooms/a.toml?fps=17&seed=3", Kind.EMULATED, "rooms/a.toml", "emu-a"),
+        ("emu:?line=uart", Kind.EMULATED, "", "emu-uart"),
+        ("emu:?firmware=xep", Kind.EMULATED, "", "emu-xep"),
+        ("emu:lab?radar=left_front", Kind.EMULATED, "lab", "emu-lab-left_front"),
+        ("/dev/ttyACM0", Kind.PORT, "/dev/ttyACM0", "ttyACM0"),
+        ("./ports/radar_1?line=uart", Kind.PORT, "ports/radar_1", "radar_1"),
+        ("serial=202611210001", Kind.SERIAL_NUMBER, "202611210001", "202611210001"),
+        ("tcp://192.0.2.7:3000", Kind.TCP, "192.0.2.7:3000", "tcp-192.0.2.7-3000"),
+        ("auto", Kind.AUTO, "", "auto"),
+    ],
+)
+def test_what_a_spec_names(text: str, kind: Kind, target: str, name: str) -> None:
+    spec = one(text)
+    assert (spec.kind, spec.target, spec.name) == (kind, target, name)
+
+
+def test_recordings_must_exist(tmp_path: Path) -> None:
+    recording = tmp_path / "drive.mcap"
+    with pytest.raises(SpecError, match="there is no recording"):
+        one(f"replay:{recording}")
+    recording.touch()
+    assert one(f"replay:{recording}").name == "replay-drive"
+
+
+def test_options() -> None:
+    spec = one("emu:lab?fps=10&seed=7&has=reflector,stage")
+    assert (spec.fps, spec.seed, spec.has) == (10.0, 7, frozenset({"reflector", "stage"}))
+    assert (one("emu").fps, one("emu").seed, one("emu").has) == (17.0, 0, frozenset())
+
+
+def test_radars_that_would_share_a_name_get_numbers() -> None:
+    names = [spec.name for spec in parse_specs(["/a/radar", "/b/radar", "/c/radar"])]
+    assert names == ["radar", "radar-2", "radar-3"]
+
+
+def test_what_this_program_makes_itself_is_not_shared() -> None:
+    assert not one("emu:?line=tcp").shared
+    assert all(one(text).shared for text in ("/dev/ttyACM0", "tcp://h:1", "serial=202611210001"))
+
+
+@pytest.mark.parametrize(
+    ("text", "remedy"),
+    [
+        ("ttyACM0", "names no radar; allowed are emu"),
+        ("", "names no radar"),
+        ("serial=12", "has 12 digits"),
+        ("tcp://host", "tcp://HOST:PORT"),
+        ("tcp://host:99999", "a port of 1...65535"),
+        ("emu:lab?colour=red", "'colour=red' is no option here; allowed are firmware=..., fps="),
+        ("emu:lab?seed", "'seed' is no option here"),
+        ("emu:lab?seed=-1", "a whole number"),
+        ("emu:lab?fps=0", "a rate of 1...65535 Hz"),
+        ("emu:lab?fps=fast", "a rate of 1...65535 Hz"),
+        ("emu:?firmware=own", "must be sensor, or xep without line="),
+        ("emu:?firmware=xep&line=pty", "must be sensor, or xep without line="),
+        ("emu:?line=wifi", "must be memory or pty or uart or tcp"),
+        ("/dev/ttyACM0?line=pty", "must be uart"),
+        ("/dev/ttyACM0?seed=3", "is no option here"),
+    ],
+)
+def test_specs_that_name_nothing(text: str, remedy: str) -> None:
+    with pytest.raises(SpecError) as refusal:
+        one(text)
+    assert remedy in str(refusal.value)
+    assert "\n" not in str(refusal.value)

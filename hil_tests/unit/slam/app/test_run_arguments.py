@@ -1,0 +1,52 @@
+"""The ROS 2 recipe in the help of `uwb-slam run` does what it says."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+
+import numpy as np
+import pytest
+
+from slam.app import ros_messages as ros
+from slam.app.cli import main
+from slam.app.run_arguments import CSV_TO_TUM
+from slam.app.tum import TumSample, parse_tum_line
+
+
+def csv_of(message: object) -> str:
+    """Write a message as `ros2 topic echo --csv` does: all fields in order, arrays spread."""
+
+    def values(part: object) -> Iterator[str]:
+        if isinstance(part, np.ndarray):
+            yield from map(str, part.tolist())
+        elif is_dataclass(part):
+            for field in fields(part):
+                if field.name != "__msgtype__":
+                    yield from values(getattr(part, field.name))
+        else:
+            yield str(part)
+
+    return ",".join(values(message))
+
+
+def test_lines_of_ros2_topic_echo_become_tum_lines_with_the_same_floats() -> None:
+    samples = [
+        TumSample(t_ns=1_700_000_000_000_000_005, x_m=1 / 3, y_m=-2e-17, qz=-0.6, qw=0.8),
+        TumSample(t_ns=1_700_000_001_234_567_890, x_m=-1.5, y_m=0.0, qz=0.0, qw=1.0),
+    ]
+    csv = "".join(f"{csv_of(ros.odometry(sample))}\n" for sample in samples)
+    assert csv.startswith("1700000000,5,odom,base_link,0.3333333333333333,-2e-17,0.0,0.0,0.0,-0.6,")
+    done = subprocess.run(
+        ["sed", "-uE", CSV_TO_TUM], input=csv, capture_output=True, text=True, check=True
+    )
+    assert [parse_tum_line(line) for line in done.stdout.splitlines()] == samples
+
+
+def test_the_help_shows_that_very_recipe(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["run", "--help"])
+    said = capsys.readouterr().out
+    assert f"sed -uE '{CSV_TO_TUM}'" in said
+    assert "--odometry-clock unix" in said

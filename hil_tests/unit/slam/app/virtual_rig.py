@@ -1,0 +1,149 @@
+"""A rig in virtual time: emulated radars whose clocks drift, on lines that delay, and odometry.
+
+What the threads of a run would put into its inbox, each event at its own virtual time.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from queue import Empty
+
+import numpy as np
+
+from emulator.device import radar_device
+from emulator.echo import echo_source
+from emulator.identity import Identity
+from emulator.loopback import LoopbackTransport
+from emulator.odometry import scene_odometry
+from emulator.odometry_feed import stamp_ns
+from emulator.pace import Pace
+from emulator.scene import Scene
+from slam.app.emulated_rig import FRAME_RATE_HZ, RAW_CONFIG, rig_of
+from slam.app.run_events import Event, FrameCame, LinkSaid, OdometryEnded, OdometryLine, WireCame
+from slam.app.session import RadarInfo
+from slam.app.sources import RadarLink, RigSource
+from slam.app.tum import TumSample
+from xethru_protocol.driver import X4M300
+
+NS_PER_S = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Timed:
+    """An event and when it comes, virtual host time."""
+
+    t_ns: int
+    event: Event
+
+
+class VirtualInbox:
+    """An inbox whose events come when virtual time reaches them; waiting takes none."""
+
+    def __init__(self, events: list[Timed]) -> None:
+        self._heap = [(row.t_ns, number, row.event) for number, row in enumerate(events)]
+        heapq.heapify(self._heap)
+        self.now_ns = 0
+
+    def clock_ns(self) -> int:
+        return self.now_ns
+
+    def get_nowait(self) -> Event:
+        if not self._heap or self._heap[0][0] > self.now_ns:
+            raise Empty
+        return heapq.heappop(self._heap)[2]
+
+    def get(self, timeout: float) -> Event:
+        end_ns = self.now_ns + round(timeout * NS_PER_S)
+        if not self._heap or self._heap[0][0] > end_ns:
+            self.now_ns = end_ns
+            raise Empty
+        self.now_ns = max(self.now_ns, self._heap[0][0])
+        return self.get_nowait()
+
+
+class Words:
+    """Listens, and keeps what was said."""
+
+    def __init__(self) -> None:
+        self.said: list[tuple[str, str]] = []
+        self.samples: list[TumSample] = []
+
+    def on_odometry(self, sample: TumSample) -> None:
+        self.samples.append(sample)
+
+    def on_wire(self, event: WireCame) -> None: ...
+
+    def on_link(self, event: LinkSaid) -> None: ...
+
+    def say(self, who: str, text: str, *, warning: bool) -> None:
+        self.said.append((who, text))
+
+    def about(self, who: str) -> str:
+        return " | ".join(text for name, text in self.said if name == who)
+
+
+def drifting(scene: Scene, ppm: tuple[float, ...], skew_ms: tuple[float, ...]) -> Scene:
+    """Return the scene with clocks that are off, and samples that are out of step."""
+    radars = [
+        radar.model_copy(update={"clock_ppm": each, "start_skew_ms": skew})
+        for radar, each, skew in zip(scene.radars, ppm, skew_ms, strict=True)
+    ]
+    return scene.model_copy(update={"radars": tuple(radars)})
+
+
+def radar_events(
+    scene: Scene, seed: int, end_s: float, delay_ns: Callable[[], int]
+) -> tuple[tuple[RadarInfo, ...], list[Timed]]:
+    """Let every radar of a scene stream in its own virtual time until `end_s`, frames delayed."""
+    links, lines = [], []
+    for index, (radar, mount) in enumerate(zip(scene.radars, rig_of(scene).mounts, strict=True)):
+        source = echo_source(scene, index, seed)
+        identity = Identity(serial=radar.serial)
+        device = radar_device(identity, source, Pace.REALTIME, clock=radar.clock)
+        line = LoopbackTransport(device)
+        driver = X4M300(line, clock=line.clock_ns)
+        links.append(RadarLink(mount=mount, port=line.name, serial=radar.serial, driver=driver))
+        lines.append(line)
+    events = []
+    with RigSource(links) as rig:
+        rig.start(RAW_CONFIG, FRAME_RATE_HZ)
+        for radar_index, link in enumerate(links):
+            last_ns = 0
+            for frame in link.driver.frames(timeout_s=5.0):
+                if frame.arrival_ns > end_s * NS_PER_S:
+                    break
+                # a line keeps the order of what it delays
+                last_ns = max(frame.arrival_ns + delay_ns(), last_ns + 1)
+                late = replace(frame, arrival_ns=last_ns)
+                events.append(Timed(last_ns, FrameCame(radar=radar_index, frame=late)))
+    return rig.radars, events
+
+
+def odometry_events(scene: Scene, seed: int, delay_ns: Callable[[], int]) -> list[Timed]:
+    """Return the lines of a scene's odometry, each a while after its stamp; then the end."""
+    events, last_ns = [], 0
+    for text in scene_odometry(scene, seed):
+        last_ns = max(stamp_ns(text) + delay_ns(), last_ns + 1)
+        events.append(Timed(last_ns, OdometryLine(text=text, arrival_ns=last_ns)))
+    return [*events, Timed(last_ns, OdometryEnded(trouble=""))]
+
+
+def delays(seed: int, most_ms: float) -> Callable[[], int]:
+    """Return delays like those of USB: anything up to `most_ms`, now and then five times more."""
+    generator = np.random.default_rng(seed)
+
+    def draw() -> int:
+        factor = 5.0 if generator.random() < 0.02 else 1.0
+        return math.floor(generator.uniform(0.0, most_ms * factor * 1e6))
+
+    return draw
+
+
+def straight_odometry(duration_s: float, rate_hz: float = 20.0) -> Iterator[tuple[int, str]]:
+    """Yield (stamp [ns], TUM line) of a robot that drives 5 cm/s along x."""
+    for number in range(int(duration_s * rate_hz) + 1):
+        t_s = number / rate_hz
+        yield round(t_s * NS_PER_S), f"{t_s:.9f} {0.05 * t_s!r} 0.0 0 0 0 0.0 1.0"

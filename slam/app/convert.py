@@ -1,0 +1,116 @@
+"""`uwb-slam convert`: sessions from and to the files of others."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from slam.app import rosbag_layout as layout
+from slam.app.errors import AppError, UsageError
+from slam.app.imported import SlamSettings
+from slam.app.mat_convert import MatOptions, convert_mat, write_detections
+from slam.app.rig_file import load_rig
+from slam.app.rosbag_read import BagOptions, convert_bag
+from slam.app.rosbag_write import write_bag
+from slam.app.session_head import settings_text
+from slam.app.session_reader import RecordedSession, open_session
+from slam.app.wire_export import write_wire
+from slam.config import SlamConfig
+from slam.presets import ConfigError, load_preset
+from slam.robust.parameters import WheelNoise
+
+SESSION_SUFFIX, MAT_SUFFIX, WIRE_SUFFIX = ".mcap", ".mat", ".xtwire"
+_PRESET = "robust"
+_MAT_PRESET = "paper"  # whose front end such ranges are of: they scatter by a bin, 7 mm
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConvertOptions:
+    """What the command line of `uwb-slam convert` says; None where it does not."""
+
+    source: Path
+    out: Path
+    rig: Path | None
+    area_m: tuple[float, float] | None
+    truth_topic: str
+    rate_hz: int
+    preset: str | None
+    radar: str | None
+
+
+def run_convert(options: ConvertOptions, check: Callable[[], None]) -> None:
+    """Convert a session to a bag or MATLAB file, or such a file to a session; names say which.
+
+    Raises
+    ------
+    AppError
+        One line; what was begun is removed.
+    """
+    if options.out.exists():
+        raise AppError(f"{options.out}: exists; choose another name")
+    out_is_session = options.out.suffix == SESSION_SUFFIX
+    if options.source.suffix == SESSION_SUFFIX and not out_is_session:
+        _say(_from_session(open_session(options.source), options, check))
+        return
+    if not out_is_session:
+        raise UsageError(
+            f"{options.out}: of a bag or MATLAB file a session is made; give a name that ends in "
+            ".mcap"
+        )
+    try:
+        said, odd = _to_session(options, check)
+    except BaseException:
+        options.out.unlink(missing_ok=True)
+        raise
+    for line in odd:
+        print(f"uwb-slam: {options.source}: {line}", file=sys.stderr)  # noqa: T201 - a warning
+    _say(said)
+
+
+def _from_session(
+    session: RecordedSession, options: ConvertOptions, check: Callable[[], None]
+) -> str:
+    if options.out.suffix == WIRE_SUFFIX:
+        return write_wire(session, options.out, options.radar, check)
+    if options.out.suffix != MAT_SUFFIX:
+        return write_bag(session, options.out, check)
+    if options.preset is None and session.info.config_json:
+        config = SlamConfig.model_validate_json(session.info.config_json)
+    else:
+        config = _config(options.preset or _PRESET)
+    return write_detections(session, options.out, config, check)
+
+
+def _to_session(options: ConvertOptions, check: Callable[[], None]) -> tuple[str, list[str]]:
+    is_mat = options.source.suffix == MAT_SUFFIX
+    preset = options.preset or (_MAT_PRESET if is_mat else _PRESET)
+    settings = SlamSettings(
+        preset=preset, config_json=settings_text(_config(preset)), wheels=asdict(WheelNoise())
+    )
+    if is_mat:
+        of_mat = MatOptions(
+            rig=None if options.rig is None else load_rig(options.rig).rig,
+            rate_hz=options.rate_hz,
+            settings=settings,
+        )
+        return convert_mat(options.source, options.out, of_mat, check), []
+    of_bag = BagOptions(
+        rig=layout.AUTHORS_RIG if options.rig is None else load_rig(options.rig).rig,
+        area_m=options.area_m,
+        truth_topic=options.truth_topic,
+        settings=settings,
+    )
+    return convert_bag(options.source, options.out, of_bag, check)
+
+
+def _config(preset: str) -> SlamConfig:
+    try:
+        return load_preset(preset)
+    except ConfigError as error:
+        raise UsageError(str(error)) from None
+
+
+def _say(line: str) -> None:
+    print(line)  # noqa: T201 - the result
