@@ -28,6 +28,7 @@ from slam.robust.points import RangeBearing, assign, named_rows, range_bearing_r
 from slam.robust.ranges import Antennas, RangeScan, View, antennas_of, rows_of, sides_of, view
 from slam.robust.relinearisation import is_due, relinearise
 from slam.robust.reports import ExpectedRange, MapLandmark, MapWall, UpdateReport
+from slam.robust.roundness import Roundness
 from slam.robust.run_log import RunLog
 from slam.robust.state import State
 from slam.robust.surprise import Trial, trials
@@ -76,6 +77,8 @@ class RobustBackEnd:
         self._log = RunLog(parameters.wheels, None if parameters.relinearisation else window)
         self._motion = at_rest()
         self._walls = WallKeeper(self.state, parameters)
+        round_rule = parameters.roundness
+        self._roundness = None if round_rule is None else Roundness(round_rule)
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
         self._landmark_of_label: dict[int, int] = {}
         self._n_updates = 0
@@ -155,7 +158,9 @@ class RobustBackEnd:
         whereabouts = self._whereabouts
         self.parameters = whereabouts.parameters = judged(self.state, self._log, self.parameters)
         lost = whereabouts.is_lost
-        relinearised = self._is_due() and self.relinearise()
+        relinearised = self._give_radii()
+        if relinearised or is_due(self._log, self.state, self.parameters):
+            relinearised |= self.relinearise()
         self._log.set_causal(self.state.pose)
         return UpdateReport(
             continued=continued,
@@ -194,7 +199,7 @@ class RobustBackEnd:
         for point, row in zip(points, rows, strict=True):
             landmark_id = None if row is None else self._see_point(point, row)
             found.append(landmark_id)
-        if self._is_due():
+        if is_due(self._log, self.state, self.parameters):
             self.relinearise()
         self._log.set_causal(state.pose)
         return tuple(found)
@@ -224,9 +229,12 @@ class RobustBackEnd:
             return False
         return relinearise(self._log, self.state, self.parameters)
 
-    def _is_due(self) -> bool:
-        """Tell whether all poses should be solved for."""
-        return is_due(self._log, self.state, self.parameters)
+    def _give_radii(self) -> bool:
+        """Give landmarks the radii that are evident; tell whether all poses were solved for."""
+        if self._roundness is None or self._whereabouts.is_lost or self._whereabouts.is_suspicious:
+            return False
+        hits = self._existence.hits
+        return self._roundness.give(self.state, self._log, self.parameters, hits)
 
     def _continue_tracks(
         self, scans: Sequence[RangeScan], antennas: Antennas
@@ -251,7 +259,7 @@ class RobustBackEnd:
         of_radar, noise = {scan.radar: scan for scan in scans}, self.parameters.ranges
         z = np.array([of_radar[c.radar].ranges_m[c.index] for c in found])
         sigmas = [of_radar[c.radar].sigma(c.index, noise.sigma_m) for c in found]
-        for (radar, _, landmark_id), range_m, sigma_m in zip(continued, z, sigmas, strict=True):
+        for (radar, at, landmark_id), range_m, sigma_m in zip(continued, z, sigmas, strict=True):
             x, y = antennas.position_m[radar].tolist()
             self._log.add_range(
                 self._log.n_poses - 1,
@@ -260,15 +268,16 @@ class RobustBackEnd:
                 antenna=(x, y),
                 range_m=float(range_m),
                 sigma_m=sigma_m,
+                alone=of_radar[radar].is_alone(at),
             )
+        noise_m = np.hypot(sigmas, state.feature_doubts_m[[c.row for c in found]])
         rows = rows_of(
             state,
             seen,
             np.array([c.radar for c in found], dtype=np.intp),
             np.array([c.row for c in found], dtype=np.intp),
         )
-        self._walls.note(found)
-        nis, _ = state.update(rows.at, rows.H, z - rows.predicted_m, np.square(sigmas))
+        nis, _ = state.update(rows.at, rows.H, z - rows.predicted_m, np.square(noise_m))
         return continued, nis
 
     def _continue_side(
@@ -284,20 +293,21 @@ class RobustBackEnd:
         near = landmarks_in_view(self.state, seen, radars, noise, rule) if radars else None
         if near is None:
             return []
-        self._trials += trials(near, seen, scans, self.state, self.parameters)
         sure = near.surer_than(rule.tight_sigmas * noise.sigma_m)
+        doubts_m = self.state.feature_doubts_m
+        near = near.doubted(doubts_m)
+        self._trials += trials(near, seen, scans, self.state, self.parameters)
         inside = seen.inside(noise, -limits.view_inset_rad, -limits.view_inset_m)[radars]
         self._miss_unsure(near, sure, inside, scans)
         if sure is None:
             return []
         self._expected += expected_ranges(self.state, sure, antennas)
-        found = continue_tracks(sure, scans, noise, rule)
+        found = continue_tracks(sure.doubted(doubts_m), scans, noise, rule)
         ids = self.state.feature_ids
         count = Counter(continuation.row for continuation in found)
         for row in count:
             self._existence.hit(ids[row])
         expected = inside[:, sure.landmarks].all(axis=0)
-        expected &= self._walls.certain[sure.landmarks]
         for row in sure.landmarks[expected].tolist():
             hidden = any(scan.may_hide(float(seen.ranges_m[scan.radar, row])) for scan in scans)
             if row not in count and not hidden:
@@ -389,6 +399,7 @@ class RobustBackEnd:
                 antenna=slot.antenna_then,
                 range_m=member.leftover.range_m,
                 sigma_m=member.leftover.sigma_m,
+                alone=member.leftover.alone,
             )
 
     def _delete_lost(self) -> tuple[int, ...]:

@@ -26,12 +26,14 @@ from slam.robust.symmetric import Array, Indices
 class BodyPoint:
     """A point in the body frame of now.
 
-    ``point_m`` (2,), ``covariance`` (2, 2), ``by_offsets`` (2, r): d(point) / d(range offsets).
+    ``point_m`` (2,), ``covariance`` (2, 2), ``by_offsets`` (2, r): d(point) / d(range offsets);
+    ``outward`` (2,): away from where it was seen from, where the axis of a round target lies.
     """
 
     point_m: Array
     covariance: Array
     by_offsets: Array
+    outward: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -61,8 +63,11 @@ def point_rows(state: State, row: int, point: BodyPoint) -> FeatureRows:
     at = np.concatenate([np.array([1, 2]), offsets, state.landmark_columns(np.array([row]))])
     H = np.hstack([-R.T, -point.by_offsets, R.T])
     S = H @ state.P.block(at) @ H.T + point.covariance
+    seen_m = point.point_m
+    if point.outward is not None and (radius_m := state.radii_m.get(state.landmark_ids[row], 0.0)):
+        seen_m = seen_m + radius_m * point.outward
     return FeatureRows(
-        residual=point.point_m - R.T @ (state.landmarks_m[row] - state.position_m),
+        residual=seen_m - R.T @ (state.landmarks_m[row] - state.position_m),
         at=at,
         H=H,
         S=(S + S.T) / 2,

@@ -68,6 +68,30 @@ class Sightings:
     offset_covariance: Array | None = None
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Fit:
+    """A law at its best.
+
+    Attributes
+    ----------
+    unknown
+        shape (2,): the law's own two.
+    offsets_m, radars
+        shape (q,): what the offsets of these radars are off by.
+    chi_square
+        Of the residuals and of the offsets.
+    by_law, extra
+        d(range) / d(unknown), shape (k, 2), and d(range) / d(offset), shape (k, q).
+    """
+
+    unknown: Array
+    offsets_m: Array
+    radars: tuple[int, ...]
+    chi_square: float
+    by_law: Array
+    extra: Array
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
     """Chi-squares of the two laws, each at its best."""
@@ -97,7 +121,12 @@ def compare(sightings: Sightings, toward_rad: float) -> Verdict:
     n = np.array([math.cos(toward_rad), math.sin(toward_rad)])
     point = _least(sightings, np.array([*(middle + range_m * n)]), _point_law)
     wall = _least(sightings, np.array([toward_rad, range_m + float(n @ middle)]), _wall_law)
-    return Verdict(point=point, wall=wall)
+    return Verdict(point=point.chi_square, wall=wall.chi_square)
+
+
+def fit_wall(sightings: Sightings, start: Array) -> Fit:
+    """Return the wall (phi, d) of least chi-square near a start."""
+    return _least(sightings, start, _wall_law)
 
 
 def kinds(
@@ -178,9 +207,9 @@ def _wall_law(unknown: Array, antennas: Array) -> tuple[Array, Array]:
 
 def _least(
     sightings: Sightings, start: Array, predict: Callable[[Array, Array], tuple[Array, Array]]
-) -> float:
-    """Return the least chi-square of a law: Gauss-Newton, steps halved until it falls."""
-    extra, prior = _offset_part(sightings)
+) -> Fit:
+    """Return a law at its least chi-square: Gauss-Newton, steps halved until it falls."""
+    extra, prior, radars = _offset_part(sightings)
     unknown, offsets = start, np.zeros(extra.shape[1])
 
     def chi_square(unknown: Array, offsets: Array) -> float:
@@ -211,15 +240,22 @@ def _least(
         unknown, offsets = moved
         if decrease < 1e-4:
             break
-    return best
+    return Fit(
+        unknown=unknown,
+        offsets_m=offsets,
+        radars=radars,
+        chi_square=best,
+        by_law=predict(unknown, sightings.antennas_m)[1],
+        extra=extra,
+    )
 
 
-def _offset_part(sightings: Sightings) -> tuple[Array, Array]:
-    """Return d(range) / d(offset), shape (k, q), and the offsets' information, shape (q, q)."""
+def _offset_part(sightings: Sightings) -> tuple[Array, Array, tuple[int, ...]]:
+    """Return d(range) / d(offset), (k, q), the offsets' information, (q, q), and whose, (q,)."""
     k = len(sightings.ranges_m)
     if sightings.offset_covariance is None:
-        return np.zeros((k, 0)), np.zeros((0, 0))
+        return np.zeros((k, 0)), np.zeros((0, 0)), ()
     used: Sequence[int] = np.unique(sightings.radars).tolist()
     part = (sightings.radars[:, None] == np.array(used)[None, :]).astype(np.float64)
     covariance = sightings.offset_covariance[np.ix_(used, used)] + 1e-12 * np.eye(len(used))
-    return part, np.asarray(np.linalg.inv(covariance))
+    return part, np.asarray(np.linalg.inv(covariance)), tuple(used)

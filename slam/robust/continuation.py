@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -83,6 +83,11 @@ class SureLandmarks:
         return SureLandmarks(
             landmarks=self.landmarks[sure], rows=rows, prior=self.prior[np.ix_(keep, keep)]
         )
+
+    def doubted(self, doubts_m: Array) -> SureLandmarks:
+        """Return the same with doubts, one standard deviation per row of the map, added."""
+        added = np.square(doubts_m[self.rows.landmarks])
+        return self if not added.any() else replace(self, prior=self.prior + np.diag(added))
 
     def unanswered(self, scans: Sequence[RangeScan], noise: RangeNoise, within_m: float) -> Indices:
         """Return the rows of those of which no radar hears anything where they would answer.

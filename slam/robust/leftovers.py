@@ -22,11 +22,15 @@ from slam.robust.symmetric import Array
 
 @dataclass(frozen=True, slots=True)
 class Leftover:
-    """One unused range: as measured, its target's label where known, its standard deviation."""
+    """One unused range: as measured, its target's label where known, its standard deviation.
+
+    ``alone`` tells whether no other echo overlaps its own.
+    """
 
     range_m: float
     label: int | None
     sigma_m: float
+    alone: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -121,7 +125,12 @@ class Leftovers:
         unused: tuple[list[Leftover], ...] = tuple([] for _ in antennas.yaw_rad)
         for scan in scans:
             unused[scan.radar].extend(
-                Leftover(range_m, scan.label(index), scan.sigma(index, self._sigma_m))
+                Leftover(
+                    range_m,
+                    scan.label(index),
+                    scan.sigma(index, self._sigma_m),
+                    scan.is_alone(index),
+                )
                 for index, range_m in enumerate(scan.ranges_m)
                 if (scan.radar, index) not in used and 0.0 < range_m < LONGEST_M
             )

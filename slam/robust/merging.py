@@ -70,6 +70,11 @@ def apply_merge(state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float
     K = np.asarray(np.linalg.solve(S, PHt.T).T, dtype=np.float64)
     state.P.subtract_gains(K, PHt, S)
     state.correct(K @ residual)
+    ids = state.landmark_ids
+    for kept, gone in pairs:
+        if ids[gone] in state.radii_m:
+            state.radii_m.setdefault(ids[kept], state.radii_m[ids[gone]])
+            state.radius_doubts_m.setdefault(ids[kept], state.radius_doubts_m.get(ids[gone], 0.0))
     for row in sorted((second for _, second in pairs), reverse=True):
         state.remove(row)
 
@@ -139,7 +144,8 @@ def _distances_sq(state: State, pairs: Indices, sigma_m: float) -> Array:
     # Where rounding has left no spread at all, nothing is ruled out here.
     determinant = np.maximum(xx * yy - xy**2, 0.0)
     numerator = yy * x**2 - 2.0 * xy * x * y + xx * y**2
-    return np.where(determinant > 1e-12 * xx * yy, numerator / np.maximum(determinant, 1e-300), 0.0)
+    spread_out = determinant > 1e-12 * xx * yy
+    return np.where(spread_out, numerator / np.where(spread_out, determinant, 1.0), 0.0)
 
 
 def _joint_merge(state: State, fair: list[Merge], floor: float, rule: MapRule) -> Merge | None:

@@ -218,7 +218,8 @@ class WallRule:
     unmapped_per_rad_m
         Density of walls not yet in the map: the likelihood of a match must exceed it.
     cell_m, reach_m
-        Walls are known in cells of this length; how far from one of them a wall may answer.
+        Walls are known in cells of this length; how far from one of them what looks like the
+        same wall may be that.
     resolution_m, resolution_rad
         A wall as near as this to a mapped one, and not it, is its echo merged with another: a
         pulse is longer than that.
@@ -236,6 +237,40 @@ class WallRule:
     reach_m: float = 1.0
     resolution_m: float = 0.05
     resolution_rad: float = 0.1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RoundnessRule:
+    """When a landmark is a round target and no point.
+
+    Attributes
+    ----------
+    window, most_turn_rad
+        Frames looked back, fewer if the robot turned by more than that since.
+    min_ranges, min_way_m
+        Fewest ranges, and least way between the first and the last.
+    every
+        Frames that hit a landmark between two looks at it.
+    sigmas, largest_m
+        How many standard deviations a radius must be from zero to be likely, and what none exceeds.
+    lead
+        By how much the cost of the solution over all poses must fall for it to be believed.
+    sharper
+        Share of the standard deviation at the last look that is worth another one.
+    excess_sigmas
+        How far chi-square may exceed its degrees of freedom, in its standard deviations.
+    """
+
+    window: int = 120
+    most_turn_rad: float = 0.1
+    min_ranges: int = 60
+    min_way_m: float = 0.4
+    every: int = 10
+    sigmas: float = 3.0
+    largest_m: float = 0.5
+    lead: float = 9.0
+    sharper: float = 0.9
+    excess_sigmas: float = 3.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -355,4 +390,5 @@ class BackEndParameters:
     surprise: SurpriseRule = field(default_factory=SurpriseRule)
     relocation: RelocationRule = field(default_factory=RelocationRule)
     walls: WallRule | None = field(default_factory=WallRule)
+    roundness: RoundnessRule | None = field(default_factory=RoundnessRule)
     relinearisation: RelinearisationRule | None = field(default_factory=RelinearisationRule)

@@ -73,6 +73,11 @@ class RangeScan:
         """Return the standard deviation [m] of one range, if it is not told the other one."""
         return otherwise_m if self.sigmas_m is None else self.sigmas_m[index]
 
+    def is_alone(self, index: int) -> bool:
+        """Tell whether no other echo overlaps that of a range."""
+        others = (*self.ranges_m[:index], *self.ranges_m[index + 1 :], *self.blurred_m)
+        return all(abs(other_m - self.ranges_m[index]) > BLUR_M for other_m in others)
+
     def may_hide(self, range_m: float) -> bool:
         """Tell whether an echo at a range may be part of a blurred one."""
         return any(abs(blurred_m - range_m) <= BLUR_M for blurred_m in self.blurred_m)
@@ -186,6 +191,8 @@ def view(state: State, antennas: Antennas) -> View:
         by_wall = np.stack([-places @ turned.T, np.ones((len(places), len(phi)))], axis=-1)
         by_feature = np.concatenate([directions, by_wall], axis=1)
         directions = np.concatenate([directions, walls], axis=1)
+    if state.radii_m:
+        ranges = ranges - state.feature_radii_m
     return View(
         ranges_m=ranges + state.offsets_m[:, None],
         off_boresight_rad=wrap_angles(bearings - antennas.yaw_rad[:, None]),

@@ -7,12 +7,14 @@ from contextlib import suppress
 
 import numpy as np
 
-from slam.robust.parameters import BackEndParameters
-from slam.robust.problem import start_prior
+from slam.robust.parameters import BackEndParameters, RelinearisationRule
+from slam.robust.problem import Estimate, start_prior
 from slam.robust.run_log import RunLog
 from slam.robust.smoother import Smoother, Solution
 from slam.robust.state import HEADING, State
 from slam.robust.symmetric import Array, SymmetricMatrix
+
+_UNKNOWN = 100.0
 
 
 def is_due(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
@@ -36,15 +38,10 @@ def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> boo
     if rule is None:
         return False
     log.tried()
-    prior = start_prior(
-        parameters.wheels.calibration_sigmas,
-        (parameters.ranges.offset_sigma_m,) * len(state.offsets_m),
-        len(state.feature_ids),
-    )
-    problem = log.problem(state, prior)
-    smoother = Smoother(problem, rule)
-    start = min(log.starts(state, problem), key=smoother.cost)
+    smoother, start = _all_poses(log, state, parameters, rule)
     solution = smoother.solve(start)
+    if solution is not None and not is_determined(solution.information):
+        solution = None
     if solution is not None:
         _replace(state, solution)
         log.solved(solution.estimate)
@@ -56,6 +53,71 @@ def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> boo
             prior = smoother.condensed(known, n_steps, rule.outlier_sigmas)
             log.condense(prior, state.feature_ids, n_steps)
     return solution is not None
+
+
+def give_radius(
+    log: RunLog,
+    state: State,
+    parameters: BackEndParameters,
+    candidate: tuple[int, float],
+    lead: float,
+) -> bool:
+    """Give the landmark in a row a radius if all that was measured is likelier so; tell if it is.
+
+    ``lead`` is by how much the cost of the solution over all poses must fall. Then that solution
+    takes the belief's place.
+    """
+    rule = parameters.relinearisation
+    if rule is None:
+        return False
+    row, radius_m = candidate
+    smoother, start = _all_poses(log, state, parameters, rule)
+    solution = smoother.solve(start)
+    if solution is None:
+        return False
+    least = solution.cost - lead
+    id_, point_m = state.landmark_ids[row], state.landmarks_m[row].copy()
+    before_m = state.radii_m.pop(id_, 0.0)
+    away = point_m - state.position_m
+    state.landmarks_m[row] += (radius_m - before_m) * away / max(float(np.hypot(*away)), 1e-6)
+    if radius_m:
+        state.radii_m[id_] = radius_m
+    smoother, start = _all_poses(log, state, parameters, rule)
+    solution = smoother.solve(start)
+    fits = solution is not None and solution.cost <= least
+    if solution is not None and fits and is_determined(solution.information):
+        _replace(state, solution)
+        log.solved(solution.estimate)
+        return True
+    state.landmarks_m[row] = point_m
+    state.radii_m.pop(id_, None)
+    if before_m:
+        state.radii_m[id_] = before_m
+    return False
+
+
+def is_determined(information: Array) -> bool:
+    """Tell whether all unknowns of a solution are known to better than 100 m, rad or 1.
+
+    A landmark all of whose ranges were left out as too far off has no information but rounding;
+    its covariance would be of 1e14 m^2, and have negative eigenvalues.
+    """
+    variances = np.linalg.inv(information).diagonal()
+    return bool(np.all((variances > 0.0) & (variances < _UNKNOWN**2)))
+
+
+def _all_poses(
+    log: RunLog, state: State, parameters: BackEndParameters, rule: RelinearisationRule
+) -> tuple[Smoother, Estimate]:
+    """Return the problem of all poses and the better of the values to start from."""
+    prior = start_prior(
+        parameters.wheels.calibration_sigmas,
+        (parameters.ranges.offset_sigma_m,) * len(state.offsets_m),
+        len(state.feature_ids),
+    )
+    problem = log.problem(state, prior)
+    smoother = Smoother(problem, rule)
+    return smoother, min(log.starts(state, problem), key=smoother.cost)
 
 
 def _replace(state: State, solution: Solution) -> None:

@@ -6,6 +6,7 @@ the calibration, the offsets and the landmarks (module ``condensed``).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -17,10 +18,12 @@ from slam.robust.motion import calibrated_motion
 from slam.robust.parameters import WheelNoise
 from slam.robust.problem import Estimate, Prior, Problem
 from slam.robust.state import State, rotation
-from slam.robust.symmetric import Array
+from slam.robust.symmetric import Array, Indices
 
 # Standard deviations of a step that someone else made the robot take.
 _CARRIED_M, _CARRIED_RAD = 100.0, 10.0
+# No frame gives more used ranges than that.
+_MOST_RANGES_PER_POSE = 24
 
 
 @dataclass(slots=True)
@@ -31,6 +34,7 @@ class _Ranges:
     antennas: list[tuple[float, float]] = field(default_factory=list)
     ranges_m: list[float] = field(default_factory=list)
     sigmas_m: list[float] = field(default_factory=list)
+    alone: list[bool] = field(default_factory=list)
 
     def keep(self, at: Sequence[int]) -> None:
         """Drop all rows but some."""
@@ -40,6 +44,7 @@ class _Ranges:
         self.antennas = [self.antennas[i] for i in at]
         self.ranges_m = [self.ranges_m[i] for i in at]
         self.sigmas_m = [self.sigmas_m[i] for i in at]
+        self.alone = [self.alone[i] for i in at]
 
 
 @dataclass(slots=True)
@@ -55,6 +60,32 @@ class _Points:
         self.landmarks = [self.landmarks[i] for i in at]
         self.points = [self.points[i] for i in at]
         self.roots = [self.roots[i] for i in at]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoggedSightings:
+    """Ranges of one landmark over the last frames, where odometry alone has the antennas.
+
+    Attributes
+    ----------
+    antennas_m
+        shape (k, 2), in the frame of the first pose looked back to.
+    places_m, headings_rad, way_m
+        shapes (k, 2), (k,), (k,): of the robot, and its way since that pose.
+    ranges_m, sigmas_m, radars
+        shape (k,).
+    newest
+        shape (3,): the newest pose in that frame.
+    """
+
+    antennas_m: Array
+    places_m: Array
+    headings_rad: Array
+    way_m: Array
+    ranges_m: Array
+    sigmas_m: Array
+    radars: Indices
+    newest: Array
 
 
 class RunLog:
@@ -153,8 +184,11 @@ class RunLog:
         antenna: tuple[float, float],
         range_m: float,
         sigma_m: float,
+        alone: bool = True,
     ) -> None:
         """Append a range used; ``antenna`` is in the body frame of the pose.
+
+        ``alone`` tells whether no other echo overlaps its own.
 
         Raises
         ------
@@ -170,6 +204,7 @@ class RunLog:
         ranges.antennas.append(antenna)
         ranges.ranges_m.append(range_m)
         ranges.sigmas_m.append(sigma_m)
+        ranges.alone.append(alone)
 
     def add_point(self, landmark_id: int, point: Array, covariance: Array) -> None:
         """Append a range and bearing of the newest pose with its covariance."""
@@ -194,6 +229,48 @@ class RunLog:
         if self._condensed is not None:
             self._condensed.drop(landmark_id)
 
+    def is_condensed(self, landmark_id: int) -> bool:
+        """Tell whether condensed poses told of a landmark."""
+        return self._condensed is not None and landmark_id in self._condensed.landmark_ids
+
+    def sightings(
+        self, landmark_id: int, window: int, calibration: Array, most_turn_rad: float = math.inf
+    ) -> LoggedSightings:
+        """Return the ranges of a landmark over the last ``window`` poses, of echoes all alone.
+
+        Fewer poses, if the robot turned by more than ``most_turn_rad`` since.
+        """
+        first = max(self.n_poses - 1 - window, self._first)
+        steps = np.array(self._increments[first - self._first :]).reshape(-1, 3)
+        turned_rad = np.cumsum(np.abs(steps[::-1, 2]))
+        first = max(first, self.n_poses - 1 - int(np.sum(turned_rad <= most_turn_rad)))
+        steps = np.array(self._increments[first - self._first :]).reshape(-1, 3)
+        ranges = self._ranges
+        # Rows are nearly in order of time: tracklets look back a few frames only.
+        begin = max(len(ranges.poses) - _MOST_RANGES_PER_POSE * window, 0)
+        poses = np.array(ranges.poses[begin:], dtype=np.intp)
+        names = self._rows_of(ranges.landmarks[begin:], {landmark_id: 0})
+        alone = np.array(ranges.alone[begin:], dtype=bool)
+        rows = begin + np.flatnonzero((names == 0) & (poses >= first) & alone)
+        at = np.array([ranges.poses[row] for row in rows], dtype=np.intp) - first
+        chain = _chain(np.zeros(3), steps, calibration)
+        way_m = np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
+        mounts = np.array([ranges.antennas[row] for row in rows]).reshape(-1, 2)
+        c, s = np.cos(chain[at, 2]), np.sin(chain[at, 2])
+        turned = np.column_stack(
+            [c * mounts[:, 0] - s * mounts[:, 1], s * mounts[:, 0] + c * mounts[:, 1]]
+        )
+        return LoggedSightings(
+            antennas_m=chain[at, :2] + turned,
+            places_m=chain[at, :2],
+            headings_rad=chain[at, 2],
+            way_m=way_m[at],
+            ranges_m=np.array([ranges.ranges_m[row] for row in rows]),
+            sigmas_m=np.array([ranges.sigmas_m[row] for row in rows]),
+            radars=np.array([ranges.radars[row] for row in rows], dtype=np.intp),
+            newest=chain[-1],
+        )
+
     def problem(self, state: State, prior: Prior) -> Problem:
         """Return all that was measured of the landmarks the state has now.
 
@@ -207,6 +284,11 @@ class RunLog:
         of_point = self._rows_of(points.landmarks, rows)
         used, used_points = np.flatnonzero(of_range >= 0), np.flatnonzero(of_point >= 0)
         sigmas = np.square(self._wheels.calibration_sigmas)
+        sigmas_m = np.array(ranges.sigmas_m)[used]
+        if state.radius_doubts_m:
+            sigmas_m = np.hypot(sigmas_m, state.feature_doubts_m[of_range[used]])
+        # What lies on a round target's surface is nearer than its axis, which is the landmark.
+        ranges_m = np.array(ranges.ranges_m)[used] + state.feature_radii_m[of_range[used]]
         return Problem(
             increments=np.array(self._increments).reshape(-1, 3),
             covariances=np.array(self._covariances).reshape(-1, 3, 3),
@@ -216,8 +298,8 @@ class RunLog:
             range_radars=np.array(ranges.radars, dtype=np.intp)[used],
             range_landmarks=of_range[used],
             range_antennas=np.array(ranges.antennas).reshape(-1, 2)[used],
-            ranges_m=np.array(ranges.ranges_m)[used],
-            range_sigmas_m=np.array(ranges.sigmas_m)[used],
+            ranges_m=ranges_m,
+            range_sigmas_m=sigmas_m,
             point_poses=np.array(points.poses, dtype=np.intp)[used_points] - self._first,
             point_landmarks=of_point[used_points],
             points=np.array(points.points).reshape(-1, 2)[used_points],

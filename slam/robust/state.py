@@ -80,6 +80,9 @@ class State:
         shape (w, 2): phi [rad], not wrapped, and d [m], map frame.
     wall_ids
         w ids in row order, of the same numbers as the landmarks'.
+    radii_m, radius_doubts_m
+        Radius of each landmark known to be round, by id, whose axis is the landmark; and what not
+        knowing it better adds to its ranges.
     P
         Covariance of the errors, size 6 + r + 2 (n + w).
     """
@@ -93,6 +96,8 @@ class State:
         "next_id",
         "offsets_m",
         "position_m",
+        "radii_m",
+        "radius_doubts_m",
         "wall_ids",
         "walls",
     )
@@ -108,6 +113,8 @@ class State:
         self.landmark_ids: list[int] = []
         self.walls: Array = np.zeros((0, 2))
         self.wall_ids: list[int] = []
+        self.radii_m: dict[int, float] = {}
+        self.radius_doubts_m: dict[int, float] = {}
         self.next_id = 0
         sigmas = [0.0, 0.0, 0.0, *calibration_sigmas, *offset_sigmas_m]
         self.P = SymmetricMatrix(np.diag(np.square(sigmas)))
@@ -131,6 +138,16 @@ class State:
     def features(self) -> Array:
         """Return landmarks and walls in the order of their columns, shape (n + w, 2)."""
         return np.vstack([self.landmarks_m, self.walls])
+
+    @property
+    def feature_radii_m(self) -> Array:
+        """Return the radii of landmarks and walls in the order of their columns, (n + w,)."""
+        return np.array([self.radii_m.get(id_, 0.0) for id_ in self.feature_ids])
+
+    @property
+    def feature_doubts_m(self) -> Array:
+        """Return what doubt about radii adds to the ranges of landmarks and walls, (n + w,)."""
+        return np.array([self.radius_doubts_m.get(id_, 0.0) for id_ in self.feature_ids])
 
     def landmark_columns(self, rows: NDArray[np.intp]) -> Indices:
         """Return where landmarks lie in the error, shape (2 k,); walls are the rows from n on."""
@@ -214,6 +231,8 @@ class State:
         first = self.offsets.stop + 2 * row
         self.P.keep(np.delete(np.arange(self.P.size), [first, first + 1]))
         n = len(self.landmark_ids)
+        self.radii_m.pop(self.feature_ids[row], None)
+        self.radius_doubts_m.pop(self.feature_ids[row], None)
         if row < n:
             self.landmarks_m = np.delete(self.landmarks_m, row, axis=0)
             del self.landmark_ids[row]

@@ -89,6 +89,10 @@ class _Hypothesis:
     def score(self) -> float:
         return sum(self.votes.values())
 
+    def score_without_one(self) -> float:
+        """Return the score without the landmark that says most against the pose."""
+        return self.score() - max(self.votes.values(), default=0.0)
+
 
 class Surprise:
     """The running evidence that the robot is not where the map has it.
@@ -120,8 +124,13 @@ class Surprise:
 
     @property
     def is_suspicious(self) -> bool:
-        """Tell whether anything speaks against the pose."""
-        return self.score > self._rule.suspicious
+        """Tell whether more than one landmark speaks against the pose.
+
+        One alone may hide behind a box or be of another shape than a point: were that enough, it
+        could neither be deleted nor solved for again, and would speak on.
+        """
+        scores = (one.score_without_one() for one in self._hypotheses)
+        return max(scores, default=0.0) > self._rule.suspicious
 
     @property
     def is_carried(self) -> bool:

@@ -74,8 +74,13 @@ class Tracklet:
 
     def body_point(self) -> BodyPoint:
         """Return it as a point seen from the body of now."""
+        antennas = [(member.slot.x_m, member.slot.y_m) for member in self.members]
+        away = self.point_m - np.mean(antennas, axis=0)
         return BodyPoint(
-            point_m=self.point_m, covariance=self.covariance, by_offsets=self.by_offsets
+            point_m=self.point_m,
+            covariance=self.covariance,
+            by_offsets=self.by_offsets,
+            outward=away / max(math.hypot(away[0], away[1]), 1e-6),
         )
 
     @property

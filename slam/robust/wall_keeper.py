@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slam.robust.continuation import Continuation
 from slam.robust.leftovers import Leftovers
 from slam.robust.parameters import BackEndParameters, WallRule
 from slam.robust.ranges import Antennas, View
 from slam.robust.reports import MapWall
-from slam.robust.state import HEADING, State
-from slam.robust.symmetric import Array
+from slam.robust.state import HEADING, State, rotation
 from slam.robust.tracklets import Tracklet
 from slam.robust.wall_tracklets import (
     WallTracker,
@@ -27,7 +24,7 @@ from slam.robust.walls import (
     along_wall,
     foot_points,
     give_birth_to_wall,
-    hide_unreached,
+    hide_unknown,
     is_unresolved,
     match_wall,
     update_with_wall,
@@ -48,42 +45,51 @@ class WallKeeper:
     ----------
     cells
         Which parts of them have answered.
-    feet_m
-        shape (r, w, 2), map frame: where each radar's echo of each wall comes from now.
-    certain
-        shape (n + w,): what should be seen now if it is in view; walls only where they answered
-        before.
     """
 
     def __init__(self, state: State, parameters: BackEndParameters) -> None:
         self._state, self._parameters = state, parameters
         self._rule = parameters.walls or WallRule()
         self.cells = WallCells(self._rule.cell_m)
-        self.feet_m: Array = np.zeros((len(state.offsets_m), 0, 2))
-        self.certain: NDArray[np.bool_] = np.zeros(0, dtype=bool)
 
     def look(self, seen: View, antennas: Antennas) -> View:
-        """Return a view without the walls that end before they come into it."""
+        """Return a view without the walls that are not known where they would answer."""
         state = self._state
         feet = [foot_points(state, row, antennas) for row in range(len(state.wall_ids))]
-        self.feet_m = np.array(feet).reshape(-1, len(antennas.yaw_rad), 2).transpose(1, 0, 2)
-        seen, self.certain = hide_unreached(
-            state, seen, self.feet_m, self.cells, self._rule.reach_m
-        )
-        return seen
-
-    def note(self, found: Sequence[Continuation]) -> None:
-        """Note which parts of which walls answered."""
-        state, n = self._state, len(self._state.landmark_ids)
-        for continuation in found:
-            row = continuation.row - n
-            if row >= 0:
-                foot = self.feet_m[continuation.radar, row]
-                self.cells.add(state.wall_ids[row], along_wall(state, row, foot[None, :]))
+        by_radar = np.array(feet).reshape(-1, len(antennas.yaw_rad), 2).transpose(1, 0, 2)
+        return hide_unknown(state, seen, by_radar, self.cells)
 
     def is_point(self, tracklet: Tracklet) -> bool:
-        """Tell whether the ranges of a tracklet follow a point's law rather than a wall's."""
-        return self._parameters.walls is None or self._tracker().is_point(tracklet)
+        """Tell whether the ranges of a tracklet follow a point's law rather than a wall's.
+
+        What goes on where a mapped wall does is not known to be a point yet: over a few frames
+        both laws fit.
+        """
+        if self._parameters.walls is None:
+            return True
+        tracker = self._tracker()
+        return tracker.is_point(tracklet) and not self._is_on_a_wall(tracklet, tracker)
+
+    def _is_on_a_wall(self, tracklet: Tracklet, tracker: WallTracker) -> bool:
+        """Tell whether a mapped wall nearby explains the ranges of a tracklet, too."""
+        state, rule = self._state, self._rule
+        if not state.wall_ids:
+            return False
+        sightings = tracker.sightings(tracklet.members)
+        for row, wall_id in enumerate(state.wall_ids):
+            phi, d = (float(value) for value in state.walls[row])
+            n = np.array([np.cos(phi - state.heading_rad), np.sin(phi - state.heading_rad)])
+            depth = d - float(state.position_m @ np.array([np.cos(phi), np.sin(phi)]))
+            ranges = depth - sightings.antennas_m @ n
+            away = sightings.ranges_m - ranges
+            if np.abs(away).max() > rule.resolution_m:
+                continue
+            feet = sightings.antennas_m + ranges[:, None] * n
+            places = state.position_m + feet @ rotation(state.heading_rad).T
+            along = along_wall(state, row, places).tolist()
+            if min(self.cells.distance_m(wall_id, place) for place in along) <= rule.reach_m:
+                return True
+        return False
 
     def _tracker(self) -> WallTracker:
         state = self._state

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slam.robust.classification import Law, Sightings, compare
+from slam.robust.classification import Law, Sightings, compare, fit_wall
 from slam.robust.leftovers import Slot
 from slam.robust.parameters import BackEndParameters, RangeNoise, WallRule
 from slam.robust.symmetric import Array
@@ -108,7 +108,8 @@ class WallTracker:
     def follow(self, guess: Array, frames: Sequence[Sequence[Slot]]) -> WallTracklet:
         """Return what the last frames hold of a guess; twice, from the result of the first."""
         first = self._walk(float(guess[0]), float(guess[1]), frames)
-        return self._walk(float(first.wall[0]), float(first.wall[1]), frames)
+        second = self._walk(float(first.wall[0]), float(first.wall[1]), frames)
+        return second if self._offset_covariance is None else self._with_free_offsets(second)
 
     def _walk(self, phi: float, d: float, frames: Sequence[Sequence[Slot]]) -> WallTracklet:
         """Filter the line backwards; plain floats, the loop is short and runs often."""
@@ -161,6 +162,30 @@ class WallTracker:
             chi_square=chi_square,
             dof=len(members) - 2,
             share=hit / max(in_view, 1),
+        )
+
+    def _with_free_offsets(self, walked: WallTracklet) -> WallTracklet:
+        """Judge the members by a wall *and* the radars' common offsets, which are uncertain.
+
+        While walking, the doubt about an offset is noise of each range, and a wall would be
+        allowed to miss every range by it. It is one number: a wall may miss them all alike.
+        """
+        if walked.dof < 1:
+            return walked
+        sightings, rule = self.sightings(walked.members), self._rule
+        fit = fit_wall(sightings, walked.wall)
+        information = (fit.by_law.T / sightings.variances) @ fit.by_law
+        prior = np.diag([_PRIOR_RAD**-2, rule.prior_sigma_m**-2])
+        covariance: Array = np.asarray(np.linalg.inv(information + prior), dtype=np.float64)
+        by_offsets = np.zeros((2, len(self._offsets)))
+        by_offsets[:, fit.radars] = -covariance @ (fit.by_law.T / sightings.variances) @ fit.extra
+        covariance[0, 0] += self._turned(walked.members)
+        return replace(
+            walked,
+            wall=fit.unknown - by_offsets[:, fit.radars] @ fit.offsets_m,
+            covariance=covariance,
+            by_offsets=by_offsets,
+            chi_square=fit.chi_square,
         )
 
     def _turned(self, members: Sequence[Member]) -> float:

@@ -17,7 +17,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.geometry import wrap_angle
 from slam.robust.births import FeatureRows
@@ -195,28 +194,18 @@ def foot_points(state: State, wall_row: int, antennas: Antennas) -> Array:
     return np.asarray(places + np.outer(d - places @ n, n))
 
 
-def hide_unreached(
-    state: State, seen: View, feet_m: Array, cells: WallCells, reach_m: float
-) -> tuple[View, NDArray[np.bool_]]:
-    """Turn walls out of view where they are not known to be.
+def hide_unknown(state: State, seen: View, feet_m: Array, cells: WallCells) -> View:
+    """Turn walls out of view where no wall tracklet has shown them.
+
+    The end of a wall answers, too, from farther on: its edge's range leaves the wall's by
+    x^2 / 2 r only, within the gates of single ranges for long, and would turn wall and pose.
 
     ``feet_m`` has shape (r, w, 2): where echoes come from.
-
-    Returns
-    -------
-    seen
-        The view, walls farther than ``reach_m`` from any cell that answered behind the back.
-    certain
-        shape (n + w,): which should be seen if they are in view: landmarks, and walls whose
-        cells of all antennas answered before.
     """
     n = len(state.landmark_ids)
-    certain = np.ones(n + len(state.wall_ids), dtype=bool)
     off = seen.off_boresight_rad.copy()
     for row, wall_id in enumerate(state.wall_ids):
-        along = along_wall(state, row, feet_m[:, row]).tolist()
-        certain[n + row] = all(cells.surrounds(wall_id, place) for place in along)
-        for radar, place in enumerate(along):
-            if cells.distance_m(wall_id, place) > reach_m:
+        for radar, place in enumerate(along_wall(state, row, feet_m[:, row]).tolist()):
+            if not cells.surrounds(wall_id, place):
                 off[radar, n + row] = math.pi
-    return replace(seen, off_boresight_rad=off), certain
+    return replace(seen, off_boresight_rad=off)

@@ -37,12 +37,16 @@ class Whereabouts:
         self.parameters = parameters
         self._surprise = Surprise(parameters.surprise)
         self._first_pose = 0
+        self._is_lost = False
         self.elsewhere: frozenset[int] = frozenset()
 
     @property
     def is_lost(self) -> bool:
-        """Tell whether the place of the robot on the map is unknown."""
-        return bool(self.elsewhere)
+        """Tell whether the place of the robot on the map is unknown.
+
+        It stays so where nothing of the map is left: then there is no way back.
+        """
+        return self._is_lost
 
     @property
     def is_suspicious(self) -> bool:
@@ -77,7 +81,7 @@ class Whereabouts:
         """
         first = self._surprise.first_pose
         log.forget_from(first)
-        known = self.elsewhere or self._surprise.witnesses
+        known = self.elsewhere if self._is_lost else self._surprise.witnesses
         for id_ in state.feature_ids:
             if id_ not in known:
                 forget(id_, state, existence, log)
@@ -87,6 +91,7 @@ class Whereabouts:
         set_down(state, pose)
         log.carried(pose)
         self.elsewhere = frozenset(state.feature_ids)
+        self._is_lost = True
         self._first_pose = log.n_poses - 1
         self._surprise.reset()
 
@@ -107,6 +112,7 @@ class Whereabouts:
             existence.merge(kept, gone)
             log.rename(gone, kept)
         self.elsewhere = frozenset()
+        self._is_lost = False
         self._surprise.reset()
         return tuple(ids)
 

@@ -19,6 +19,7 @@ from slam.geometry import between, compose, paper_rig, transform
 from slam.metrics import nees_pose
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.births import BodyPoint, give_birth
+from slam.robust.existence import Existence
 from slam.robust.motion import calibrated_motion, predict
 from slam.robust.parameters import (
     BackEndParameters,
@@ -28,9 +29,11 @@ from slam.robust.parameters import (
     WheelNoise,
 )
 from slam.robust.relocation import apply_join, find_join, set_down
+from slam.robust.run_log import RunLog
 from slam.robust.state import State
 from slam.robust.surprise import Surprise, Trial
 from slam.robust.symmetric import Array
+from slam.robust.whereabouts import Whereabouts
 
 SIGMA_M = 7.4e-3
 PLACES = np.array(
@@ -126,6 +129,28 @@ def test_several_must_be_missing_and_nothing_speak_for_the_map() -> None:
     assert looked(500, (1, 2, 3), ()).is_carried
     assert not looked(500, (1, 2, 3), (4, 5)).is_carried
     assert not looked(500, (1, 2, 3), (4, 5, 6, 7, 8)).is_suspicious
+
+
+def test_a_robot_carried_away_from_a_map_of_which_nothing_is_left_stays_lost() -> None:
+    """Else its pose, free of doubt on an island of its own, would pass for one on the map."""
+    where, log = Whereabouts(BackEndParameters()), RunLog(WheelNoise())
+    state, existence = mapped(PLACES[:2]), Existence(MapRule())
+    log.add_motion(np.array([0.1, 0.0, 0.0]), 1e-6 * np.eye(3), 0.0, np.zeros(3))
+    where.look([Trial(7, MISSED)], state, log)
+    while state.landmark_ids:
+        state.remove(0)
+    where.set_down(state, existence, log)
+    assert np.abs(state.pose_covariance()).max() == 0.0
+    assert where.is_lost
+    assert where.lost_covariance[0, 0] >= 1.0
+    see(state, PLACES[:3])
+    where.look([Trial(id_, MISSED) for id_ in state.landmark_ids], state, log)
+    for id_ in state.landmark_ids:
+        existence.hit(id_, 20)
+    assert where.find(state, existence, log) == ()
+    where.set_down(state, existence, log)
+    assert where.is_lost
+    assert where.elsewhere == frozenset()
 
 
 def test_what_was_mapped_after_the_robot_was_carried_is_no_witness() -> None:
