@@ -23,6 +23,12 @@ SILENCE_S = 10.0
 """A source without a new pose for so long is dead; that of wheels that stand still talks on."""
 MOST_SPEED_MPS = 10.0
 """Faster robots do not carry these radars; a pose that far off was set by hand or reset."""
+AHEAD_NS = 60 * NS_PER_S
+"""A file may begin so much later than a run, and a clock be so far off."""
+MOST_STAMP_NS = (2**31 - 1_000_000) * NS_PER_S
+"""The seconds of a ROS message end at 2**31; days before, for a drive that begins there goes on."""
+MOST_M = 1e8
+"""Farther than once around the Earth, as positions on a map may be; the filter squares them."""
 _COMPLAINTS = 5
 
 
@@ -123,6 +129,8 @@ class LiveOdometry:
             sample = parse_tum_line(line)
         except TumError as error:
             return None, self._refuse(str(error))
+        if trouble := _cannot_be(sample):
+            return None, self._refuse(trouble)
         if self._track is not None and sample.t_ns <= self._track.last_ns:
             back_s = (self._track.last_ns - sample.t_ns) / NS_PER_S
             return None, self._refuse(
@@ -172,6 +180,9 @@ class LiveOdometry:
 
     def end(self, trouble: str) -> None:
         """Take note that no more lines will come."""
+        if not trouble and self._track is None:
+            trouble = f"odometry from {self._name}: ended before its first pose"
+            trouble += f": {self._trouble}" if self._trouble else ""
         self.ended, self.trouble = True, trouble
 
     def dead(self, now_ns: int, since_ns: int) -> str:
@@ -194,6 +205,17 @@ class LiveOdometry:
         said = "no line" if self._heard_ns is None else "no more line"
         return f"odometry from {self._name}: {said} for {SILENCE_S:g} s; is its sender running?"
 
+    def is_elsewhere(self, now_ns: int) -> str:
+        """Return why its stamps cannot be of the clock that it was said to have, "" if they can."""
+        t_ns = self.session_ns(now_ns)
+        if self._fixed is None or self.first_ns - AHEAD_NS <= t_ns <= self.last_ns + AHEAD_NS:
+            return ""
+        return (
+            f"odometry from {self._name}: its newest pose is of {self.last_ns / NS_PER_S:.3f} s, "
+            f"and by --odometry-clock it is {t_ns / NS_PER_S:.3f} s now: its stamps are of another "
+            "clock; if you do not know which, leave the option out"
+        )
+
     def covers(self, t_ns: int) -> bool:
         """Return whether a pose at or after this time is known."""
         return self._track is not None and t_ns <= self._track.last_ns
@@ -210,3 +232,15 @@ class LiveOdometry:
         if self._track is None:
             raise OdometryError(f"odometry from {self._name}: no pose came")
         return self._track
+
+
+def _cannot_be(sample: TumSample) -> str:
+    """Return why a session cannot hold a pose, or the filter not take it; "" if both can."""
+    if not 0 <= sample.t_ns < MOST_STAMP_NS:
+        return (
+            f"stamp {sample.t_ns / NS_PER_S:.3f} s is none of 0 to {MOST_STAMP_NS // NS_PER_S} s, "
+            "which a session can hold"
+        )
+    if max(abs(sample.x_m), abs(sample.y_m)) > MOST_M:
+        return f"position ({sample.x_m:g}, {sample.y_m:g}) m is nowhere on Earth"
+    return ""

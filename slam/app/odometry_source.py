@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import select
 import socket
 import stat
@@ -92,14 +93,15 @@ def parse_source(text: str) -> LineSource:
 
 def _tcp_source(text: str, rest: str) -> LineSource:
     host, _, port = rest.removeprefix("//").rpartition(":")
-    if not rest.startswith("//") or not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
+    number = int(port) if re.fullmatch(r"[0-9]{1,5}", port) else 0
+    if not rest.startswith("//") or not host or not 0 < number < 1 << 16:
         raise UsageError(f"odometry {text}: must be tcp://HOST:PORT")
-    return LineSource(kind=SourceKind.TCP, place=host.strip("[]"), number=int(port))
+    return LineSource(kind=SourceKind.TCP, place=host.strip("[]"), number=number)
 
 
 def _serial_source(text: str, rest: str) -> LineSource:
     path, at, baud = rest.partition("@")
-    if not path or (at and not (baud.isdecimal() and int(baud) > 0)):
+    if not path or (at and not re.fullmatch(r"[1-9][0-9]{0,7}", baud)):
         raise UsageError(f"odometry {text}: must be serial:PORT or serial:PORT@BAUD")
     return LineSource(kind=SourceKind.SERIAL, place=path, number=int(baud or BAUD))
 
@@ -250,6 +252,8 @@ def _open(source: LineSource) -> _Bytes:
             case SourceKind.TCP:
                 line = socket.create_connection((source.place, source.number), _CONNECT_S)
                 return _connected(line, lambda: None)
+    except UnicodeError:  # as the codec of host names has it
+        raise OdometryError(f"odometry from {source.name}: is no name of a host") from None
     except (OSError, XeThruError) as error:
         reason = getattr(error, "strerror", None) or error
         raise OdometryError(f"odometry from {source.name}: {reason}") from None

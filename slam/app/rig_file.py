@@ -21,6 +21,7 @@ from slam.app.errors import AppError, naming
 from slam.geometry import Mount, Rig
 from slam.robust.parameters import WheelNoise
 
+_MOST_BYTES = 1 << 20
 _Sigma = Annotated[StrictFloat | StrictInt, Field(ge=0, le=10, allow_inf_nan=False)]
 _Number = Annotated[StrictFloat | StrictInt, Field(ge=-1000, le=1000, allow_inf_nan=False)]
 
@@ -106,11 +107,17 @@ def load_rig(path: Path) -> RigFile:
         One line with file, key and what is allowed.
     """
     try:
-        table = tomllib.loads(path.read_bytes().decode())
+        with path.open("rb") as stream:
+            content = stream.read(_MOST_BYTES + 1)
+        if len(content) > _MOST_BYTES:
+            raise AppError(f"{path}: longer than {_MOST_BYTES >> 20} MiB, so it is no rig file")
+        table = tomllib.loads(content.decode())
     except OSError as error:
         raise AppError(f"{path}: cannot read the rig file: {error.strerror or error}") from None
     except ValueError as error:  # neither UTF-8 nor TOML
         raise AppError(f"{path}: not valid TOML: {error}") from None
+    except RecursionError:
+        raise AppError(f"{path}: no rig file: brackets within brackets without end") from None
     try:
         rig = RigFile.model_validate(table)
     except ValidationError as error:

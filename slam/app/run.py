@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import time
 from collections.abc import Callable
@@ -183,7 +184,7 @@ def parse_clock(text: str, source: LineSource) -> FixedClock | None:
         return FixedClock(time.monotonic_ns() - time.time_ns())
     if text == "monotonic":
         return FixedClock(0)
-    if text.isascii() and text.isdigit():
+    if re.fullmatch(r"[0-9]{1,18}", text):  # of 63 bits
         return FixedClock(int(text))
     raise UsageError(
         f"--odometry-clock {text}: must be arrival, unix, monotonic, or the monotonic "

@@ -186,7 +186,7 @@ class LiveSource:
             if silent and waited_s > START_LIMIT_S:
                 raise AppError(f"radar {', '.join(silent)}: no frame in {START_LIMIT_S:g} s")
             if self._odometry.ended and not self._odometry.has_pose:
-                raise AppError(self._odometry.trouble or "odometry: ended before its first pose")
+                raise AppError(self._odometry.trouble)
             if text := self._odometry.dead(now_ns, self._began_ns):
                 raise AppError(text)
             if silent or not self._odometry.has_pose:
@@ -201,6 +201,10 @@ class LiveSource:
                     f"by its clock it is {start_ns / NS_PER_S:.3f} s: it ended before the run "
                     "could begin, or --odometry-clock is another"
                 )
+            if text := self._odometry.is_elsewhere(now_ns):
+                raise AppError(text)
+            if self._odometry.session_ns(now_ns) < NS_PER_S:
+                continue  # no session holds what was before 0
             self._assembler.begin(start_ns)
             return start_ns
 

@@ -113,7 +113,7 @@ class TickAssembler:
                 return None
             if received:
                 break
-            self._tick += 1
+            self._tick = max(self._tick + 1, self._next_with_something(now_ns))
         for row in received:
             self._waiting[row.frame.radar].popleft()
         self._note_lag(now_ns - end_ns)
@@ -122,6 +122,15 @@ class TickAssembler:
         scan = self._scan(received, begin_ns, used=used)
         self._tick += 1
         return scan
+
+    def _next_with_something(self, now_ns: int) -> int:
+        """Return the tick of the oldest frame, or the first one that may still get some.
+
+        Those before it are empty; there are billions where odometry's clock was set from 1970.
+        """
+        assert self.start_ns is not None
+        heads_ns = [queue[0].frame.t_ns for queue in self._waiting if queue]
+        return (min([now_ns - GRACE_NS, *heads_ns]) - self.start_ns) // self._period_ns
 
     def _may_get_more(
         self, received: Sequence[ReceivedFrame], needed_ns: int, end_ns: int, now_ns: int

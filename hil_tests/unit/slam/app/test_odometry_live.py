@@ -105,3 +105,39 @@ def test_a_clock_that_is_known_needs_no_arrivals() -> None:
     odometry.take(line(1.0), 0)
     assert odometry.drift_ppm is None
     assert odometry.session_ns(7 * NS_PER_S) == 2 * NS_PER_S
+
+
+@pytest.mark.parametrize("stamp_s", [-0.001, -3e9, 2.0**31, 9e9])
+def test_stamps_that_no_session_can_hold_are_refused(stamp_s: float) -> None:
+    odometry, said = fed(line(5.0), line(stamp_s), line(5.1))
+    assert "s, which a session can hold; such lines are passed over" in said[1]
+    assert odometry.last_ns == 5_100_000_000
+
+
+@pytest.mark.parametrize("x_m", [1e9, -1e308])
+def test_positions_that_overflow_the_filter_are_refused(x_m: float) -> None:
+    odometry, said = fed(line(5.0), line(5.1, x_m))
+    assert said[1].endswith("m is nowhere on Earth; such lines are passed over")
+    assert odometry.n_refused == 1
+
+
+def test_a_source_that_ends_without_a_pose_says_what_was_wrong_with_its_lines() -> None:
+    odometry, _ = fed("-1 0 0 0 0 0 0 1")
+    odometry.end("")
+    assert odometry.trouble.startswith(
+        "odometry from a test: ended before its first pose: stamp -1.000 s is none of 0 to"
+    )
+
+
+@pytest.mark.parametrize(
+    ("origin_s", "now_s", "fits"),
+    [(0, 103, True), (0, 5000, False), (5000, 103, False), (-1_700_000_000, 103, False)],
+)
+def test_stamps_of_another_clock_than_the_one_named_are_told(
+    origin_s: int, now_s: int, fits: bool
+) -> None:
+    odometry = LiveOdometry("a test", FixedClock(origin_s * NS_PER_S))
+    odometry.take(line(100.0), 0)
+    said = odometry.is_elsewhere(now_s * NS_PER_S)
+    assert (said == "") is fits
+    assert fits or "its stamps are of another clock" in said

@@ -147,3 +147,18 @@ def test_a_source_that_is_not_there_is_named(tmp_path: Path) -> None:
         port = listener.getsockname()[1]
     with pytest.raises(OdometryError, match=f"TCP socket 127.0.0.1:{port}: Connection refused"):
         lines_of(parse_source(f"tcp://127.0.0.1:{port}"))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [f"tcp://h:{'9' * 5000}", "tcp://h:²", f"serial:p@{'9' * 5000}", "serial:p@²", "serial:p@0"],
+)
+def test_numbers_that_are_none_are_wrong_usage(text: str) -> None:
+    with pytest.raises(UsageError, match="must be"):
+        parse_source(text)
+
+
+@pytest.mark.parametrize("host", ["a..б", "a" * 300 + "б", "a\udcffb"])
+def test_what_is_no_name_of_a_host_is_one_line(host: str) -> None:
+    with pytest.raises(OdometryError, match="is no name of a host"):
+        lines_of(parse_source(f"tcp://{host}:1"))

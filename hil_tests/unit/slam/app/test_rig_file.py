@@ -95,3 +95,11 @@ def test_a_missing_file_and_a_folder_that_does_not_exist_are_named(tmp_path: Pat
     radar = RigRadar(name="a", serial="202305070101", x_m=0.0, y_m=0.0, yaw_deg=0.0)
     with pytest.raises(AppError, match="cannot be written"):
         write_rig(tmp_path / "no" / "rig.toml", RigFile(radars=(radar,)))
+
+
+def test_what_is_endless_is_no_rig_file(tmp_path: Path) -> None:
+    (deep := tmp_path / "deep.toml").write_text("a=" + "[" * 5000)
+    with pytest.raises(AppError, match="brackets within brackets"):
+        load_rig(deep)
+    with pytest.raises(AppError, match="longer than 1 MiB"):
+        load_rig(Path("/dev/zero"))

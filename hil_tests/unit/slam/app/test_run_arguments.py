@@ -11,6 +11,9 @@ import pytest
 
 from slam.app import ros_messages as ros
 from slam.app.cli import main
+from slam.app.errors import UsageError
+from slam.app.odometry_source import parse_source
+from slam.app.run import parse_clock
 from slam.app.run_arguments import CSV_TO_TUM
 from slam.app.tum import TumSample, parse_tum_line
 
@@ -50,3 +53,9 @@ def test_the_help_shows_that_very_recipe(capsys: pytest.CaptureFixture[str]) -> 
     said = capsys.readouterr().out
     assert f"sed -uE '{CSV_TO_TUM}'" in said
     assert "--odometry-clock unix" in said
+
+
+@pytest.mark.parametrize("text", ["9" * 5000, "9" * 19, "²", "-5", ""])
+def test_a_clock_that_is_none_is_wrong_usage(text: str) -> None:
+    with pytest.raises(UsageError, match="must be arrival, unix, monotonic"):
+        parse_clock(text, parse_source("-"))

@@ -169,3 +169,17 @@ def test_it_ends_where_odometry_ended() -> None:
         assembler.take(frame(0, START_NS + number * PERIOD_NS + 1))
     assert len(scans_until(assembler, START_NS + 3 * NS_PER_S)) == 6  # the last one unused
     assert assembler.ended
+
+
+def test_a_clock_set_from_1970_costs_no_time() -> None:
+    """Five billion ticks without a frame are passed over at once, and the next frame is found."""
+    odometry = odometry_until(4.0)
+    assembler = TickAssembler(1, PERIOD_NS, odometry)
+    assembler.begin(START_NS)
+    today_ns = 1_700_000_000 * NS_PER_S
+    odometry.take(f"{today_ns // NS_PER_S} 0 0 0 0 0 0 1", 0)
+    assert scans_until(assembler, today_ns) == []
+    assembler.take(frame(0, today_ns))
+    (scan,) = scans_until(assembler, today_ns + NS_PER_S)
+    assert 0 <= today_ns - scan.t_ns < PERIOD_NS
+    assert scan.frames[0].t_ns == today_ns
