@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -31,6 +32,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     open_closed_streams()
     try:
         return _run(_parser().parse_args(argv))
+    except KeyboardInterrupt:  # before a command took note of signals
+        return _end("stopped by SIGINT", 128 + signal.SIGINT)
     finally:
         drop_what_cannot_be_said()
 

@@ -11,6 +11,7 @@ from slam.app import rosbag_layout as layout
 from slam.app.errors import AppError, UsageError
 from slam.app.imported import SlamSettings
 from slam.app.mat_convert import MatOptions, convert_mat, write_detections
+from slam.app.replay import recorded_config
 from slam.app.rig_file import load_rig
 from slam.app.rosbag_read import BagOptions, convert_bag
 from slam.app.rosbag_write import write_bag
@@ -77,7 +78,7 @@ def _from_session(
     if options.out.suffix != MAT_SUFFIX:
         return write_bag(session, options.out, check)
     if options.preset is None and session.info.config_json:
-        config = SlamConfig.model_validate_json(session.info.config_json)
+        config = recorded_config(session)
     else:
         config = _config(options.preset or _PRESET)
     return write_detections(session, options.out, config, check)

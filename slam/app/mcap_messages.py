@@ -7,6 +7,7 @@ one line that says so.
 
 from __future__ import annotations
 
+import stat
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -59,6 +60,8 @@ def open_mcap(path: Path) -> Iterator[mcap.RecordReader]:
     """
     with ExitStack() as stack:
         try:
+            if stat.S_ISFIFO(path.stat().st_mode):  # opening one waits for who writes into it
+                raise DamagedFileError(f"{path}: is a pipe; give a file, the session.mcap of a run")
             stream = stack.enter_context(path.open("rb"))
             if stream.read(len(mcap.MAGIC)) != mcap.MAGIC:
                 raise DamagedFileError(f"{path}: is no MCAP file{describe_kind(path)}")

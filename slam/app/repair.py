@@ -155,7 +155,7 @@ def repair(path: Path, out: Path | None, check: Callable[[], None]) -> Repair:
 def _held(path: Path) -> Iterator[None]:
     """Refuse a file that a run is still writing: it holds its folder."""
     try:
-        with locked(path.resolve().parent):
+        with locked(Path(os.path.realpath(path)).parent):
             yield
     except PathInUseError:
         raise AppError(f"{path}: a run is still writing it; wait for its end") from None

@@ -97,6 +97,17 @@ def settings_of(session: RecordedSession) -> SlamConfig:
             f"{session.path}: recorded before sessions told SLAM's settings; "
             "its frames can be read, but not be replayed; record it again"
         )
+    return recorded_config(session)
+
+
+def recorded_config(session: RecordedSession) -> SlamConfig:
+    """Return the settings that a session tells.
+
+    Raises
+    ------
+    AppError
+        This version does not know them.
+    """
     try:
         return SlamConfig.model_validate_json(session.info.config_json)
     except ValidationError as error:

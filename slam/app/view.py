@@ -14,6 +14,7 @@ from pathlib import Path
 
 from slam.app.errors import AppError, UsageError, naming
 from slam.app.live_view import LiveView
+from slam.app.mcap_records import MAGIC
 from slam.app.progress import Progress
 from slam.app.replay import LostFrames, replay_session, settings_of
 from slam.app.rrd_file import is_finished, require_readable
@@ -94,15 +95,21 @@ def session_file(given: Path, *, allow_view: bool = False) -> Path:
 
 
 def refuse_overwriting(recorded: Path, out: Path | None) -> None:
-    """See that a result does not take the place of what it is made of.
+    """See that a result does not take the place of what it is made of, or of another recording.
 
     Raises
     ------
     UsageError
         It would.
     """
-    if out is not None and out.exists() and out.samefile(recorded):
+    if out is None or not out.is_file():
+        return
+    if out.samefile(recorded):
         raise UsageError(f"{out}: is the session itself; write to another file")
+    with out.open("rb") as stream:
+        is_recording = stream.read(len(MAGIC)) == MAGIC
+    if is_recording:
+        raise UsageError(f"{out}: is a recording, which cannot be repeated; write to another file")
 
 
 def write_view(session: RecordedSession, path: Path, stop: StopFlag) -> None:

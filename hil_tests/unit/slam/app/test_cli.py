@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 from emulator.path_lock import locked
+from hil_tests.unit.slam.app.sessions import session_info
 from slam.app.cli import main
+from slam.app.session_log import SessionLog
 
 HEAVY = {
     "numpy",
@@ -151,3 +153,26 @@ def test_a_signal_after_a_commands_last_check_counts_too(
     monkeypatch.setattr("slam.app.cli._evaluate", lambda *_: os.kill(os.getpid(), which))
     assert main(["evaluate", "one.tum", "two.tum"]) == code
     assert capsys.readouterr().err == f"uwb-slam: stopped by {which.name}\n"
+
+
+def test_a_signal_before_a_command_takes_note_of_signals_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("slam.app.cli._parser", interrupted)
+    assert main(["run"]) == 130
+    assert capsys.readouterr().err == "uwb-slam: stopped by SIGINT\n"
+
+
+@pytest.mark.parametrize("command", ["view", "report"])
+def test_no_result_takes_the_place_of_another_recording(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = SessionLog(session := tmp_path / "session.mcap", session_info())
+    log.close()
+    (other := tmp_path / "other.mcap").write_bytes(session.read_bytes())
+    assert main([command, str(session), "--out", str(other)]) == 2
+    assert f"{other}: is a recording, which cannot be repeated" in capsys.readouterr().err
+    assert other.read_bytes() == session.read_bytes()

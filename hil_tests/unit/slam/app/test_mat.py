@@ -15,6 +15,7 @@ from scipy.io import loadmat, savemat
 
 from hil_tests.unit.slam.app.sessions import feed, scan, session_info
 from slam.app.cli import main
+from slam.app.errors import AppError
 from slam.app.mat_convert import MAT_RIG
 from slam.app.mat_file import MatDrive, read_mat, write_mat
 from slam.app.odometry import OdometryTrack
@@ -196,6 +197,29 @@ def test_a_session_as_such_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert not drive.frames[1][2].any()  # that frame was lost
     for row, counter in enumerate(collected):
         assert drive.frames[2][row].tolist() == scan(counter, 4).frames[1].samples.tolist()
+
+
+def test_settings_that_this_version_does_not_know_are_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    info = replace(four_radars(), config_json='{"unheard_of": 1}', versions={"xethru-hil": "9.9"})
+    session = tmp_path / "s.mcap"
+    track = OdometryTrack.from_lines([format_tum_line(scan(0).t_ns, np.zeros(3))])
+    log = SessionLog(session, info, track)
+    log.on_scan(scan(0, 4))
+    log.close()
+    code, said, err = run(capsys, session, tmp_path / "a.mat")
+    assert (code, said) == (1, "")
+    assert err.startswith(f"uwb-slam: {session}: its setting ")
+    assert err.endswith("it was recorded with xethru-hil 9.9\n")
+    assert err.count("\n") == 1
+
+
+def test_a_file_that_cannot_be_written_says_why(tmp_path: Path) -> None:
+    savemat(tmp_path / "a.mat", authors_table())
+    drive = read_mat(tmp_path / "a.mat")
+    with pytest.raises(AppError, match="cannot be written: No such file or directory"):
+        write_mat(tmp_path / "no folder" / "b.mat", drive)
 
 
 def test_two_radars_are_no_such_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

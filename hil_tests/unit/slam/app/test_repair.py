@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from pathlib import Path
 
@@ -135,3 +136,20 @@ def test_a_file_with_nothing_in_it_stays_as_it_is(
     assert code == 1
     assert "nothing in it can be kept" in err
     assert list(tmp_path.iterdir()) == [cut]
+
+
+def test_a_link_to_itself_and_a_pipe_are_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (loop := tmp_path / "loop.mcap").symlink_to("loop.mcap")
+    assert run(capsys, loop) == (
+        1,
+        "",
+        f"uwb-slam: {loop}: cannot read: Too many levels of symbolic links\n",
+    )
+    os.mkfifo(pipe := tmp_path / "pipe.mcap")
+    assert run(capsys, pipe) == (
+        1,
+        "",
+        f"uwb-slam: {pipe}: is a pipe; give a file, the session.mcap of a run\n",
+    )
