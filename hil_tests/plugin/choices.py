@@ -142,6 +142,8 @@ def choose(config: pytest.Config) -> Choices:
     cassette, report = config.getoption("hil_cassette"), config.getoption("hil_json")
     if cassette and not config.getoption("hil_diff"):
         raise pytest.UsageError("--hil-cassette needs --hil-diff")
+    if report:
+        _check_place(Path(config.invocation_params.dir, report))
     return Choices(
         specs=specs,
         chosen=bool(chosen),
@@ -162,11 +164,21 @@ def _modules_of(rig: Path) -> list[str]:
     """Return specs of the modules of a rig file; what else is wrong with it, `radar_rig` tells."""
     try:
         radars = tomllib.loads(rig.read_text("utf-8"))["radars"]
-        return [f"serial={radar['serial']}" for radar in radars]
+        modules = [f"serial={radar['serial']}" for radar in radars]
     except OSError as error:
         raise SpecError(f"--rig {rig}: {error.strerror}") from None
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise SpecError(f"--rig {rig}: no rig file with serial numbers: {error!r}") from None
+    if not modules:  # the emulator in their place would pass
+        raise SpecError(f"--rig {rig}: no rig file with serial numbers: it names no radar")
+    return modules
+
+
+def _check_place(report: Path) -> None:
+    """Refuse a place where no file can be, before tests run whose numbers would be lost."""
+    wrong = report if report.is_dir() else next((p for p in report.parents if p.is_file()), None)
+    if wrong is not None:
+        raise pytest.UsageError(f"--hil-json {report}: {wrong} is there already; name a new file")
 
 
 def _words(text: str) -> list[str]:

@@ -162,11 +162,19 @@ def pytest_terminal_summary(
     terminalreporter: pytest.TerminalReporter, config: pytest.Config
 ) -> None:
     """Print what ran where."""
-    config.stash[SUMMARY].write_terminal(terminalreporter)
+    summary = config.stash[SUMMARY]
+    summary.write_terminal(terminalreporter)
+    if summary.trouble:
+        terminalreporter.line(f"ERROR: {summary.trouble}", red=True)
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
     """Write the JSON report."""
     path = session.config.stash[CHOICES].json
     if path is not None and not hasattr(session.config, "workerinput"):
-        session.config.stash[SUMMARY].write_json(path)
+        summary = session.config.stash[SUMMARY]
+        try:
+            summary.write_json(path)
+        except OSError as error:
+            summary.trouble = f"--hil-json {path}: cannot be written: {error.strerror or error}"
+            session.exitstatus = session.exitstatus or pytest.ExitCode.TESTS_FAILED

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import hashlib
 import os
 import re
 import tempfile
@@ -12,6 +13,7 @@ from pathlib import Path
 __all__ = ["PortBusyError", "PortLock"]
 
 _ANYBODY = 0o666
+_LONGEST_NAME = 200  # file systems take 255
 
 
 class PortBusyError(Exception):
@@ -41,13 +43,20 @@ class PortLock:
         with contextlib.suppress(FileExistsError):
             folder.mkdir()
             folder.chmod(0o777)  # other users lock here, too
-        path = folder / (re.sub(r"[^0-9A-Za-z.]+", "_", device).strip("_") + ".lock")
+        name = re.sub(r"[^0-9A-Za-z.]+", "_", device).strip("_")
+        if len(name) > _LONGEST_NAME:
+            name = hashlib.blake2b(device.encode(errors="surrogateescape")).hexdigest()
+        path = folder / f"{name}.lock"
         self._descriptor = _open(path)
         try:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             owner = os.read(self._descriptor, 20).decode().strip() or "unknown"
             self.release()
+            if owner == str(os.getpid()):
+                raise PortBusyError(
+                    f"{target} is in this session twice, under two names; name each radar once"
+                ) from None
             raise PortBusyError(
                 f"{target} is being tested by another session (process {owner}); wait for it, or "
                 "end it"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import os
 import socket
 import time
 from abc import ABC, abstractmethod
@@ -246,7 +247,7 @@ class PortPlace(Place):
     @property
     def lock_target(self) -> str | None:
         """The port."""
-        return self._path
+        return os.path.realpath(self._path)
 
     def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
         """See `Place.open_line`."""

@@ -18,6 +18,7 @@ on a stage, for tests that ask for them with ``@pytest.mark.requires``.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -163,15 +164,15 @@ def _kind(body: str) -> tuple[Kind, str]:
         return Kind.SERIAL_NUMBER, number
     if body.startswith("tcp://"):
         host, _, port = body.removeprefix("tcp://").rpartition(":")
-        if not host or not port.isdigit() or not 0 < int(port) < 65536:
+        if not host or not re.fullmatch(r"[0-9]{1,5}", port) or not 0 < int(port) < 65536:
             raise SpecError(f"--radar {body}: must be tcp://HOST:PORT with a port of 1...65535")
         return Kind.TCP, body.removeprefix("tcp://")
     if scheme == "replay" and colon:
-        if not Path(rest).exists():
+        if not rest or not os.path.exists(rest):
             raise SpecError(f"--radar {body}: there is no recording {rest}")
         return Kind.REPLAY, rest
     if body.startswith(("/", "./", "../", "~")):
-        return Kind.PORT, str(Path(body).expanduser())
+        return Kind.PORT, str(Path(os.path.expanduser(body)))
     raise SpecError(
         f"--radar {body}: names no radar; allowed are emu[:SCENE], a port such as /dev/ttyACM0, "
         "serial=NUMBER, auto, tcp://HOST:PORT, replay:RECORDING"
@@ -204,7 +205,7 @@ def _check(text: str, kind: Kind, options: Mapping[str, str]) -> None:
             f"--radar {text}: firmware={firmware}: must be sensor, or xep without line="
         )
     seed = options.get("seed", "0")
-    if not seed.isdigit() or int(seed) >= 2**63:
+    if not re.fullmatch(r"[0-9]{1,19}", seed) or int(seed) >= 2**63:
         raise SpecError(f"--radar {text}: seed={seed}: must be a whole number of 0...2**63 - 1")
     try:
         fps = float(options.get("fps", DEFAULT_FPS))

@@ -15,9 +15,16 @@ _OUTCOMES = ("passed", "failed", "skipped")
 
 
 class Summary:
-    """Collects the reports of all tests that used radars, also those of workers."""
+    """Collects the reports of all tests that used radars, also those of workers.
+
+    Attributes
+    ----------
+    trouble
+        Why the JSON could not be written; "" where nothing is wrong.
+    """
 
     def __init__(self) -> None:
+        self.trouble = ""
         self._counts: dict[str, Counter[str]] = defaultdict(Counter)
         self._said: dict[str, str] = {}
         self._reasons: Counter[str] = Counter()

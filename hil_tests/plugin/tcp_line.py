@@ -34,9 +34,10 @@ class TcpTransport:
         host, _, port = self.name.removeprefix("tcp://").rpartition(":")
         try:
             self._socket = socket.create_connection((host.strip("[]"), int(port)), _CONNECT_S)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # the latter of what is no name of a host
+            reason = getattr(error, "strerror", None) or error
             raise PortUnavailable(
-                f"{self.name} cannot be reached: {error.strerror or error}; does the adapter, or "
+                f"{self.name} cannot be reached: {reason}; does the adapter, or "
                 "'xethru-emulator serve --tcp', run there?"
             ) from None
         self._socket.setblocking(False)

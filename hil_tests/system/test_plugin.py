@@ -244,3 +244,12 @@ def test_the_answers_of_a_module_become_a_cassette(tmp_path: Path, address: str)
     cassette = json.loads((tmp_path / "module.json").read_text())
     assert cassette["recorded"]["real_module"] is False
     assert len(cassette["exchanges"]) > 100
+
+
+def test_a_place_where_no_file_can_be_is_refused_before_tests_run(tmp_path: Path) -> None:
+    (tmp_path / "test_own.py").write_text(OWN_TEST)
+    for place in (".", "test_own.py/ran.json"):
+        done = run(tmp_path, "test_own.py", "--hil-json", place)
+        assert done.returncode == pytest.ExitCode.USAGE_ERROR
+        assert "is there already; name a new file" in done.stderr
+        assert "Traceback" not in done.stdout + done.stderr

@@ -15,6 +15,8 @@ from hil_tests.plugin.locks import PortBusyError, PortLock
 from hil_tests.plugin.measurements import Measure
 from hil_tests.plugin.rates import carried_rate_hz
 from hil_tests.plugin.tap import WireTap
+from hil_tests.plugin.tcp_line import TcpTransport
+from xethru_protocol.errors import PortUnavailable
 
 
 def test_a_lock_is_for_one_process(tmp_path: Path) -> None:
@@ -35,7 +37,7 @@ def test_a_lock_is_for_one_process(tmp_path: Path) -> None:
 
 def test_a_lock_is_not_given_twice(tmp_path: Path) -> None:
     lock = PortLock(str(tmp_path))
-    with pytest.raises(PortBusyError, match="wait for it"):
+    with pytest.raises(PortBusyError, match="in this session twice, under two names"):
         PortLock(str(tmp_path))
     lock.release()
     PortLock(str(tmp_path)).release()
@@ -81,3 +83,16 @@ def test_measurements_beyond_their_limits_fail(value: float) -> None:
 )
 def test_rates_that_lines_carry(bytes_per_s: float, rate_hz: float) -> None:
     assert carried_rate_hz(17.0, bytes_per_s) == rate_hz
+
+
+def test_a_lock_takes_names_of_any_length() -> None:
+    lock = PortLock("h" * 5000)
+    with pytest.raises(PortBusyError, match="twice"):
+        PortLock("h" * 5000)
+    lock.release()
+
+
+@pytest.mark.parametrize("host", ["a..б", "a" * 300])
+def test_what_is_no_name_of_a_host_cannot_be_reached(host: str) -> None:
+    with pytest.raises(PortUnavailable, match="cannot be reached"):
+        TcpTransport(f"tcp://{host}:5")

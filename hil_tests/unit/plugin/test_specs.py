@@ -84,3 +84,24 @@ def test_specs_that_name_nothing(text: str, remedy: str) -> None:
         one(text)
     assert remedy in str(refusal.value)
     assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"tcp://h:{'9' * 5000}",
+        "tcp://h:²",
+        "emu:?seed=²",
+        f"emu:?seed={'9' * 5000}",
+        f"replay:{'a' * 5000}",
+        "replay:",
+        "replay:a\0b",
+    ],
+)
+def test_nonsense_is_one_line(text: str) -> None:
+    with pytest.raises(SpecError, match="--radar"):
+        one(text)
+
+
+def test_a_user_whom_nobody_knows_has_no_port() -> None:
+    assert one("~nobody-of-this-name/port").target == "~nobody-of-this-name/port"
