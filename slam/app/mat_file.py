@@ -129,8 +129,9 @@ def write_mat(path: Path, drive: MatDrive) -> None:
         table["t"] = drive.stamps_s[:, np.newaxis]
     if drive.mounts is not None:
         table["mounts"] = drive.mounts / _POSE_UNITS
-    with naming(path), path.open("wb") as stream:  # savemat's own words would not say why
-        savemat(stream, table, appendmat=False, do_compression=True)
+    with naming(path):
+        path.open("wb").close()  # savemat's own words would not say why it cannot be
+        savemat(path, table, appendmat=False, do_compression=True)
 
 
 def _variable(
