@@ -60,6 +60,11 @@ def run_convert(options: ConvertOptions, check: Callable[[], None]) -> None:
             f"{options.out}: of a bag or MATLAB file a session is made; give a name that ends in "
             ".mcap"
         )
+    if options.source.suffix == SESSION_SUFFIX and _is_session(options.source):
+        raise UsageError(
+            f"{options.source}: is a session already; name an OUT that ends in .mat, .xtwire or "
+            ".bag, or a new folder for a bag of ROS 2"
+        )
     try:
         said, odd = _to_session(options, check)
     except BaseException:
@@ -68,6 +73,14 @@ def run_convert(options: ConvertOptions, check: Callable[[], None]) -> None:
     for line in odd:
         print(f"uwb-slam: {options.source}: {line}", file=sys.stderr)  # noqa: T201 - a warning
     _say(said)
+
+
+def _is_session(path: Path) -> bool:
+    try:
+        open_session(path)
+    except AppError:  # what else it is, or what is wrong with it, the reader of bags tells
+        return False
+    return True
 
 
 def _from_session(

@@ -215,6 +215,17 @@ def test_settings_that_this_version_does_not_know_are_one_line(
     assert err.count("\n") == 1
 
 
+def test_a_session_is_not_made_of_a_session(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = tmp_path / "s.mcap"
+    SessionLog(session, session_info()).close()
+    code, said, err = run(capsys, session, tmp_path / "a.mcap")
+    assert (code, said) == (2, "")
+    assert err.startswith(f"uwb-slam: {session}: is a session already; name an OUT that ends in")
+    assert not (tmp_path / "a.mcap").exists()
+
+
 def test_a_file_that_cannot_be_written_says_why(tmp_path: Path) -> None:
     savemat(tmp_path / "a.mat", authors_table())
     drive = read_mat(tmp_path / "a.mat")
