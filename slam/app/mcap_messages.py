@@ -50,8 +50,8 @@ Entry: TypeAlias = Metadata | RawMessage
 
 
 @contextmanager
-def open_mcap(path: Path) -> Iterator[mcap.RecordReader]:
-    """Open a file whose first bytes are those of MCAP.
+def open_mcap(path: Path, size: int | None = None) -> Iterator[mcap.RecordReader]:
+    """Open a file whose first bytes are those of MCAP; of one that grows read `size` bytes.
 
     Raises
     ------
@@ -65,17 +65,19 @@ def open_mcap(path: Path) -> Iterator[mcap.RecordReader]:
             stream = stack.enter_context(path.open("rb"))
             if stream.read(len(mcap.MAGIC)) != mcap.MAGIC:
                 raise DamagedFileError(f"{path}: is no MCAP file{describe_kind(path)}")
-            size = _size(stream)
+            whole = _size(stream)
         except IsADirectoryError:
             raise DamagedFileError(
                 f"{path}: is a directory{describe_kind(path)}; give the session.mcap in it"
             ) from None
         except OSError as error:
             raise _unreadable(path, error) from None
-        yield mcap.RecordReader(stream, size)
+        yield mcap.RecordReader(stream, whole if size is None else min(size, whole))
 
 
-def read_entries(path: Path, on_cut: Callable[[int], None]) -> Iterator[Entry]:
+def read_entries(
+    path: Path, on_cut: Callable[[int], None], size: int | None = None
+) -> Iterator[Entry]:
     """Yield metadata and messages in the order of the file, holding one chunk in memory.
 
     Parameters
@@ -84,6 +86,8 @@ def read_entries(path: Path, on_cut: Callable[[int], None]) -> Iterator[Entry]:
         The file.
     on_cut
         Called with the position in bytes where the file ends too early, before the end.
+    size
+        How many bytes of the file to read, so that one that grows reads the same again; None: all.
 
     Raises
     ------
@@ -92,7 +96,7 @@ def read_entries(path: Path, on_cut: Callable[[int], None]) -> Iterator[Entry]:
     """
     schemas: dict[int, str] = {}
     channels: dict[int, tuple[str, str]] = {}
-    with open_mcap(path) as reader:
+    with open_mcap(path, size) as reader:
         try:
             for found in reader.read():
                 if isinstance(found, mcap.Cut):

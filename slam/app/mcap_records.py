@@ -73,19 +73,23 @@ class RecordReader:
     stream
         The file; its first bytes are known to be `MAGIC`.
     size
-        Of the file in bytes.
+        Of the file in bytes; what a recorder adds meanwhile is not looked at.
     """
 
     def __init__(self, stream: BinaryIO, size: int) -> None:
         self._stream, self._size = stream, size
         self._is_data_over = False
 
+    def _read(self, n_bytes: int | None = None) -> bytes:
+        left = max(self._size - self._stream.tell(), 0)
+        return self._stream.read(left if n_bytes is None else min(n_bytes, left))
+
     def read(self) -> Iterator[Found]:
         """Yield the records, those in chunks one by one, to the footer or as far as it goes."""
         at: int | None = len(MAGIC)
         while at is not None:
             self._stream.seek(at)
-            head = self._stream.read(_HEAD.size)
+            head = self._read(_HEAD.size)
             if len(head) < _HEAD.size or (not any(head) and self._is_zero_from(at)):
                 yield Cut(at)
                 return
@@ -95,7 +99,7 @@ class RecordReader:
                 # A length that is damaged looks like a cut, but then a sound chunk follows.
                 at = yield from self._last_or_damaged(at, code, length)
                 continue
-            body = self._stream.read(length)
+            body = self._read(length)
             try:
                 if code == CHUNK:
                     yield from _records_in(at, _content(body))
@@ -142,7 +146,7 @@ class RecordReader:
         if following is None and self._is_record(code, length):
             if code == CHUNK:
                 self._stream.seek(at + _HEAD.size)
-                yield from _records_in(at, _content_before_cut(self._stream.read()))
+                yield from _records_in(at, _content_before_cut(self._read()))
             yield Cut(at)
             return None
         yield Damage(at, self._size if following is None else following, "no record stands there")
@@ -161,7 +165,7 @@ class RecordReader:
     def _is_head(self, at: int) -> bool:
         """Whether a record of a known kind may begin at a place, or the file ends there."""
         self._stream.seek(at)
-        head = self._stream.read(_HEAD.size)
+        head = self._read(_HEAD.size)
         if len(head) < _HEAD.size:
             return True
         code, length = _HEAD.unpack(head)
@@ -170,7 +174,7 @@ class RecordReader:
     def _is_zero_from(self, at: int) -> bool:
         """Whether nothing but zeros follows, as after a loss of power."""
         self._stream.seek(at)
-        while piece := self._stream.read(_PIECE_BYTES):
+        while piece := self._read(_PIECE_BYTES):
             if any(piece):
                 return False
         return True
@@ -181,7 +185,7 @@ class RecordReader:
         place = at + _NAME_AT  # of a name, at the earliest
         while place < self._size:
             self._stream.seek(place)
-            piece = self._stream.read(_PIECE_BYTES + overlap)
+            piece = self._read(_PIECE_BYTES + overlap)
             for found in _all_in(piece):
                 chunk_at = place + found - _NAME_AT
                 if self._is_sound(chunk_at):
@@ -191,11 +195,11 @@ class RecordReader:
 
     def _is_sound(self, at: int) -> bool:
         self._stream.seek(at)
-        code, length = _HEAD.unpack(self._stream.read(_HEAD.size))
+        code, length = _HEAD.unpack(self._read(_HEAD.size))
         if code != CHUNK or length > min(self._size - at - _HEAD.size, _MOST_BYTES):
             return False
         try:
-            _content(self._stream.read(length))
+            _content(self._read(length))
         except DAMAGES:
             return False
         return True

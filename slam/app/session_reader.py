@@ -78,8 +78,11 @@ class RecordedSession:
         Where the file ends too early, after `records` has come to its end; None where it is whole.
     """
 
-    def __init__(self, path: Path, info: SessionInfo, *, has_scan_marks: bool) -> None:
+    def __init__(
+        self, path: Path, info: SessionInfo, *, has_scan_marks: bool, size: int | None = None
+    ) -> None:
         self.path = path
+        self._size = size  # when it was opened: a run may be writing it still
         self.info = info
         self.has_scan_marks = has_scan_marks
         self.cut_at_byte: int | None = None
@@ -151,7 +154,7 @@ class RecordedSession:
         }
         of_scan: dict[int, tuple[Detection, ...]] = {}
         held: list[Detection] = []
-        for entry in read_entries(self.path, self._on_cut):
+        for entry in read_entries(self.path, self._on_cut, self._size):
             if not isinstance(entry, RawMessage):
                 continue
             if entry.topic in index_of:
@@ -173,7 +176,7 @@ class RecordedSession:
         for radar in self.info.radars:
             ways[f"/radar/{radar.name}/rx"] = (radar.name, "rx")
             ways[f"/radar/{radar.name}/tx"] = (radar.name, "tx")
-        for entry in read_entries(self.path, self._on_cut):
+        for entry in read_entries(self.path, self._on_cut, self._size):
             if isinstance(entry, RawMessage) and (found := ways.get(entry.topic)):
                 with self._naming(entry):
                     data = ros.deserialise(entry.data, ros.BYTE_ARRAY).data.tobytes()
@@ -204,7 +207,7 @@ class RecordedSession:
             f"/radar/{radar.name}/frame": (index, radar, limits_of(radar))
             for index, radar in enumerate(self.info.radars)
         }
-        for entry in read_entries(self.path, self._on_cut):
+        for entry in read_entries(self.path, self._on_cut, self._size):
             if not isinstance(entry, RawMessage):
                 continue
             with self._naming(entry):
@@ -238,7 +241,11 @@ def open_session(path: Path) -> RecordedSession:
     number = 0
     radars: list[RadarInfo] = []
     cut: list[int] = []
-    for entry in read_entries(path, cut.append):
+    try:
+        size = path.stat().st_size
+    except OSError:
+        size = None  # what is wrong with it is told below
+    for entry in read_entries(path, cut.append, size):
         if isinstance(entry, Metadata):
             if entry.name == METADATA_NAME:
                 head, number = entry.values, session_format(path, entry.values)
@@ -260,6 +267,7 @@ def open_session(path: Path) -> RecordedSession:
         path,
         read_session_table(path, head, tuple(radars)),
         has_scan_marks=number > 1,
+        size=size,
     )
 
 

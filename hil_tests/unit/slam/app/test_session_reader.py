@@ -356,3 +356,18 @@ def test_what_is_no_session_is_one_line(session_file: Path, tmp_path: Path) -> N
         open_session(tmp_path / "foreign.mcap")
     with pytest.raises(AppError, match="is a directory; give the session"):
         open_session(tmp_path)
+
+
+def test_a_session_that_grows_reads_the_same_again(tmp_path: Path) -> None:
+    """What a run adds after it was opened would have scans without the odometry read before."""
+    log = SessionLog(path := tmp_path / "session.mcap", session_info())
+    feed(log, 60)
+    log.close()
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    session = open_session(path)
+    n_scans = sum(1 for _ in session.scans())
+    assert 0 < n_scans < 60
+    path.write_bytes(whole)
+    assert sum(1 for _ in session.scans()) == n_scans
+    assert sum(1 for _ in open_session(path).scans()) == 60
