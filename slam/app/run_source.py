@@ -38,6 +38,7 @@ SETTLE_S = 2.0
 START_LIMIT_S = 15.0
 SILENT_RIG_S = 10.0
 WARN_LAG_S = 2.0
+UNUSED_S = 5.0
 _POLL_S = 0.05
 _DRIFT_EVERY_S = 60.0
 
@@ -137,6 +138,8 @@ class LiveSource:
         self._last_counters: list[int | None] = [None] * len(radars)
         self._drift_told_ns = self._began_ns
         self._lag_told_s = WARN_LAG_S
+        self._unused_since_ns: int | None = None
+        self._unused_told = False
         self.clocks = tuple(ArrivalClock(radar.rate_hz) for radar in radars)
         self.ended: Ended | None = None
         self.worst_lag_s = self.busy_s = 0.0
@@ -237,6 +240,7 @@ class LiveSource:
             self.ended = Ended(text=f"the {self._duration_s:g} s asked for are over")
             return None
         self._note_lag()
+        self._note_unused(scan)
         return scan
 
     def _drain(self, wait_s: float) -> None:
@@ -306,6 +310,21 @@ class LiveSource:
                 "run",
                 f"SLAM is {lag_s:.1f} s behind the radars: this machine is too slow, or busy with "
                 "something else; all frames are recorded",
+                warning=True,
+            )
+
+    def _note_unused(self, scan: Scan) -> None:
+        """Say it where SLAM has stood still for long: its clock may be another one by now."""
+        if scan.used:
+            self._unused_since_ns = None
+        elif self._unused_since_ns is None:
+            self._unused_since_ns, self._unused_told = scan.t_ns, False
+        elif scan.t_ns - self._unused_since_ns > UNUSED_S * NS_PER_S and not self._unused_told:
+            self._unused_told = True
+            self._listener.say(
+                "run",
+                f"SLAM got no scan for {UNUSED_S:g} s, as odometry does not cover their time or "
+                "they came too late; they are recorded. Was a clock set?",
                 warning=True,
             )
 

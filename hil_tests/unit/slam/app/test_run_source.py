@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ from hil_tests.unit.slam.app.virtual_rig import (
 )
 from slam.app.emulated_rig import RAW_CONFIG, rig_of, wheels_of
 from slam.app.errors import AppError
-from slam.app.odometry_live import LiveOdometry
+from slam.app.odometry_live import FixedClock, LiveOdometry
 from slam.app.run_events import FrameCame, OdometryLine, RadarBack, RadarLost
 from slam.app.run_source import LiveSource
 from slam.app.runner import RunRecord, run_slam
@@ -83,8 +83,10 @@ def source_of(
     return source_on(drive, VirtualInbox([*events, *also]))
 
 
-def source_on(drive: Drive, inbox: VirtualInbox) -> tuple[LiveSource, LiveOdometry, Words]:
-    odometry, words = LiveOdometry("the test"), Words()
+def source_on(
+    drive: Drive, inbox: VirtualInbox, clock: FixedClock | None = None
+) -> tuple[LiveSource, LiveOdometry, Words]:
+    odometry, words = LiveOdometry("the test", clock), Words()
     source = LiveSource(
         drive.infos,
         sampler_limits(RAW_CONFIG),
@@ -236,3 +238,22 @@ def test_a_machine_that_is_too_slow_for_a_while_records_all_and_says_so(drive: D
     assert late
     assert all(len(scan.frames) == len(PPM) for scan in late[:-1])
     assert source.worst_lag_s > 10.0
+
+
+def test_odometry_whose_clock_is_set_while_it_is_trusted_is_told(drive: Drive) -> None:
+    """With a clock known beforehand no later frame lies between two poses."""
+    set_ns = 8 * NS_PER_S
+    events = []
+    for row in drive.events:
+        if row.t_ns > 16 * NS_PER_S:
+            continue
+        if isinstance(row.event, OdometryLine) and row.t_ns > set_ns:
+            stamp, _, rest = row.event.text.partition(" ")
+            late = replace(row.event, text=f"{float(stamp) + 3600:.9f} {rest}")
+            events.append(replace(row, event=late))
+        else:
+            events.append(row)
+    source, _, words = source_on(drive, VirtualInbox(events), FixedClock(0))
+    source.settle()
+    assert {scan.used for scan in source.scans()} == {True, False}
+    assert "SLAM got no scan for 5 s" in words.about("run")
