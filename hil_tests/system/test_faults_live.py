@@ -10,7 +10,6 @@ from pathlib import Path
 from hil_tests.device.serving import emulator
 from xethru_protocol.driver import X4M300, RawConfig
 
-
 CTL = (sys.executable, "-m", "emulator.cli", "ctl")
 
 
