@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from slam.app import rosbag_layout as layout
 from slam.app.errors import AppError, UsageError
 from slam.app.imported import SlamSettings
 from slam.app.mat_convert import MatOptions, convert_mat, write_detections
+from slam.app.replay import settings_of
 from slam.app.rig_file import load_rig
 from slam.app.rosbag_read import BagOptions, convert_bag
 from slam.app.rosbag_write import write_bag
@@ -52,21 +54,31 @@ def run_convert(options: ConvertOptions, check: Callable[[], None]) -> None:
         raise AppError(f"{options.out}: exists; choose another name")
     out_is_session = options.out.suffix == SESSION_SUFFIX
     if options.source.suffix == SESSION_SUFFIX and not out_is_session:
-        _say(_from_session(open_session(options.source), options, check))
+        with _removing(options.out):
+            said = _from_session(open_session(options.source), options, check)
+        _say(said)
         return
     if not out_is_session:
         raise UsageError(
             f"{options.out}: of a bag or MATLAB file a session is made; give a name that ends in "
             ".mcap"
         )
-    try:
+    with _removing(options.out):
         said, odd = _to_session(options, check)
-    except BaseException:
-        options.out.unlink(missing_ok=True)
-        raise
     for line in odd:
         print(f"uwb-slam: {options.source}: {line}", file=sys.stderr)  # noqa: T201 - a warning
     _say(said)
+
+
+@contextmanager
+def _removing(out: Path) -> Iterator[None]:
+    """Remove a file that was begun where the block fails; a bag's folder goes with its writer."""
+    try:
+        yield
+    except BaseException:
+        if not out.is_dir():
+            out.unlink(missing_ok=True)
+        raise
 
 
 def _from_session(
@@ -77,7 +89,7 @@ def _from_session(
     if options.out.suffix != MAT_SUFFIX:
         return write_bag(session, options.out, check)
     if options.preset is None and session.info.config_json:
-        config = SlamConfig.model_validate_json(session.info.config_json)
+        config = settings_of(session)
     else:
         config = _config(options.preset or _PRESET)
     return write_detections(session, options.out, config, check)
