@@ -20,7 +20,6 @@ from PIL import Image
 
 from hil_tests.system.recorded_session import (
     FAULT,
-    LOST_COUNTER,
     record_session,
     write_shorter_scene,
 )
@@ -110,7 +109,6 @@ def test_the_lost_frame_and_the_fault_are_in_lane_and_log(viewed: Viewed) -> Non
         "streaming",
         "ended",
     ]
-    assert LOST_COUNTER > 0
 
 
 @pytest.mark.skipif(not HAS_LAVAPIPE, reason="Mesa's lavapipe (mesa-vulkan-drivers) is missing")
