@@ -163,7 +163,7 @@ def _kind(body: str) -> tuple[Kind, str]:
         return Kind.SERIAL_NUMBER, number
     if body.startswith("tcp://"):
         host, _, port = body.removeprefix("tcp://").rpartition(":")
-        if not host or not port.isdigit() or not 0 < int(port) < 65536:
+        if not host or not port.isdecimal() or not 0 < int(port) < 65536:
             raise SpecError(f"--radar {body}: must be tcp://HOST:PORT with a port of 1...65535")
         return Kind.TCP, body.removeprefix("tcp://")
     if scheme == "replay" and colon:
@@ -204,7 +204,7 @@ def _check(text: str, kind: Kind, options: Mapping[str, str]) -> None:
             f"--radar {text}: firmware={firmware}: must be sensor, or xep without line="
         )
     seed = options.get("seed", "0")
-    if not seed.isdigit() or int(seed) >= 2**63:
+    if not seed.isdecimal() or int(seed) >= 2**63:
         raise SpecError(f"--radar {text}: seed={seed}: must be a whole number of 0...2**63 - 1")
     try:
         fps = float(options.get("fps", DEFAULT_FPS))
