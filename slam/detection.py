@@ -105,8 +105,8 @@ class PaperDetector:
 
     def _peaks(self, smoothed: Array) -> tuple[NDArray[np.intp], Array, Array]:
         """Return the bin of each peak, how far beyond it the peak lies [bins], and its height."""
-        # Here, as in `SavitzkyGolay`: scipy.signal takes half a second to load, and only this front end
-        # needs it.
+        # Here, as in `SavitzkyGolay`: scipy.signal takes half a second to load, and only this
+        # front end needs it.
         from scipy.signal import find_peaks
 
         config = self.config
