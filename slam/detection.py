@@ -12,7 +12,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
-from scipy.signal import find_peaks, savgol_filter
 
 from slam.background import LeakageFreeDetector
 from slam.config import (
@@ -106,6 +105,10 @@ class PaperDetector:
 
     def _peaks(self, smoothed: Array) -> tuple[NDArray[np.intp], Array, Array]:
         """Return the bin of each peak, how far beyond it the peak lies [bins], and its height."""
+        # Here, as in `SavitzkyGolay`: scipy.signal takes half a second to load, and only this
+        # front end needs it.
+        from scipy.signal import find_peaks
+
         config = self.config
         peaks, properties = find_peaks(
             smoothed,
@@ -147,6 +150,8 @@ class SavitzkyGolay:
 
     def __init__(self, length: int, order: int) -> None:
         # The filter is linear: its answers to unit impulses are its matrix.
+        from scipy.signal import savgol_filter
+
         response: Array = np.asarray(savgol_filter(np.eye(2 * length), length, order, axis=0))
         half = length // 2
         self.length = length

@@ -109,11 +109,13 @@ def test_importing_the_protocol_loads_no_heavy_library() -> None:
         ("emulator.cli", "serve"),
         ("emulator.cli", "play"),
         ("slam.app.cli", ""),
-        ("slam.app.cli", "demo"),
-        ("slam.app.cli", "sweep"),
-        ("slam.app.cli", "evaluate"),
-        ("slam.app.cli", "view"),
-        ("slam.app.cli", "report"),
+        *(
+            ("slam.app.cli", command)
+            for command in (
+                *("demo", "run", "replay", "view", "report", "evaluate", "repair", "convert"),
+                *("calibrate", "sweep", "experiment"),
+            )
+        ),
     ],
 )
 def test_help_of_every_command_loads_no_heavy_library(module: str, command: str) -> None:

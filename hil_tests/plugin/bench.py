@@ -56,6 +56,12 @@ class RadarAtPlace:
         place = place_of(spec)
         lock = place.lock_target
         self._lock = None if lock is None else PortLock(lock)
+        try:
+            place.explore()
+        except BaseException:
+            if self._lock is not None:
+                self._lock.release()
+            raise
         self.place: Place = place
         self.identity = ""
         self.broken: str | None = None

@@ -69,9 +69,9 @@ def write_bundle(
         if radar.place.scene_text is not None:
             (folder / "scene.toml").write_text(radar.place.scene_text, "utf-8")
     _write_wire(folder / "wire.mcap", taps)
-    from hil_tests.plugin.rerun_bundle import write_rrd  # Rerun takes half a second to import
-
     with contextlib.suppress(ImportError):  # the rest of the bundle does without
+        from hil_tests.plugin.rerun_bundle import write_rrd  # Rerun takes half a second to import
+
         write_rrd(folder / "session.rrd", taps, measurements, failure)
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from hil_tests.plugin.transactions import TRANSACTIONS, Transaction
-from xethru_protocol.codec import decode_command, decode_response, describe
+from xethru_protocol.codec import decode_command, decode_response, describe, encode
 from xethru_protocol.framing import PacketReader, encode_normal
 from xethru_protocol.messages import Ack, Error, Pong, ReplyByte, ReplyFloat, ReplyInt, ReplyString
 from xethru_protocol.packets import FramingFault, NeedData
@@ -143,8 +143,6 @@ def ask_all(
 def _ask(
     line: Transport, reader: PacketReader, clock_ns: Callable[[], int], asked: Transaction
 ) -> Exchange:
-    from xethru_protocol.codec import encode
-
     payload = encode(asked.command)
     line.write(encode_normal(payload))
     deadline_ns = clock_ns() + round(_PATIENCE_S * 1e9)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -88,7 +89,8 @@ def gate(
     """Return the radars, each in its known state, or end the test with the reason.
 
     A test is skipped where a radar lacks what it requires, and fails so under ``--hil-strict``. It
-    fails where a radar does not answer; tests after that are skipped, or fail, without trying.
+    fails where a radar does not answer; tests after that are skipped, or fail, without trying. A
+    test that ends here leaves no line open.
     """
     from hil_tests.plugin.bench import BrokenRadarError
     from hil_tests.plugin.locks import PortBusyError
@@ -99,25 +101,26 @@ def gate(
     findings = FINDINGS.of(item)
     findings.names = names
     found: list[RadarAtPlace] = []
-    for name in names:
-        _check_kind(request, bench, name)
-        problem: Exception | None = None
-        try:
-            radar = bench.radar(name)
-            found.append(radar)
-            findings.radars = tuple(found)
-            _check_capabilities(request, radar)
-            _check_permissions(request, radar)
-            radar.begin_test()
-            _check_capabilities(request, radar)  # which firmware it has is known only now
-        except (BrokenRadarError, PlaceError, PortBusyError, XeThruError) as error:
-            problem = error
-        if isinstance(problem, BrokenRadarError):
-            lacking(request, names, str(problem))
-        if problem is not None:
-            for radar in found:
-                radar.end_test()
-            pytest.fail(f"{name}: {problem}", pytrace=False)
+    with contextlib.ExitStack() as begun:
+        for name in names:
+            _check_kind(request, bench, name)
+            problem: Exception | None = None
+            try:
+                radar = bench.radar(name)
+                found.append(radar)
+                findings.radars = tuple(found)
+                _check_capabilities(request, radar)
+                _check_permissions(request, radar)
+                begun.callback(radar.end_test)
+                radar.begin_test()
+                _check_capabilities(request, radar)  # which firmware it has is known only now
+            except (BrokenRadarError, PlaceError, PortBusyError, XeThruError) as error:
+                problem = error
+            if isinstance(problem, BrokenRadarError):
+                lacking(request, names, str(problem))
+            if problem is not None:
+                pytest.fail(f"{name}: {problem}", pytrace=False)
+        begun.pop_all()  # the fixture ends them, behind the test
     return tuple(found)
 
 

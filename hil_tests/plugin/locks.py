@@ -35,6 +35,8 @@ class PortLock:
     ------
     PortBusyError
         If somebody else has it.
+    OSError
+        If the lock file cannot be opened, or is a link.
     """
 
     def __init__(self, target: str) -> None:
@@ -73,11 +75,15 @@ class PortLock:
 
 
 def _open(path: Path) -> int:
-    """Return a descriptor of a lock file that anybody may open."""
+    """Return a descriptor of a lock file that anybody may open.
+
+    Never of what a link leads to: where anybody may write, it could lead to a file of ours.
+    """
+    flags = os.O_CLOEXEC | os.O_NOFOLLOW
     try:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, _ANYBODY)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | flags, _ANYBODY)
     except PermissionError:
-        return os.open(path, os.O_RDONLY | os.O_CLOEXEC)  # enough for flock
+        return os.open(path, os.O_RDONLY | flags)  # enough for flock
     with contextlib.suppress(OSError):
         os.fchmod(descriptor, _ANYBODY)  # whatever the umask
     return descriptor

@@ -92,6 +92,9 @@ class Place(ABC):
         """The scene file of an emulated radar; None without one."""
         return None
 
+    def explore(self) -> None:  # noqa: B027 - most places know it without asking
+        """Find out what can be done there; called once, when no other session can have it."""
+
     def begin_test(self) -> None:  # noqa: B027 - most places have nothing to do
         """Do what must be done before each test."""
 
@@ -234,20 +237,21 @@ class PortPlace(Place):
         path = spec.target
         if spec.kind is Kind.SERIAL_NUMBER:
             path = _port_of(spec.target)
-        able = {"settings", "profiles", "files"}
-        line = SerialTransport(path)
-        bytes_per_s = _UART_BYTES_PER_S if spec.line == "uart" else line.bytes_per_s
-        line.close()
-        if not math.isinf(bytes_per_s):
-            able.add("uart")
-        super().__init__(spec, frozenset(able), f"module at {path}")
-        self.bytes_per_s = bytes_per_s
+        super().__init__(spec, frozenset({"settings", "profiles", "files"}), f"module at {path}")
         self._path = path
 
     @property
     def lock_target(self) -> str | None:
         """The port."""
         return os.path.realpath(self._path)
+
+    def explore(self) -> None:
+        """Ask the port whether it is a UART."""
+        line = SerialTransport(self._path)
+        self.bytes_per_s = _UART_BYTES_PER_S if self.spec.line == "uart" else line.bytes_per_s
+        line.close()
+        if not math.isinf(self.bytes_per_s):
+            self.capabilities |= {"uart"}
 
     def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
         """See `Place.open_line`."""

@@ -10,10 +10,12 @@ from pathlib import Path
 from hil_tests.device.serving import emulator
 from xethru_protocol.driver import X4M300, RawConfig
 
+CTL = (sys.executable, "-m", "emulator.cli", "ctl")
+
 
 def ctl(*words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "emulator.cli", "ctl", *words],
+        [*CTL, *words],
         capture_output=True,
         text=True,
         timeout=20,
@@ -36,9 +38,16 @@ def test_what_the_driver_counts_is_what_the_truth_log_says(tmp_path: Path) -> No
         assert [record["kind"] for record in written] == ["missing_frames"] * 2
         assert radar.frames_lost == sum(record["parameters"]["frames"] for record in written)
 
-        added = ctl(served.paths[0], "fault", "add", "counter_jump", "frames=5")
-        assert added.returncode == 0, added.stderr
-        list(radar.frames(150))  # many came while ctl started
+        with subprocess.Popen(
+            [*CTL, served.paths[0], "fault", "add", "counter_jump", "frames=5"],
+            stderr=subprocess.PIPE,
+            text=True,
+        ) as adding:
+            while adding.poll() is None:  # a port that nobody reads overflows
+                next(radar.frames(1))
+            assert adding.stderr is not None
+            assert adding.returncode == 0, adding.stderr.read()
+        list(radar.frames(50))
         assert radar.frames_lost == 6 + 5
         state = json.loads(ctl(served.paths[0], "state").stdout)
         (told,) = state["radars"].values()

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from emulator.scene import load_scene
+from hil_tests.device.serving import emulator
 from hil_tests.system.short_scene import write_short_scene
 from slam.app.cli import main
 from slam.app.rig_file import RigFile, RigRadar, write_rig
@@ -54,20 +55,11 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
             )
         ),
     )
-    command = [sys.executable, "-m", "emulator.cli", "serve", str(scene_path)]
-    with subprocess.Popen(
-        [*command, "--pace", "realtime", "--link-dir", str(folder / "ports")],
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as emulator:
-        assert emulator.stdout is not None
-        ready = json.loads(emulator.stdout.readline())
-        yield Robot(
-            rig=rig,
-            odometry=ready["odometry"],
-            ports=[device["path"] for device in reversed(ready["devices"])],
-        )
-        emulator.terminate()
+    pace = ("--pace", "realtime", "--link-dir", folder / "ports")
+    with emulator("serve", scene_path, *pace) as served:
+        assert served.odometry is not None
+        yield Robot(rig=rig, odometry=served.odometry, ports=[*reversed(served.paths)])
+        served.end()
 
 
 def run_command(robot: Robot, out: Path, *more: str) -> list[str]:

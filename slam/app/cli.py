@@ -12,13 +12,14 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from slam.app.arguments import count, folder, seed
+from slam.app.arguments import folder, seed
+from slam.app.convert_arguments import add_convert
 from slam.app.errors import EXIT_FAILED, AppError, naming
 from slam.app.experiments import EXPERIMENTS, Experiment, ExperimentModule
 from slam.app.run_arguments import add_run
 from slam.app.standard_streams import drop_what_cannot_be_said, open_closed_streams
 from slam.app.stop import StopFlag, StopRequestedError
-from slam.app.stress import STRESSES
+from slam.app.sweep_arguments import add_sweep
 from slam.app.view_arguments import add_report, add_rerun, add_view
 
 _TYPICAL_SEED = 19
@@ -155,16 +156,12 @@ def _parser() -> argparse.ArgumentParser:
     repair.add_argument("--out", type=Path, metavar="FILE", help="write there, touch nothing else")
     repair.set_defaults(command=_repair)
 
-    _add_convert(
+    add_convert(
         commands.add_parser(
             "convert",
             help="sessions from and to rosbags and .mat, in the layout of the paper's data set",
-            description="IN is a session, then OUT is a MATLAB file of detections if its name "
-            "ends in .mat, the raw bytes of one port if in .xtwire, a bag of ROS 1 if in .bag, or "
-            "else a new folder with a bag of ROS 2; or IN is a .mat or a bag, then OUT is a "
-            "session, which replay, view and report take.",
         )
-    )
+    ).set_defaults(command=_convert)
 
     calibrate = commands.add_parser(
         "calibrate",
@@ -181,18 +178,9 @@ def _parser() -> argparse.ArgumentParser:
     calibrate.add_argument("--json", action="store_true", help="print one JSON object")
     calibrate.set_defaults(command=_calibrate)
 
-    _add_sweep(
-        commands.add_parser(
-            "sweep",
-            help="repeat a run over scenes, presets and seeds",
-            description="Runs every scene with every preset and seed in process, without ports, "
-            "and writes each run's summary and the statistics of each group. Stopped, the same "
-            "command goes on where it was. All numbers are simulated.",
-            epilog="STRESS is one of: "
-            + "; ".join(f"{row.name}: {row.help}" for row in STRESSES.values())
-            + ".",
-        )
-    )
+    add_sweep(
+        commands.add_parser("sweep", help="repeat a run over scenes, presets and seeds")
+    ).set_defaults(command=_sweep)
 
     experiment = commands.add_parser(
         "experiment",
@@ -210,79 +198,6 @@ def _parser() -> argparse.ArgumentParser:
             "--out", type=folder, default=Path("out/experiments"), help="folder for the results"
         )
     return parser
-
-
-def _add_convert(convert: argparse.ArgumentParser) -> None:
-    convert.add_argument(
-        "source", type=Path, metavar="IN", help="session.mcap, *.mat, *.bag or folder"
-    )
-    convert.add_argument("out", type=Path, metavar="OUT", help="must not exist")
-    convert.add_argument(
-        "--rig", type=Path, help="where the radars of a bag sit, named UWBradar1 and so on"
-    )
-    convert.add_argument(
-        "--frame-area",
-        type=float,
-        nargs=2,
-        metavar=("START", "END"),
-        help="what the modules of a bag were asked for, module metres (default: 0.2 9.4)",
-    )
-    convert.add_argument(
-        "--truth", default="/slam_out_pose", metavar="TOPIC", help="default: %(default)s"
-    )
-    convert.add_argument(
-        "--rate", type=count, default=5, help="states/s of a .mat, which has no stamps (default: 5)"
-    )
-    convert.add_argument(
-        "--preset",
-        help="settings of SLAM (default: a session's own; for a bag robust, for a .mat paper)",
-    )
-    convert.add_argument("--radar", metavar="NAME", help="whose raw bytes, for .xtwire")
-    convert.set_defaults(command=_convert)
-
-
-def _setting(text: str) -> tuple[str, tuple[str, ...]]:
-    key, _, values = text.partition("=")
-    named = tuple(value.strip() for value in values.split(","))
-    if not key or not all(named):
-        raise argparse.ArgumentTypeError(f"must be KEY=VALUE or KEY=V1,V2, not {text!r}")
-    return key.strip(), named
-
-
-def _add_sweep(sweep: argparse.ArgumentParser) -> None:
-    sweep.add_argument("--scene", nargs="+", action="extend", help="names or files (default: lab)")
-    sweep.add_argument(
-        "--preset", nargs="+", action="extend", help="settings of SLAM (default: robust)"
-    )
-    sweep.add_argument("--seeds", type=count, default=20, help="number of seeds, from 0")
-    sweep.add_argument(
-        "--set",
-        type=_setting,
-        action="append",
-        default=[],
-        metavar="KEY=V1,V2",
-        help="replace a setting of the presets, like association.gate=0.6,9.2; several values, or "
-        "several --set, make a group for every combination",
-    )
-    sweep.add_argument(
-        "--stress",
-        nargs="+",
-        action="extend",
-        default=[],
-        choices=tuple(STRESSES),
-        metavar="STRESS",
-        help="run under these hardships, too, and print how much worse it gets",
-    )
-    sweep.add_argument(
-        "--bound",
-        action="store_true",
-        help="compute on each run's data what is possible with the true associations (GTSAM)",
-    )
-    where = sweep.add_mutually_exclusive_group()
-    where.add_argument("--jobs", type=count, help="processes (default: one per core)")
-    where.add_argument("--dask", metavar="ADDRESS", help="scheduler of a Dask cluster to run on")
-    sweep.add_argument("--json", type=Path, required=True, metavar="OUT", help="result file")
-    sweep.set_defaults(command=_sweep)
 
 
 class _ExperimentParser(argparse.ArgumentParser):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -53,7 +54,9 @@ def run_convert(options: ConvertOptions, check: Callable[[], None]) -> None:
         raise AppError(f"{options.out}: exists; choose another name")
     out_is_session = options.out.suffix == SESSION_SUFFIX
     if options.source.suffix == SESSION_SUFFIX and not out_is_session:
-        _say(_from_session(open_session(options.source), options, check))
+        with _removing(options.out):
+            said = _from_session(open_session(options.source), options, check)
+        _say(said)
         return
     if not out_is_session:
         raise UsageError(
@@ -65,11 +68,8 @@ def run_convert(options: ConvertOptions, check: Callable[[], None]) -> None:
             f"{options.source}: is a session already; name an OUT that ends in .mat, .xtwire or "
             ".bag, or a new folder for a bag of ROS 2"
         )
-    try:
+    with _removing(options.out):
         said, odd = _to_session(options, check)
-    except BaseException:
-        options.out.unlink(missing_ok=True)
-        raise
     for line in odd:
         print(f"uwb-slam: {options.source}: {line}", file=sys.stderr)  # noqa: T201 - a warning
     _say(said)
@@ -81,6 +81,17 @@ def _is_session(path: Path) -> bool:
     except AppError:  # what else it is, or what is wrong with it, the reader of bags tells
         return False
     return True
+
+
+@contextmanager
+def _removing(out: Path) -> Iterator[None]:
+    """Remove a file that was begun where the block fails; a bag's folder goes with its writer."""
+    try:
+        yield
+    except BaseException:
+        if not out.is_dir():
+            out.unlink(missing_ok=True)
+        raise
 
 
 def _from_session(

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import numpy as np
-
-from emulator.path_lock import PathInUseError, locked
 from emulator.scene import Scene
 from slam.app.emulated_rig import (
     FRAME_RATE_HZ,
@@ -32,27 +29,22 @@ from slam.app.odometry import read_odometry_socket
 from slam.app.outlines import outlines_m
 from slam.app.progress import Progress
 from slam.app.report_table import print_table
-from slam.app.runner import RunRecord, run_slam
+from slam.app.run_results import (
+    RESULTS,
+    prepare_folder,
+    saying_what_is_left,
+    write_trajectories,
+)
+from slam.app.runner import run_slam
 from slam.app.session import RadarInfo, SessionInfo, SessionObserver
 from slam.app.session_head import settings_text
 from slam.app.session_log import SessionLog
-from slam.app.stop import StopFlag, StopRequestedError
-from slam.app.tum import Trajectory, write_tum
+from slam.app.stop import StopFlag
 from slam.app.wire_tap import WireTap
 from slam.config import SlamConfig
 from slam.robust_pipeline import make_slam
 
-OUTPUTS = (
-    "session.mcap",
-    "session.rrd",
-    "map.png",
-    "summary.json",
-    "estimate.tum",
-    "truth.tum",
-    "odometry.tum",
-)
-
-
+OUTPUTS = ("session.mcap", "session.rrd", *RESULTS)
 _STALE = ("report.html",)
 """What `uwb-slam report` made of an earlier run."""
 
@@ -96,7 +88,7 @@ def run_demo(options: DemoOptions, stop: StopFlag) -> None:
         live = None
         if options.rerun is not None:  # before an earlier run's files are given up
             live = held.enter_context(LiveView(options.rerun, stop.check))
-        _prepare(options.out, held)
+        prepare_folder(options.out, (*OUTPUTS, *_STALE), held)
         _run(options, scene, config, stop, live)
         if live is not None:
             sys.stdout.flush()
@@ -137,7 +129,7 @@ def _run(
         if tap is not None:
             tap.attach(log)
         slam = make_slam(config, rig, wheels_of(scene))
-        with _saying_what_is_left(kept), source:  # closed before the logs, for its last words
+        with saying_what_is_left(kept), source:  # closed before the logs, for its last words
             scans = source.scans(end_counter(trajectory.duration_ns), stop.check)
             try:
                 record = run_slam(scans, odometry, slam, trajectory.poses, observers)
@@ -146,7 +138,7 @@ def _run(
                 # Ended before the drivers close: they need not wait for answers then.
                 emulator.end()
                 raise EmulatorError(f"{cause}{kept}") from None
-    with _saying_what_is_left(kept):
+    with saying_what_is_left(kept):
         stop.check()
         summary = summarise(
             record,
@@ -159,7 +151,7 @@ def _run(
         if summary is None:
             raise AppError(f"{options.scene}: too short for SLAM, no state was estimated{kept}")
         stop.check()
-        _write_trajectories(options.out, record)
+        write_trajectories(options.out, record)
         with naming(path := options.out / "summary.json"):
             path.write_text(summary.to_json() + "\n", encoding="ascii")
         stop.check()
@@ -203,38 +195,3 @@ def _closing(view: SessionObserver) -> Callable[..., bool]:
         return False
 
     return close
-
-
-@contextmanager
-def _saying_what_is_left(kept: str) -> Iterator[None]:
-    """Let a stop by a signal say what was recorded until then."""
-    try:
-        yield
-    except StopRequestedError as stopped:
-        raise StopRequestedError(stopped.received, kept) from None
-
-
-def _prepare(out: Path, held: ExitStack) -> None:
-    """Make the folder, hold it, and remove an earlier run's files so that no two runs mix."""
-    with naming(out):
-        out.mkdir(parents=True, exist_ok=True)
-        try:
-            held.enter_context(locked(out))
-        except PathInUseError:
-            raise AppError(
-                f"{out}: another run is writing there; wait for its end or choose another --out"
-            ) from None
-        for name in (*OUTPUTS, *_STALE):
-            (out / name).unlink(missing_ok=True)
-
-
-def _write_trajectories(out: Path, record: RunRecord) -> None:
-    """Write estimate, truth and odometry at the stamps of SLAM's states."""
-    stamps_ns = np.array([result.t_ns for result in record.results], dtype=np.int64)
-    for name, poses in (
-        ("estimate", np.array([result.belief.pose for result in record.results])),
-        ("truth", record.truth),
-        ("odometry", np.array([result.odometry_pose for result in record.results])),
-    ):
-        with naming(path := out / f"{name}.tum"):
-            write_tum(path, Trajectory(stamps_ns=stamps_ns, poses=poses))

@@ -41,8 +41,8 @@ def take_screenshot(rrd: Path, out: Path, *, at_s: float | None, check: Callable
     Raises
     ------
     AppError
-        There is no graphics driver, the viewer does not come to rest, or the picture cannot be
-        written.
+        There is no graphics driver, the recording is no view of a session, the viewer does not
+        come to rest, or the picture cannot be written.
     """
     with ViewerProcess(ViewerKind.HEADLESS) as process:
         process.wait_until_ready(check)
@@ -68,10 +68,10 @@ def _settled(
     give_up = time.monotonic() + _SETTLE_LIMIT_S
     while client.get_state().loading or not client.get_state().recordings:
         _wait(check, give_up)
-    (timeline,) = (
-        line for line in client.get_state().recordings[0].timelines if line.name == DEVICE_TIME
-    )
-    end_s = (timeline.end or 0) / 1e9
+    lines = {line.name: line for line in client.get_state().recordings[0].timelines}
+    if DEVICE_TIME not in lines:
+        raise AppError(f"{rrd}: has no timeline {DEVICE_TIME}, so it is no view of a session")
+    end_s = (lines[DEVICE_TIME].end or 0) / 1e9
     client.set_time(
         DEVICE_TIME, duration=end_s if at_s is None else min(at_s, end_s), play_state="paused"
     )

@@ -59,7 +59,7 @@ class ViewerProcess:
     def __init__(self, kind: ViewerKind, *files: Path) -> None:
         self._kind, self._files = kind, files
         self._process: subprocess.Popen[bytes] | None = None
-        self._port, self._web_port = _free_port(), _free_port()
+        self._port, self._web_port = _two_free_ports()
 
     @property
     def url(self) -> str:
@@ -215,10 +215,11 @@ def _require_display() -> None:
         )
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind((_HERE, 0))
-        return int(probe.getsockname()[1])
+def _two_free_ports() -> tuple[int, int]:
+    with socket.socket() as one, socket.socket() as other:  # both held, so that they differ
+        one.bind((_HERE, 0))
+        other.bind((_HERE, 0))
+        return int(one.getsockname()[1]), int(other.getsockname()[1])
 
 
 def _listens(port: int) -> bool:

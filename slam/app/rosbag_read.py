@@ -32,6 +32,7 @@ from slam.app.stop import StopRequestedError
 from slam.app.tum import NS_PER_S, TumSample
 from slam.frames import RadarFrame
 from slam.geometry import Rig
+from xethru_protocol.errors import XeThruError
 from xethru_protocol.x4 import frame_area
 
 # A header's stamp further from the time of recording is of another clock.
@@ -240,7 +241,10 @@ def _radar_info(bag: Path, name: str, contents: _Contents, options: BagOptions) 
             "say --frame-area START END, in metres, as the modules were asked for"
         )
     area_m = options.area_m or _PAPER_AREA_M
-    area = frame_area(*area_m)
+    try:
+        area = frame_area(*area_m)
+    except XeThruError as error:
+        raise AppError(f"--frame-area: {error}") from None
     if area.n_bins != stream.n_bins:
         raise AppError(
             f"{bag}: frames of {stream.n_bins} bins, but a frame area of {area_m[0]:g} to "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
@@ -116,8 +117,11 @@ def write_bag(session: RecordedSession, out: Path, check: Callable[[], None]) ->
             bag.close()
     except BaseException as error:
         _remove(out)
-        if isinstance(error, OSError):
-            raise AppError(f"{out}: cannot be written: {error.strerror or error}") from None
+        if isinstance(
+            error, OSError | sqlite3.Error
+        ):  # SQLite has words of its own for a full disk
+            reason = getattr(error, "strerror", None) or error
+            raise AppError(f"{out}: cannot be written: {reason}") from None
         raise
     frames, poses, truths = counts
     kind = "ROS 1" if out.suffix == ".bag" else "ROS 2"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import sys
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,26 +14,25 @@ import numpy as np
 
 from slam.app.emulated_rig import RAW_CONFIG, versions
 from slam.app.errors import AppError, UsageError
-from slam.app.link_log import LinkLog
 from slam.app.live_view import LiveView
 from slam.app.odometry_live import FixedClock, LiveOdometry
 from slam.app.odometry_source import LineSource, parse_source
 from slam.app.progress import Progress
 from slam.app.rig_file import load_rig
 from slam.app.rig_match import are_emulated, open_rig
-from slam.app.run_events import LinkSaid, WireCame
+from slam.app.run_events import LinkSaid
+from slam.app.run_listener import LoggingListener
 from slam.app.run_readers import Inbox, Readers, tap_wire
 from slam.app.run_results import RESULTS, prepare_folder, write_results
 from slam.app.run_source import LiveSource, drift_text
 from slam.app.run_table import Row, print_run_table
 from slam.app.runner import RunRecord, nobody_knows, run_slam
-from slam.app.session import LogLine, RadarInfo, Scan, SessionInfo, SessionObserver, Snapshot
-from slam.app.session_file import CannotWriteError
+from slam.app.session import RadarInfo, SessionInfo, SessionObserver
 from slam.app.session_head import settings_text
 from slam.app.session_log import SessionLog
 from slam.app.sources import RigSource, sampler_limits
 from slam.app.stop import StopFlag
-from slam.app.tum import NS_PER_S, TumSample
+from slam.app.tum import NS_PER_S
 from slam.geometry import Rig
 from slam.presets import ConfigError, load_preset
 from slam.robust_pipeline import make_slam
@@ -118,7 +116,7 @@ def run_rig(options: RunOptions, stop: StopFlag) -> None:
             time_base=TIME_BASE,
         )
         slam = make_slam(config, rig_file.rig, wheels)
-        listener = _Listener()
+        listener = LoggingListener()
         source = LiveSource(
             rig_source.radars,
             sampler_limits(RAW_CONFIG),
@@ -150,7 +148,8 @@ def run_rig(options: RunOptions, stop: StopFlag) -> None:
                     observers,
                     gains_db=[radar.gain_db for radar in info.radars],
                 )
-        log.close()
+        listener.end_log()
+        rig_source.close()  # while a page is served, others may have the modules
         _finish(options, info, record, rig_file.rig, source, listener)
         if live is not None:
             sys.stdout.flush()
@@ -192,70 +191,13 @@ def parse_clock(text: str, source: LineSource) -> FixedClock | None:
     )
 
 
-class _Listener:
-    """Hands on what a run learns beside scans; keeps odometry until the log is there.
-
-    A log that cannot be written any more is said once, and the run goes on without.
-    """
-
-    def __init__(self) -> None:
-        self.link_log = LinkLog()
-        self.log_trouble = ""
-        self._log: SessionLog | None = None
-        self._early: list[TumSample] = []
-
-    def attach(self, log: SessionLog, *others: SessionObserver) -> None:
-        """Begin to write; let the others hear what is said, too."""
-        self._log = log
-        for sample in self._early:
-            self.on_odometry(sample)
-        self.link_log.attach(self, *others)
-
-    def on_odometry(self, sample: TumSample) -> None:
-        if self._log is None:
-            self._early.append(sample)
-        else:
-            self._write(lambda log: log.on_odometry(sample))
-
-    def on_wire(self, event: WireCame) -> None:
-        self._write(lambda log: log.on_wire(event.radar, event.way, event.data, event.host_ns))
-
-    def on_link(self, event: LinkSaid) -> None:
-        self.link_log.on_record(event.radar, event.record)
-
-    def say(self, who: str, text: str, *, warning: bool) -> None:
-        self.link_log.say(who, text, warning=warning)
-
-    def on_scan(self, scan: Scan) -> None:
-        self._write(lambda log: log.on_scan(scan))
-
-    def on_snapshot(self, snapshot: Snapshot) -> None:
-        self._write(lambda log: log.on_snapshot(snapshot))
-
-    def on_log(self, line: LogLine) -> None:
-        self._write(lambda log: log.on_log(line))
-
-    def close(self) -> None:
-        """Nothing to do."""
-
-    def _write(self, write: Callable[[SessionLog], None]) -> None:
-        if self._log is None:
-            return
-        try:
-            write(self._log)
-        except CannotWriteError as error:
-            self._log = None
-            self.log_trouble = str(error)
-            self.say("run", f"{error}; the run goes on and is not recorded", warning=True)
-
-
 def _finish(  # noqa: PLR0917 - everything a run ends with
     options: RunOptions,
     info: SessionInfo,
     record: RunRecord,
     rig: Rig,
     source: LiveSource,
-    listener: _Listener,
+    listener: LoggingListener,
 ) -> None:
     print_run_table(
         info,
@@ -267,7 +209,7 @@ def _finish(  # noqa: PLR0917 - everything a run ends with
     write_results(options.out, info, record, rig)
     ended = source.ended
     assert ended is not None
-    kept = f"; what was recorded is in {options.out}"
+    kept = f"; {listener.log_trouble or f'what was recorded is in {options.out}'}"
     if ended.stopped is not None:
         raise type(ended.stopped)(ended.stopped.received, kept)
     if ended.failed:

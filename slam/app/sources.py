@@ -143,6 +143,10 @@ class RigSource:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        """Close; see there."""
+        self.close()
+
+    def close(self) -> None:
         """Stop the radars and close every driver; doing so again does nothing."""
         open_links, self._open_links = self._open_links, ()
         for link in open_links:

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from slam.app.session import Snapshot
 from slam.geometry import between, compose, transform
@@ -29,7 +29,7 @@ def band_95(dof: int) -> tuple[float, float]:
     >>> [round(bound, 2) for bound in band_95(3)]
     [0.22, 9.35]
     """
-    return float(chi2.ppf(_TAIL, dof)), float(chi2.ppf(1.0 - _TAIL, dof))
+    return float(chdtri(dof, 1.0 - _TAIL)), float(chdtri(dof, _TAIL))
 
 
 def nis_dof(snapshot: Snapshot) -> int | None:

@@ -2,36 +2,28 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.geometry import Rig
 from slam.robust.births import give_birth, match, update_with_point
-from slam.robust.continuation import (
-    Continuation,
-    SureLandmarks,
-    continue_tracks,
-    labelled,
-    landmarks_in_view,
-)
+from slam.robust.continuation import Continuation, labelled
 from slam.robust.existence import Existence
-from slam.robust.expected import expected_ranges
 from slam.robust.leftovers import Leftovers
 from slam.robust.map_report import report_landmarks
 from slam.robust.motion import at_rest, calibrated_motion, predict
 from slam.robust.offsets import judged
 from slam.robust.parameters import BackEndParameters, PointRule
 from slam.robust.points import RangeBearing, assign, named_rows, range_bearing_rows
-from slam.robust.ranges import Antennas, RangeScan, View, antennas_of, rows_of, sides_of, view
+from slam.robust.ranges import Antennas, RangeScan, antennas_of, rows_of, sides_of, view
 from slam.robust.relinearisation import is_due, relinearise
 from slam.robust.reports import ExpectedRange, MapLandmark, MapWall, UpdateReport
 from slam.robust.roundness import Roundness
 from slam.robust.run_log import RunLog
+from slam.robust.side import listen
 from slam.robust.state import State
-from slam.robust.surprise import Trial, trials
+from slam.robust.surprise import Trial
 from slam.robust.symmetric import Array
 from slam.robust.tracklets import (
     Member,
@@ -247,7 +239,11 @@ class RobustBackEnd:
         seen = self._whereabouts.seen_from_here(seen, state)
         found: list[Continuation] = []
         for side in self._sides:
-            found += self._continue_side([s for s in scans if s.radar in side], seen, antennas)
+            of_side = [scan for scan in scans if scan.radar in side]
+            heard = listen(of_side, seen, antennas, state, self._existence, self.parameters)
+            found += heard.continued
+            self._expected += heard.expected
+            self._trials += heard.trials
         if any(scan.labels is not None for scan in scans):
             found = labelled(scans, state, self._landmark_of_label)
         else:
@@ -279,56 +275,6 @@ class RobustBackEnd:
         )
         nis, _ = state.update(rows.at, rows.H, z - rows.predicted_m, np.square(noise_m))
         return continued, nis
-
-    def _continue_side(
-        self, scans: list[RangeScan], seen: View, antennas: Antennas
-    ) -> list[Continuation]:
-        """Find the ranges of known landmarks on one side; count hits and misses."""
-        noise, rule, limits = (
-            self.parameters.ranges,
-            self.parameters.continuation,
-            self.parameters.map,
-        )
-        radars = [scan.radar for scan in scans]
-        near = landmarks_in_view(self.state, seen, radars, noise, rule) if radars else None
-        if near is None:
-            return []
-        sure = near.surer_than(rule.tight_sigmas * noise.sigma_m)
-        doubts_m = self.state.feature_doubts_m
-        near = near.doubted(doubts_m)
-        self._trials += trials(near, seen, scans, self.state, self.parameters)
-        inside = seen.inside(noise, -limits.view_inset_rad, -limits.view_inset_m)[radars]
-        self._miss_unsure(near, sure, inside, scans)
-        if sure is None:
-            return []
-        self._expected += expected_ranges(self.state, sure, antennas)
-        found = continue_tracks(sure.doubted(doubts_m), scans, noise, rule)
-        ids = self.state.feature_ids
-        count = Counter(continuation.row for continuation in found)
-        for row in count:
-            self._existence.hit(ids[row])
-        expected = inside[:, sure.landmarks].all(axis=0)
-        for row in sure.landmarks[expected].tolist():
-            hidden = any(scan.may_hide(float(seen.ranges_m[scan.radar, row])) for scan in scans)
-            if row not in count and not hidden:
-                self._existence.miss(ids[row])
-        whole = max(len(scans), 2)
-        self._existence.seen_whole(ids[row] for row, n in count.items() if n >= whole)
-        return found
-
-    def _miss_unsure(
-        self,
-        near: SureLandmarks,
-        sure: SureLandmarks | None,
-        inside: NDArray[np.bool_],
-        scans: list[RangeScan],
-    ) -> None:
-        """Count a miss of landmarks too unsure for single ranges, where nothing at all is heard."""
-        known = () if sure is None else sure.landmarks
-        silent = near.unanswered(scans, self.parameters.ranges, self.parameters.map.view_inset_m)
-        for row in np.setdiff1d(silent, known).tolist():
-            if inside[:, row].all():
-                self._existence.miss(self.state.feature_ids[row])
 
     def _raise_tracklets(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Make tracklets of what is left over; each updates a landmark or becomes one."""

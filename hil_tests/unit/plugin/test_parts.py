@@ -43,6 +43,17 @@ def test_a_lock_is_not_given_twice(tmp_path: Path) -> None:
     PortLock(str(tmp_path)).release()
 
 
+def test_a_lock_follows_no_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a folder where anybody may write, a link could lead to a file of ours."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    (folder := tmp_path / "xethru-hil-locks").mkdir()
+    (ours := tmp_path / "ours").write_text("not to be lost")
+    (folder / "radar.lock").symlink_to(ours)
+    with pytest.raises(OSError, match="symbolic links"):
+        PortLock("radar")
+    assert ours.read_text() == "not to be lost"
+
+
 def test_a_tap_forgets_the_oldest(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tap, "MOST_BYTES", 10)
     wire = WireTap(clock_ns=lambda: 5)

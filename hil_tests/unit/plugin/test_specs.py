@@ -70,6 +70,8 @@ def test_what_this_program_makes_itself_is_not_shared() -> None:
         ("emu:lab?colour=red", "'colour=red' is no option here; allowed are firmware=..., fps="),
         ("emu:lab?seed", "'seed' is no option here"),
         ("emu:lab?seed=-1", "a whole number"),
+        ("emu:lab?seed=\u00b2", "a whole number"),
+        ("tcp://host:\u00b2", "a port of 1...65535"),
         ("emu:lab?fps=0", "a rate of 1...65535 Hz"),
         ("emu:lab?fps=fast", "a rate of 1...65535 Hz"),
         ("emu:?firmware=own", "must be sensor, or xep without line="),

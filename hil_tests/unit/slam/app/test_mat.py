@@ -242,6 +242,39 @@ def test_two_radars_are_no_such_robot(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "four radars, a pair to the left and one to the right; the rig has 2" in err
 
 
+def test_a_session_with_settings_of_another_version_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    info = replace(four_radars(), config_json='{"of_tomorrow": 1}', wheels={"scale_sigma": 0.1})
+    log = SessionLog(tmp_path / "s.mcap", info)
+    log.on_scan(scan(0, 4))
+    log.close()
+    code, _, err = run(capsys, tmp_path / "s.mcap", tmp_path / "a.mat")
+    assert code == 1
+    (line,) = err.splitlines()
+    assert "its setting of_tomorrow is not one of this version" in line
+
+
+def test_a_file_that_was_begun_is_removed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, *_: object, **__: object) -> None:
+        path.write_bytes(b"begun")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("slam.app.mat_file.savemat", full)
+    lines = [format_tum_line(scan(k).t_ns, np.zeros(3)) for k in range(2)]
+    log = SessionLog(tmp_path / "s.mcap", four_radars(), OdometryTrack.from_lines(lines))
+    for counter in range(2):
+        log.on_scan(scan(counter, 4))
+    log.close()
+    out = tmp_path / "a.mat"
+    code, _, err = run(capsys, tmp_path / "s.mcap", out, "--preset", "paper")
+    assert code == 1
+    assert "No space left on device" in err
+    assert not out.exists()
+
+
 def problem(capsys: pytest.CaptureFixture[str], path: Path) -> str:
     out = path.parent / "s.mcap"
     code, said, err = run(capsys, path, out)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import signal
+import sqlite3
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -209,6 +210,10 @@ def test_another_frame_area(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert run(capsys, short, tmp_path / "s.mcap", "--frame-area", 0.2, 3.41)[0] == 0
     (radar, *_) = open_session(tmp_path / "s.mcap").info.radars
     assert (radar.n_bins, round(radar.range_start_m, 2)) == (500, 0.2)
+    for area_m in ((9.4, 0.2), ("nan", 9.4)):
+        (tmp_path / "s.mcap").unlink(missing_ok=True)
+        said = problem(capsys, short, "--frame-area", *area_m)
+        assert said.startswith("uwb-slam: --frame-area: ")
 
 
 def test_what_is_odd_is_said_and_left_out(
@@ -306,6 +311,30 @@ def test_a_signal_stops_a_conversion_and_leaves_nothing(recorded: Path, tmp_path
         write_bag(open_session(recorded), tmp_path / "out", stop)
     assert not (tmp_path / "out").exists()
     assert not (tmp_path / "s.mcap").exists()
+
+
+@pytest.mark.parametrize(
+    "error",
+    [OSError(28, "No space left on device"), sqlite3.OperationalError("disk is full")],
+    ids=["OSError", "SQLite"],
+)
+def test_a_disk_that_fills_up_is_one_line_and_leaves_nothing(
+    error: Exception,
+    recorded: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def full(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("slam.app.rosbag_write._fill", full)
+    for out in (tmp_path / kind for kind in KINDS):
+        code, said, err = run(capsys, recorded, out)
+        assert (code, said) == (1, "")
+        (line,) = err.splitlines()
+        assert line.startswith(f"uwb-slam: {out}: cannot be written: ")
+        assert not out.exists()
 
 
 def test_frames_of_one_period_are_one_scan_even_if_one_is_lost(
