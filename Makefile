@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PYTEST := $(BIN)/python -m pytest
 
-.PHONY: demo test check bench sweep pictures clean
+.PHONY: demo test test-all check bench sweep pictures clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed-demo
@@ -14,6 +14,10 @@ demo: $(VENV)/installed-demo
 # One process more than cores: many tests wait for a pty.
 test: $(VENV)/installed-test
 	$(PYTEST) -n $$($(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 1)') --dist worksteal
+
+# And the cases that would take the default suite over five minutes of two cores.
+test-all: $(VENV)/installed-test
+	$(PYTEST) -n auto -m ''
 
 check: $(VENV)/installed-dev
 	$(BIN)/ruff format --no-cache --check .

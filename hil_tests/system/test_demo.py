@@ -178,6 +178,7 @@ def test_ports_and_in_process_give_the_same_belief_bit_for_bit(demo: Finished) -
     assert summary == again
 
 
+@pytest.mark.thorough
 def test_seeds_differ(demo: Finished) -> None:
     other = run_in_process(str(demo.scene), "robust", SEED + 1)
     assert (

@@ -137,7 +137,14 @@ def test_a_file_that_may_not_grow_is_one_line(tmp_path: Path) -> None:
     assert all(line.startswith("scene time") for line in progress), run.stderr
 
 
-@pytest.mark.parametrize("step", ["summarise", "write_trajectories", "print_table"])
+@pytest.mark.parametrize(
+    "step",
+    [
+        pytest.param("summarise", marks=pytest.mark.thorough),
+        "write_trajectories",
+        pytest.param("print_table", marks=pytest.mark.thorough),
+    ],
+)
 def test_a_signal_after_the_last_scan(
     tmp_path: Path,
     step: str,

@@ -185,6 +185,7 @@ def test_the_modules_of_a_rig_file_are_found_by_number(
     assert "202305070102+202305070104" in done.stdout
 
 
+@pytest.mark.thorough
 def test_workers_share_emulated_radars_and_leave_real_ones_to_one_of_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -205,6 +206,7 @@ def test_workers_share_emulated_radars_and_leave_real_ones_to_one_of_them(
     assert "all workers want this radar at once" in refused.stderr
 
 
+@pytest.mark.thorough
 def test_recordings_are_played(tmp_path: Path) -> None:
     recording = Path(__file__).parents[2] / "fixtures" / "recordings" / "float"
     done = run(tmp_path, "--pyargs", device("test_stream"), "--radar", f"replay:{recording}")
@@ -212,6 +214,7 @@ def test_recordings_are_played(tmp_path: Path) -> None:
     assert "replay-float       1       0        0" in done.stdout
 
 
+@pytest.mark.thorough
 def test_a_uart_left_at_another_rate_is_found_again(tmp_path: Path) -> None:
     (tmp_path / "test_mine.py").write_text(
         "def test_leaves_it(radar):\n    radar.set_baud_rate(921600)\n\n"
@@ -221,6 +224,7 @@ def test_a_uart_left_at_another_rate_is_found_again(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout
 
 
+@pytest.mark.thorough
 def test_artefacts_of_all_tests_where_asked(tmp_path: Path) -> None:
     (tmp_path / "test_mine.py").write_text(OWN_TEST)
     done = run(tmp_path, "--radar", "emu:lab?seed=3", "--hil-keep", "all", "--hil-artifacts", "a")
@@ -234,6 +238,7 @@ def test_artefacts_of_all_tests_where_asked(tmp_path: Path) -> None:
     assert 'name = "lab"' in (folder / "scene.toml").read_text()
 
 
+@pytest.mark.thorough
 def test_the_answers_of_a_module_become_a_cassette(tmp_path: Path, address: str) -> None:
     done = run(
         tmp_path,

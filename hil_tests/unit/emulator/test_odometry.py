@@ -32,7 +32,8 @@ def straight(length_m: float, steps: int) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize(
-    ("scene", "median_m", "margin_m"), [("lab", 0.053, 0.010), ("classroom", 0.330, 0.070)]
+    ("scene", "median_m", "margin_m"),
+    [("lab", 0.053, 0.010), pytest.param("classroom", 0.330, 0.070, marks=pytest.mark.thorough)],
 )
 def test_ate_over_seeds_0_to_99_is_that_of_the_robot_class(
     scene: str, median_m: float, margin_m: float
@@ -137,7 +138,7 @@ def test_constants_of_runs_are_normal_with_the_stated_sigmas() -> None:
     assert abs(np.std(scales) - 1) < 4 / math.sqrt(2 * n)
 
 
-@pytest.mark.parametrize("steps", [500, 2000])
+@pytest.mark.parametrize("steps", [500, pytest.param(2000, marks=pytest.mark.thorough)])
 def test_white_noise_of_a_leg_does_not_depend_on_the_step(steps: int) -> None:
     """Over 10 m: heading h sqrt(10); along 2 mm sqrt(10) when the heading is exact."""
     n = 150

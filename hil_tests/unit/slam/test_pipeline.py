@@ -204,6 +204,7 @@ def test_the_rule_of_sample_times_changes_no_bit_where_it_must_not(sample_time: 
     assert bytes_of(results) == bytes_of(run(world, paper))
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.parametrize(("room", "environment"), [(LAB, "lab"), (CLASSROOM, "classroom")])
 def test_slam_beats_the_odometry_it_is_given(room: Room, environment: str) -> None:
