@@ -164,10 +164,10 @@ class RadarAtPlace:
                 if radar.ping(1.0) is not PongCode.XTS_SPRP_NOTREADY:
                     return
             except ResponseTimeout:
-                if "uart" in self.place.capabilities and self._found_at_another_rate(line):
-                    continue
                 if self.place.clock_ns() > deadline_ns:
                     raise
+                if "uart" in self.place.capabilities and self._found_at_another_rate(line):
+                    continue
             self.place.sleep(_QUIET_S)
 
     def _found_at_another_rate(self, line: Transport) -> bool:

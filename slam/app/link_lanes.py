@@ -72,13 +72,17 @@ class LinkLanes:
         self.counts = {radar.name: LinkCount() for radar in self.radars}
 
     def on_scan(self, scan: Scan) -> Iterator[LinkChange]:
-        """Yield the changes that one tick brings; a radar without a frame in it is silent."""
+        """Yield the changes that one tick brings; a radar without a frame in it is silent.
+
+        What SLAM did not use holds late frames, too, and tells nothing of the radars not in it.
+        """
         frames = {frame.radar: frame for frame in scan.frames}
         for index, radar in enumerate(self.radars):
             count = self.counts[radar.name]
             frame = frames.get(index)
             if frame is None:
-                yield from self._change(radar.name, scan.t_ns, LinkState.SILENT)
+                if scan.used:
+                    yield from self._change(radar.name, scan.t_ns, LinkState.SILENT)
                 continue
             before = count.last_counter
             gap = 0 if before is None else max(frame.counter - before - 1, 0)

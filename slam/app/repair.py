@@ -139,8 +139,9 @@ def repair(path: Path, out: Path | None, check: Callable[[], None]) -> Repair:
             _write(path, fresh, survey, check)
             result = _result(fresh, target, survey, kept if out is None else None)
             if out is None:
-                path.rename(kept)
-            fresh.rename(target)
+                _swap(fresh, path, kept)
+            else:
+                fresh.replace(out)
         except OSError as error:
             raise AppError(
                 f"{error.filename or fresh}: cannot be written: {error.strerror or error}; "
@@ -149,6 +150,20 @@ def repair(path: Path, out: Path | None, check: Callable[[], None]) -> Repair:
         finally:
             fresh.unlink(missing_ok=True)
     return result
+
+
+def _swap(fresh: Path, path: Path, kept: Path) -> None:
+    """Put a file in another's place, which goes on under its second name; all of it or nothing."""
+    try:
+        kept.hardlink_to(path)  # whatever ends us before the next line, the session has its name
+    except OSError:  # FAT and some network shares have no second names
+        path.rename(kept)
+    try:
+        fresh.replace(path)
+    except OSError:
+        kept.replace(path)
+        kept.unlink(missing_ok=True)  # two names of one file: replacing did nothing
+        raise
 
 
 @contextmanager

@@ -33,6 +33,13 @@ def test_a_radar_without_a_frame_in_a_tick_is_silent_and_others_go_on() -> None:
     assert changes == {"radar1": "frames lost"}
 
 
+def test_late_frames_that_slam_did_not_use_make_no_other_radar_silent() -> None:
+    lanes = LinkLanes(session_info(2).radars)
+    list(lanes.on_scan(scan(0)))
+    late = scan(1)
+    assert list(lanes.on_scan(replace(late, frames=late.frames[:1], used=False))) == []
+
+
 def test_a_module_is_set_up_streams_fails_and_streams_again() -> None:
     lanes = LinkLanes(session_info(1).radars)
     states = [

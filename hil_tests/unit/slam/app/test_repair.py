@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 from pathlib import Path
@@ -153,3 +154,34 @@ def test_a_link_to_itself_and_a_pipe_are_one_line(
         "",
         f"uwb-slam: {pipe}: is a pipe; give a file, the session.mcap of a run\n",
     )
+
+
+@pytest.mark.parametrize("has_second_names", [True, False], ids=["hard links", "none, as on FAT"])
+def test_a_file_that_cannot_take_its_place_leaves_everything_as_it_was(
+    has_second_names: bool,
+    cut: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    before = cut.read_bytes()
+    replace = Path.replace
+
+    def fail(path: Path, target: Path) -> Path:
+        if path.suffix == ".repairing":
+            raise OSError(errno.EIO, "Input/output error", str(path))
+        return replace(path, target)
+
+    def no_names(path: Path, target: Path) -> None:
+        raise OSError(errno.EPERM, "Operation not permitted", str(path))
+
+    monkeypatch.setattr(Path, "replace", fail)
+    if not has_second_names:
+        monkeypatch.setattr(Path, "hardlink_to", no_names)
+    code, _, err = run(capsys, cut)
+    assert (code, err.count("\n")) == (1, 1)
+    assert f"{cut} is as it was" in err
+    assert (list(tmp_path.iterdir()), cut.read_bytes()) == ([cut], before)
+    monkeypatch.setattr(Path, "replace", replace)
+    assert run(capsys, cut)[0] == 0
+    assert Path(f"{cut}.unrepaired").read_bytes() == before
