@@ -86,7 +86,8 @@ def map_figure(
         _write_plain_title(axes, info, estimate)
     else:
         _write_title(axes, summary)
-    figure.legend(loc="outside right upper", frameon=False, handlelength=1.6)
+    # beside the axes, below a title that may be longer than they are wide
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, handlelength=1.6)
 
 
 def _draw_start(axes: Axes, pose: NDArray[np.float64]) -> None:
