@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from slam.close_echoes import KnownPulse, SplitTest, fit_echoes
 from slam.pulse_filter import BINS_PER_STEP, PulseFilter
 from slam.pulse_model import ComplexArray
-from slam.whole_echoes import Correlation, fit_whole_echoes
+from slam.whole_echoes import REACH_STEPS, Correlation, fit_whole_echoes
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -198,9 +198,9 @@ def _fitted_whole(group: Array, others: Array, filtered: Filtered, split: SplitT
     """Return the echoes near a group of peaks around which every sample is known."""
     pulse_filter = filtered.pulse_filter
     search = _SEARCH * pulse_filter.sigma_bins
-    # a few steps more, from which z is interpolated
-    first = int((group[0, _POSITION] - search) / BINS_PER_STEP) - 5
-    last = int((group[-1, _POSITION] + search) / BINS_PER_STEP) + 6
+    # one step more than z is interpolated from, rounding included
+    first = int((group[0, _POSITION] - search) / BINS_PER_STEP) - REACH_STEPS - 1
+    last = int((group[-1, _POSITION] + search) / BINS_PER_STEP) + REACH_STEPS + 2
     steps = np.arange(max(first, 0), min(last + 1, filtered.y.size))
     begin = BINS_PER_STEP * float(steps[0])
     z = filtered.y[steps] - _correlated(others, steps, pulse_filter)

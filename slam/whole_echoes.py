@@ -48,9 +48,10 @@ _OPTIMISM = 10.0
 """How many times what it forecasts a search may gain, at most."""
 _COARSE, _FINE = 1.0, 1e-4
 """Gains of twice the log-likelihood too small to go on: while echoes are counted, and at last."""
-_REACH_STEPS = 4
-_WINDOW = np.arange(2 * _REACH_STEPS + 1)
-_TAYLOR = np.linalg.inv(np.vander(_WINDOW - _REACH_STEPS, increasing=True)).T + 0j
+REACH_STEPS = 4
+"""On either side of a step, how many it takes to interpolate there."""
+_WINDOW = np.arange(2 * REACH_STEPS + 1)
+_TAYLOR = np.linalg.inv(np.vander(_WINDOW - REACH_STEPS, increasing=True)).T + 0j
 """From nine values of z to the polynomial through them; z is smooth over ten steps."""
 
 
@@ -77,23 +78,23 @@ class Correlation:
         self.step_bins = step_bins
         self.curvature = 0.5 / sigma_bins**2
         """Of rho at its top [1/bin**2]."""
-        self._around = z[np.arange(z.size - 2 * _REACH_STEPS)[:, np.newaxis] + _WINDOW] @ _TAYLOR
+        self._around = z[np.arange(z.size - 2 * REACH_STEPS)[:, np.newaxis] + _WINDOW] @ _TAYLOR
         self._polynomials: list[list[complex]] = self._around.tolist()
 
     def on_steps(self, first: float, last: float) -> tuple[Array, ComplexArray]:
         """Return the positions of the steps within two positions, and z there."""
-        begin = max(0, math.ceil(first / self.step_bins) - _REACH_STEPS)
-        end = max(begin + 1, math.floor(last / self.step_bins) + 1 - _REACH_STEPS)
+        begin = max(0, math.ceil(first / self.step_bins) - REACH_STEPS)
+        end = max(begin + 1, math.floor(last / self.step_bins) + 1 - REACH_STEPS)
         values = self._around[begin:end, 0]
-        return (np.arange(begin, begin + values.size) + _REACH_STEPS) * self.step_bins, values
+        return (np.arange(begin, begin + values.size) + REACH_STEPS) * self.step_bins, values
 
     def at(self, position: float) -> tuple[complex, complex]:
         """Return z and its derivative by the position [1/bin]; positions count from ``z[0]``."""
         steps = position / self.step_bins
-        nearest = min(max(round(steps), _REACH_STEPS), len(self._polynomials) - 1 + _REACH_STEPS)
+        nearest = min(max(round(steps), REACH_STEPS), len(self._polynomials) - 1 + REACH_STEPS)
         offset = steps - nearest
         value = slope = 0j
-        for coefficient in reversed(self._polynomials[nearest - _REACH_STEPS]):
+        for coefficient in reversed(self._polynomials[nearest - REACH_STEPS]):
             slope = slope * offset + value
             value = value * offset + coefficient
         return value, slope / self.step_bins

@@ -52,7 +52,10 @@ def test_every_answer_is_the_emulators(
 
 @pytest.mark.parametrize("path", sorted(CASSETTES.glob("*.json")), ids=lambda path: path.stem)
 def test_the_emulator_answers_as_the_cassette(path: Path) -> None:
-    """Offline: what a module once answered, the emulator answers ever after."""
+    """Offline: the answers of each cassette come again.
+
+    The shipped one is the emulator's own, which guards against change and proves no likeness.
+    """
     cassette = Cassette.read(path)
     emulated = emulator()
     now = ask_all(emulated.take_line(), emulated.place.clock_ns, cassette.transactions)
