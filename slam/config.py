@@ -304,8 +304,15 @@ class RobustConfig(_Model):
     # Typical standard deviation of a range: how sure a prediction must be to continue a track,
     # and that of every range of a front end that predicts none.
     range_sigma_m: Positive = 2.8e-3
-    # What the front end's own prediction leaves out, added to it in squares.
-    range_floor_m: NonNegative = 2e-3
+    # The variance of a range as a share of what the front end predicts, for no misfit and per
+    # square of the misfit; and what that leaves out, added to it in squares.
+    predicted_share: Positive = 1.0
+    misfit_share: NonNegative = 0.0
+    range_floor_m: NonNegative = 0.0
+    # Added, in squares, where it is decided whose a range is: a neighbour's echo may shift it.
+    association_doubt_m: NonNegative = 0.0
+    # Innovations of more standard deviations weigh less.
+    huber_sigmas: Annotated[float, Field(gt=0)] = math.inf
     # What the front end says of its own ranges, if anything: an echo that one pulse does not
     # explain is of several targets, and lies between them.
     max_misfit: Positive = 1.5

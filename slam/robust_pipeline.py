@@ -152,7 +152,10 @@ class RobustSlam:
             return told.range_sigma_m
         if detection.misfit > told.max_misfit or detection.sigma_m > told.max_predicted_sigma_m:
             return math.inf
-        return math.hypot(told.range_floor_m, detection.sigma_m)
+        variance = told.predicted_share
+        if told.misfit_share:
+            variance += told.misfit_share * detection.misfit**2
+        return math.hypot(told.range_floor_m, math.sqrt(variance) * detection.sigma_m)
 
     def _scans(
         self,
@@ -196,6 +199,8 @@ def back_end_parameters(config: SlamConfig, wheels: WheelNoise) -> BackEndParame
         wheels=replace(wheels, walk_per_sqrt_m=told.wheel_walk_per_sqrt_m),
         ranges=RangeNoise(
             sigma_m=told.range_sigma_m,
+            doubt_m=told.association_doubt_m,
+            huber_sigmas=told.huber_sigmas,
             offset_sigma_m=told.offset_sigma_m,
             calibrated_sigma_m=told.calibrated_offset_sigma_m or None,
             detection_probability=told.detection_probability,

@@ -33,6 +33,7 @@ from slam.robust.tracklets import (
     guesses_of,
 )
 from slam.robust.wall_keeper import WallKeeper
+from slam.robust.weights import huber_sigmas_m
 from slam.robust.whereabouts import Whereabouts, forget, merge_landmarks
 
 
@@ -136,13 +137,14 @@ class RobustBackEnd:
         self._silent = np.where(antennas.heard, 0, self._silent + 1)
         self._expected, self._trials = [], []
         was_lost = self._whereabouts.is_lost
-        continued, nis = self._continue_tracks(scans, antennas)
+        doubted = [scan.doubted(self.parameters.ranges.doubt_m) for scan in scans]
+        continued, nis = self._continue_tracks(scans, doubted, antennas)
         carried = self._whereabouts.is_carried
         if carried:
             self._whereabouts.set_down(self.state, self._existence, self._log)
             self._leftovers.clear()
         used = {(radar, index) for radar, index, _ in continued}
-        self._leftovers.keep(self._log.n_poses - 1, antennas, scans, used)
+        self._leftovers.keep(self._log.n_poses - 1, antennas, doubted, used)
         born, seen_again = self._raise_tracklets()
         deleted = self._delete_lost()
         self._n_updates += 1
@@ -229,9 +231,12 @@ class RobustBackEnd:
         return self._roundness.give(self.state, self._log, self.parameters, hits)
 
     def _continue_tracks(
-        self, scans: Sequence[RangeScan], antennas: Antennas
+        self, scans: Sequence[RangeScan], doubted: Sequence[RangeScan], antennas: Antennas
     ) -> tuple[tuple[tuple[int, int, int], ...], float]:
-        """Find the ranges of known landmarks and correct the state with all of them at once."""
+        """Find the ranges of known landmarks and correct the state with all of them at once.
+
+        They are found among the ``doubted``, and weigh as ``scans`` tell and Huber allows.
+        """
         state = self.state
         if not state.feature_ids:
             return (), 0.0
@@ -239,7 +244,7 @@ class RobustBackEnd:
         seen = self._whereabouts.seen_from_here(seen, state)
         found: list[Continuation] = []
         for side in self._sides:
-            of_side = [scan for scan in scans if scan.radar in side]
+            of_side = [scan for scan in doubted if scan.radar in side]
             heard = listen(of_side, seen, antennas, state, self._existence, self.parameters)
             found += heard.continued
             self._expected += heard.expected
@@ -254,7 +259,17 @@ class RobustBackEnd:
         continued = tuple((c.radar, c.index, ids[c.row]) for c in found)
         of_radar, noise = {scan.radar: scan for scan in scans}, self.parameters.ranges
         z = np.array([of_radar[c.radar].ranges_m[c.index] for c in found])
-        sigmas = [of_radar[c.radar].sigma(c.index, noise.sigma_m) for c in found]
+        rows = rows_of(
+            state,
+            seen,
+            np.array([c.radar for c in found], dtype=np.intp),
+            np.array([c.row for c in found], dtype=np.intp),
+        )
+        innovations_m = z - rows.predicted_m
+        sigmas = np.array([of_radar[c.radar].sigma(c.index, noise.sigma_m) for c in found])
+        doubts_m = state.feature_doubts_m[[c.row for c in found]]
+        prior = np.vecdot(rows.H @ state.P.block(rows.at), rows.H) + np.square(doubts_m)
+        sigmas = huber_sigmas_m(innovations_m, prior, sigmas, noise.huber_sigmas)
         for (radar, at, landmark_id), range_m, sigma_m in zip(continued, z, sigmas, strict=True):
             x, y = antennas.position_m[radar].tolist()
             self._log.add_range(
@@ -263,17 +278,11 @@ class RobustBackEnd:
                 landmark_id,
                 antenna=(x, y),
                 range_m=float(range_m),
-                sigma_m=sigma_m,
+                sigma_m=float(sigma_m),
                 alone=of_radar[radar].is_alone(at),
             )
-        noise_m = np.hypot(sigmas, state.feature_doubts_m[[c.row for c in found]])
-        rows = rows_of(
-            state,
-            seen,
-            np.array([c.radar for c in found], dtype=np.intp),
-            np.array([c.row for c in found], dtype=np.intp),
-        )
-        nis, _ = state.update(rows.at, rows.H, z - rows.predicted_m, np.square(noise_m))
+        variances = np.square(sigmas) + np.square(doubts_m)
+        nis, _ = state.update(rows.at, rows.H, innovations_m, variances)
         return continued, nis
 
     def _raise_tracklets(self) -> tuple[tuple[int, ...], tuple[int, ...]]:

@@ -76,6 +76,11 @@ class RangeNoise:
     ----------
     sigma_m
         Standard deviation of a range.
+    doubt_m
+        Added in squares to what a front end tells of each range, wherever it is decided whose the
+        range is: a neighbour's echo may shift it by so much.
+    huber_sigmas
+        Innovations of more standard deviations weigh less, as in Huber's estimator.
     offset_sigma_m
         Standard deviation of each radar's unknown constant range offset; zero if calibrated.
     calibrated_sigma_m
@@ -92,6 +97,8 @@ class RangeNoise:
     """
 
     sigma_m: float = 7.4e-3
+    doubt_m: float = 0.0
+    huber_sigmas: float = math.inf
     offset_sigma_m: float = 0.0
     calibrated_sigma_m: float | None = None
     calibrated_evidence: float = 3.0

@@ -73,6 +73,12 @@ class RangeScan:
         """Return the standard deviation [m] of one range, if it is not told the other one."""
         return otherwise_m if self.sigmas_m is None else self.sigmas_m[index]
 
+    def doubted(self, doubt_m: float) -> RangeScan:
+        """Return the scan with a doubt added to what the front end tells of each range."""
+        if self.sigmas_m is None or not doubt_m:
+            return self
+        return replace(self, sigmas_m=tuple(math.hypot(s, doubt_m) for s in self.sigmas_m))
+
     def is_alone(self, index: int) -> bool:
         """Tell whether no other echo overlaps that of a range."""
         others = (*self.ranges_m[:index], *self.ranges_m[index + 1 :], *self.blurred_m)

@@ -135,9 +135,20 @@ def test_echoes_of_several_targets_are_left_out_and_told() -> None:
     t_ns = 40 * TICK_NS
     good, bad = echoes(straight(t_ns), 0, t_ns), echoes(straight(t_ns), 1, t_ns, misfit=9.0)
     (result,) = slam.step_detections([*good, *bad], straight, t_ns)
-    floor_m = ROBUST.robust.range_floor_m
-    told = [math.hypot(1e-3, floor_m)] * len(good) + [math.inf] * len(bad)
-    assert result.range_sigmas_m == pytest.approx(told)
+    assert result.range_sigmas_m[len(good) :] == (math.inf,) * len(bad)
+
+
+@pytest.mark.parametrize("misfit", [0.0, 0.5, 1.4])
+def test_a_range_is_as_sure_as_its_misfit_tells(misfit: float) -> None:
+    """Variance (share + share of misfit^2) sigma^2 + floor^2, for a sigma of 1 mm: hand-computed."""
+    told = {"predicted_share": 0.5, "misfit_share": 2.0, "range_floor_m": 2e-3}
+    slam = robust(override(ROBUST, {f"robust.{key}": value for key, value in told.items()}))
+    slam.step_detections((), straight, 0)
+    (result,) = slam.step_detections(
+        echoes(straight(TICK_NS), 0, TICK_NS, misfit=misfit), straight, TICK_NS
+    )
+    expected = {0.0: math.sqrt(4.5), 0.5: math.sqrt(5.0), 1.4: math.sqrt(8.42)}[misfit]
+    assert result.range_sigmas_m == pytest.approx([1e-3 * expected] * len(result.detections))
 
 
 def test_a_blurred_echo_is_no_miss_of_what_it_may_hide_and_an_empty_frame_is() -> None:
