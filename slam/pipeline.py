@@ -100,6 +100,10 @@ class Slam(Protocol):
         """Return the states still held back at the end of a run."""
         ...
 
+    def walls_m(self) -> Array:
+        """Return the ends of the walls mapped so far, shape (k, 2, 2) [m], map frame."""
+        ...
+
 
 class UwbRadarSlam:
     """UWB radar SLAM as in the paper: fixes of two radars, DBSCAN over a window, EKF SLAM.
@@ -162,6 +166,10 @@ class UwbRadarSlam:
         if self.config.window.end_of_run is EndOfRun.DROP:
             self._window.clear()
         return tuple(self._estimate() for _ in range(len(self._window)))
+
+    def walls_m(self) -> Array:
+        """Return none: the paper's map has points only."""
+        return np.empty((0, 2, 2))
 
     def _take(
         self, detect: Callable[[], tuple[Detection, ...]], pose_at: PoseAt, t_ns: int

@@ -107,6 +107,14 @@ class RobustSlam:
         """Return the states not yet returned: none, for nothing is delayed."""
         return ()
 
+    def walls_m(self) -> Array:
+        """Return the ends of the stretches of wall that answered, shape (k, 2, 2) [m], map frame.
+
+        Of walls hit often enough to be reported.
+        """
+        walls = self.back_end.walls()
+        return np.concatenate([np.empty((0, 2, 2)), *(wall.spans_m for wall in walls)])
+
     def _take(
         self,
         detect: Callable[[], tuple[Detection, ...]],

@@ -77,6 +77,9 @@ def map_figure(
             label="true landmark",
             zorder=4,
         )
+    for number, ends_m in enumerate(record.walls_m):
+        name = "estimated wall" if number == 0 else None
+        axes.plot(*transform(place, ends_m).T, color=LANDMARK, linewidth=2.0, label=name)
     _draw_landmarks(axes, record.results[-1].belief, place)
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
 from slam.detector import Detection
 from slam.frames import RadarFrame
 from slam.pipeline import PoseAt, Slam, StepResult
@@ -40,3 +43,7 @@ class RecordedSlam:
     def flush(self) -> tuple[StepResult, ...]:
         """Return the states still held back at the end of a run."""
         return self._slam.flush()
+
+    def walls_m(self) -> NDArray[np.float64]:
+        """Return the pipeline's walls."""
+        return self._slam.walls_m()

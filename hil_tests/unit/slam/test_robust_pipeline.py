@@ -140,7 +140,7 @@ def test_echoes_of_several_targets_are_left_out_and_told() -> None:
 
 @pytest.mark.parametrize("misfit", [0.0, 0.5, 1.4])
 def test_a_range_is_as_sure_as_its_misfit_tells(misfit: float) -> None:
-    """Variance (share + share of misfit^2) sigma^2 + floor^2, for a sigma of 1 mm: hand-computed."""
+    """Variance (share + share of misfit^2) sigma^2 + floor^2, sigma 1 mm, by hand."""
     told = {"predicted_share": 0.5, "misfit_share": 2.0, "range_floor_m": 2e-3}
     slam = robust(override(ROBUST, {f"robust.{key}": value for key, value in told.items()}))
     slam.step_detections((), straight, 0)

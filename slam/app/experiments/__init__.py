@@ -88,6 +88,11 @@ _ROWS: tuple[Experiment, ...] = (
         module="slam.app.experiments.stress",
     ),
     Experiment(
+        name="scenes",
+        help="what one preset does in each scene of a sweep",
+        module="slam.app.experiments.scenes",
+    ),
+    Experiment(
         name="victoria-park",
         help="the robust back end on real data, a car among trees, against GTSAM's batch solution",
         module="slam.app.experiments.victoria_park",

@@ -40,7 +40,7 @@ def draw_stress(
         panels = figure.subplots(len(tables), 2, squeeze=False, sharex="col")
         for (errors, consistency), (clean, groups) in zip(panels, tables, strict=True):
             _draw_errors(errors, clean, groups)
-            _draw_consistency(consistency, groups)
+            draw_consistency(consistency, groups, [group["stress"] for group in groups])
         _legend(figure, panels[0, 0], panels[0, 1])
 
 
@@ -86,8 +86,19 @@ def _draw_errors(axes: Axes, clean: dict[str, Any], groups: Sequence[dict[str, A
     axes.invert_yaxis()
 
 
-def _draw_consistency(axes: Axes, groups: Sequence[dict[str, Any]]) -> None:
-    axes.axvspan(*groups[0]["anees_band_95"], color=GRID, zorder=0, label="95 % band")
+def draw_consistency(axes: Axes, groups: Sequence[dict[str, Any]], names: Sequence[str]) -> None:
+    """Draw the ten ANEES of each group in a row of its own, over the band of its seeds."""
+    for place, group in enumerate(groups):
+        low, high = group["anees_band_95"]
+        axes.barh(
+            place,
+            high - low,
+            left=low,
+            height=0.8,
+            color=GRID,
+            zorder=0,
+            label="95 % band" if place == 0 else None,
+        )
     for place, group in enumerate(groups):
         values = [value for _, value in group["anees_pose"]]
         axes.plot(
@@ -102,7 +113,7 @@ def _draw_consistency(axes: Axes, groups: Sequence[dict[str, Any]]) -> None:
         )
     axes.set_xscale("log")
     label(axes, "consistency", "mean NEES of the pose (3 dof)", "")
-    axes.set_yticks(range(len(groups)), [group["stress"] for group in groups])
+    axes.set_yticks(range(len(groups)), names)
     axes.invert_yaxis()
 
 

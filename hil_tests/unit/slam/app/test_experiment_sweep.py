@@ -87,6 +87,24 @@ def test_stress_compares_with_clean_runs(
     assert capsys.readouterr().out.count("x clean") == 4
 
 
+def test_scenes_has_a_row_per_clean_group(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["experiment", "scenes", "--sweep", written(tmp_path, runs())]
+    assert main([*command, "--out", str(tmp_path / "out")]) == 0
+    numbers = json.loads((tmp_path / "out" / "scenes.json").read_text())
+    # 10 and 2 mm, where the wheels have 40
+    assert [
+        (row["name"], row["ratio"], row["anees_mean"], row["anees_in_band"])
+        for row in numbers["groups"]
+    ] == [
+        ("lab, preset paper", pytest.approx(0.25), pytest.approx(3.35), 8),
+        ("lab, preset robust", pytest.approx(0.05), pytest.approx(3.0), 10),
+    ]
+    assert (tmp_path / "out" / "scenes.png").read_bytes().startswith(b"\x89PNG")
+    assert "0.250" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
     [
@@ -97,7 +115,7 @@ def test_stress_compares_with_clean_runs(
         ('{"groups": [{"scene": "lab"}]}', "is not a result"),
     ],
 )
-@pytest.mark.parametrize("name", ["consistency", "stress"])
+@pytest.mark.parametrize("name", ["consistency", "stress", "scenes"])
 def test_what_no_sweep_wrote_is_1_and_one_line(
     name: str,
     content: str | None,

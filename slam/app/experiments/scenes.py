@@ -1,0 +1,97 @@
+"""How one preset does in scenes that nobody chose it on: errors, maps, consistency per scene.
+
+Light, so that ``--help`` is; the drawing is in ``scenes_picture``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from slam.app.stop import StopFlag
+
+NAME = "scenes"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the sweep to look at."""
+    parser.add_argument(
+        "--sweep",
+        type=Path,
+        default=Path("out/scenes.json"),
+        metavar="JSON",
+        help="result of `uwb-slam sweep --scene ...` (default: %(default)s)",
+    )
+
+
+def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
+    """Draw and print the clean groups of a sweep, a row per scene."""
+    # heavy, see module text
+    from slam.app.experiments.results import print_table, write_json
+    from slam.app.experiments.scenes_picture import draw_scenes
+    from slam.app.experiments.sweep_result import read_groups
+    from slam.app.report_table import mm_text, share_text
+    from slam.app.stress import CLEAN
+    from slam.app.summary import ratio
+    from slam.app.sweep_groups import group_name
+    from slam.app.sweep_tables import in_band
+
+    groups = [group for group in read_groups(arguments.sweep) if group["stress"] == CLEAN]
+    stop.check()
+    draw_scenes(arguments.out / f"{NAME}.png", groups)
+    rows = [
+        {
+            "name": group_name(group),
+            "runs": group["runs"],
+            "runs_below_odometry": group["runs_below_odometry"],
+            "odometry_ate_rmse_m": group["odometry_ate_rmse_m"],
+            "ate_rmse_m": group["ate_rmse_m"],
+            "ratio": ratio(group["ate_rmse_m"]["median"], group["odometry_ate_rmse_m"]["median"]),
+            "anees_mean": sum(nees for _, nees in group["anees_pose"]) / len(group["anees_pose"]),
+            "anees_in_band": in_band(group),
+            "nis_mean": group["nis_mean"],
+            "landmark_medians": group["landmark_medians"],
+            "without_duplicates": group["without_duplicates"],
+            "confident_false": group["confident_false"],
+        }
+        for group in groups
+    ]
+    write_json(arguments.out / f"{NAME}.json", {"simulated": True, "groups": rows})
+    print_table(
+        "medians over seeds, one preset, no parameter per scene: simulated numbers",
+        (
+            "scene",
+            "seeds",
+            "odometry",
+            "SLAM",
+            "p90",
+            "ratio",
+            "better",
+            "ANEES",
+            "in band",
+            "NIS",
+            "precision",
+            "recall",
+            "no duplicate",
+            "confident false",
+        ),
+        [
+            (
+                row["name"],
+                str(row["runs"]),
+                mm_text(row["odometry_ate_rmse_m"]["median"]),
+                mm_text(row["ate_rmse_m"]["median"]),
+                mm_text(row["ate_rmse_m"]["p90"]),
+                f"{row['ratio']:.3f}",
+                f"{row['runs_below_odometry']} of {row['runs']}",
+                f"{row['anees_mean']:.1f}",
+                f"{row['anees_in_band']} of 10",
+                "-" if row["nis_mean"] is None else f"{row['nis_mean']:.2f}",
+                share_text(row["landmark_medians"]["precision"]),
+                share_text(row["landmark_medians"]["recall"]),
+                f"{row['without_duplicates']:.0%}",
+                str(row["confident_false"]),
+            )
+            for row in rows
+        ],
+    )
