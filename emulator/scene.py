@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
+from emulator.bounded_file import read_bounded
 from emulator.people import PersonSpec
 from emulator.scene_tables import (
     CarriedSpec,
@@ -187,7 +188,7 @@ def load_scene(path_or_name: str | Path) -> Scene:
         )
     source = _SHIPPED_SCENES / f"{text}.toml" if is_name else Path(path_or_name)
     try:
-        table = tomllib.loads(source.read_bytes().decode())
+        table = tomllib.loads(read_bounded(source).decode())
     except OSError as error:
         raise SceneError(f"{text}: cannot read the scene file: {error.strerror}") from error
     except UnicodeDecodeError as error:

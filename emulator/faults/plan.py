@@ -37,6 +37,7 @@ from pydantic import (
     model_validator,
 )
 
+from emulator.bounded_file import read_bounded
 from emulator.faults.catalogue import KINDS
 from emulator.faults.kind import Kind, Parameters, Target
 from xethru_protocol.messages import Command
@@ -211,7 +212,7 @@ def load_plan(path: Path | str) -> FaultPlan:
             )
         source = _SHIPPED / f"{path}.toml"
     try:
-        text = source.read_bytes().decode()
+        text = read_bounded(source).decode()
     except OSError as error:
         raise FaultPlanError(f"{path}: cannot read the scenario: {error.strerror}") from error
     except UnicodeDecodeError as error:

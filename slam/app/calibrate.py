@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from emulator.bounded_file import read_bounded
 from emulator.scene import Scene, SceneError, load_scene
 from slam.app.errors import AppError, UsageError
 from slam.app.odometry import OdometryTrack
@@ -181,7 +182,9 @@ def read_reflectors(name: str) -> Array:
     table: dict[str, Any] = {}
     if path.suffix == ".toml" and path.is_file():
         try:
-            table = tomllib.loads(path.read_text(encoding="utf-8"))
+            table = tomllib.loads(read_bounded(path).decode())
+        except OSError as error:
+            raise AppError(f"{path}: cannot be read: {error.strerror}") from None
         except ValueError as error:
             raise AppError(f"{path}: not valid TOML: {error}") from None
     if "reflectors" not in table:

@@ -6,8 +6,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+from emulator.bounded_file import read_bounded
 from slam.app.errors import AppError
 
+_MOST_BYTES = 1 << 28
 _NEEDED = {"scene", "preset", "settings", "stress", "ate_rmse_m", "anees_pose", "nis_times"}
 
 
@@ -20,7 +22,7 @@ def read_groups(path: Path) -> list[dict[str, Any]]:
         It cannot be read, or no sweep wrote it; one line.
     """
     try:
-        groups: list[dict[str, Any]] = json.loads(path.read_bytes())["groups"]
+        groups: list[dict[str, Any]] = json.loads(read_bounded(path, _MOST_BYTES))["groups"]
         complete = all(group.keys() >= _NEEDED for group in groups)
     except OSError as error:
         raise AppError(
