@@ -74,7 +74,7 @@ def apply_merge(state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float
     for kept, gone in pairs:
         if ids[gone] in state.radii_m:
             state.radii_m.setdefault(ids[kept], state.radii_m[ids[gone]])
-            state.radius_doubts_m.setdefault(ids[kept], state.radius_doubts_m.get(ids[gone], 0.0))
+            state.range_doubts_m.setdefault(ids[kept], state.range_doubts_m.get(ids[gone], 0.0))
     for row in sorted((second for _, second in pairs), reverse=True):
         state.remove(row)
 

@@ -230,6 +230,9 @@ class WallRule:
     resolution_m, resolution_rad
         A wall as near as this to a mapped one, and not it, is its echo merged with another: a
         pulse is longer than that.
+    roughness_m
+        Added in squares to the standard deviation of a known wall's ranges: no wall is a mirror to
+        a fraction of a millimetre, and within a Fresnel zone of its end the edge answers, too.
     """
 
     window: int = 40
@@ -244,6 +247,7 @@ class WallRule:
     reach_m: float = 1.0
     resolution_m: float = 0.05
     resolution_rad: float = 0.1
+    roughness_m: float = 3e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

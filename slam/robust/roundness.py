@@ -215,7 +215,7 @@ class Roundness:
             lead = 0.0 if known_m else rule.lead
             if give_radius(log, state, parameters, (row, told_m), lead):
                 solved = True
-                state.radius_doubts_m[id_] = _DOUBT_PER_SIGMA * radius.sigma_m if told_m else 0.0
+                state.range_doubts_m[id_] = _DOUBT_PER_SIGMA * radius.sigma_m if told_m else 0.0
         return solved
 
     def _is_news(self, id_: int, radius: Radius) -> bool:

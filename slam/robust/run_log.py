@@ -285,7 +285,7 @@ class RunLog:
         used, used_points = np.flatnonzero(of_range >= 0), np.flatnonzero(of_point >= 0)
         sigmas = np.square(self._wheels.calibration_sigmas)
         sigmas_m = np.array(ranges.sigmas_m)[used]
-        if state.radius_doubts_m:
+        if state.range_doubts_m:
             sigmas_m = np.hypot(sigmas_m, state.feature_doubts_m[of_range[used]])
         # What lies on a round target's surface is nearer than its axis, which is the landmark.
         ranges_m = np.array(ranges.ranges_m)[used] + state.feature_radii_m[of_range[used]]

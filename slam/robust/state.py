@@ -80,9 +80,10 @@ class State:
         shape (w, 2): phi [rad], not wrapped, and d [m], map frame.
     wall_ids
         w ids in row order, of the same numbers as the landmarks'.
-    radii_m, radius_doubts_m
-        Radius of each landmark known to be round, by id, whose axis is the landmark; and what not
-        knowing it better adds to its ranges.
+    radii_m, range_doubts_m
+        Radius of each landmark known to be round, by id, whose axis is the landmark; and what is
+        added in squares to the ranges of a feature: not knowing its radius better, a wall's
+        roughness.
     P
         Covariance of the errors, size 6 + r + 2 (n + w).
     """
@@ -97,7 +98,7 @@ class State:
         "offsets_m",
         "position_m",
         "radii_m",
-        "radius_doubts_m",
+        "range_doubts_m",
         "wall_ids",
         "walls",
     )
@@ -114,7 +115,7 @@ class State:
         self.walls: Array = np.zeros((0, 2))
         self.wall_ids: list[int] = []
         self.radii_m: dict[int, float] = {}
-        self.radius_doubts_m: dict[int, float] = {}
+        self.range_doubts_m: dict[int, float] = {}
         self.next_id = 0
         sigmas = [0.0, 0.0, 0.0, *calibration_sigmas, *offset_sigmas_m]
         self.P = SymmetricMatrix(np.diag(np.square(sigmas)))
@@ -146,8 +147,8 @@ class State:
 
     @property
     def feature_doubts_m(self) -> Array:
-        """Return what doubt about radii adds to the ranges of landmarks and walls, (n + w,)."""
-        return np.array([self.radius_doubts_m.get(id_, 0.0) for id_ in self.feature_ids])
+        """Return what doubt adds to the ranges of landmarks and walls, (n + w,)."""
+        return np.array([self.range_doubts_m.get(id_, 0.0) for id_ in self.feature_ids])
 
     def landmark_columns(self, rows: NDArray[np.intp]) -> Indices:
         """Return where landmarks lie in the error, shape (2 k,); walls are the rows from n on."""
@@ -232,7 +233,7 @@ class State:
         self.P.keep(np.delete(np.arange(self.P.size), [first, first + 1]))
         n = len(self.landmark_ids)
         self.radii_m.pop(self.feature_ids[row], None)
-        self.radius_doubts_m.pop(self.feature_ids[row], None)
+        self.range_doubts_m.pop(self.feature_ids[row], None)
         if row < n:
             self.landmarks_m = np.delete(self.landmarks_m, row, axis=0)
             del self.landmark_ids[row]

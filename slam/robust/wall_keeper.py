@@ -125,6 +125,7 @@ class WallKeeper:
             return None
         if row is None:
             wall_id = give_birth_to_wall(state, seen)
+            state.range_doubts_m[wall_id] = self._rule.roughness_m
             row = len(state.wall_ids) - 1
         else:
             wall_id = state.wall_ids[row]

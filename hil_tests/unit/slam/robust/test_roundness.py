@@ -135,7 +135,7 @@ def test_a_radius_shortens_ranges_and_lengthens_them_back_for_the_smoother() -> 
     problem = log.problem(state, start_prior((0.1, 0.1, 0.1), (0.01,) * 4, 4))
     assert problem.ranges_m == pytest.approx([1.0, 1.07])
     assert problem.range_sigmas_m == pytest.approx([SIGMA_M, SIGMA_M])
-    state.radius_doubts_m[2] = 3e-3
+    state.range_doubts_m[2] = 3e-3
     problem = log.problem(state, start_prior((0.1, 0.1, 0.1), (0.01,) * 4, 4))
     assert problem.range_sigmas_m == pytest.approx([SIGMA_M, math.hypot(SIGMA_M, 3e-3)])
     near = landmarks_in_view(
@@ -146,7 +146,7 @@ def test_a_radius_shortens_ranges_and_lengthens_them_back_for_the_smoother() -> 
     assert added == pytest.approx(np.diag(np.where(near.rows.landmarks == 1, 9e-6, 0.0)))
     state.remove(1)
     assert state.radii_m == {}
-    assert state.radius_doubts_m == {}
+    assert state.range_doubts_m == {}
 
 
 def test_a_radius_that_the_whole_run_contradicts_is_not_given() -> None:
