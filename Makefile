@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PYTEST := $(BIN)/python -m pytest
 
-.PHONY: demo test test-all check bench sweep pictures clean
+.PHONY: demo test test-all check bench sweep stress scenes pictures clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed-demo
@@ -34,6 +34,18 @@ bench: $(VENV)/installed-bench
 sweep: $(VENV)/installed-sweep
 	$(BIN)/uwb-slam sweep --scene lab classroom --preset paper robust --seeds 100 --bound --json out/sweep.json
 	$(BIN)/uwb-slam experiment consistency --sweep out/sweep.json --out out
+
+# What each hardship costs, on ten seeds.
+stress: $(VENV)/installed-demo
+	$(BIN)/uwb-slam sweep --scene lab classroom --seeds 10 --json out/stress.json \
+		--stress outliers dropped skew walk silent all dead offsets carried
+	$(BIN)/uwb-slam experiment stress --sweep out/stress.json --out out
+
+# Every scene that has a drive through something to map, five seeds each.
+scenes: $(VENV)/installed-demo
+	$(BIN)/uwb-slam sweep --seeds 5 --json out/scenes.json --scene lab classroom lab_six symmetric \
+		smoke calibration two_rooms walls corridor store hall
+	$(BIN)/uwb-slam experiment scenes --sweep out/scenes.json --out out
 
 # The pictures of fixtures/pictures, and the numbers of `limits`: about a quarter of an hour of one
 # core. Needs Mesa's lavapipe (Debian: mesa-vulkan-drivers) for the screenshot of Rerun and Chromium
