@@ -35,17 +35,18 @@ sweep: $(VENV)/installed-sweep
 	$(BIN)/uwb-slam sweep --scene lab classroom --preset paper robust --seeds 100 --bound --json out/sweep.json
 	$(BIN)/uwb-slam experiment consistency --sweep out/sweep.json --out out
 
-# What each hardship costs, on ten seeds.
+# What each hardship costs preset robust, on five seeds: 100 runs, a quarter of an hour of two cores.
+# Stopped, it goes on where it was; picture and table in out/experiments.
 stress: $(VENV)/installed-demo
-	$(BIN)/uwb-slam sweep --scene lab classroom --seeds 10 --json out/stress.json \
+	$(BIN)/uwb-slam sweep --scene lab classroom --seeds 5 --json out/stress.json \
 		--stress outliers dropped skew walk silent all dead offsets carried
-	$(BIN)/uwb-slam experiment stress --sweep out/stress.json --out out
+	$(BIN)/uwb-slam experiment stress --sweep out/stress.json
 
-# Every scene that has a drive through something to map, five seeds each.
+# Preset robust in every scene that has wheels and something to map, five seeds each; likewise.
 scenes: $(VENV)/installed-demo
 	$(BIN)/uwb-slam sweep --seeds 5 --json out/scenes.json --scene lab classroom lab_six symmetric \
 		smoke calibration two_rooms walls corridor store hall
-	$(BIN)/uwb-slam experiment scenes --sweep out/scenes.json --out out
+	$(BIN)/uwb-slam experiment scenes --sweep out/scenes.json
 
 # The pictures of fixtures/pictures, and the numbers of `limits`: about a quarter of an hour of one
 # core. Needs Mesa's lavapipe (Debian: mesa-vulkan-drivers) for the screenshot of Rerun and Chromium

@@ -19,5 +19,5 @@ def read_bounded(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
     with path.open("rb") as file:
         content = file.read(most_bytes + 1)
     if len(content) > most_bytes:
-        raise OSError(errno.EFBIG, f"longer than {most_bytes} bytes")
+        raise OSError(errno.EFBIG, f"longer than {most_bytes >> 20} MiB")
     return content

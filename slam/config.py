@@ -301,15 +301,16 @@ class RobustConfig(_Model):
 
     # Full opening angle within which the front end finds what is there, wider than -3 dB.
     field_of_view_deg: Annotated[float, Field(gt=0, lt=180)] = 65.0
-    # Typical standard deviation of a range: how sure a prediction must be to continue a track,
-    # and that of every range of a front end that predicts none.
+    # How sure a prediction must be for a single range to continue a track, and the standard
+    # deviation of every range of a front end that predicts none.
     range_sigma_m: Positive = 2.8e-3
     # The variance of a range as a share of what the front end predicts, for no misfit and per
     # square of the misfit; and what that leaves out, added to it in squares.
     predicted_share: Positive = 1.0
     misfit_share: NonNegative = 0.0
     range_floor_m: NonNegative = 0.0
-    # Added, in squares, where it is decided whose a range is: a neighbour's echo may shift it.
+    # Added, in squares, where it is decided whose a range is: a neighbour's echo may shift it. The
+    # ranges of a tracklet, decided on together, keep it.
     association_doubt_m: NonNegative = 0.0
     # Innovations of more standard deviations weigh less.
     huber_sigmas: Annotated[float, Field(gt=0)] = math.inf

@@ -100,8 +100,8 @@ class Slam(Protocol):
         """Return the states still held back at the end of a run."""
         ...
 
-    def walls_m(self) -> Array:
-        """Return the ends of the walls mapped so far, shape (k, 2, 2) [m], map frame."""
+    def wall_spans_m(self) -> Array:
+        """Return the ends of the stretches of wall that answered, (k, 2, 2) [m], map frame."""
         ...
 
 
@@ -167,7 +167,7 @@ class UwbRadarSlam:
             self._window.clear()
         return tuple(self._estimate() for _ in range(len(self._window)))
 
-    def walls_m(self) -> Array:
+    def wall_spans_m(self) -> Array:
         """Return none: the paper's map has points only."""
         return np.empty((0, 2, 2))
 

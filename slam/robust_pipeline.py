@@ -107,7 +107,7 @@ class RobustSlam:
         """Return the states not yet returned: none, for nothing is delayed."""
         return ()
 
-    def walls_m(self) -> Array:
+    def wall_spans_m(self) -> Array:
         """Return the ends of the stretches of wall that answered, shape (k, 2, 2) [m], map frame.
 
         Of walls hit often enough to be reported.
@@ -161,7 +161,7 @@ class RobustSlam:
         if detection.misfit > told.max_misfit or detection.sigma_m > told.max_predicted_sigma_m:
             return math.inf
         variance = told.predicted_share
-        if told.misfit_share:
+        if not math.isnan(detection.misfit):
             variance += told.misfit_share * detection.misfit**2
         return math.hypot(told.range_floor_m, math.sqrt(variance) * detection.sigma_m)
 

@@ -1,4 +1,4 @@
-"""The map of a run as a picture: truth, odometry, estimate, landmarks with their uncertainty."""
+"""The map of a run as a picture: truth, odometry, estimate, walls, landmarks with ellipses."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def map_figure(
             label="true landmark",
             zorder=4,
         )
-    for number, ends_m in enumerate(record.walls_m):
+    for number, ends_m in enumerate(record.wall_spans_m):
         name = "estimated wall" if number == 0 else None
         axes.plot(*transform(place, ends_m).T, color=LANDMARK, linewidth=2.0, label=name)
     _draw_landmarks(axes, record.results[-1].belief, place)

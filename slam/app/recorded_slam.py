@@ -44,6 +44,6 @@ class RecordedSlam:
         """Return the states still held back at the end of a run."""
         return self._slam.flush()
 
-    def walls_m(self) -> NDArray[np.float64]:
+    def wall_spans_m(self) -> NDArray[np.float64]:
         """Return the pipeline's walls."""
-        return self._slam.walls_m()
+        return self._slam.wall_spans_m()

@@ -17,11 +17,11 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, ValidationError
 
+from emulator.bounded_file import read_bounded
 from slam.app.errors import AppError, naming
 from slam.geometry import Mount, Rig
 from slam.robust.parameters import WheelNoise
 
-_MOST_BYTES = 1 << 20
 _Sigma = Annotated[StrictFloat | StrictInt, Field(ge=0, le=10, allow_inf_nan=False)]
 _Number = Annotated[StrictFloat | StrictInt, Field(ge=-1000, le=1000, allow_inf_nan=False)]
 
@@ -107,11 +107,7 @@ def load_rig(path: Path) -> RigFile:
         One line with file, key and what is allowed.
     """
     try:
-        with path.open("rb") as stream:
-            content = stream.read(_MOST_BYTES + 1)
-        if len(content) > _MOST_BYTES:
-            raise AppError(f"{path}: longer than {_MOST_BYTES >> 20} MiB, so it is no rig file")
-        table = tomllib.loads(content.decode())
+        table = tomllib.loads(read_bounded(path).decode())
     except OSError as error:
         raise AppError(f"{path}: cannot read the rig file: {error.strerror or error}") from None
     except ValueError as error:  # neither UTF-8 nor TOML

@@ -49,8 +49,8 @@ class RunRecord:
         Session time of the first scan.
     duration_ns, wall_s
         Session time covered and the time it took.
-    walls_m
-        Ends of the walls mapped in the end, shape (k, 2, 2), map frame.
+    wall_spans_m
+        Ends of the stretches of wall that answered, shape (k, 2, 2), map frame.
     """
 
     results: tuple[StepResult, ...]
@@ -60,7 +60,7 @@ class RunRecord:
     duration_ns: int
     wall_s: float
     start_ns: int = 0
-    walls_m: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 2, 2)))
+    wall_spans_m: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 2, 2)))
 
 
 def run_slam(
@@ -123,7 +123,7 @@ def run_slam(
         n_frames=n_frames,
         duration_ns=duration_ns,
         start_ns=start_ns or 0,
-        walls_m=slam.walls_m(),
+        wall_spans_m=slam.wall_spans_m(),
         wall_s=time.monotonic() - started,
     )
 

@@ -33,7 +33,7 @@ from slam.robust.tracklets import (
     guesses_of,
 )
 from slam.robust.wall_keeper import WallKeeper
-from slam.robust.weights import huber_sigmas_m
+from slam.robust.weights import huber_weighted_sigmas_m
 from slam.robust.whereabouts import Whereabouts, forget, merge_landmarks
 
 
@@ -268,8 +268,11 @@ class RobustBackEnd:
         innovations_m = z - rows.predicted_m
         sigmas = np.array([of_radar[c.radar].sigma(c.index, noise.sigma_m) for c in found])
         doubts_m = state.feature_doubts_m[[c.row for c in found]]
-        prior = np.vecdot(rows.H @ state.P.block(rows.at), rows.H) + np.square(doubts_m)
-        sigmas = huber_sigmas_m(innovations_m, prior, sigmas, noise.huber_sigmas)
+        by_state = rows.H @ state.P.block(rows.at)
+        S = by_state @ rows.H.T + np.diag(np.square(sigmas) + np.square(doubts_m))
+        nis = float(innovations_m @ np.linalg.solve(S, innovations_m))
+        prior = np.vecdot(by_state, rows.H) + np.square(doubts_m)
+        sigmas = huber_weighted_sigmas_m(innovations_m, prior, sigmas, noise.huber_sigmas)
         for (radar, at, landmark_id), range_m, sigma_m in zip(continued, z, sigmas, strict=True):
             x, y = antennas.position_m[radar].tolist()
             self._log.add_range(
@@ -282,7 +285,7 @@ class RobustBackEnd:
                 alone=of_radar[radar].is_alone(at),
             )
         variances = np.square(sigmas) + np.square(doubts_m)
-        nis, _ = state.update(rows.at, rows.H, innovations_m, variances)
+        state.update(rows.at, rows.H, innovations_m, variances)
         return continued, nis
 
     def _raise_tracklets(self) -> tuple[tuple[int, ...], tuple[int, ...]]:

@@ -78,7 +78,7 @@ class RangeNoise:
         Standard deviation of a range.
     doubt_m
         Added in squares to what a front end tells of each range, wherever it is decided whose the
-        range is: a neighbour's echo may shift it by so much.
+        range is: a neighbour's echo may shift it by so much. The ranges of a tracklet keep it.
     huber_sigmas
         Innovations of more standard deviations weigh less, as in Huber's estimator.
     offset_sigma_m
@@ -231,8 +231,8 @@ class WallRule:
         A wall as near as this to a mapped one, and not it, is its echo merged with another: a
         pulse is longer than that.
     roughness_m
-        Added in squares to the standard deviation of a known wall's ranges: no wall is a mirror to
-        a fraction of a millimetre, and within a Fresnel zone of its end the edge answers, too.
+        Added in squares to the standard deviation of a known wall's single ranges: none is a mirror
+        to a fraction of a millimetre, and within a Fresnel zone of its end the edge answers, too.
     """
 
     window: int = 40

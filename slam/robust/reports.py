@@ -86,8 +86,8 @@ class UpdateReport:
     deleted
         Ids.
     nis, dof
-        Normalised innovation squared of the ranges that continued tracks, and its degrees of
-        freedom.
+        Normalised innovation squared of the ranges that continued tracks, before Huber's weights,
+        and its degrees of freedom.
     relinearised
         Whether all poses were solved for.
     expected

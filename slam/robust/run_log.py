@@ -188,7 +188,8 @@ class RunLog:
     ) -> None:
         """Append a range used; ``antenna`` is in the body frame of the pose.
 
-        ``alone`` tells whether no other echo overlaps its own.
+        ``sigma_m`` is what it weighed in the filter, with doubt and Huber's weight; ``alone`` tells
+        whether no other echo overlaps its own.
 
         Raises
         ------

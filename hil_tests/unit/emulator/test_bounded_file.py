@@ -19,10 +19,10 @@ ENDLESS = "/dev/zero"
 
 def test_a_file_of_the_most_bytes_is_read_and_one_more_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "f"
-    path.write_bytes(b"12345")
-    assert read_bounded(path, 5) == b"12345"
-    with pytest.raises(OSError, match="longer than 4 bytes") as caught:
-        read_bounded(path, 4)
+    path.write_bytes(bytes(2 << 20))
+    assert len(read_bounded(path, 2 << 20)) == 2 << 20
+    with pytest.raises(OSError, match="longer than 1 MiB") as caught:
+        read_bounded(path, (2 << 20) - 1)
     assert caught.value.errno == errno.EFBIG
 
 

@@ -138,8 +138,10 @@ def test_echoes_of_several_targets_are_left_out_and_told() -> None:
     assert result.range_sigmas_m[len(good) :] == (math.inf,) * len(bad)
 
 
-@pytest.mark.parametrize("misfit", [0.0, 0.5, 1.4])
-def test_a_range_is_as_sure_as_its_misfit_tells(misfit: float) -> None:
+@pytest.mark.parametrize(
+    ("misfit", "variance_mm2"), [(0.0, 4.5), (0.5, 5.0), (1.4, 8.42), (math.nan, 4.5)]
+)
+def test_a_range_is_as_sure_as_its_misfit_tells(misfit: float, variance_mm2: float) -> None:
     """Variance (share + share of misfit^2) sigma^2 + floor^2, sigma 1 mm, by hand."""
     told = {"predicted_share": 0.5, "misfit_share": 2.0, "range_floor_m": 2e-3}
     slam = robust(override(ROBUST, {f"robust.{key}": value for key, value in told.items()}))
@@ -147,8 +149,8 @@ def test_a_range_is_as_sure_as_its_misfit_tells(misfit: float) -> None:
     (result,) = slam.step_detections(
         echoes(straight(TICK_NS), 0, TICK_NS, misfit=misfit), straight, TICK_NS
     )
-    expected = {0.0: math.sqrt(4.5), 0.5: math.sqrt(5.0), 1.4: math.sqrt(8.42)}[misfit]
-    assert result.range_sigmas_m == pytest.approx([1e-3 * expected] * len(result.detections))
+    expected_m = 1e-3 * math.sqrt(variance_mm2)
+    assert result.range_sigmas_m == pytest.approx([expected_m] * len(result.detections))
 
 
 def test_a_blurred_echo_is_no_miss_of_what_it_may_hide_and_an_empty_frame_is() -> None:
@@ -257,6 +259,11 @@ def test_another_front_end_can_be_brought() -> None:
     assert [(found.radar, found.range_m) for found in result.detections] == [(2, 0.7)]
 
 
+def test_a_map_without_walls_has_none() -> None:
+    assert robust().wall_spans_m().shape == (0, 2, 2)
+    assert UwbRadarSlam(load_preset("paper"), RIG).wall_spans_m().shape == (0, 2, 2)
+
+
 def test_every_key_of_the_table_reaches_the_back_end() -> None:
     settings = {
         "robust.field_of_view_deg": 50.0,
@@ -266,6 +273,8 @@ def test_every_key_of_the_table_reaches_the_back_end() -> None:
         "robust.detection_probability": 0.7,
         "robust.false_ranges_per_frame": 0.26,
         "robust.wheel_walk_per_sqrt_m": 0.15,
+        "robust.association_doubt_m": 3e-3,
+        "robust.huber_sigmas": 2.5,
         "detection.min_range_m": 0.2,
         "detection.max_range_m": 1.5,
     }
@@ -274,6 +283,7 @@ def test_every_key_of_the_table_reaches_the_back_end() -> None:
     assert ranges.field_of_view_rad == math.radians(50.0)
     assert (ranges.sigma_m, ranges.offset_sigma_m, ranges.calibrated_sigma_m) == (4e-3, 0.02, 1e-3)
     assert ranges.detection_probability == 0.7
+    assert (ranges.doubt_m, ranges.huber_sigmas) == (3e-3, 2.5)
     assert ranges.clutter_per_m == pytest.approx(0.2)
     assert (ranges.min_range_m, ranges.max_range_m) == (0.2, 1.5)
     assert (told.wheels.scale_sigma, told.wheels.walk_per_sqrt_m) == (0.01, 0.15)

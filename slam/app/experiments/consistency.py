@@ -34,7 +34,8 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
     from slam.app.sweep_groups import group_name
     from slam.app.sweep_tables import in_band, nis_in_band
 
-    groups = [group for group in read_groups(arguments.sweep) if group["stress"] == CLEAN]
+    result = arguments.out / f"{NAME}.json"
+    groups = [group for group in read_groups(arguments.sweep, result) if group["stress"] == CLEAN]
     stop.check()
     draw_consistency(arguments.out / f"{NAME}.png", groups)
     rows = []
@@ -50,7 +51,7 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
                 "nis_mean": group["nis_mean"],
             }
         )
-    write_json(arguments.out / f"{NAME}.json", {"simulated": True, "groups": rows})
+    write_json(result, {"simulated": True, "groups": rows})
     print_table(
         "times of ten in their 95 % band: simulated numbers",
         ("group", "seeds", "ANEES", "known association", "NIS", "NIS mean"),

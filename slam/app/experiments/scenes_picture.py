@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator, NullLocator
 
 from slam.app.experiments.stress_picture import draw_consistency
 from slam.app.picture import ESTIMATE, GRID, INK, LANDMARK, ODOMETRY, label, picture
@@ -18,7 +19,11 @@ def draw_scenes(path: Path, groups: Sequence[dict[str, Any]]) -> None:
     names = [group_name(group) for group in groups]
     with picture(path, width_in=10.4, height_in=1.6 + 0.34 * len(groups)) as figure:
         figure.suptitle(
-            "One preset in every scene (simulated)", fontsize=11, color=INK, x=0.01, ha="left"
+            "Clean runs, a row per scene and preset (simulated)",
+            fontsize=11,
+            color=INK,
+            x=0.01,
+            ha="left",
         )
         errors, consistency = figure.subplots(1, 2)
         _draw_errors(errors, groups, names)
@@ -46,7 +51,9 @@ def _draw_errors(axes: Axes, groups: Sequence[dict[str, Any]], names: Sequence[s
             values, places, linestyle="none", marker=marker, markersize=6, color=colour, label=text
         )
     axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_locator(NullLocator())
     label(axes, "absolute trajectory error", "mm", "")
     axes.set_yticks(places, names)
-    axes.invert_yaxis()
+    axes.set_ylim(len(groups) - 0.5, -0.5)

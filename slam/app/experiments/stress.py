@@ -34,7 +34,8 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
     from slam.app.sweep_groups import group_name
     from slam.app.sweep_tables import in_band, print_stress_tables, stress_tables, times_clean
 
-    groups = read_groups(arguments.sweep)
+    result = arguments.out / f"{NAME}.json"
+    groups = read_groups(arguments.sweep, result)
     tables = stress_tables(groups)
     if not tables:
         raise AppError(f"{arguments.sweep}: has no stressed runs; `uwb-slam sweep --stress` does")
@@ -54,5 +55,5 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
         for clean, rows in tables
         for group in rows
     ]
-    write_json(arguments.out / f"{NAME}.json", {"simulated": True, "groups": numbers})
+    write_json(result, {"simulated": True, "groups": numbers})
     print_stress_tables(groups)

@@ -83,7 +83,7 @@ def _draw_errors(axes: Axes, clean: dict[str, Any], groups: Sequence[dict[str, A
         "",
     )
     axes.set_yticks(places, [group["stress"] for group in groups])
-    axes.invert_yaxis()
+    axes.set_ylim(len(groups) - 0.5, -0.5)
 
 
 def draw_consistency(axes: Axes, groups: Sequence[dict[str, Any]], names: Sequence[str]) -> None:
@@ -114,7 +114,7 @@ def draw_consistency(axes: Axes, groups: Sequence[dict[str, Any]], names: Sequen
     axes.set_xscale("log")
     label(axes, "consistency", "mean NEES of the pose (3 dof)", "")
     axes.set_yticks(range(len(groups)), names)
-    axes.invert_yaxis()
+    axes.set_ylim(len(groups) - 0.5, -0.5)
 
 
 def _legend(figure: Figure, *panels: Axes) -> None:

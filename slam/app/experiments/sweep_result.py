@@ -13,14 +13,17 @@ _MOST_BYTES = 1 << 28
 _NEEDED = {"scene", "preset", "settings", "stress", "ate_rmse_m", "anees_pose", "nis_times"}
 
 
-def read_groups(path: Path) -> list[dict[str, Any]]:
+def read_groups(path: Path, result: Path) -> list[dict[str, Any]]:
     """Return the groups of a sweep's result file, in its order.
 
     Raises
     ------
     AppError
-        It cannot be read, or no sweep wrote it; one line.
+        It cannot be read, no sweep wrote it, or `result`, which is about to be written, would
+        replace it; one line.
     """
+    if result.resolve() == path.resolve():
+        raise AppError(f"{path}: the result would replace the sweep; choose another --out")
     try:
         groups: list[dict[str, Any]] = json.loads(read_bounded(path, _MOST_BYTES))["groups"]
         complete = all(group.keys() >= _NEEDED for group in groups)
@@ -28,7 +31,7 @@ def read_groups(path: Path) -> list[dict[str, Any]]:
         raise AppError(
             f"{path}: cannot be read: {error.strerror or error}; `uwb-slam sweep --json` writes it"
         ) from None
-    except (ValueError, LookupError, TypeError, AttributeError):
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         complete, groups = False, []
     if not groups or not complete:
         raise AppError(f"{path}: is not a result of this version's `uwb-slam sweep --json`")

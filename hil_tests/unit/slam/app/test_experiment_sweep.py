@@ -133,6 +133,18 @@ def test_what_no_sweep_wrote_is_1_and_one_line(
     assert (text.out, text.err.count("\n")) == ("", 1)
 
 
+@pytest.mark.parametrize("name", ["consistency", "stress", "scenes"])
+def test_a_result_never_replaces_its_sweep(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / f"{name}.json"
+    Path(written(tmp_path, runs())).rename(path)
+    before = path.read_bytes()
+    assert main(["experiment", name, "--sweep", str(path), "--out", str(tmp_path)]) == 1
+    assert "choose another --out" in capsys.readouterr().err
+    assert path.read_bytes() == before
+
+
 def test_a_sweep_without_stresses_has_no_stress_table(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

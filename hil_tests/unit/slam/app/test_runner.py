@@ -49,7 +49,7 @@ class LateSlam:
     def flush(self) -> tuple[StepResult, ...]:
         return tuple(self.waiting)
 
-    def walls_m(self) -> NDArray[np.float64]:
+    def wall_spans_m(self) -> NDArray[np.float64]:
         return np.array([[[0.0, 1.0], [2.0, 1.0]]])
 
 
@@ -100,7 +100,7 @@ def test_every_state_comes_with_its_own_counter_truth_and_place() -> None:
     assert record.n_frames == 2 * len(COUNTERS)
     assert record.start_ns == COUNTERS[0] * FRAME_NS
     assert record.start_ns + record.duration_ns == COUNTERS[-1] * FRAME_NS
-    np.testing.assert_array_equal(record.walls_m, [[[0.0, 1.0], [2.0, 1.0]]])
+    np.testing.assert_array_equal(record.wall_spans_m, [[[0.0, 1.0], [2.0, 1.0]]])
 
 
 def test_an_unused_scan_is_told_and_not_stepped() -> None:

@@ -1,5 +1,6 @@
 """The robust back end in a world of ranges: it finds the map. Seeds are fixed."""
 
+import copy
 import math
 from dataclasses import replace
 
@@ -61,6 +62,48 @@ def test_a_relinearised_belief_stays_where_the_filter_was_in_a_linear_regime() -
     assert (np.abs(back_end.pose - before) <= sigmas).all()
     again = np.sqrt(np.diag(back_end.pose_covariance))
     assert again == pytest.approx(sigmas, rel=0.2)
+
+
+def told(scans: list[RangeScan], sigma_m: float) -> list[RangeScan]:
+    """Return scans of which a front end tells how sure each range is."""
+    return [replace(scan, sigmas_m=(sigma_m,) * len(scan.ranges_m)) for scan in scans]
+
+
+def test_a_doubtful_range_is_taken_for_what_it_may_be_and_weighs_less() -> None:
+    """One range 5 mm off, told to be sure to 1 mm: inside the gate with a doubt of 2 mm only."""
+    rig, sigma_m = paper_rig(), 1e-3
+    run = cut(simulate(LAB, 1, sigma_m), 150)
+    parameters = parameters_for(LAB, sigma_m)
+    parameters = replace(
+        parameters, ranges=replace(parameters.ranges, doubt_m=2e-3, huber_sigmas=2.0)
+    )
+    back_end = RobustBackEnd(rig, parameters)
+    for increment, scans in zip(run.increments, run.scans, strict=True):
+        back_end.predict(increment)
+        before = copy.deepcopy(back_end)
+        report = back_end.update(told(scans, sigma_m))
+    radar, index, landmark_id = report.continued[0]
+    scan = next(scan for scan in scans if scan.radar == radar)
+    ranges_m = list(scan.ranges_m)
+    ranges_m[index] += 5e-3
+    off = [replace(each, ranges_m=tuple(ranges_m)) if each is scan else each for each in scans]
+
+    def after(**changes: float) -> tuple[bool, float, float]:
+        """Return whether the range was used, how far it moved its landmark, and the NIS."""
+        twin = copy.deepcopy(before)
+        twin.parameters = replace(parameters, ranges=replace(parameters.ranges, **changes))
+        report = twin.update(told(off, sigma_m))
+        row = twin.state.landmark_ids.index(landmark_id)
+        moved = twin.state.landmarks_m[row] - before.state.landmarks_m[row]
+        return (radar, index, landmark_id) in report.continued, math.hypot(*moved), report.nis
+
+    used, moved_m, nis = after()
+    in_full = after(huber_sigmas=math.inf)
+    assert used
+    assert in_full[0]
+    assert moved_m < 0.7 * in_full[1]
+    assert nis == pytest.approx(in_full[2])  # what is reported is before Huber's weight
+    assert not after(doubt_m=0.0)[0]
 
 
 def test_points_with_names_make_a_map() -> None:

@@ -263,6 +263,8 @@ def test_four_bare_walls_hold_the_robot_and_become_no_points() -> None:
         back_end.predict(increment)
         back_end.update(scans)
     assert back_end.landmarks() == ()
+    rough = dict.fromkeys(back_end.state.wall_ids, WallRule().roughness_m)
+    assert back_end.state.range_doubts_m == rough
     true_d_m = {0: 3.0, 1: 3.0, 2: 1.0, 3: 1.0}
     for wall in back_end.walls():
         quarter = round(wall.phi_rad / (math.pi / 2))

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slam.robust.ranges import RangeScan
-from slam.robust.weights import huber_sigmas_m
+from slam.robust.weights import huber_weighted_sigmas_m
 
 positive = st.floats(1e-4, 1e-1)
 
@@ -18,7 +18,7 @@ def test_near_its_prediction_a_range_counts_in_full(
     prior: float, sigma: float, sigmas_off: float
 ) -> None:
     nu = np.array([sigmas_off * np.sqrt(prior**2 + sigma**2)]) * (1 - 1e-9)
-    weighed = huber_sigmas_m(nu, np.array([prior**2]), np.array([sigma]), 2.0)
+    weighed = huber_weighted_sigmas_m(nu, np.array([prior**2]), np.array([sigma]), 2.0)
     np.testing.assert_array_equal(weighed, [sigma])
 
 
@@ -29,13 +29,13 @@ def test_far_from_it_a_range_moves_the_state_no_further_than_at_the_bound(
     """Closed form: a scalar state of variance p moves by nu p / S', which is 2 p / sqrt(S)."""
     S = prior**2 + sigma**2
     nu = sigmas_off * np.sqrt(S)
-    weighed = huber_sigmas_m(np.array([nu]), np.array([prior**2]), np.array([sigma]), 2.0)
+    weighed = huber_weighted_sigmas_m(np.array([nu]), np.array([prior**2]), np.array([sigma]), 2.0)
     moved = nu * prior**2 / (prior**2 + float(weighed[0]) ** 2)
     assert moved == pytest.approx(2.0 * prior**2 / np.sqrt(S), rel=1e-9)
 
 
 def test_without_a_bound_every_range_counts_in_full() -> None:
-    weighed = huber_sigmas_m(np.array([5.0]), np.array([0.0]), np.array([1e-3]), np.inf)
+    weighed = huber_weighted_sigmas_m(np.array([5.0]), np.array([0.0]), np.array([1e-3]), np.inf)
     np.testing.assert_array_equal(weighed, [1e-3])
 
 
