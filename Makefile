@@ -35,7 +35,7 @@ sweep: $(VENV)/installed-sweep
 	$(BIN)/uwb-slam sweep --scene lab classroom --preset paper robust --seeds 100 --bound --json out/sweep.json
 	$(BIN)/uwb-slam experiment consistency --sweep out/sweep.json --out out
 
-# What each hardship costs preset robust, on five seeds: 100 runs, a quarter of an hour of two cores.
+# What each hardship costs preset robust, on five seeds: 100 runs, 23 minutes of two cores.
 # Stopped, it goes on where it was; picture and table in out/experiments.
 stress: $(VENV)/installed-demo
 	$(BIN)/uwb-slam sweep --scene lab classroom --seeds 5 --json out/stress.json \

@@ -22,6 +22,9 @@ TARGETS = {
 }
 """How many times the clean error each hardship may cost."""
 
+_MOST_NEES = 100.0
+"""What is above is an arrow at the edge."""
+
 
 def draw_stress(
     path: Path, tables: Sequence[tuple[dict[str, Any], Sequence[dict[str, Any]]]]
@@ -101,16 +104,23 @@ def draw_consistency(axes: Axes, groups: Sequence[dict[str, Any]], names: Sequen
         )
     for place, group in enumerate(groups):
         values = [value for _, value in group["anees_pose"]]
-        axes.plot(
-            values,
-            [place] * len(values),
-            linestyle="none",
-            marker="o",
-            markersize=4,
-            alpha=0.7,
-            color=ESTIMATE,
-            label="ANEES at one of ten times" if place == 0 else None,
-        )
+        for marker, shown in (
+            ("o", [value for value in values if value <= _MOST_NEES]),
+            (">", [_MOST_NEES for value in values if value > _MOST_NEES]),
+        ):
+            axes.plot(
+                shown,
+                [place] * len(shown),
+                linestyle="none",
+                marker=marker,
+                markersize=4,
+                alpha=0.7,
+                color=ESTIMATE,
+                label="ANEES at one of ten times" if place == 0 and marker == "o" else None,
+            )
+    lowest = min(group["anees_band_95"][0] for group in groups)
+    values = [value for group in groups for _, value in group["anees_pose"]]
+    axes.set_xlim(0.7 * min(lowest, *values), 1.2 * _MOST_NEES)
     axes.set_xscale("log")
     label(axes, "consistency", "mean NEES of the pose (3 dof)", "")
     axes.set_yticks(range(len(groups)), names)
