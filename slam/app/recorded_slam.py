@@ -45,5 +45,5 @@ class RecordedSlam:
         return self._slam.flush()
 
     def wall_spans_m(self) -> NDArray[np.float64]:
-        """Return the pipeline's walls."""
+        """Return the pipeline's stretches of wall, shape (k, 2, 2) [m], map frame."""
         return self._slam.wall_spans_m()

@@ -6,8 +6,8 @@ Light, so that ``--help`` is; the drawing is in ``consistency_picture``.
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
+from slam.app.experiments.sweep_result import add_sweep_argument, read_groups
 from slam.app.stop import StopFlag
 
 NAME = "consistency"
@@ -15,13 +15,7 @@ NAME = "consistency"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the sweep to look at."""
-    parser.add_argument(
-        "--sweep",
-        type=Path,
-        default=Path("out/sweep.json"),
-        metavar="JSON",
-        help="result of `uwb-slam sweep` (default: %(default)s, which `make sweep` writes)",
-    )
+    add_sweep_argument(parser, "out/sweep.json", "`uwb-slam sweep`, like `make sweep`")
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
@@ -29,7 +23,6 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
     # heavy, see module text
     from slam.app.experiments.consistency_picture import draw_consistency
     from slam.app.experiments.results import print_table, write_json
-    from slam.app.experiments.sweep_result import read_groups
     from slam.app.stress import CLEAN
     from slam.app.sweep_groups import group_name
     from slam.app.sweep_tables import in_band, nis_in_band

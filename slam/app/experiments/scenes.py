@@ -6,8 +6,8 @@ Light, so that ``--help`` is; the drawing is in ``scenes_picture``.
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
+from slam.app.experiments.sweep_result import add_sweep_argument, read_groups
 from slam.app.stop import StopFlag
 
 NAME = "scenes"
@@ -15,21 +15,16 @@ NAME = "scenes"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the sweep to look at."""
-    parser.add_argument(
-        "--sweep",
-        type=Path,
-        default=Path("out/scenes.json"),
-        metavar="JSON",
-        help="result of `uwb-slam sweep --scene ...` (default: %(default)s)",
-    )
+    add_sweep_argument(parser, "out/scenes.json", "`uwb-slam sweep --scene ...`")
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
     """Draw and print the clean groups of a sweep, a row per scene."""
     # heavy, see module text
+    from statistics import fmean
+
     from slam.app.experiments.results import print_table, write_json
     from slam.app.experiments.scenes_picture import draw_scenes
-    from slam.app.experiments.sweep_result import read_groups
     from slam.app.report_table import mm_text, share_text
     from slam.app.stress import CLEAN
     from slam.app.summary import ratio
@@ -48,7 +43,7 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
             "odometry_ate_rmse_m": group["odometry_ate_rmse_m"],
             "ate_rmse_m": group["ate_rmse_m"],
             "ratio": ratio(group["ate_rmse_m"]["median"], group["odometry_ate_rmse_m"]["median"]),
-            "anees_mean": sum(nees for _, nees in group["anees_pose"]) / len(group["anees_pose"]),
+            "anees_mean": fmean(nees for _, nees in group["anees_pose"]),
             "anees_in_band": in_band(group),
             "times": len(group["anees_pose"]),
             "nis_mean": group["nis_mean"],

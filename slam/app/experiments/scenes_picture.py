@@ -9,7 +9,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullLocator
 
-from slam.app.experiments.stress_picture import draw_consistency
+from slam.app.experiments.stress_picture import draw_consistency, legend_below
 from slam.app.picture import ESTIMATE, GRID, INK, LANDMARK, ODOMETRY, label, picture
 from slam.app.sweep_groups import group_name
 
@@ -28,10 +28,7 @@ def draw_scenes(path: Path, groups: Sequence[dict[str, Any]]) -> None:
         errors, consistency = figure.subplots(1, 2)
         _draw_errors(errors, groups, names)
         draw_consistency(consistency, groups, [""] * len(groups))
-        panels = (errors, consistency)
-        handles = [handle for axes in panels for handle in axes.get_legend_handles_labels()[0]]
-        labels = [text for axes in panels for text in axes.get_legend_handles_labels()[1]]
-        figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)
+        legend_below(figure, errors, consistency)
 
 
 def _draw_errors(axes: Axes, groups: Sequence[dict[str, Any]], names: Sequence[str]) -> None:

@@ -6,8 +6,8 @@ Light, so that ``--help`` is; the drawing is in ``stress_picture``.
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
+from slam.app.experiments.sweep_result import add_sweep_argument, read_groups
 from slam.app.stop import StopFlag
 
 NAME = "stress"
@@ -15,13 +15,7 @@ NAME = "stress"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the sweep to look at."""
-    parser.add_argument(
-        "--sweep",
-        type=Path,
-        default=Path("out/stress.json"),
-        metavar="JSON",
-        help="result of `uwb-slam sweep --stress ...` (default: %(default)s)",
-    )
+    add_sweep_argument(parser, "out/stress.json", "`uwb-slam sweep --stress ...`")
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
@@ -30,7 +24,6 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
     from slam.app.errors import AppError
     from slam.app.experiments.results import write_json
     from slam.app.experiments.stress_picture import draw_stress
-    from slam.app.experiments.sweep_result import read_groups
     from slam.app.sweep_groups import group_name
     from slam.app.sweep_tables import in_band, print_stress_tables, stress_tables, times_clean
 

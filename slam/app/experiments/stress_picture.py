@@ -44,7 +44,7 @@ def draw_stress(
         for (errors, consistency), (clean, groups) in zip(panels, tables, strict=True):
             _draw_errors(errors, clean, groups)
             draw_consistency(consistency, groups, [group["stress"] for group in groups])
-        _legend(figure, panels[0, 0], panels[0, 1])
+        legend_below(figure, panels[0, 0], panels[0, 1])
 
 
 def _draw_errors(axes: Axes, clean: dict[str, Any], groups: Sequence[dict[str, Any]]) -> None:
@@ -91,17 +91,10 @@ def _draw_errors(axes: Axes, clean: dict[str, Any], groups: Sequence[dict[str, A
 
 def draw_consistency(axes: Axes, groups: Sequence[dict[str, Any]], names: Sequence[str]) -> None:
     """Draw the ten ANEES of each group in a row of its own, over the band of its seeds."""
-    for place, group in enumerate(groups):
-        low, high = group["anees_band_95"]
-        axes.barh(
-            place,
-            high - low,
-            left=low,
-            height=0.8,
-            color=GRID,
-            zorder=0,
-            label="95 % band" if place == 0 else None,
-        )
+    bands = [group["anees_band_95"] for group in groups]
+    lows = [low for low, _ in bands]
+    widths = [high - low for low, high in bands]
+    axes.barh(range(len(groups)), widths, left=lows, color=GRID, zorder=0, label="95 % band")
     for place, group in enumerate(groups):
         values = [value for _, value in group["anees_pose"]]
         for marker, shown in (
@@ -118,16 +111,16 @@ def draw_consistency(axes: Axes, groups: Sequence[dict[str, Any]], names: Sequen
                 color=ESTIMATE,
                 label="ANEES at one of ten times" if place == 0 and marker == "o" else None,
             )
-    lowest = min(group["anees_band_95"][0] for group in groups)
-    values = [value for group in groups for _, value in group["anees_pose"]]
-    axes.set_xlim(0.7 * min(lowest, *values), 1.2 * _MOST_NEES)
+    every = [value for group in groups for _, value in group["anees_pose"]]
+    axes.set_xlim(0.7 * min(*lows, *every), 1.2 * _MOST_NEES)
     axes.set_xscale("log")
     label(axes, "consistency", "mean NEES of the pose (3 dof)", "")
     axes.set_yticks(range(len(groups)), names)
     axes.set_ylim(len(groups) - 0.5, -0.5)
 
 
-def _legend(figure: Figure, *panels: Axes) -> None:
+def legend_below(figure: Figure, *panels: Axes) -> None:
+    """Put what the panels show below all of them."""
     handles = [handle for axes in panels for handle in axes.get_legend_handles_labels()[0]]
     names = [name for axes in panels for name in axes.get_legend_handles_labels()[1]]
     figure.legend(handles, names, loc="outside lower center", ncols=5, frameon=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,17 @@ from slam.app.errors import AppError
 
 _MOST_BYTES = 1 << 28
 _NEEDED = {"scene", "preset", "settings", "stress", "ate_rmse_m", "anees_pose", "nis_times"}
+
+
+def add_sweep_argument(parser: argparse.ArgumentParser, default: str, made_by: str) -> None:
+    """Add `--sweep`, the result file to look at."""
+    parser.add_argument(
+        "--sweep",
+        type=Path,
+        default=Path(default),
+        metavar="JSON",
+        help=f"result of {made_by} (default: %(default)s)",
+    )
 
 
 def read_groups(path: Path, result: Path) -> list[dict[str, Any]]:

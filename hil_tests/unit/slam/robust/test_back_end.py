@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hil_tests.unit.slam.robust.range_trials import drive
 from hil_tests.unit.slam.robust.range_world import (
     LAB,
     Run,
-    drive,
     parameters_for,
     simulate,
 )
