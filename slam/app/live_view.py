@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Self
 
 from slam.app.session import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
-from slam.app.view_arguments import SERVE_WEB, SPAWN
+from slam.app.view_targets import SERVE_WEB, SPAWN
 
 _FLUSH_S = 0.5
 """Longest time that a frame waits for others to be shown with it."""

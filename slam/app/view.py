@@ -21,7 +21,7 @@ from slam.app.rrd_file import is_finished, require_readable
 from slam.app.session import SessionObserver
 from slam.app.session_reader import RecordedSession, open_session
 from slam.app.stop import StopFlag
-from slam.app.view_arguments import SERVE_WEB, SPAWN
+from slam.app.view_targets import SERVE_WEB, SPAWN
 
 SESSION_NAME, VIEW_NAME = "session.mcap", "session.rrd"
 

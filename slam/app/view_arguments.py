@@ -7,10 +7,7 @@ import math
 from pathlib import Path
 
 from slam.app.arguments import folder
-
-SPAWN, SERVE_WEB, CONNECT = "spawn", "serve-web", "connect"
-DEFAULT_VIEWER_URL = "rerun+http://127.0.0.1:9876/proxy"
-"""Where a viewer started as `rerun` listens."""
+from slam.app.view_targets import CONNECT, DEFAULT_VIEWER_URL, SERVE_WEB, SPAWN
 
 
 def rerun_target(text: str) -> str:
