@@ -412,3 +412,27 @@ def test_a_long_run_keeps_its_belief_and_forgets_its_rows() -> None:
     (early, early_whole), (late, late_whole) = sizes
     assert late - early < 0.25 * (late_whole - early_whole)
     assert late < 0.5 * late_whole
+
+
+def test_a_range_beyond_the_limit_is_left_out_and_costs_the_limit() -> None:
+    """Of 78 ranges the eleventh is off by 40 standard deviations; by default the limit is four."""
+    problem, start = short_run(3, 0.0)
+    rule = RelinearisationRule(iterations=40)
+    ranges_m = problem.ranges_m.copy()
+    ranges_m[10] += 0.2
+    spoilt = Smoother(replace(problem, ranges_m=ranges_m), rule)
+    names = ("poses", "radars", "landmarks", "antennas", "sigmas_m")
+    names = ("ranges_m", *(f"range_{name}" for name in names))
+    rows = {name: np.delete(getattr(problem, name), 10, axis=0) for name in names}
+    without = Smoother(replace(problem, **rows), rule)
+    solution, wanted = (each.solve(start, tolerance=1e-14) for each in (spoilt, without))
+    assert solution is not None
+    assert wanted is not None
+    assert packed(solution.estimate) == pytest.approx(packed(wanted.estimate), abs=1e-9)
+    assert solution.information == pytest.approx(wanted.information, rel=1e-6)
+    assert solution.cost == pytest.approx(wanted.cost + 4.0**2, abs=1e-6)
+    prior, expected = (
+        each.condensed(wanted.estimate, N_GONE, rule.outlier_sigmas) for each in (spoilt, without)
+    )
+    assert prior.information == pytest.approx(expected.information, rel=1e-9)
+    assert prior.gradient == pytest.approx(expected.gradient, abs=1e-9)
