@@ -339,6 +339,23 @@ def test_both_starts_of_a_solution_begin_at_the_first_pose_kept() -> None:
     assert chained.poses == pytest.approx(causal.poses, abs=1e-9)
 
 
+def test_each_calibration_error_walks_in_proportion_to_its_own_deviation() -> None:
+    """Each variance gains a quarter of the first one over a quarter of a metre."""
+    sigmas = (0.01, 0.02, 0.03)
+    s, w, kappa = sigmas
+    wheels = WheelNoise(
+        scale_sigma=s, turn_scale_sigma=w, curvature_sigma_rad_per_m=kappa, walk_per_sqrt_m=1.0
+    )
+    log, state = RunLog(wheels), State(sigmas, (0.0,) * N_RADARS)
+    step = np.array([0.25, 0.0, 0.0])
+    motion = calibrated_motion(step, np.zeros(3), wheels)
+    log.add_motion(step, motion.covariance, motion.walk_variance, np.zeros(3))
+    problem = log.problem(state, start_prior(sigmas, (0.0,) * N_RADARS, 0))
+    assert problem.walks[0] == pytest.approx(0.25 * np.square(sigmas))
+    predict(state, motion, wheels)
+    assert state.P.full().diagonal()[3:6] == pytest.approx(1.25 * np.square(sigmas))
+
+
 def test_the_first_pose_is_where_the_first_values_are() -> None:
     _, start = short_run(6, 1e-5)
     values = first_values(start)
