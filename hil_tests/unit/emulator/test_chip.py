@@ -38,7 +38,8 @@ class OneEchoSource(RampSource):
         scene_times_ns: NDArray[np.int64],
     ) -> NDArray[np.int64]:
         ramp = super().rf_counters(capture, frame_counters, scene_times_ns)
-        return ramp * (frame_counters[:, np.newaxis] == self._counter)
+        ramp[frame_counters != self._counter] = 0
+        return ramp
 
 
 # Protocol reference 9.3, column "After INIT/boot".

@@ -438,9 +438,8 @@ def test_a_range_beyond_the_limit_is_left_out_and_costs_the_limit() -> None:
     ranges_m = problem.ranges_m.copy()
     ranges_m[10] += 0.2
     spoilt = Smoother(replace(problem, ranges_m=ranges_m), rule)
-    names = ("poses", "radars", "landmarks", "antennas", "sigmas_m")
-    names = ("ranges_m", *(f"range_{name}" for name in names))
-    rows = {name: np.delete(getattr(problem, name), 10, axis=0) for name in names}
+    names = ("range_poses", "range_radars", "range_landmarks", "range_antennas", "range_sigmas_m")
+    rows = {name: np.delete(getattr(problem, name), 10, axis=0) for name in (*names, "ranges_m")}
     without = Smoother(replace(problem, **rows), rule)
     solution, wanted = (each.solve(start, tolerance=1e-14) for each in (spoilt, without))
     assert solution is not None
