@@ -203,6 +203,16 @@ def test_true_ranges_pass_their_gates_as_often_as_they_say(n_radars: int, share:
     assert whole / TRIALS == pytest.approx(share, abs=0.003)
 
 
+@pytest.mark.parametrize(("sigmas", "n_used"), [(2.62, 2), (2.64, 1), (2.99, 1), (3.01, 0)])
+def test_a_gate_ends_where_it_says(sigmas: float, n_used: int) -> None:
+    """Two ranges so far off: 2 * 2.63^2 = 13.8 for both together, 3^2 = 9 for one alone."""
+    noise = replace(NOISE, clutter_per_m=1e-12)
+    range_m = 1.0 + sigmas * math.hypot(0.01, noise.sigma_m)
+    scans = [RangeScan(radar=radar, ranges_m=(range_m,)) for radar in LEFT]
+    best = options_of(scans, np.ones(2), 1e-4 * np.eye(2), noise, RULE)[0]
+    assert len(best.used) == n_used
+
+
 def test_true_points_pass_the_gate_of_99_percent_as_often_as_it_says() -> None:
     """Drawn from the distribution of the state's own errors, by its own formulas."""
     rng = np.random.default_rng(12)
@@ -278,6 +288,33 @@ def test_a_point_is_matched_by_the_rule_written_out(seed: int, n: int) -> None:
     clear = len(scores) == 1 or scores[1][0] - scores[0][0] >= rule.match_lead
     wanted = squared <= rule.match_gate and density > rule.unmapped_per_m2 and clear
     assert match(state, point, rule) == (best if wanted else None)
+
+
+def sure_point(sigma_m: float, *landmarks_m: tuple[float, float]) -> tuple[State, BodyPoint]:
+    """Return a state that is sure of everything, and a point 1 m ahead that is not."""
+    state = random_state(0, len(landmarks_m), 0.3)
+    state.P = SymmetricMatrix(1e-18 * np.eye(state.P.size))
+    state.landmarks_m = state.position_m + np.array(landmarks_m) @ rotation(state.heading_rad).T
+    point = BodyPoint(
+        point_m=np.array([1.0, 0.0]),
+        covariance=sigma_m**2 * np.eye(2),
+        by_offsets=np.zeros((2, N_RADARS)),
+    )
+    return state, point
+
+
+@pytest.mark.parametrize(("sigma_m", "row"), [(0.39, 0), (0.41, None)])
+def test_a_point_that_is_likelier_new_is_no_match(sigma_m: float, row: int | None) -> None:
+    """1 / (2 pi sigma^2) exceeds one landmark per square metre below 0.399 m."""
+    state, point = sure_point(sigma_m, (1.0, 0.0))
+    assert match(state, point, MapRule(unmapped_per_m2=1.0)) == row
+
+
+@pytest.mark.parametrize(("apart_m", "row"), [(0.244, None), (0.246, 1)])
+def test_a_point_between_two_landmarks_is_neither(apart_m: float, row: int | None) -> None:
+    """(0.245 m / 0.1 m)^2 = 6 is the likelihood margin."""
+    state, point = sure_point(0.1, (1.0, apart_m), (1.0, 0.0))
+    assert match(state, point, MapRule(match_lead=6.0)) == row
 
 
 # --- what is left alone ---------------------------------------------------------------------------

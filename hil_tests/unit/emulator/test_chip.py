@@ -6,8 +6,10 @@ import math
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from emulator.chip import Chip
+from emulator.echo_source import CaptureSettings
 from emulator.refusal import Refusal
 from hil_tests.unit.emulator.doubles import FormulaSource, RampSource
 from xethru_protocol.codes import X4Setting
@@ -20,6 +22,24 @@ def working_point(chip: Chip) -> None:
     chip.set(X4Setting.ITERATIONS, 16)
     chip.set(X4Setting.PULSESPERSTEP, 300)
     chip.set(X4Setting.FRAMEAREA, (0.2, 9.4))
+
+
+class OneEchoSource(RampSource):
+    """Zeros but for one frame."""
+
+    def __init__(self, counter: int) -> None:
+        super().__init__()
+        self._counter = counter
+
+    def rf_counters(
+        self,
+        capture: CaptureSettings,
+        frame_counters: NDArray[np.int64],
+        scene_times_ns: NDArray[np.int64],
+    ) -> NDArray[np.int64]:
+        ramp = super().rf_counters(capture, frame_counters, scene_times_ns)
+        ramp[frame_counters != self._counter] = 0
+        return ramp
 
 
 # Protocol reference 9.3, column "After INIT/boot".
@@ -204,6 +224,18 @@ def test_a_hundred_all_zero_frames_switch_the_transmitter_off() -> None:
     chip.next_frame()
     assert not chip.running
     assert chip.get(X4Setting.TXPOWER) == 0
+
+
+def test_zero_frames_that_do_not_follow_each_other_switch_nothing_off() -> None:
+    """Frame 50 alone is not zero: 99 zero frames behind it are allowed, and 50 before it."""
+    chip = Chip(OneEchoSource(50))
+    working_point(chip)
+    chip.set(X4Setting.FPS, 17.0)
+    for _ in range(150):
+        chip.next_frame()
+    assert (chip.running, chip.get(X4Setting.TXPOWER)) == (True, 2)
+    chip.next_frame()
+    assert (chip.running, chip.get(X4Setting.TXPOWER)) == (False, 0)
 
 
 @pytest.mark.parametrize(

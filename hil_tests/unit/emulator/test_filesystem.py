@@ -5,8 +5,10 @@ from __future__ import annotations
 import pytest
 
 from emulator.device import radar_device
+from emulator.filesystem import FileSystem
 from emulator.options import DeviceOptions
 from emulator.pace import Pace
+from emulator.refusal import Refusal
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource, ramp_device
 from xethru_protocol import messages as m
 
@@ -82,14 +84,31 @@ def test_twenty_files_exist(host: BareHost) -> None:
     assert host.ask(m.SearchFileType(file_type=USER)) == m.ReplyInt(values=tuple(range(20)))
 
 
-@pytest.mark.parametrize("storage", [0x18000, 0x48000])
-def test_storage_size(storage: int) -> None:
-    options = DeviceOptions(storage_bytes=storage)
+@pytest.mark.parametrize(
+    ("options", "storage"),
+    [(DeviceOptions(storage_bytes=0x18000), 0x18000), (DeviceOptions(), 0x48000)],
+)
+def test_all_files_together_fill_the_storage(options: DeviceOptions, storage: int) -> None:
     host = BareHost(radar_device(IDENTITY, RampSource(), Pace.ASAP, options=options))
-    assert host.ask(m.CreateFile(**KEY, length=storage)) == m.Ack()
-    assert host.ask(m.CreateFile(**MISSING, length=1)) == m.Error(code=9)
+    assert host.ask(m.CreateFile(**KEY, length=storage - 10)) == m.Ack()
+    assert host.ask(m.CreateFile(**MISSING, length=11)) == m.Error(code=9)
+    assert host.ask(m.CreateFile(**MISSING, length=10)) == m.Ack()
+    third = m.CreateFile(file_type=USER, identifier=3, length=1)
+    assert host.ask(third) == m.Error(code=9)
     assert host.ask(m.FormatFilesystem(key=0x427F00C9)) == m.Ack(), "open files too"
     assert host.ask(m.FindAllFiles()) == m.ReplyInt(values=())
+
+
+def test_what_the_firmware_writes_itself_needs_room_too() -> None:
+    files = FileSystem(100, {(1, 0): bytes(60)})
+    files.replace((2, 0), bytes(40))
+    with pytest.raises(Refusal):
+        files.replace((2, 0), bytes(41))
+    with pytest.raises(Refusal):
+        files.replace((3, 0), bytes(1))
+    files.replace((1, 0), bytes(59))
+    files.replace((3, 0), bytes(1))
+    assert files.free_bytes == 0
 
 
 def test_find_all_lists_types_then_identifiers(host: BareHost) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from slam.batch_terms import WheelModel
 from slam.calibration import Calibration, CalibrationPriors, Drive, calibrate, make_drive
 from slam.calibration_gains import estimate_gains
 from slam.calibration_tracks import RangeSet, place
@@ -132,6 +133,13 @@ def test_exact_ranges_and_odometry_give_the_exact_offsets() -> None:
     nearest = np.linalg.norm(found.landmarks_m[:, np.newaxis] - RODS, axis=2).min(axis=1)
     assert nearest.max() < 5e-6
     assert poor_drive(exact, found) == ()
+
+
+def test_a_scale_that_is_known_stays_and_a_turn_scale_that_is_not_is_found() -> None:
+    priors = CalibrationPriors(wheels=WheelModel(scale_sigma=1e-9, turn_scale_sigma=0.03))
+    found = calibrate(drive(World(wheel_noise=1.0)), priors)
+    assert abs(found.wheels[0]) < 1e-7
+    assert abs(found.wheels[1]) > 1e-4
 
 
 def test_mounts_that_are_off_are_found_too() -> None:

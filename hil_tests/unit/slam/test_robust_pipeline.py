@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -91,9 +92,12 @@ def test_a_setting_without_a_table_can_be_overridden() -> None:
 
 def test_wheels_are_those_of_the_scenes_specification() -> None:
     scene, _ = scene_and_config("classroom", "robust")
-    wheels = wheels_of(scene)
-    assert wheels.calibration_sigmas == (0.023, 0.023, 0.0139)
+    odometry = scene.odometry.model_copy(update={"turn_scale_sigma": 0.031})
+    wheels = wheels_of(scene.model_copy(update={"odometry": odometry}))
+    assert wheels.calibration_sigmas == (0.023, 0.031, 0.0139)
     assert wheels.heading_rad_per_rad == 0.01
+    start = RobustSlam(ROBUST, RIG, wheels).back_end.state.P.full().diagonal()[3:6]
+    np.testing.assert_allclose(np.sqrt(start), [0.023, 0.031, 0.0139])
 
 
 def test_ranges_correct_wheels_that_report_too_much() -> None:
@@ -233,19 +237,20 @@ def test_a_tick_without_frames_goes_on_by_odometry() -> None:
     assert slam.flush() == ()
 
 
-def test_another_front_end_can_be_brought() -> None:
+def test_another_front_end_can_be_brought_and_is_told_each_radars_range_offset() -> None:
     class Fixed:
         def detect(self, frame: RadarFrame, range_offset_m: float = 0.0) -> tuple[Detection, ...]:
-            return (Detection(radar=frame.radar, t_ns=frame.t_ns, range_m=0.7, amplitude=0.01),)
+            range_m = 0.7 - range_offset_m
+            return (Detection(radar=frame.radar, t_ns=frame.t_ns, range_m=range_m, amplitude=0.01),)
 
         def detect_many(
             self, frames: Sequence[RadarFrame], offsets_m: Sequence[float]
         ) -> list[tuple[Detection, ...]]:
-            return [self.detect(frame) for frame in frames]
+            return [self.detect(*row) for row in zip(frames, offsets_m, strict=True)]
 
-    def frame(t_ns: int) -> RadarFrame:
+    def frame(t_ns: int, radar: int) -> RadarFrame:
         return RadarFrame(
-            radar=2,
+            radar=radar,
             t_ns=t_ns,
             counter=0,
             samples=np.zeros(8, dtype=np.float32),
@@ -253,10 +258,12 @@ def test_another_front_end_can_be_brought() -> None:
             bin_length_m=0.0064,
         )
 
-    slam = make_slam(ROBUST, RIG, WheelNoise(), Fixed())
-    slam.step([frame(0)], straight, 0)
-    (result,) = slam.step([frame(TICK_NS)], straight, TICK_NS)
-    assert [(found.radar, found.range_m) for found in result.detections] == [(2, 0.7)]
+    mounts = [replace(mount, range_offset_m=0.01 * k) for k, mount in enumerate(RIG.mounts)]
+    slam = make_slam(ROBUST, replace(RIG, mounts=tuple(mounts)), WheelNoise(), Fixed())
+    slam.step([frame(0, 2)], straight, 0)
+    (result,) = slam.step([frame(TICK_NS, 2), frame(TICK_NS, 1)], straight, TICK_NS)
+    assert [found.radar for found in result.detections] == [2, 1]
+    assert [found.range_m for found in result.detections] == pytest.approx([0.68, 0.69])
 
 
 def test_a_map_without_walls_has_none() -> None:

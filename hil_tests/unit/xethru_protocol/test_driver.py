@@ -129,6 +129,9 @@ def test_counters_wrap_without_loss_and_restarts_are_no_loss(driver_on: DriverOn
     [
         ((5, 1_000_006, 7, 8), 0),  # 6, damaged
         ((5, 1_000_006, 9, 10), 2),
+        ((5, 9, 8, 9), 1),  # the first 9, damaged, was 6 or 7
+        ((5, 9, 9), 2),  # ... or 8
+        ((5, 7, 6, 7), 1),  # nothing lies between 5 and 6: the chip was restarted
         ((5, 9, 10, 7, 8), 3),  # the chip was restarted after a true gap
         ((5, 0x8000_0006, 7), 0),
         ((0xFFFF_FFFE, 0x0FFF_FFFF, 0, 1), 0),  # FFFFFFFF, damaged

@@ -8,6 +8,7 @@ import threading
 import tty
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -133,6 +134,40 @@ def test_cancelled_read_loses_no_bytes() -> None:
             with pytest.raises(asyncio.CancelledError):
                 await reading
             assert await line.read(1.0) == b"first"
+        finally:
+            line.close()
+            os.close(master)
+            os.close(slave)
+
+    asyncio.run(use())
+
+
+@pytest.mark.parametrize("cancel", [False, True])
+def test_no_timer_outlives_the_read_that_set_it(cancel: bool) -> None:
+    async def use() -> None:
+        master, slave = pty.openpty()
+        line = AsyncSerialTransport(os.ttyname(slave))
+        loop = asyncio.get_running_loop()
+        set_timer = loop.call_later
+        timers: list[asyncio.TimerHandle] = []
+
+        def call_later(delay_s: float, *what: Any) -> asyncio.TimerHandle:  # noqa: ANN401 - any
+            timers.append(set_timer(delay_s, *what))
+            return timers[-1]
+
+        loop.call_later = call_later  # type: ignore[method-assign, assignment]
+        try:
+            reading = asyncio.create_task(line.read(60.0))
+            while not timers:
+                await asyncio.sleep(0)
+            if cancel:
+                reading.cancel()
+                with pytest.raises(asyncio.CancelledError):
+                    await reading
+            else:
+                os.write(master, b"!")
+                assert await reading == b"!"
+            assert [timer.cancelled() for timer in timers] == [True]
         finally:
             line.close()
             os.close(master)

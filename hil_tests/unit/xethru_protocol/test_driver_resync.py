@@ -81,6 +81,13 @@ def test_waiting_for_owed_pongs_never_outlasts_the_timeout(driver_on: DriverOn) 
     assert line.now_ns - began_ns == pytest.approx(100_000_000, abs=1_000_000)
 
 
+def test_all_that_came_before_a_request_is_no_answer_to_it(driver_on: DriverOn) -> None:
+    radar, line = driver_on(lambda command: [m.Ack()])
+    line.say(frame(0), frame(1), m.Error(code=21))
+    assert radar.request(FIRST) == m.Ack()
+    assert radar.stray_count == 1
+
+
 def test_frames_that_stream_do_not_put_off_a_timeout(driver_on: DriverOn) -> None:
     radar, line = driver_on(silent)
     for k in range(60):

@@ -117,6 +117,24 @@ def test_a_counter_that_begins_anew_begins_a_new_line_with_the_known_drift() -> 
     assert clock.drift_ppm == pytest.approx(40.0, abs=0.1)
 
 
+@pytest.mark.parametrize("back", [0, 1])
+def test_a_counter_that_repeats_or_goes_back_by_one_begins_a_new_line(back: int) -> None:
+    clock = ArrivalClock(RATE_HZ)
+    for counter in range(10):
+        clock.stamp_ns(counter, taken_ns(counter, 0.0))
+    arrival_ns = taken_ns(10, 0.0)
+    assert clock.stamp_ns(9 - back, arrival_ns) == arrival_ns
+    assert clock.restarts == 1
+
+
+def test_frames_that_arrive_at_once_have_stamps_one_after_the_other() -> None:
+    """The line passes through the last arrival, so each stamp would be that of the first frame."""
+    clock = ArrivalClock(RATE_HZ)
+    arrival_ns = 7 * NS_PER_S
+    stamps_ns = [clock.stamp_ns(counter, arrival_ns) for counter in range(3)]
+    assert stamps_ns == [arrival_ns, arrival_ns + 1, arrival_ns + 2]
+
+
 @settings(max_examples=50)
 @given(st.floats(-500.0, 500.0), st.integers(0, 10**13), st.integers(0, 10**13))
 def test_a_line_there_and_back(ppm: float, origin_ns: int, nominal_ns: int) -> None:

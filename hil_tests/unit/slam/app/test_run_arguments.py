@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+import time
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 
@@ -59,3 +60,12 @@ def test_the_help_shows_that_very_recipe(capsys: pytest.CaptureFixture[str]) -> 
 def test_a_clock_that_is_none_is_wrong_usage(text: str) -> None:
     with pytest.raises(UsageError, match="must be arrival, unix, monotonic"):
         parse_clock(text, parse_source("-"))
+
+
+def test_a_unix_clock_shows_the_seconds_since_1970(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The host was started 100 s ago, 1 700 000 000 s after 1970."""
+    monkeypatch.setattr(time, "monotonic_ns", lambda: 100_000_000_000)
+    monkeypatch.setattr(time, "time_ns", lambda: 1_700_000_100_000_000_007)
+    clock = parse_clock("unix", parse_source("-"))
+    assert clock is not None
+    assert clock.session_ns(105_000_000_000) == 1_700_000_105_000_000_007

@@ -240,6 +240,22 @@ def test_a_machine_that_is_too_slow_for_a_while_records_all_and_says_so(drive: D
     assert source.worst_lag_s > 10.0
 
 
+def test_a_counter_that_goes_back_by_one_loses_no_frame(drive: Drive) -> None:
+    events = []
+    for row in drive.events:
+        if row.t_ns > 14 * NS_PER_S:
+            continue
+        event = row.event
+        if isinstance(event, FrameCame) and event.radar == 1 and row.t_ns > 10 * NS_PER_S:
+            event = replace(event, frame=replace(event.frame, counter=event.frame.counter - 2))
+        events.append(replace(row, event=event))
+    source, _, _ = source_on(drive, VirtualInbox(events))
+    source.settle()
+    assert len(list(source.scans())) > 40
+    assert [clock.restarts for clock in source.clocks] == [0, 1, 0, 0]
+    assert source.lost_frames == 0
+
+
 def test_odometry_whose_clock_is_set_while_it_is_trusted_is_told(drive: Drive) -> None:
     """With a clock known beforehand no later frame lies between two poses."""
     set_ns = 8 * NS_PER_S

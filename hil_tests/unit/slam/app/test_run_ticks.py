@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -126,6 +127,46 @@ def test_of_too_many_frames_the_oldest_are_recorded_and_not_used() -> None:
     counters = [scan.counter for scan in used]
     assert counters == sorted(set(counters))
     assert assembler.n_left_out == assembler.n_unused == 12 - len(used)
+
+
+def test_slam_that_is_too_late_uses_nothing_until_it_has_caught_up() -> None:
+    """Late from more than 10 s on; in time again from 1 s on."""
+    assembler = TickAssembler(1, PERIOD_NS, odometry_until(20.0))
+    assembler.begin(START_NS)
+    rows = []
+    for tick, lag_s in enumerate((10.0, 10.1, 5.0, 1.1, 1.0, 10.0)):
+        assembler.take(frame(0, START_NS + tick * PERIOD_NS))
+        lag_ns = round(lag_s * NS_PER_S)
+        scan = assembler.next_scan(START_NS + (tick + 1) * PERIOD_NS + lag_ns)
+        assert scan is not None
+        assert assembler.lag_ns == lag_ns
+        rows.append(scan.used)
+    assert rows == [True, False, False, False, True, True]
+    assert (assembler.n_late, assembler.n_unused) == (3, 3)
+
+
+@pytest.mark.parametrize(
+    ("ages_ns", "left_out"),
+    [
+        ((PERIOD_NS,), 0),
+        ((PERIOD_NS + 1,), 1),
+        ((PERIOD_NS // 4, -1), 0),
+        ((PERIOD_NS // 4 + 1, -1), 1),
+        ((PERIOD_NS // 4 + 1, -PERIOD_NS), 0),  # the newer one is of the next tick
+    ],
+)
+def test_a_frame_is_too_late_for_a_tick_by_a_period_or_a_quarter_where_a_newer_one_is_there(
+    ages_ns: tuple[int, ...], left_out: int
+) -> None:
+    assembler = TickAssembler(1, PERIOD_NS, odometry_until(12.0))
+    assembler.begin(START_NS)
+    begin_ns = START_NS + 2 * PERIOD_NS
+    assert assembler.next_scan(begin_ns + GRACE_NS) is None  # two empty ticks are over
+    for age_ns in ages_ns:
+        assembler.take(frame(0, begin_ns - age_ns))
+    scans = scans_until(assembler, begin_ns + GRACE_NS)
+    assert scans[0].t_ns == begin_ns
+    assert assembler.n_left_out == left_out
 
 
 def test_a_burst_after_a_stall_is_recorded_and_the_run_is_not_held_up() -> None:

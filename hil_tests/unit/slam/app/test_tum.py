@@ -29,11 +29,16 @@ def test_stamp_has_every_nanosecond_of_the_text() -> None:
 
 @pytest.mark.parametrize(
     ("qz", "qw", "heading_rad"),
-    [(0.0, 1.0, 0.0), (math.sqrt(0.5), math.sqrt(0.5), math.pi / 2), (-0.5, math.sqrt(0.75), -1)],
+    [
+        (0.0, 1.0, 0.0),
+        (math.sqrt(0.5), math.sqrt(0.5), math.pi / 2),
+        (-0.5, math.sqrt(0.75), -math.pi / 3),
+        (0.5, -math.sqrt(0.75), 5 * math.pi / 3),  # q and -q are the same turn
+        (-math.sqrt(0.75), -0.5, -4 * math.pi / 3),
+    ],
 )
 def test_heading_is_twice_the_quaternion_angle(qz: float, qw: float, heading_rad: float) -> None:
-    expected = -math.pi / 3 if heading_rad == -1 else heading_rad
-    assert parse_tum_line(f"0 0 0 0 0 0 {qz!r} {qw!r}").heading_rad == pytest.approx(expected)
+    assert parse_tum_line(f"0 0 0 0 0 0 {qz!r} {qw!r}").heading_rad == pytest.approx(heading_rad)
 
 
 @given(st.integers(-(2**62), 2**62), finite, finite, st.floats(-3.1, 3.1))

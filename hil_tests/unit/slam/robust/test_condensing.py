@@ -339,6 +339,23 @@ def test_both_starts_of_a_solution_begin_at_the_first_pose_kept() -> None:
     assert chained.poses == pytest.approx(causal.poses, abs=1e-9)
 
 
+def test_each_calibration_error_walks_in_proportion_to_its_own_deviation() -> None:
+    """Each variance gains a quarter of the first one over a quarter of a metre."""
+    sigmas = (0.01, 0.02, 0.03)
+    s, w, kappa = sigmas
+    wheels = WheelNoise(
+        scale_sigma=s, turn_scale_sigma=w, curvature_sigma_rad_per_m=kappa, walk_per_sqrt_m=1.0
+    )
+    log, state = RunLog(wheels), State(sigmas, (0.0,) * N_RADARS)
+    step = np.array([0.25, 0.0, 0.0])
+    motion = calibrated_motion(step, np.zeros(3), wheels)
+    log.add_motion(step, motion.covariance, motion.walk_variance, np.zeros(3))
+    problem = log.problem(state, start_prior(sigmas, (0.0,) * N_RADARS, 0))
+    assert problem.walks[0] == pytest.approx(0.25 * np.square(sigmas))
+    predict(state, motion, wheels)
+    assert state.P.full().diagonal()[3:6] == pytest.approx(1.25 * np.square(sigmas))
+
+
 def test_the_first_pose_is_where_the_first_values_are() -> None:
     _, start = short_run(6, 1e-5)
     values = first_values(start)
@@ -412,3 +429,26 @@ def test_a_long_run_keeps_its_belief_and_forgets_its_rows() -> None:
     (early, early_whole), (late, late_whole) = sizes
     assert late - early < 0.25 * (late_whole - early_whole)
     assert late < 0.5 * late_whole
+
+
+def test_a_range_beyond_the_limit_is_left_out_and_costs_the_limit() -> None:
+    """Of 78 ranges the eleventh is off by 40 standard deviations; by default the limit is four."""
+    problem, start = short_run(3, 0.0)
+    rule = RelinearisationRule(iterations=40)
+    ranges_m = problem.ranges_m.copy()
+    ranges_m[10] += 0.2
+    spoilt = Smoother(replace(problem, ranges_m=ranges_m), rule)
+    names = ("range_poses", "range_radars", "range_landmarks", "range_antennas", "range_sigmas_m")
+    rows = {name: np.delete(getattr(problem, name), 10, axis=0) for name in (*names, "ranges_m")}
+    without = Smoother(replace(problem, **rows), rule)
+    solution, wanted = (each.solve(start, tolerance=1e-14) for each in (spoilt, without))
+    assert solution is not None
+    assert wanted is not None
+    assert packed(solution.estimate) == pytest.approx(packed(wanted.estimate), abs=1e-9)
+    assert solution.information == pytest.approx(wanted.information, rel=1e-6)
+    assert solution.cost == pytest.approx(wanted.cost + 4.0**2, abs=1e-6)
+    prior, expected = (
+        each.condensed(wanted.estimate, N_GONE, rule.outlier_sigmas) for each in (spoilt, without)
+    )
+    assert prior.information == pytest.approx(expected.information, rel=1e-9)
+    assert prior.gradient == pytest.approx(expected.gradient, abs=1e-9)

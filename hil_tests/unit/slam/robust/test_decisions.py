@@ -143,6 +143,23 @@ def test_a_merge_must_stand_out_from_its_rivals() -> None:
     assert find_merge(state, existence, rule) is None
 
 
+@pytest.mark.parametrize(
+    ("third_m", "sigma_m", "merges"),
+    [
+        (0.069, 0.02, False),
+        (0.070, 0.02, True),  # 12^0.5 sigma: 3 nats less likely, as each is unsure by sigma
+        (9.0, 0.284, False),
+        (9.0, 0.280, True),  # below (4 pi)^-0.5 m the density exceeds 1 per square metre
+    ],
+)
+def test_a_merge_is_made_from_the_likelihood_margin_and_the_density_on(
+    third_m: float, sigma_m: float, merges: bool
+) -> None:
+    state, existence = mapped(np.array([[0.0, 1.0], [0.0, 1.0], [third_m, 1.0]]), sigma_m)
+    merge = find_merge(state, existence, MapRule())
+    assert (merge is not None and merge.pairs == ((0, 1),)) == merges
+
+
 def test_what_was_seen_whole_together_is_never_merged() -> None:
     state, existence = mapped(np.array([[0.0, 1.0], [0.03, 1.0]]))
     for _ in range(MapRule().apart_frames):

@@ -170,6 +170,34 @@ def test_walls_match_only_where_they_were_seen() -> None:
     assert not is_unresolved(state, other, cells, rule)
 
 
+@pytest.mark.parametrize(
+    ("others_m", "sigmas", "row"),
+    [
+        ((), (0.52, 1.0), 0),
+        ((), (0.54, 1.0), None),  # 1 / (2 pi 0.531) is 0.3 walls per rad and metre
+        ((1.244,), (0.01, 0.1), None),
+        ((1.246,), (0.01, 0.1), 0),  # (0.245 m / 0.1 m)^2 is the likelihood margin, 6
+    ],
+)
+def test_a_wall_that_is_likelier_new_or_another_is_no_match(
+    others_m: tuple[float, ...], sigmas: tuple[float, float], row: int | None
+) -> None:
+    """The state is sure of everything; the wall is seen where the first one of the map is."""
+    state, cells, rule = State((0.0,) * 3, (0.0,) * 4), WallCells(0.1), WallRule()
+    state.walls = np.array([[math.pi / 2, d_m] for d_m in (1.0, *others_m)])
+    state.wall_ids = list(range(len(state.walls)))
+    state.P = SymmetricMatrix(1e-18 * np.eye(10 + 2 * len(state.walls)))
+    for wall_id in state.wall_ids:
+        cells.add(wall_id, np.zeros(1))
+    seen = BodyWall(
+        wall=state.walls[0],
+        covariance=np.diag(np.square(sigmas)),
+        by_offsets=np.zeros((2, 4)),
+        feet_m=np.array([[0.0, 1.0]]),
+    )
+    assert match_wall(state, seen, cells, rule) == row
+
+
 def test_cells_tell_where_a_wall_answered() -> None:
     cells = WallCells(0.1)
     cells.add(7, np.array([-0.05, 0.05, 0.15, 0.95]))
