@@ -11,7 +11,6 @@ from slam.robust.births import give_birth, match, update_with_point
 from slam.robust.continuation import Continuation, labelled
 from slam.robust.existence import Existence
 from slam.robust.leftovers import Leftovers
-from slam.robust.map_report import report_landmarks
 from slam.robust.motion import at_rest, calibrated_motion, predict
 from slam.robust.offsets import judged
 from slam.robust.parameters import BackEndParameters, PointRule
@@ -93,7 +92,16 @@ class RobustBackEnd:
 
     def landmarks(self) -> tuple[MapLandmark, ...]:
         """Return the landmarks hit often enough to be reported."""
-        return report_landmarks(self.state, self.reported_rows(), self._existence.hits)
+        state, rows = self.state, self.reported_rows()
+        return tuple(
+            MapLandmark(
+                landmark_id=state.landmark_ids[row],
+                position_m=point_m,
+                covariance=state.landmark_covariance(row),
+                hits=self._existence.hits(state.landmark_ids[row]),
+            )
+            for row, point_m in zip(rows, state.landmarks_m[rows], strict=True)
+        )
 
     def reported_rows(self) -> list[int]:
         """Return the rows of landmarks hit often enough to be reported; of an island, none."""

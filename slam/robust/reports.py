@@ -4,23 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from slam.robust.classification import Kind
 from slam.robust.symmetric import Array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MapLandmark:
-    """One landmark of the map: id, position (2,) [m], covariance (2, 2), frames that hit it.
-
-    ``kind`` follows from the mapped walls: a corner of two, the mirror ghost of another landmark,
-    or just a point.
-    """
+    """One landmark of the map: id, position (2,) [m], covariance (2, 2), frames that hit it."""
 
     landmark_id: int
     position_m: Array
     covariance: Array
     hits: int
-    kind: Kind = Kind.POINT
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
