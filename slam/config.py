@@ -320,8 +320,6 @@ class RobustConfig(_Model):
     max_predicted_sigma_m: Positive = 8e-3
     # Standard deviation of each radar's unknown constant range offset.
     offset_sigma_m: NonNegative = 0.0
-    # The same of a calibrated rig, for which it is taken once the ranges say so; 0: never.
-    calibrated_offset_sigma_m: NonNegative = 0.0
     detection_probability: Annotated[float, Field(gt=0, lt=1)] = 0.95
     # Ranges of nothing that stands there, per radar and frame.
     false_ranges_per_frame: Positive = 0.05

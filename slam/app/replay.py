@@ -8,6 +8,7 @@ the run recorded are compared on the way.
 from __future__ import annotations
 
 import hashlib
+import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
@@ -32,6 +33,7 @@ from slam.app.session_states import state_row
 from slam.app.stop import StopFlag
 from slam.app.tum import TumSample
 from slam.config import SlamConfig
+from slam.presets import ConfigError, without_removed_keys
 from slam.robust.parameters import WheelNoise
 from slam.robust_pipeline import make_slam
 
@@ -106,10 +108,17 @@ def recorded_config(session: RecordedSession) -> SlamConfig:
     Raises
     ------
     AppError
-        This version does not know them.
+        This version does not know them, or they cannot be read.
     """
     try:
-        return SlamConfig.model_validate_json(session.info.config_json)
+        tables = json.loads(session.info.config_json)
+        if isinstance(tables, dict):
+            tables = without_removed_keys(tables, str(session.path))
+        return SlamConfig.model_validate(tables)
+    except json.JSONDecodeError as error:
+        raise AppError(f"{session.path}: its settings cannot be read: {error}") from None
+    except ConfigError as error:
+        raise AppError(str(error)) from None
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         key = ".".join(str(part) for part in first["loc"])

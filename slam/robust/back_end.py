@@ -12,7 +12,6 @@ from slam.robust.continuation import Continuation, labelled
 from slam.robust.existence import Existence
 from slam.robust.leftovers import Leftovers
 from slam.robust.motion import at_rest, calibrated_motion, predict
-from slam.robust.offsets import judged
 from slam.robust.parameters import BackEndParameters, PointRule
 from slam.robust.points import RangeBearing, assign, named_rows, range_bearing_rows
 from slam.robust.ranges import Antennas, RangeScan, antennas_of, rows_of, sides_of, view
@@ -157,9 +156,7 @@ class RobustBackEnd:
         deleted = self._delete_lost()
         self._n_updates += 1
         merged = self._merge()
-        whereabouts = self._whereabouts
-        self.parameters = whereabouts.parameters = judged(self.state, self._log, self.parameters)
-        lost = whereabouts.is_lost
+        lost = self._whereabouts.is_lost
         relinearised = self._give_radii()
         if relinearised or is_due(self._log, self.state, self.parameters):
             relinearised |= self.relinearise()
