@@ -67,13 +67,6 @@ class SampleTime(StrEnum):
     OWN = "own"  # each radar from the pose at the time of its own frame
 
 
-class PairBearing(StrEnum):
-    """What gives the direction of an echo that two radars of a pair see."""
-
-    RANGES = "ranges"  # as printed: the difference of the two ranges
-    PHASE = "phase"  # that difference refined by the carrier's phase, see slam/phase_bearing.py
-
-
 class Pairing(StrEnum):
     """Which detections of two radars are combined into fixes."""
 
@@ -218,7 +211,6 @@ class TrilaterationConfig(_Model):
     # own radar's, so the start skew of unsynchronised radars counts, too.
     max_stamp_difference_s: Annotated[float, Field(ge=0, allow_inf_nan=True)] = math.inf
     sample_time: SampleTime = SampleTime.NOMINAL
-    bearing: PairBearing = PairBearing.RANGES
 
     @property
     def field_of_view_rad(self) -> float:

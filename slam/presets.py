@@ -25,6 +25,7 @@ _SHIPPED_PRESETS = Path(__file__).parent.parent / "fixtures" / "presets"
 
 REMOVED_KEYS: Mapping[str, str | float] = {
     "robust.calibrated_offset_sigma_m": 0.0,
+    "trilateration.bearing": "ranges",
 }
 """Settings that no longer exist, with their defaults in the last version that had them."""
 _LAST_VERSION_WITH_THEM = "0.1.0"

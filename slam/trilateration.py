@@ -15,11 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from slam.config import PairBearing, Pairing, TrilaterationConfig
+from slam.config import Pairing, TrilaterationConfig
 from slam.detection import Detection
 from slam.geometry import RadarPair, Rig, mount_at, pair_of
-from slam.phase_bearing import pair_ranges_m
-from slam.pulse_model import PulseModel
 
 Array = NDArray[np.float64]
 
@@ -149,18 +147,13 @@ class Trilaterator:
     Parameters
     ----------
     config
-        Field of view, stamp tolerance, pairing rule, and what bearings are made of.
+        Field of view, stamp tolerance and pairing rule.
     rig
         The mounts; its pairs are worked out once.
-    pulse
-        What the radars send; its carrier counts where bearings use the phase.
     """
 
-    def __init__(
-        self, config: TrilaterationConfig, rig: Rig, pulse: PulseModel | None = None
-    ) -> None:
+    def __init__(self, config: TrilaterationConfig, rig: Rig) -> None:
         self.config = config
-        self._wavelength_m = (pulse or PulseModel()).wavelength_m
         self.rig = rig
         self.pairs = rig.pairs()
 
@@ -216,7 +209,7 @@ class Trilaterator:
             pair = self._pair_at(index, stamps_ns, motions)
             if pair is None:
                 continue
-            ranges_m = self._ranges_m(index, members)
+            ranges_m = np.array([(a.range_m, b.range_m) for a, b in members])
             xy, accepted = bilaterate(
                 ranges_m[:, 0], ranges_m[:, 1], pair, self.config.field_of_view_rad
             )
@@ -228,14 +221,6 @@ class Trilaterator:
                 if seen
             ]
         return fixes
-
-    def _ranges_m(self, index: int, members: Sequence[tuple[Detection, Detection]]) -> Array:
-        """Return the ranges to intersect, shape (n, 2): as detected, or refined by the phases."""
-        if self.config.bearing is PairBearing.RANGES:
-            return np.array([(a.range_m, b.range_m) for a, b in members])
-        pair, mounts = self.pairs[index], self.rig.mounts
-        constant_rad = mounts[pair.first].phase_offset_rad - mounts[pair.second].phase_offset_rad
-        return pair_ranges_m(members, self._wavelength_m, constant_rad)
 
     def _pair_at(
         self, index: int, stamps_ns: tuple[int, int], motions: Mapping[int, Array]
