@@ -32,13 +32,6 @@ class FrontEnd(StrEnum):
     JOINT = "joint"  # the same, and pulses that overlap are fitted together
 
 
-class LeakageFilter(StrEnum):
-    """What happens to the part of a frame that moves with the radar, leakage above all."""
-
-    NONE = "none"  # as printed
-    RUNNING_MEAN = "running_mean"  # near the antenna, the mean of past frames is subtracted
-
-
 class BackgroundFilter(StrEnum):
     """What happens to samples before smoothing."""
 
@@ -192,16 +185,6 @@ class MatchedFilterConfig(_Model):
     model_error: NonNegative = 0.08
 
 
-class LeakageConfig(_Model):
-    """Subtraction of what moves with the radar, before any front end."""
-
-    filter: LeakageFilter = LeakageFilter.NONE
-    # Subtracted up to here; a wall farther away never is, however long it keeps its distance.
-    max_range_m: Positive = 0.45
-    # Frames after which an old state of affairs is forgotten to 1/e.
-    memory_frames: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 50.0
-
-
 class TrilaterationConfig(_Model):
     """Which pairs of ranges become a fix (paper eq. 1 and 2)."""
 
@@ -329,7 +312,6 @@ class SlamConfig(_Model):
 
     detection: DetectionConfig = DetectionConfig()
     matched_filter: MatchedFilterConfig = MatchedFilterConfig()
-    leakage: LeakageConfig = LeakageConfig()
     trilateration: TrilaterationConfig = TrilaterationConfig()
     window: WindowConfig = WindowConfig()
     clustering: ClusteringConfig = ClusteringConfig()

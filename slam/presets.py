@@ -24,6 +24,9 @@ class ConfigError(ValueError):
 _SHIPPED_PRESETS = Path(__file__).parent.parent / "fixtures" / "presets"
 
 REMOVED_KEYS: Mapping[str, str | float] = {
+    "leakage.filter": "none",
+    "leakage.max_range_m": 0.45,
+    "leakage.memory_frames": 50.0,
     "robust.calibrated_offset_sigma_m": 0.0,
     "trilateration.bearing": "ranges",
 }

@@ -66,7 +66,7 @@ def test_unknown_names_are_answered_with_the_known_ones(
         ({"window": {"sise": 3}}, "x.toml: unknown key window.sise; allowed: min_distance_m, "),
         (
             {"radar": {}},
-            "x.toml: unknown key radar; allowed: detection, matched_filter, leakage, ",
+            "x.toml: unknown key radar; allowed: detection, matched_filter, trilateration, ",
         ),
         ({"window": {"size": 0}}, r"x.toml: window.size: .* greater than or equal to 1 .*: 0\)"),
         ({"window": 3}, r"x.toml: window: .* \(given: 3\)"),
