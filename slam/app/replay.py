@@ -94,9 +94,9 @@ def settings_of(session: RecordedSession) -> SlamConfig:
     AppError
         The file does not tell them, or this version does not know them.
     """
-    if not session.info.config_json or not session.info.wheels or not session.has_scan_marks:
+    if not session.info.config_json or not session.info.wheels:
         raise AppError(
-            f"{session.path}: recorded before sessions told SLAM's settings; "
+            f"{session.path}: does not hold SLAM's settings; "
             "its frames can be read, but not be replayed; record it again"
         )
     return recorded_config(session)

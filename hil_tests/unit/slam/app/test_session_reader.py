@@ -126,45 +126,6 @@ def test_scans_come_back_as_the_run_took_them(tmp_path: Path) -> None:
         assert truth.tolist() == (one.t_ns * np.array([1e-9, 1 / 3, 0.1])).tolist()
 
 
-def as_first_format(path: Path, out: Path) -> None:
-    """Rewrite a session as earlier versions did: no marks, no exact states, no settings."""
-    with path.open("rb") as source, out.open("wb") as target:
-        reader = make_reader(source)
-        (metadata,) = reader.iter_metadata()
-        writer = Writer(target, compression=CompressionType.ZSTD)
-        writer.start(profile="ros2", library="xethru-hil")
-        early = ("scene", "preset", "seed", "true_landmarks_m", "versions")
-        writer.add_metadata(metadata.name, {key: metadata.metadata[key] for key in early})
-        channels: dict[str, int] = {}
-        for schema, channel, message in reader.iter_messages(log_time_order=False):
-            assert schema is not None
-            if channel.topic in ("/scan", "/slam/state"):
-                continue
-            if channel.topic not in channels:
-                number = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.topic] = writer.register_channel(channel.topic, "cdr", number)
-            writer.add_message(
-                channel_id=channels[channel.topic],
-                log_time=message.log_time,
-                publish_time=message.publish_time,
-                sequence=message.sequence,
-                data=message.data,
-            )
-        writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
-
-
-def test_sessions_of_the_first_format_are_read(session_file: Path, tmp_path: Path) -> None:
-    as_first_format(session_file, tmp_path / "old.mcap")
-    old, new = open_session(tmp_path / "old.mcap"), open_session(session_file)
-    assert (old.has_scan_marks, new.has_scan_marks) == (False, True)
-    assert old.info.config_json == ""
-    assert old.info.radars == new.info.radars
-    first = [(one.counter, [f.samples.tobytes() for f in one.frames]) for one in scans(new)]
-    again = [(one.counter, [f.samples.tobytes() for f in one.frames]) for one in scans(old)]
-    assert again == first
-    assert old.odometry().samples == new.odometry().samples
-
-
 def test_what_is_unknown_stays_unknown(tmp_path: Path) -> None:
     path = tmp_path / "s.mcap"
     unknown = np.full(3, np.nan)
@@ -269,15 +230,32 @@ def test_wire_bytes_come_back_with_both_clocks(tmp_path: Path) -> None:
     }
 
 
-def test_a_session_of_a_later_version_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("number", "remedy"),
+    [
+        ("3", "a newer xethru-hil wrote it"),
+        ("two", "a newer xethru-hil wrote it"),
+        ("1", "record the session again"),
+        (None, "record the session again"),
+    ],
+)
+def test_a_session_of_another_format_is_refused_in_one_line(
+    tmp_path: Path, number: str | None, remedy: str
+) -> None:
+    table = session_table(session_info())
+    del table["format"]
+    if number is not None:
+        table["format"] = number
     path = tmp_path / "s.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start()
-        writer.add_metadata(METADATA_NAME, session_table(session_info()) | {"format": "3"})
+        writer.add_metadata(METADATA_NAME, table)
         writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
-    with pytest.raises(AppError, match="format 3; this version reads up to 2, a newer"):
+    with pytest.raises(AppError) as caught:
         open_session(path)
+    line = f"{path}: a session of format {number or 1}; this version reads format 2; {remedy}"
+    assert str(caught.value) == line
 
 
 @pytest.mark.parametrize("preset", ["paper", "robust"])
