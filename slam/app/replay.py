@@ -220,7 +220,7 @@ def _scans(
         line = next(waiting, None)
 
 
-class LostFrames:
+class LostFrames(SessionObserver):
     """Counts the frames missing between counters, over all radars."""
 
     def __init__(self, radars: Sequence[RadarInfo]) -> None:
@@ -235,17 +235,8 @@ class LostFrames:
                 self.count += frame.counter - last - 1
             self._last[frame.radar] = frame.counter
 
-    def on_snapshot(self, snapshot: Snapshot) -> None:
-        """Nothing to do."""
 
-    def on_log(self, line: LogLine) -> None:
-        """Nothing to do."""
-
-    def close(self) -> None:
-        """Nothing to do."""
-
-
-class Comparison:
+class Comparison(SessionObserver):
     """Compares every state with the one that was recorded, to the last bit."""
 
     def __init__(self) -> None:
@@ -257,9 +248,6 @@ class Comparison:
         """Take a recorded state."""
         self._expected[snapshot.t_ns] = _digest(snapshot)
 
-    def on_scan(self, scan: Scan) -> None:
-        """Nothing to do."""
-
     def on_snapshot(self, snapshot: Snapshot) -> None:
         """Compare a state of the replay."""
         expected = self._expected.get(snapshot.t_ns)
@@ -269,12 +257,6 @@ class Comparison:
             self._n_same += 1
         elif self._first_other_ns is None:
             self._first_other_ns = snapshot.t_ns
-
-    def on_log(self, line: LogLine) -> None:
-        """Nothing to do."""
-
-    def close(self) -> None:
-        """Nothing to do."""
 
     @property
     def is_same(self) -> bool:
