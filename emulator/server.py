@@ -210,11 +210,6 @@ class Server:
         for service in services:
             service.register(self._selector)
 
-    @property
-    def waker_fd(self) -> int:
-        """A non-blocking descriptor; a byte written to it ends the loop's wait."""
-        return self._waker_fd
-
     def run(self) -> None:
         """Serve until `stop`."""
         while not self._stopped:

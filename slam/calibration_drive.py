@@ -14,6 +14,9 @@ from slam.geometry import Rig
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
+_LEAST_STEP_NS = 100_000_000
+"""Samples closer than this are joined into one step."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrationPriors:
@@ -137,7 +140,6 @@ def make_drive(
     ranges: RangeSet,
     *,
     wheels: WheelModel | None = None,
-    least_step_ns: int = 100_000_000,
 ) -> Drive:
     """Cut odometry into steps for the batch.
 
@@ -152,8 +154,6 @@ def make_drive(
         All single ranges.
     wheels
         The white noise of each sample's step; it adds up over the samples of a node's step.
-    least_step_ns
-        Samples closer than this are joined into one step.
     """
     model = wheels or WheelModel()
     poses = poses.copy()
@@ -161,7 +161,7 @@ def make_drive(
     variances = np.vstack([np.zeros(3), model.sigmas(steps_of(poses)) ** 2]).cumsum(axis=0)
     chosen = [0]
     for index in range(1, len(stamps_ns)):
-        if stamps_ns[index] - stamps_ns[chosen[-1]] >= least_step_ns:
+        if stamps_ns[index] - stamps_ns[chosen[-1]] >= _LEAST_STEP_NS:
             chosen.append(index)
     if len(chosen) > 1 and chosen[-1] != len(stamps_ns) - 1:
         chosen[-1] = len(stamps_ns) - 1

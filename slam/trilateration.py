@@ -120,23 +120,6 @@ def bilaterate(
     return xy, accepted
 
 
-def bilateration_jacobian(first_m: float, second_m: float, pair: RadarPair) -> Array:
-    """Return d(range, bearing) / d(l1, l2) of a fix seen from the base footprint.
-
-    Shape (2, 2): rows range [m] and bearing [rad], columns the first and the second range [m].
-    """
-    l1, l2, d = first_m, second_m, pair.baseline_m
-    u = (l1 - l2) * (l1 + l2) / (2 * d)
-    v = math.sqrt((l1**2 + l2**2) / 2 - d**2 / 4 - u**2)
-    du = np.array([l1 / d, -l2 / d])
-    dv = np.array([l1 * (d / 2 - u), l2 * (d / 2 + u)]) / (d * v)
-    x, y = pair.midpoint + u * pair.along + v * pair.ahead
-    d_xy = np.outer(pair.along, du) + np.outer(pair.ahead, dv)
-    r = math.hypot(x, y)
-    result: Array = np.array([[x / r, y / r], [-y / r**2, x / r**2]]) @ d_xy
-    return result
-
-
 class Trilaterator:
     """Pairs the detections of one pose, those of one radar with those of the other.
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from emulator.odometry import scene_truth
+from emulator.odometry import odometry_times_ns, tum_line
 from emulator.scene import LeakageSpec, NoiseSpec, PathSpec, RadarSpec, Scene, TargetSpec
 from slam.app.emulated_rig import (
     FRAME_RATE_HZ,
@@ -93,7 +93,8 @@ def results_of(
             "window.min_turn_rad": 0.05,
         },
     )
-    track = OdometryTrack.from_lines(scene_truth(scene))
+    times = odometry_times_ns(trajectory.duration_ns, scene.odometry.rate_hz)
+    track = OdometryTrack.from_lines(map(tum_line, times.tolist(), trajectory.poses(times)))
     with open_loopback(scene, 0) as source:
         source.start(RAW_CONFIG, FRAME_RATE_HZ)
         scans: Iterable[Scan] = source.scans(end_counter(trajectory.duration_ns), lambda: None)

@@ -255,11 +255,6 @@ def open_session(path: Path) -> RecordedSession:
     return RecordedSession(path, read_session_table(path, head, tuple(radars)), size=size)
 
 
-def scans(session: RecordedSession) -> Iterator[Scan]:
-    """Yield the scans of a session as the run took them, without the truth; see `Scan`."""
-    return (scan for scan, _ in session.scans())
-
-
 def _radar_info(path: Path, message: RawMessage) -> RadarInfo:
     try:
         text = str(ros.deserialise(message.data, ros.STRING).data)

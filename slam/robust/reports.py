@@ -23,8 +23,8 @@ class MapWall:
 
     Attributes
     ----------
-    wall_id, hits
-        Its id, of the same numbers as the landmarks', and the frames that hit it.
+    hits
+        The frames that hit it.
     phi_rad, d_m
         Direction of its normal, away from the robot, and distance along it from the origin.
     covariance
@@ -33,7 +33,6 @@ class MapWall:
         shape (k, 2, 2): ends of the stretches that answered, map frame [m].
     """
 
-    wall_id: int
     phi_rad: float
     d_m: float
     covariance: Array

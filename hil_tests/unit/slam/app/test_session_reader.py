@@ -18,7 +18,7 @@ from slam.app.odometry import OdometryTrack
 from slam.app.session import LogLine, Scan, Snapshot
 from slam.app.session_head import METADATA_NAME, session_table, settings_text
 from slam.app.session_log import SessionLog
-from slam.app.session_reader import open_session, scans
+from slam.app.session_reader import open_session
 from slam.app.session_records import TruthPose
 from slam.app.session_states import snapshot_of, state_row
 from slam.app.tum import TumSample, format_tum_line
@@ -92,7 +92,7 @@ def test_scans_group_by_tick_also_where_a_radar_started_whole_periods_late(tmp_p
         frames = (first,) if tick == 0 else (first, replace(second, counter=tick - 1))
         log.on_scan(replace(scan(tick), frames=frames))
     log.close()
-    grouped = list(scans(open_session(path)))
+    grouped = [one for one, _ in open_session(path).scans()]
     assert [(s.counter, [f.counter for f in s.frames]) for s in grouped] == [
         (0, [0]),
         *((tick, [tick, tick - 1]) for tick in range(1, 5)),
