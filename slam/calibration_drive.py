@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,12 +82,8 @@ class Calibration:
         Shape (k, 2), map frame: the body frame at the start, or the frame of known reflectors.
     path
         The most likely path, map frame.
-    wheels
-        Shape (3,): scale, turn scale, curvature [rad/m].
     landmark
         Shape (n_ranges,): the landmark each range was used for, or UNASSIGNED.
-    residuals_m
-        Shape (n_ranges,): expected less measured; NaN where not used.
     sigma_m
         Standard deviation of a used range, as found.
     """
@@ -97,9 +93,7 @@ class Calibration:
     covariance_m2: Array
     landmarks_m: Array
     path: PathNodes
-    wheels: Array
     landmark: Indices
-    residuals_m: Array
     sigma_m: float
 
     @property
@@ -114,23 +108,6 @@ class Calibration:
         variances = np.diag(self.covariance_m2).reshape(-1, 3)
         result: Array = np.sqrt(variances[:, 1:])
         return result
-
-    def rig(self, nominal: Rig) -> Rig:
-        """Return the rig with offsets and mount positions corrected, all else as it was."""
-        shifts = zip(
-            nominal.mounts, self.offsets_m.tolist(), self.mount_shifts_m.tolist(), strict=True
-        )
-        return Rig(
-            mounts=tuple(
-                replace(
-                    mount,
-                    x_m=mount.x_m + shift_x,
-                    y_m=mount.y_m + shift_y,
-                    range_offset_m=offset,
-                )
-                for mount, offset, (shift_x, shift_y) in shifts
-            )
-        )
 
 
 def make_drive(

@@ -55,16 +55,6 @@ class Fix:
     y_m: float
     detections: tuple[Detection, Detection]
 
-    @property
-    def range_m(self) -> float:
-        """Return the distance from the base footprint, r of the paper."""
-        return math.hypot(self.x_m, self.y_m)
-
-    @property
-    def bearing_rad(self) -> float:
-        """Return the direction from the base footprint, phi of the paper, in [-pi, pi]."""
-        return math.atan2(self.y_m, self.x_m)
-
 
 def bilaterate(
     first_m: Array, second_m: Array, pair: RadarPair, field_of_view_rad: float

@@ -57,8 +57,8 @@ def copy_of_the_vendors_recording(folder: Path) -> Path:
 
 def counters_played(recording: Path, faults: list[RecordingFault]) -> list[int]:
     options = PlayOptions(rate=0, loop=False)
-    (radar,) = played_radars(recording, options, identity=IDENTITY, on_fault=faults.append)
-    line = LoopbackTransport(radar.device)
+    (played,) = played_radars(recording, options, identity=IDENTITY, on_fault=faults.append)
+    line = LoopbackTransport(played.device)
     counters = []
     with X4M300(line, clock=line.clock_ns) as radar:
         while True:
