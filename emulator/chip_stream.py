@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from emulator.commands import Module
 from emulator.module_clock import ModuleClock
+from emulator.outbox import MessageStream
 from emulator.pace import Pace
 from xethru_protocol.codes import SensorMode
 from xethru_protocol.messages import Command, DataFloat, Response
@@ -13,7 +14,7 @@ __all__ = ["ChipStream"]
 _CLOCK_TOLERANCE_NS = 2
 
 
-class ChipStream:
+class ChipStream(MessageStream):
     """Frames of a module in MANUAL mode.
 
     Under `Pace.ASAP` the next frame is always due. Under `Pace.REALTIME` counter k is due at
@@ -98,9 +99,3 @@ class ChipStream:
     def restarted(self, ready_ns: int) -> None:
         """Look again: the chip is off until a host sets a rate again."""
         self._known = False
-
-    def port_opened(self, now_ns: int) -> None:
-        """Change nothing: a radar does not know who listens."""
-
-    def port_closed(self, now_ns: int) -> None:
-        """Change nothing: the module streams on, and overflows."""

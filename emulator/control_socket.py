@@ -11,6 +11,7 @@ from pathlib import Path
 
 from emulator.control import Control
 from emulator.link import LinkError
+from emulator.server import Service
 
 __all__ = ["ControlSocket"]
 
@@ -31,7 +32,7 @@ class _Client:
     watched: int = selectors.EVENT_READ
 
 
-class ControlSocket:
+class ControlSocket(Service):
     """A listening unix socket, as a `Service` of the server's loop.
 
     Parameters
@@ -69,12 +70,6 @@ class ControlSocket:
         """Register with the loop."""
         self._selector = selector
         selector.register(self._listener, selectors.EVENT_READ, self._accept)
-
-    def advance(self, now_ns: int) -> None:
-        """Do nothing: only clients make something happen."""
-
-    def wake_ns(self, now_ns: int) -> int | None:
-        """Return None: time alone changes nothing."""
 
     def close(self) -> None:
         """Close everything and remove the socket; the loop may be gone."""

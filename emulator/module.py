@@ -147,11 +147,6 @@ class Module:
         """Whether only the base firmware runs: option "xep", or safe mode."""
         return self.state in (State.XEP, State.SAFE)
 
-    @property
-    def reset_requested(self) -> bool:
-        """Whether a restart is due."""
-        return self.restart is not None
-
     def power_up(self, *, into_bootloader: bool = False) -> None:
         """Restart: chip defaults, saved settings, and the mode the module was left in."""
         self.chip.init()

@@ -33,7 +33,6 @@ __all__ = [
     "drift",
     "odometry_times_ns",
     "scene_odometry",
-    "scene_truth",
     "tum_line",
 ]
 
@@ -141,13 +140,6 @@ def scene_odometry(scene: Scene, seed: int) -> tuple[str, ...]:
         unseen = (times[1:] > lifted_ns) & (times[:-1] < down_ns)
     poses = drift(trajectory.poses(times), scene.odometry, seed=seed, unseen=unseen)
     return _tum_lines(times, poses)
-
-
-def scene_truth(scene: Scene) -> tuple[str, ...]:
-    """Return the true poses at the odometry's times as TUM lines, world frame."""
-    trajectory = scene.trajectory()
-    times = odometry_times_ns(trajectory.duration_ns, scene.odometry.rate_hz)
-    return _tum_lines(times, trajectory.poses(times))
 
 
 def _tum_lines(times_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> tuple[str, ...]:

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from emulator.link import LinkError
 from emulator.pace import Pace
+from emulator.server import Service
 
 __all__ = ["OdometryFeed"]
 
@@ -39,7 +40,7 @@ class _Client:
     watched: int = field(default=0)
 
 
-class OdometryFeed:
+class OdometryFeed(Service):
     """A listening unix socket that plays the odometry to each client.
 
     Parameters

@@ -7,6 +7,7 @@ Source: protocol reference 8.4.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import deque
 from enum import Enum, auto
 from typing import NamedTuple, Protocol
@@ -29,36 +30,34 @@ class MessageKind(Enum):
     """DATA STRING and generic byte or float messages: the first to go."""
 
 
-class MessageStream(Protocol):
+class MessageStream(ABC):
     """Messages a module sends of its own accord, each with the time it falls due."""
 
+    @abstractmethod
     def next_due_ns(self) -> int | None:
         """Return when the next message is due; None while nothing streams."""
-        ...
 
+    @abstractmethod
     def take(self) -> Response:
         """Return the next message and move on."""
-        ...
 
+    @abstractmethod
     def skip_due_before(self, time_ns: int) -> int:
         """Give up every message due before a time; return how many (frame counters run on)."""
-        ...
 
+    @abstractmethod
     def command_done(self, command: Command[Response], now_ns: int) -> None:
         """Learn that the module carried out, or refused, a command."""
-        ...
 
-    def restarted(self, ready_ns: int) -> None:
+    # A recording goes on through a reset; a radar streams whether a host listens or not.
+    def restarted(self, ready_ns: int) -> None:  # noqa: B027 - see above
         """Learn that the module restarts, and when it will be ready; until then it is silent."""
-        ...
 
-    def port_opened(self, now_ns: int) -> None:
+    def port_opened(self, now_ns: int) -> None:  # noqa: B027 - see above
         """Learn that a host opened the port."""
-        ...
 
-    def port_closed(self, now_ns: int) -> None:
+    def port_closed(self, now_ns: int) -> None:  # noqa: B027 - see above
         """Learn that the last host closed the port."""
-        ...
 
 
 class Outbox(Protocol):

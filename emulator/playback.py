@@ -27,7 +27,7 @@ from xethru_protocol.recordings import (
 )
 from xethru_protocol.recordings.records import TimedMessages
 
-__all__ = ["PlayOptions", "PlayedRadar", "RecordingError", "played_radars", "recording_device"]
+__all__ = ["PlayOptions", "PlayedRadar", "RecordingError", "played_radars"]
 
 _ONLY_NAME = "player"
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
@@ -131,30 +131,6 @@ def played_radars(
         )
         played.append(PlayedRadar(name=name, serial=who.serial, device=device, stream=stream))
     return tuple(played)
-
-
-def recording_device(
-    recording: Path,
-    identity: Identity,
-    *,
-    rate: float,
-    loop: bool,
-    on_fault: Callable[[RecordingFault], None],
-    warn: Callable[[str], None] = lambda line: None,
-) -> Device:
-    """Return a module that plays the only radar of a recording; see `played_radars`.
-
-    Raises
-    ------
-    RecordingError
-        As there, and when the recording is of several radars.
-    """
-    options = PlayOptions(rate=rate, loop=loop)
-    played = played_radars(recording, options, identity=identity, on_fault=on_fault, warn=warn)
-    if len(played) > 1:
-        names = ", ".join(sorted(radar.name for radar in played))
-        raise RecordingError(f"{recording} holds several radars ({names}), not one")
-    return played[0].device
 
 
 class _Survey:

@@ -14,6 +14,7 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
+from emulator.outbox import MessageStream
 from emulator.playback_control import SLOWEST_RATE, KindSteps, PlayClock, PlayState
 from xethru_protocol.codes import SensorMode, X4Setting
 from xethru_protocol.messages import Command, Response, SetMode, X4DriverSet
@@ -74,7 +75,7 @@ def schedule(
         yield TimedMessage(time_ns=round(elapsed_ns / rate) if rate else 0, message=message)
 
 
-class PlayStream:
+class PlayStream(MessageStream):
     """The messages of a recording, due one after the other while a host has the port open.
 
     Where nobody tells who opens the port, a host's first command shows that it is there.
@@ -158,9 +159,6 @@ class PlayStream:
             self.port_opened(now_ns)
         if self._clock.begins_ns > now_ns:
             self._clock.begin_at(now_ns if _starts_radar(command) else now_ns + QUIET_NS)
-
-    def restarted(self, ready_ns: int) -> None:
-        """Change nothing: a recording does not know of resets."""
 
     def port_opened(self, now_ns: int) -> None:
         """Play from the beginning, or from where a seek without a host went, soon."""

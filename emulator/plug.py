@@ -13,6 +13,7 @@ from pathlib import Path
 
 from emulator.link import LinkError, PtyLink
 from emulator.port_watch import PortWatch
+from emulator.server import Service
 from emulator.tcp_link import TcpLink
 
 __all__ = ["Plug"]
@@ -21,7 +22,7 @@ LOOK_AGAIN_NS = 20_000_000
 """How often to look whether the port is back; a host looks less often."""
 
 
-class Plug:
+class Plug(Service):
     """Takes the lines to one module away and brings them back: a service of the loop.
 
     Parameters

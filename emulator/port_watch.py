@@ -12,6 +12,8 @@ import selectors
 import struct
 from collections.abc import Callable
 
+from emulator.server import Service
+
 __all__ = ["PortWatch"]
 
 _IN_CLOSE_WRITE = 0x08
@@ -21,7 +23,7 @@ _IN_NONBLOCK = os.O_NONBLOCK
 _EVENT = struct.Struct("iIII")  # watch, mask, cookie, length of a name (none for a device)
 
 
-class PortWatch:
+class PortWatch(Service):
     """Calls back when the first host opens a terminal and when the last one closes it.
 
     Identical events that follow each other at once are merged by the kernel, so the count of two
@@ -69,12 +71,6 @@ class PortWatch:
         """Register with the loop."""
         if self.works:
             selector.register(self._fd, selectors.EVENT_READ, self._read)
-
-    def advance(self, now_ns: int) -> None:
-        """Do nothing: only events matter."""
-
-    def wake_ns(self, now_ns: int) -> int | None:
-        """Return None: only events matter."""
 
     def close(self) -> None:
         """Stop watching."""

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Literal
 
 from emulator.link import LinkError
+from emulator.server import Service
 from xethru_protocol.framing import PacketReader
 from xethru_protocol.packets import NeedData
 from xethru_protocol.plausibility import Direction
@@ -30,7 +31,7 @@ MOST_WAITING = 1 << 20
 _READ = 65_536
 
 
-class ModuleLine:
+class ModuleLine(Service):
     """A module's port as a device, and as a `Service` of the server's loop.
 
     Parameters

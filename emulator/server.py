@@ -10,6 +10,7 @@ import contextlib
 import os
 import selectors
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
@@ -67,20 +68,20 @@ class ByteLink(Protocol):
         ...
 
 
-class Service(Protocol):
+class Service(ABC):
     """Anything else the loop serves beside the ports, with descriptors and deadlines of its own."""
 
+    @abstractmethod
     def register(self, selector: selectors.BaseSelector) -> None:
         """Register descriptors; ``data`` is called with ``(events, now_ns)`` when one is ready."""
-        ...
 
-    def advance(self, now_ns: int) -> None:
+    def advance(self, now_ns: int) -> None:  # noqa: B027 - some wait for descriptors only
         """Let time pass."""
-        ...
 
     def wake_ns(self, now_ns: int) -> int | None:
-        """Return when `advance` should be called next."""
-        ...
+        """Return when `advance` should be called next; None if only descriptors matter."""
+        del now_ns
+        return None
 
 
 class Port:
@@ -208,11 +209,6 @@ class Server:
         self._selector.register(self._wake_fd, selectors.EVENT_READ, self._woken)
         for service in services:
             service.register(self._selector)
-
-    @property
-    def waker_fd(self) -> int:
-        """A non-blocking descriptor; a byte written to it ends the loop's wait."""
-        return self._waker_fd
 
     def run(self) -> None:
         """Serve until `stop`."""

@@ -14,6 +14,7 @@ import socket
 from collections.abc import Callable
 
 from emulator.link import LinkError
+from emulator.server import Service
 
 __all__ = ["TcpLink", "is_loopback"]
 
@@ -39,7 +40,7 @@ def is_loopback(host: str) -> bool:
         return False  # a name: who knows where it leads
 
 
-class TcpLink:
+class TcpLink(Service):
     """A listening socket and its one client: a line and a service of the loop.
 
     Parameters
@@ -99,12 +100,6 @@ class TcpLink:
         """Register with the loop."""
         self._selector = selector
         selector.register(self._listener, selectors.EVENT_READ, self._accept)
-
-    def advance(self, now_ns: int) -> None:
-        """Do nothing: only events matter."""
-
-    def wake_ns(self, now_ns: int) -> int | None:
-        """Return None: only events matter."""
 
     def fileno(self) -> int:
         """Return the client's descriptor; -1 while there is none."""

@@ -322,18 +322,14 @@ class _Estimator:
     def _result(self, model: _Model, landmark: Indices, solution: Solution) -> Calibration:
         layout = self._layout(model)
         term = self._range_term(layout, landmark, Square())
-        residuals = np.full(len(landmark), np.nan)
-        residuals[landmark != UNASSIGNED] = term.residuals(solution.state) * term.sigma_m
-        used = residuals[landmark != UNASSIGNED]
+        used = term.residuals(solution.state) * term.sigma_m
         return Calibration(
             offsets_m=model.radars[:, 0],
             mount_shifts_m=model.radars[:, 1:] - self._mounts,
             covariance_m2=solution.covariance(np.arange(layout.radars.start, layout.size)),
             landmarks_m=model.landmarks,
             path=PathNodes(t_ns=self._drive.path.t_ns, poses=model.poses),
-            wheels=model.wheels,
             landmark=landmark,
-            residuals_m=residuals,
             sigma_m=float(np.sqrt(np.mean(used**2))) if len(used) else math.nan,
         )
 

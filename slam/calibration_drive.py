@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,9 @@ from slam.geometry import Rig
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
+
+_LEAST_STEP_NS = 100_000_000
+"""Samples closer than this are joined into one step."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,12 +82,8 @@ class Calibration:
         Shape (k, 2), map frame: the body frame at the start, or the frame of known reflectors.
     path
         The most likely path, map frame.
-    wheels
-        Shape (3,): scale, turn scale, curvature [rad/m].
     landmark
         Shape (n_ranges,): the landmark each range was used for, or UNASSIGNED.
-    residuals_m
-        Shape (n_ranges,): expected less measured; NaN where not used.
     sigma_m
         Standard deviation of a used range, as found.
     """
@@ -94,9 +93,7 @@ class Calibration:
     covariance_m2: Array
     landmarks_m: Array
     path: PathNodes
-    wheels: Array
     landmark: Indices
-    residuals_m: Array
     sigma_m: float
 
     @property
@@ -112,23 +109,6 @@ class Calibration:
         result: Array = np.sqrt(variances[:, 1:])
         return result
 
-    def rig(self, nominal: Rig) -> Rig:
-        """Return the rig with offsets and mount positions corrected, all else as it was."""
-        shifts = zip(
-            nominal.mounts, self.offsets_m.tolist(), self.mount_shifts_m.tolist(), strict=True
-        )
-        return Rig(
-            mounts=tuple(
-                replace(
-                    mount,
-                    x_m=mount.x_m + shift_x,
-                    y_m=mount.y_m + shift_y,
-                    range_offset_m=offset,
-                )
-                for mount, offset, (shift_x, shift_y) in shifts
-            )
-        )
-
 
 def make_drive(
     rig: Rig,
@@ -137,7 +117,6 @@ def make_drive(
     ranges: RangeSet,
     *,
     wheels: WheelModel | None = None,
-    least_step_ns: int = 100_000_000,
 ) -> Drive:
     """Cut odometry into steps for the batch.
 
@@ -152,8 +131,6 @@ def make_drive(
         All single ranges.
     wheels
         The white noise of each sample's step; it adds up over the samples of a node's step.
-    least_step_ns
-        Samples closer than this are joined into one step.
     """
     model = wheels or WheelModel()
     poses = poses.copy()
@@ -161,7 +138,7 @@ def make_drive(
     variances = np.vstack([np.zeros(3), model.sigmas(steps_of(poses)) ** 2]).cumsum(axis=0)
     chosen = [0]
     for index in range(1, len(stamps_ns)):
-        if stamps_ns[index] - stamps_ns[chosen[-1]] >= least_step_ns:
+        if stamps_ns[index] - stamps_ns[chosen[-1]] >= _LEAST_STEP_NS:
             chosen.append(index)
     if len(chosen) > 1 and chosen[-1] != len(stamps_ns) - 1:
         chosen[-1] = len(stamps_ns) - 1

@@ -20,7 +20,6 @@ from slam.geometry import wrap_angles
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-_NS_PER_S = 1_000_000_000
 # A robot of this class moves a radar by at most some centimetres per frame; a followed range obeys
 # its own velocity far better than that.
 _GATE_M = 0.012

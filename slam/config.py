@@ -32,13 +32,6 @@ class FrontEnd(StrEnum):
     JOINT = "joint"  # the same, and pulses that overlap are fitted together
 
 
-class LeakageFilter(StrEnum):
-    """What happens to the part of a frame that moves with the radar, leakage above all."""
-
-    NONE = "none"  # as printed
-    RUNNING_MEAN = "running_mean"  # near the antenna, the mean of past frames is subtracted
-
-
 class BackgroundFilter(StrEnum):
     """What happens to samples before smoothing."""
 
@@ -65,13 +58,6 @@ class SampleTime(StrEnum):
 
     NOMINAL = "nominal"  # as printed: all radars look from the pose of the collected state
     OWN = "own"  # each radar from the pose at the time of its own frame
-
-
-class PairBearing(StrEnum):
-    """What gives the direction of an echo that two radars of a pair see."""
-
-    RANGES = "ranges"  # as printed: the difference of the two ranges
-    PHASE = "phase"  # that difference refined by the carrier's phase, see slam/phase_bearing.py
 
 
 class Pairing(StrEnum):
@@ -199,16 +185,6 @@ class MatchedFilterConfig(_Model):
     model_error: NonNegative = 0.08
 
 
-class LeakageConfig(_Model):
-    """Subtraction of what moves with the radar, before any front end."""
-
-    filter: LeakageFilter = LeakageFilter.NONE
-    # Subtracted up to here; a wall farther away never is, however long it keeps its distance.
-    max_range_m: Positive = 0.45
-    # Frames after which an old state of affairs is forgotten to 1/e.
-    memory_frames: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 50.0
-
-
 class TrilaterationConfig(_Model):
     """Which pairs of ranges become a fix (paper eq. 1 and 2)."""
 
@@ -218,7 +194,6 @@ class TrilaterationConfig(_Model):
     # own radar's, so the start skew of unsynchronised radars counts, too.
     max_stamp_difference_s: Annotated[float, Field(ge=0, allow_inf_nan=True)] = math.inf
     sample_time: SampleTime = SampleTime.NOMINAL
-    bearing: PairBearing = PairBearing.RANGES
 
     @property
     def field_of_view_rad(self) -> float:
@@ -320,8 +295,6 @@ class RobustConfig(_Model):
     max_predicted_sigma_m: Positive = 8e-3
     # Standard deviation of each radar's unknown constant range offset.
     offset_sigma_m: NonNegative = 0.0
-    # The same of a calibrated rig, for which it is taken once the ranges say so; 0: never.
-    calibrated_offset_sigma_m: NonNegative = 0.0
     detection_probability: Annotated[float, Field(gt=0, lt=1)] = 0.95
     # Ranges of nothing that stands there, per radar and frame.
     false_ranges_per_frame: Positive = 0.05
@@ -339,7 +312,6 @@ class SlamConfig(_Model):
 
     detection: DetectionConfig = DetectionConfig()
     matched_filter: MatchedFilterConfig = MatchedFilterConfig()
-    leakage: LeakageConfig = LeakageConfig()
     trilateration: TrilaterationConfig = TrilaterationConfig()
     window: WindowConfig = WindowConfig()
     clustering: ClusteringConfig = ClusteringConfig()

@@ -13,12 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
-from slam.background import LeakageFreeDetector
 from slam.config import (
     BackgroundFilter,
     DetectionConfig,
     FrontEnd,
-    LeakageFilter,
     PeakPosition,
     SlamConfig,
 )
@@ -32,15 +30,10 @@ Array = NDArray[np.float64]
 
 
 def make_detector(config: SlamConfig) -> Detector:
-    """Return the front end that ``config`` names, behind its leakage filter if it has one.
-
-    With a leakage filter the result keeps a state per radar and belongs to one run.
-    """
-    paper = config.detection.front_end is FrontEnd.PAPER
-    detector = PaperDetector(config.detection) if paper else MatchedFilterDetector(config)
-    if config.leakage.filter is LeakageFilter.NONE:
-        return detector
-    return LeakageFreeDetector(detector, config.leakage)
+    """Return the front end that ``config`` names."""
+    if config.detection.front_end is FrontEnd.PAPER:
+        return PaperDetector(config.detection)
+    return MatchedFilterDetector(config)
 
 
 class PaperDetector:

@@ -91,8 +91,8 @@ class Mount:
     range_offset_m
         What this module measures too long; the front end subtracts it from every range.
     phase_offset_rad
-        What this module and its antennas add to an echo's carrier phase; only its difference
-        between the radars of a pair counts, and only where bearings use the phase.
+        What this module and its antennas add to an echo's carrier phase. Rig files and sessions
+        keep it; SLAM does not use it.
     """
 
     name: str

@@ -97,43 +97,18 @@ def ate_rmse_m(estimate_xy: Array, reference_xy: Array) -> float:
     return rmse_m(transform(align_se2(estimate_xy, reference_xy), estimate_xy), reference_xy)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class IcpAte:
-    """Three readings of "RMS ATE after ICP"; the paper does not say which it means.
+def icp_ate_rmse_m(estimate_xy: Array, reference_xy: Array) -> float:
+    """Return the RMS distance of the ICP-aligned points to the nearest reference points [m].
 
-    Attributes
-    ----------
-    nearest_rmse_m
-        RMS distance of the ICP-aligned points to the nearest reference point: what ICP itself
-        minimises. Time plays no part, so drift along the path costs nothing.
-    per_axis_rmse_m
-        The authors' later evaluation script: nearest neighbours looked up *before* the alignment,
-        mean over both axes together, so 1 / sqrt(2) of a distance.
-    time_rmse_m
-        RMS distance by time under the same alignment.
-    """
-
-    nearest_rmse_m: float
-    per_axis_rmse_m: float
-    time_rmse_m: float
-
-
-def icp_ate(estimate_xy: Array, reference_xy: Array) -> IcpAte:
-    """Return the paper's trajectory error in its three readings.
-
-    Both have shape (n, 2) [m], rows together by time, *both in their start frames*: ICP begins
-    with the two start poses on each other, as two SLAM systems started together are.
+    This is what ICP minimises, and one reading of the paper's "RMS ATE after ICP". Time plays no
+    part, so drift along the path costs nothing. Both have shape (n, 2) [m], rows together by time,
+    *both in their start frames*: ICP begins with the two start poses on each other, as two SLAM
+    systems started together are.
     """
     _check_rows(estimate_xy, reference_xy)
-    tree = KDTree(reference_xy)
-    _, before = _nearest(tree, estimate_xy)
     aligned = transform(icp_align_se2(estimate_xy, reference_xy), estimate_xy)
-    distances, _ = _nearest(tree, aligned)
-    return IcpAte(
-        nearest_rmse_m=math.sqrt(float(np.mean(distances**2))),
-        per_axis_rmse_m=math.sqrt(float(np.mean((aligned - reference_xy[before]) ** 2))),
-        time_rmse_m=rmse_m(aligned, reference_xy),
-    )
+    distances, _ = _nearest(KDTree(reference_xy), aligned)
+    return math.sqrt(float(np.mean(distances**2)))
 
 
 def icp_align_se2(estimate_xy: Array, reference_xy: Array) -> Array:

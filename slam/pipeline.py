@@ -17,7 +17,6 @@ from slam.detection import Detection, Detector, make_detector
 from slam.ekf_slam import Belief, motion_noise, predict, start
 from slam.frames import RadarFrame
 from slam.geometry import Rig, between
-from slam.pulse_model import PulseModel
 from slam.robust.reports import UpdateReport
 from slam.trilateration import NO_MOTIONS, Fix, Trilaterator
 from slam.window import CollectedState, has_moved
@@ -127,11 +126,7 @@ class UwbRadarSlam:
         sensor = config.observation
         self._Q = np.diag([sensor.sigma_range_m**2, sensor.sigma_bearing_rad**2])
         self._detector = detector or make_detector(config)
-        pulse = PulseModel(
-            carrier_hz=config.matched_filter.carrier_hz,
-            bandwidth_hz=config.matched_filter.bandwidth_hz,
-        )
-        self._trilaterator = Trilaterator(config.trilateration, rig, pulse)
+        self._trilaterator = Trilaterator(config.trilateration, rig)
         self._window: deque[CollectedState] = deque()
         self._collected_pose: Array | None = None  # odometry where the last state was collected
         self._estimated_pose: Array = np.zeros(3)  # Odom[s - 1]

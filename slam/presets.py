@@ -23,6 +23,16 @@ class ConfigError(ValueError):
 # user's own project must not come first, as it would by that name.
 _SHIPPED_PRESETS = Path(__file__).parent.parent / "fixtures" / "presets"
 
+REMOVED_KEYS: Mapping[str, str | float] = {
+    "leakage.filter": "none",
+    "leakage.max_range_m": 0.45,
+    "leakage.memory_frames": 50.0,
+    "robust.calibrated_offset_sigma_m": 0.0,
+    "trilateration.bearing": "ranges",
+}
+"""Settings that no longer exist, with their defaults in the last version that had them."""
+_LAST_VERSION_WITH_THEM = "0.1.0"
+
 
 def load_preset(name: str, environment: str = BASE_ENVIRONMENT) -> SlamConfig:
     """Return the preset ``fixtures/presets/<name>.toml`` for one environment.
@@ -98,6 +108,45 @@ def override(config: SlamConfig, settings: Mapping[str, object]) -> SlamConfig:
     return _validated(tables, "setting", context=TEXT_ALLOWED)
 
 
+def without_removed_keys(tables: Mapping[str, Any], source: str) -> dict[str, Any]:
+    """Return the tables of a configuration without the keys in `REMOVED_KEYS`.
+
+    >>> without_removed_keys({"robust": {"calibrated_offset_sigma_m": 0.0}}, "old.toml")
+    {'robust': {}}
+
+    Raises
+    ------
+    ConfigError
+        A removed key has another value than its default, so the run would not be the same.
+    """
+    kept = dict(tables)
+    for removed, default in REMOVED_KEYS.items():
+        part, _, field = removed.partition(".")
+        table = kept.get(part)
+        if not isinstance(table, dict) or field not in table:
+            continue
+        if not _is_same(table[field], default):
+            raise ConfigError(
+                f"{source}: {removed}: version {_LAST_VERSION_WITH_THEM} was the last with this "
+                f"key; only its default {default!r} is still read (given: {table[field]!r})"
+            )
+        kept[part] = {key: value for key, value in table.items() if key != field}
+        if not kept[part] and part not in SlamConfig.model_fields:
+            del kept[part]
+    return kept
+
+
+def _is_same(value: object, default: str | float) -> bool:
+    if isinstance(value, bool):
+        return False
+    if isinstance(value, str) and isinstance(default, float):  # from a command line
+        try:
+            return float(value) == default
+        except ValueError:
+            return False
+    return value == default
+
+
 def _table(value: object, key: str, source: str) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise ConfigError(f"{source}: {key}: must be a table (given: {value!r})")
@@ -105,6 +154,7 @@ def _table(value: object, key: str, source: str) -> dict[str, Any]:
 
 
 def _validated(tables: Mapping[str, Any], source: str, context: str | None = None) -> SlamConfig:
+    tables = without_removed_keys(tables, source)
     try:
         return SlamConfig.model_validate(tables, context=context)
     except ValidationError as error:

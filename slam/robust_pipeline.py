@@ -210,7 +210,6 @@ def back_end_parameters(config: SlamConfig, wheels: WheelNoise) -> BackEndParame
             doubt_m=told.association_doubt_m,
             huber_sigmas=told.huber_sigmas,
             offset_sigma_m=told.offset_sigma_m,
-            calibrated_sigma_m=told.calibrated_offset_sigma_m or None,
             detection_probability=told.detection_probability,
             clutter_per_m=told.false_ranges_per_frame / reach_m,
             field_of_view_rad=told.field_of_view_rad,

@@ -15,11 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from slam.config import PairBearing, Pairing, TrilaterationConfig
+from slam.config import Pairing, TrilaterationConfig
 from slam.detection import Detection
 from slam.geometry import RadarPair, Rig, mount_at, pair_of
-from slam.phase_bearing import pair_ranges_m
-from slam.pulse_model import PulseModel
 
 Array = NDArray[np.float64]
 
@@ -56,16 +54,6 @@ class Fix:
     x_m: float
     y_m: float
     detections: tuple[Detection, Detection]
-
-    @property
-    def range_m(self) -> float:
-        """Return the distance from the base footprint, r of the paper."""
-        return math.hypot(self.x_m, self.y_m)
-
-    @property
-    def bearing_rad(self) -> float:
-        """Return the direction from the base footprint, phi of the paper, in [-pi, pi]."""
-        return math.atan2(self.y_m, self.x_m)
 
 
 def bilaterate(
@@ -122,23 +110,6 @@ def bilaterate(
     return xy, accepted
 
 
-def bilateration_jacobian(first_m: float, second_m: float, pair: RadarPair) -> Array:
-    """Return d(range, bearing) / d(l1, l2) of a fix seen from the base footprint.
-
-    Shape (2, 2): rows range [m] and bearing [rad], columns the first and the second range [m].
-    """
-    l1, l2, d = first_m, second_m, pair.baseline_m
-    u = (l1 - l2) * (l1 + l2) / (2 * d)
-    v = math.sqrt((l1**2 + l2**2) / 2 - d**2 / 4 - u**2)
-    du = np.array([l1 / d, -l2 / d])
-    dv = np.array([l1 * (d / 2 - u), l2 * (d / 2 + u)]) / (d * v)
-    x, y = pair.midpoint + u * pair.along + v * pair.ahead
-    d_xy = np.outer(pair.along, du) + np.outer(pair.ahead, dv)
-    r = math.hypot(x, y)
-    result: Array = np.array([[x / r, y / r], [-y / r**2, x / r**2]]) @ d_xy
-    return result
-
-
 class Trilaterator:
     """Pairs the detections of one pose, those of one radar with those of the other.
 
@@ -149,18 +120,13 @@ class Trilaterator:
     Parameters
     ----------
     config
-        Field of view, stamp tolerance, pairing rule, and what bearings are made of.
+        Field of view, stamp tolerance and pairing rule.
     rig
         The mounts; its pairs are worked out once.
-    pulse
-        What the radars send; its carrier counts where bearings use the phase.
     """
 
-    def __init__(
-        self, config: TrilaterationConfig, rig: Rig, pulse: PulseModel | None = None
-    ) -> None:
+    def __init__(self, config: TrilaterationConfig, rig: Rig) -> None:
         self.config = config
-        self._wavelength_m = (pulse or PulseModel()).wavelength_m
         self.rig = rig
         self.pairs = rig.pairs()
 
@@ -216,7 +182,7 @@ class Trilaterator:
             pair = self._pair_at(index, stamps_ns, motions)
             if pair is None:
                 continue
-            ranges_m = self._ranges_m(index, members)
+            ranges_m = np.array([(a.range_m, b.range_m) for a, b in members])
             xy, accepted = bilaterate(
                 ranges_m[:, 0], ranges_m[:, 1], pair, self.config.field_of_view_rad
             )
@@ -228,14 +194,6 @@ class Trilaterator:
                 if seen
             ]
         return fixes
-
-    def _ranges_m(self, index: int, members: Sequence[tuple[Detection, Detection]]) -> Array:
-        """Return the ranges to intersect, shape (n, 2): as detected, or refined by the phases."""
-        if self.config.bearing is PairBearing.RANGES:
-            return np.array([(a.range_m, b.range_m) for a, b in members])
-        pair, mounts = self.pairs[index], self.rig.mounts
-        constant_rad = mounts[pair.first].phase_offset_rad - mounts[pair.second].phase_offset_rad
-        return pair_ranges_m(members, self._wavelength_m, constant_rad)
 
     def _pair_at(
         self, index: int, stamps_ns: tuple[int, int], motions: Mapping[int, Array]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from emulator.chip_stream import ChipStream
+from emulator.outbox import MessageStream
 from emulator.profiles.stream import ProfileStream
 from xethru_protocol.messages import Command, Response
 
 __all__ = ["CombinedStream"]
 
 
-class CombinedStream:
+class CombinedStream(MessageStream):
     """Messages of a module in any mode; at most one of its two streams has any.
 
     Parameters
@@ -55,12 +56,6 @@ class CombinedStream:
         self._raw.restarted(ready_ns)
         self._profile.restarted(ready_ns)
         self._active = self._choice()
-
-    def port_opened(self, now_ns: int) -> None:
-        """Change nothing: a radar does not know who listens."""
-
-    def port_closed(self, now_ns: int) -> None:
-        """Change nothing: the module runs on, and overflows."""
 
     def _choice(self) -> ChipStream | ProfileStream:
         """Return who speaks until a message, a command or a restart changes it."""

@@ -23,6 +23,7 @@ from emulator.filesystem import FileSystem
 from emulator.modes import ModeMachine
 from emulator.module_clock import ModuleClock
 from emulator.options import DeviceOptions
+from emulator.outbox import MessageStream
 from emulator.pace import Pace
 from emulator.profile_settings import ProfileSettings
 from emulator.profiles.noise_map import (
@@ -72,7 +73,7 @@ class ProfileHost(Protocol):
         ...
 
 
-class ProfileStream:
+class ProfileStream(MessageStream):
     """Messages of a module in RUN.
 
     Parameters
@@ -156,12 +157,6 @@ class ProfileStream:
         self._run = None
         if self._module.modes.mode is SensorMode.XTID_SM_RUN:
             self._start(ready_ns)
-
-    def port_opened(self, now_ns: int) -> None:
-        """Change nothing: a radar does not know who listens."""
-
-    def port_closed(self, now_ns: int) -> None:
-        """Change nothing: the profile runs on."""
 
     def noise_map_files(self) -> tuple[bytes, bytes]:
         """Return what the slow and the fast noise map's files would hold now; empty without map."""

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import combinations
 from random import Random
 
@@ -18,7 +17,7 @@ from hil_tests.property.trilateration_oracles import (
     distance,
     off_boresight,
 )
-from slam.config import PairBearing, Pairing, TrilaterationConfig
+from slam.config import Pairing, TrilaterationConfig
 from slam.detection import Detection
 from slam.geometry import Rig, paper_rig
 from slam.trilateration import Fix, Trilaterator
@@ -139,54 +138,6 @@ def test_one_to_one_tells_two_targets_apart_by_their_loudness() -> None:
     config = TrilaterationConfig(pairing=Pairing.ONE_TO_ONE)
     found = sorted((f.x_m, f.y_m) for f in Trilaterator(config, rig).locate(detections, 0))
     assert found == [pytest.approx(tuple(t), abs=1e-12) for t in targets]
-
-
-CARRIER_M = 299_792_458 / (2 * 7.29e9)
-"""Range after which an echo's carrier repeats."""
-
-
-@given(
-    st.floats(-0.09, 0.09),
-    st.floats(0.5, 1.5),
-    st.tuples(st.floats(-2e-3, 2e-3), st.floats(-2e-3, 2e-3)),
-    st.tuples(st.floats(-3, 3), st.floats(-3, 3), st.floats(-3, 3)),
-)
-def test_phases_refine_the_bearing_and_need_the_modules_constants(
-    x_m: float, y_m: float, errors_m: tuple[float, float], phases: tuple[float, float, float]
-) -> None:
-    """An echo measured e too far shows the carrier's phase at e: 2 pi e / 20.56 mm more."""
-    *offsets, reflection = phases
-    mounts = tuple(
-        replace(mount, phase_offset_rad=offset)
-        for mount, offset in zip(paper_rig().mounts[:2], offsets, strict=True)
-    )
-    target = np.array([x_m, y_m])
-    seen = [
-        Detection(
-            radar=radar,
-            t_ns=0,
-            range_m=distance(mount, target) + error_m,
-            amplitude=0.01,
-            phase_rad=math.remainder(
-                reflection + offset + math.tau * error_m / CARRIER_M, math.tau
-            ),
-            sigma_m=1e-3,
-        )
-        for radar, (mount, error_m, offset) in enumerate(
-            zip(mounts, errors_m, offsets, strict=True)
-        )
-    ]
-
-    def off_deg(bearing: PairBearing) -> float:
-        config = TrilaterationConfig(bearing=bearing, field_of_view_deg=100.0)
-        (fix,) = Trilaterator(config, Rig(mounts=mounts)).locate(seen, 0)
-        from_middle = [math.atan2(y - 0.2, x) for x, y in ((fix.x_m, fix.y_m), target)]
-        return abs(math.degrees(from_middle[0] - from_middle[1]))
-
-    assert off_deg(PairBearing.PHASE) < 0.05
-    difference_m = abs(errors_m[0] - errors_m[1])
-    # Without it the bearing is off by the difference over the base, 0.29 degrees per mm.
-    assert off_deg(PairBearing.RANGES) >= 0.8 * math.degrees(difference_m / 0.2) - 0.05
 
 
 def test_stamps_too_far_apart_make_no_fix() -> None:

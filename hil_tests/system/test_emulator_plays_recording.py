@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from emulator.identity import Identity
 from emulator.loopback import LoopbackTransport
-from emulator.playback import recording_device
+from emulator.playback import PlayOptions, played_radars
 from hil_tests.device.serving import Served, emulator
 from xethru_protocol.codes import PongCode
 from xethru_protocol.driver import X4M300
@@ -137,14 +137,13 @@ def test_a_host_that_asks_first_hears_it_all_too(
 
 def test_real_time_is_kept(recording: Path, recorded: list[BasebandIq]) -> None:
     """At ten times the recorded speed, 30 s take 3 s, by the clock of the module's own line."""
-    device = recording_device(
+    (radar,) = played_radars(
         recording,
-        Identity(serial="123456789012"),
-        rate=10,
-        loop=False,
+        PlayOptions(rate=10, loop=False),
+        identity=Identity(serial="123456789012"),
         on_fault=lambda fault: pytest.fail(fault.reason),
     )
-    line = LoopbackTransport(device)
+    line = LoopbackTransport(radar.device)
     with X4M300(line, clock=line.clock_ns) as driver:
         frames = list(driver.frames(len(recorded), timeout_s=5.0))
     elapsed_s = (frames[-1].arrival_ns - frames[0].arrival_ns) / 1e9

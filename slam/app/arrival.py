@@ -77,22 +77,18 @@ class ClockLine:
 class LowerEnvelope:
     """Follows one clock by the readings that arrived soonest.
 
-    Of each second of arrivals the reading with the least delay is kept, for `window_s` seconds.
+    Of each second of arrivals the reading with the least delay is kept, for `WINDOW_S` seconds.
 
     Parameters
     ----------
-    window_s
-        How far back it looks.
     drift, drift_sigma
         Slope to expect, and its standard deviation.
     """
 
-    def __init__(
-        self, *, window_s: int = WINDOW_S, drift: float = 0.0, drift_sigma: float = DRIFT_SIGMA
-    ) -> None:
+    def __init__(self, *, drift: float = 0.0, drift_sigma: float = DRIFT_SIGMA) -> None:
         self._drift, self._drift_sigma = drift, drift_sigma
         # Of each second: (second, nominal, arrival - nominal), relative to the first reading.
-        self._soonest: deque[tuple[int, int, int]] = deque(maxlen=window_s)
+        self._soonest: deque[tuple[int, int, int]] = deque(maxlen=WINDOW_S)
         self._first: tuple[int, int] | None = None
         self._judged = _Likelihood(
             hull=((0, 0),), mean_x=0.0, mean_y=0.0, weight=0.0, prior=drift, variance=drift_sigma**2

@@ -15,7 +15,7 @@ from slam.geometry import Rig, between
 from slam.metrics import (
     align_se2,
     ate_rmse_m,
-    icp_ate,
+    icp_ate_rmse_m,
     landmark_metrics,
     nees_pose,
 )
@@ -71,7 +71,7 @@ def summarise(
         duration_s=record.duration_ns / NS_PER_S,
         realtime_factor=record.duration_ns / NS_PER_S / record.wall_s,
         ate_rmse_m=ate_rmse_m(estimate[:, :2], truth_xy),
-        ate_icp_rmse_m=icp_ate(estimate[:, :2], truth_in_map[:, :2]).nearest_rmse_m,
+        ate_icp_rmse_m=icp_ate_rmse_m(estimate[:, :2], truth_in_map[:, :2]),
         odometry_ate_rmse_m=ate_rmse_m(odometry[:, :2], truth_xy),
         final_error_m=float(np.linalg.norm(estimate[-1, :2] - truth_in_map[-1, :2])),
         landmarks=LandmarkSummary(

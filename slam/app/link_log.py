@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from slam.app.session import LogLine, Scan, SessionObserver, Snapshot
+from slam.app.session import LogLine, Scan, SessionObserver
 from xethru_protocol.driver import ProtocolRecord
 
 
-class LinkLog:
+class LinkLog(SessionObserver):
     """Stamps what the drivers report with session time and passes it on, once someone listens."""
 
     def __init__(self) -> None:
@@ -37,15 +37,6 @@ class LinkLog:
     def on_scan(self, scan: Scan) -> None:
         """Keep session time."""
         self._t_ns = scan.t_ns
-
-    def on_snapshot(self, snapshot: Snapshot) -> None:
-        """Nothing to do."""
-
-    def on_log(self, line: LogLine) -> None:
-        """Nothing to do: these lines come from here."""
-
-    def close(self) -> None:
-        """Nothing to do."""
 
     def _tell(self, line: LogLine) -> None:
         for listener in self._listeners:

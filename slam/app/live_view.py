@@ -110,7 +110,7 @@ class LiveView:
             time.sleep(_POLL_S)
 
 
-class _WhileWatched:
+class _WhileWatched(SessionObserver):
     """Passes everything on until the viewer is gone."""
 
     def __init__(self, view: SessionObserver, has_ended: Callable[[], bool]) -> None:

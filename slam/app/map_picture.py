@@ -20,8 +20,6 @@ from slam.app.summary import Summary
 from slam.ekf_slam import Belief
 from slam.geometry import between, compose, transform
 
-_MARGIN_M = 0.25
-
 
 def draw_map(
     path: Path,

@@ -7,7 +7,6 @@ lines arrive, or known beforehand; then radar frames, stamped with the host's ti
 from __future__ import annotations
 
 import math
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,14 +31,6 @@ MOST_M = 1e8
 _COMPLAINTS = 5
 
 
-class SessionClock(Protocol):
-    """What the host's clock shows against session time."""
-
-    def session_ns(self, host_ns: int) -> int:
-        """Return the session time of a host time."""
-        ...
-
-
 class FixedClock:
     """A clock known beforehand: `origin_ns` is the host's time at session time 0."""
 
@@ -47,7 +38,7 @@ class FixedClock:
         self._line = ClockLine(origin_ns=origin_ns)
 
     def session_ns(self, host_ns: int) -> int:
-        """See `SessionClock`."""
+        """Return the session time of a host time."""
         return self._line.nominal_ns(host_ns)
 
 

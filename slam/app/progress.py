@@ -10,7 +10,7 @@ from typing import TextIO
 
 import numpy as np
 
-from slam.app.session import LogLine, Scan, SessionInfo, Snapshot
+from slam.app.session import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.tum import NS_PER_S
 from slam.geometry import transform
 
@@ -20,7 +20,7 @@ _NO_RADARS = frozenset({"odometry", "run"})
 """Who else log lines are about."""
 
 
-class Progress:
+class Progress(SessionObserver):
     """Shows scene time, frames per second and radar, pose error, landmarks and lost frames.
 
     The pose error compares with the truth, which SLAM itself never sees.

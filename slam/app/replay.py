@@ -8,6 +8,7 @@ the run recorded are compared on the way.
 from __future__ import annotations
 
 import hashlib
+import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
@@ -32,6 +33,7 @@ from slam.app.session_states import state_row
 from slam.app.stop import StopFlag
 from slam.app.tum import TumSample
 from slam.config import SlamConfig
+from slam.presets import ConfigError, without_removed_keys
 from slam.robust.parameters import WheelNoise
 from slam.robust_pipeline import make_slam
 
@@ -92,9 +94,9 @@ def settings_of(session: RecordedSession) -> SlamConfig:
     AppError
         The file does not tell them, or this version does not know them.
     """
-    if not session.info.config_json or not session.info.wheels or not session.has_scan_marks:
+    if not session.info.config_json or not session.info.wheels:
         raise AppError(
-            f"{session.path}: recorded before sessions told SLAM's settings; "
+            f"{session.path}: does not hold SLAM's settings; "
             "its frames can be read, but not be replayed; record it again"
         )
     return recorded_config(session)
@@ -106,10 +108,17 @@ def recorded_config(session: RecordedSession) -> SlamConfig:
     Raises
     ------
     AppError
-        This version does not know them.
+        This version does not know them, or they cannot be read.
     """
     try:
-        return SlamConfig.model_validate_json(session.info.config_json)
+        tables = json.loads(session.info.config_json)
+        if isinstance(tables, dict):
+            tables = without_removed_keys(tables, str(session.path))
+        return SlamConfig.model_validate(tables)
+    except json.JSONDecodeError as error:
+        raise AppError(f"{session.path}: its settings cannot be read: {error}") from None
+    except ConfigError as error:
+        raise AppError(str(error)) from None
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         key = ".".join(str(part) for part in first["loc"])
@@ -211,7 +220,7 @@ def _scans(
         line = next(waiting, None)
 
 
-class LostFrames:
+class LostFrames(SessionObserver):
     """Counts the frames missing between counters, over all radars."""
 
     def __init__(self, radars: Sequence[RadarInfo]) -> None:
@@ -226,17 +235,8 @@ class LostFrames:
                 self.count += frame.counter - last - 1
             self._last[frame.radar] = frame.counter
 
-    def on_snapshot(self, snapshot: Snapshot) -> None:
-        """Nothing to do."""
 
-    def on_log(self, line: LogLine) -> None:
-        """Nothing to do."""
-
-    def close(self) -> None:
-        """Nothing to do."""
-
-
-class Comparison:
+class Comparison(SessionObserver):
     """Compares every state with the one that was recorded, to the last bit."""
 
     def __init__(self) -> None:
@@ -248,9 +248,6 @@ class Comparison:
         """Take a recorded state."""
         self._expected[snapshot.t_ns] = _digest(snapshot)
 
-    def on_scan(self, scan: Scan) -> None:
-        """Nothing to do."""
-
     def on_snapshot(self, snapshot: Snapshot) -> None:
         """Compare a state of the replay."""
         expected = self._expected.get(snapshot.t_ns)
@@ -260,12 +257,6 @@ class Comparison:
             self._n_same += 1
         elif self._first_other_ns is None:
             self._first_other_ns = snapshot.t_ns
-
-    def on_log(self, line: LogLine) -> None:
-        """Nothing to do."""
-
-    def close(self) -> None:
-        """Nothing to do."""
 
     @property
     def is_same(self) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.app.link_lanes import LinkChange, LinkLanes
-from slam.app.session import LogLine, Scan, SessionInfo, Snapshot
+from slam.app.session import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.tum import NS_PER_S
 from slam.app.view_numbers import (
     POSE_DOF,
@@ -50,7 +50,7 @@ class ReportSeries:
     n_landmarks: NDArray[np.float64]
 
 
-class ReportData:
+class ReportData(SessionObserver):
     """Observes a run, and keeps what its report shows.
 
     Attributes

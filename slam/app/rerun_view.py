@@ -19,7 +19,7 @@ from slam.app.rerun_map import TRAIL_STATES, MapLayer
 from slam.app.rerun_numbers import NumberLayer
 from slam.app.rerun_recording import FileTarget, Recording, ViewerTarget
 from slam.app.rerun_sdk import rr
-from slam.app.session import LogLine, Scan, SessionInfo, Snapshot
+from slam.app.session import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.tum import NS_PER_S
 from slam.app.view_echoes import beams_of
 from slam.app.view_guide import about
@@ -27,7 +27,7 @@ from slam.app.view_guide import about
 _BLOCK_STATES = 128
 
 
-class RerunView:
+class RerunView(SessionObserver):
     """Draws a session, into a file in large blocks, or live as it happens.
 
     Parameters

@@ -12,7 +12,7 @@ from slam.app.session_log import SessionLog
 from slam.app.tum import TumSample
 
 
-class LoggingListener:
+class LoggingListener(SessionObserver):
     """Hands on what a run learns beside scans; keeps odometry until the log is there.
 
     A log that cannot be written any more is said once, and the run goes on without.
@@ -70,9 +70,6 @@ class LoggingListener:
     def on_log(self, line: LogLine) -> None:
         """Write a line about the link."""
         self._write(lambda log: log.on_log(line))
-
-    def close(self) -> None:
-        """Nothing to do; see `end_log`."""
 
     def end_log(self) -> None:
         """Close the log; that its last chunk does not fit is no reason to lose the results."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,8 +155,11 @@ class LogLine:
     text: str
 
 
-class SessionObserver(Protocol):
-    """Gets everything a run produces, in order: a log, a viewer, a progress line."""
+class SessionObserver:
+    """Gets everything a run produces, in order: a log, a viewer, a progress line.
+
+    Subclasses define the methods they need.
+    """
 
     def on_scan(self, scan: Scan) -> None:
         """Take the frames of one counter."""

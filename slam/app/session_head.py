@@ -20,7 +20,7 @@ LENGTH_UNIT = "module metres, c = 3.0e8 m/s"
 """Of a radar's range_start_m and bin_length_m in its text; its mount is in true metres."""
 
 FORMAT = 2
-"""Of the file: 1 had neither scan marks nor exact states nor settings."""
+"""Of the file; format 1 was never released."""
 
 
 def session_table(info: SessionInfo) -> dict[str, str]:
@@ -56,21 +56,21 @@ def radar_text(radar: RadarInfo) -> str:
     return json.dumps(asdict(radar) | {"length_unit": LENGTH_UNIT})
 
 
-def session_format(path: Path, table: Mapping[str, str]) -> int:
-    """Return the number of the file's format.
+def check_format(path: Path, table: Mapping[str, str]) -> None:
+    """Check that this version reads the file's format.
 
     Raises
     ------
     AppError
-        The format is of a later version of this program.
+        The file is of another format; one line.
     """
     number = table.get("format", "1")
-    if not (number.isascii() and number.isdigit()) or int(number) > FORMAT:
-        raise AppError(
-            f"{path}: a session of format {number}; this version reads up to {FORMAT}, a newer "
-            "one of xethru-hil wrote it"
-        )
-    return int(number)
+    if number == str(FORMAT):
+        return
+    remedy = "record the session again" if number == "1" else "a newer xethru-hil wrote it"
+    raise AppError(
+        f"{path}: a session of format {number}; this version reads format {FORMAT}; {remedy}"
+    )
 
 
 def read_session_table(

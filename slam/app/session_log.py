@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from slam.app import ros_messages as ros
 from slam.app.odometry import OdometryTrack
-from slam.app.session import LogLine, Scan, SessionInfo, Snapshot
+from slam.app.session import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.session_file import SessionFile
 from slam.app.session_head import METADATA_NAME, radar_text, session_table
 from slam.app.session_states import state_row
@@ -29,7 +29,7 @@ TruthAt = Callable[[NDArray[np.int64]], NDArray[np.float64]]
 """True poses, shape (n, 3), world frame, at n session times [ns]."""
 
 
-class SessionLog:
+class SessionLog(SessionObserver):
     """Writes a session as it happens.
 
     Topics: `/radar/<name>/frame` with the frame counter in the record's sequence number and a

@@ -25,9 +25,9 @@ from slam.app.odometry import OdometryTrack
 from slam.app.session import LogLine, RadarInfo, Scan, SessionInfo, Snapshot
 from slam.app.session_head import (
     METADATA_NAME,
+    check_format,
     read_radar_text,
     read_session_table,
-    session_format,
 )
 from slam.app.session_records import (
     ReceivedFrame,
@@ -37,12 +37,10 @@ from slam.app.session_records import (
     limits_of,
     read_record,
 )
-from slam.app.sources import whole_periods
 from slam.app.tum import TumSample
 from slam.detector import Detection
 from slam.frames import RadarFrame
 from slam.geometry import Mount, Rig
-from xethru_protocol.x4 import frame_time_ns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,19 +70,14 @@ class RecordedSession:
         The file.
     info
         Scene, preset, seed, settings, radars and versions of the run.
-    has_scan_marks
-        Whether `ScanEnd` records are in it; files of the first format have none.
     cut_at_byte
         Where the file ends too early, after `records` has come to its end; None where it is whole.
     """
 
-    def __init__(
-        self, path: Path, info: SessionInfo, *, has_scan_marks: bool, size: int | None = None
-    ) -> None:
+    def __init__(self, path: Path, info: SessionInfo, *, size: int | None = None) -> None:
         self.path = path
         self._size = size  # when it was opened: a run may be writing it still
         self.info = info
-        self.has_scan_marks = has_scan_marks
         self.cut_at_byte: int | None = None
 
     @property
@@ -118,12 +111,8 @@ class RecordedSession:
     def scans(self) -> Iterator[tuple[Scan, NDArray[np.float64] | None]]:
         """Yield every scan as the run took it, and the true pose at it, shape (3,), if known.
 
-        A scan that damage or the end of a cut file left incomplete is not among them. Files of the
-        first format have no marks: there the frames of one tick, which stand together, are a scan.
+        A scan that damage or the end of a cut file left incomplete is not among them.
         """
-        if not self.has_scan_marks:
-            yield from ((scan, None) for scan in _scans_by_tick(self))
-            return
         held: list[ReceivedFrame] = []
         for record in self._received():
             if isinstance(record, ReceivedFrame):
@@ -238,7 +227,6 @@ def open_session(path: Path) -> RecordedSession:
         One line with the file: missing, foreign, damaged, or cut before the radars are named.
     """
     head: dict[str, str] | None = None
-    number = 0
     radars: list[RadarInfo] = []
     cut: list[int] = []
     try:
@@ -248,7 +236,8 @@ def open_session(path: Path) -> RecordedSession:
     for entry in read_entries(path, cut.append, size):
         if isinstance(entry, Metadata):
             if entry.name == METADATA_NAME:
-                head, number = entry.values, session_format(path, entry.values)
+                head = entry.values
+                check_format(path, head)
         elif entry.topic.startswith("/radar/") and entry.topic.endswith("/info"):
             radars.append(_radar_info(path, entry))
         else:
@@ -263,38 +252,7 @@ def open_session(path: Path) -> RecordedSession:
         )
     if not radars:
         raise AppError(f"{path}: ends before any radar is named; record the session again")
-    return RecordedSession(
-        path,
-        read_session_table(path, head, tuple(radars)),
-        has_scan_marks=number > 1,
-        size=size,
-    )
-
-
-def scans(session: RecordedSession) -> Iterator[Scan]:
-    """Yield the scans of a session as the run took them, without the truth; see `Scan`."""
-    return (scan for scan, _ in session.scans())
-
-
-def _scans_by_tick(session: RecordedSession) -> Iterator[Scan]:
-    radars = session.info.radars
-    late = [whole_periods(radar.start_skew_ns, radar.rate_hz) for radar in radars]
-    held: list[RadarFrame] = []
-    for record in session.records():
-        if not isinstance(record, RadarFrame):
-            continue
-        if held and record.counter + late[record.radar] != held[0].counter + late[held[0].radar]:
-            yield _scan(held, radars, late)
-            held = []
-        held.append(record)
-    if held:
-        yield _scan(held, radars, late)
-
-
-def _scan(frames: list[RadarFrame], radars: tuple[RadarInfo, ...], late: list[int]) -> Scan:
-    radar = frames[0].radar
-    tick = frames[0].counter + late[radar]
-    return Scan(counter=tick, t_ns=frame_time_ns(tick, radars[radar].rate_hz), frames=tuple(frames))
+    return RecordedSession(path, read_session_table(path, head, tuple(radars)), size=size)
 
 
 def _radar_info(path: Path, message: RawMessage) -> RadarInfo:

@@ -134,7 +134,7 @@ class RigSource:
         self.lost_frames = 0
 
     def __enter__(self) -> Self:
-        """Nothing to do: the links are open already."""
+        """Return the source; its links are open already."""
         return self
 
     def __exit__(

@@ -64,7 +64,6 @@ def drive_back_end(
     *,
     with_ids: bool,
     wheels: WheelNoise = PERFECT_WHEELS,
-    rule: RelinearisationRule = PARK_RULE,
     check: Callable[[], None] = lambda: None,
 ) -> ParkRun:
     """Run a drive through the robust back end's public interface.
@@ -77,13 +76,13 @@ def drive_back_end(
         Whether the back end is told which tree each observation is of.
     wheels
         Standard deviations of the wheels' calibration errors; the reference's model has none.
-    rule
-        When all poses are solved for again.
     check
         Called once per step; may raise to stop.
     """
     began = time.process_time()
-    back_end = RobustBackEnd(Rig(mounts=()), BackEndParameters(wheels=wheels, relinearisation=rule))
+    back_end = RobustBackEnd(
+        Rig(mounts=()), BackEndParameters(wheels=wheels, relinearisation=PARK_RULE)
+    )
     given: list[tuple[int, int | None]] = []
     path = [back_end.pose]
     for step, points in enumerate(drive.seen):

@@ -11,9 +11,7 @@ from slam.robust.births import give_birth, match, update_with_point
 from slam.robust.continuation import Continuation, labelled
 from slam.robust.existence import Existence
 from slam.robust.leftovers import Leftovers
-from slam.robust.map_report import report_landmarks
 from slam.robust.motion import at_rest, calibrated_motion, predict
-from slam.robust.offsets import judged
 from slam.robust.parameters import BackEndParameters, PointRule
 from slam.robust.points import RangeBearing, assign, named_rows, range_bearing_rows
 from slam.robust.ranges import Antennas, RangeScan, antennas_of, rows_of, sides_of, view
@@ -93,7 +91,16 @@ class RobustBackEnd:
 
     def landmarks(self) -> tuple[MapLandmark, ...]:
         """Return the landmarks hit often enough to be reported."""
-        return report_landmarks(self.state, self.reported_rows(), self._existence.hits)
+        state, rows = self.state, self.reported_rows()
+        return tuple(
+            MapLandmark(
+                landmark_id=state.landmark_ids[row],
+                position_m=point_m,
+                covariance=state.landmark_covariance(row),
+                hits=self._existence.hits(state.landmark_ids[row]),
+            )
+            for row, point_m in zip(rows, state.landmarks_m[rows], strict=True)
+        )
 
     def reported_rows(self) -> list[int]:
         """Return the rows of landmarks hit often enough to be reported; of an island, none."""
@@ -149,9 +156,7 @@ class RobustBackEnd:
         deleted = self._delete_lost()
         self._n_updates += 1
         merged = self._merge()
-        whereabouts = self._whereabouts
-        self.parameters = whereabouts.parameters = judged(self.state, self._log, self.parameters)
-        lost = whereabouts.is_lost
+        lost = self._whereabouts.is_lost
         relinearised = self._give_radii()
         if relinearised or is_due(self._log, self.state, self.parameters):
             relinearised |= self.relinearise()

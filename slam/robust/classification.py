@@ -37,14 +37,6 @@ class Law(Enum):
     UNDECIDED = "undecided"
 
 
-class Kind(Enum):
-    """What a point of the map is."""
-
-    POINT = "point"
-    CORNER = "corner"
-    GHOST = "ghost"
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sightings:
     """Ranges of one reflector from several places.
@@ -127,69 +119,6 @@ def compare(sightings: Sightings, toward_rad: float) -> Verdict:
 def fit_wall(sightings: Sightings, start: Array) -> Fit:
     """Return the wall (phi, d) of least chi-square near a start."""
     return _least(sightings, start, _wall_law)
-
-
-def kinds(
-    points_m: Array,
-    covariances: Sequence[Array] | Array,
-    walls: Array,
-    gate: float = 9.21,
-    floor_m: float = 0.02,
-) -> list[Kind]:
-    """Tell what the points of a map are, given its walls.
-
-    A point where two walls cross is their corner. One that lies behind a wall where another
-    point's mirror image would be is that point's ghost: radar, wall, target, wall, radar is a way
-    of the same length as that to the image, so the ghost is at rest like a target.
-
-    Parameters
-    ----------
-    points_m, covariances
-        shapes (n, 2) and (n, 2, 2), map frame.
-    walls
-        shape (w, 2): phi [rad], d [m].
-    gate
-        Bound on the squared Mahalanobis distance (2 dof) from crossing or image; 99 %.
-    floor_m
-        Standard deviation of crossings and images, for what covariances leave out.
-    """
-    crossings, found = wall_crossings(walls), []
-    images = [_images(points_m, wall) for wall in walls]
-    for row, (point, covariance) in enumerate(zip(points_m, covariances, strict=True)):
-        S = np.linalg.inv(covariance + floor_m**2 * np.eye(2))
-        others = [np.delete(image, row, axis=0) for image in images]
-        if _is_near(crossings, point, S, gate):
-            found.append(Kind.CORNER)
-        elif any(_is_near(image[~np.isnan(image[:, 0])], point, S, gate) for image in others):
-            found.append(Kind.GHOST)
-        else:
-            found.append(Kind.POINT)
-    return found
-
-
-def _is_near(places: Array, point: Array, information: Array, gate: float) -> bool:
-    away = places - point
-    return bool(np.any(np.einsum("ki,ij,kj->k", away, information, away) <= gate))
-
-
-def _images(points_m: Array, wall: Array) -> Array:
-    """Return the mirror images of the points in front of a wall, NaN for those behind it."""
-    n = np.array([math.cos(float(wall[0])), math.sin(float(wall[0]))])
-    depth = float(wall[1]) - points_m @ n
-    images = points_m + 2.0 * depth[:, None] * n
-    return np.asarray(np.where(depth[:, None] > 0.0, images, np.nan))
-
-
-def wall_crossings(walls: Array) -> Array:
-    """Return where walls cross that are at least 30 degrees from parallel, shape (k, 2)."""
-    normals = np.column_stack([np.cos(walls[:, 0]), np.sin(walls[:, 0])])
-    found = []
-    for i in range(len(walls)):
-        for j in range(i + 1, len(walls)):
-            pair = normals[[i, j]]
-            if abs(float(np.linalg.det(pair))) >= 0.5:
-                found.append(np.linalg.solve(pair, walls[[i, j], 1]))
-    return np.array(found).reshape(-1, 2)
 
 
 def _point_law(unknown: Array, antennas: Array) -> tuple[Array, Array]:

@@ -83,9 +83,6 @@ class RangeNoise:
         Innovations of more standard deviations weigh less, as in Huber's estimator.
     offset_sigma_m
         Standard deviation of each radar's unknown constant range offset; zero if calibrated.
-    calibrated_sigma_m
-        The same for a calibrated rig, if this may be one or not: then that is tested, and where
-        the evidence is ``calibrated_evidence`` nats, taken for true.
     detection_probability
         That a target in view is detected in a frame.
     clutter_per_m
@@ -100,8 +97,6 @@ class RangeNoise:
     doubt_m: float = 0.0
     huber_sigmas: float = math.inf
     offset_sigma_m: float = 0.0
-    calibrated_sigma_m: float | None = None
-    calibrated_evidence: float = 3.0
     detection_probability: float = 0.92
     clutter_per_m: float = 0.15 / 1.3
     field_of_view_rad: float = math.radians(65.0)

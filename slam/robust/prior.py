@@ -28,12 +28,11 @@ X, HEADING, AFTER_POSE = slice(0, 2), 2, 3
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PriorTerms:
-    """A prior at an estimate: its cost, and half of that cost's derivatives in additive errors.
+    """Half of the derivatives of a prior's cost at an estimate, in additive errors.
 
     ``information`` has shape (m, m), ``gradient`` (m,).
     """
 
-    cost: float
     information: Array
     gradient: Array
 
@@ -57,7 +56,7 @@ def prior_cost(prior: Prior, values: Array, n_offsets: int) -> float:
 
 
 def prior_terms(prior: Prior, values: Array, n_offsets: int) -> PriorTerms:
-    """Return cost, information and gradient at some values, shape (m,)."""
+    """Return information and gradient at some values, shape (m,)."""
     e, turned = _errors(prior, values, n_offsets)
     pulled = prior.information @ e
     back = rotation(-wrap_angle(float(values[HEADING] - prior.mean[HEADING])))
@@ -67,7 +66,6 @@ def prior_terms(prior: Prior, values: Array, n_offsets: int) -> PriorTerms:
     information = _right(half.T, back, by_heading, points)
     gradient = _right((pulled + prior.gradient)[None, :], back, by_heading, points)[0]
     return PriorTerms(
-        cost=float(e @ (pulled + 2.0 * prior.gradient)),
         information=(information + information.T) / 2,
         gradient=gradient,
     )

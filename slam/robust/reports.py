@@ -4,23 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from slam.robust.classification import Kind
 from slam.robust.symmetric import Array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MapLandmark:
-    """One landmark of the map: id, position (2,) [m], covariance (2, 2), frames that hit it.
-
-    ``kind`` follows from the mapped walls: a corner of two, the mirror ghost of another landmark,
-    or just a point.
-    """
+    """One landmark of the map: id, position (2,) [m], covariance (2, 2), frames that hit it."""
 
     landmark_id: int
     position_m: Array
     covariance: Array
     hits: int
-    kind: Kind = Kind.POINT
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -29,8 +23,8 @@ class MapWall:
 
     Attributes
     ----------
-    wall_id, hits
-        Its id, of the same numbers as the landmarks', and the frames that hit it.
+    hits
+        The frames that hit it.
     phi_rad, d_m
         Direction of its normal, away from the robot, and distance along it from the origin.
     covariance
@@ -39,7 +33,6 @@ class MapWall:
         shape (k, 2, 2): ends of the stretches that answered, map frame [m].
     """
 
-    wall_id: int
     phi_rad: float
     d_m: float
     covariance: Array

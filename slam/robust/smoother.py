@@ -45,7 +45,6 @@ class Solution:
     estimate: Estimate
     information: Array
     cost: float
-    iterations: int
 
 
 class Smoother:
@@ -97,7 +96,7 @@ class Smoother:
             np.linalg.cholesky(information)
         except np.linalg.LinAlgError:
             return None
-        return Solution(estimate=estimate, information=information, cost=cost, iterations=iteration)
+        return Solution(estimate=estimate, information=information, cost=cost)
 
     def cost(self, estimate: Estimate, limit: float = math.inf) -> float:
         """Return the sum of squared white residuals, each measurement's capped at ``limit``."""

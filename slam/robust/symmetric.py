@@ -99,11 +99,6 @@ class SymmetricMatrix:
             result -= np.einsum("ij,ij->i", grams[rows], grams[columns])
         return result
 
-    def diagonal(self) -> Array:
-        """Return a copy of the diagonal, shape (m,)."""
-        self._carry_out()
-        return np.array(self._lower.diagonal()[: self._size])
-
     def full(self) -> Array:
         """Return a full copy, shape (m, m), symmetric bit for bit."""
         self._carry_out()

@@ -143,7 +143,6 @@ class WallKeeper:
         T = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
         spans = np.array(self.cells.spans_m(wall_id)).reshape(-1, 2)
         return MapWall(
-            wall_id=wall_id,
             phi_rad=phi,
             d_m=d,
             covariance=T @ P @ T.T,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from emulator.odometry import drift, odometry_times_ns, scene_odometry, scene_truth, tum_line
+from emulator.odometry import drift, odometry_times_ns, scene_odometry, tum_line
 from emulator.scene import CarriedSpec, OdometrySpec, load_scene
 from emulator.trajectory import drive
 from slam.metrics import ate_rmse_m
@@ -187,14 +187,6 @@ def test_lines_are_tum_and_reproduce_every_float() -> None:
         assert 2 * math.atan2(values[5], values[6]) - heading == pytest.approx(
             math.tau * round((2 * math.atan2(values[5], values[6]) - heading) / math.tau), abs=1e-12
         )
-
-
-def test_truth_lines_share_the_odometrys_times() -> None:
-    scene = load_scene("smoke")
-    truth = [line.split(" ") for line in scene_truth(scene)]
-    odometry = [line.split(" ") for line in scene_odometry(scene, 0)]
-    assert [row[0] for row in truth] == [row[0] for row in odometry]
-    assert [float(value) for value in truth[-1][1:3]] == pytest.approx([0, 0], abs=1e-12)
 
 
 @pytest.mark.parametrize(

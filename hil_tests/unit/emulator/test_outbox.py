@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from emulator.outbox import FirmwareOutbox, LosslessOutbox, MessageKind
+from emulator.outbox import FirmwareOutbox, LosslessOutbox, MessageKind, MessageStream
 from xethru_protocol import messages as m
 
 SECOND = 1_000_000_000
@@ -12,7 +12,7 @@ FRAME, REPLY, DEBUG = MessageKind.FRAME, MessageKind.REPLY, MessageKind.DEBUG
 
 
 @dataclass
-class Ticker:
+class Ticker(MessageStream):
     """A stream that is due every ``period_ns``."""
 
     period_ns: int
@@ -33,12 +33,6 @@ class Ticker:
         return skipped
 
     def command_done(self, command: m.Command[m.Response], now_ns: int) -> None: ...
-
-    def restarted(self, ready_ns: int) -> None: ...
-
-    def port_opened(self, now_ns: int) -> None: ...
-
-    def port_closed(self, now_ns: int) -> None: ...
 
 
 def numbers(outbox: FirmwareOutbox, now_ns: int) -> list[int]:

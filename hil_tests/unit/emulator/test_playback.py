@@ -12,7 +12,7 @@ import pytest
 from emulator.device import Device
 from emulator.identity import Identity
 from emulator.loopback import LoopbackTransport
-from emulator.playback import RecordingError, recording_device
+from emulator.playback import PlayOptions, RecordingError, played_radars
 from hil_tests.golden.vectors import FIXTURES
 from hil_tests.unit.emulator.doubles import BareHost
 from xethru_protocol import messages as m
@@ -33,14 +33,14 @@ SECOND = 1_000_000_000
 
 
 def device_of(recording: Path, rate: float = 0, warnings: list[str] | None = None) -> Device:
-    return recording_device(
+    (radar,) = played_radars(
         recording,
-        IDENTITY,
-        rate=rate,
-        loop=False,
+        PlayOptions(rate=rate, loop=False),
+        identity=IDENTITY,
         on_fault=lambda fault: pytest.fail(fault.reason),
         warn=lambda line: None if warnings is None else warnings.append(line),
     )
+    return radar.device
 
 
 def wire_bytes(device: Device) -> bytes:
@@ -56,8 +56,9 @@ def copy_of_the_vendors_recording(folder: Path) -> Path:
 
 
 def counters_played(recording: Path, faults: list[RecordingFault]) -> list[int]:
-    device = recording_device(recording, IDENTITY, rate=0, loop=False, on_fault=faults.append)
-    line = LoopbackTransport(device)
+    options = PlayOptions(rate=0, loop=False)
+    (played,) = played_radars(recording, options, identity=IDENTITY, on_fault=faults.append)
+    line = LoopbackTransport(played.device)
     counters = []
     with X4M300(line, clock=line.clock_ns) as radar:
         while True:
@@ -82,7 +83,12 @@ def test_a_recording_of_nothing_is_refused(tmp_path: Path) -> None:
     recording = copy_of_the_vendors_recording(tmp_path)
     next(recording.glob("*baseband_iq*.dat")).write_bytes(b"")
     with pytest.raises(RecordingError):
-        recording_device(recording, IDENTITY, rate=0, loop=False, on_fault=lambda fault: None)
+        played_radars(
+            recording,
+            PlayOptions(rate=0, loop=False),
+            identity=IDENTITY,
+            on_fault=lambda fault: None,
+        )
 
 
 def test_radar_frames_come_byte_for_byte_without_escapes() -> None:

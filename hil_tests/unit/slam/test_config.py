@@ -3,7 +3,13 @@
 import pytest
 
 from slam.config import Assignment, EndOfRun, SlamConfig
-from slam.presets import ConfigError, config_from_tables, load_preset, override
+from slam.presets import (
+    REMOVED_KEYS,
+    ConfigError,
+    config_from_tables,
+    load_preset,
+    override,
+)
 
 
 def test_preset_paper_is_table_one() -> None:
@@ -60,7 +66,7 @@ def test_unknown_names_are_answered_with_the_known_ones(
         ({"window": {"sise": 3}}, "x.toml: unknown key window.sise; allowed: min_distance_m, "),
         (
             {"radar": {}},
-            "x.toml: unknown key radar; allowed: detection, matched_filter, leakage, ",
+            "x.toml: unknown key radar; allowed: detection, matched_filter, trilateration, ",
         ),
         ({"window": {"size": 0}}, r"x.toml: window.size: .* greater than or equal to 1 .*: 0\)"),
         ({"window": 3}, r"x.toml: window: .* \(given: 3\)"),
@@ -157,3 +163,31 @@ def test_override_reads_text_as_the_type_of_the_key() -> None:
 def test_override_of_an_unknown_key_names_the_known_ones(key: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         override(SlamConfig(), {key: 1})
+
+
+@pytest.mark.parametrize("default", [0.0, 0, "0", "0.0"])
+def test_removed_key_at_its_old_default_is_still_read(default: object) -> None:
+    assert override(SlamConfig(), {"robust.calibrated_offset_sigma_m": default}) == SlamConfig()
+
+
+def test_every_removed_key_at_its_old_default_is_read_from_a_file() -> None:
+    tables: dict[str, dict[str, object]] = {"window": {"size": 7}}
+    for key, default in REMOVED_KEYS.items():
+        part, field = key.split(".")
+        tables.setdefault(part, {})[field] = default
+    config = config_from_tables(tables, source="x.toml")
+    assert config == config_from_tables({"window": {"size": 7}}, source="x.toml")
+
+
+@pytest.mark.parametrize("key", REMOVED_KEYS)
+@pytest.mark.parametrize("value", [1e-3, "other", True, False, None])
+def test_removed_key_at_another_value_is_one_line_naming_key_and_version(
+    key: str, value: object
+) -> None:
+    part, field = key.split(".")
+    message = rf"^x.toml: {key}: version 0\.1\.0 was the last with this key; only its default "
+    with pytest.raises(ConfigError, match=message) as caught:
+        config_from_tables({part: {field: value}}, source="x.toml")
+    assert "\n" not in str(caught.value)
+    with pytest.raises(ConfigError, match=rf"^setting: {key}: version 0\.1\.0 was the last"):
+        override(SlamConfig(), {key: value})

@@ -276,7 +276,6 @@ def test_every_key_of_the_table_reaches_the_back_end() -> None:
         "robust.field_of_view_deg": 50.0,
         "robust.range_sigma_m": 4e-3,
         "robust.offset_sigma_m": 0.02,
-        "robust.calibrated_offset_sigma_m": 1e-3,
         "robust.detection_probability": 0.7,
         "robust.false_ranges_per_frame": 0.26,
         "robust.wheel_walk_per_sqrt_m": 0.15,
@@ -288,13 +287,12 @@ def test_every_key_of_the_table_reaches_the_back_end() -> None:
     told = back_end_parameters(override(ROBUST, settings), WheelNoise(scale_sigma=0.01))
     ranges = told.ranges
     assert ranges.field_of_view_rad == math.radians(50.0)
-    assert (ranges.sigma_m, ranges.offset_sigma_m, ranges.calibrated_sigma_m) == (4e-3, 0.02, 1e-3)
+    assert (ranges.sigma_m, ranges.offset_sigma_m) == (4e-3, 0.02)
     assert ranges.detection_probability == 0.7
     assert (ranges.doubt_m, ranges.huber_sigmas) == (3e-3, 2.5)
     assert ranges.clutter_per_m == pytest.approx(0.2)
     assert (ranges.min_range_m, ranges.max_range_m) == (0.2, 1.5)
     assert (told.wheels.scale_sigma, told.wheels.walk_per_sqrt_m) == (0.01, 0.15)
-    assert back_end_parameters(ROBUST, WheelNoise()).ranges.calibrated_sigma_m is None
 
 
 def test_the_table_refuses_what_makes_no_sense() -> None:

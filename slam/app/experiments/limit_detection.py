@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.app.experiments.limit_bounds import detection_probability, known_pulse
 from slam.app.experiments.limit_cells import (
@@ -18,8 +17,6 @@ from slam.app.experiments.limit_cells import (
 from slam.app.experiments.limit_frames import BIN_LENGTH_M, N_BINS, chip_frames
 from slam.config import MatchedFilterConfig
 from slam.pulse_filter import threshold_sigmas
-
-Array = NDArray[np.float64]
 
 SNRS_DB = (0, 2, 3, 4, 5, 6, 7, 8, 10, 12, 16, 20, 22, 23, 24, 25, 26, 28)
 FALSE_ALARMS = (1e-3, 1e-2, 1e-1)

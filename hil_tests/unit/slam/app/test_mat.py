@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -20,9 +21,11 @@ from slam.app.mat_convert import MAT_RIG
 from slam.app.mat_file import MatDrive, read_mat, write_mat
 from slam.app.odometry import OdometryTrack
 from slam.app.session import SessionInfo
+from slam.app.session_head import settings_text
 from slam.app.session_log import SessionLog
 from slam.app.session_reader import open_session
 from slam.app.tum import format_tum_line
+from slam.config import SlamConfig
 from slam.detector import Detection
 from slam.presets import load_preset
 from slam.trilateration import Trilaterator
@@ -253,6 +256,26 @@ def test_a_session_with_settings_of_another_version_is_one_line(
     assert code == 1
     (line,) = err.splitlines()
     assert "its setting of_tomorrow is not one of this version" in line
+
+
+@pytest.mark.parametrize(
+    ("sigma_m", "code", "message"),
+    [(0.0, 0, ""), (1e-3, 1, "robust.calibrated_offset_sigma_m: version 0.1.0 was the last")],
+)
+def test_a_removed_setting_of_a_session_is_read_at_its_default_only(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], sigma_m: float, code: int, message: str
+) -> None:
+    stored = json.loads(settings_text(SlamConfig()))
+    stored["robust"]["calibrated_offset_sigma_m"] = sigma_m
+    info = replace(four_radars(), config_json=json.dumps(stored), wheels={"scale_sigma": 0.1})
+    track = OdometryTrack.from_lines([format_tum_line(scan(0).t_ns, np.zeros(3))])
+    log = SessionLog(tmp_path / "s.mcap", info, track)
+    log.on_scan(scan(0, 4))
+    log.close()
+    ended, _, err = run(capsys, tmp_path / "s.mcap", tmp_path / "a.mat")
+    assert ended == code
+    assert message in err
+    assert err.count("\n") == code
 
 
 def test_a_file_that_was_begun_is_removed(

@@ -8,31 +8,22 @@ import pytest
 
 from hil_tests.unit.slam.app.sessions import scan, session_info
 from slam.app.run_listener import LoggingListener
-from slam.app.session import LogLine, Scan, Snapshot
+from slam.app.session import LogLine, SessionObserver
 from slam.app.session_file import CannotWriteError
 from slam.app.session_log import SessionLog
 from slam.app.session_reader import open_session
 from slam.app.tum import TumSample
 
 
-class Heard:
+class Heard(SessionObserver):
     """Keeps the lines that a user would see."""
 
     def __init__(self) -> None:
         self.lines: list[LogLine] = []
 
-    def on_scan(self, scan: Scan) -> None:
-        """Nothing to do."""
-
-    def on_snapshot(self, snapshot: Snapshot) -> None:
-        """Nothing to do."""
-
     def on_log(self, line: LogLine) -> None:
         """Keep it."""
         self.lines.append(line)
-
-    def close(self) -> None:
-        """Nothing to do."""
 
 
 def pose(number: int) -> TumSample:

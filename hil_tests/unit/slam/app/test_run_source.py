@@ -25,7 +25,7 @@ from slam.app.odometry_live import FixedClock, LiveOdometry
 from slam.app.run_events import FrameCame, OdometryLine, RadarBack, RadarLost
 from slam.app.run_source import LiveSource
 from slam.app.runner import RunRecord, run_slam
-from slam.app.session import LogLine, RadarInfo, Scan, Snapshot
+from slam.app.session import RadarInfo, Scan, SessionObserver
 from slam.app.sources import sampler_limits
 from slam.metrics import ate_rmse_m
 from slam.presets import load_preset
@@ -50,19 +50,13 @@ class Drive:
 
 
 @dataclass
-class Heard:
+class Heard(SessionObserver):
     """What an observer of a run was told."""
 
     scans: list[Scan] = field(default_factory=list)
 
     def on_scan(self, scan: Scan) -> None:
         self.scans.append(scan)
-
-    def on_snapshot(self, snapshot: Snapshot) -> None: ...
-
-    def on_log(self, line: LogLine) -> None: ...
-
-    def close(self) -> None: ...
 
 
 @pytest.fixture(scope="module")

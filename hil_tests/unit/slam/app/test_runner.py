@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hil_tests.unit.slam.app.sessions import FRAME_NS, scan
 from slam.app.odometry import OdometryTrack
 from slam.app.runner import nobody_knows, run_slam
-from slam.app.session import LogLine, Scan, Snapshot
+from slam.app.session import Scan, SessionObserver, Snapshot
 from slam.app.tum import TumSample
 from slam.ekf_slam import Belief
 from slam.frames import RadarFrame
@@ -53,7 +53,7 @@ class LateSlam:
         return np.array([[[0.0, 1.0], [2.0, 1.0]]])
 
 
-class Listener:
+class Listener(SessionObserver):
     def __init__(self) -> None:
         self.scans: list[int] = []
         self.snapshots: list[Snapshot] = []
@@ -63,10 +63,6 @@ class Listener:
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         self.snapshots.append(snapshot)
-
-    def on_log(self, line: LogLine) -> None: ...
-
-    def close(self) -> None: ...
 
 
 def truth_at(stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:

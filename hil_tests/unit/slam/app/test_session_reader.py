@@ -18,7 +18,7 @@ from slam.app.odometry import OdometryTrack
 from slam.app.session import LogLine, Scan, Snapshot
 from slam.app.session_head import METADATA_NAME, session_table, settings_text
 from slam.app.session_log import SessionLog
-from slam.app.session_reader import open_session, scans
+from slam.app.session_reader import open_session
 from slam.app.session_records import TruthPose
 from slam.app.session_states import snapshot_of, state_row
 from slam.app.tum import TumSample, format_tum_line
@@ -92,7 +92,7 @@ def test_scans_group_by_tick_also_where_a_radar_started_whole_periods_late(tmp_p
         frames = (first,) if tick == 0 else (first, replace(second, counter=tick - 1))
         log.on_scan(replace(scan(tick), frames=frames))
     log.close()
-    grouped = list(scans(open_session(path)))
+    grouped = [one for one, _ in open_session(path).scans()]
     assert [(s.counter, [f.counter for f in s.frames]) for s in grouped] == [
         (0, [0]),
         *((tick, [tick, tick - 1]) for tick in range(1, 5)),
@@ -124,45 +124,6 @@ def test_scans_come_back_as_the_run_took_them(tmp_path: Path) -> None:
     for one, truth in taken:
         assert truth is not None
         assert truth.tolist() == (one.t_ns * np.array([1e-9, 1 / 3, 0.1])).tolist()
-
-
-def as_first_format(path: Path, out: Path) -> None:
-    """Rewrite a session as earlier versions did: no marks, no exact states, no settings."""
-    with path.open("rb") as source, out.open("wb") as target:
-        reader = make_reader(source)
-        (metadata,) = reader.iter_metadata()
-        writer = Writer(target, compression=CompressionType.ZSTD)
-        writer.start(profile="ros2", library="xethru-hil")
-        early = ("scene", "preset", "seed", "true_landmarks_m", "versions")
-        writer.add_metadata(metadata.name, {key: metadata.metadata[key] for key in early})
-        channels: dict[str, int] = {}
-        for schema, channel, message in reader.iter_messages(log_time_order=False):
-            assert schema is not None
-            if channel.topic in ("/scan", "/slam/state"):
-                continue
-            if channel.topic not in channels:
-                number = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.topic] = writer.register_channel(channel.topic, "cdr", number)
-            writer.add_message(
-                channel_id=channels[channel.topic],
-                log_time=message.log_time,
-                publish_time=message.publish_time,
-                sequence=message.sequence,
-                data=message.data,
-            )
-        writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
-
-
-def test_sessions_of_the_first_format_are_read(session_file: Path, tmp_path: Path) -> None:
-    as_first_format(session_file, tmp_path / "old.mcap")
-    old, new = open_session(tmp_path / "old.mcap"), open_session(session_file)
-    assert (old.has_scan_marks, new.has_scan_marks) == (False, True)
-    assert old.info.config_json == ""
-    assert old.info.radars == new.info.radars
-    first = [(one.counter, [f.samples.tobytes() for f in one.frames]) for one in scans(new)]
-    again = [(one.counter, [f.samples.tobytes() for f in one.frames]) for one in scans(old)]
-    assert again == first
-    assert old.odometry().samples == new.odometry().samples
 
 
 def test_what_is_unknown_stays_unknown(tmp_path: Path) -> None:
@@ -269,15 +230,32 @@ def test_wire_bytes_come_back_with_both_clocks(tmp_path: Path) -> None:
     }
 
 
-def test_a_session_of_a_later_version_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("number", "remedy"),
+    [
+        ("3", "a newer xethru-hil wrote it"),
+        ("two", "a newer xethru-hil wrote it"),
+        ("1", "record the session again"),
+        (None, "record the session again"),
+    ],
+)
+def test_a_session_of_another_format_is_refused_in_one_line(
+    tmp_path: Path, number: str | None, remedy: str
+) -> None:
+    table = session_table(session_info())
+    del table["format"]
+    if number is not None:
+        table["format"] = number
     path = tmp_path / "s.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start()
-        writer.add_metadata(METADATA_NAME, session_table(session_info()) | {"format": "3"})
+        writer.add_metadata(METADATA_NAME, table)
         writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
-    with pytest.raises(AppError, match="format 3; this version reads up to 2, a newer"):
+    with pytest.raises(AppError) as caught:
         open_session(path)
+    line = f"{path}: a session of format {number or 1}; this version reads format 2; {remedy}"
+    assert str(caught.value) == line
 
 
 @pytest.mark.parametrize("preset", ["paper", "robust"])

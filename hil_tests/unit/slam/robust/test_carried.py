@@ -238,5 +238,5 @@ def test_where_the_island_was_begun_does_not_matter() -> None:
     one, other = after
     assert one.pose == pytest.approx(truth, abs=1e-6)
     assert other.pose == pytest.approx(truth, abs=1e-6)
-    scale = np.sqrt(np.outer(one.P.diagonal(), one.P.diagonal()))
+    scale = np.sqrt(np.outer(one.P.full().diagonal(), one.P.full().diagonal()))
     assert (np.abs(one.P.full() - other.P.full()) <= 1e-3 * scale + 1e-12).all()

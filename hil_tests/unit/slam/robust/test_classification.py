@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from slam.robust.classification import Kind, Law, Sightings, compare, kinds, wall_crossings
+from slam.robust.classification import Law, Sightings, compare
 from slam.robust.symmetric import Array
 
 SIGMA_M = 1e-3
@@ -93,25 +93,3 @@ def test_a_corner_is_a_point_at_its_apex() -> None:
     verdict = compare(sightings(antennas, ranges), toward)
     assert verdict.point == pytest.approx(0.0, abs=1e-6)
     assert verdict.law(30.0) is Law.POINT
-
-
-def test_points_at_crossings_of_walls_are_corners() -> None:
-    walls = np.array([[0.0, 2.0], [math.pi / 2, 1.0], [math.pi / 2 + 0.1, 3.0]])
-    assert wall_crossings(walls)[0] == pytest.approx([2.0, 1.0])
-    assert len(wall_crossings(walls)) == 2  # nearly parallel walls cross anywhere
-    points = np.array([[2.01, 1.0], [2.2, 1.0]])
-    covariances = np.tile(1e-4 * np.eye(2), (2, 1, 1))
-    assert kinds(points, covariances, walls, floor_m=0.01) == [Kind.CORNER, Kind.POINT]
-
-
-def test_the_image_of_a_point_behind_a_wall_is_its_ghost() -> None:
-    """By way of the wall to and fro, target t is as far as its image: 2 |p - t'| in all."""
-    wall = np.array([[math.pi / 2, 1.0]])
-    target, image = np.array([0.3, 0.4]), np.array([0.3, 1.6])
-    antenna = np.array([-0.2, 0.0])
-    way = np.hypot(*(antenna - [0.3, 1.6]))
-    bounce = antenna + (image - antenna) * (1.0 - antenna[1]) / (image[1] - antenna[1])
-    assert np.hypot(*(bounce - antenna)) + np.hypot(*(target - bounce)) == pytest.approx(way)
-    points = np.array([target, image, [0.9, 1.6]])
-    covariances = np.tile(1e-5 * np.eye(2), (3, 1, 1))
-    assert kinds(points, covariances, wall) == [Kind.POINT, Kind.GHOST, Kind.POINT]

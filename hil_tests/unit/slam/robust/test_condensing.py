@@ -308,14 +308,14 @@ def test_a_prior_pulls_as_its_cost_falls() -> None:
     rng = np.random.default_rng(8)
     values = prior.mean + 0.1 * rng.standard_normal(len(prior.mean))
     terms = prior_terms(prior, values, N_RADARS)
-    assert terms.cost == pytest.approx(prior_cost(prior, values, N_RADARS), rel=1e-12)
 
     def cost(x: Complex) -> Complex:
         e = invariant_errors(prior.mean, x)
         return np.atleast_1d(e @ (prior.information @ e + 2.0 * prior.gradient))
 
     slope = derivative(cost, values)[0]
-    assert terms.cost == pytest.approx(float(cost(values.astype(np.complex128))[0].real), rel=1e-9)
+    here = prior_cost(prior, values, N_RADARS)
+    assert here == pytest.approx(float(cost(values.astype(np.complex128))[0].real), rel=1e-9)
     assert np.abs(2.0 * terms.gradient - slope).max() <= 1e-9 * np.abs(slope).max()
     K = derivative(lambda y: invariant_errors(prior.mean, y), values)
     wanted = K.T @ prior.information @ K

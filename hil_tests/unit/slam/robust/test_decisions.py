@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
@@ -22,7 +20,6 @@ from slam.robust.existence import Existence
 from slam.robust.leftovers import Leftovers
 from slam.robust.merging import find_merge
 from slam.robust.motion import calibrated_motion
-from slam.robust.offsets import calibrated_evidence, take_as_calibrated
 from slam.robust.parameters import MapRule, RangeNoise, TrackletRule, WheelNoise
 from slam.robust.ranges import RangeScan, antennas_of
 from slam.robust.state import State
@@ -201,25 +198,3 @@ def test_walking_biases_are_as_uncertain_to_the_filter_as_to_the_smoother() -> N
     again = np.sqrt(np.diag(back_end.state.P.block(at)))
     assert again == pytest.approx(sigmas, rel=0.1)
     assert (np.abs(back_end.state.calibration - mean) < 0.5 * sigmas[3:]).all()
-
-
-def test_the_evidence_for_a_calibrated_rig_is_the_ratio_of_two_likelihoods() -> None:
-    """Brute force: the same measurements of two offsets under either prior."""
-    rng = np.random.default_rng(3)
-    narrow, wide = 1e-3, 2e-2
-    H, R = rng.standard_normal((3, 2)), np.diag([1e-6, 4e-6, 9e-6])
-    z = H @ np.array([2e-3, -1e-3]) + 1e-3 * rng.standard_normal(3)
-
-    def log_likelihood(sigma: float) -> float:
-        S = sigma**2 * H @ H.T + R
-        return -0.5 * float(z @ np.linalg.solve(S, z) + np.linalg.slogdet(math.tau * S)[1])
-
-    state = State((0.01, 0.01, 0.01), (wide, wide))
-    state.update(np.array([6, 7]), H, z, R)
-    wanted = log_likelihood(narrow) - log_likelihood(wide)
-    assert calibrated_evidence(state, narrow, wide) == pytest.approx(wanted, abs=1e-9)
-    other = State((0.01, 0.01, 0.01), (narrow, narrow))
-    other.update(np.array([6, 7]), H, z, R)
-    take_as_calibrated(state, narrow, wide)
-    assert state.offsets_m == pytest.approx(other.offsets_m, abs=1e-12)
-    assert state.P.full() == pytest.approx(other.P.full(), abs=1e-15)
