@@ -12,9 +12,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from hil_tests.patience import seconds
 from slam.app.parent_death import signal_at_parents_death
 
-END_LIMIT_S = 10
+END_LIMIT_S = seconds(10)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,6 +6,7 @@ import signal
 from pathlib import Path
 
 from hil_tests.device.serving import emulator
+from hil_tests.patience import seconds
 from xethru_protocol.driver import X4M300, RawConfig
 
 
@@ -13,7 +14,7 @@ def test_driver_goes_on_when_its_emulator_comes_back(tmp_path: Path) -> None:
     links = tmp_path / "links"
     serve = ("serve", "--bare", "--link-dir", links)
     with emulator(*serve) as first:
-        radar = X4M300.open(first.paths[0], reconnect_s=15.0)
+        radar = X4M300.open(first.paths[0], reconnect_s=seconds(15))
         geometry = radar.configure_raw(RawConfig(frame_area_m=(0.4, 5.0)))
         radar.start(17.0)
         radar.read_frame()

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from hil_tests.device.serving import emulator
+from hil_tests.patience import seconds
 from xethru_protocol.driver import X4M300, RawConfig
 
 CTL = (sys.executable, "-m", "emulator.cli", "ctl")
@@ -18,7 +19,7 @@ def ctl(*words: str) -> subprocess.CompletedProcess[str]:
         [*CTL, *words],
         capture_output=True,
         text=True,
-        timeout=20,
+        timeout=seconds(20),
         check=False,
     )
 
@@ -64,7 +65,7 @@ def test_a_wrong_scenario_is_one_line(tmp_path: Path) -> None:
         [sys.executable, "-m", "emulator.cli", "serve", "--bare", "--faults", str(scenario)],
         capture_output=True,
         text=True,
-        timeout=20,
+        timeout=seconds(20),
         check=False,
     )
     assert result.returncode == 1
@@ -77,7 +78,7 @@ def test_the_list_of_faults_is_json() -> None:
         [sys.executable, "-m", "emulator.cli", "faults", "--json"],
         capture_output=True,
         text=True,
-        timeout=20,
+        timeout=seconds(20),
         check=True,
     )
     listed = json.loads(result.stdout)

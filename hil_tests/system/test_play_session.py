@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from hil_tests.device.serving import emulator
+from hil_tests.patience import seconds
 from hil_tests.unit.emulator.test_playback_control import samples, write_session
 from xethru_protocol import messages as m
 from xethru_protocol.connection import Connection, Role
@@ -18,7 +19,7 @@ from xethru_protocol.driver import X4M300, RawConfig
 
 SECOND = 1_000_000_000
 NAMES = ("front_left", "rear_left", "front_right", "rear_right")
-LIMIT_S = 10
+LIMIT_S = seconds(10)
 
 
 @pytest.fixture
@@ -58,7 +59,7 @@ def test_every_radar_plays_at_a_port_of_its_own(session: Path) -> None:
         with X4M300.open(served.paths[2]) as driver:
             driver.configure_raw(RawConfig())
             driver.start(20.0)
-            for counter, frame in enumerate(driver.frames(30, timeout_s=5.0)):
+            for counter, frame in enumerate(driver.frames(30, timeout_s=seconds(5))):
                 assert frame.counter == counter
                 assert np.array_equal(frame.samples, samples(2, counter))
         assert served.end() == 0

@@ -7,9 +7,8 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from hil_tests.patience import seconds, wait_until
 from hil_tests.system.recorded_session import (
     FAULT,
     record_session,
@@ -145,12 +145,12 @@ def test_a_page_is_served_here_until_a_signal(viewed: Viewed) -> None:
         url = process.stderr.readline().split()[-1]
         assert "stays at" in process.stderr.readline()
         assert url.startswith("http://127.0.0.1:")
-        with urllib.request.urlopen(url, timeout=10) as page:
+        with urllib.request.urlopen(url, timeout=seconds(10)) as page:
             assert b"wasm" in page.read()
         port = int(url.split(":")[2].split("/")[0])
         process.send_signal(signal.SIGINT)
         assert "stopped by SIGINT" in process.stderr.read()
-        assert process.wait(timeout=10) == 128 + signal.SIGINT
+        assert process.wait(timeout=seconds(10)) == 128 + signal.SIGINT
     with socket.socket() as probe:
         assert probe.connect_ex(("127.0.0.1", port)) != 0  # the viewer has ended with it
 
@@ -252,12 +252,6 @@ def without_pictures(path: Path) -> dict[str, int]:
 def connects(port: int) -> bool:
     with socket.socket() as probe:
         return probe.connect_ex(("127.0.0.1", port)) == 0
-
-
-def wait_until(is_true: Callable[[], bool], limit_s: float = 10.0) -> None:
-    give_up = time.monotonic() + limit_s
-    while not is_true() and time.monotonic() < give_up:
-        time.sleep(0.1)
 
 
 def kill_viewer() -> None:
