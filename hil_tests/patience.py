@@ -28,7 +28,8 @@ def wait_until(
     """Return when the condition is true; AssertionError if the process ends or hangs before."""
     give_up_s = time.monotonic() + seconds(30)
     while not condition():
-        assert process is None or process.poll() is None, "the process has ended"
+        if process is not None and process.poll() is not None:
+            raise AssertionError(f"it ended with {process.returncode}: {process.communicate()}")
         assert time.monotonic() < give_up_s, "what was waited for did not come"
         time.sleep(0.01)
 

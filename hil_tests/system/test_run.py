@@ -37,7 +37,7 @@ class Robot:
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
     folder = tmp_path_factory.mktemp("robot")
-    scene_path = write_short_scene(folder)
+    scene_path = write_short_scene(folder, repeats=20)  # it drives on in all tests of this file
     scene = load_scene(scene_path)
     rig = folder / "robot.toml"
     write_rig(

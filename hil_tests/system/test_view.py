@@ -23,6 +23,7 @@ from hil_tests.system.recorded_session import (
     record_session,
     write_shorter_scene,
 )
+from slam.app import rerun_recording
 from slam.app.cli import main
 from slam.app.errors import AppError
 from slam.app.live_view import LiveView
@@ -196,7 +197,10 @@ def saving_viewer(saved: Path) -> Iterator[str]:
         process.terminate()
 
 
-def test_a_viewer_gets_every_row_that_a_file_gets(viewed: Viewed, tmp_path: Path) -> None:
+def test_a_viewer_gets_every_row_that_a_file_gets(
+    viewed: Viewed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rerun_recording, "_VIEWER_CLOSE_LIMIT_S", seconds(5))
     expected = without_pictures(viewed.rrd)
     with saving_viewer(saved := tmp_path / "saved.rrd") as url:
         session = open_session(viewed.session)
@@ -210,7 +214,8 @@ def test_a_viewer_gets_every_row_that_a_file_gets(viewed: Viewed, tmp_path: Path
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")  # of one that is still written
-def test_a_demo_is_watched_while_it_runs(tmp_path: Path) -> None:
+def test_a_demo_is_watched_while_it_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rerun_recording, "_VIEWER_CLOSE_LIMIT_S", seconds(5))
     scene, out = str(write_shorter_scene(tmp_path)), tmp_path / "out"
     out.mkdir()
     (out / "report.html").write_text("of an earlier run")
