@@ -22,6 +22,11 @@ def seconds(limit_s: float) -> float:
     return limit_s * PATIENCE
 
 
+def patient_ns() -> int:
+    """Return the time [ns] of a slow clock: a driver that has it waits longer for answers."""
+    return round(time.monotonic_ns() / PATIENCE)
+
+
 def wait_until(
     condition: Callable[[], object], process: subprocess.Popen[Any] | None = None
 ) -> None:

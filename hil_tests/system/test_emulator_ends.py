@@ -14,11 +14,11 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.device.serving import emulator
+from hil_tests.device.serving import emulator, open_radar
 from hil_tests.patience import catches, seconds, wait_until
 from xethru_protocol.codes import InfoItem, PongCode
 from xethru_protocol.connection import Connection, Role
-from xethru_protocol.driver import X4M300, RawConfig
+from xethru_protocol.driver import RawConfig
 from xethru_protocol.messages import ReplyString, SystemGetInfo
 from xethru_protocol.packets import NeedData
 
@@ -84,7 +84,7 @@ def test_a_signal_during_the_start_ends_it_with_0(
 def test_a_signal_while_streaming_ends_it_too(tmp_path: Path) -> None:
     with (
         emulator("serve", "smoke", "--pace", "asap", environment=environment(tmp_path)) as served,
-        X4M300.open(served.paths[0]) as driver,
+        open_radar(served.paths[0]) as driver,
     ):
         driver.configure_raw()
         driver.start(5.0)
@@ -101,7 +101,7 @@ def test_a_killed_emulator_is_succeeded_by_the_next(tmp_path: Path) -> None:
     assert len(list(links.iterdir())) == 6, "a killed process cleans nothing up"
     with emulator(*arguments, environment=environment(tmp_path)) as second:
         for path in second.paths:
-            with X4M300.open(path) as driver:
+            with open_radar(path) as driver:
                 assert driver.ping() is PongCode.XTS_SPRP_READY
         assert len(list((tmp_path / "xethru").glob("*.json"))) == 1
         assert second.odometry is not None
@@ -134,7 +134,7 @@ def test_a_closed_stdout_does_not_matter(tmp_path: Path) -> None:
     ) as process:
         port = tmp_path / "l" / "radar_1"
         wait_until(port.is_symlink, process)
-        with X4M300.open(str(port)) as driver:
+        with open_radar(str(port)) as driver:
             driver.ping()  # the loop runs
         process.terminate()
         assert process.wait(seconds(10)) == 0
@@ -161,7 +161,7 @@ def test_a_host_killed_while_streaming_is_followed_by_another(pace: str, tmp_pat
             assert first.stdout.readline() == "streaming\n"
             first.kill()
         time.sleep(0.3)
-        with X4M300.open(served.paths[0]) as second:
+        with open_radar(served.paths[0]) as second:
             second.configure_raw(RawConfig(downconversion=True))
             second.start(17.0)
             frames = list(second.frames(5))
@@ -174,7 +174,7 @@ def test_bare_serves_stock_modules_without_odometry(tmp_path: Path) -> None:
         assert served.odometry is None
         assert len(set(served.serials)) == 3
         for path, serial in zip(served.paths, served.serials, strict=True):
-            with X4M300.open(path) as driver:
+            with open_radar(path) as driver:
                 info = driver.info()
                 assert (info.serial_number, info.mode) == (serial, "RUN")
 

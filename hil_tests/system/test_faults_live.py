@@ -7,9 +7,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-from hil_tests.device.serving import emulator
+from hil_tests.device.serving import emulator, open_radar
 from hil_tests.patience import seconds
-from xethru_protocol.driver import X4M300, RawConfig
+from xethru_protocol.driver import RawConfig
 
 CTL = (sys.executable, "-m", "emulator.cli", "ctl")
 
@@ -31,7 +31,7 @@ def test_what_the_driver_counts_is_what_the_truth_log_says(tmp_path: Path) -> No
     )
     truth = tmp_path / "truth.jsonl"
     arguments = ("serve", "--bare", "--faults", str(scenario), "--truth", str(truth))
-    with emulator(*arguments) as served, X4M300.open(served.paths[0]) as radar:
+    with emulator(*arguments) as served, open_radar(served.paths[0]) as radar:
         radar.configure_raw(RawConfig(frame_area_m=(0.4, 1.0)))
         radar.start(50.0)
         list(radar.frames(30))

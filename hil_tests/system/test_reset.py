@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.device.serving import Served, emulator
+from hil_tests.device.serving import Served, emulator, open_radar
 from hil_tests.patience import seconds
 from xethru_protocol.driver import X4M300, Frame, RawConfig
 from xethru_protocol.errors import Disconnected, PortUnavailable, ResponseTimeout
@@ -50,7 +50,7 @@ def where_it_is(serial: str) -> str | None:
 
 
 def test_with_the_port_closed(served: Served) -> None:
-    with X4M300.open(served.paths[0]) as radar:
+    with open_radar(served.paths[0]) as radar:
         asked_ns = time.monotonic_ns()
         radar.reset()
     back_s = 0.0
@@ -67,9 +67,9 @@ def test_with_the_port_closed(served: Served) -> None:
 
 
 def test_with_the_port_open(served: Served) -> None:
-    with X4M300.open(served.paths[0]) as radar:
+    with open_radar(served.paths[0]) as radar:
         asked_ns = time.monotonic_ns()
-        radar.reset(wait=True, timeout_s=LATEST_S)
+        radar.reset(wait=True)
         radar.configure_raw(CONFIG)
         radar.start(FPS)
         assert SOONEST_S < seconds_after(served, asked_ns, radar.read_frame()) < LATEST_S
@@ -77,13 +77,13 @@ def test_with_the_port_open(served: Served) -> None:
 
 
 def test_while_streaming(served: Served, mode: str) -> None:
-    with X4M300.open(served.paths[0], reconnect_s=seconds(10)) as radar:
+    with open_radar(served.paths[0], reconnect_s=10.0) as radar:
         geometry = radar.configure_raw(CONFIG)
         radar.start(FPS)
         radar.read_frame()
         asked_ns = time.monotonic_ns()
         if mode == "stay":
-            radar.reset(wait=True, timeout_s=LATEST_S)  # nothing hangs up: only who asked knows
+            radar.reset(wait=True)  # nothing hangs up: only who asked knows
             radar.configure_raw(CONFIG)
             radar.start(FPS)
         else:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.patience import seconds
+from hil_tests.patience import patient_ns, seconds
 from hil_tests.unit.xethru_protocol.pty_machine import PtyMachine
 from xethru_protocol import messages as m
 from xethru_protocol.async_driver import AsyncX4M300
@@ -41,7 +41,7 @@ def return_as(machine: PtyMachine, name: str) -> threading.Timer:
 
 @pytest.mark.parametrize("name", ["home", "elsewhere"])
 def test_radar_goes_on_at_the_port_its_module_returned_to(machine: PtyMachine, name: str) -> None:
-    with X4M300.open(machine.path("home"), reconnect_s=seconds(10)) as radar:
+    with X4M300.open(machine.path("home"), clock=patient_ns, reconnect_s=10.0) as radar:
         radar.configure_raw()
         radar.start(17.0)
         assert [got.counter for got in radar.frames(2)] == [0, 1]
@@ -61,7 +61,9 @@ def test_radar_goes_on_at_the_port_its_module_returned_to(machine: PtyMachine, n
 @pytest.mark.parametrize("name", ["home", "elsewhere"])
 def test_asynchronous_radar_does_too_while_two_tasks_use_it(machine: PtyMachine, name: str) -> None:
     async def use() -> None:
-        async with AsyncX4M300.open(machine.path("home"), reconnect_s=seconds(10)) as radar:
+        async with AsyncX4M300.open(
+            machine.path("home"), clock=patient_ns, reconnect_s=10.0
+        ) as radar:
             await radar.configure_raw()
             await radar.start(17.0)
             assert (await radar.read_frame()).counter == 0
@@ -85,7 +87,7 @@ def test_asynchronous_radar_does_too_while_two_tasks_use_it(machine: PtyMachine,
 
 def test_frames_are_read_while_another_task_asks(machine: PtyMachine) -> None:
     async def use() -> None:
-        async with AsyncX4M300.open(machine.path("home")) as radar:
+        async with AsyncX4M300.open(machine.path("home"), clock=patient_ns) as radar:
             await radar.configure_raw()
             await radar.start(17.0)
             counters: list[int] = []
@@ -106,7 +108,7 @@ def test_frames_are_read_while_another_task_asks(machine: PtyMachine) -> None:
 
 def test_waiting_task_can_be_cancelled_and_stops_nobody_else(machine: PtyMachine) -> None:
     async def use() -> None:
-        async with AsyncX4M300.open(machine.path("home")) as radar:
+        async with AsyncX4M300.open(machine.path("home"), clock=patient_ns) as radar:
             waiting = asyncio.create_task(radar.read_frame(60.0))
             await asyncio.sleep(0.02)
             await radar.ping()  # heard by the task that reads
@@ -144,7 +146,7 @@ def test_cancelled_read_loses_no_bytes() -> None:
 
 def test_closing_wakes_the_task_that_reads(machine: PtyMachine) -> None:
     async def use() -> None:
-        radar = AsyncX4M300.open(machine.path("home"), reconnect_s=seconds(10))
+        radar = AsyncX4M300.open(machine.path("home"), clock=patient_ns, reconnect_s=10.0)
         await radar.ping()
         waiting = asyncio.create_task(radar.read_frame(60.0))
         await asyncio.sleep(0.02)
@@ -157,7 +159,7 @@ def test_closing_wakes_the_task_that_reads(machine: PtyMachine) -> None:
 
 def test_command_that_was_cancelled_leaves_its_answer_to_nobody(machine: PtyMachine) -> None:
     async def use() -> None:
-        async with AsyncX4M300.open(machine.path("home")) as radar:
+        async with AsyncX4M300.open(machine.path("home"), clock=patient_ns) as radar:
             asking = asyncio.create_task(radar.info())
             await asyncio.sleep(0)
             await asyncio.sleep(0)
@@ -219,7 +221,7 @@ def test_long_asynchronous_writes_wait_for_room() -> None:
 
 
 def test_rate_is_that_of_the_port(machine: PtyMachine) -> None:
-    with X4M300.open(machine.path("home"), baudrate=921600) as radar:
+    with X4M300.open(machine.path("home"), clock=patient_ns, baudrate=921600) as radar:
         assert _speed(radar) == termios.B921600
         radar.set_baud_rate(230400)
         assert _speed(radar) == termios.B230400
