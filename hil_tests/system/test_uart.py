@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.device.serving import Served, emulator, open_radar
+from hil_tests.device.serving import Served, emulator
 from hil_tests.patience import seconds
 from xethru_protocol.codes import PongCode
 from xethru_protocol.driver import X4M300, RawConfig
@@ -26,7 +26,7 @@ def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
 def test_the_speed_must_fit_and_can_be_changed(served: Served) -> None:
     with X4M300.open(served.paths[0], baudrate=57600) as deaf, pytest.raises(ResponseTimeout):
         deaf.ping()
-    with open_radar(served.paths[0]) as radar:
+    with X4M300.open(served.paths[0]) as radar:
         assert radar.ping() is PongCode.XTS_SPRP_READY
         radar.set_baud_rate(921600)
         radar.configure_raw(RawConfig(frame_area_m=(0.4, 5.0)))

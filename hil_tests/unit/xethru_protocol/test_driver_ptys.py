@@ -221,7 +221,7 @@ def test_long_asynchronous_writes_wait_for_room() -> None:
 
 
 def test_rate_is_that_of_the_port(machine: PtyMachine) -> None:
-    with X4M300.open(machine.path("home"), clock=patient_ns, baudrate=921600) as radar:
+    with X4M300.open(machine.path("home"), baudrate=921600) as radar:
         assert _speed(radar) == termios.B921600
         radar.set_baud_rate(230400)
         assert _speed(radar) == termios.B230400
