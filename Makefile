@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PYTEST := $(BIN)/python -m pytest
 
-.PHONY: demo test test-all check bench sweep stress scenes pictures clean
+.PHONY: demo test test-quick test-all check bench sweep stress scenes pictures clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed-demo
@@ -14,6 +14,11 @@ demo: $(VENV)/installed-demo
 # One process more than cores: many tests wait for a pty.
 test: $(VENV)/installed-test
 	$(PYTEST) -n $$($(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 1)') --dist worksteal
+
+# About a minute: the bytes of the protocol, the driver and the mathematics of SLAM.
+test-quick: $(VENV)/installed-test
+	$(PYTEST) -n auto --dist worksteal hil_tests/golden hil_tests/unit/xethru_protocol \
+		hil_tests/unit/slam --ignore hil_tests/unit/slam/app
 
 # And the cases that would take the default suite over five minutes of two cores.
 test-all: $(VENV)/installed-test

@@ -10,8 +10,10 @@ from pathlib import Path
 
 from PIL import Image
 
+from hil_tests.patience import seconds
+
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-_LIMIT_S = 60.0
+_LIMIT_S = seconds(60)
 
 
 def find_browser() -> str | None:

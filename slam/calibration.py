@@ -329,6 +329,7 @@ class _Estimator:
             covariance_m2=solution.covariance(np.arange(layout.radars.start, layout.size)),
             landmarks_m=model.landmarks,
             path=PathNodes(t_ns=self._drive.path.t_ns, poses=model.poses),
+            wheels=model.wheels,
             landmark=landmark,
             sigma_m=float(np.sqrt(np.mean(used**2))) if len(used) else math.nan,
         )

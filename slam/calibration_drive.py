@@ -82,6 +82,8 @@ class Calibration:
         Shape (k, 2), map frame: the body frame at the start, or the frame of known reflectors.
     path
         The most likely path, map frame.
+    wheels
+        Shape (3,): scale, turn scale, curvature [rad/m].
     landmark
         Shape (n_ranges,): the landmark each range was used for, or UNASSIGNED.
     sigma_m
@@ -93,6 +95,7 @@ class Calibration:
     covariance_m2: Array
     landmarks_m: Array
     path: PathNodes
+    wheels: Array
     landmark: Indices
     sigma_m: float
 

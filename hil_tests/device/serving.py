@@ -12,9 +12,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from hil_tests.patience import patient_ns, seconds
 from slam.app.parent_death import signal_at_parents_death
+from xethru_protocol.driver import X4M300
 
-END_LIMIT_S = 10
+END_LIMIT_S = seconds(10)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,6 +36,11 @@ class Served:
         """Send a signal; return the exit code."""
         self.process.send_signal(number)
         return self.process.wait(END_LIMIT_S)
+
+
+def open_radar(path: str, reconnect_s: float = 0.0) -> X4M300:
+    """Return a driver on a port, which waits for answers as long as a busy machine takes."""
+    return X4M300.open(path, clock=patient_ns, reconnect_s=reconnect_s)
 
 
 @contextmanager

@@ -40,6 +40,9 @@ class Content(bytes):
         return f"<{len(self)} bytes>"
 
 
+NO_CHECK = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+
+
 class SlowClock:
     """Every look at it takes 0.15 s, so that a chunk holds half a dozen messages."""
 
@@ -126,9 +129,7 @@ def test_a_cut_at_any_byte_leaves_a_prefix(whole: Content, tmp_path: Path) -> No
     assert longest == len(everything)
 
 
-@settings(
-    max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=30, suppress_health_check=NO_CHECK)
 @given(data=st.data())
 def test_repair_makes_what_every_program_opens(
     whole: Content, tmp_path: Path, data: st.DataObject
@@ -158,9 +159,7 @@ def test_repair_makes_what_every_program_opens(
     assert {found.name for found in tmp_path.iterdir()} == {path.name, kept.name}
 
 
-@settings(
-    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=40, suppress_health_check=NO_CHECK)
 @given(share=st.floats(0, 1), garbage=st.binary(min_size=1, max_size=40))
 def test_damage_in_the_middle_loses_the_chunk_it_is_in(
     whole: Content, tmp_path: Path, share: float, garbage: bytes
@@ -256,9 +255,7 @@ def test_ros_types_survive(whole: Content, tmp_path: Path) -> None:
     assert (t_ns, len(message.data)) == (0, N_BINS)  # type: ignore[attr-defined]  # made at run time
 
 
-@settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=60, suppress_health_check=NO_CHECK)
 @given(data=st.data())
 def test_any_bytes_are_one_line_or_messages(
     whole: Content, tmp_path: Path, data: st.DataObject

@@ -11,7 +11,7 @@ description = "Half a metre along x and back, two radars on each side."
 
 [path]
 waypoints_m = [[0.0, 0.0], [0.5, 0.0]]
-laps = ["forward", "backward"]
+laps = {laps}
 speed_mps = 0.05
 turn_rate_deg_per_s = 28.125
 
@@ -35,9 +35,9 @@ _RADARS = {
 _RODS = ((0.1, 0.9), (0.5, 1.3), (0.0, -1.0), (0.45, -0.8), (0.9, 0.8))
 
 
-def write_short_scene(folder: Path) -> Path:
-    """Write the scene file and return its path; the drive takes 59 s of scene time."""
-    parts = [_SCENE]
+def write_short_scene(folder: Path, repeats: int = 1) -> Path:
+    """Write the scene file and return its path; the drive takes 59 s of scene time each."""
+    parts = [_SCENE.format(laps=["forward", "backward"] * repeats)]
     for index, (name, (x, y, yaw)) in enumerate(_RADARS.items()):
         parts.append(
             f'[[radars]]\nname = "{name}"\nserial = "00000000010{index}"\n'

@@ -33,7 +33,6 @@ def short_drive(folder: Path) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(120)
 def test_a_recorded_drive_gives_back_what_the_scene_planted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

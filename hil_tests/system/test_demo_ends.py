@@ -5,14 +5,14 @@ import resource
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
 
+from hil_tests.patience import catches, seconds, wait_until
 from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.sessions import surviving_counters
 from slam.app import demo as demo_module
@@ -43,18 +43,11 @@ def running_demo(
     try:
         log = out / "session.mcap"
         if progressed:
-            wait_until(lambda: log.exists() and log.stat().st_size > WELL_UNDER_WAY_BYTES, 30)
+            wait_until(lambda: log.exists() and log.stat().st_size > WELL_UNDER_WAY_BYTES, demo)
         yield demo
     finally:
         demo.kill()
         demo.communicate()
-
-
-def wait_until(condition: Callable[[], bool], limit_s: float) -> None:
-    give_up = time.monotonic() + limit_s
-    while not condition():
-        assert time.monotonic() < give_up, "waited in vain"
-        time.sleep(0.02)
 
 
 def children(pid: int) -> list[int]:
@@ -93,7 +86,7 @@ def test_ctrl_c_half_way(tmp_path: Path) -> None:
     with running_demo(out, tmp_path / "tmp") as demo:
         (emulator,) = children(demo.pid)
         demo.send_signal(signal.SIGINT)
-        stdout, stderr = demo.communicate(timeout=20)
+        stdout, stderr = demo.communicate(timeout=seconds(20))
     assert demo.returncode == 130
     assert stdout == ""
     assert stderr.splitlines()[-1] == f"uwb-slam: stopped by SIGINT; what was recorded is in {out}"
@@ -111,7 +104,7 @@ def test_a_closed_terminal_half_way(tmp_path: Path) -> None:
         (emulator,) = children(demo.pid)
         for _ in range(2):  # the kernel's and the shell's
             demo.send_signal(signal.SIGHUP)
-        _, stderr = demo.communicate(timeout=20)
+        _, stderr = demo.communicate(timeout=seconds(20))
     assert demo.returncode == 129
     assert stderr.splitlines()[-1] == f"uwb-slam: stopped by SIGHUP; what was recorded is in {out}"
     assert is_gone(emulator)
@@ -128,7 +121,7 @@ def test_a_file_that_may_not_grow_is_one_line(tmp_path: Path) -> None:
         capture_output=True,
         text=True,
         check=False,
-        timeout=60,
+        timeout=seconds(60),
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
     )
     assert (run.returncode, run.stdout) == (1, "")
@@ -174,16 +167,18 @@ def test_a_signal_after_the_last_scan(
 
 
 @pytest.mark.parametrize(
-    ("delay_s", "which", "code"), [(0.2, signal.SIGINT, 130), (1.2, signal.SIGTERM, 143)]
+    ("has_emulator", "which", "code"), [(False, signal.SIGINT, 130), (True, signal.SIGTERM, 143)]
 )
 def test_a_signal_while_it_starts(
-    tmp_path: Path, delay_s: float, which: signal.Signals, code: int
+    tmp_path: Path, has_emulator: bool, which: signal.Signals, code: int
 ) -> None:
     with running_demo(tmp_path / "out", tmp_path / "tmp", progressed=False) as demo:
-        time.sleep(delay_s)
+        wait_until(lambda: catches(demo.pid, signal.SIGHUP), demo)
+        if has_emulator:
+            wait_until(lambda: children(demo.pid), demo)
         started = children(demo.pid)
         demo.send_signal(which)
-        _, stderr = demo.communicate(timeout=20)
+        _, stderr = demo.communicate(timeout=seconds(20))
     assert demo.returncode == code
     assert f"uwb-slam: stopped by {which.name}" in stderr
     assert "Traceback" not in stderr
@@ -197,7 +192,7 @@ def test_kill_9_leaves_a_readable_session_and_no_emulator(tmp_path: Path) -> Non
         (emulator,) = children(demo.pid)
         demo.kill()
         demo.wait()
-        wait_until(lambda: is_gone(emulator), 10)
+        wait_until(lambda: is_gone(emulator))
     assert leftovers(tmp_path / "tmp") == []
     log = out / "session.mcap"
     counters = surviving_counters(log, "/radar/left_rear/frame")
@@ -211,7 +206,7 @@ def test_the_emulator_dies(tmp_path: Path) -> None:
     with running_demo(out, tmp_path / "tmp") as demo:
         (emulator,) = children(demo.pid)
         os.kill(emulator, signal.SIGKILL)
-        _, stderr = demo.communicate(timeout=30)
+        _, stderr = demo.communicate(timeout=seconds(30))
     assert demo.returncode == 1
     last = stderr.splitlines()[-1]
     assert last == (f"uwb-slam: the emulator ended by SIGKILL; what was recorded is in {out}")
@@ -225,7 +220,7 @@ def test_the_emulator_freezes(tmp_path: Path) -> None:
     with running_demo(out, tmp_path / "tmp") as demo:
         (emulator,) = children(demo.pid)
         os.kill(emulator, signal.SIGSTOP)
-        _, stderr = demo.communicate(timeout=60)
+        _, stderr = demo.communicate(timeout=seconds(60))
     assert demo.returncode == 1
     last = stderr.splitlines()[-1]
     assert last.startswith("uwb-slam: radar ")

@@ -13,7 +13,7 @@ from emulator.identity import Identity
 from emulator.loopback import LoopbackTransport
 from emulator.pace import Pace
 from emulator.scene import load_scene
-from hil_tests.device.serving import Served, emulator
+from hil_tests.device.serving import Served, emulator, open_radar
 from xethru_protocol.driver import X4M300, RawConfig
 
 pytestmark = pytest.mark.slow
@@ -46,7 +46,7 @@ def through_ports(served: Served, config: RawConfig, count: int, fps: float) -> 
     contents: list[Content] = [{} for _ in served.paths]
 
     def one(index: int, path: str) -> None:
-        with X4M300.open(path) as driver:
+        with open_radar(path) as driver:
             contents[index] = read(driver, config, count, fps)
 
     threads = [

@@ -5,15 +5,15 @@ from __future__ import annotations
 import signal
 from pathlib import Path
 
-from hil_tests.device.serving import emulator
-from xethru_protocol.driver import X4M300, RawConfig
+from hil_tests.device.serving import emulator, open_radar
+from xethru_protocol.driver import RawConfig
 
 
 def test_driver_goes_on_when_its_emulator_comes_back(tmp_path: Path) -> None:
     links = tmp_path / "links"
     serve = ("serve", "--bare", "--link-dir", links)
     with emulator(*serve) as first:
-        radar = X4M300.open(first.paths[0], reconnect_s=15.0)
+        radar = open_radar(first.paths[0], reconnect_s=15.0)
         geometry = radar.configure_raw(RawConfig(frame_area_m=(0.4, 5.0)))
         radar.start(17.0)
         radar.read_frame()

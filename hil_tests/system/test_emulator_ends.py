@@ -14,10 +14,11 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.device.serving import emulator
+from hil_tests.device.serving import emulator, open_radar
+from hil_tests.patience import catches, seconds, wait_until
 from xethru_protocol.codes import InfoItem, PongCode
 from xethru_protocol.connection import Connection, Role
-from xethru_protocol.driver import X4M300, RawConfig
+from xethru_protocol.driver import RawConfig
 from xethru_protocol.messages import ReplyString, SystemGetInfo
 from xethru_protocol.packets import NeedData
 
@@ -31,7 +32,7 @@ def environment(tmp_path: Path) -> dict[str, str]:
 
 def lines_of(path: str, most: int) -> list[str]:
     with socket.socket(socket.AF_UNIX) as client:
-        client.settimeout(10)
+        client.settimeout(seconds(10))
         client.connect(path)
         data = b""
         while data.count(b"\n") < most and (chunk := client.recv(65536)):
@@ -58,16 +59,6 @@ def test_a_signal_ends_it_with_0_and_nothing_is_left(
     assert list((tmp_path / "xethru").iterdir()) == []
 
 
-def catches(pid: int, number: signal.Signals) -> bool:
-    """Tell whether a process has a handler of its own for a signal (Linux)."""
-    (line,) = (
-        line
-        for line in Path(f"/proc/{pid}/status").read_text().splitlines()
-        if line.startswith("SigCgt:")
-    )
-    return bool(int(line.split()[1], 16) >> (number - 1) & 1)
-
-
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="asks /proc who catches signals")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("delay_s", [0.0, 0.05, 0.2, 0.4, 0.8])
@@ -81,14 +72,11 @@ def test_a_signal_during_the_start_ends_it_with_0(
         text=True,
         env={**os.environ, **environment(tmp_path)},
     ) as process:
-        deadline = time.monotonic() + 20
         # before that it is the interpreter that starts, and no program can answer
-        while not catches(process.pid, signal.SIGHUP):
-            assert time.monotonic() < deadline
-            time.sleep(0.001)
+        wait_until(lambda: catches(process.pid, signal.SIGHUP), process)
         time.sleep(delay_s)
         process.send_signal(number)
-        _, errors = process.communicate(timeout=20)
+        _, errors = process.communicate(timeout=seconds(20))
     assert (process.returncode, errors) == (0, "")
     assert not (tmp_path / "l").exists()
 
@@ -96,7 +84,7 @@ def test_a_signal_during_the_start_ends_it_with_0(
 def test_a_signal_while_streaming_ends_it_too(tmp_path: Path) -> None:
     with (
         emulator("serve", "smoke", "--pace", "asap", environment=environment(tmp_path)) as served,
-        X4M300.open(served.paths[0]) as driver,
+        open_radar(served.paths[0]) as driver,
     ):
         driver.configure_raw()
         driver.start(5.0)
@@ -113,7 +101,7 @@ def test_a_killed_emulator_is_succeeded_by_the_next(tmp_path: Path) -> None:
     assert len(list(links.iterdir())) == 6, "a killed process cleans nothing up"
     with emulator(*arguments, environment=environment(tmp_path)) as second:
         for path in second.paths:
-            with X4M300.open(path) as driver:
+            with open_radar(path) as driver:
                 assert driver.ping() is PongCode.XTS_SPRP_READY
         assert len(list((tmp_path / "xethru").glob("*.json"))) == 1
         assert second.odometry is not None
@@ -144,14 +132,12 @@ def test_a_closed_stdout_does_not_matter(tmp_path: Path) -> None:
     with subprocess.Popen(
         ["sh", "-c", command], env={**os.environ, **environment(tmp_path)}
     ) as process:
-        deadline = time.monotonic() + 20
-        while not (tmp_path / "l" / "radar_1").is_symlink():
-            assert process.poll() is None
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
-        time.sleep(0.2)  # until the loop runs
+        port = tmp_path / "l" / "radar_1"
+        wait_until(port.is_symlink, process)
+        with open_radar(str(port)) as driver:
+            driver.ping()  # the loop runs
         process.terminate()
-        assert process.wait(10) == 0
+        assert process.wait(seconds(10)) == 0
     assert not (tmp_path / "l").exists()
 
 
@@ -175,7 +161,7 @@ def test_a_host_killed_while_streaming_is_followed_by_another(pace: str, tmp_pat
             assert first.stdout.readline() == "streaming\n"
             first.kill()
         time.sleep(0.3)
-        with X4M300.open(served.paths[0]) as second:
+        with open_radar(served.paths[0]) as second:
             second.configure_raw(RawConfig(downconversion=True))
             second.start(17.0)
             frames = list(second.frames(5))
@@ -188,7 +174,7 @@ def test_bare_serves_stock_modules_without_odometry(tmp_path: Path) -> None:
         assert served.odometry is None
         assert len(set(served.serials)) == 3
         for path, serial in zip(served.paths, served.serials, strict=True):
-            with X4M300.open(path) as driver:
+            with open_radar(path) as driver:
                 info = driver.info()
                 assert (info.serial_number, info.mode) == (serial, "RUN")
 
@@ -205,7 +191,7 @@ def test_odometry_comes_whole_under_asap_and_in_time_under_realtime(tmp_path: Pa
             client.setblocking(False)
             data = b""
             while data.count(b"\n") < 4:
-                assert select.select([client], [], [], 10)[0]
+                assert select.select([client], [], [], seconds(10))[0]
                 data += client.recv(65536)
             elapsed_s = (time.monotonic_ns() - served.scene_time_zero_ns) / 1e9
     first = data.decode().splitlines()
@@ -229,7 +215,9 @@ def test_tcp_ports_are_told_and_reach_the_same_modules(tmp_path: Path) -> None:
     with emulator(*arguments, environment=environment(tmp_path)) as served:
         (word,) = (tmp_path / "xethru").glob("*.json")
         for told in json.loads(word.read_text())["devices"]:
-            with socket.create_connection(("127.0.0.1", told["tcp"]), timeout=10) as client:
+            with socket.create_connection(
+                ("127.0.0.1", told["tcp"]), timeout=seconds(10)
+            ) as client:
                 line = Connection(Role.HOST)
                 client.sendall(line.send(SystemGetInfo(item=InfoItem.XTID_SSIC_SERIALNUMBER)))
                 while isinstance(event := line.next_event(), NeedData):

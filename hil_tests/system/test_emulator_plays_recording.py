@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from emulator.identity import Identity
 from emulator.loopback import LoopbackTransport
 from emulator.playback import PlayOptions, played_radars
-from hil_tests.device.serving import Served, emulator
+from hil_tests.device.serving import Served, emulator, open_radar
 from xethru_protocol.codes import PongCode
 from xethru_protocol.driver import X4M300
 from xethru_protocol.messages import BasebandIq
@@ -81,7 +81,7 @@ def test_every_counter_and_every_sample_arrives(
     record_property: Callable[[str, object], None],
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    with X4M300.open(player.paths[0]) as driver:
+    with open_radar(player.paths[0]) as driver:
         frames = list(driver.frames(len(recorded), timeout_s=5.0))
         assert (driver.frames_lost, driver.fault_count) == (0, 0)
     assert len(frames) == 514
@@ -128,7 +128,7 @@ def test_a_host_that_asks_first_hears_it_all_too(
     player: Served, recorded: list[BasebandIq]
 ) -> None:
     for _ in range(2):
-        with X4M300.open(player.paths[0]) as driver:
+        with open_radar(player.paths[0]) as driver:
             assert driver.ping() is PongCode.XTS_SPRP_READY
             assert driver.info().order_code == "X4M300"
             counters = [frame.counter for frame in driver.frames(len(recorded), timeout_s=5.0)]
@@ -154,7 +154,7 @@ def test_real_time_is_kept(recording: Path, recorded: list[BasebandIq]) -> None:
 def test_a_loop_begins_again(recording: Path, recorded: list[BasebandIq]) -> None:
     with (
         emulator("play", recording, "--rate", "0", "--loop") as served,
-        X4M300.open(served.paths[0]) as driver,
+        open_radar(served.paths[0]) as driver,
     ):
         counters = [frame.counter for frame in driver.frames(1200, timeout_s=5.0)]
         assert served.end() == 0

@@ -7,8 +7,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-from hil_tests.device.serving import emulator
-from xethru_protocol.driver import X4M300, RawConfig
+from hil_tests.device.serving import emulator, open_radar
+from hil_tests.patience import seconds
+from xethru_protocol.driver import RawConfig
 
 CTL = (sys.executable, "-m", "emulator.cli", "ctl")
 
@@ -18,7 +19,7 @@ def ctl(*words: str) -> subprocess.CompletedProcess[str]:
         [*CTL, *words],
         capture_output=True,
         text=True,
-        timeout=20,
+        timeout=seconds(20),
         check=False,
     )
 
@@ -30,7 +31,7 @@ def test_what_the_driver_counts_is_what_the_truth_log_says(tmp_path: Path) -> No
     )
     truth = tmp_path / "truth.jsonl"
     arguments = ("serve", "--bare", "--faults", str(scenario), "--truth", str(truth))
-    with emulator(*arguments) as served, X4M300.open(served.paths[0]) as radar:
+    with emulator(*arguments) as served, open_radar(served.paths[0]) as radar:
         radar.configure_raw(RawConfig(frame_area_m=(0.4, 1.0)))
         radar.start(50.0)
         list(radar.frames(30))
@@ -64,7 +65,7 @@ def test_a_wrong_scenario_is_one_line(tmp_path: Path) -> None:
         [sys.executable, "-m", "emulator.cli", "serve", "--bare", "--faults", str(scenario)],
         capture_output=True,
         text=True,
-        timeout=20,
+        timeout=seconds(20),
         check=False,
     )
     assert result.returncode == 1
@@ -77,7 +78,7 @@ def test_the_list_of_faults_is_json() -> None:
         [sys.executable, "-m", "emulator.cli", "faults", "--json"],
         capture_output=True,
         text=True,
-        timeout=20,
+        timeout=seconds(20),
         check=True,
     )
     listed = json.loads(result.stdout)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 from rosbags.highlevel import AnyReader
 
+from hil_tests.patience import wait_until
 from hil_tests.system.short_scene import write_short_scene
 from slam.app.cli import main
 from slam.app.session_reader import open_session
@@ -67,11 +67,7 @@ def test_repair_and_replay_of_what_a_killed_demo_left(
     command = [sys.executable, "-m", "slam.app.cli", "demo", "--wire", "--out", str(out)]
     command += ["--scene", str(write_short_scene(tmp_path)), "--preset", "paper"]
     demo = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    give_up = time.monotonic() + 60
-    while not session.exists() or session.stat().st_size < 1_000_000:
-        assert demo.poll() is None
-        assert time.monotonic() < give_up
-        time.sleep(0.01)
+    wait_until(lambda: session.exists() and session.stat().st_size >= 1_000_000, demo)
     demo.kill()
     demo.wait()
     left = open_session(session)

@@ -10,15 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil_tests.device.serving import emulator
+from hil_tests.device.serving import emulator, open_radar
+from hil_tests.patience import seconds
 from hil_tests.unit.emulator.test_playback_control import samples, write_session
 from xethru_protocol import messages as m
 from xethru_protocol.connection import Connection, Role
-from xethru_protocol.driver import X4M300, RawConfig
+from xethru_protocol.driver import RawConfig
 
 SECOND = 1_000_000_000
 NAMES = ("front_left", "rear_left", "front_right", "rear_right")
-LIMIT_S = 10
+LIMIT_S = seconds(10)
 
 
 @pytest.fixture
@@ -55,7 +56,7 @@ def test_every_radar_plays_at_a_port_of_its_own(session: Path) -> None:
         assert served.serials == tuple(f"20261121000{number}" for number in range(4))
         expected = [sent(number, range(30)) for number in range(4)]
         assert heard(served.paths, len(expected[0])) == expected
-        with X4M300.open(served.paths[2]) as driver:
+        with open_radar(served.paths[2]) as driver:
             driver.configure_raw(RawConfig())
             driver.start(20.0)
             for counter, frame in enumerate(driver.frames(30, timeout_s=5.0)):

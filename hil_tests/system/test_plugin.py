@@ -12,10 +12,11 @@ from xml.etree import ElementTree
 import pytest
 
 from hil_tests.device.serving import emulator
+from hil_tests.patience import seconds
 
 pytestmark = pytest.mark.slow  # each run of pytest takes seconds to start on a busy machine
 
-LIMIT_S = 60
+LIMIT_S = seconds(60)
 
 # What CONTRIBUTING shows as a test of one's own.
 OWN_TEST = """

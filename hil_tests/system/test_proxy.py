@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hil_tests.device.serving import emulator
-from xethru_protocol.driver import X4M300, RawConfig
+from hil_tests.device.serving import emulator, open_radar
+from xethru_protocol.driver import RawConfig
 from xethru_protocol.recordings.wire_capture import read_chunks
 
 SHORT = RawConfig(frame_area_m=(0.4, 1.0))
@@ -22,7 +22,7 @@ def test_no_byte_changes_without_a_fault_and_the_capture_holds_them_all(tmp_path
         emulator("serve", "--bare") as module,
         emulator("proxy", "--port", module.paths[0], "--wire", str(wire)) as proxy,
     ):
-        with X4M300.open(proxy.paths[0]) as radar:
+        with open_radar(proxy.paths[0]) as radar:
             radar.raw_listener = heard
             radar.configure_raw(SHORT)
             radar.start(50.0)
@@ -44,7 +44,7 @@ def test_faults_hit_the_line_of_the_module(tmp_path: Path) -> None:
     with (
         emulator("serve", "--bare") as module,
         emulator("proxy", "--port", module.paths[0], "--faults", str(scenario)) as proxy,
-        X4M300.open(proxy.paths[0]) as radar,
+        open_radar(proxy.paths[0]) as radar,
     ):
         radar.configure_raw(SHORT)
         radar.start(50.0)

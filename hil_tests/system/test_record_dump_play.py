@@ -11,7 +11,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from typing import Any
 import pytest
 
 from hil_tests.device.serving import emulator
+from hil_tests.patience import seconds, wait_until
 from xethru_protocol.cli import main
 
 pytestmark = pytest.mark.slow
@@ -122,7 +122,7 @@ def test_a_signal_leaves_a_complete_recording_and_a_stopped_module(
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
             wait_for_records(out, process)
             process.send_signal(number)
-            printed, _ = process.communicate(timeout=10)
+            printed, _ = process.communicate(timeout=seconds(10))
         assert process.returncode == code
         info = json.loads(xethru("info", "--port", served.paths[0], "--json"))
     summary = json.loads(printed)
@@ -144,7 +144,7 @@ def test_unplugging_keeps_what_came(
         ) as process:
             wait_for_records(out, process)
             served.process.kill()
-            printed, errors = process.communicate(timeout=10)
+            printed, errors = process.communicate(timeout=seconds(10))
     assert (process.returncode, printed) == (1, "")
     (line,) = errors.splitlines()
     assert line.startswith(f"xethru record: {served.paths[0]} was disconnected")
@@ -156,11 +156,8 @@ def test_unplugging_keeps_what_came(
 
 def wait_for_records(out: Path, process: subprocess.Popen[str]) -> None:
     """Wait until some frames are on disk."""
-    deadline = time.monotonic() + 20
-    while not any(path.stat().st_size > 50_000 for path in out.glob("xethru_datafloat_*")):
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    files = "xethru_datafloat_*"
+    wait_until(lambda: any(path.stat().st_size > 50_000 for path in out.glob(files)), process)
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")

@@ -6,7 +6,6 @@ import json
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ import pytest
 
 from emulator.scene import load_scene
 from hil_tests.device.serving import emulator
+from hil_tests.patience import seconds, wait_until
 from hil_tests.system.short_scene import write_short_scene
 from slam.app.cli import main
 from slam.app.rig_file import RigFile, RigRadar, write_rig
@@ -37,7 +37,7 @@ class Robot:
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
     folder = tmp_path_factory.mktemp("robot")
-    scene_path = write_short_scene(folder)
+    scene_path = write_short_scene(folder, repeats=20)  # it drives on in all tests of this file
     scene = load_scene(scene_path)
     rig = folder / "robot.toml"
     write_rig(
@@ -92,7 +92,7 @@ def test_a_run_from_stdin_ends_when_it_is_told_to_and_replays_to_the_last_bit(
             capture_output=True,
             text=True,
             check=False,
-            timeout=60,
+            timeout=seconds(60),
         )
         wheels.terminate()
     assert process.returncode == 0, process.stderr
@@ -135,9 +135,10 @@ def test_a_signal_leaves_a_session_that_replays(
         stderr=subprocess.PIPE,
         text=True,
     ) as process:
-        wait_for_size(out / "session.mcap", 200_000)
+        session = out / "session.mcap"
+        wait_until(lambda: session.exists() and session.stat().st_size >= 200_000, process)
         process.send_signal(which)
-        said = process.communicate(timeout=30)[1]
+        said = process.communicate(timeout=seconds(30))[1]
     assert process.returncode == code
     if which is not signal.SIGKILL:
         last = said.splitlines()[-1]
@@ -156,13 +157,6 @@ def test_a_signal_leaves_a_session_that_replays(
         ).read_bytes()
     n_again = len((tmp_path / "again" / "estimate.tum").read_text().splitlines())
     assert n_again > 5
-
-
-def wait_for_size(path: Path, size: int) -> None:
-    give_up = time.monotonic() + 30.0
-    while not path.exists() or path.stat().st_size < size:
-        assert time.monotonic() < give_up, "no session grew"
-        time.sleep(0.05)
 
 
 def test_what_cannot_begin_says_why_in_one_line(

@@ -6,13 +6,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from hil_tests.patience import seconds, wait_until
 from hil_tests.system.short_scene import write_short_scene
 from slam.app.cli import main
 from slam.app.emulated_rig import end_counter
@@ -26,7 +26,7 @@ def sweep(tmp_path: Path, jobs: int) -> dict[str, Any]:
     command = [sys.executable, "-m", "slam.app.cli", "sweep", "--scene", str(scene)]
     command += ["--preset", "paper"]
     command += ["--seeds", "3", "--jobs", str(jobs), "--json", str(out)]
-    run = subprocess.run(command, capture_output=True, text=True, check=True, timeout=100)
+    run = subprocess.run(command, capture_output=True, text=True, check=True, timeout=seconds(100))
     assert run.stdout.startswith("short, preset paper, 3 seeds (simulated): SLAM ATE median")
     result: dict[str, Any] = json.loads(out.read_text())
     return result
@@ -58,19 +58,18 @@ def test_ctrl_c_ends_a_sweep_and_its_workers(tmp_path: Path) -> None:
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, process_group=0
     )
     part = tmp_path / "o.json.part"
-    runs: list[Any] = []
-    give_up = time.monotonic() + 60
-    while not runs:
-        assert time.monotonic() < give_up, "no run was ever done"
-        assert process.poll() is None
-        time.sleep(0.05)
+
+    def runs_done() -> int:
         with contextlib.suppress(OSError, ValueError):  # not there yet, or being written
-            runs = json.loads(part.read_text())["runs"]
+            return len(json.loads(part.read_text())["runs"])
+        return 0
+
+    wait_until(runs_done, process)
     # to the whole group, as a terminal does
     os.killpg(process.pid, signal.SIGINT)
-    _, stderr = process.communicate(timeout=60)
+    _, stderr = process.communicate(timeout=seconds(60))
     assert process.returncode == 130
-    done = len(json.loads(part.read_text())["runs"])
+    done = runs_done()
     *progress, last = stderr.splitlines()
     assert last == f"uwb-slam: stopped by SIGINT; {done} of 50 runs are in {part}", stderr
     assert len(progress) == done
@@ -93,7 +92,11 @@ def test_ctrl_c_while_workers_start(tmp_path: Path) -> None:
         "raise SystemExit(main(['sweep', '--jobs', '2', '--json', out]))\n"
     )
     process = subprocess.run(
-        [sys.executable, str(script)], capture_output=True, text=True, process_group=0, timeout=60
+        [sys.executable, str(script)],
+        capture_output=True,
+        text=True,
+        process_group=0,
+        timeout=seconds(60),
     )
     assert (process.returncode, process.stdout) == (130, "")
     assert process.stderr == "uwb-slam: stopped by SIGINT\n"

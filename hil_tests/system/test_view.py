@@ -7,9 +7,8 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,11 +17,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from hil_tests.patience import seconds, wait_until
 from hil_tests.system.recorded_session import (
     FAULT,
     record_session,
     write_shorter_scene,
 )
+from slam.app import rerun_recording
 from slam.app.cli import main
 from slam.app.errors import AppError
 from slam.app.live_view import LiveView
@@ -145,12 +146,12 @@ def test_a_page_is_served_here_until_a_signal(viewed: Viewed) -> None:
         url = process.stderr.readline().split()[-1]
         assert "stays at" in process.stderr.readline()
         assert url.startswith("http://127.0.0.1:")
-        with urllib.request.urlopen(url, timeout=10) as page:
+        with urllib.request.urlopen(url, timeout=seconds(10)) as page:
             assert b"wasm" in page.read()
         port = int(url.split(":")[2].split("/")[0])
         process.send_signal(signal.SIGINT)
         assert "stopped by SIGINT" in process.stderr.read()
-        assert process.wait(timeout=10) == 128 + signal.SIGINT
+        assert process.wait(timeout=seconds(10)) == 128 + signal.SIGINT
     with socket.socket() as probe:
         assert probe.connect_ex(("127.0.0.1", port)) != 0  # the viewer has ended with it
 
@@ -196,7 +197,10 @@ def saving_viewer(saved: Path) -> Iterator[str]:
         process.terminate()
 
 
-def test_a_viewer_gets_every_row_that_a_file_gets(viewed: Viewed, tmp_path: Path) -> None:
+def test_a_viewer_gets_every_row_that_a_file_gets(
+    viewed: Viewed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rerun_recording, "_VIEWER_CLOSE_LIMIT_S", seconds(5))
     expected = without_pictures(viewed.rrd)
     with saving_viewer(saved := tmp_path / "saved.rrd") as url:
         session = open_session(viewed.session)
@@ -210,7 +214,8 @@ def test_a_viewer_gets_every_row_that_a_file_gets(viewed: Viewed, tmp_path: Path
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")  # of one that is still written
-def test_a_demo_is_watched_while_it_runs(tmp_path: Path) -> None:
+def test_a_demo_is_watched_while_it_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rerun_recording, "_VIEWER_CLOSE_LIMIT_S", seconds(5))
     scene, out = str(write_shorter_scene(tmp_path)), tmp_path / "out"
     out.mkdir()
     (out / "report.html").write_text("of an earlier run")
@@ -252,12 +257,6 @@ def without_pictures(path: Path) -> dict[str, int]:
 def connects(port: int) -> bool:
     with socket.socket() as probe:
         return probe.connect_ex(("127.0.0.1", port)) == 0
-
-
-def wait_until(is_true: Callable[[], bool], limit_s: float = 10.0) -> None:
-    give_up = time.monotonic() + limit_s
-    while not is_true() and time.monotonic() < give_up:
-        time.sleep(0.1)
 
 
 def kill_viewer() -> None:

@@ -13,6 +13,7 @@ import pytest
 
 from emulator.cli import main
 from emulator.path_lock import locked
+from hil_tests.patience import seconds
 
 
 @pytest.mark.parametrize(
@@ -137,12 +138,12 @@ def test_ctrl_c_ends_a_question_that_nobody_answers(tmp_path: Path) -> None:
         silent.listen()
         command = [sys.executable, "-m", "emulator.cli", "ctl", str(tmp_path / "s"), "state"]
         with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as asking:
-            silent.settimeout(10)
+            silent.settimeout(seconds(10))
             connection, _ = silent.accept()
             with connection:
                 assert connection.recv(100).endswith(b"\n")
                 asking.send_signal(signal.SIGINT)
-                _, said = asking.communicate(timeout=5)
+                _, said = asking.communicate(timeout=seconds(5))
     assert (asking.returncode, said) == (130, "")
 
 

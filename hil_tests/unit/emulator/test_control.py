@@ -16,6 +16,7 @@ from emulator.cli_faults import request_of
 from emulator.control import Control
 from emulator.control_socket import LONGEST_LINE, ControlSocket
 from hil_tests.faulty import FaultyLine
+from hil_tests.patience import seconds
 from xethru_protocol.errors import Disconnected
 
 
@@ -154,7 +155,7 @@ def test_clients_of_the_socket_are_served_one_line_after_the_other(tmp_path: Pat
     with socket.socket(socket.AF_UNIX) as one, socket.socket(socket.AF_UNIX) as flood:
         one.connect(str(path))
         flood.connect(str(path))
-        one.settimeout(1.0)
+        one.settimeout(seconds(1))
         flood.setblocking(False)
         one.sendall(b'{"verb":"state"}\n{"verb":"reset"}\n{"verb":')
         turn(selector)

@@ -10,12 +10,15 @@ from pathlib import Path
 import pytest
 
 from emulator.link import LinkError, PtyLink
+from hil_tests.patience import seconds
 
 
 def read_exactly(descriptor: int, count: int) -> bytes:
     data = b""
     while len(data) < count:
-        assert select.select([descriptor], [], [], 5)[0], f"only {len(data)} of {count} bytes"
+        assert select.select([descriptor], [], [], seconds(5))[0], (
+            f"only {len(data)} of {count} bytes"
+        )
         data += os.read(descriptor, count - len(data))
     return data
 
@@ -30,7 +33,7 @@ def test_every_byte_passes_unchanged_for_a_client_that_sets_nothing_up(tmp_path:
             os.write(client, every_byte)
             read_exactly_from_link = b""
             while len(read_exactly_from_link) < 256:
-                select.select([link], [], [], 5)
+                select.select([link], [], [], seconds(5))
                 read_exactly_from_link += link.read()
             assert read_exactly_from_link == every_byte
             assert link.read() == b"", "nothing is echoed"

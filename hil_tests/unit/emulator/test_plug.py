@@ -17,6 +17,7 @@ from emulator.device_ports import DevicePorts, LinkOptions, NamedDevice, open_po
 from emulator.options import DeviceOptions
 from emulator.pace import Pace
 from emulator.server import Server
+from hil_tests.patience import seconds
 from hil_tests.unit.emulator.doubles import IDENTITY, RampSource
 from xethru_protocol import messages as m
 from xethru_protocol.connection import Connection, Role
@@ -100,7 +101,7 @@ def test_an_open_port_hangs_up_and_its_name_is_gone_until_the_module_is_back(ben
     assert bench.names() == ["radar"]
     bench.at_ms(RESTART_MS)
     assert bench.names() == []
-    assert select.select([host], [], [], 5)[0], "a blocked reader wakes up"
+    assert select.select([host], [], [], seconds(5))[0], "a blocked reader wakes up"
     with contextlib.suppress(OSError):  # EIO
         assert os.read(host, 1) == b"", "end of file"
     with pytest.raises(OSError, match="Input/output error"):
@@ -151,7 +152,7 @@ def test_a_tcp_client_is_hung_up_on_and_none_is_let_in_meanwhile(with_tcp: Bench
     assert isinstance(port, int)
 
     def is_let_in() -> bool:
-        with socket.create_connection(("127.0.0.1", port), timeout=5) as client:
+        with socket.create_connection(("127.0.0.1", port), timeout=seconds(5)) as client:
             client.sendall(Connection(Role.HOST).send(m.ModReset()))
             for _ in range(20):
                 with_tcp.server.turn(longest_wait_s=0.001)
@@ -159,7 +160,7 @@ def test_a_tcp_client_is_hung_up_on_and_none_is_let_in_meanwhile(with_tcp: Bench
                 return client.recv(100) != b""
             return False
 
-    with socket.create_connection(("127.0.0.1", port), timeout=5) as first:
+    with socket.create_connection(("127.0.0.1", port), timeout=seconds(5)) as first:
         with_tcp.reset(first.fileno())
         with_tcp.at_ms(RESTART_MS)
         assert first.recv(1) == b""

@@ -21,6 +21,7 @@ from emulator.link import PtyLink
 from emulator.pace import Pace
 from emulator.server import PACKETS_PER_TURN, Port, Server
 from hil_tests.bench.pair_line import PairLine
+from hil_tests.patience import seconds
 from hil_tests.unit.emulator.doubles import ramp_device
 from xethru_protocol import messages as m
 from xethru_protocol.codes import SensorMode, X4Setting
@@ -36,8 +37,7 @@ class Clock:
         return self.now_ns
 
 
-LIMIT_S = 60
-"""Only ends a test that has failed anyway."""
+LIMIT_S = seconds(60)
 
 
 class PairLink(PairLine):
@@ -270,7 +270,7 @@ def test_stop_ends_a_waiting_loop(asap: Bench) -> None:
     loop.start()
     time.sleep(0.2)  # nothing is due and nobody speaks: by now it waits without a limit
     asap.server.stop()
-    loop.join(LIMIT_S / 6)
+    loop.join(LIMIT_S)
     assert not loop.is_alive()
 
 

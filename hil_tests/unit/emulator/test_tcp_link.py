@@ -16,6 +16,7 @@ import pytest
 from emulator.device_ports import DevicePorts, LinkOptions, NamedDevice, open_ports
 from emulator.link import LinkError
 from emulator.server import Server
+from hil_tests.patience import seconds, wait_until
 from hil_tests.unit.emulator.doubles import ramp_device
 from xethru_protocol import messages as m
 from xethru_protocol.codes import SensorMode, X4Setting
@@ -23,7 +24,7 @@ from xethru_protocol.connection import Connection, Role
 from xethru_protocol.packets import NeedData
 
 PONG = m.Pong(value=0xAAEEAEEA)
-LIMIT_S = 30
+LIMIT_S = seconds(30)
 """Only ends a test that has failed anyway."""
 
 
@@ -88,9 +89,11 @@ class Host:
         return self.hear()
 
     def is_hung_up(self) -> bool:
-        self.bench.turns()
-        if not select.select([self.fd], [], [], 5)[0]:
-            return False
+        def is_readable() -> list[int]:
+            self.bench.turns()
+            return select.select([self.fd], [], [], 0)[0]
+
+        wait_until(is_readable)
         try:
             return os.read(self.fd, 65536) == b""
         except ConnectionError:

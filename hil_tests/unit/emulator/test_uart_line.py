@@ -22,6 +22,7 @@ from emulator.server import Port
 from emulator.uart_bits import what_is_heard
 from emulator.uart_line import UartLine
 from emulator.usb_line import UsbLine
+from hil_tests.patience import seconds
 from hil_tests.unit.emulator.doubles import ramp_device
 from xethru_protocol import messages as m
 from xethru_protocol.codes import SensorMode, X4Setting
@@ -249,8 +250,8 @@ def link(tmp_path: Path) -> Iterator[PtyLink]:
         yield made
 
 
-def read_within_5_s(link: PtyLink) -> bytes:
-    deadline = time.monotonic() + 5
+def read_all(link: PtyLink) -> bytes:
+    deadline = time.monotonic() + seconds(5)
     while time.monotonic() < deadline:
         select.select([link], [], [], 0.05)
         if data := link.read():
@@ -273,10 +274,10 @@ def test_bytes_pass_whole_and_a_flush_of_output_is_told(link: PtyLink) -> None:
     os.write(host, bytes(range(256)))
     data = b""
     while len(data) < 256:
-        data += read_within_5_s(link)
+        data += read_all(link)
     assert data == bytes(range(256))
     termios.tcflush(host, termios.TCOFLUSH)
-    select.select([link], [], [], 5)
+    select.select([link], [], [], seconds(5))
     link.read()
     assert link.flushes == ["flushed"]  # type: ignore[attr-defined] # for the test
     os.close(host)

@@ -43,8 +43,9 @@ def only_own_emulators(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 @pytest.fixture
 def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wait less for modules that never answer."""
+    """Wait less for modules that never answer, and longer at a rate at which one may."""
     monkeypatch.setattr(patient, "_PATIENCE_S", 0.3)
+    monkeypatch.setattr(patient, "_GLANCE_S", 1.0)
 
 
 def examined(capsys: Capture, *arguments: str) -> tuple[int, list[dict[str, Any]]]:

@@ -5,13 +5,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
+from hil_tests.patience import seconds, wait_until
 from hil_tests.unit.xethru_protocol.pty_module import PtyModule
 from xethru_protocol.cli import main, output, session
 from xethru_protocol.driver import X4M300
@@ -102,11 +102,10 @@ def test_the_module_is_stopped_when_the_terminal_closes(
             preexec_fn=lambda: signal.signal(signal.SIGHUP, before),
         ) as process,
     ):
-        while not any(path.stat().st_size for path in out.glob("xethru_datafloat_*")):
-            assert process.poll() is None
-            time.sleep(0.01)
+        files = "xethru_datafloat_*"
+        wait_until(lambda: any(path.stat().st_size for path in out.glob(files)), process)
         process.send_signal(signal.SIGHUP)
-        _, errors = process.communicate(timeout=10)
+        _, errors = process.communicate(timeout=seconds(10))
         assert module.fps == 0
     assert (process.returncode, errors) == (code, b"")
     kept = describe_recording(out)  # complete: no faults

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from hil_tests.patience import patient_ns, seconds
 from hil_tests.unit.xethru_protocol.pty_machine import PtyMachine
 from xethru_protocol import messages as m
 from xethru_protocol.async_driver import AsyncX4M300
@@ -41,7 +42,7 @@ def return_as(machine: PtyMachine, name: str) -> threading.Timer:
 
 @pytest.mark.parametrize("name", ["home", "elsewhere"])
 def test_radar_goes_on_at_the_port_its_module_returned_to(machine: PtyMachine, name: str) -> None:
-    with X4M300.open(machine.path("home"), reconnect_s=10.0) as radar:
+    with X4M300.open(machine.path("home"), clock=patient_ns, reconnect_s=10.0) as radar:
         radar.configure_raw()
         radar.start(17.0)
         assert [got.counter for got in radar.frames(2)] == [0, 1]
@@ -61,7 +62,9 @@ def test_radar_goes_on_at_the_port_its_module_returned_to(machine: PtyMachine, n
 @pytest.mark.parametrize("name", ["home", "elsewhere"])
 def test_asynchronous_radar_does_too_while_two_tasks_use_it(machine: PtyMachine, name: str) -> None:
     async def use() -> None:
-        async with AsyncX4M300.open(machine.path("home"), reconnect_s=10.0) as radar:
+        async with AsyncX4M300.open(
+            machine.path("home"), clock=patient_ns, reconnect_s=10.0
+        ) as radar:
             await radar.configure_raw()
             await radar.start(17.0)
             assert (await radar.read_frame()).counter == 0
@@ -85,7 +88,7 @@ def test_asynchronous_radar_does_too_while_two_tasks_use_it(machine: PtyMachine,
 
 def test_frames_are_read_while_another_task_asks(machine: PtyMachine) -> None:
     async def use() -> None:
-        async with AsyncX4M300.open(machine.path("home")) as radar:
+        async with AsyncX4M300.open(machine.path("home"), clock=patient_ns) as radar:
             await radar.configure_raw()
             await radar.start(17.0)
             counters: list[int] = []
@@ -106,7 +109,7 @@ def test_frames_are_read_while_another_task_asks(machine: PtyMachine) -> None:
 
 def test_waiting_task_can_be_cancelled_and_stops_nobody_else(machine: PtyMachine) -> None:
     async def use() -> None:
-        async with AsyncX4M300.open(machine.path("home")) as radar:
+        async with AsyncX4M300.open(machine.path("home"), clock=patient_ns) as radar:
             waiting = asyncio.create_task(radar.read_frame(60.0))
             await asyncio.sleep(0.02)
             await radar.ping()  # heard by the task that reads
@@ -133,7 +136,7 @@ def test_cancelled_read_loses_no_bytes() -> None:
             reading.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await reading
-            assert await line.read(1.0) == b"first"
+            assert await line.read(seconds(1)) == b"first"
         finally:
             line.close()
             os.close(master)
@@ -178,7 +181,7 @@ def test_no_timer_outlives_the_read_that_set_it(cancel: bool) -> None:
 
 def test_closing_wakes_the_task_that_reads(machine: PtyMachine) -> None:
     async def use() -> None:
-        radar = AsyncX4M300.open(machine.path("home"), reconnect_s=10.0)
+        radar = AsyncX4M300.open(machine.path("home"), clock=patient_ns, reconnect_s=10.0)
         await radar.ping()
         waiting = asyncio.create_task(radar.read_frame(60.0))
         await asyncio.sleep(0.02)
@@ -191,7 +194,7 @@ def test_closing_wakes_the_task_that_reads(machine: PtyMachine) -> None:
 
 def test_command_that_was_cancelled_leaves_its_answer_to_nobody(machine: PtyMachine) -> None:
     async def use() -> None:
-        async with AsyncX4M300.open(machine.path("home")) as radar:
+        async with AsyncX4M300.open(machine.path("home"), clock=patient_ns) as radar:
             asking = asyncio.create_task(radar.info())
             await asyncio.sleep(0)
             await asyncio.sleep(0)
@@ -204,7 +207,7 @@ def test_command_that_was_cancelled_leaves_its_answer_to_nobody(machine: PtyMach
 
 
 def test_asynchronous_line_that_takes_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("xethru_protocol.async_transport._WRITE_TIMEOUT_S", 0.1)
+    monkeypatch.setattr("xethru_protocol.async_transport._WRITE_TIMEOUT_S", 0.3)
     master, slave = pty.openpty()
     tty.setraw(slave)
 
@@ -216,7 +219,7 @@ def test_asynchronous_line_that_takes_nothing_is_given_up(monkeypatch: pytest.Mo
             nonlocal ticks
             while True:
                 ticks += 1
-                await asyncio.sleep(0.01)
+                await asyncio.sleep(0)
 
         ticking = asyncio.create_task(tick())
         with pytest.raises(Disconnected, match="takes no data any more"):

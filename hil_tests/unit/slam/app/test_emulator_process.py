@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from hil_tests.patience import wait_until
 from slam.app import emulator_process
 from slam.app.emulator_process import EmulatorProcess
 from slam.app.errors import EmulatorError
@@ -61,8 +62,7 @@ def test_one_that_ignores_sigterm_is_killed(
         "while :; do sleep 0.05; done\n"
     )
     with EmulatorProcess("lab", 0):
-        while not pid_file.exists():
-            pass
+        wait_until(pid_file.exists)
     with pytest.raises(ProcessLookupError):
         os.kill(int(pid_file.read_text()), 0)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from hil_tests.patience import seconds
 from slam.app.errors import OdometryError, UsageError
 from slam.app.odometry_source import LineSource, SourceKind, parse_source, read_lines
 
@@ -40,7 +41,7 @@ def threads() -> Iterator[Callable[[Callable[[], object]], None]]:
 
     yield start
     for thread in started:
-        thread.join(timeout=5.0)
+        thread.join(timeout=seconds(5))
         assert not thread.is_alive()
 
 

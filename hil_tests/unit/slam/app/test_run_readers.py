@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hil_tests.patience import seconds
 from slam.app import run_readers
 from slam.app.odometry_source import parse_source
 from slam.app.run_events import Event, FrameCame, OdometryEnded, OdometryLine, RadarBack, RadarLost
@@ -62,7 +63,7 @@ def told_until(
     events: list[Event] = []
     with Readers(links, parse_source(str(source)), inbox):
         while not done(events):
-            events.append(inbox.get(timeout=10.0))
+            events.append(inbox.get(timeout=seconds(10)))
     return events
 
 

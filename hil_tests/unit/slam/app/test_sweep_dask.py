@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from hil_tests.patience import seconds
 from slam.app import sweep_dask
 from slam.app.cli import main
 from slam.app.errors import AppError
@@ -74,7 +75,7 @@ def test_somebody_else_at_the_port_is_1(
         thread.start()
         address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
         assert main(["sweep", "--dask", address, "--json", str(tmp_path / "o.json")]) == 1
-    thread.join(timeout=5)
+    thread.join(timeout=seconds(5))
     text = capsys.readouterr()
     assert "no Dask scheduler answers there" in text.err
     assert text.err.count("\n") == 1

@@ -87,7 +87,6 @@ def test_both_back_ends_solve_the_same_park() -> None:
     assert known.given[0] == (min(drive.labels), 0)
 
 
-@pytest.mark.timeout(60)  # imports and a PNG: a second or two of work, more on a busy machine
 def test_the_experiment_draws_and_counts(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -11,9 +11,13 @@ from pathlib import Path
 
 import pytest
 
+from hil_tests.patience import seconds
 from slam.app.workers import _throw_away
 
-SCRIPT = """\
+LIMIT_S = seconds(15)
+OUTLASTS_S = 10 * LIMIT_S
+
+SCRIPT = f"""\
 import os, signal, sys, time
 from slam.app.workers import worker_results
 
@@ -23,7 +27,7 @@ def work(task):
     if task == "die":
         os.kill(os.getpid(), signal.SIGKILL)
     if task == "sleep":
-        time.sleep(60)
+        time.sleep({OUTLASTS_S})
     return os.getpid()
 
 if __name__ == "__main__":
@@ -51,7 +55,7 @@ def test_every_worker_begins_with_the_groups_signals_blocked(tmp_path: Path) -> 
         "print(*(int(one) for one in signal.pthread_sigmask(signal.SIG_BLOCK, ())))\n"
     )
     with started(tmp_path, body) as process:
-        output, errors = process.communicate(timeout=15)
+        output, errors = process.communicate(timeout=LIMIT_S)
     assert (process.returncode, errors) == (0, "")
     blocked = sorted((signal.SIGINT, signal.SIGTERM, signal.SIGHUP))
     *workers, parent = output.split("\n")[:-1]
@@ -64,14 +68,14 @@ def test_no_worker_survives_a_killed_parent(tmp_path: Path) -> None:
     body = (
         "with worker_results(work, [('pid',), ('sleep',), ('sleep',)], 2) as results:\n"
         "    print(next(results), flush=True)\n"
-        "    time.sleep(60)\n"
+        f"    time.sleep({OUTLASTS_S})\n"
     )
     with started(tmp_path, body) as process:
         assert process.stdout is not None
         assert process.stdout.readline().strip().isdigit()
         process.kill()
         # every worker holds these pipes: they end when the last of them has, or this times out
-        process.communicate(timeout=15)
+        process.communicate(timeout=LIMIT_S)
 
 
 def test_work_that_is_thrown_away_ends_at_once_and_without_a_word(tmp_path: Path) -> None:
@@ -82,7 +86,7 @@ def test_work_that_is_thrown_away_ends_at_once_and_without_a_word(tmp_path: Path
         "    next(results)\n"
     )
     with started(tmp_path, body) as process:
-        output, errors = process.communicate(timeout=15)
+        output, errors = process.communicate(timeout=LIMIT_S)
     assert (process.returncode, output, errors) == (0, "", "")
 
 
@@ -95,7 +99,7 @@ def test_what_killed_workers_leave_is_removed_without_a_word(tmp_path: Path) -> 
         "print('PYTHONWARNINGS' in os.environ)\n"
     )
     with started(tmp_path, body) as process:
-        output, errors = process.communicate(timeout=15)
+        output, errors = process.communicate(timeout=LIMIT_S)
     assert (process.returncode, output, errors) == (0, "False\n", "")
 
 
@@ -109,7 +113,7 @@ def test_a_worker_that_dies_breaks_the_results(tmp_path: Path) -> None:
         "    print('broken')\n"
     )
     with started(tmp_path, body) as process:
-        output, errors = process.communicate(timeout=15)
+        output, errors = process.communicate(timeout=LIMIT_S)
     assert (process.returncode, output, errors) == (0, "broken\n", "")
 
 
