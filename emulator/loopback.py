@@ -8,7 +8,7 @@ clock, ``X4M300(transport, clock=transport.clock_ns)``, and its time limits are 
 from __future__ import annotations
 
 from emulator.device import Device
-from xethru_protocol.errors import Disconnected
+from xethru_protocol.wire.errors import Disconnected
 
 __all__ = ["LoopbackTransport"]
 

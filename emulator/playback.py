@@ -1,23 +1,38 @@
-"""From a recording on disk to the modules that play it."""
+"""Recordings played at emulated ports.
+
+Both are pure. A `PlayClock` maps times of the recording to times of the device, piece by piece:
+within a piece ``due = anchor + (position - anchor position) / rate``, and every pause, seek and
+change of rate begins a new piece. `KindSteps` remembers which kinds were asked for when.
+
+Playing begins anew for every host that opens the port: at once when it starts the radar (FPS > 0
+or SETMODE RUN), else after half a second without a command, so that a host that only listens has
+had time to flush its side. It ends when the last host has closed the port. Meanwhile the module
+answers every command like any other; FPS, mode and geometry settings are acknowledged and change
+nothing about what is played. Nothing is dropped: a host that reads slowly makes the recording
+wait. A host that only asks something and leaves within half a second hears none of it.
+
+A host sets a frame area, reads back what the module made of it, and takes only frames of that
+size. While a recording plays, its frames are what they are, so the read-back must be theirs.
+"""
 
 from __future__ import annotations
 
+import math
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from emulator.chip import Chip
-from emulator.commands import Module
+import numpy as np
+
+from emulator.chip.chip import Chip
 from emulator.device import BootTiming, Device
-from emulator.echo import echo_source
-from emulator.identity import Identity
-from emulator.outbox import LosslessOutbox
-from emulator.playback_control import is_answer
-from emulator.played_chip import FrameSurvey, PlayedChip, PlayedFrames
-from emulator.player import NOMINAL_PERIOD_NS, NS_PER_S, PlayStream, TimedMessage, schedule
-from emulator.scene import empty_room
-from xethru_protocol.messages import Response
+from emulator.echo.echo import echo_source
+from emulator.module.memory import Identity
+from emulator.module.module import Module
+from emulator.module.outbox import LosslessOutbox, MessageStream
+from emulator.scene.scene import empty_room
 from xethru_protocol.recordings import (
     RadarFacts,
     RecordingError,
@@ -26,8 +41,570 @@ from xethru_protocol.recordings import (
     recording_radars,
 )
 from xethru_protocol.recordings.records import TimedMessages
+from xethru_protocol.wire import x4
+from xethru_protocol.wire.codes import ResponseCode, SensorMode, X4Setting
+from xethru_protocol.wire.messages import (
+    Command,
+    DataFloat,
+    ReplyFloat,
+    Response,
+    SetMode,
+    X4DriverSet,
+    X4Value,
+)
+from xethru_protocol.wire.table import ROWS, UnknownMessage
 
-__all__ = ["PlayOptions", "PlayedRadar", "RecordingError", "played_radars"]
+SLOWEST_RATE = 1e-6
+"""Least rate above 0 that a playback in progress takes; a year for half a minute."""
+_UNKNOWN = "unknown"
+_ANSWERS = frozenset(
+    (
+        ResponseCode.XTS_SPR_ACK,
+        ResponseCode.XTS_SPR_ERROR,
+        ResponseCode.XTS_SPR_PONG,
+        ResponseCode.XTS_SPR_REPLY,
+        ResponseCode.XTS_SPR_HIL,
+    )
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlayState:
+    """What a playback is doing.
+
+    Attributes
+    ----------
+    playing
+        Whether a host has the port and something is left to play.
+    paused
+        Whether it was told to pause.
+    position_ns
+        Time of the recording that has been reached, ns since its first message; below its
+        beginning in the gap between two rounds.
+    rate
+        Multiple of real time; 0 for as fast as the port takes it.
+    loop
+        Whether it begins again at the end.
+    kinds
+        Which kinds it plays, as from `kind_of`; None for all.
+    """
+
+    playing: bool
+    paused: bool
+    position_ns: int
+    rate: float
+    loop: bool
+    kinds: frozenset[str] | None
+
+
+class PlayClock:
+    """The time of a recording on the clock of the device that plays it.
+
+    Parameters
+    ----------
+    rate
+        Multiple of real time; at 0 everything is due at once, and the position is that of the
+        last message played.
+    """
+
+    def __init__(self, rate: float) -> None:
+        self.rate = rate
+        self.paused = False
+        self._anchor_ns = 0
+        self._anchor_position_ns = 0
+
+    def start(self, position_ns: int, at_ns: int) -> None:
+        """Be at a position of the recording at a time of the device, which may lie ahead."""
+        self._anchor_position_ns = position_ns
+        self._anchor_ns = at_ns
+
+    @property
+    def begins_ns(self) -> int:
+        """When the piece in force begins, or began."""
+        return self._anchor_ns
+
+    def begin_at(self, at_ns: int) -> None:
+        """Begin the piece in force, which has not begun, at another time."""
+        self._anchor_ns = at_ns
+
+    def due_ns(self, position_ns: int) -> int | None:
+        """Return when the device's clock reaches a position; None while paused."""
+        if self.paused:
+            return None
+        if not self.rate:
+            return self._anchor_ns
+        return self._anchor_ns + round((position_ns - self._anchor_position_ns) / self.rate)
+
+    def position_ns(self, now_ns: int) -> int:
+        """Return the position that a time of the device has reached."""
+        if self.paused or not self.rate or now_ns <= self._anchor_ns:
+            return self._anchor_position_ns
+        return self._anchor_position_ns + math.floor((now_ns - self._anchor_ns) * self.rate)
+
+    def reached(self, position_ns: int) -> None:
+        """Note that a message was played; at rate 0 nothing else moves the position."""
+        if not self.rate:
+            self._anchor_position_ns = max(self._anchor_position_ns, position_ns)
+
+    def wrap(self, round_ns: int) -> None:
+        """Count positions from the next round on, which begins a round's length later."""
+        self._anchor_position_ns -= round_ns
+
+    def pause(self, now_ns: int) -> None:
+        """Stand still."""
+        self._settle(now_ns)
+        self.paused = True
+
+    def resume(self, now_ns: int) -> None:
+        """Go on from where it stood still, if it does."""
+        if self.paused:
+            self.paused = False
+            self._anchor_ns = max(self._anchor_ns, now_ns)
+
+    def set_rate(self, rate: float, now_ns: int) -> None:
+        """Go on from the position of now at another rate."""
+        self._settle(now_ns)
+        self.rate = rate
+
+    def _settle(self, now_ns: int) -> None:
+        if now_ns > self._anchor_ns:
+            self._anchor_position_ns = self.position_ns(now_ns)
+            self._anchor_ns = now_ns
+
+
+class KindSteps:
+    """Which kinds are played from which position of the recording on.
+
+    The kinds in force when the clock passes a message decide about it, even where a slow host
+    has made it wait since.
+    """
+
+    def __init__(self, kinds: frozenset[str] | None) -> None:
+        self._steps: list[tuple[int, frozenset[str] | None]] = [(0, kinds)]
+
+    @property
+    def newest(self) -> frozenset[str] | None:
+        """The kinds in force now; None for all."""
+        return self._steps[-1][1]
+
+    def change(self, kinds: frozenset[str] | None, position_ns: int) -> None:
+        """Play other kinds from a position on."""
+        while len(self._steps) > 1 and self._steps[-1][0] >= position_ns:
+            self._steps.pop()
+        self._steps.append((position_ns, kinds))
+
+    def forget(self) -> None:
+        """Have the newest kinds in force everywhere, as after a seek."""
+        self._steps = [(0, self.newest)]
+
+    def forget_before(self, position_ns: int) -> None:
+        """Drop what only concerns messages before a position."""
+        while len(self._steps) > 1 and self._steps[1][0] <= position_ns:
+            del self._steps[0]
+
+    def passes(self, position_ns: int, message: Response) -> bool:
+        """Whether a message at a position is played."""
+        _, kinds = self._steps[0]
+        for begin_ns, later in self._steps[1:]:
+            if begin_ns <= position_ns:
+                kinds = later
+        return kinds is None or kind_of(message) in kinds
+
+
+def kind_of(message: Response) -> str:
+    """Return the kind of a message, as filters name it.
+
+    Examples
+    --------
+    >>> from xethru_protocol.wire.messages import PresenceSingle
+    >>> kind_of(PresenceSingle(counter=0, state=0, distance_m=0, direction=0, signal_quality=0))
+    'presence-single'
+    """
+    return _UNKNOWN if isinstance(message, UnknownMessage) else _slug(ROWS[type(message)].name)
+
+
+def kinds(names: Iterable[str]) -> frozenset[str]:
+    """Return the kinds that names mean; case, spaces, ``-`` and ``_`` do not matter.
+
+    Raises
+    ------
+    ValueError
+        When a name is no kind that can be played; the message lists them.
+
+    Examples
+    --------
+    >>> sorted(kinds(["DATA FLOAT", "baseband_iq"]))
+    ['baseband-iq', 'data-float']
+    """
+    wanted = frozenset(map(_slug, names))
+    for name in sorted(wanted - _KINDS):
+        raise ValueError(f"{name!r} is no kind of message; known are {', '.join(sorted(_KINDS))}")
+    return wanted
+
+
+def is_answer(message: Response) -> bool:
+    """Whether a message answers a command; nobody asks for recorded ones."""
+    if isinstance(message, UnknownMessage):
+        return message.code in _ANSWERS
+    return ROWS[type(message)].prefix[0] in _ANSWERS
+
+
+def _slug(name: str) -> str:
+    return name.strip().lower().replace(" ", "-").replace("_", "-")
+
+
+_KINDS = frozenset(
+    _slug(row.name)
+    for kind, row in ROWS.items()
+    if issubclass(kind, Response) and row.prefix[0] not in _ANSWERS
+) | {_UNKNOWN}
+
+
+NS_PER_S = 1_000_000_000
+QUIET_NS = NS_PER_S // 2
+NOMINAL_PERIOD_NS = NS_PER_S // 17
+"""Spacing of records that carry no time: the profile's nominal 17 messages per second."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TimedMessage:
+    """A message and its time since the first one of the recording, ns."""
+
+    time_ns: int
+    message: Response
+
+
+def schedule(
+    messages: Iterable[tuple[Response, int | None]], rate: float
+) -> Iterator[TimedMessage]:
+    """Tell when each message of a recording is played.
+
+    Parameters
+    ----------
+    messages
+        The messages in order, each with the recording's own time of it, ns; None where it has
+        none.
+    rate
+        Multiple of real time; 0 for as fast as the port takes them.
+
+    Yields
+    ------
+    Times that never decrease: a stamp that runs backwards plays at once.
+
+    Raises
+    ------
+    OverflowError
+        When a rate near 0 puts a message beyond all time.
+
+    Examples
+    --------
+    >>> from xethru_protocol.wire.messages import Ack
+    >>> [item.time_ns for item in schedule([(Ack(), 5), (Ack(), 1005), (Ack(), 905)], rate=2.0)]
+    [0, 500, 500]
+    """
+    elapsed_ns = 0
+    previous_ns: int | None = None
+    for index, (message, stamp_ns) in enumerate(messages):
+        if index:
+            if stamp_ns is None or previous_ns is None:
+                elapsed_ns += NOMINAL_PERIOD_NS
+            else:
+                elapsed_ns += max(stamp_ns - previous_ns, 0)
+        previous_ns = stamp_ns
+        yield TimedMessage(time_ns=round(elapsed_ns / rate) if rate else 0, message=message)
+
+
+class PlayStream(MessageStream):
+    """The messages of a recording, due one after the other while a host has the port open.
+
+    Where nobody tells who opens the port, a host's first command shows that it is there.
+
+    What is being played can be controlled meanwhile. No control brings a message twice or out of
+    order, or loses one, but for what a seek leaves out and a filter passes over; a message that
+    the line has begun to take is sent whole. Pause, rate, loop and filter outlast the host.
+
+    Parameters
+    ----------
+    timed
+        What to play, as from `schedule` at rate 1; gone through anew for every host and round,
+        one message ahead, so that it need not lie in memory. A seek and a new filter go through
+        it from the beginning, too, up to where it stands.
+    loop_gap_ns
+        Time of the recording between the last message and the first when playing in a loop; None
+        to play once.
+    rate
+        Multiple of real time; 0 for as fast as the line takes it.
+    from_ns
+        Where every host and round begins, ns since the first message.
+    kinds
+        What to play, as from `kinds`; None for all. What is left out takes its time all the same.
+    """
+
+    def __init__(
+        self,
+        timed: Iterable[TimedMessage],
+        *,
+        loop_gap_ns: int | None = None,
+        rate: float = 1.0,
+        from_ns: int = 0,
+        kinds: frozenset[str] | None = None,
+    ) -> None:
+        self._timed = timed
+        self._loop = loop_gap_ns is not None
+        self._gap_ns = NOMINAL_PERIOD_NS if loop_gap_ns is None else loop_gap_ns
+        self._from_ns = from_ns
+        self._clock = PlayClock(rate)
+        self._kinds = KindSteps(kinds)
+        self._coming: Iterator[tuple[int, TimedMessage]] = iter(())
+        self._first = (0, 0)  # least index and time of what is still to be played of this round
+        self._next: TimedMessage | None = None
+        self._next_index = 0
+        self._last_ns = 0  # time of the last message gone through
+        self._round_waits = False  # whether a further round was entered and none of it is played
+        self._listening = False
+        self._begun = False
+        self._sought_ns: int | None = None
+
+    def next_due_ns(self) -> int | None:
+        """Return when the next message is due; None with no host, paused or at the end."""
+        if not self._listening or self._next is None:
+            return None
+        return self._clock.due_ns(self._next.time_ns)
+
+    def take(self) -> Response:
+        """Return the next message; there must be one."""
+        taken = self._next
+        assert taken is not None
+        self._begun = True
+        self._round_waits = False
+        self._first = (self._next_index + 1, 0)
+        self._clock.reached(taken.time_ns)
+        self._kinds.forget_before(taken.time_ns)
+        self._advance()
+        if self._next is None and self._loop:
+            self._next_round()
+        return taken.message
+
+    def skip_due_before(self, time_ns: int) -> int:
+        """Skip nothing: a recording is played whole."""
+        del time_ns
+        return 0
+
+    def command_done(self, command: Command[Response], now_ns: int) -> None:
+        """Begin when the host starts the radar; wait on while it asks and configures."""
+        if self._begun:
+            return
+        if not self._listening:
+            self.port_opened(now_ns)
+        if self._clock.begins_ns > now_ns:
+            self._clock.begin_at(now_ns if _starts_radar(command) else now_ns + QUIET_NS)
+
+    def port_opened(self, now_ns: int) -> None:
+        """Play from the beginning, or from where a seek without a host went, soon."""
+        self._begun = False
+        self._listening = True
+        self._go(self._from_ns if self._sought_ns is None else self._sought_ns, now_ns + QUIET_NS)
+        self._sought_ns = None
+
+    def port_closed(self, now_ns: int) -> None:
+        """Stop playing."""
+        del now_ns
+        self._begun = self._listening = self._round_waits = False
+        self._coming = iter(())
+        self._next = None
+
+    def state(self, now_ns: int) -> PlayState:
+        """Return what the playback is doing."""
+        return PlayState(
+            playing=self._listening and self._next is not None,
+            paused=self._clock.paused,
+            position_ns=self._clock.position_ns(now_ns),
+            rate=self._clock.rate,
+            loop=self._loop,
+            kinds=self._kinds.newest,
+        )
+
+    def pause(self, now_ns: int) -> None:
+        """Stand still: no message becomes due until `resume`, not even one the line made wait."""
+        self._clock.pause(now_ns)
+
+    def resume(self, now_ns: int) -> None:
+        """Go on where `pause` stopped; the time between two messages is that of the recording."""
+        self._clock.resume(now_ns)
+
+    def set_rate(self, rate: float, now_ns: int) -> None:
+        """Go on at another multiple of real time; 0 for as fast as the line takes it.
+
+        Raises
+        ------
+        ValueError
+            When it is neither 0 nor a finite number of at least `SLOWEST_RATE`.
+        """
+        if rate and not SLOWEST_RATE <= rate < math.inf:
+            raise ValueError(f"rate {rate:g} is neither 0 nor a number from {SLOWEST_RATE:g} on")
+        self._clock.set_rate(rate, now_ns)
+
+    def seek(self, position_ns: int, now_ns: int) -> None:
+        """Go on at once with the first message at or after a time of the recording.
+
+        Past the end there is none: it ends, or in a loop the next round follows. Without a host,
+        the next one begins there.
+
+        Raises
+        ------
+        ValueError
+            When the time lies before the first message.
+        """
+        if position_ns < 0:
+            raise ValueError("a recording begins at 0 s")
+        if not self._listening:
+            self._sought_ns = position_ns
+            return
+        self._go(position_ns, max(now_ns, self._clock.begins_ns))
+
+    def set_loop(self, loop: bool, now_ns: int) -> None:
+        """Begin again at the end, or not; at the end already, begin again at once."""
+        self._loop = loop
+        if not self._listening:
+            return
+        if loop and self._next is None:
+            self._go(self._from_ns, now_ns)
+        elif not loop and self._round_waits:
+            self._next = None
+
+    def set_filter(self, kinds: frozenset[str] | None, now_ns: int) -> None:
+        """Play other kinds, as from `kinds`, None for all, from the position of now on.
+
+        The kinds in force when the recording's clock passes a message decide about it, even where
+        a slow host has made it wait since. Where a loop had nothing to play, it begins again.
+        """
+        over = self._next is None
+        self._kinds.change(kinds, self._clock.position_ns(now_ns))
+        if not self._listening:
+            return
+        if over and self._loop:
+            self._go(self._from_ns, now_ns)
+            return
+        self._open()
+        if self._next is None and self._loop:
+            self._next_round()
+
+    def _go(self, position_ns: int, at_ns: int) -> None:
+        """Be at a position of the recording at a time of the device."""
+        self._kinds.forget()
+        self._first = (0, position_ns)
+        self._round_waits = False
+        self._open()
+        past_the_end = self._next is None and self._last_ns < position_ns
+        self._clock.start(self._last_ns if past_the_end else position_ns, at_ns)
+        if self._next is None and self._loop:
+            self._next_round()
+
+    def _next_round(self) -> None:
+        self._clock.wrap(self._last_ns + self._gap_ns - self._from_ns)
+        self._kinds.forget()
+        self._first = (0, self._from_ns)
+        self._round_waits = True
+        self._open()
+
+    def _open(self) -> None:
+        """Go through the recording up to the next message to play."""
+        self._coming = enumerate(self._timed)
+        self._last_ns = 0
+        self._advance()
+
+    def _advance(self) -> None:
+        first_index, first_ns = self._first
+        for index, item in self._coming:
+            self._last_ns = item.time_ns
+            if index < first_index or item.time_ns < first_ns:
+                continue
+            if self._kinds.passes(item.time_ns, item.message):
+                self._next, self._next_index = item, index
+                return
+        self._next = None
+
+
+def _starts_radar(command: Command[Response]) -> bool:
+    match command:
+        case X4DriverSet(setting=X4Setting.FPS, value=float(fps)):
+            return fps > 0
+        case SetMode(mode=SensorMode.XTID_SM_RUN):
+            return True
+    return False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlayedFrames:
+    """What a recording tells of its radar frames.
+
+    Attributes
+    ----------
+    n_values
+        float32 values per frame: bins of RF, or twice the bins of baseband.
+    area_m
+        Frame area as the recorded module read it back [module metres]; None if nobody asked it.
+    """
+
+    n_values: int
+    area_m: tuple[float, float] | None
+
+
+class FrameSurvey:
+    """Looks for radar frames among the messages of a recording."""
+
+    def __init__(self) -> None:
+        self._sizes: Counter[int] = Counter()
+        self._area_m: tuple[float, float] | None = None
+
+    def look_at(self, message: Response) -> None:
+        """Look at the next message."""
+        if isinstance(message, DataFloat) and message.content_id == 0:
+            self._sizes[message.values.size] += 1
+        elif (
+            isinstance(message, ReplyFloat)
+            and message.content_id == X4Setting.FRAMEAREA
+            and len(message.values) == 2
+        ):
+            self._area_m = message.values[0], message.values[1]
+
+    def found(self) -> PlayedFrames | None:
+        """Return what was found; of several sizes the most frequent counts. None: no frames.
+
+        The area is the last one the host of the recording asked for.
+        """
+        if not self._sizes:
+            return None
+        return PlayedFrames(n_values=self._sizes.most_common(1)[0][0], area_m=self._area_m)
+
+
+class PlayedChip(Chip):
+    """A chip whose frames come from a recording.
+
+    It takes every setting. FRAMEBINCOUNT answers the recorded frames' bins, RF or baseband as
+    DOWNCONVERSION was set, since a frame does not say which it is (protocol reference 6.1).
+    FRAMEAREA answers the recorded area, if known, else the requested start and as many bins.
+    """
+
+    def __init__(self, frames: PlayedFrames) -> None:
+        self._frames = frames
+        super().__init__(echo_source(empty_room(), 0, 0))
+
+    def get(self, setting: X4Setting) -> X4Value:
+        """Return what GET answers, or raise `Refusal` for a setting without getter."""
+        downconverted = bool(self.settings.downconversion)
+        n_bins = self._frames.n_values // 2 if downconverted else self._frames.n_values
+        if setting is X4Setting.FRAMEBINCOUNT:
+            return n_bins
+        if setting is X4Setting.FRAMEAREA:
+            if self._frames.area_m is not None:
+                return self._frames.area_m
+            start_m = self.area.start_m
+            bin_m = x4.BASEBAND_BIN_M if downconverted else x4.RF_BIN_M
+            end_m = start_m + bin_m * (n_bins - 1 if downconverted else n_bins)
+            return start_m, float(np.float32(end_m))
+        return super().get(setting)
+
 
 _ONLY_NAME = "player"
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")

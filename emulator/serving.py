@@ -7,33 +7,96 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
+from emulator.chip.pace import Pace
 from emulator.device import Device, radar_device
-from emulator.device_ports import DevicePorts, LinkOptions, NamedDevice, open_ports
-from emulator.echo import echo_source
-from emulator.fault_bench import FaultBench
-from emulator.faults.plan import FaultPlanError, load_plan
-from emulator.identity import Identity
-from emulator.link import LinkError
-from emulator.link_folder import link_folder, socket_path
-from emulator.odometry import scene_odometry
-from emulator.odometry_feed import OdometryFeed
-from emulator.options import DeviceOptions
-from emulator.pace import Pace
-from emulator.playback import PlayOptions, RecordingError, played_radars
-from emulator.port_watch import PortWatch
-from emulator.proxy import ModuleLine, open_module
-from emulator.run_directory import Announcement
-from emulator.saved_state import Memory
-from emulator.scene import Scene, SceneError, UnknownSceneError, empty_room, load_scene
-from emulator.server import Server, Service
-from emulator.stopping import Stop
+from emulator.echo.echo import echo_source
+from emulator.faults.faulty_device import FaultyDevice, wrap
+from emulator.faults.kind import InnerDevice
+from emulator.faults.plan import FaultPlan, FaultPlanError, TruthLog, load_plan
+from emulator.module.memory import Identity, Memory
+from emulator.module.settings import DeviceOptions
+from emulator.playback import PlayOptions, PlayStream, played_radars
+from emulator.ports.control import Control, ControlSocket
+from emulator.ports.folders import Announcement, link_folder, socket_path
+from emulator.ports.module_ports import DevicePorts, LinkOptions, NamedDevice, open_ports
+from emulator.ports.odometry import OdometryFeed
+from emulator.ports.proxy import ModuleLine, open_module
+from emulator.ports.pty import LinkError, PortWatch
+from emulator.ports.server import Server, Service
+from emulator.scene.scene import Scene, SceneError, UnknownSceneError, empty_room, load_scene
+from emulator.scene.wheels import scene_odometry
+from xethru_protocol.recordings import RecordingError
 from xethru_protocol.recordings.wire_capture import Way, WireCapture
+from xethru_protocol.system import Stop
 
-__all__ = ["CannotServeError", "play", "proxy", "serve"]
+
+class FaultBench:
+    """Wraps radars, writes one truth log, offers one control socket.
+
+    Parameters
+    ----------
+    plan
+        None: no faults until somebody asks for some.
+    truth
+        File of the truth log, made anew; None: kept in memory only.
+    cleanup
+        Closes what was opened.
+    zero_ns
+        Device time from which the scenario counts.
+
+    Raises
+    ------
+    LinkError
+        When the truth log cannot be written.
+    """
+
+    def __init__(
+        self,
+        plan: FaultPlan | None,
+        truth: Path | None,
+        cleanup: contextlib.ExitStack,
+        *,
+        zero_ns: int,
+    ) -> None:
+        self._plan = FaultPlan() if plan is None else plan
+        self._zero_ns = zero_ns
+        self._cleanup = cleanup
+        self.devices: dict[str, FaultyDevice] = {}
+        self.truth = TruthLog()
+        if truth is not None:
+            try:
+                # by lines: whoever follows the file sees a fault when it is injected
+                stream = cleanup.enter_context(truth.open("w", buffering=1, encoding="utf-8"))
+            except OSError as error:
+                raise LinkError(f"{truth}: cannot write the truth log: {error.strerror}") from error
+            self.truth = TruthLog(stream.write)
+
+    def wrap(self, device: InnerDevice, name: str) -> FaultyDevice:
+        """Return a device with the faults of the plan."""
+        faulty = wrap(device, name, self._plan, self.truth, zero_ns=self._zero_ns)
+        self.devices[name] = faulty
+        return faulty
+
+    def check_names(self) -> None:
+        """Raise `FaultPlanError` if the plan names a radar that is not there."""
+        for index, spec in enumerate(self._plan.fault):
+            for name in spec.radar:
+                if name not in self.devices:
+                    raise FaultPlanError(
+                        f"fault[{index}].radar: no radar is called {name!r}; "
+                        f"there are {', '.join(self.devices)}"
+                    )
+
+    def control(self, path: Path, players: Mapping[str, PlayStream] | None = None) -> ControlSocket:
+        """Open the control socket; `LinkError` if it cannot be had."""
+        offered = ControlSocket(path, Control(self.devices, players))
+        self._cleanup.callback(offered.close)
+        return offered
+
 
 SOCKET_NAME = "odometry.sock"
 CONTROL_NAME = "control.sock"

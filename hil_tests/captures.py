@@ -1,6 +1,6 @@
 """The paper's raw capture: what tests of echoes set a chip to, and vary."""
 
-from emulator.echo_source import CaptureSettings
+from emulator.chip.chip import CaptureSettings
 
 __all__ = ["PAPER"]
 

@@ -14,21 +14,19 @@ from collections.abc import Sequence
 
 import pytest
 
+from emulator.chip.chip import EchoSource
+from emulator.chip.pace import Pace
 from emulator.device import radar_device
-from emulator.echo import echo_source
-from emulator.echo_source import EchoSource
-from emulator.faults.faulty_device import FaultyDevice, wrap
-from emulator.faults.inject import fault
-from emulator.faults.inner_device import InnerDevice
-from emulator.faults.plan import FaultPlan
-from emulator.faults.truth import TruthLog
-from emulator.identity import Identity
-from emulator.pace import Pace
-from emulator.scene import empty_room
-from xethru_protocol.driver import X4M300
-from xethru_protocol.errors import Disconnected, PortUnavailable
-from xethru_protocol.raw_config import RawConfig
+from emulator.echo.echo import echo_source
+from emulator.faults.faulty_device import FaultyDevice, fault, wrap
+from emulator.faults.kind import InnerDevice
+from emulator.faults.plan import FaultPlan, TruthLog
+from emulator.module.memory import Identity
+from emulator.scene.scene import empty_room
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.transport import Transport
+from xethru_protocol.wire.errors import Disconnected, PortUnavailable
 
 __all__ = ["PATH", "SERIAL", "FaultyLine", "fault", "faulty_line"]
 

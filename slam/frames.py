@@ -1,8 +1,11 @@
-"""The narrow door into SLAM: one radar frame in true metres, stamped in session time."""
+"""What every front end does: raw frames in, the ranges of their echoes out."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,3 +53,89 @@ class RadarFrame:
             )
         if not self.bin_length_m > 0:
             raise ValueError(f"bin_length_m is {self.bin_length_m}, must be positive")
+
+
+# A sampler's limit is reached when this part of its span is missing: it comes as float32.
+_LIMIT_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Detection:
+    """One echo seen by one radar: a range without a direction.
+
+    Attributes
+    ----------
+    radar
+        Index of the mount.
+    t_ns
+        Session time of the frame.
+    range_m
+        True metres from the antenna, the mount's range offset removed.
+    amplitude
+        Normalised RF units: of the pulse, or of the smoothed peak under the paper's front end.
+    phase_rad
+        Carrier phase of the echo at ``range_m``, in [-pi, pi]; NaN where the front end has none.
+    sigma_m
+        Predicted standard deviation of ``range_m``; NaN where the front end predicts none.
+    misfit
+        Energy near the peak that the fitted pulse leaves over what noise would leave: about 1
+        for one pulse alone; NaN where the front end fits none.
+    saturated
+        Whether samples of the echo lay at a limit of the module's sampler.
+    """
+
+    radar: int
+    t_ns: int
+    range_m: float
+    amplitude: float
+    phase_rad: float = math.nan
+    sigma_m: float = math.nan
+    misfit: float = math.nan
+    saturated: bool = False
+
+
+class Detector(Protocol):
+    """A front end; frames of one radar are given in the order of their counters."""
+
+    def detect(self, frame: RadarFrame, range_offset_m: float = 0.0) -> tuple[Detection, ...]:
+        """Return the echoes of one frame inside the range limits, nearest first.
+
+        Parameters
+        ----------
+        frame
+            The raw frame.
+        range_offset_m
+            What this module measures too long (``Mount.range_offset_m``).
+        """
+        ...
+
+    def detect_many(
+        self, frames: Sequence[RadarFrame], offsets_m: Sequence[float]
+    ) -> list[tuple[Detection, ...]]:
+        """Return what ``detect`` returns, for each frame with its range offset.
+
+        The frames may be of several radars; those that agree in length are filtered together.
+        """
+        ...
+
+
+def usable_samples(frame: RadarFrame) -> NDArray[np.bool_]:
+    """Return which samples are known (not NaN) and inside the frame's limits, shape (n_bins,)."""
+    usable: NDArray[np.bool_] = ~np.isnan(frame.samples)
+    if frame.limits is not None:
+        low, high = _inner_limits(frame.limits)
+        usable &= (frame.samples > low) & (frame.samples < high)
+    return usable
+
+
+def reaches_limits(frame: RadarFrame, lowest: float, highest: float) -> bool:
+    """Tell whether a frame with these extreme samples is cut off at its limits."""
+    if frame.limits is None:
+        return False
+    low, high = _inner_limits(frame.limits)
+    return lowest <= low or highest >= high
+
+
+def _inner_limits(limits: tuple[float, float]) -> tuple[float, float]:
+    margin = _LIMIT_TOLERANCE * (limits[1] - limits[0])
+    return limits[0] + margin, limits[1] - margin

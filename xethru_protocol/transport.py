@@ -1,23 +1,31 @@
-"""Bytes to and from a port. The only user of pyserial.
+"""Bytes to and from a port, blocking or with asyncio, and where ports are found.
 
 >>> from xethru_protocol.transport import SerialTransport
 >>> SerialTransport("/dev/no-such-port")
 Traceback (most recent call last):
-xethru_protocol.errors.PortUnavailable: there is no port /dev/no-such-port; 'xethru list' shows...
+xethru_protocol.wire.errors.PortUnavailable: there is no port /dev/no-such-port; 'xethru list'...
+
+An emulator leaves one file ``<pid>.json`` with its ready line in the run directory, because
+pseudo-terminals appear in no list of ports.
 """
 
+import asyncio
 import errno
+import json
 import math
 import os
 import select
+import tempfile
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from pathlib import Path
+from typing import Any, Protocol
 
 import serial
 from serial.tools import list_ports
 
-from xethru_protocol.errors import Disconnected, PortUnavailable
+from xethru_protocol.wire.errors import Disconnected, PortUnavailable
 
 _CHUNK_BYTES = 65536
 _WRITE_TIMEOUT_S = 5.0
@@ -217,3 +225,193 @@ def _why(path: str, error: Exception) -> str:
     if "Could not configure port" in text:
         return reasons[errno.ENOTTY]
     return f"port {path} cannot be opened: {text}"
+
+
+_TURN_S = 0.005  # how long one task may read on while data never end
+
+
+class AsyncTransport(Protocol):
+    """What `AsyncX4M300` needs of a line to a module."""
+
+    @property
+    def name(self) -> str:
+        """What to call this line in messages to people."""
+
+    async def read(self, timeout_s: float) -> bytes:
+        """Whatever has arrived, waiting up to ``timeout_s`` for the first byte; b"" if none.
+
+        Raises `Disconnected` if the line is gone.
+        """
+
+    async def write(self, data: bytes) -> None:
+        """Send all of ``data``; raises `Disconnected` if the line is gone."""
+
+    def close(self) -> None:
+        """Release the line; who reads from it gets `Disconnected`. May be called twice."""
+
+
+class AsyncSerialTransport:
+    """A serial port whose descriptor the running event loop watches; see `SerialTransport`."""
+
+    def __init__(self, path: str, baudrate: int = 115200) -> None:
+        self._port = SerialTransport(path, baudrate)
+        self._waiting: set[_Waiting] = set()
+        self._turn_ends_s = 0.0
+
+    @property
+    def name(self) -> str:
+        """See `AsyncTransport.name`."""
+        return self._port.name
+
+    @property
+    def bytes_per_s(self) -> float:
+        """See `SerialTransport.bytes_per_s`."""
+        return self._port.bytes_per_s
+
+    def set_baudrate(self, baudrate: int) -> None:
+        """See `SerialTransport.set_baudrate`."""
+        self._port.set_baudrate(baudrate)
+
+    async def read(self, timeout_s: float) -> bytes:
+        """See `AsyncTransport.read`."""
+        loop = asyncio.get_running_loop()
+        if loop.time() > self._turn_ends_s:  # a line that never pauses: now the other tasks
+            await asyncio.sleep(0)  # before reading: a task cancelled here must lose no bytes
+            self._turn_ends_s = loop.time() + _TURN_S
+        data = self._port.read(0.0)
+        if data or timeout_s <= 0:
+            return data
+        ready = await self._wait(loop.add_reader, loop.remove_reader, timeout_s)
+        self._turn_ends_s = loop.time() + _TURN_S
+        return self._port.read(0.0) if ready else b""
+
+    async def write(self, data: bytes) -> None:
+        """See `AsyncTransport.write`."""
+        loop = asyncio.get_running_loop()
+        rest = memoryview(data)
+        deadline_s = loop.time() + _WRITE_TIMEOUT_S
+        while rest := rest[self._port.write_some(rest) :]:
+            left_s = deadline_s - loop.time()
+            if not await self._wait(loop.add_writer, loop.remove_writer, left_s):
+                raise Disconnected(f"{self.name} takes no data any more; is the module hanging?")
+
+    def close(self) -> None:
+        """See `AsyncTransport.close`."""
+        for waiting in tuple(self._waiting):
+            waiting.unwatch()
+            if not waiting.ready.done():
+                waiting.ready.set_exception(Disconnected(f"{self.name} was closed"))
+        self._port.close()
+
+    async def _wait(
+        self,
+        watch: Callable[..., object],
+        unwatch: Callable[[int], object],
+        timeout_s: float,
+    ) -> bool:
+        """Wait until the descriptor is ready; False if it is not in time."""
+        waiting = _Waiting(self._waiting, self._port.fileno(), unwatch)
+        watch(waiting.descriptor, waiting.end, True)
+        limit_s = min(max(timeout_s, 0.0), _LONGEST_WAIT_S)
+        # half the cost of wait_for(), which a stream of frames would feel
+        timer = asyncio.get_running_loop().call_later(limit_s, waiting.end, False)
+        try:
+            return await waiting.ready
+        finally:
+            timer.cancel()
+            waiting.unwatch()
+
+
+class _Waiting:
+    """A task that waits for a descriptor, which must not be watched once it is closed."""
+
+    def __init__(
+        self, others: "set[_Waiting]", descriptor: int, unwatch: Callable[[int], object]
+    ) -> None:
+        self.descriptor = descriptor
+        self.ready: asyncio.Future[bool] = asyncio.get_running_loop().create_future()
+        self._others = others
+        self._unwatch = unwatch
+        others.add(self)
+
+    def end(self, ready: bool) -> None:
+        if not self.ready.done():
+            self.ready.set_result(ready)
+
+    def unwatch(self) -> None:
+        if self in self._others:
+            self._others.discard(self)
+            self._unwatch(self.descriptor)
+
+
+# Vendor and product ids; the vendor's sources disagree on which of the first two is the
+# application and which the bootloader (Protocol reference 10).
+_USB_IDS: dict[tuple[int | None, int | None], str] = {
+    (0x03EB, 0x6124): "XeThru module",
+    (0x03EB, 0x2404): "XeThru module or its bootloader",
+    (0x0403, 0x6001): "FTDI adapter (X2 module?)",
+    (0x0403, 0x6014): "FTDI adapter (X2 module?)",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PortInfo:
+    """A port worth trying."""
+
+    path: str
+    kind: str  # "usb" or "emulated"
+    description: str
+    serial: str | None
+
+
+def find_ports() -> tuple[PortInfo, ...]:
+    """Ports that may be modules: USB first, then those of running emulators."""
+    return (*_usb_ports(), *_emulated_ports(run_directory()))
+
+
+def run_directory() -> Path:
+    """Folder in which running emulators leave word; it may not exist."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    if runtime and Path(runtime).is_dir():
+        return Path(runtime) / "xethru"
+    return Path(tempfile.gettempdir()) / f"xethru-{os.getuid()}"
+
+
+def _usb_ports() -> Iterator[PortInfo]:
+    for port in usb_serial_ports():
+        description = _USB_IDS.get((port.vendor_id, port.product_id))
+        if description is not None:
+            yield PortInfo(path=port.path, kind="usb", description=description, serial=port.serial)
+
+
+def _emulated_ports(folder: Path) -> Iterator[PortInfo]:
+    if not folder.is_dir():
+        return
+    for entry in sorted(folder.glob("*.json")):
+        try:
+            word: dict[str, Any] = json.loads(entry.read_text())
+            if not is_running(int(word["pid"])):
+                continue
+            devices = [
+                (str(one["path"]), str(one["name"]), one["serial"]) for one in word["devices"]
+            ]
+        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
+            continue  # not an emulator's word, or one that is just being written
+        for path, name, serial_number in devices:
+            if os.path.exists(path):  # False, too, for what can be no path
+                yield PortInfo(
+                    path=path, kind="emulated", description=f"emulated {name}", serial=serial_number
+                )
+
+
+def is_running(pid: int) -> bool:
+    """Whether a process of this number exists; False for numbers no process can have."""
+    if pid <= 0:  # kill() would mean groups of processes
+        return False
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True

@@ -1,1 +1,1 @@
-"""Faults on demand, each of them written down: see `emulator.faults.catalogue`."""
+"""Faults on demand, each of them written down: see `emulator.faults.plan`."""

@@ -1,38 +1,260 @@
-"""A device with faults: between a module and its line, it spoils what it was told to spoil.
+"""Faults for a test, by name: armed within a block, and counted.
 
 While no fault is armed every byte goes through as it is. Whatever the faults, everything depends
 on the bytes, the times and the seed alone.
+
+>>> from emulator.faults.plan import fault_spec
+>>> fault_spec("counter_jump", frames=3).row.layer.value
+'stream'
 """
 
 from __future__ import annotations
 
+import zlib
 from collections import Counter
-from collections.abc import Sequence
-from typing import cast
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, cast
 
-from emulator.faults.armed import Armed, Opportunity
-from emulator.faults.inner_device import InnerDevice
 from emulator.faults.kind import (
     Action,
     CommandEffect,
     Context,
+    EmulatedInside,
+    InnerDevice,
+    Kind,
     MomentEffect,
+    PacketClass,
+    PacketEffect,
+    Parameters,
     Piece,
     Restart,
     SayToModule,
     Target,
     Unplug,
+    classify,
+    command_bytes,
 )
-from emulator.faults.line_queue import LineQueue
-from emulator.faults.packets import PacketClass, classify, command_bytes
-from emulator.faults.plan import FaultPlan, FaultSpec
-from emulator.faults.power import Power
-from emulator.faults.spoiling import spoiled_pieces
-from emulator.faults.truth import Injected, TruthLog
-from emulator.faults.watch import Watch
-from xethru_protocol.messages import Command, Response
+from emulator.faults.line import LineQueue, Watch
+from emulator.faults.plan import FaultPlan, FaultSpec, Injected, TruthLog, fault_spec
+from emulator.scene.philox import Dice
+from xethru_protocol.wire.messages import Command, ModReset, Response
+from xethru_protocol.wire.table import ROWS, UnknownMessage
 
-__all__ = ["FaultyDevice", "wrap"]
+NS_PER_S = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Opportunity:
+    """Something that a fault could hit; ``time_ns`` counts from the start of the scenario."""
+
+    time_ns: int
+    packet_class: PacketClass | None = None
+    counter: int | None = None
+    command: Command[Response] | None = None
+    to_module: bool = False
+
+
+class Armed:
+    """One fault of one radar.
+
+    Parameters
+    ----------
+    number
+        By which it is cleared again.
+    spec
+        What it is.
+    radar
+        Name of the radar: every radar has its own chance.
+    seed
+        For a fault without its own.
+
+    Attributes
+    ----------
+    firings
+        How often it was injected.
+    since_ns, first_counter, packets_since
+        Time, frame counter and packets since it was injected last.
+    """
+
+    def __init__(self, number: int, spec: FaultSpec, radar: str, seed: int) -> None:
+        self.number = number
+        self.spec = spec
+        self.kind: Kind = spec.row
+        self.parameters: Parameters = spec.kind_parameters()
+        stream = zlib.crc32(radar.encode()) << 32 | number
+        self.dice = Dice(seed if spec.seed is None else spec.seed, stream)
+        self.firings = 0
+        self.since_ns = 0
+        self.first_counter: int | None = None
+        self.packets_since = 0
+        self._seen = 0
+
+    @property
+    def spent(self) -> bool:
+        """Whether it has been injected as often as it should."""
+        return 0 < self.spec.count <= self.firings
+
+    def over(self, time_ns: int) -> bool:
+        """Whether nothing of it is left to come."""
+        until_s = self.spec.until_s
+        if until_s is not None and time_ns >= round(until_s * NS_PER_S):
+            return True
+        return self.spent and not self.kind.lasting
+
+    def concerns(self, opportunity: Opportunity) -> bool:
+        """Whether it is the sort of thing that the fault hits, now or later."""
+        spec = self.spec
+        target = self.target
+        if opportunity.to_module != (target is Target.COMMAND):
+            return False
+        if target is Target.MOMENT:
+            fits = opportunity.packet_class is None
+        elif target is Target.FRAME:
+            fits = opportunity.packet_class is PacketClass.FRAME
+        elif target is Target.REPLY:
+            fits = opportunity.packet_class is PacketClass.REPLY
+        elif target is Target.PACKET:
+            fits = opportunity.packet_class is not None and spec.packet in (
+                "any",
+                opportunity.packet_class.value,
+            )
+        else:
+            fits = True
+        return fits and (spec.command is None or _is_command(opportunity.command, spec.command))
+
+    @property
+    def target(self) -> Target:
+        """What it waits for: a moment may be that of a frame or of an answer."""
+        spec, target = self.spec, self.kind.target
+        if target is not Target.MOMENT:
+            return target
+        if spec.command is not None:
+            return Target.REPLY
+        by_frame = spec.frame is not None or spec.every > 1 or spec.probability < 1
+        return Target.FRAME if by_frame else Target.MOMENT
+
+    def due(self, opportunity: Opportunity) -> bool:
+        """Whether it wants to be injected here; every call counts as one opportunity."""
+        spec = self.spec
+        if self.spent or opportunity.time_ns < round(spec.at_s * NS_PER_S):
+            return False
+        if spec.frame is not None and (
+            opportunity.counter is None or opportunity.counter < spec.frame
+        ):
+            return False
+        self._seen += 1
+        if self._seen % spec.every:
+            return False
+        return spec.probability >= 1 or self.dice.chance(spec.probability)
+
+    def fired(self, now_ns: int, counter: int | None) -> None:
+        """Learn that it was injected."""
+        self.firings += 1
+        self.since_ns = now_ns
+        self.first_counter = counter
+        self.packets_since = 0
+
+    def next_ns(self, time_ns: int) -> int | None:
+        """Return when time alone makes it due, on the scenario's clock; None if never."""
+        if self.target is not Target.MOMENT or self.over(time_ns):
+            return None
+        return round(self.spec.at_s * NS_PER_S)
+
+
+def _is_command(command: Command[Response] | None, wanted: str | int) -> bool:
+    if command is None:
+        return False
+    row = ROWS.get(type(command))
+    if row is not None:
+        return row.name == wanted or row.prefix[0] == wanted
+    return isinstance(command, UnknownMessage) and command.code == wanted
+
+
+def spoiled_pieces(
+    armed: Armed,
+    pieces: Sequence[Piece],
+    opportunity: Opportunity,
+    watch: Watch,
+    now_ns: int,
+    *,
+    fires: bool,
+) -> Sequence[Piece] | None:
+    """Return the pieces with a fault in them; None if it found nothing to spoil."""
+    context = Context(
+        now_ns=now_ns,
+        since_ns=now_ns if fires else armed.since_ns,
+        firings=armed.firings + fires,
+        packets_since=0 if fires else armed.packets_since + 1,
+        first_counter=watch.counter if fires else armed.first_counter,
+        packet_class=cast("PacketClass", opportunity.packet_class),
+        command=opportunity.command,
+        previous_frame=watch.previous_frame,
+        lattice=watch.lattice,
+    )
+    effect = cast("PacketEffect", armed.kind.effect)
+    result: list[Piece] = []
+    applied = False
+    for piece in pieces:
+        spoiled = effect(piece.data, armed.parameters, armed.dice, context)
+        applied |= spoiled is not None
+        result += [
+            Piece(
+                part.data,
+                delay_ns=piece.delay_ns + part.delay_ns,
+                aside=piece.aside or part.aside,
+                behind=piece.behind + part.behind,
+            )
+            for part in ([Piece(piece.data)] if spoiled is None else spoiled)
+        ]
+    return result if applied else None
+
+
+class Power:
+    """Power and watchdog of one module.
+
+    A module that is not emulated here, as one behind a proxy, can only be told to reset itself.
+
+    Parameters
+    ----------
+    module
+        The module.
+
+    Attributes
+    ----------
+    deaf
+        Whether a module that was told to reset is to be taken for gone, until it says BOOTING.
+    """
+
+    def __init__(self, module: InnerDevice) -> None:
+        self._module = module
+        self._inside = module if isinstance(module, EmulatedInside) else None
+        self.deaf = False
+
+    @property
+    def hears(self) -> bool:
+        """Whether the module hears the host."""
+        return not self.deaf and (self._inside is None or self._inside.listens)
+
+    def crash(self, reason: str, now_ns: int) -> None:
+        """Restart the module as by a fault, which it counts towards safe mode."""
+        if self._inside is None:
+            self._reset(now_ns)
+        else:
+            self._inside.crash(reason, now_ns)
+
+    def cycle(self, now_ns: int) -> None:
+        """Cut the power and give it back, which makes the module forget its faults."""
+        if self._inside is None:
+            self._reset(now_ns)
+        else:
+            self._inside.power_cycle(now_ns)
+
+    def _reset(self, now_ns: int) -> None:
+        self.deaf = True
+        self._module.receive_data(command_bytes(ModReset()), now_ns)
+
 
 PACKETS_PER_CALL = 32
 _RETRY_NS = 10_000_000
@@ -389,3 +611,42 @@ def wrap(
     """
     truth = TruthLog() if truth is None else truth
     return FaultyDevice(device, name, plan or FaultPlan(), truth, zero_ns=zero_ns)
+
+
+class Injection:
+    """A fault that was armed within a block."""
+
+    def __init__(self, armed: Armed) -> None:
+        self._armed = armed
+
+    @property
+    def injected(self) -> int:
+        """How often it was injected so far."""
+        return self._armed.firings
+
+
+@contextmanager
+def fault(device: FaultyDevice, kind: str, **keys: Any) -> Iterator[Injection]:  # noqa: ANN401 - validated
+    """Arm a fault within a block; it is cleared at its end.
+
+    Parameters
+    ----------
+    device
+        The module to spoil.
+    kind
+        See `xethru-emulator faults`.
+    keys
+        Those of a scenario file (``count``, ``every``, ``command`` ...); what is none of them is
+        a parameter of the kind.
+
+    Raises
+    ------
+    FaultPlanError
+        Naming the key and what is allowed.
+    """
+    number = device.add(fault_spec(kind, **keys))
+    armed = device.armed[-1]
+    try:
+        yield Injection(armed)
+    finally:
+        device.clear(number)

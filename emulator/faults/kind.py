@@ -12,34 +12,179 @@ that suits it, and nothing is written to the truth log.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from emulator.faults.dice import Dice
-from emulator.faults.packets import PacketClass
-from xethru_protocol.lattice import Lattice
-from xethru_protocol.messages import Command, Response
+from emulator.scene.philox import Dice
+from xethru_protocol.driver.frames import Lattice
+from xethru_protocol.wire.codes import ElementType, ResponseCode
+from xethru_protocol.wire.connection import Connection, Role
+from xethru_protocol.wire.framing import (
+    ESCAPE,
+    NO_ESCAPE_HEADER_BYTES,
+    NO_ESCAPE_START,
+    START,
+    encode_no_escape,
+    unescape,
+)
+from xethru_protocol.wire.messages import Command, Response
 
-__all__ = [
-    "Action",
-    "CommandEffect",
-    "Context",
-    "Handling",
-    "Kind",
-    "Layer",
-    "MomentEffect",
-    "PacketEffect",
-    "Parameters",
-    "Piece",
-    "Restart",
-    "SayToModule",
-    "Target",
-    "Unplug",
-]
+_FRAME = struct.Struct("<4sIxBBIII")
+_PAYLOAD = struct.Struct("<BBIII")
+_WRAP = 1 << 32
+_REPLIES = frozenset(
+    {
+        ResponseCode.XTS_SPR_PONG,
+        ResponseCode.XTS_SPR_ACK,
+        ResponseCode.XTS_SPR_REPLY,
+        ResponseCode.XTS_SPR_ERROR,
+    }
+)
+
+
+class PacketClass(Enum):
+    """What a packet from the module is."""
+
+    FRAME = "frame"
+    """A radar frame, RF or baseband. Protocol reference 6.1."""
+    REPLY = "reply"
+    """ACK, ERROR, PONG or REPLY: answers a command. Protocol reference 3."""
+    SYSTEM = "system"
+    """BOOTING, READY and the like. Protocol reference 5."""
+    DATA = "data"
+    """Anything else: profile output, strings, and bytes that are no packet."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameParts:
+    """A radar frame taken apart; ``samples`` float32, shape (n,), read-only."""
+
+    counter: int
+    samples: NDArray[np.float32]
+
+
+def classify(packet: bytes) -> PacketClass:
+    """Return what a packet is, by its first bytes.
+
+    >>> classify(bytes.fromhex("7D 10 6D 7E"))
+    <PacketClass.REPLY: 'reply'>
+    """
+    if packet.startswith(NO_ESCAPE_START):
+        return PacketClass.FRAME if frame_counter(packet) is not None else PacketClass.DATA
+    if len(packet) < 4 or packet[0] != START:
+        return PacketClass.DATA
+    code = packet[2] if packet[1] == ESCAPE else packet[1]
+    if code in _REPLIES:
+        return PacketClass.REPLY
+    return PacketClass.SYSTEM if code == ResponseCode.XTS_SPR_SYSTEM else PacketClass.DATA
+
+
+def frame_counter(packet: bytes) -> int | None:
+    """Return the counter of a radar frame; None for anything else."""
+    if len(packet) < _FRAME.size:
+        return None
+    magic, length, code, kind, content_id, counter, count = _FRAME.unpack_from(packet)
+    is_frame = (
+        magic == NO_ESCAPE_START
+        and (code, kind, content_id) == (ResponseCode.XTS_SPR_DATA, ElementType.XTS_SPRD_FLOAT, 0)
+        and length == len(packet) - NO_ESCAPE_HEADER_BYTES == _PAYLOAD.size + 4 * count
+    )
+    return counter if is_frame else None
+
+
+def frame_parts(packet: bytes) -> FrameParts | None:
+    """Return counter and samples of a radar frame; None for anything else."""
+    counter = frame_counter(packet)
+    if counter is None:
+        return None
+    return FrameParts(counter=counter, samples=np.frombuffer(packet, "<f4", offset=_FRAME.size))
+
+
+def frame_packet(counter: int, samples: NDArray[np.float32]) -> bytes:
+    """Return a radar frame in NoEscape framing; the counter wraps at 2**32."""
+    head = _PAYLOAD.pack(
+        ResponseCode.XTS_SPR_DATA,
+        ElementType.XTS_SPRD_FLOAT,
+        0,
+        counter % _WRAP,
+        samples.size,
+    )
+    return encode_no_escape(head + samples.astype("<f4", copy=False).tobytes())
+
+
+def normal_payload(packet: bytes) -> bytes | None:
+    """Return the unescaped payload of a Normal packet; None if it is none."""
+    if len(packet) < 4 or packet[0] != START:
+        return None
+    return unescape(packet[1:-1])[:-1]
+
+
+def response_bytes(message: Response) -> bytes:
+    """Return a message as a module sends it."""
+    return Connection(Role.MODULE).send(message)
+
+
+def command_bytes(command: Command[Response]) -> bytes:
+    """Return a command as a host sends it."""
+    return Connection(Role.HOST).send(command)
+
+
+class InnerDevice(Protocol):
+    """A module as its port sees it: see `emulator.device.Device`."""
+
+    @property
+    def wants_data(self) -> bool:
+        """Whether more bytes should be read from the host now."""
+        ...
+
+    def receive_data(self, data: bytes, now_ns: int) -> None:
+        """Take bytes from the host."""
+        ...
+
+    def advance(self, now_ns: int) -> None:
+        """Let time pass."""
+        ...
+
+    def next_packet(self, now_ns: int) -> bytes | None:
+        """Return the next packet to send now."""
+        ...
+
+    def wake_ns(self, now_ns: int) -> int | None:
+        """Return when time alone changes something."""
+        ...
+
+    def port_opened(self, now_ns: int) -> None:
+        """Learn that a host opened the port."""
+        ...
+
+    def port_closed(self, now_ns: int) -> None:
+        """Learn that the last host closed the port."""
+        ...
+
+
+@runtime_checkable
+class EmulatedInside(Protocol):
+    """What an emulated module has beyond that: its inside can be made to fail."""
+
+    @property
+    def listens(self) -> bool:
+        """Whether it hears the host: not while it starts or sleeps."""
+        ...
+
+    def crash(self, reason: str, now_ns: int) -> None:
+        """Restart at once as after a fault, which counts towards safe mode."""
+        ...
+
+    def power_cycle(self, now_ns: int) -> None:
+        """Restart at once as after a power cut, which forgets the faults."""
+        ...
 
 
 class Layer(Enum):

@@ -1,5 +1,12 @@
 """Scenario files: which faults hit which radar, when, how often.
 
+To add one, write an effect in the file of its layer and a row in that file's table; the scenario
+files, the command line and the tests that go through the table then know it.
+
+JSON lines, one object per fault: ``t_ns`` (device time), ``radar``, ``kind``, ``parameters``,
+``counter`` (of the last radar frame, null before the first), ``offset`` (bytes sent to the host
+before the packet that it hit).
+
 A scenario is TOML that a person reads and writes; a mistake is one `FaultPlanError` line naming
 file, key and what is allowed::
 
@@ -21,9 +28,14 @@ file, key and what is allowed::
 
 from __future__ import annotations
 
+import json
 import math
 import tomllib
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -37,22 +49,122 @@ from pydantic import (
     model_validator,
 )
 
-from emulator.bounded_file import read_bounded
-from emulator.faults.catalogue import KINDS
 from emulator.faults.kind import Kind, Parameters, Target
-from xethru_protocol.messages import Command
-from xethru_protocol.table import ROWS
+from emulator.faults.kinds import bytes as byte_kinds
+from emulator.faults.kinds import commands, device, frames, stream
+from xethru_protocol.system import read_bounded
+from xethru_protocol.wire.messages import Command
+from xethru_protocol.wire.table import ROWS
 
-__all__ = [
-    "FaultPlan",
-    "FaultPlanError",
-    "FaultSpec",
-    "fault_spec",
-    "load_plan",
-    "parse_fault",
-    "parse_plan",
-    "plan_names",
-]
+KINDS: Mapping[str, Kind] = MappingProxyType(
+    {
+        kind.name: kind
+        for kind in (
+            *byte_kinds.KINDS,
+            *frames.KINDS,
+            *frames.BULK_KINDS,
+            *commands.KINDS,
+            *stream.KINDS,
+            *device.KINDS,
+            *device.TIME_KINDS,
+            *stream.ENVIRONMENT_KINDS,
+        )
+    }
+)
+"""The catalogue, in the order of its layers."""
+
+_LIMITS = {
+    "minimum": "at_least",
+    "maximum": "at_most",
+    "exclusiveMinimum": "above",
+    "exclusiveMaximum": "below",
+    "enum": "one_of",
+    "pattern": "pattern",
+}
+
+
+def described(kind: Kind) -> dict[str, Any]:
+    """Return a kind as JSON-able values: what it does, its parameters, what is counted."""
+    schema = kind.parameters.model_json_schema()
+    return {
+        "kind": kind.name,
+        "layer": kind.layer.value,
+        "acts_on": kind.target.value,
+        "summary": kind.summary,
+        "counted": kind.counted,
+        "hidden": kind.hidden or None,
+        "lasting": kind.lasting,
+        "parameters": {
+            name: _parameter(field) for name, field in schema.get("properties", {}).items()
+        },
+        "example": example(kind),
+    }
+
+
+def example(kind: Kind) -> str:
+    """Return a scenario with one fault of a kind, as TOML."""
+    parameters = kind.parameters().model_dump(exclude_none=True)
+    lines = ["[[fault]]", f'kind = "{kind.name}"', "at_s = 2.0"]
+    if parameters:
+        inner = ", ".join(f"{name} = {_toml(value)}" for name, value in parameters.items())
+        lines.append(f"parameters = {{ {inner} }}")
+    return "\n".join(lines)
+
+
+def _parameter(field: dict[str, Any]) -> dict[str, Any]:
+    options = [option for option in field.get("anyOf", ()) if option.get("type") != "null"]
+    limits = {**field, **(options[0] if options else {})}
+    said = {"default": field.get("default"), "meaning": field.get("description", "")}
+    return said | {ours: limits[name] for name, ours in _LIMITS.items() if name in limits}
+
+
+def _toml(value: object) -> str:
+    return f'"{value}"' if isinstance(value, str) else repr(value)
+
+
+_KEPT = 100_000  # records in memory; a log on disk has no such end
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Injected:
+    """One injected fault; see the module for the fields."""
+
+    t_ns: int
+    radar: str
+    kind: str
+    parameters: Mapping[str, Any]
+    counter: int | None
+    offset: int
+
+
+class TruthLog:
+    """What was injected, in order.
+
+    Parameters
+    ----------
+    write
+        Called with every record as a line of JSON, line end included; None: kept in memory only.
+
+    Attributes
+    ----------
+    records
+        The last 100 000.
+    counts
+        How often each kind was injected.
+    """
+
+    def __init__(self, write: Callable[[str], object] | None = None) -> None:
+        self._write = write
+        self.records: deque[Injected] = deque(maxlen=_KEPT)
+        self.counts: Counter[str] = Counter()
+
+    def note(self, injected: Injected) -> None:
+        """Add a record."""
+        self.records.append(injected)
+        self.counts[injected.kind] += 1
+        if self._write is not None:
+            self._write(json.dumps(asdict(injected), separators=(",", ":")) + "\n")
+
 
 # Beside this package, in the repository and in the wheel alike.
 _SHIPPED = Path(__file__).parents[2] / "fixtures" / "faults"

@@ -1,19 +1,257 @@
-"""The presence profile's processing: frames in; once a tick its state, detections and movement."""
+"""The presence profile's processing: frames in; once a tick its state, detections and movement.
+
+Excess
+    Per bin, the power at moving frequencies over the noise map's, 1 where nobody moves. A bin
+    with an excess beyond the threshold, ``14 - sensitivity`` dB, in either matrix is occupied; so
+    is one where the last three frames, less the mean of the fast window, lie 4 dB further above
+    the noise, because the matrices smear whoever walks.
+Detection
+    A run of occupied bins, gaps of up to 0.4 m bridged. Its distance is where most moves in the
+    last three frames if they excite it, else that of the largest excess, as for somebody who only
+    breathes. A detection whose distance lies outside the zone is none. Whoever moves now comes
+    first, before an old trail in the slow matrix.
+Velocity
+    From the phase between the newest frames: unambiguous within +-17.5 cm/s at 7.29 GHz and
+    17 frames/s, so the change of range over half a second selects which multiple of 35 cm/s to
+    add. Direction is its sign, still below 10 cm/s.
+
+A slow matrix remembers 20 s, so presence outlives a person by up to that. False alarms: in white
+noise at sensitivity 9 none came in 43 325 ticks, twelve hours of virtual time. By the rule of
+three that is fewer than one in 14 000 ticks with 95 % confidence; a lower rate was not measured.
+
+The reference gives the fields of messages only; everything here is ours.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.profiles.detection import Detection, Excess, detections, movement_list
-from emulator.profiles.doppler import FAST, MATRICES, SlowTime
-from emulator.profiles.noise_map import NoiseMap, Powers
-from emulator.profiles.sweep import ProfileSweep
-from xethru_protocol.codes import PresenceState
+from emulator.echo.echo import SPEED_OF_LIGHT_MPS
+from emulator.profiles.doppler import (
+    FAST,
+    FRAME_RATE_HZ,
+    MATRICES,
+    SLOW,
+    Matrix,
+    NoiseMap,
+    Powers,
+    ProfileSweep,
+    SlowTime,
+)
+from xethru_protocol.wire import x4
+from xethru_protocol.wire.codes import MatrixInstance, PresenceDirection, PresenceState
 
-__all__ = ["Presence", "PresenceProcessing"]
+_TINY = float(np.finfo(np.float64).tiny)
+_BRIDGED_BINS = 8
+_NEWEST_FRAMES = 3
+_EARLIER_BY = 9
+_NEWEST_MARGIN_DB = 4.0
+_STILL_MPS = 0.1
+_QUIETEST_THRESHOLD_DB = 14.0
+_INTERVAL_BINS = 10
+_FULL_MOVEMENT_DB = 40.0
+_NO_MOVEMENT_DB = 3.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Detection:
+    """Somebody in the zone.
+
+    Attributes
+    ----------
+    distance_m
+        Module metres.
+    excess_db
+        Largest excess of the run over the noise map.
+    velocity_mps
+        Radial velocity, positive away; 0 for somebody who does not walk.
+    moving
+        Whether it moves right now.
+    """
+
+    distance_m: float
+    excess_db: float
+    velocity_mps: float
+    moving: bool
+
+    @property
+    def direction(self) -> PresenceDirection:
+        """Which way it moves."""
+        if abs(self.velocity_mps) < _STILL_MPS:
+            return PresenceDirection.STILL
+        away = self.velocity_mps > 0
+        return PresenceDirection.AWAY if away else PresenceDirection.TOWARDS
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Excess:
+    """Movement over the noise map per bin: `slow` and `fast`, shape (n_bins,), linear."""
+
+    slow: NDArray[np.float64]
+    fast: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, power: Powers, noise_map: NoiseMap) -> Excess:
+        """Return the excess of matrices."""
+        return cls(
+            slow=_excess(power, noise_map, SLOW),
+            fast=_excess(power, noise_map, FAST),
+        )
+
+    @property
+    def either(self) -> NDArray[np.float64]:
+        """The larger of the two."""
+        return np.maximum(self.slow, self.fast)
+
+
+def _excess(power: Powers, noise_map: NoiseMap, matrix: Matrix) -> NDArray[np.float64]:
+    moving = matrix.moving
+    floor = noise_map.power[matrix.instance][:, moving].sum(axis=1)
+    now = power[matrix.instance][:, moving].sum(axis=1)
+    # a source without any noise has no floor to compare with
+    return np.asarray(now / np.maximum(floor, _TINY), dtype=np.float64)
+
+
+def threshold_db(sensitivity: int) -> float:
+    """Return the excess from which a bin is occupied, 14 ... 5 dB for 0 ... 9."""
+    return _QUIETEST_THRESHOLD_DB - sensitivity
+
+
+def detections(
+    sweep: ProfileSweep,
+    excess: Excess,
+    noise_map: NoiseMap,
+    frames: NDArray[np.complex128],
+    sensitivity: int,
+) -> tuple[Detection, ...]:
+    """Return who is in the zone: who moves right now first, then the strongest.
+
+    Parameters
+    ----------
+    sweep
+        The geometry.
+    excess
+        Over the noise map.
+    noise_map
+        The map itself: it tells the noise of a frame.
+    frames
+        Shape (n_frames, n_bins), the frames of the fast matrix, oldest first.
+    sensitivity
+        0...9.
+    """
+    threshold = 10 ** (threshold_db(sensitivity) / 10)
+    residual = frames - frames.mean(axis=0)
+    newest = _mean_power(residual[-_NEWEST_FRAMES:])
+    floor = _frame_noise(noise_map)
+    audible = np.maximum(floor, _TINY) * 10 ** (_NEWEST_MARGIN_DB / 10) * threshold
+    now = newest / audible * threshold
+    strength = np.maximum(excess.either, now)
+    found = []
+    for first, last in _runs(strength > threshold):
+        run = slice(first, last + 1)
+        centre = first + int(np.argmax(strength[run]))
+        velocity_mps = 0.0
+        candidate = first + int(np.argmax(now[run]))
+        moving = bool(now[candidate] > threshold)
+        if moving:
+            centre = candidate
+            velocity_mps = _velocity_mps(residual, centre, audible, sweep.carrier_hz)
+        if sweep.in_zone[centre]:
+            found.append(
+                Detection(
+                    distance_m=float(sweep.range_m[centre]),
+                    excess_db=10 * math.log10(float(strength[run].max())),
+                    velocity_mps=velocity_mps,
+                    moving=moving,
+                )
+            )
+    return tuple(sorted(found, key=lambda one: (not one.moving, -one.excess_db)))
+
+
+def movement_list(sweep: ProfileSweep, excess: NDArray[np.float64]) -> tuple[float, ...]:
+    """Return movement 0...100 per interval of ten bins (51 cm), their average in front.
+
+    0 is an excess of up to 3 dB in all bins of the interval, 100 one of 40 dB.
+    """
+    inside = excess[sweep.in_zone]
+    starts = np.arange(0, len(inside), _INTERVAL_BINS)
+    peak_db = 10 * np.log10(np.maximum(np.maximum.reduceat(inside, starts), 1e-30))
+    share = (peak_db - _NO_MOVEMENT_DB) / (_FULL_MOVEMENT_DB - _NO_MOVEMENT_DB)
+    values = 100 * np.clip(share, 0, 1)
+    return (float(values.mean()), *values.tolist())
+
+
+def _runs(occupied: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+    """Yield first and last bin of each run, short gaps bridged."""
+    bins = np.flatnonzero(occupied)
+    if len(bins) == 0:
+        return
+    breaks = np.flatnonzero(np.diff(bins) > _BRIDGED_BINS)
+    firsts = [int(bins[0]), *(int(bins[index + 1]) for index in breaks)]
+    lasts = [*(int(bins[index]) for index in breaks), int(bins[-1])]
+    yield from zip(firsts, lasts, strict=True)
+
+
+def _mean_power(frames: NDArray[np.complex128]) -> NDArray[np.float64]:
+    power: NDArray[np.float64] = (frames.real**2 + frames.imag**2).mean(axis=0)
+    return power
+
+
+def _frame_noise(noise_map: NoiseMap) -> NDArray[np.float64]:
+    """Return the noise power of one frame per bin, from the map at moving frequencies."""
+    window = FAST.window
+    per_cell = noise_map.power[MatrixInstance.FAST][:, FAST.moving].mean(axis=1)
+    scale = float(window.sum() ** 2 / (window**2).sum())
+    return np.asarray(per_cell * scale, dtype=np.float64)
+
+
+def _velocity_mps(
+    residual: NDArray[np.complex128],
+    centre: int,
+    audible: NDArray[np.float64],
+    carrier_hz: float,
+) -> float:
+    """Return the radial velocity of what is newest at a bin, positive away."""
+    near = slice(max(centre - 2, 0), centre + 3)
+    newest = residual[-2 * _NEWEST_FRAMES :, near]
+    turned = (newest[1:] * newest[:-1].conj()).sum()
+    wavelength_m = SPEED_OF_LIGHT_MPS / carrier_hz
+    per_cycle_mps = wavelength_m / 2 * FRAME_RATE_HZ
+    by_phase_mps = -math.atan2(turned.imag, turned.real) / math.tau * per_cycle_mps
+    by_range_mps = _range_rate_mps(residual, centre, audible)
+    cycles = round((by_range_mps - by_phase_mps) / per_cycle_mps)
+    return by_phase_mps + cycles * per_cycle_mps
+
+
+def _range_rate_mps(
+    residual: NDArray[np.complex128], centre: int, audible: NDArray[np.float64]
+) -> float:
+    """Return the change of range over the last half second, at 2 m/s at most.
+
+    0 if nothing was audible half a second ago, as when a chest pauses.
+    """
+    now = _mean_power(residual[-_NEWEST_FRAMES:])
+    before = _mean_power(residual[-_NEWEST_FRAMES - _EARLIER_BY : -_EARLIER_BY])
+    reach = 20
+    first = max(centre - reach, 0)
+    earlier = first + int(np.argmax(before[first : centre + reach + 1]))
+    if before[earlier] < audible[earlier]:
+        return 0.0
+    moved_bins = _centroid(now, centre) - _centroid(before, earlier)
+    return moved_bins * x4.BASEBAND_BIN_M * FRAME_RATE_HZ / _EARLIER_BY
+
+
+def _centroid(power: NDArray[np.float64], centre: int) -> float:
+    near = np.arange(max(centre - 2, 0), min(centre + 3, len(power)))
+    weight = power[near]
+    total = float(weight.sum())
+    return float((near * weight).sum()) / total if total > 0 else float(centre)
+
 
 _ABSORBABLE = 2.0
 """Excess up to which the noise map adapts; every threshold lies above."""

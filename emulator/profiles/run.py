@@ -1,4 +1,12 @@
-"""One run of the profile: its frames in order, and the messages each of them brings.
+"""The running profile as a stream of messages: it starts, pauses and ends with the mode.
+
+Source: protocol reference 7.1; amplitude, not power, as 11 row 23 assumes.
+
+Assumed where the reference is silent: counters of all messages are those of radar frames; radar
+cross sections are 0, because released firmware computes none; bytes begin at -130 dB and go in
+steps of 0.5 dB, rounded to the nearest.
+
+Source: protocol reference 7.2 and 7.3.
 
 A matrix is hundreds of messages, a range bin each; they are spread evenly over the frames until
 the next one, so that the module's queue of 50 slots can take them. Pulse-Doppler matrices are sent
@@ -7,25 +15,203 @@ from when they are full, noise maps from when they are in use.
 Frames nobody hears of are not synthesised: a run that must catch up with a long silence goes
 through the frames that fill the matrices (and those that make the noise map), which leaves the
 same state but for the noise map's adaptation.
+
+The radar runs on the emulator's clock under both paces: a presence message a second is what makes
+a profile useful to a host. Under `Pace.REALTIME` counter k is due at
+``scene_time_zero_ns`` + the scene time at which the module's clock shows k's nominal time, and a
+profile that starts begins with the first counter still ahead. Under `Pace.ASAP` the start of the
+profile is scene time 0, so that what a host gets does not depend on when it starts it, and nothing
+is dropped.
+
+RUN after a pause fills the matrices anew (assumed) and keeps the noise map. A module that restarts
+begins when it is ready.
+
+Source: protocol reference 4.6, 8.1 to 8.3.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Protocol
 
-from emulator.module_clock import ModuleClock
-from emulator.profiles.baseband import baseband_ap, baseband_iq
-from emulator.profiles.doppler import MATRICES, SLOW, Matrix
-from emulator.profiles.noise_map import Powers
-from emulator.profiles.presence import PresenceProcessing
-from emulator.profiles.reports import MATRIX_REPORTS, matrix_reports, moving_list, presence_single
-from emulator.profiles.sweep import FRAMES_PER_TICK, ProfileSweep
-from xethru_protocol.codes import MatrixControl, OutputFeature
-from xethru_protocol.messages import Response
+import numpy as np
+from numpy.typing import NDArray
 
-__all__ = ["OutputSettings", "ProfileRun"]
+from emulator.chip.chip import EchoSource, Refusal
+from emulator.chip.clock import ModuleClock
+from emulator.chip.pace import Pace
+from emulator.module.memory import FileSystem
+from emulator.module.modes import ModeMachine
+from emulator.module.outbox import MessageStream
+from emulator.module.settings import DeviceOptions, ProfileSettings
+from emulator.profiles.doppler import (
+    FRAME_RATE_HZ,
+    FRAMES_PER_TICK,
+    MATRICES,
+    SLOW,
+    MapSource,
+    Matrix,
+    NoiseMap,
+    Powers,
+    ProfileSweep,
+    StoredMap,
+    default_noise_map,
+    map_source,
+)
+from emulator.profiles.presence import Presence, PresenceProcessing, threshold_db
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire import x4
+from xethru_protocol.wire.codes import (
+    FileType,
+    MatrixControl,
+    NoiseMapControl,
+    OutputFeature,
+    PresenceDirection,
+    SensorMode,
+)
+from xethru_protocol.wire.messages import BasebandAp, BasebandIq, Command, Response
+
+
+def baseband_iq(
+    sweep: ProfileSweep, counter: int, iq: NDArray[np.complex128], sampling_hz: float
+) -> BasebandIq:
+    """Return a frame as I and Q; ``sampling_hz`` fills the sampling frequency's field."""
+    return BasebandIq(
+        counter=counter & 0xFFFFFFFF,
+        num_bins=sweep.n_bins,
+        bin_length_m=x4.BASEBAND_BIN_M,
+        sampling_frequency_hz=sampling_hz,
+        carrier_frequency_hz=sweep.carrier_hz,
+        range_offset_m=float(sweep.range_m[0]),
+        i=iq.real.astype(np.float32),
+        q=iq.imag.astype(np.float32),
+    )
+
+
+def baseband_ap(
+    sweep: ProfileSweep, counter: int, iq: NDArray[np.complex128], sampling_hz: float
+) -> BasebandAp:
+    """Return a frame as amplitude and phase [rad, -pi ... pi]; see `baseband_iq`."""
+    return BasebandAp(
+        counter=counter & 0xFFFFFFFF,
+        num_bins=sweep.n_bins,
+        bin_length_m=x4.BASEBAND_BIN_M,
+        sampling_frequency_hz=sampling_hz,
+        carrier_frequency_hz=sweep.carrier_hz,
+        range_offset_m=float(sweep.range_m[0]),
+        amplitude=np.hypot(iq.real, iq.imag).astype(np.float32),
+        phase=np.arctan2(iq.imag, iq.real).astype(np.float32),
+    )
+
+
+BYTE_START_DB = -130.0
+BYTE_STEP_DB = 0.5
+_DB_PER_QUALITY = 3.0
+BEST_QUALITY = 10
+
+MATRIX_REPORTS: dict[int, Callable[..., m.Response]] = {
+    OutputFeature.PULSEDOPPLER_FLOAT: m.PulseDopplerFloat,
+    OutputFeature.PULSEDOPPLER_BYTE: m.PulseDopplerByte,
+    OutputFeature.NOISEMAP_FLOAT: m.NoiseMapFloat,
+    OutputFeature.NOISEMAP_BYTE: m.NoiseMapByte,
+}
+_BYTES = frozenset({OutputFeature.PULSEDOPPLER_BYTE, OutputFeature.NOISEMAP_BYTE})
+
+
+def presence_single(counter: int, presence: Presence, sensitivity: int) -> m.PresenceSingle:
+    """Return the nearest thing to one person: the first detection.
+
+    Signal quality is a step per 3 dB above the threshold, 1...10, and 0 without presence.
+    """
+    strongest = presence.detections[0] if presence.detections else None
+    quality = 0
+    if strongest is not None:
+        margin_db = strongest.excess_db - threshold_db(sensitivity)
+        quality = min(max(round(margin_db / _DB_PER_QUALITY), 1), BEST_QUALITY)
+    return m.PresenceSingle(
+        counter=counter & 0xFFFFFFFF,
+        state=presence.state,
+        distance_m=0.0 if strongest is None else strongest.distance_m,
+        direction=PresenceDirection.STILL if strongest is None else strongest.direction,
+        signal_quality=quality,
+    )
+
+
+def moving_list(counter: int, presence: Presence) -> m.PresenceMovingList:
+    """Return movement by range, and the distances of all detections."""
+    nothing = (0.0,) * len(presence.detections)
+    return m.PresenceMovingList(
+        counter=counter & 0xFFFFFFFF,
+        state=presence.state,
+        movement_slow=presence.movement_slow,
+        movement_fast=presence.movement_fast,
+        detection_distance_m=tuple(found.distance_m for found in presence.detections),
+        detection_rcs=nothing,
+        detection_velocity=nothing,
+    )
+
+
+def matrix_reports(
+    feature: int,
+    matrix: Matrix,
+    sweep: ProfileSweep,
+    power: NDArray[np.float64],
+    *,
+    counter: int,
+    matrix_counter: int,
+) -> Iterator[m.Response]:
+    """Yield the messages of one matrix, a range bin each.
+
+    Parameters
+    ----------
+    feature
+        A key of `MATRIX_REPORTS`.
+    matrix
+        Which of the two.
+    sweep
+        Its ranges.
+    power
+        Shape (n_bins, matrix.pulses), of pulse-Doppler or noise map; a snapshot.
+    counter
+        Of the newest frame in it.
+    matrix_counter
+        Matrices of this kind since the profile started.
+    """
+    message = MATRIX_REPORTS[feature]
+    levels = _levels(power) if feature in _BYTES else None
+    for index, range_m in enumerate(sweep.range_m.tolist()):
+        content = (
+            {"power": power[index].astype(np.float32)}
+            if levels is None
+            else {
+                "levels": levels[index].tobytes(),
+                "byte_step_start_db": BYTE_START_DB,
+                "byte_step_size_db": BYTE_STEP_DB,
+            }
+        )
+        yield message(
+            counter=counter & 0xFFFFFFFF,
+            matrix_counter=matrix_counter & 0xFFFFFFFF,
+            range_idx=index,
+            range_bins=sweep.n_bins,
+            frequency_count=matrix.pulses,
+            pulsedoppler_instance=int(matrix.instance),
+            fps=FRAME_RATE_HZ,
+            fps_decimated=matrix.rate_hz,
+            frequency_start_hz=matrix.start_hz,
+            frequency_step_hz=matrix.step_hz,
+            range_m=range_m,
+            **content,
+        )
+
+
+def _levels(power: NDArray[np.float64]) -> NDArray[np.uint8]:
+    decibels = 10 * np.log10(np.maximum(power, np.finfo(np.float64).tiny))
+    steps = np.rint((decibels - BYTE_START_DB) / BYTE_STEP_DB)
+    return np.clip(steps, 0, 255).astype(np.uint8)
+
 
 _BASEBAND = {
     OutputFeature.BASEBAND_IQ: baseband_iq,
@@ -227,3 +413,210 @@ class ProfileRun:
 def _next_multiple(taken: int, period: int) -> int:
     """Return the index of the first frame, from `taken` on, that completes a period."""
     return taken + (-(taken + 1)) % period
+
+
+_FILES = ((int(FileType.NOISEMAP_SLOW), 0), (int(FileType.NOISEMAP_FAST), 0))
+
+
+class ProfileHost(Protocol):
+    """What of a module its profile looks at."""
+
+    @property
+    def modes(self) -> ModeMachine:
+        """The mode, and which profile is loaded."""
+        ...
+
+    @property
+    def profile(self) -> ProfileSettings:
+        """The settings of that profile."""
+        ...
+
+    @property
+    def options(self) -> DeviceOptions:
+        """How open questions are answered."""
+        ...
+
+    @property
+    def files(self) -> FileSystem:
+        """Where noise maps are kept over restarts."""
+        ...
+
+    def save(self) -> None:
+        """Keep what the flash holds."""
+        ...
+
+
+class ProfileStream(MessageStream):
+    """Messages of a module in RUN.
+
+    Parameters
+    ----------
+    module
+        Whose modes and settings to obey.
+    source
+        What its radar sees.
+    pace
+        Whether anything may be dropped.
+    clock
+        The module's own: its start skew and its rate error.
+    scene_time_zero_ns
+        Device time of scene time 0, and of power-up [ns].
+    largest_block
+        Most frames synthesised at once.
+    """
+
+    def __init__(
+        self,
+        module: ProfileHost,
+        source: EchoSource,
+        *,
+        pace: Pace,
+        clock: ModuleClock,
+        scene_time_zero_ns: int = 0,
+        largest_block: int = 8,
+    ) -> None:
+        self._module = module
+        self._source = source
+        self._pace = pace
+        self._zero_ns = scene_time_zero_ns
+        self._clock = clock
+        self._largest_block = largest_block
+        self._run: ProfileRun | None = None
+        self._paused = False
+        self._was_silent = False
+        self._creating = False
+        self.restarted(scene_time_zero_ns)
+
+    @property
+    def running(self) -> ProfileRun | None:
+        """The run whose messages go to the host."""
+        return None if self._paused else self._run
+
+    def next_due_ns(self) -> int | None:
+        """Return when the next message is due; None while no profile runs, or says anything."""
+        run = self.running
+        return None if run is None else run.next_due_ns()
+
+    def take(self) -> Response:
+        """Return the next message; there must be one."""
+        run = self.running
+        assert run is not None
+        message = run.take()
+        self._keep_created_map()
+        return message
+
+    def skip_due_before(self, time_ns: int) -> int:
+        """Give up every message due before a time; the radar sweeps on."""
+        run = self.running
+        if run is None or self._pace is Pace.ASAP:
+            return 0
+        skipped = run.skip_before(time_ns)
+        self._keep_created_map()
+        return skipped
+
+    def command_done(self, command: Command[Response], now_ns: int) -> None:
+        """Start, pause, resume or end as the mode says; catch up when an output is switched on."""
+        mode = self._module.modes.mode
+        if mode is SensorMode.XTID_SM_RUN:
+            self._go_on(now_ns)
+        elif mode is SensorMode.XTID_SM_IDLE:
+            self._paused = True
+        else:
+            self._run = None
+        del command  # the mode says all
+
+    def restarted(self, ready_ns: int) -> None:
+        """Begin anew at a time, if the module is in RUN then."""
+        self._run = None
+        if self._module.modes.mode is SensorMode.XTID_SM_RUN:
+            self._start(ready_ns)
+
+    def noise_map_files(self) -> tuple[bytes, bytes]:
+        """Return what the slow and the fast noise map's files would hold now; empty without map."""
+        current = self._current_map()
+        return (b"", b"") if current is None else current.files()
+
+    def _go_on(self, now_ns: int) -> None:
+        run = self._run
+        if run is None:
+            self._start(now_ns)
+            return
+        if self._paused:
+            self._start(now_ns, run.processing.noise_map)
+        elif self._was_silent:
+            run.pass_before(now_ns)
+            self._keep_created_map()
+        self._was_silent = run.silent
+
+    def _start(self, now_ns: int, noise_map: NoiseMap | None = None) -> None:
+        settings = self._module.profile
+        sweep = ProfileSweep(
+            self._source,
+            zone_m=settings.zone_m,
+            tx_center_frequency=settings.tx_center_frequency,
+            largest_block=self._largest_block,
+        )
+        clock = self._clock
+        if self._pace is Pace.ASAP:
+            zero_ns, first_counter = now_ns - clock.skew_ns, 0
+        else:
+            zero_ns = self._zero_ns
+            first_counter = sweep.first_counter_from(clock.nominal_ns(now_ns - zero_ns))
+        self._run = ProfileRun(
+            sweep,
+            PresenceProcessing(sweep, noise_map or self._first_map(sweep)),
+            lambda: self._module.profile,
+            first_counter=first_counter,
+            zero_ns=zero_ns,
+            clock=clock,
+            sampling_hz=self._module.options.baseband_sampling_hz,
+        )
+        self._creating = not self._run.processing.noise_map.complete
+        self._paused = False
+        self._was_silent = self._run.silent
+
+    def _first_map(self, sweep: ProfileSweep) -> NoiseMap:
+        settings = self._module.profile
+        stored = self._stored_map(sweep)
+        match map_source(settings.noise_map_control, stored=stored is not None):
+            case MapSource.STORED if stored is not None:
+                return stored.noise_map
+            case MapSource.DEFAULT:
+                return default_noise_map(sweep.n_bins, settings.tx_center_frequency)
+        return NoiseMap()
+
+    def _stored_map(self, sweep: ProfileSweep) -> StoredMap | None:
+        """Return the map in the module's files, if there is one of this zone and band."""
+        slow, fast = (self._module.files.get(key) or b"" for key in _FILES)
+        stored = StoredMap.of_files((slow, fast))
+        zone_m = self._module.profile.zone_m
+        if stored is None or not stored.fits(zone_m, sweep.tx_center_frequency, sweep.n_bins):
+            return None
+        return stored
+
+    def _keep_created_map(self) -> None:
+        """Store a map that has just been created, if stored maps are in use."""
+        control = self._module.profile.noise_map_control
+        wanted = control & NoiseMapControl.NO_DEFAULT and not (
+            control & NoiseMapControl.IGNORE_STORED
+        )
+        current = self._current_map() if self._creating else None
+        if current is None:
+            return
+        self._creating = False
+        if wanted:
+            with contextlib.suppress(Refusal):  # no room: the next start creates one again
+                for key, data in zip(_FILES, current.files(), strict=True):
+                    self._module.files.replace(key, data)
+            self._module.save()
+
+    def _current_map(self) -> StoredMap | None:
+        run = self._run
+        if run is None or not run.processing.noise_map.complete:
+            return None
+        settings = self._module.profile
+        return StoredMap(
+            zone_m=settings.zone_m,
+            tx_center_frequency=settings.tx_center_frequency,
+            noise_map=run.processing.noise_map.copy(),
+        )

@@ -3,11 +3,11 @@
 import subprocess
 import sys
 import tomllib
-from pathlib import Path
 
 import pytest
 
-REPOSITORY = Path(__file__).parents[2]
+from hil_tests.paths import REPOSITORY
+
 HEAVY = ("joblib", "matplotlib", "mcap", "pydantic", "rerun", "rosbags", "scipy", "sklearn")
 
 pytestmark = pytest.mark.skipif(

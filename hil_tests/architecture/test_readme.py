@@ -1,13 +1,13 @@
 """The README's Python examples run and print what it says; its diagram is the device's own."""
 
 import doctest
-from pathlib import Path
 
 import pytest
 
-from emulator.modes import state_diagram
+from emulator.module.modes import state_diagram
+from hil_tests.paths import REPOSITORY
 
-README = Path(__file__).parents[2] / "README.md"
+README = REPOSITORY / "README.md"
 
 
 pytestmark = pytest.mark.skipif(not README.exists(), reason="the README lives in the source tree")

@@ -24,13 +24,17 @@ from typing import IO
 
 import numpy as np
 
-from xethru_protocol import messages as m
-from xethru_protocol.cli.decode import found_in, message_of
-from xethru_protocol.codes import SystemCode
-from xethru_protocol.connection import Connection, Role
-from xethru_protocol.framing import Framing, FramingFault, Packet
-from xethru_protocol.packets import encode_normal
-from xethru_protocol.statistics import LinkStatistics
+from xethru_protocol.cli.recordings import found_in, message_of
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import SystemCode
+from xethru_protocol.wire.connection import Connection, Role
+from xethru_protocol.wire.framing import (
+    Framing,
+    FramingFault,
+    LinkStatistics,
+    Packet,
+    encode_normal,
+)
 
 CHUNK_BYTES = 65536  # as the command reads
 BLOCK_BYTES = 1_000_000  # made at once

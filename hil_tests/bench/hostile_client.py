@@ -23,19 +23,19 @@ from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 
+from emulator.chip.pace import Pace
 from emulator.device import Device, radar_device
-from emulator.echo import echo_source
-from emulator.identity import Identity
-from emulator.pace import Pace
-from emulator.scene import empty_room
-from emulator.server import Port, Server
+from emulator.echo.echo import echo_source
+from emulator.module.memory import Identity
+from emulator.ports.server import Port, Server
+from emulator.scene.scene import empty_room
 from hil_tests.bench.pair_line import PairLine
 from hil_tests.golden.vectors import load, load_hand_made
-from xethru_protocol import messages as m
-from xethru_protocol.codes import PongCode, SensorMode, X4Setting
-from xethru_protocol.connection import Connection, Role
-from xethru_protocol.packets import NeedData, encode_normal
-from xethru_protocol.x4 import real_frame_rate
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import PongCode, SensorMode, X4Setting
+from xethru_protocol.wire.connection import Connection, Role
+from xethru_protocol.wire.framing import NeedData, encode_normal
+from xethru_protocol.wire.x4 import real_frame_rate
 
 NS_PER_S = 1_000_000_000
 STEP_NS = 10_000_000

@@ -24,15 +24,18 @@ from pathlib import Path
 from types import CodeType, FrameType, TracebackType
 from typing import Self
 
+from emulator.chip.pace import Pace
 from emulator.device import radar_device
-from emulator.echo import echo_source
-from emulator.identity import Identity
+from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport
-from emulator.odometry import scene_odometry
-from emulator.pace import Pace
-from emulator.scene import load_scene
+from emulator.module.memory import Identity
+from emulator.scene.scene import load_scene
+from emulator.scene.wheels import scene_odometry
+from hil_tests.paths import REPOSITORY
 from slam.app.cli import main as uwb_slam
-from slam.app.emulated_rig import (
+from slam.app.odometry.track import OdometryTrack
+from slam.app.records import SessionInfo
+from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
     end_counter,
@@ -42,14 +45,12 @@ from slam.app.emulated_rig import (
     true_landmarks_m,
     wheels_of,
 )
-from slam.app.odometry import OdometryTrack
-from slam.app.runner import run_slam
-from slam.app.session import SessionInfo
-from slam.app.session_log import SessionLog
-from slam.robust_pipeline import make_slam
-from xethru_protocol.driver import X4M300
+from slam.app.run.runner import run_slam
+from slam.app.session.log import SessionLog
+from slam.robust.pipeline import make_slam
+from xethru_protocol.driver.radar import X4M300
 
-ROOT = Path(__file__).parents[2]
+ROOT = REPOSITORY
 PRODUCT = ("xethru_protocol", "emulator", "slam")
 SCENE = "lab"
 SEED = 0

@@ -13,7 +13,9 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.sessions import scan, session_info
-from slam.app.emulated_rig import (
+from slam.app.odometry.track import OdometryTrack
+from slam.app.odometry.tum import TumSample
+from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
     end_counter,
@@ -21,13 +23,11 @@ from slam.app.emulated_rig import (
     rig_of,
     scene_and_config,
 )
-from slam.app.odometry import OdometryTrack
-from slam.app.rerun_view import RerunView
-from slam.app.runner import run_slam
-from slam.app.session_log import SessionLog
-from slam.app.sweep import run_in_process
-from slam.app.tum import TumSample
-from slam.pipeline import UwbRadarSlam
+from slam.app.run.runner import run_slam
+from slam.app.session.log import SessionLog
+from slam.app.sweep.run import run_in_process
+from slam.app.view.panels import RerunView
+from slam.paper.pipeline import UwbRadarSlam
 
 N_SCANS = 512
 Result = TypeVar("Result")

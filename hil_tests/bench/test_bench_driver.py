@@ -16,10 +16,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from xethru_protocol import messages as m
-from xethru_protocol.async_driver import AsyncX4M300
-from xethru_protocol.connection import Connection, Role
-from xethru_protocol.driver import X4M300, FrameGeometry, RawConfig
+from xethru_protocol.driver.async_radar import AsyncX4M300
+from xethru_protocol.driver.frames import FrameGeometry
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.connection import Connection, Role
 
 FRAMES = 2000
 GEOMETRY = FrameGeometry(range_start_m=0.2, bin_length_m=0.0064, n_bins=1431, downconversion=False)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from emulator.echo import echo_source
-from emulator.echo_source import CaptureSettings
-from emulator.noise import frame_noise_units
-from emulator.odometry import scene_odometry
-from emulator.scene import load_scene
+from emulator.chip.chip import CaptureSettings
+from emulator.echo.echo import echo_source
+from emulator.scene.philox import frame_noise_units
+from emulator.scene.scene import load_scene
+from emulator.scene.wheels import scene_odometry
 from hil_tests.captures import PAPER
 
 FAST = replace(PAPER, pulses_per_step=10)  # the settings of 400 frames/s

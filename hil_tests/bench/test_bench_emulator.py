@@ -15,21 +15,22 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from emulator.chip import Chip
+from emulator.chip.chip import Chip
+from emulator.chip.pace import Pace
 from emulator.device import radar_device
-from emulator.echo import echo_source
-from emulator.identity import Identity
+from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport
-from emulator.pace import Pace
-from emulator.scene import load_scene
+from emulator.module.memory import Identity
+from emulator.scene.scene import load_scene
 from hil_tests.bench.virtual_time import counters_of
 from hil_tests.device.serving import Served, emulator
-from xethru_protocol import messages as m
-from xethru_protocol.codes import SensorMode, X4Setting
-from xethru_protocol.connection import Connection, Role
-from xethru_protocol.driver import X4M300, RawConfig
-from xethru_protocol.packets import NeedData
-from xethru_protocol.x4 import real_frame_rate
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import SensorMode, X4Setting
+from xethru_protocol.wire.connection import Connection, Role
+from xethru_protocol.wire.framing import NeedData
+from xethru_protocol.wire.x4 import real_frame_rate
 
 FAST = RawConfig(iterations=16, pulses_per_step=10)
 SECONDS = 5.0

@@ -6,7 +6,7 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from hil_tests.unit.emulator.profiles.doubles import SECOND, profile, room, standing
-from xethru_protocol.codes import OutputFeature
+from xethru_protocol.wire.codes import OutputFeature
 
 FRAMES = 340
 OUTPUTS = {

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from xethru_protocol import messages as m
-from xethru_protocol.codes import X4Setting
-from xethru_protocol.connection import Connection, Role
-from xethru_protocol.lattice import Lattice
-from xethru_protocol.packets import NEED_DATA, Framing
+from xethru_protocol.driver.frames import Lattice
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import X4Setting
+from xethru_protocol.wire.connection import Connection, Role
+from xethru_protocol.wire.framing import NEED_DATA, Framing
 
 FRAMES = 2000
 CHUNK = 65536

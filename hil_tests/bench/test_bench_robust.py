@@ -12,11 +12,10 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from threadpoolctl import threadpool_limits
 
 from hil_tests.unit.slam.robust.range_world import LAB, parameters_for, simulate
-from slam.app.experiments.step_cost_study import mapped_state, stepper
+from slam.app.experiments.step_cost import mapped_state, stepper
 from slam.geometry import paper_rig
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.existence import Existence
-from slam.robust.merging import find_merge
+from slam.robust.map import Existence, find_merge
 from slam.robust.parameters import MapRule
 
 SIGMA_M = 7.4e-3

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from pytest_benchmark.fixture import BenchmarkFixture
 from threadpoolctl import threadpool_limits
 
-from slam.association import update_map
-from slam.clustering import filter_window
 from slam.config import (
     AssociationConfig,
     ClusteringConfig,
@@ -18,12 +16,13 @@ from slam.config import (
     SlamConfig,
     TrilaterationConfig,
 )
-from slam.detection import PaperDetector, make_detector
-from slam.ekf_slam import Belief, predict, update
 from slam.frames import RadarFrame
+from slam.front_end.paper import PaperDetector, make_detector
 from slam.geometry import paper_rig
-from slam.trilateration import Fix, Trilaterator
-from slam.window import CollectedState
+from slam.paper.association import update_map
+from slam.paper.clustering import CollectedState, filter_window
+from slam.paper.ekf import Belief, predict, update
+from slam.paper.trilateration import Fix, Trilaterator
 
 Array = NDArray[np.float64]
 BIN_LENGTH_M = 299_792_458 / (2 * 23.328e9)

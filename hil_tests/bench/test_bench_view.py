@@ -12,11 +12,11 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from hil_tests.unit.slam.app.sessions import scan, session_info, snapshot
-from slam.app.rerun_view import RerunView
-from slam.app.session import Scan, Snapshot
-from slam.detector import Detection
-from slam.ekf_slam import start
-from slam.pipeline import StepResult
+from slam.app.records import Scan, Snapshot
+from slam.app.view.panels import RerunView
+from slam.frames import Detection
+from slam.paper.ekf import start
+from slam.paper.pipeline import StepResult
 
 N_RADARS = 4
 FRAME_RATE_HZ = 400

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from emulator.chip.pace import Pace
 from emulator.device import radar_device
-from emulator.echo import echo_source
-from emulator.identity import Identity
+from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport
-from emulator.pace import Pace
-from emulator.scene import load_scene
-from xethru_protocol.driver import X4M300, RawConfig
+from emulator.module.memory import Identity
+from emulator.scene.scene import load_scene
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.radar import X4M300
 
 NS_PER_S = 1_000_000_000
 FPS = 17.0

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from hil_tests.paths import FIXTURES
 from hil_tests.plugin.bench import RadarAtPlace
 from hil_tests.plugin.cassette import Cassette, ask_all, differences, today
 from hil_tests.plugin.choices import CHOICES
@@ -17,7 +18,7 @@ from hil_tests.plugin.gate import leave_out
 from hil_tests.plugin.measurements import Measure
 from hil_tests.plugin.specs import parse_specs
 
-CASSETTES = Path(__file__).parents[2] / "fixtures" / "cassettes"
+CASSETTES = FIXTURES / "cassettes"
 
 
 def emulator() -> RadarAtPlace:

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from xethru_protocol.codes import FileError, PongCode
-from xethru_protocol.driver import X4M300
-from xethru_protocol.errors import DeviceError
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.wire.codes import FileError, PongCode
+from xethru_protocol.wire.errors import DeviceError
 
 pytestmark = pytest.mark.requires("settings", "files")
 

@@ -10,10 +10,11 @@ import pytest
 
 from hil_tests.plugin.bench import RadarAtPlace
 from hil_tests.plugin.measurements import Measure
-from xethru_protocol import messages as m
-from xethru_protocol.codes import X4Setting
-from xethru_protocol.driver import X4M300, RawConfig
-from xethru_protocol.errors import ResponseTimeout
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import X4Setting
+from xethru_protocol.wire.errors import ResponseTimeout
 
 pytestmark = pytest.mark.requires("settings")
 

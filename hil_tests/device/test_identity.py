@@ -6,10 +6,10 @@ import re
 
 import pytest
 
-from xethru_protocol import messages as m
-from xethru_protocol.codes import InfoItem, PongCode, SensorMode
-from xethru_protocol.driver import X4M300
-from xethru_protocol.errors import DeviceError
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import InfoItem, PongCode, SensorMode
+from xethru_protocol.wire.errors import DeviceError
 
 pytestmark = pytest.mark.requires("settings")
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from xethru_protocol import messages as m
-from xethru_protocol.codes import ProfileId, SensorMode, X4Setting
-from xethru_protocol.driver import X4M300
-from xethru_protocol.errors import DeviceError
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import ProfileId, SensorMode, X4Setting
+from xethru_protocol.wire.errors import DeviceError
 
 pytestmark = [pytest.mark.requires("settings"), pytest.mark.requires("profiles")]
 

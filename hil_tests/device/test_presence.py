@@ -11,16 +11,16 @@ import pytest
 
 from hil_tests.plugin.bench import RadarAtPlace
 from hil_tests.plugin.measurements import Measure
-from xethru_protocol import messages as m
-from xethru_protocol.codes import (
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import (
     LedMode,
     NoiseMapControl,
     OutputFeature,
     PresenceState,
     SensorMode,
 )
-from xethru_protocol.driver import X4M300
-from xethru_protocol.errors import DeviceError, LocalProtocolError
+from xethru_protocol.wire.errors import DeviceError, LocalProtocolError
 
 pytestmark = [pytest.mark.requires("settings"), pytest.mark.requires("profiles")]
 

@@ -6,10 +6,11 @@ import pytest
 
 from hil_tests.plugin.bench import RadarAtPlace
 from hil_tests.plugin.measurements import Measure
-from xethru_protocol import messages as m
-from xethru_protocol.codes import PongCode, X4Setting
-from xethru_protocol.driver import X4M300, RawConfig
-from xethru_protocol.errors import Disconnected, ResponseTimeout
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import PongCode, X4Setting
+from xethru_protocol.wire.errors import Disconnected, ResponseTimeout
 
 pytestmark = pytest.mark.requires("settings")
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from xethru_protocol import messages as m
-from xethru_protocol.codes import PongCode, X4Setting
-from xethru_protocol.driver import X4M300, RawConfig
-from xethru_protocol.errors import DeviceError, LocalProtocolError
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import PongCode, X4Setting
+from xethru_protocol.wire.errors import DeviceError, LocalProtocolError
 
 pytestmark = pytest.mark.requires("settings")
 

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 
 import pytest
 
-from xethru_protocol.driver import X4M300, RawConfig
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.radar import X4M300
 
 pytestmark = pytest.mark.requires("settings")
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from xethru_protocol.codes import PongCode
-from xethru_protocol.driver import X4M300
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.wire.codes import PongCode
 
 
 def test_frames_come_one_after_the_other(radar: X4M300, frame_rate_hz: float) -> None:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from hil_tests.golden.vectors import ABOUT, Fields, Vector
-from xethru_protocol import messages as m
-from xethru_protocol.codes import FramePostprocessing, X4Setting
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import FramePostprocessing, X4Setting
 
 
 def _number(text: str | int) -> int:

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
-from slam.app.sweep_run import SweepRun, make_case, run_case
+from hil_tests.paths import FIXTURES
+from slam.app.sweep.run import SweepRun, make_case, run_case
 
-BANDS = Path(__file__).parents[2] / "fixtures" / "baselines" / "lap_bands.toml"
+BANDS = FIXTURES / "baselines" / "lap_bands.toml"
 N_SEEDS = 30
 CASES = (("lab", "robust"), ("classroom", "robust"))
 _HEAD = """\

@@ -13,17 +13,17 @@ import os
 import subprocess
 import sys
 import tomllib
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from emulator.echo import echo_source
-from emulator.echo_source import CaptureSettings
-from emulator.scene import load_scene
+from emulator.chip.chip import CaptureSettings
+from emulator.echo.echo import echo_source
+from emulator.scene.scene import load_scene
+from hil_tests.paths import FIXTURES
 
-BASELINE = Path(__file__).parents[2] / "fixtures" / "baselines" / "chip_counters.toml"
+BASELINE = FIXTURES / "baselines" / "chip_counters.toml"
 CASES: list[dict[str, Any]] = tomllib.loads(BASELINE.read_text())["case"]
 
 PRINT_DIGESTS = (

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import tomllib
-from pathlib import Path
 
 import pytest
 
-FIXTURES = Path(__file__).parents[2] / "fixtures"
+from hil_tests.paths import FIXTURES
+
 ENTRIES: dict[str, dict[str, str]] = {
     entry["path"]: entry
     for entry in tomllib.loads((FIXTURES / "MANIFEST.toml").read_text())["file"]

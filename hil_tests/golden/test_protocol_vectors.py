@@ -12,19 +12,19 @@ import pytest
 
 from hil_tests.golden.builders import BUILDERS, message_of
 from hil_tests.golden.vectors import ABOUT, Vector, load, load_hand_made
-from xethru_protocol.codec import decode_command, decode_response, describe
-from xethru_protocol.connection import Connection, Role
-from xethru_protocol.framing import (
+from xethru_protocol.wire.codec import decode_command, decode_response, describe
+from xethru_protocol.wire.connection import Connection, Role
+from xethru_protocol.wire.framing import (
     NEED_DATA,
+    Direction,
     FaultKind,
     Framing,
     FramingFault,
     Packet,
     PacketReader,
 )
-from xethru_protocol.messages import DeleteNoiseMap, Message, UnknownMessage, X4DriverSet
-from xethru_protocol.plausibility import Direction
-from xethru_protocol.table import ROWS
+from xethru_protocol.wire.messages import DeleteNoiseMap, Message, UnknownMessage, X4DriverSet
+from xethru_protocol.wire.table import ROWS
 
 DOCUMENTED = load()
 HAND_MADE = load_hand_made()

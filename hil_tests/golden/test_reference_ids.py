@@ -11,10 +11,11 @@ from typing import Any
 
 import pytest
 
-from hil_tests.golden.vectors import FIXTURES, load, load_hand_made
-from xethru_protocol import codes
-from xethru_protocol.codec import decode_command, decode_response
-from xethru_protocol.messages import Hil, LegacyDirCommand, SetCom, UnknownMessage
+from hil_tests.golden.vectors import load, load_hand_made
+from hil_tests.paths import FIXTURES
+from xethru_protocol.wire import codes
+from xethru_protocol.wire.codec import decode_command, decode_response
+from xethru_protocol.wire.messages import Hil, LegacyDirCommand, SetCom, UnknownMessage
 
 TABLES: list[dict[str, Any]] = tomllib.loads(
     (FIXTURES / "wire" / "reference_ids.toml").read_text("utf-8")
@@ -45,8 +46,9 @@ def values_in_vectors(place: str) -> set[int]:
 def test_every_enum_stands_in_the_reference() -> None:
     enums = {
         name
-        for name in codes.__all__
+        for name in vars(codes)
         if isinstance(entry := getattr(codes, name), type) and issubclass(entry, IntEnum | IntFlag)
+        if entry.__module__ == codes.__name__
     }
     listed = [table["enum"] for table in TABLES]
     assert set(listed) == enums

@@ -9,7 +9,7 @@ import hashlib
 import re
 from pathlib import Path
 
-FIXTURES = Path(__file__).parents[2] / "fixtures"
+from hil_tests.paths import FIXTURES
 
 
 def with_hashes(manifest: str, folder: Path) -> str:

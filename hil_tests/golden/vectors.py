@@ -7,12 +7,12 @@ reference, for rows and codes that the former do not show.
 
 import json
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
+
+from hil_tests.paths import FIXTURES
 
 Fields = dict[str, Any]
 
-FIXTURES = Path(__file__).parents[2] / "fixtures"
 
 # Entries of a vector that are not fields of its message.
 ABOUT = {

@@ -3,28 +3,153 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Sequence
+import fcntl
+import hashlib
+import math
+import os
+import re
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
-from hil_tests.plugin.locks import PortBusyError, PortLock
-from hil_tests.plugin.places import Place, PlaceError, place_of, scene_radars
+import pytest
+
+from hil_tests.plugin.places import Place, PlaceError, WireTap, place_of, scene_radars
 from hil_tests.plugin.specs import Kind, RadarSpec
-from hil_tests.plugin.tap import WireTap
-from xethru_protocol import messages as m
-from xethru_protocol.codes import PongCode, SensorMode, X4Setting
-from xethru_protocol.core import POWER_UP_BAUD
-from xethru_protocol.driver import X4M300
-from xethru_protocol.errors import (
+from xethru_protocol.driver.link import BAUD_RATES, POWER_UP_BAUD
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.transport import Transport, set_rate
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import PongCode, SensorMode, X4Setting
+from xethru_protocol.wire.errors import (
     DeviceError,
     Disconnected,
     PortUnavailable,
     ResponseTimeout,
     XeThruError,
 )
-from xethru_protocol.procedures import BAUD_RATES
-from xethru_protocol.transport import Transport, set_rate
 
-__all__ = ["Bench", "BrokenRadarError", "RadarAtPlace"]
+_ANYBODY = 0o666
+_LONGEST_NAME = 200  # file systems take 255
+
+
+class PortBusyError(Exception):
+    """Another test session has the radar; the message says which process."""
+
+
+class PortLock:
+    """The right to talk to a radar, until released or until this process ends.
+
+    Keyed on the device behind links, so ``/dev/serial/by-id/...`` and ``/dev/ttyACM0`` are the same
+    radar. The file stays behind; the lock does not.
+
+    Parameters
+    ----------
+    target
+        A path of a port, or any other name of a radar, such as an address.
+
+    Raises
+    ------
+    PortBusyError
+        If somebody else has it.
+    OSError
+        If the lock file cannot be opened, or is a link.
+    """
+
+    def __init__(self, target: str) -> None:
+        device = os.path.realpath(target) if target.startswith("/") else target
+        folder = Path(tempfile.gettempdir()) / "xethru-hil-locks"
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir()
+            folder.chmod(0o777)  # other users lock here, too
+        name = re.sub(r"[^0-9A-Za-z.]+", "_", device).strip("_")
+        if len(name) > _LONGEST_NAME:
+            name = hashlib.blake2b(device.encode(errors="surrogateescape")).hexdigest()
+        path = folder / f"{name}.lock"
+        self._descriptor = _open(path)
+        try:
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            owner = os.read(self._descriptor, 20).decode().strip() or "unknown"
+            self.release()
+            if owner == str(os.getpid()):
+                raise PortBusyError(
+                    f"{target} is in this session twice, under two names; name each radar once"
+                ) from None
+            raise PortBusyError(
+                f"{target} is being tested by another session (process {owner}); wait for it, or "
+                "end it"
+            ) from None
+        with contextlib.suppress(OSError):  # another user's file: locked all the same
+            os.ftruncate(self._descriptor, 0)
+            os.write(self._descriptor, f"{os.getpid()}\n".encode())
+
+    def release(self) -> None:
+        """Let others have it; calling it again does nothing."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+
+def _open(path: Path) -> int:
+    """Return a descriptor of a lock file that anybody may open.
+
+    Never of what a link leads to: where anybody may write, it could lead to a file of ours.
+    """
+    flags = os.O_CLOEXEC | os.O_NOFOLLOW
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | flags, _ANYBODY)
+    except PermissionError:
+        return os.open(path, os.O_RDONLY | flags)  # enough for flock
+    with contextlib.suppress(OSError):
+        os.fchmod(descriptor, _ANYBODY)  # whatever the umask
+    return descriptor
+
+
+RF_FRAME_BYTES = 5747  # 1431 bins (Protocol reference 9.5)
+_SHARE = 0.8  # of a UART; the rest is for answers
+
+
+def carried_rate_hz(wanted_hz: float, bytes_per_s: float) -> float:
+    """Return the frame rate that a test asks for, or what a UART carries of 1431 bins, whole Hz.
+
+    >>> carried_rate_hz(17.0, math.inf), carried_rate_hz(17.0, 11520.0)
+    (17.0, 1.0)
+    """
+    if math.isinf(bytes_per_s):
+        return wanted_hz
+    return min(wanted_hz, float(max(math.floor(bytes_per_s * _SHARE / RF_FRAME_BYTES), 1)))
+
+
+def matched(path: Path, drivers: Mapping[str, X4M300]) -> Mapping[str, X4M300]:
+    """Return the drivers under the names of a rig file; the test fails if they are not its modules.
+
+    Parameters
+    ----------
+    path
+        Rig file of `uwb-slam calibrate --rig`: one ``[[radars]]`` table with name and serial each.
+    drivers
+        The radars there are, by the names of their specs.
+    """
+    from slam.app.errors import AppError
+    from slam.app.rig.files import load_rig
+
+    try:
+        wanted = {radar.serial: radar.name for radar in load_rig(path).radars}
+    except AppError as error:
+        pytest.fail(str(error), pytrace=False)
+    there = {name: driver.info().serial_number or "none told" for name, driver in drivers.items()}
+    missing = {serial: name for serial, name in wanted.items() if serial not in there.values()}
+    if missing:
+        lost = ", ".join(f"{name} ({serial})" for serial, name in missing.items())
+        others = ", ".join(f"{serial} at {name}" for name, serial in there.items())
+        pytest.fail(f"{path}: missing {lost}; there are {others}", pytrace=False)
+    strangers = [f"{serial} at {name}" for name, serial in there.items() if serial not in wanted]
+    if strangers:
+        pytest.fail(f"{path}: not of this rig: {', '.join(strangers)}", pytrace=False)
+    return {wanted[serial]: drivers[name] for name, serial in there.items()}
+
 
 _PATIENCE_NS = 10_000_000_000  # a restart takes 2 ... 9 s (Protocol reference 8.1)
 _QUIET_S = 0.05

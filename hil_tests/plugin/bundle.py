@@ -26,12 +26,12 @@ import numpy as np
 
 from hil_tests.plugin.bench import RadarAtPlace
 from hil_tests.plugin.measurements import Measurement
-from hil_tests.plugin.tap import WireBytes, WireTap
-from xethru_protocol.codec import describe, encode
-from xethru_protocol.connection import Connection, Role
-from xethru_protocol.messages import BasebandIq, Command, DataFloat, Message
-from xethru_protocol.packets import NEED_DATA, FramingFault
-from xethru_protocol.recordings.cdr import BYTE_ARRAY, SCHEMAS, pack_array
+from hil_tests.plugin.places import WireBytes, WireTap
+from xethru_protocol.recordings.mcap import BYTE_ARRAY, SCHEMAS, pack_array
+from xethru_protocol.wire.codec import describe, encode
+from xethru_protocol.wire.connection import Connection, Role
+from xethru_protocol.wire.framing import NEED_DATA, FramingFault
+from xethru_protocol.wire.messages import BasebandIq, Command, DataFloat, Message
 
 __all__ = ["folder_name", "write_bundle"]
 

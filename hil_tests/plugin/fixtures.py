@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from hil_tests.plugin.bench import carried_rate_hz
 from hil_tests.plugin.choices import CHOICES
 from hil_tests.plugin.gate import FINDINGS, gate, lacking
 from hil_tests.plugin.measurements import Measure
-from hil_tests.plugin.rates import carried_rate_hz
 
 if TYPE_CHECKING:
     from hil_tests.plugin.bench import Bench, RadarAtPlace
-    from xethru_protocol.driver import X4M300
+    from xethru_protocol.driver.radar import X4M300
 
 __all__ = [
     "frame_rate_hz",
@@ -103,7 +103,7 @@ def radar_rig(
 
     With ``--rig`` by the names of its file; each module is found by its serial number there.
     """
-    from hil_tests.plugin.rigs import matched
+    from hil_tests.plugin.bench import matched
 
     found = gate(request, hil_bench, hil_bench.rig(rig_name))
     rig = request.config.stash[CHOICES].rig

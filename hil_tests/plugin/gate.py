@@ -92,10 +92,9 @@ def gate(
     fails where a radar does not answer; tests after that are skipped, or fail, without trying. A
     test that ends here leaves no line open.
     """
-    from hil_tests.plugin.bench import BrokenRadarError
-    from hil_tests.plugin.locks import PortBusyError
+    from hil_tests.plugin.bench import BrokenRadarError, PortBusyError
     from hil_tests.plugin.places import PlaceError
-    from xethru_protocol.errors import XeThruError
+    from xethru_protocol.wire.errors import XeThruError
 
     item: pytest.Item = request.node
     findings = FINDINGS.of(item)

@@ -6,33 +6,196 @@ import contextlib
 import json
 import math
 import os
+import select
 import socket
 import time
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal
 
 from hil_tests.device.serving import Served, emulator
+from hil_tests.paths import FIXTURES
 from hil_tests.plugin.specs import Kind, RadarSpec
-from hil_tests.plugin.tap import WireTap
-from hil_tests.plugin.tcp_line import TcpTransport
-from xethru_protocol.driver import X4M300, known_ports
-from xethru_protocol.errors import PortUnavailable
-from xethru_protocol.ports import find_ports
-from xethru_protocol.transport import SerialTransport, Transport
+from xethru_protocol.driver.radar import X4M300, known_ports
+from xethru_protocol.transport import SerialTransport, Transport, find_ports
+from xethru_protocol.wire.errors import Disconnected, PortUnavailable
 
 if TYPE_CHECKING:
-    from emulator.scene import Scene
+    from emulator.scene.scene import Scene
 
-__all__ = [
-    "CAPABILITIES",
-    "Place",
-    "PlaceError",
-    "place_of",
-    "ports_that_answer",
-    "scene_radars",
-]
+MOST_BYTES = 32 << 20  # of one test, some five minutes of frames; then the oldest go
+
+Way = Literal["rx", "tx"]
+
+
+@dataclass(frozen=True, slots=True)
+class WireBytes:
+    """Bytes that passed together.
+
+    Attributes
+    ----------
+    way
+        ``rx``: from the module; ``tx``: from the host.
+    data
+        As they passed: packets may begin and end anywhere.
+    t_ns
+        The driver's clock, ns; of a module in this process, virtual.
+    """
+
+    way: Way
+    data: bytes
+    t_ns: int
+
+
+class WireTap:
+    """What passed over the lines to one radar, oldest first.
+
+    Attributes
+    ----------
+    clock_ns
+        The driver's clock.
+    started_unix_ns, started_ns
+        Wall clock and driver's clock at one moment, so that a reader can date what passed.
+    forgotten_bytes
+        Bytes that were dropped from the beginning.
+    """
+
+    def __init__(self, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        self.clock_ns = clock_ns
+        self.started_unix_ns = time.time_ns()
+        self.started_ns = clock_ns()
+        self.forgotten_bytes = 0
+        self._kept: deque[WireBytes] = deque()
+        self._bytes = 0
+
+    @property
+    def passed(self) -> tuple[WireBytes, ...]:
+        """What is kept."""
+        return tuple(self._kept)
+
+    def note(self, way: Way, data: bytes) -> None:
+        """Keep what passed."""
+        self._kept.append(WireBytes(way, data, self.clock_ns()))
+        self._bytes += len(data)
+        while self._bytes > MOST_BYTES:
+            size = len(self._kept.popleft().data)
+            self._bytes -= size
+            self.forgotten_bytes += size
+
+    def around(self, transport: Transport) -> TappedTransport:
+        """Return a line that passes everything on and notes it."""
+        return TappedTransport(transport, self)
+
+
+class TappedTransport:
+    """A line with a tap; what else it can do, the line itself does."""
+
+    def __init__(self, line: Transport, tap: WireTap) -> None:
+        self._line = line
+        self._tap = tap
+
+    @property
+    def name(self) -> str:
+        """Name of the line."""
+        return self._line.name
+
+    def read(self, timeout_s: float) -> bytes:
+        """See `Transport.read`."""
+        data = self._line.read(timeout_s)
+        if data:
+            self._tap.note("rx", data)
+        return data
+
+    def write(self, data: bytes) -> None:
+        """See `Transport.write`."""
+        self._tap.note("tx", bytes(data))
+        self._line.write(data)
+
+    def close(self) -> None:
+        """See `Transport.close`."""
+        self._line.close()
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - capacity and baud rate, where a line has them
+        """Return what the line itself has."""
+        return getattr(self._line, name)
+
+
+_CONNECT_S = 5.0
+_WRITE_S = 5.0
+_CHUNK_BYTES = 65536
+
+
+class TcpTransport:
+    """An `xethru_protocol.transport.Transport` over a TCP connection.
+
+    Parameters
+    ----------
+    address
+        ``host:port`` or ``tcp://host:port``.
+
+    Raises
+    ------
+    PortUnavailable
+        If nobody listens there.
+    """
+
+    def __init__(self, address: str) -> None:
+        self.name = address if address.startswith("tcp://") else f"tcp://{address}"
+        host, _, port = self.name.removeprefix("tcp://").rpartition(":")
+        try:
+            self._socket = socket.create_connection((host.strip("[]"), int(port)), _CONNECT_S)
+        except (OSError, UnicodeError) as error:  # the latter of what is no name of a host
+            reason = getattr(error, "strerror", None) or error
+            raise PortUnavailable(
+                f"{self.name} cannot be reached: {reason}; does the adapter, or "
+                "'xethru-emulator serve --tcp', run there?"
+            ) from None
+        self._socket.setblocking(False)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def read(self, timeout_s: float) -> bytes:
+        """Return what has arrived, waiting up to ``timeout_s`` [s]; b"" if nothing."""
+        try:
+            ready, _, _ = select.select([self._socket], [], [], max(timeout_s, 0.0))
+            if not ready:
+                return b""
+            data = self._socket.recv(_CHUNK_BYTES)
+        except (OSError, ValueError) as error:  # ValueError: closed
+            raise Disconnected(self._lost()) from error
+        if not data:
+            raise Disconnected(self._lost())
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send all of ``data``."""
+        rest = memoryview(data)
+        deadline_s = time.monotonic() + _WRITE_S
+        while rest:
+            left_s = deadline_s - time.monotonic()
+            if left_s <= 0:
+                raise Disconnected(f"{self.name} takes no data any more; is the module hanging?")
+            try:
+                _, ready, _ = select.select([], [self._socket], [], left_s)
+                if ready:
+                    rest = rest[self._socket.send(rest) :]
+            except BlockingIOError:
+                continue
+            except (OSError, ValueError) as error:
+                raise Disconnected(self._lost()) from error
+
+    def close(self) -> None:
+        """Hang up; calling it again does nothing."""
+        self._socket.close()
+
+    def _lost(self) -> str:
+        return (
+            f"{self.name} hung up; is the module gone, or has another program taken it? "
+            "(an adapter has one client at a time)"
+        )
+
 
 CAPABILITIES: Mapping[str, str] = {
     "settings": "a recording that is played takes none",
@@ -146,11 +309,11 @@ class MemoryPlace(Place):
 
     def begin_test(self) -> None:
         """Make a fresh module: what a test leaves behind is gone."""
+        from emulator.chip.pace import Pace
         from emulator.device import radar_device
-        from emulator.echo import echo_source
-        from emulator.identity import Identity
-        from emulator.options import DeviceOptions
-        from emulator.pace import Pace
+        from emulator.echo.echo import echo_source
+        from emulator.module.memory import Identity
+        from emulator.module.settings import DeviceOptions
         from hil_tests.faulty import FaultyLine
 
         radar = self._scene.radars[self._index]
@@ -305,7 +468,7 @@ def ports_that_answer() -> tuple[tuple[str, str], ...]:
 
     A port that some program has open is left alone: opening it would take bytes from that program.
     """
-    from xethru_protocol.cli.port_users import port_users
+    from xethru_protocol.cli.port_probe import port_users
 
     found = []
     for port in find_ports():
@@ -331,7 +494,7 @@ def _port_of(serial: str) -> str:
 
 
 def _serial_number(radar: X4M300) -> str | None:
-    from xethru_protocol.errors import XeThruError
+    from xethru_protocol.wire.errors import XeThruError
 
     try:
         radar.ping(0.5)
@@ -357,7 +520,7 @@ def scene_radars(spec: RadarSpec) -> tuple[str, ...]:
 
 
 def _scene(spec: RadarSpec) -> Scene:
-    from emulator.scene import SceneError, empty_room, load_scene
+    from emulator.scene.scene import SceneError, empty_room, load_scene
 
     try:
         return load_scene(spec.target) if spec.target else empty_room(_EMPTY_ROOM_RADARS)
@@ -376,7 +539,7 @@ def _scene_text(spec: RadarSpec) -> str | None:
         return None
     path = Path(spec.target)
     if path.suffix != ".toml":
-        path = Path(__file__).parents[2] / "fixtures" / "scenes" / f"{spec.target}.toml"
+        path = FIXTURES / "scenes" / f"{spec.target}.toml"
     return path.read_text("utf-8")
 
 

@@ -14,10 +14,10 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from hil_tests.plugin.measurements import Measurement
-from hil_tests.plugin.tap import WireTap
-from xethru_protocol.codec import describe
-from xethru_protocol.messages import DataFloat, Message
-from xethru_protocol.packets import FramingFault
+from hil_tests.plugin.places import WireTap
+from xethru_protocol.wire.codec import describe
+from xethru_protocol.wire.framing import FramingFault
+from xethru_protocol.wire.messages import DataFloat, Message
 
 __all__ = ["write_rrd"]
 

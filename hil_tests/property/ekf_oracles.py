@@ -7,8 +7,8 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from slam import ekf_slam
-from slam.ekf_slam import Belief
+from slam.paper import ekf as ekf_slam
+from slam.paper.ekf import Belief
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

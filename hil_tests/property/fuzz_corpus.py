@@ -7,9 +7,10 @@ generator that changes would silently test something else.
 import struct
 from pathlib import Path
 
-from xethru_protocol.packets import encode_no_escape, encode_normal
+from hil_tests.paths import FIXTURES
+from xethru_protocol.wire.framing import encode_no_escape, encode_normal
 
-FOLDER = Path(__file__).parents[2] / "fixtures" / "fuzz"
+FOLDER = FIXTURES / "fuzz"
 
 _ACK = bytes.fromhex("7D 10 6D 7E")
 _PONG = bytes.fromhex("7D 01 EA AE EE AA 7C 7E")

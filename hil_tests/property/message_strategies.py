@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from xethru_protocol import wire, wire_lists
-from xethru_protocol.messages import REGISTERS, X4DriverGet
-from xethru_protocol.table import ROWS, Message
+from xethru_protocol.wire import fields as wire_kinds
+from xethru_protocol.wire.messages import REGISTERS, X4DriverGet
+from xethru_protocol.wire.table import ROWS, Message
 
 FLOATS = st.floats(width=32, allow_nan=False)
 BYTES = st.binary(max_size=40)
@@ -47,53 +47,55 @@ def of_type(draw: st.DrawFn, cls: type[Message]) -> Any:  # noqa: ANN401 - any r
     return cls(**fields)
 
 
-def _choices(kinds: tuple[tuple[str, wire.Kind], ...], name: str) -> list[int] | None:
+def _choices(kinds: tuple[tuple[str, wire_kinds.Kind], ...], name: str) -> list[int] | None:
     """Values that a later field's layout depends on; None if none does."""
     for _, kind in kinds:
-        if isinstance(kind, wire.ByDiscriminator) and kind.field == name:
+        if isinstance(kind, wire_kinds.ByDiscriminator) and kind.field == name:
             return list(kind.layouts)
-        if isinstance(kind, wire_lists.TypedElements) and kind.field == name:
+        if isinstance(kind, wire_kinds.TypedElements) and kind.field == name:
             return list(kind.types)
     return None
 
 
 def _field(  # noqa: PLR0911, PLR0912 - one case per kind of field
-    kind: wire.Kind, fields: dict[str, Any], sizes: dict[str, int]
+    kind: wire_kinds.Kind, fields: dict[str, Any], sizes: dict[str, int]
 ) -> st.SearchStrategy[Any]:
     match kind:
-        case wire.Number():
+        case wire_kinds.Number():
             return SCALARS[kind.code]
-        case wire.Member(enum=enum):
+        case wire_kinds.Member(enum=enum):
             return st.sampled_from(list(enum))
-        case wire.Spelling(codes=codes):
+        case wire_kinds.Spelling(codes=codes):
             return st.sampled_from(codes)
-        case wire.OptionalByte(required=True):
+        case wire_kinds.OptionalByte(required=True):
             return SCALARS["B"]
-        case wire.OptionalByte():
+        case wire_kinds.OptionalByte():
             return st.none() | SCALARS["B"]
-        case wire.ShortForm(short=short, field=field):
+        case wire_kinds.ShortForm(short=short, field=field):
             return st.sampled_from([None, 1] if fields[field] in short else [None])
-        case wire.ByDiscriminator():
+        case wire_kinds.ByDiscriminator():
             return _discriminated(kind, fields)
-        case wire.Bins(count_field=count):
+        case wire_kinds.Bins(count_field=count):
             return array(sizes[count])
-        case wire_lists.Floats(count=count, per=per):
+        case wire_kinds.Floats(count=count, per=per):
             size = sizes[count] * per
             return st.lists(FLOATS, min_size=size, max_size=size).map(tuple)
-        case wire_lists.Block(count=count):
+        case wire_kinds.Block(count=count):
             return st.binary(min_size=sizes[count], max_size=sizes[count])
-        case wire_lists.Text():
+        case wire_kinds.Text():
             return TEXTS
-        case wire.RestBytes():
+        case wire_kinds.RestBytes():
             return BYTES
-        case wire_lists.TypedElements(field=field, types=types):
+        case wire_kinds.TypedElements(field=field, types=types):
             return _elements(types[fields[field]])
-        case wire.Elements():
+        case wire_kinds.Elements():
             return _elements(kind)
     raise AssertionError(f"no strategy for {kind}")
 
 
-def _discriminated(kind: wire.ByDiscriminator, fields: dict[str, Any]) -> st.SearchStrategy[Any]:
+def _discriminated(
+    kind: wire_kinds.ByDiscriminator, fields: dict[str, Any]
+) -> st.SearchStrategy[Any]:
     codes, names = kind.layouts[fields[kind.field]]
     if fields.get(kind.width_field) == 1:
         codes = "B"
@@ -101,7 +103,7 @@ def _discriminated(kind: wire.ByDiscriminator, fields: dict[str, Any]) -> st.Sea
     return st.tuples(*scalars) if len(names) > 1 else scalars[0]
 
 
-def _elements(kind: wire.Elements) -> st.SearchStrategy[Any]:
+def _elements(kind: wire_kinds.Elements) -> st.SearchStrategy[Any]:
     match kind.code:
         case "a":
             return st.integers(0, 40).flatmap(array)

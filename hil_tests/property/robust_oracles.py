@@ -10,8 +10,7 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from slam.robust.state import State
-from slam.robust.symmetric import SymmetricMatrix
+from slam.robust.state import State, SymmetricMatrix
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -2,7 +2,7 @@
 
 from hypothesis import strategies as st
 
-from xethru_protocol.packets import encode_no_escape, encode_normal
+from xethru_protocol.wire.framing import encode_no_escape, encode_normal
 
 _NASTY = st.sampled_from([0x7C, 0x7D, 0x7E, 0x7F, 0x00, 0x01, 0x0E, 0x10, 0x12, 0xA0])
 

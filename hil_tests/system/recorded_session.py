@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.odometry import scene_odometry
+from emulator.scene.wheels import scene_odometry
 from hil_tests.system.short_scene import write_short_scene
-from slam.app.emulated_rig import (
+from slam.app.odometry.track import OdometryTrack
+from slam.app.records import LogLine, Scan, SessionInfo
+from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
     end_counter,
@@ -22,13 +24,11 @@ from slam.app.emulated_rig import (
     versions,
     wheels_of,
 )
-from slam.app.odometry import OdometryTrack
-from slam.app.outlines import outlines_m
-from slam.app.runner import RunRecord, run_slam
-from slam.app.session import LogLine, Scan, SessionInfo
-from slam.app.session_head import settings_text
-from slam.app.session_log import SessionLog
-from slam.robust_pipeline import make_slam
+from slam.app.run.pictures import outlines_m
+from slam.app.run.runner import RunRecord, run_slam
+from slam.app.session.log import SessionLog
+from slam.app.session.messages import settings_text
+from slam.robust.pipeline import make_slam
 
 STARTED_UNIX_NS = 1_790_000_000_000_000_000
 LOST_RADAR, LOST_COUNTER = 1, 40

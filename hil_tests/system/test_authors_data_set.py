@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emulator.odometry import scene_odometry
+from emulator.scene.wheels import scene_odometry
 from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.authors_bag import AuthorsBag
 from slam.app.cli import main
-from slam.app.emulated_rig import FRAME_RATE_HZ, RAW_CONFIG, open_loopback, scene_and_config
-from slam.app.evaluate import evaluate
-from slam.app.odometry import OdometryTrack
+from slam.app.odometry.track import OdometryTrack
+from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, open_loopback, scene_and_config
+from slam.app.run.results import evaluate
 
 pytestmark = pytest.mark.slow
 

@@ -7,14 +7,15 @@ from pathlib import Path
 
 import pytest
 
+from hil_tests.paths import FIXTURES
 from hil_tests.unit.slam.app.sessions import session_info
 from slam.app.cli import main
-from slam.app.odometry import OdometryTrack
-from slam.app.rig_file import load_rig
-from slam.app.session_log import SessionLog
-from slam.app.tum import TumSample
+from slam.app.odometry.track import OdometryTrack
+from slam.app.odometry.tum import TumSample
+from slam.app.rig.files import load_rig
+from slam.app.session.log import SessionLog
 
-SCENES = Path(__file__).parents[2] / "fixtures" / "scenes"
+SCENES = FIXTURES / "scenes"
 
 
 def short_drive(folder: Path) -> str:

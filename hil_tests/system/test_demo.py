@@ -16,19 +16,19 @@ from rosbags.highlevel import AnyReader
 
 from hil_tests.patience import seconds
 from hil_tests.system.short_scene import write_short_scene
-from slam.app import ros_messages as ros
-from slam.app.emulated_rig import (
+from slam.app.odometry.tum import read_tum
+from slam.app.records import Scan
+from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
     end_counter,
     open_loopback,
     scene_and_config,
 )
-from slam.app.evaluate import evaluate
-from slam.app.rerun_recording import count_rows
-from slam.app.session import Scan
-from slam.app.sweep import run_in_process, run_one
-from slam.app.tum import read_tum
+from slam.app.run.results import evaluate
+from slam.app.session import messages as ros
+from slam.app.sweep.run import run_in_process, run_one
+from slam.app.view.rerun_recording import count_rows
 
 pytestmark = pytest.mark.slow
 

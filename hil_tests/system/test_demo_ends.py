@@ -15,9 +15,9 @@ from mcap.reader import make_reader
 from hil_tests.patience import catches, seconds, wait_until
 from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.sessions import surviving_counters
-from slam.app import demo as demo_module
 from slam.app.cli import main
-from slam.app.rerun_recording import count_rows
+from slam.app.commands import demo as demo_module
+from slam.app.view.rerun_recording import count_rows
 
 pytestmark = [
     pytest.mark.slow,

@@ -7,14 +7,15 @@ from collections.abc import Iterator
 
 import pytest
 
+from emulator.chip.pace import Pace
 from emulator.device import radar_device
-from emulator.echo import echo_source
-from emulator.identity import Identity
+from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport
-from emulator.pace import Pace
-from emulator.scene import load_scene
+from emulator.module.memory import Identity
+from emulator.scene.scene import load_scene
 from hil_tests.device.serving import Served, emulator, open_radar
-from xethru_protocol.driver import X4M300, RawConfig
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.radar import X4M300
 
 pytestmark = pytest.mark.slow
 

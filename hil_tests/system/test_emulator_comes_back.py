@@ -6,7 +6,7 @@ import signal
 from pathlib import Path
 
 from hil_tests.device.serving import emulator, open_radar
-from xethru_protocol.driver import RawConfig
+from xethru_protocol.driver.link import RawConfig
 
 
 def test_driver_goes_on_when_its_emulator_comes_back(tmp_path: Path) -> None:

@@ -16,11 +16,11 @@ import pytest
 
 from hil_tests.device.serving import emulator, open_radar
 from hil_tests.patience import catches, seconds, wait_until
-from xethru_protocol.codes import InfoItem, PongCode
-from xethru_protocol.connection import Connection, Role
-from xethru_protocol.driver import RawConfig
-from xethru_protocol.messages import ReplyString, SystemGetInfo
-from xethru_protocol.packets import NeedData
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.wire.codes import InfoItem, PongCode
+from xethru_protocol.wire.connection import Connection, Role
+from xethru_protocol.wire.framing import NeedData
+from xethru_protocol.wire.messages import ReplyString, SystemGetInfo
 
 pytestmark = pytest.mark.slow
 
@@ -145,7 +145,7 @@ def test_a_closed_stdout_does_not_matter(tmp_path: Path) -> None:
 def test_a_host_killed_while_streaming_is_followed_by_another(pace: str, tmp_path: Path) -> None:
     host = (
         "import sys\n"
-        "from xethru_protocol.driver import X4M300\n"
+        "from xethru_protocol.driver.radar import X4M300\n"
         "radar = X4M300.open(sys.argv[1])\n"
         "radar.configure_raw()\n"
         "radar.start(17.0)\n"

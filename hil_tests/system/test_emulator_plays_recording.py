@@ -10,18 +10,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from emulator.identity import Identity
 from emulator.loopback import LoopbackTransport
+from emulator.module.memory import Identity
 from emulator.playback import PlayOptions, played_radars
 from hil_tests.device.serving import Served, emulator, open_radar
-from xethru_protocol.codes import PongCode
-from xethru_protocol.driver import X4M300
-from xethru_protocol.messages import BasebandIq
+from hil_tests.paths import REPOSITORY
+from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings import read_recording
+from xethru_protocol.wire.codes import PongCode
+from xethru_protocol.wire.messages import BasebandIq
 
 pytestmark = pytest.mark.slow
-
-REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 def shared_data() -> Path:

@@ -8,8 +8,9 @@ import sys
 from pathlib import Path
 
 from hil_tests.device.serving import emulator, open_radar
+from hil_tests.paths import FIXTURES
 from hil_tests.patience import seconds
-from xethru_protocol.driver import RawConfig
+from xethru_protocol.driver.link import RawConfig
 
 CTL = (sys.executable, "-m", "emulator.cli", "ctl")
 
@@ -87,7 +88,7 @@ def test_the_list_of_faults_is_json() -> None:
 
 
 def test_a_playback_is_paused_and_goes_on() -> None:
-    recording = Path(__file__).parents[2] / "fixtures" / "recordings" / "float"
+    recording = FIXTURES / "recordings" / "float"
     with emulator("play", str(recording)) as served:
         for words, paused in ((("pause",), True), (("resume",), False)):
             done = ctl(served.paths[0], *words)

@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from emulator.pace import Pace
+from emulator.chip.pace import Pace
 from hil_tests.bench.hostile_client import MOST_OBJECTS_GROWN, run
 from hil_tests.device.serving import Served, emulator
 from hil_tests.patience import seconds
-from xethru_protocol import messages as m
-from xethru_protocol.codes import PongCode, SensorMode, X4Setting
-from xethru_protocol.connection import Connection, Role
-from xethru_protocol.packets import NeedData
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import PongCode, SensorMode, X4Setting
+from xethru_protocol.wire.connection import Connection, Role
+from xethru_protocol.wire.framing import NeedData
 
 
 @pytest.mark.parametrize("pace", list(Pace))

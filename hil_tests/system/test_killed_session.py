@@ -13,7 +13,7 @@ from rosbags.highlevel import AnyReader
 from hil_tests.patience import wait_until
 from hil_tests.system.short_scene import write_short_scene
 from slam.app.cli import main
-from slam.app.session_reader import open_session
+from slam.app.session.reader import open_session
 
 pytestmark = pytest.mark.slow
 
@@ -25,7 +25,7 @@ RECORDER = """
 import sys
 from pathlib import Path
 from hil_tests.unit.slam.app.sessions import feed, scan, session_info, snapshot
-from slam.app.session_log import SessionLog
+from slam.app.session.log import SessionLog
 
 log = SessionLog(Path(sys.argv[1]), session_info())
 counter = 0

@@ -13,9 +13,9 @@ import pytest
 from hil_tests.device.serving import emulator, open_radar
 from hil_tests.patience import seconds
 from hil_tests.unit.emulator.test_playback_control import samples, write_session
-from xethru_protocol import messages as m
-from xethru_protocol.connection import Connection, Role
-from xethru_protocol.driver import RawConfig
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.connection import Connection, Role
 
 SECOND = 1_000_000_000
 NAMES = ("front_left", "rear_left", "front_right", "rear_right")

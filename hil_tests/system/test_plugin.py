@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import pytest
 
 from hil_tests.device.serving import emulator
+from hil_tests.paths import FIXTURES
 from hil_tests.patience import seconds
 
 pytestmark = pytest.mark.slow  # each run of pytest takes seconds to start on a busy machine
@@ -209,7 +210,7 @@ def test_workers_share_emulated_radars_and_leave_real_ones_to_one_of_them(
 
 @pytest.mark.thorough
 def test_recordings_are_played(tmp_path: Path) -> None:
-    recording = Path(__file__).parents[2] / "fixtures" / "recordings" / "float"
+    recording = FIXTURES / "recordings" / "float"
     done = run(tmp_path, "--pyargs", device("test_stream"), "--radar", f"replay:{recording}")
     assert done.returncode == 0, done.stdout
     assert "replay-float       1       0        0" in done.stdout

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from hil_tests.device.serving import emulator, open_radar
-from xethru_protocol.driver import RawConfig
+from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.recordings.wire_capture import read_chunks
 
 SHORT = RawConfig(frame_area_m=(0.4, 1.0))

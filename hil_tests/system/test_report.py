@@ -12,7 +12,7 @@ from PIL import Image
 from hil_tests.browser import find_browser, photograph
 from hil_tests.system.recorded_session import record_session
 from slam.app.cli import main
-from slam.app.rerun_recording import count_rows
+from slam.app.view.rerun_recording import count_rows
 
 pytestmark = pytest.mark.slow
 

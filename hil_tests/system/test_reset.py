@@ -14,10 +14,12 @@ import pytest
 
 from hil_tests.device.serving import Served, emulator, open_radar
 from hil_tests.patience import seconds
-from xethru_protocol.driver import X4M300, Frame, RawConfig
-from xethru_protocol.errors import Disconnected, PortUnavailable, ResponseTimeout
-from xethru_protocol.messages import ModReset
-from xethru_protocol.ports import find_ports
+from xethru_protocol.driver.frames import Frame
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.transport import find_ports
+from xethru_protocol.wire.errors import Disconnected, PortUnavailable, ResponseTimeout
+from xethru_protocol.wire.messages import ModReset
 
 pytestmark = pytest.mark.slow
 

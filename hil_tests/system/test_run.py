@@ -12,13 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from emulator.scene import load_scene
+from emulator.scene.scene import load_scene
 from hil_tests.device.serving import emulator
 from hil_tests.patience import seconds, wait_until
 from hil_tests.system.short_scene import write_short_scene
 from slam.app.cli import main
-from slam.app.rig_file import RigFile, RigRadar, write_rig
-from slam.app.session_reader import open_session
+from slam.app.rig.files import RigFile, RigRadar, write_rig
+from slam.app.session.reader import open_session
 
 pytestmark = pytest.mark.slow
 

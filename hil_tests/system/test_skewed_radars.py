@@ -16,23 +16,22 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from emulator.odometry import odometry_times_ns, tum_line
-from emulator.scene import LeakageSpec, NoiseSpec, PathSpec, RadarSpec, Scene, TargetSpec
-from slam.app.emulated_rig import (
+from emulator.scene.scene import LeakageSpec, NoiseSpec, PathSpec, RadarSpec, Scene, TargetSpec
+from emulator.scene.wheels import odometry_times_ns, tum_line
+from slam.app.odometry.track import OdometryTrack
+from slam.app.records import Scan
+from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
+    EmulatorProcess,
     end_counter,
     open_loopback,
     open_ports,
     rig_of,
 )
-from slam.app.emulator_process import EmulatorProcess
-from slam.app.odometry import OdometryTrack
-from slam.app.runner import run_slam
-from slam.app.session import Scan
-from slam.config import FrontEnd, SampleTime
-from slam.pipeline import StepResult, UwbRadarSlam
-from slam.presets import load_preset, override
+from slam.app.run.runner import run_slam
+from slam.config import FrontEnd, SampleTime, load_preset, override
+from slam.paper.pipeline import StepResult, UwbRadarSlam
 
 NO_SKEW_MS = (0.0, 0.0, 0.0, 0.0)
 RECIPE_MS = (0.0, 190.0, 100.0, 150.0)

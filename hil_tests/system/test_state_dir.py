@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from hil_tests.device.serving import emulator, open_radar
-from xethru_protocol.files import FileName
+from xethru_protocol.driver.files import FileName
 
 FILE = FileName(file_type=0x80000001, identifier=7)
 

@@ -15,8 +15,8 @@ import pytest
 from hil_tests.patience import seconds, wait_until
 from hil_tests.system.short_scene import write_short_scene
 from slam.app.cli import main
-from slam.app.emulated_rig import end_counter
-from slam.app.sweep_run import make_case, run_case
+from slam.app.rig.emulated import end_counter
+from slam.app.sweep.run import make_case, run_case
 
 pytestmark = pytest.mark.slow
 

@@ -9,9 +9,10 @@ import pytest
 
 from hil_tests.device.serving import Served, emulator
 from hil_tests.patience import seconds
-from xethru_protocol.codes import PongCode
-from xethru_protocol.driver import X4M300, RawConfig
-from xethru_protocol.errors import ResponseTimeout
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.wire.codes import PongCode
+from xethru_protocol.wire.errors import ResponseTimeout
 
 pytestmark = pytest.mark.slow
 

@@ -23,17 +23,15 @@ from hil_tests.system.recorded_session import (
     record_session,
     write_shorter_scene,
 )
-from slam.app import rerun_recording
 from slam.app.cli import main
+from slam.app.commands.view import is_finished, session_file
 from slam.app.errors import AppError
-from slam.app.live_view import LiveView
-from slam.app.replay import replay_session
-from slam.app.rerun_recording import count_rows
-from slam.app.rerun_sdk import RrdReader, rr
-from slam.app.rerun_viewer import executable
-from slam.app.rrd_file import is_finished
-from slam.app.session_reader import open_session
-from slam.app.view import session_file
+from slam.app.run.replay import replay_session
+from slam.app.session.reader import open_session
+from slam.app.view import rerun_recording
+from slam.app.view.rerun_recording import count_rows
+from slam.app.view.rerun_sdk import RrdReader, rr
+from slam.app.view.viewer import LiveView, executable
 
 pytestmark = pytest.mark.slow
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from hil_tests.bench.virtual_time import counters_of
-from xethru_protocol.driver import RawConfig
+from xethru_protocol.driver.link import RawConfig
 
 TIMER_HZ_AT_17 = 17.049379
 """What the chip's timer makes of FPS 17, measured. Protocol reference 9.6."""

@@ -7,20 +7,260 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import math
 import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from slam.app.arguments import folder, seed
-from slam.app.convert_arguments import add_convert
-from slam.app.errors import EXIT_FAILED, AppError, naming
+from slam.app.errors import EXIT_FAILED, AppError, StopFlag, StopRequestedError, naming
 from slam.app.experiments import EXPERIMENTS, Experiment, ExperimentModule
-from slam.app.run_arguments import add_run
-from slam.app.standard_streams import drop_what_cannot_be_said, open_closed_streams
-from slam.app.stop import StopFlag, StopRequestedError
-from slam.app.sweep_arguments import add_sweep
-from slam.app.view_arguments import add_report, add_rerun, add_view
+from slam.app.sweep.stress import STRESSES
+from slam.app.view import CONNECT, DEFAULT_VIEWER_URL, SERVE_WEB, SPAWN
+from xethru_protocol.system import drop_what_cannot_be_said, open_closed_streams
+
+
+def folder(text: str) -> Path:
+    """Return a folder to write into; its name must be UTF-8, Rerun's writer takes no other."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise argparse.ArgumentTypeError(f"must be a UTF-8 name, not {text!r}") from None
+    return Path(text)
+
+
+def seed(text: str) -> int:
+    """Return the seed of a random generator: a whole number, 0 or more."""
+    return _whole_number(text, least=0)
+
+
+def count(text: str) -> int:
+    """Return how many of something: a whole number, 1 or more."""
+    return _whole_number(text, least=1)
+
+
+def _whole_number(text: str, *, least: int) -> int:
+    if not text.isascii() or not text.isdigit() or not least <= int(text) < 2**63:
+        raise argparse.ArgumentTypeError(f"must be a whole number, {least} or more, not {text!r}")
+    return int(text)
+
+
+def rerun_target(text: str) -> str:
+    """Return `spawn`, `serve-web`, or the address of a viewer."""
+    if text in {SPAWN, SERVE_WEB}:
+        return text
+    if text == CONNECT:
+        return DEFAULT_VIEWER_URL
+    if text.startswith(("rerun+http://", "rerun+https://")) and text.endswith("/proxy"):
+        return text
+    raise argparse.ArgumentTypeError(
+        f"must be {SPAWN}, {CONNECT}, {SERVE_WEB}, or an address like {DEFAULT_VIEWER_URL}, "
+        f"not {text!r}"
+    )
+
+
+def add_rerun(parser: argparse.ArgumentParser) -> None:
+    """Add `--rerun`: watch a run while it happens."""
+    parser.add_argument(
+        "--rerun",
+        type=rerun_target,
+        metavar="WHERE",
+        help="watch live: spawn (a window), serve-web (a page for a browser), connect (a viewer "
+        f"at {DEFAULT_VIEWER_URL}), or the address of another viewer",
+    )
+
+
+def add_view(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `uwb-slam view`."""
+    parser.add_argument(
+        "session", type=Path, metavar="SESSION", help="a session.mcap, an .rrd, or a run's folder"
+    )
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--web", action="store_true", help="serve a page for a browser")
+    where.add_argument("--out", type=folder, metavar="FILE.rrd", help="write a file, show nothing")
+    where.add_argument(
+        "--screenshot", type=folder, metavar="FILE.png", help="write a picture, no window needed"
+    )
+    parser.add_argument(
+        "--at",
+        type=_seconds,
+        metavar="S",
+        help="when the screenshot is taken, since the first scan (default: the end)",
+    )
+
+
+def add_report(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `uwb-slam report`."""
+    parser.add_argument(
+        "session", type=Path, metavar="SESSION", help="a session.mcap, or a run's folder"
+    )
+    parser.add_argument(
+        "--out", type=folder, metavar="FILE.html", help="(default: report.html beside the session)"
+    )
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value >= 0.0):
+        raise argparse.ArgumentTypeError(f"must be seconds, 0 or more, not {text!r}")
+    return value
+
+
+CSV_TO_TUM = (
+    r"s/^([0-9]+),([0-9]+),[^,]*,[^,]*,"
+    + ",".join([r"([^,]*)"] * 7)
+    + r",.*/\1.000000000\2 \3 \4 \5 \6 \7 \8 \9/; s/\.0*([0-9]{9}) /.\1 /"
+)
+"""For `sed -E`: a line of `ros2 topic echo --csv` of a nav_msgs/Odometry to a TUM line."""
+
+_DESCRIPTION = """\
+Opens the modules that a rig file names by their serial numbers, follows the robot's odometry, and
+runs SLAM while frames arrive. Ends with the odometry, after --duration, or by Ctrl-C; writes
+session, map, trajectories and numbers.
+"""
+
+_EPILOG = rf"""
+With ROS 2, whose stamps are seconds since 1970 (sed -u passes every line on at once; awk may not):
+
+  PYTHONUNBUFFERED=1 ros2 topic echo --csv /odom nav_msgs/msg/Odometry |
+    sed -uE '{CSV_TO_TUM}' |
+    uwb-slam run --rig robot.toml --odometry - --odometry-clock unix
+
+With an emulator in another terminal, which has both radars and odometry:
+
+  xethru-emulator serve lab --link-dir ports
+  uwb-slam run --rig robot.toml --odometry ports/odometry.sock
+"""
+
+
+def add_run(run: argparse.ArgumentParser) -> argparse.ArgumentParser:
+    """Add them, and return the parser."""
+    run.formatter_class = argparse.RawDescriptionHelpFormatter
+    run.description, run.epilog = _DESCRIPTION, _EPILOG
+    run.add_argument("--rig", type=Path, required=True, metavar="RIG", help="a rig file, TOML")
+    run.add_argument(
+        "--odometry",
+        required=True,
+        metavar="SRC",
+        help="TUM lines (timestamp x y z qx qy qz qw) from: - (stdin), a file or FIFO, unix:PATH, "
+        "tcp://HOST:PORT, serial:PORT[@BAUD]",
+    )
+    run.add_argument(
+        "--odometry-clock",
+        default="arrival",
+        metavar="CLOCK",
+        help="what its stamps are: arrival (any clock, told by when lines come; the default), "
+        "unix, monotonic, or the monotonic nanoseconds at stamp 0",
+    )
+    run.add_argument(
+        "--ports", nargs="+", metavar="PORT", help="the modules' ports (default: look for them)"
+    )
+    run.add_argument("--out", type=folder, default=Path("out/run"), help="folder for the results")
+    run.add_argument("--preset", default="robust", help="settings of SLAM (default: %(default)s)")
+    run.add_argument("--fps", type=count, default=5, help="frames/s (default: %(default)s)")
+    run.add_argument("--duration", type=count, metavar="S", help="end after so many seconds")
+    run.add_argument("--wire", action="store_true", help="record every byte of the ports, too")
+    add_rerun(run)
+    return run
+
+
+_CONVERT_DESCRIPTION = (
+    "IN is a session, then OUT is a MATLAB file of detections if its name "
+    "ends in .mat, the raw bytes of one port if in .xtwire, a bag of ROS 1 if in .bag, or "
+    "else a new folder with a bag of ROS 2; or IN is a .mat or a bag, then OUT is a "
+    "session, which replay, view and report take."
+)
+
+
+def add_convert(convert: argparse.ArgumentParser) -> argparse.ArgumentParser:
+    """Add them, and return the parser."""
+    convert.description = _CONVERT_DESCRIPTION
+    convert.add_argument(
+        "source", type=Path, metavar="IN", help="session.mcap, *.mat, *.bag or folder"
+    )
+    convert.add_argument("out", type=Path, metavar="OUT", help="must not exist")
+    convert.add_argument(
+        "--rig", type=Path, help="where the radars of a bag sit, named UWBradar1 and so on"
+    )
+    convert.add_argument(
+        "--frame-area",
+        type=float,
+        nargs=2,
+        metavar=("START", "END"),
+        help="what the modules of a bag were asked for, module metres (default: 0.2 9.4)",
+    )
+    convert.add_argument(
+        "--truth", default="/slam_out_pose", metavar="TOPIC", help="default: %(default)s"
+    )
+    convert.add_argument(
+        "--rate", type=count, default=5, help="states/s of a .mat, which has no stamps (default: 5)"
+    )
+    convert.add_argument(
+        "--preset",
+        help="settings of SLAM (default: a session's own; for a bag robust, for a .mat paper)",
+    )
+    convert.add_argument("--radar", metavar="NAME", help="whose raw bytes, for .xtwire")
+    return convert
+
+
+_SWEEP_DESCRIPTION = (
+    "Runs every scene with every preset and seed in process, without ports, "
+    "and writes each run's summary and the statistics of each group. Stopped, the same "
+    "command goes on where it was. All numbers are simulated."
+)
+_SWEEP_EPILOG = (
+    "STRESS is one of: " + "; ".join(f"{row.name}: {row.help}" for row in STRESSES.values()) + "."
+)
+
+
+def add_sweep(sweep: argparse.ArgumentParser) -> argparse.ArgumentParser:
+    """Add them, and return the parser."""
+    sweep.description, sweep.epilog = _SWEEP_DESCRIPTION, _SWEEP_EPILOG
+    sweep.add_argument("--scene", nargs="+", action="extend", help="names or files (default: lab)")
+    sweep.add_argument(
+        "--preset", nargs="+", action="extend", help="settings of SLAM (default: robust)"
+    )
+    sweep.add_argument("--seeds", type=count, default=20, help="number of seeds, from 0")
+    sweep.add_argument(
+        "--set",
+        type=_setting,
+        action="append",
+        default=[],
+        metavar="KEY=V1,V2",
+        help="replace a setting of the presets, like association.gate=0.6,9.2; several values, or "
+        "several --set, make a group for every combination",
+    )
+    sweep.add_argument(
+        "--stress",
+        nargs="+",
+        action="extend",
+        default=[],
+        choices=tuple(STRESSES),
+        metavar="STRESS",
+        help="run under these hardships, too, and print how much worse it gets",
+    )
+    sweep.add_argument(
+        "--bound",
+        action="store_true",
+        help="compute on each run's data what is possible with the true associations (GTSAM)",
+    )
+    where = sweep.add_mutually_exclusive_group()
+    where.add_argument("--jobs", type=count, help="processes (default: one per core)")
+    where.add_argument("--dask", metavar="ADDRESS", help="scheduler of a Dask cluster to run on")
+    sweep.add_argument("--json", type=Path, required=True, metavar="OUT", help="result file")
+    return sweep
+
+
+def _setting(text: str) -> tuple[str, tuple[str, ...]]:
+    key, _, values = text.partition("=")
+    named = tuple(value.strip() for value in values.split(","))
+    if not key or not all(named):
+        raise argparse.ArgumentTypeError(f"must be KEY=VALUE or KEY=V1,V2, not {text!r}")
+    return key.strip(), named
+
 
 _TYPICAL_SEED = 19
 """Of seeds 0-19 in the lab, the one whose errors lie nearest the medians; see DECISIONS."""
@@ -215,7 +455,7 @@ class _ExperimentParser(argparse.ArgumentParser):
 
 
 def _demo(arguments: argparse.Namespace, stop: StopFlag) -> None:
-    from slam.app.demo import DemoOptions, run_demo  # heavy, see module text
+    from slam.app.commands.demo import DemoOptions, run_demo  # heavy, see module text
 
     options = DemoOptions(
         out=arguments.out,
@@ -229,7 +469,7 @@ def _demo(arguments: argparse.Namespace, stop: StopFlag) -> None:
 
 
 def _run_rig(arguments: argparse.Namespace, stop: StopFlag) -> None:
-    from slam.app.run import RunOptions, run_rig  # heavy, see module text
+    from slam.app.commands.run import RunOptions, run_rig  # heavy, see module text
 
     options = RunOptions(
         rig=arguments.rig,
@@ -247,13 +487,13 @@ def _run_rig(arguments: argparse.Namespace, stop: StopFlag) -> None:
 
 
 def _replay(arguments: argparse.Namespace, stop: StopFlag) -> None:
-    from slam.app.replay import ReplayOptions, run_replay  # heavy, see module text
+    from slam.app.run.replay import ReplayOptions, run_replay  # heavy, see module text
 
     run_replay(ReplayOptions(session=arguments.session, out=arguments.out), stop)
 
 
 def _view(arguments: argparse.Namespace, stop: StopFlag) -> None:
-    from slam.app.view import ViewOptions, run_view  # heavy, see module text
+    from slam.app.commands.view import ViewOptions, run_view  # heavy, see module text
 
     options = ViewOptions(
         session=arguments.session,
@@ -266,25 +506,25 @@ def _view(arguments: argparse.Namespace, stop: StopFlag) -> None:
 
 
 def _report(arguments: argparse.Namespace, stop: StopFlag) -> None:
-    from slam.app.report import ReportOptions, run_report  # heavy, see module text
+    from slam.app.commands.report import ReportOptions, run_report  # heavy, see module text
 
     run_report(ReportOptions(session=arguments.session, out=arguments.out), stop)
 
 
 def _evaluate(arguments: argparse.Namespace, stop: StopFlag) -> None:
-    from slam.app.evaluate import run_evaluate  # heavy, see module text
+    from slam.app.run.results import run_evaluate  # heavy, see module text
 
     run_evaluate(arguments.estimate, arguments.reference, as_json=arguments.json)
 
 
 def _repair(arguments: argparse.Namespace, stop: StopFlag) -> None:
-    from slam.app.repair import repair  # heavy, see module text
+    from slam.app.session.repair import repair  # heavy, see module text
 
     print(repair(arguments.session, arguments.out, stop.check))  # noqa: T201 - the result
 
 
 def _convert(arguments: argparse.Namespace, stop: StopFlag) -> None:
-    from slam.app.convert import ConvertOptions, run_convert  # heavy, see module text
+    from slam.app.convert.convert import ConvertOptions, run_convert  # heavy, see module text
 
     options = ConvertOptions(
         source=arguments.source,
@@ -300,7 +540,10 @@ def _convert(arguments: argparse.Namespace, stop: StopFlag) -> None:
 
 
 def _calibrate(arguments: argparse.Namespace, stop: StopFlag) -> None:
-    from slam.app.calibrate import CalibrateOptions, run_calibrate  # heavy, see module text
+    from slam.app.commands.calibrate import (  # heavy, see module text
+        CalibrateOptions,
+        run_calibrate,
+    )
 
     options = CalibrateOptions(
         session=arguments.session,
@@ -315,7 +558,7 @@ def _calibrate(arguments: argparse.Namespace, stop: StopFlag) -> None:
 def _sweep(arguments: argparse.Namespace, stop: StopFlag) -> None:
     from joblib import cpu_count  # heavy, see module text
 
-    from slam.app.sweep import SweepOptions, run_sweep
+    from slam.app.sweep.sweep import SweepOptions, run_sweep
 
     options = SweepOptions(
         scenes=tuple(arguments.scene or ["lab"]),

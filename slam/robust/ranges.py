@@ -22,10 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.geometry import Rig, wrap_angles
-from slam.robust.motion import Motion
 from slam.robust.parameters import RangeNoise
-from slam.robust.state import State, quarter_turn, rotation
-from slam.robust.symmetric import Array, Indices
+from slam.robust.state import Array, Indices, Motion, State, quarter_turn, rotation
 
 # No radar ranges as far; keeps squares finite whatever a front end says.
 LONGEST_M = 1e6

@@ -13,12 +13,229 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from slam.geometry import compose, wrap_angle
-from slam.robust.condensed import Condensed
-from slam.robust.motion import calibrated_motion
 from slam.robust.parameters import WheelNoise
-from slam.robust.problem import Estimate, Prior, Problem
-from slam.robust.state import State, rotation
-from slam.robust.symmetric import Array, Indices
+from slam.robust.state import Array, Indices, State, calibrated_motion, rotation
+
+# Standard deviations below these are taken as these, so that information stays finite.
+_LEAST_CALIBRATION = 1e-7
+_LEAST_OFFSET_M = 1e-7
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Estimate:
+    """Values of all unknowns.
+
+    Attributes
+    ----------
+    poses
+        shape (k + 1, 3): x, y, heading.
+    calibration
+        shape (k + 1, 3) if it walks, else (1, 3): s, w, kappa.
+    offsets_m, landmarks_m
+        shapes (r,) and (n, 2); the last of the landmarks may be walls, (phi, d).
+    """
+
+    poses: Array
+    calibration: Array
+    offsets_m: Array
+    landmarks_m: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Prior:
+    """What is known beforehand of the first pose, its calibration, the offsets and landmarks.
+
+    A quadratic ``e^T information e + 2 gradient^T e`` in right-invariant errors e from ``mean``
+    (module ``prior``), all of size 6 + r + 2 n in that order; the last ``n_walls`` of the n
+    landmarks are walls.
+    """
+
+    information: Array
+    gradient: Array
+    mean: Array
+    n_walls: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Problem:
+    """All that was measured.
+
+    Attributes
+    ----------
+    increments, covariances
+        shapes (k, 3) and (k, 3, 3): reported steps from pose to pose, and their noise.
+    walks
+        shape (k, 3): variance each calibration error gains per step; all zero: constants.
+    prior
+        Of the first pose and everything that does not move.
+    range_poses, range_radars, range_landmarks
+        shape (m,) each: which pose, radar and landmark a range belongs to.
+    range_antennas, ranges_m
+        shapes (m, 2) and (m,): antenna in the body frame of the pose.
+    range_sigmas_m
+        shape (m,), noise of the ranges.
+    point_poses, point_landmarks, points, point_roots
+        shapes (q,), (q,), (q, 2), (q, 2, 2): range and bearing seen from the body's origin,
+        and a matrix that makes their noise white.
+    n_walls
+        How many of the landmarks, the last ones, are walls.
+    """
+
+    increments: Array
+    covariances: Array
+    walks: Array
+    prior: Prior
+    range_poses: Indices
+    range_radars: Indices
+    range_landmarks: Indices
+    range_antennas: Array
+    ranges_m: Array
+    range_sigmas_m: Array
+    point_poses: Indices
+    point_landmarks: Indices
+    points: Array
+    point_roots: Array
+    n_walls: int = 0
+
+    @property
+    def is_walking(self) -> bool:
+        """Tell whether the calibration has one value per pose."""
+        return bool(np.any(self.walks > 0.0))
+
+    def beginning(self, n_steps: int) -> Problem:
+        """Return what was measured before pose ``n_steps``, and the steps up to it."""
+        ranges = self.range_poses < n_steps
+        points = self.point_poses < n_steps
+        return Problem(
+            increments=self.increments[:n_steps],
+            covariances=self.covariances[:n_steps],
+            walks=self.walks[:n_steps],
+            prior=self.prior,
+            range_poses=self.range_poses[ranges],
+            range_radars=self.range_radars[ranges],
+            range_landmarks=self.range_landmarks[ranges],
+            range_antennas=self.range_antennas[ranges],
+            ranges_m=self.ranges_m[ranges],
+            range_sigmas_m=self.range_sigmas_m[ranges],
+            point_poses=self.point_poses[points],
+            point_landmarks=self.point_landmarks[points],
+            points=self.points[points],
+            point_roots=self.point_roots[points],
+            n_walls=self.n_walls,
+        )
+
+
+def start_prior(
+    calibration_sigmas: tuple[float, float, float],
+    offset_sigmas_m: tuple[float, ...],
+    n_landmarks: int,
+    pose_sigma: float = 1e-6,
+) -> Prior:
+    """Return the prior of a run that starts at the origin of its own map."""
+    calibration = np.maximum(calibration_sigmas, _LEAST_CALIBRATION)
+    offsets = np.maximum(offset_sigmas_m, _LEAST_OFFSET_M)
+    sigmas = np.concatenate([np.full(3, pose_sigma), calibration, offsets])
+    size = len(sigmas) + 2 * n_landmarks
+    information = np.zeros((size, size))
+    np.fill_diagonal(information[: len(sigmas), : len(sigmas)], sigmas**-2.0)
+    return Prior(information=information, gradient=np.zeros(size), mean=np.zeros(size))
+
+
+class Condensed:
+    """A prior whose landmarks have ids, so that the map may change under it.
+
+    Parameters
+    ----------
+    prior
+        Of the first pose kept, its calibration, the offsets and the landmarks.
+    landmark_ids
+        Of its landmarks, in order.
+    """
+
+    def __init__(self, prior: Prior, landmark_ids: Sequence[int]) -> None:
+        self._prior = prior
+        self._ids = list(landmark_ids)
+
+    @property
+    def landmark_ids(self) -> tuple[int, ...]:
+        """Return the ids of the landmarks it tells something of."""
+        return tuple(self._ids)
+
+    def of(self, landmark_ids: Sequence[int], n_walls: int = 0) -> Prior:
+        """Return the prior of a map: landmarks it does not know have no information.
+
+        The last ``n_walls`` of the ids are walls'.
+
+        Raises
+        ------
+        ValueError
+            A landmark it does know is not in the map: it should have been dropped or renamed.
+        """
+        if missing := set(self._ids) - set(landmark_ids):
+            raise ValueError(f"the prior tells of landmarks that the map lacks: {sorted(missing)}")
+        prior, head = self._prior, self._head
+        place = {id_: row for row, id_ in enumerate(landmark_ids)}
+        at = np.concatenate([np.arange(head), _columns([place[i] for i in self._ids], head)])
+        size = head + 2 * len(landmark_ids)
+        information = np.zeros((size, size))
+        information[np.ix_(at, at)] = prior.information
+        gradient, mean = np.zeros(size), np.zeros(size)
+        gradient[at], mean[at] = prior.gradient, prior.mean
+        return Prior(information=information, gradient=gradient, mean=mean, n_walls=n_walls)
+
+    def rename(self, gone: int, kept: int) -> None:
+        """Let what is known of one landmark be of another, to which it is the same point.
+
+        With l_gone = l_kept their errors differ by a constant: e_gone = e_kept + d,
+        d = mean_kept - mean_gone.
+        """
+        if gone not in self._ids:
+            return
+        if kept not in self._ids:
+            self._ids[self._ids.index(gone)] = kept
+            return
+        prior = self._prior
+        into, from_ = self._at(kept), self._at(gone)
+        d = np.zeros(len(prior.mean))
+        d[from_] = prior.mean[into] - prior.mean[from_]
+        gradient = prior.gradient + prior.information @ d
+        information = prior.information.copy()
+        information[into] += information[from_]
+        information[:, into] += information[:, from_]
+        gradient[into] += gradient[from_]
+        self._keep(gone, information, gradient)
+
+    def drop(self, landmark_id: int) -> None:
+        """Marginalise a landmark."""
+        if landmark_id not in self._ids:
+            return
+        prior, at = self._prior, self._at(landmark_id)
+        gain = prior.information[:, at] @ np.linalg.pinv(prior.information[np.ix_(at, at)])
+        information = prior.information - gain @ prior.information[at]
+        gradient = prior.gradient - gain @ prior.gradient[at]
+        self._keep(landmark_id, (information + information.T) / 2, gradient)
+
+    @property
+    def _head(self) -> int:
+        return len(self._prior.mean) - 2 * len(self._ids)
+
+    def _at(self, landmark_id: int) -> Indices:
+        return _columns([self._ids.index(landmark_id)], self._head)
+
+    def _keep(self, gone: int, information: Array, gradient: Array) -> None:
+        keep = np.delete(np.arange(len(gradient)), self._at(gone))
+        self._prior = Prior(
+            information=information[np.ix_(keep, keep)],
+            gradient=gradient[keep],
+            mean=self._prior.mean[keep],
+        )
+        self._ids.remove(gone)
+
+
+def _columns(rows: Sequence[int], head: int) -> Indices:
+    first = head + 2 * np.array(rows, dtype=np.intp)
+    return np.stack([first, first + 1], axis=-1).ravel()
+
 
 # Standard deviations of a step that someone else made the robot take.
 _CARRIED_M, _CARRIED_RAD = 100.0, 10.0

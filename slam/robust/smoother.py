@@ -1,4 +1,19 @@
-"""All poses at once: Gauss-Newton that eliminates the poses in time order.
+"""When the filter has come far from where it linearised, all poses are solved for again.
+
+What poses measured that are kept no longer is a quadratic about where they were linearised. In
+additive errors it would fix the direction of the map a little more at every such point, although
+no range can see it, and the estimate would become too sure. In right-invariant errors
+
+    e_th = theta - theta0,   e_p = Rot(-e_th) p - p0,   e_l = Rot(-e_th) l - l0
+    e_phi = phi - e_th - phi0,   e_d = d - d0 (a wall's)
+
+it does not: turning and shifting robot and map together changes what ranges tell by nothing, and
+exactly so. Hence first estimates (FEJ: Huang, Mourikis, Roumeliotis, IJRR 29(5), 2010) need not be
+kept for the measurements that stay. Calibration and offsets have additive errors.
+
+The border holds the last pose, its calibration, the range offsets and the landmarks. A band
+Cholesky eliminates all earlier poses in O(poses); what is left on the border, the Schur
+complement, is the information of the belief about now.
 
 Unknown are the poses, the calibration errors of the wheels (constant, or one set per pose that
 walks), the range offsets and the landmarks. The normal equations are a band along time with a
@@ -12,23 +27,432 @@ smoothing, Dellaert and Kaess, IJRR 25(12), 2006, with time order instead of a s
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dpbtrf, dtbtrs
 
-from slam.robust.normal_equations import (
-    BORDER_HEAD,
-    CALIBRATION,
-    POSE,
-    NormalEquations,
-    eliminate,
-    solve,
+from slam.geometry import wrap_angle, wrap_angles
+from slam.robust.parameters import BackEndParameters, RelinearisationRule
+from slam.robust.run_log import Estimate, Prior, Problem, RunLog, start_prior
+from slam.robust.state import (
+    HEADING,
+    Array,
+    Indices,
+    State,
+    SymmetricMatrix,
+    quarter_turn,
+    rotation,
 )
-from slam.robust.parameters import RelinearisationRule
-from slam.robust.prior import first_values, prior_about, prior_cost, prior_terms
-from slam.robust.problem import Estimate, Prior, Problem
-from slam.robust.residuals import measurement_residuals, motion_residuals
-from slam.robust.symmetric import Array
+
+X, POSE_HEADING, AFTER_POSE = slice(0, 2), 2, 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PriorTerms:
+    """Half of the derivatives of a prior's cost at an estimate, in additive errors.
+
+    ``information`` has shape (m, m), ``gradient`` (m,).
+    """
+
+    information: Array
+    gradient: Array
+
+
+def first_values(estimate: Estimate) -> Array:
+    """Return the values a prior is about: first pose, its calibration, offsets, landmarks."""
+    return np.concatenate(
+        [
+            estimate.poses[0],
+            estimate.calibration[0],
+            estimate.offsets_m,
+            estimate.landmarks_m.ravel(),
+        ]
+    )
+
+
+def prior_cost(prior: Prior, values: Array, n_offsets: int) -> float:
+    """Return the cost of some values, shape (m,)."""
+    e, _ = _errors(prior, values, n_offsets)
+    return float(e @ (prior.information @ e + 2.0 * prior.gradient))
+
+
+def prior_terms(prior: Prior, values: Array, n_offsets: int) -> PriorTerms:
+    """Return information and gradient at some values, shape (m,)."""
+    e, turned = _errors(prior, values, n_offsets)
+    pulled = prior.information @ e
+    back = rotation(-wrap_angle(float(values[POSE_HEADING] - prior.mean[POSE_HEADING])))
+    points = _points(len(values), n_offsets, prior.n_walls)
+    by_heading = -_swept(turned, points)
+    half = _right(prior.information, back, by_heading, points)
+    information = _right(half.T, back, by_heading, points)
+    gradient = _right((pulled + prior.gradient)[None, :], back, by_heading, points)[0]
+    return PriorTerms(
+        information=(information + information.T) / 2,
+        gradient=gradient,
+    )
+
+
+def prior_about(
+    information: Array, gradient: Array, values: Array, n_offsets: int, n_walls: int = 0
+) -> Prior:
+    """Return the prior that has this information and gradient of additive errors at values."""
+    points = _points(len(values), n_offsets, n_walls)
+    by_heading = _swept(values, points)
+    stay = np.eye(2)
+    half = _right(information, stay, by_heading, points)
+    whole = _right(half.T, stay, by_heading, points)
+    return Prior(
+        information=(whole + whole.T) / 2,
+        gradient=_right(gradient[None, :], stay, by_heading, points)[0],
+        mean=values.copy(),
+        n_walls=n_walls,
+    )
+
+
+def _errors(prior: Prior, values: Array, n_offsets: int) -> tuple[Array, Array]:
+    """Return the errors e, and the values with all points turned back by e_th."""
+    angle = wrap_angle(float(values[POSE_HEADING] - prior.mean[POSE_HEADING]))
+    turned, points = values.copy(), _points(len(values), n_offsets, prior.n_walls)
+    back = rotation(-angle)
+    turned[X] = back @ values[X]
+    turned[points] = (values[points].reshape(-1, 2) @ back.T).ravel()
+    turned[points.stop :: 2] -= angle
+    e = turned - prior.mean
+    e[POSE_HEADING] = angle
+    return e, turned
+
+
+def _points(size: int, n_offsets: int, n_walls: int) -> slice:
+    """Return where the landmarks that are no walls lie."""
+    return slice(6 + n_offsets, size - 2 * n_walls)
+
+
+def _swept(values: Array, points: slice) -> Array:
+    """Return how points and walls of some values move per radian about the origin, shape (m,)."""
+    swept = np.zeros(len(values))
+    swept[X] = quarter_turn(values[X])
+    swept[points] = quarter_turn(values[points].reshape(-1, 2)).ravel()
+    swept[points.stop :: 2] = 1.0
+    return swept
+
+
+def _right(rows: Array, turn: Array, by_heading: Array, points: slice) -> Array:
+    """Return rows times the matrix [points: turn, heading column: by_heading + 1, rest: I]."""
+    result = rows.copy()
+    result[:, POSE_HEADING] += rows @ by_heading
+    result[:, X] = rows[:, X] @ turn
+    turned = rows[:, points].reshape(len(rows), -1, 2) @ turn
+    result[:, points] = turned.reshape(len(rows), -1)
+    return result
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rows:
+    """White scalar rows of measurements: residual and derivatives."""
+
+    poses: Indices
+    landmarks: Indices
+    residual: Array
+    by_pose: Array  # (m, 3)
+    by_landmark: Array  # (m, 2)
+    radars: Indices  # -1: none
+    by_offset: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Steps:
+    """White residuals (k, 3) of all motions, derivatives (k, 3, 3) by both poses, calibration."""
+
+    residual: Array
+    by_before: Array
+    by_after: Array
+    by_calibration: Array
+
+
+def motion_residuals(problem: Problem, estimate: Estimate, roots: Array) -> Steps:
+    """Return the white residuals of all motions; ``roots`` (k, 3, 3) makes their noise white."""
+    poses = estimate.poses
+    k = len(problem.increments)
+    calibration = estimate.calibration[:k] if problem.is_walking else estimate.calibration
+    s, w, kappa = calibration[:, 0], calibration[:, 1], calibration[:, 2]
+    d = problem.increments[:, :2] / (1.0 + s)[:, None]
+    D = np.hypot(d[:, 0], d[:, 1])
+    a = (problem.increments[:, 2] - kappa * D) / (1.0 + w)
+
+    c, sn = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
+    gone = np.diff(poses[:, :2], axis=0)
+    along = c * gone[:, 0] + sn * gone[:, 1]
+    across = -sn * gone[:, 0] + c * gone[:, 1]
+    residual = np.column_stack(
+        [
+            along - d[:, 0],
+            across - d[:, 1],
+            wrap_angles(np.diff(poses[:, 2]) - a),
+        ]
+    )
+    by_before = np.zeros((k, 3, 3))
+    by_before[:, 0, 0], by_before[:, 0, 1], by_before[:, 0, 2] = -c, -sn, across
+    by_before[:, 1, 0], by_before[:, 1, 1], by_before[:, 1, 2] = sn, -c, -along
+    by_before[:, 2, 2] = -1.0
+    by_after = np.zeros((k, 3, 3))
+    by_after[:, 0, 0], by_after[:, 0, 1] = c, sn
+    by_after[:, 1, 0], by_after[:, 1, 1] = -sn, c
+    by_after[:, 2, 2] = 1.0
+    by_calibration = np.zeros((k, 3, 3))
+    by_calibration[:, :2, 0] = d / (1.0 + s)[:, None]
+    by_calibration[:, 2, 0] = -kappa * D / ((1.0 + s) * (1.0 + w))
+    by_calibration[:, 2, 1] = a / (1.0 + w)
+    by_calibration[:, 2, 2] = D / (1.0 + w)
+    return Steps(
+        residual=np.einsum("kij,kj->ki", roots, residual),
+        by_before=roots @ by_before,
+        by_after=roots @ by_after,
+        by_calibration=roots @ by_calibration,
+    )
+
+
+def measurement_residuals(problem: Problem, estimate: Estimate) -> Rows:
+    """Return the white residuals of all ranges, then of all points."""
+    ranges = _range_rows(problem, estimate)
+    if not len(problem.points):
+        return ranges
+    points = _point_rows(problem, estimate)
+    return Rows(
+        poses=np.concatenate([ranges.poses, points.poses]),
+        landmarks=np.concatenate([ranges.landmarks, points.landmarks]),
+        residual=np.concatenate([ranges.residual, points.residual]),
+        by_pose=np.vstack([ranges.by_pose, points.by_pose]),
+        by_landmark=np.vstack([ranges.by_landmark, points.by_landmark]),
+        radars=np.concatenate([ranges.radars, points.radars]),
+        by_offset=np.concatenate([ranges.by_offset, points.by_offset]),
+    )
+
+
+def _range_rows(problem: Problem, estimate: Estimate) -> Rows:
+    pose = estimate.poses[problem.range_poses]
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    mx, my = problem.range_antennas[:, 0], problem.range_antennas[:, 1]
+    arm = np.column_stack([c * mx - s * my, s * mx + c * my])
+    places = pose[:, :2] + arm
+    landmarks = estimate.landmarks_m[problem.range_landmarks]
+    away = landmarks - places
+    distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-9)
+    sigmas = problem.range_sigmas_m
+    u = away / (distance * sigmas)[:, None]
+    by_landmark = u
+    n_points = len(estimate.landmarks_m) - problem.n_walls
+    walls = np.flatnonzero(problem.range_landmarks >= n_points)
+    if len(walls):
+        # z = d - n . q: the place matters along the normal only.
+        c, s = np.cos(landmarks[walls, 0]), np.sin(landmarks[walls, 0])
+        qx, qy = places[walls].T
+        distance[walls] = landmarks[walls, 1] - c * qx - s * qy
+        u[walls] = np.column_stack([c, s]) / sigmas[walls, None]
+        by_landmark = u.copy()
+        by_wall = np.column_stack([s * qx - c * qy, np.ones(len(walls))])
+        by_landmark[walls] = by_wall / sigmas[walls, None]
+    by_pose = np.column_stack([-u, u[:, 0] * arm[:, 1] - u[:, 1] * arm[:, 0]])
+    predicted = distance + estimate.offsets_m[problem.range_radars]
+    return Rows(
+        poses=problem.range_poses,
+        landmarks=problem.range_landmarks,
+        residual=(predicted - problem.ranges_m) / sigmas,
+        by_pose=by_pose,
+        by_landmark=by_landmark,
+        radars=problem.range_radars,
+        by_offset=1.0 / sigmas,
+    )
+
+
+def _point_rows(problem: Problem, estimate: Estimate) -> Rows:
+    pose = estimate.poses[problem.point_poses]
+    away = estimate.landmarks_m[problem.point_landmarks] - pose[:, :2]
+    q = np.maximum(np.sum(away**2, axis=1), 1e-18)
+    distance = np.sqrt(q)
+    residual = np.column_stack([distance, np.arctan2(away[:, 1], away[:, 0]) - pose[:, 2]])
+    residual -= problem.points
+    residual[:, 1] = wrap_angles(residual[:, 1])
+    by_landmark = np.empty((len(q), 2, 2))
+    by_landmark[:, 0] = away / distance[:, None]
+    by_landmark[:, 1, 0], by_landmark[:, 1, 1] = -away[:, 1] / q, away[:, 0] / q
+    by_pose = np.zeros((len(q), 2, 3))
+    by_pose[:, :, :2] = -by_landmark
+    by_pose[:, 1, 2] = -1.0
+    roots = problem.point_roots
+    return Rows(
+        poses=np.repeat(problem.point_poses, 2),
+        landmarks=np.repeat(problem.point_landmarks, 2),
+        residual=np.einsum("kij,kj->ki", roots, residual).ravel(),
+        by_pose=(roots @ by_pose).reshape(-1, 3),
+        by_landmark=(roots @ by_landmark).reshape(-1, 2),
+        radars=np.full(2 * len(q), -1, dtype=np.intp),
+        by_offset=np.zeros(2 * len(q)),
+    )
+
+
+POSE, CALIBRATION = slice(0, 3), slice(3, 6)
+BORDER_HEAD = 6
+
+
+class NormalEquations:
+    """Normal equations ``[A, B; B^T, C] x = -[g, h]``: band A, border C."""
+
+    def __init__(self, n_chain: int, size: int, n_border: int) -> None:
+        self.size = size
+        self.n_chain = n_chain
+        self.diagonal = np.zeros((n_chain + 1, size, size))  # the last one goes to the border
+        self.lower = np.zeros((n_chain, size, size))  # (k + 1, k)
+        self.B = np.zeros((n_chain + 1, size, n_border))
+        self.C = np.zeros((n_border, n_border))
+        self.g = np.zeros((n_chain + 1, size))
+        self.h = np.zeros(n_border)
+
+    def add_steps(self, steps: Steps) -> None:
+        """Add motions whose calibration is one constant, in the border."""
+        before, after, by = steps.by_before, steps.by_after, steps.by_calibration
+        self._add_pairs(before, after, steps.residual)
+        transposed = by.transpose(0, 2, 1)
+        self.B[:-1, :, CALIBRATION] += before.transpose(0, 2, 1) @ by
+        self.B[1:, :, CALIBRATION] += after.transpose(0, 2, 1) @ by
+        self.C[CALIBRATION, CALIBRATION] += (transposed @ by).sum(axis=0)
+        self.h[CALIBRATION] += np.einsum("kij,kj->i", transposed, steps.residual)
+
+    def add_walking_steps(self, steps: Steps, walk_roots: Array, walks: Array) -> None:
+        """Add motions whose calibration belongs to each pose, and its walk from pose to pose."""
+        k = self.n_chain
+        before, after = np.zeros((k, 6, 6)), np.zeros((k, 6, 6))
+        before[:, :3, :3], before[:, :3, 3:] = steps.by_before, steps.by_calibration
+        after[:, :3, :3] = steps.by_after
+        for i in range(3):
+            before[:, 3 + i, 3 + i] = -walk_roots[:, i]
+            after[:, 3 + i, 3 + i] = walk_roots[:, i]
+        self._add_pairs(before, after, np.hstack([steps.residual, walks]))
+
+    def _add_pairs(self, before: Array, after: Array, residual: Array) -> None:
+        before_t, after_t = before.transpose(0, 2, 1), after.transpose(0, 2, 1)
+        self.diagonal[:-1] += before_t @ before
+        self.diagonal[1:] += after_t @ after
+        self.lower += after_t @ before
+        self.g[:-1] += np.einsum("kij,kj->ki", before_t, residual)
+        self.g[1:] += np.einsum("kij,kj->ki", after_t, residual)
+
+    def add_rows(self, rows: Rows, weight: NDArray[np.bool_], n_offsets: int) -> None:
+        """Add scalar rows, those of weight zero left out."""
+        n_poses, n_border = self.n_chain + 1, len(self.h)
+        at = np.flatnonzero(weight)
+        pose, residual = rows.poses[at], rows.residual[at]
+        by_pose = rows.by_pose[at]
+        offset = np.where(rows.radars[at] >= 0, BORDER_HEAD + rows.radars[at], -1)
+        first = BORDER_HEAD + n_offsets + 2 * rows.landmarks[at]
+        columns = np.column_stack([np.maximum(offset, BORDER_HEAD), first, first + 1])
+        columns = np.minimum(columns, n_border - 1)
+        by_border = np.column_stack(
+            [np.where(offset >= 0, rows.by_offset[at], 0.0), rows.by_landmark[at]]
+        )
+        for i in range(3):
+            for j in range(i + 1):
+                block = np.bincount(pose, by_pose[:, i] * by_pose[:, j], n_poses)
+                self.diagonal[:, i, j] += block
+                if i != j:
+                    self.diagonal[:, j, i] += block
+            self.g[:, i] += np.bincount(pose, by_pose[:, i] * residual, n_poses)
+            flat = (pose * self.size + i)[:, None] * n_border + columns
+            np.add.at(self.B.reshape(-1), flat, by_pose[:, i, None] * by_border)
+        for j in range(3):
+            self.h += np.bincount(columns[:, j], by_border[:, j] * residual, n_border)
+            flat = columns[:, j, None] * n_border + columns
+            np.add.at(self.C.reshape(-1), flat, by_border[:, j, None] * by_border)
+
+    def add_prior(self, information: Array, gradient: Array) -> None:
+        """Add what is known of the first pose, its calibration, the offsets and landmarks."""
+        pose, rest = slice(0, 3), slice(BORDER_HEAD, None)
+        self.g[0, :3] += gradient[:3]
+        self.diagonal[0, :3, :3] += information[pose, pose]
+        if self.size == BORDER_HEAD:
+            calibration = slice(3, 6)
+            self.g[0, 3:] += gradient[calibration]
+            self.diagonal[0, 3:, :] += information[calibration, :6]
+            self.diagonal[0, :3, 3:] += information[pose, calibration]
+            self.B[0, :, rest] += information[:6, rest]
+            self.C[rest, rest] += information[rest, rest]
+            self.h[rest] += gradient[rest]
+        else:
+            border = slice(3, None)
+            self.B[0, :, border] += information[pose, border]
+            self.C[border, border] += information[border, border]
+            self.h[border] += gradient[border]
+
+    def closed(self) -> tuple[Array, Array, Array, Array, Array]:
+        """Return band, B, C, g and h with the last pose moved to the border."""
+        size, k = self.size, self.n_chain
+        last = slice(0, size)
+        B = self.B[:-1].copy()
+        B[-1, :, last] += self.lower[-1].T
+        C, h = self.C.copy(), self.h.copy()
+        C[last, last] += self.diagonal[-1]
+        C[last, :] += self.B[-1]
+        C[:, last] += self.B[-1].T
+        h[last] += self.g[-1]
+        band = np.zeros((2 * size, k * size))
+        for i in range(size):
+            for j in range(size):
+                if i >= j:
+                    band[i - j, j::size] = self.diagonal[:-1, i, j]
+                band[size + i - j, j : (k - 1) * size : size] = self.lower[:-1, i, j]
+        return band, B.reshape(k * size, -1), C, self.g[:-1].ravel(), h
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Eliminated:
+    """What is left on the border, and what gives the poses back."""
+
+    information: Array
+    gradient: Array
+    factor: Array
+    W: Array
+    y: Array
+    size: int
+
+
+def eliminate(equations: NormalEquations) -> Eliminated:
+    """Eliminate all poses but the last, in time order."""
+    band, B, C, g, h = equations.closed()
+    factor, info = dpbtrf(band, lower=1)
+    if info != 0:
+        raise np.linalg.LinAlgError("the chain of poses is not positive definite")
+    right = np.asfortranarray(np.column_stack([B, g]))
+    solved, info = dtbtrs(factor, right, uplo="L", overwrite_b=1)
+    if info != 0:
+        raise np.linalg.LinAlgError("the chain of poses is singular")
+    W, y = solved[:, :-1], solved[:, -1]
+    information = C - W.T @ W
+    return Eliminated(
+        information=(information + information.T) / 2,
+        gradient=h - W.T @ y,
+        factor=factor,
+        W=W,
+        y=y,
+        size=equations.size,
+    )
+
+
+def solve(equations: NormalEquations) -> tuple[Array, Array]:
+    """Return the change of the chain (k, size) and of the border."""
+    left = eliminate(equations)
+    border = -_solve_positive(left.information, left.gradient)
+    chain, _ = dtbtrs(left.factor, -(left.y + left.W @ border)[:, None], uplo="L", trans="T")
+    if not (np.isfinite(chain).all() and np.isfinite(border).all()):
+        raise np.linalg.LinAlgError("the normal equations are singular")
+    return chain.reshape(-1, left.size), border
+
+
+def _solve_positive(matrix: Array, right: Array) -> Array:
+    L = np.linalg.cholesky(matrix)
+    return np.asarray(np.linalg.solve(L.T, np.linalg.solve(L, right)))
+
 
 _LEAST_WALK_SHARE = 1e-5
 
@@ -195,3 +619,138 @@ def _inverse_roots(covariances: Array) -> Array:
     if not len(covariances):
         return np.zeros((0, 3, 3))
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)))
+
+
+_UNKNOWN = 100.0
+
+
+def is_due(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
+    """Tell whether the pose has parted too far from the stored trajectory, or that is too long."""
+    rule = parameters.relinearisation
+    if rule is None:
+        return False
+    if log.since_solved < rule.every:
+        return False
+    if log.n_kept > rule.most_poses:
+        return True
+    if not state.feature_ids:
+        return False
+    shift_m, turn_rad = log.parted(state.pose)
+    return turn_rad > rule.turn_rad or shift_m > rule.shift_m
+
+
+def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
+    """Solve for all poses and let the result take the belief's place; tell whether it worked."""
+    rule = parameters.relinearisation
+    if rule is None:
+        return False
+    log.tried()
+    smoother, start = _all_poses(log, state, parameters, rule)
+    solution = smoother.solve(start)
+    if solution is not None and not is_determined(solution.information):
+        solution = None
+    if solution is not None:
+        _replace(state, solution)
+        log.solved(solution.estimate)
+    if log.n_kept > rule.most_poses:
+        # Best at the solution; but the log must not grow, not even where there is none.
+        known = start if solution is None else solution.estimate
+        n_steps = log.n_kept - math.ceil(rule.kept_share * rule.most_poses)
+        with suppress(np.linalg.LinAlgError):  # then it is tried again a little later
+            prior = smoother.condensed(known, n_steps, rule.outlier_sigmas)
+            log.condense(prior, state.feature_ids, n_steps)
+    return solution is not None
+
+
+def give_radius(
+    log: RunLog,
+    state: State,
+    parameters: BackEndParameters,
+    candidate: tuple[int, float],
+    lead: float,
+) -> bool:
+    """Give the landmark in a row a radius if all that was measured is likelier so; tell if it is.
+
+    ``lead`` is by how much the cost of the solution over all poses must fall. Then that solution
+    takes the belief's place.
+    """
+    rule = parameters.relinearisation
+    if rule is None:
+        return False
+    row, radius_m = candidate
+    smoother, start = _all_poses(log, state, parameters, rule)
+    solution = smoother.solve(start)
+    if solution is None:
+        return False
+    least = solution.cost - lead
+    id_, point_m = state.landmark_ids[row], state.landmarks_m[row].copy()
+    before_m = state.radii_m.pop(id_, 0.0)
+    away = point_m - state.position_m
+    state.landmarks_m[row] += (radius_m - before_m) * away / max(float(np.hypot(*away)), 1e-6)
+    if radius_m:
+        state.radii_m[id_] = radius_m
+    smoother, start = _all_poses(log, state, parameters, rule)
+    solution = smoother.solve(start)
+    fits = solution is not None and solution.cost <= least
+    if solution is not None and fits and is_determined(solution.information):
+        _replace(state, solution)
+        log.solved(solution.estimate)
+        return True
+    state.landmarks_m[row] = point_m
+    state.radii_m.pop(id_, None)
+    if before_m:
+        state.radii_m[id_] = before_m
+    return False
+
+
+def is_determined(information: Array) -> bool:
+    """Tell whether all unknowns of a solution are known to better than 100 m, rad or 1.
+
+    A landmark all of whose ranges were left out as too far off has no information but rounding;
+    its covariance would be of 1e14 m^2, and have negative eigenvalues.
+    """
+    variances = np.linalg.inv(information).diagonal()
+    return bool(np.all((variances > 0.0) & (variances < _UNKNOWN**2)))
+
+
+def _all_poses(
+    log: RunLog, state: State, parameters: BackEndParameters, rule: RelinearisationRule
+) -> tuple[Smoother, Estimate]:
+    """Return the problem of all poses and the better of the values to start from."""
+    prior = start_prior(
+        parameters.wheels.calibration_sigmas,
+        (parameters.ranges.offset_sigma_m,) * len(state.offsets_m),
+        len(state.feature_ids),
+    )
+    problem = log.problem(state, prior)
+    smoother = Smoother(problem, rule)
+    return smoother, min(log.starts(state, problem), key=smoother.cost)
+
+
+def _replace(state: State, solution: Solution) -> None:
+    """Let a solution take the place of the belief."""
+    estimate = solution.estimate
+    pose = estimate.poses[-1]
+    state.position_m = pose[:2].copy()
+    state.heading_rad = math.remainder(float(pose[2]), math.tau)
+    state.calibration = estimate.calibration[-1].copy()
+    state.offsets_m = estimate.offsets_m.copy()
+    n = len(state.landmark_ids)
+    state.landmarks_m = estimate.landmarks_m[:n].copy()
+    state.walls = estimate.landmarks_m[n:].copy()
+    state.P = SymmetricMatrix(invariant_covariance(state, solution.information))
+
+
+def invariant_covariance(state: State, information: Array) -> Array:
+    """Return the covariance of the right-invariant error from the information of additive ones.
+
+    The smoother orders (x, y, heading, ...), the filter (heading, x, y, ...);
+    e_p = e_add,p - J p e_th, landmarks likewise.
+    """
+    additive = np.linalg.inv(information)
+    order = np.concatenate([[2, 0, 1], np.arange(3, len(additive))])
+    additive = additive[np.ix_(order, order)]
+    T = state.additive_transform()
+    T[1:, HEADING] *= -1.0
+    P = T @ additive @ T.T
+    return np.asarray((P + P.T) / 2)

@@ -45,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None) -> int:
     from xethru_protocol.cli.arguments import parse
     from xethru_protocol.cli.output import end_output, one_line, warn
-    from xethru_protocol.errors import XeThruError
+    from xethru_protocol.wire.errors import XeThruError
 
     try:
         arguments = parse(argv)

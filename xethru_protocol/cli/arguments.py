@@ -1,10 +1,82 @@
 """Arguments of ``xethru``. Importing this loads nothing that a command needs."""
 
 import argparse
+import math
+from argparse import ArgumentTypeError
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
-from xethru_protocol.cli import values
+_LONGEST_S = 1e9  # 30 years
+
+
+def frame_rate(text: str) -> float:
+    """Read frames per second."""
+    value = _number(text)
+    if not 0 < value < 65536:
+        raise ArgumentTypeError(f"{text!r} must be a number between 0 and 65536")
+    return value
+
+
+def seconds(text: str) -> float:
+    """Read a time span [s]."""
+    value = _number(text)
+    if not 0 < value <= _LONGEST_S:
+        raise ArgumentTypeError(f"{text!r} must be seconds, more than 0")
+    return value
+
+
+def metres(text: str) -> float:
+    """Read a distance [m], a hundred times what any radar sees."""
+    value = _number(text)
+    if not -1000 <= value <= 1000:
+        raise ArgumentTypeError(f"{text!r} must be metres between -1000 and 1000")
+    return value
+
+
+def not_empty(text: str) -> str:
+    """Read a name."""
+    if not text:
+        raise ArgumentTypeError("an empty name is none")
+    return text
+
+
+def text(text: str) -> str:
+    """Read a text."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:  # bytes that the shell passed on
+        raise ArgumentTypeError("this is no text in UTF-8") from None
+    return text
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan  # in no range: the caller says what is allowed
+
+
+def at_least_one(text: str) -> int:
+    """Read a count."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
+    if value < 1:
+        raise ArgumentTypeError(f"{text!r} must be a whole number from 1 on")
+    return value
+
+
+def baud_rate(text: str) -> int:
+    """Read a rate that a module could be set to (Protocol reference 4.10)."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
+    if not 600 <= value <= 10_000_000:
+        raise ArgumentTypeError(f"{text!r} must be a whole number from 600 to 10000000")
+    return value
+
 
 _FROM = ("auto", "host", "module")
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
@@ -62,7 +134,7 @@ def _add_doctor(commands: _Commands) -> None:
     )
     one.add_argument(
         "--port",
-        type=values.not_empty,
+        type=not_empty,
         action="append",
         default=[],
         help="examine this port; may be given several times (default: all that are found)",
@@ -93,7 +165,7 @@ def _add_stream(commands: _Commands) -> None:
     _add_port(one)
     _add_json(one)
     _add_raw_settings(one)
-    one.add_argument("--count", type=values.at_least_one, help="stop after COUNT frames")
+    one.add_argument("--count", type=at_least_one, help="stop after COUNT frames")
     one.add_argument("--samples", action="store_true", help="print the samples, too")
 
 
@@ -110,13 +182,13 @@ def _add_record(commands: _Commands) -> None:
     _add_port(one)
     one.add_argument(
         "--out",
-        type=values.not_empty,
+        type=not_empty,
         metavar="DIR",
         help="directory for a recording in the vendor's format (ModuleConnector)",
     )
     one.add_argument(
         "--wire",
-        type=values.not_empty,
+        type=not_empty,
         metavar="FILE",
         help="also, or only, write all bytes of both directions here",
     )
@@ -128,13 +200,13 @@ def _add_record(commands: _Commands) -> None:
         "to what the module is sending, and send it nothing",
     )
     _add_raw_settings(one)
-    one.add_argument("--count", type=values.at_least_one, help="stop after COUNT messages")
+    one.add_argument("--count", type=at_least_one, help="stop after COUNT messages")
     one.add_argument(
-        "--duration", type=values.seconds, metavar="S", help="stop after S seconds of recording"
+        "--duration", type=seconds, metavar="S", help="stop after S seconds of recording"
     )
     one.add_argument(
         "--session-id",
-        type=values.text,
+        type=text,
         default="",
         metavar="TEXT",
         help="name kept in the recording",
@@ -154,7 +226,7 @@ def _add_dump(commands: _Commands) -> None:
         "message, as decode does, with its time t_ns. Exit 1 if a part could not be read.",
     )
     one.add_argument(
-        "file", type=values.not_empty, metavar="FILE", help="file or directory of a recording"
+        "file", type=not_empty, metavar="FILE", help="file or directory of a recording"
     )
     one.add_argument("--samples", action="store_true", help="print arrays whole")
     _add_radar(one)
@@ -172,13 +244,11 @@ def _add_convert(commands: _Commands) -> None:
     )
     one.add_argument(
         "source",
-        type=values.not_empty,
+        type=not_empty,
         metavar="SOURCE",
         help="any recording that 'xethru dump' reads",
     )
-    one.add_argument(
-        "target", type=values.not_empty, metavar="TARGET", help="file or directory to write"
-    )
+    one.add_argument("target", type=not_empty, metavar="TARGET", help="file or directory to write")
     _add_radar(one)
     _add_force(one, "replace TARGET if it exists")
     _add_json(one)
@@ -187,7 +257,7 @@ def _add_convert(commands: _Commands) -> None:
 def _add_radar(one: argparse.ArgumentParser) -> None:
     one.add_argument(
         "--radar",
-        type=values.not_empty,
+        type=not_empty,
         metavar="NAME",
         help="which radar of a session that holds several",
     )
@@ -205,7 +275,7 @@ def _add_decode(commands: _Commands) -> None:
         "explains every byte wins; 01 with a value that modules answer is PONG, else PING.",
     )
     one.add_argument(
-        "file", type=values.not_empty, nargs="?", metavar="FILE", help="- or none: standard input"
+        "file", type=not_empty, nargs="?", metavar="FILE", help="- or none: standard input"
     )
     one.add_argument(
         "--hex",
@@ -242,13 +312,13 @@ def _command(
 def _add_port(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--port",
-        type=values.not_empty,
+        type=not_empty,
         required=True,
         help="serial port, for example /dev/ttyACM0",
     )
     parser.add_argument(
         "--baudrate",
-        type=values.baud_rate,
+        type=baud_rate,
         default=115200,
         metavar="RATE",
         help="of a module on a UART (default 115200); without meaning on USB and for emulators",
@@ -260,13 +330,13 @@ def _add_raw_settings(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--frame-area",
         nargs=2,
-        type=values.metres,
+        type=metres,
         default=(0.2, 9.4),
         metavar=("START", "END"),
         help="range to read, in module metres (default 0.2 9.4)",
     )
     group.add_argument(
-        "--fps", type=values.frame_rate, default=17.0, help="frames per second (default 17)"
+        "--fps", type=frame_rate, default=17.0, help="frames per second (default 17)"
     )
     group.add_argument(
         "--baseband", action="store_true", help="complex baseband bins instead of RF bins"
@@ -315,8 +385,8 @@ def _reset(arguments: argparse.Namespace) -> int:
 
 
 def _stream(arguments: argparse.Namespace) -> int:
-    from xethru_protocol.cli.stream import stream
-    from xethru_protocol.raw_config import RawConfig
+    from xethru_protocol.cli.module import stream
+    from xethru_protocol.driver.link import RawConfig
 
     return stream(
         arguments.port,
@@ -332,10 +402,8 @@ def _stream(arguments: argparse.Namespace) -> int:
 def _record(arguments: argparse.Namespace) -> int:
     from pathlib import Path
 
-    from xethru_protocol.cli.record import record
-    from xethru_protocol.cli.recorder import Targets
-    from xethru_protocol.cli.recording_modes import recording_mode
-    from xethru_protocol.raw_config import RawConfig
+    from xethru_protocol.cli.record import Targets, record, recording_mode
+    from xethru_protocol.driver.link import RawConfig
 
     config = RawConfig(frame_area_m=tuple(arguments.frame_area), downconversion=arguments.baseband)
     mode = recording_mode(arguments.profile, config, arguments.fps)
@@ -359,7 +427,7 @@ def _record(arguments: argparse.Namespace) -> int:
 
 
 def _dump(arguments: argparse.Namespace) -> int:
-    from xethru_protocol.cli.dump import dump
+    from xethru_protocol.cli.recordings import dump
 
     return dump(
         arguments.file,
@@ -370,7 +438,7 @@ def _dump(arguments: argparse.Namespace) -> int:
 
 
 def _convert(arguments: argparse.Namespace) -> int:
-    from xethru_protocol.cli.convert import convert
+    from xethru_protocol.cli.recordings import convert
 
     return convert(
         arguments.source,
@@ -382,7 +450,7 @@ def _convert(arguments: argparse.Namespace) -> int:
 
 
 def _decode(arguments: argparse.Namespace) -> int:
-    from xethru_protocol.cli.decode import decode
+    from xethru_protocol.cli.recordings import decode
 
     return decode(
         None if arguments.file == "-" else arguments.file,

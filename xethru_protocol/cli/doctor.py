@@ -1,20 +1,453 @@
-"""``xethru doctor``: what is wrong with the ports of this machine, and what to do about it."""
+"""``xethru doctor``: what is wrong with the ports of this machine, and what to do about it.
 
+To add a check, add a row where its turn is. A port that another program has open must not be
+touched, so whatever opens the port comes after the rows that look for such programs.
+"""
+
+import json
 import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from xethru_protocol.cli.examination import Finding, Level, examine
-from xethru_protocol.cli.machine_checks import MACHINE_CHECKS, Machine
-from xethru_protocol.cli.output import one_line, print_json, print_line
-from xethru_protocol.cli.patient import Patient
-from xethru_protocol.cli.port_checks import PORT_CHECKS
-from xethru_protocol.cli.profiles import profile_name
-from xethru_protocol.cli.progress import counted
-from xethru_protocol.errors import XeThruError
-from xethru_protocol.ports import find_ports, run_directory
+from xethru_protocol.cli.output import counted, one_line, print_json, print_line, profile_name
+from xethru_protocol.cli.port_probe import USUAL_BAUDRATE, Check, Finding, Level, Patient, examine
+from xethru_protocol.transport import find_ports, is_running, run_directory
+from xethru_protocol.wire.codes import PongCode, ProfileId, SensorMode
+from xethru_protocol.wire.errors import XeThruError
+from xethru_protocol.wire.messages import Ping
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Machine:
+    """A computer: ports found, and the folder in which emulators leave word."""
+
+    ports: tuple[str, ...]
+    run_directory: Path
+
+    @property
+    def stale(self) -> tuple[Path, ...]:
+        """What emulators left that are not running any more."""
+        return tuple(
+            entry
+            for entry in sorted(self.run_directory.glob("*"))
+            if (pid := _process_id(entry)) is not None and not is_running(pid)
+        )
+
+    @property
+    def damaged(self) -> tuple[Path, ...]:
+        """Entries of running emulators that cannot be read."""
+        return tuple(
+            entry
+            for entry in sorted(self.run_directory.glob("*.json"))
+            if entry not in self.stale and not _is_readable(entry)
+        )
+
+
+def _process_id(entry: Path) -> int | None:
+    """Process an entry belongs to: ``<pid>.json`` or ``ports-<pid>-...``; None if it is neither."""
+    if entry.suffix == ".json":
+        text = entry.stem
+    elif entry.name.startswith("ports-"):
+        text = entry.name.split("-")[1]
+    else:
+        return None
+    return int(text) if text.isascii() and text.isdecimal() and len(text) < 20 else None
+
+
+def _is_readable(entry: Path) -> bool:
+    try:
+        return isinstance(json.loads(entry.read_text()), dict)
+    except (OSError, ValueError, RecursionError):
+        return False
+
+
+def _no_module(machine: Machine) -> str | None:
+    if machine.ports:
+        return None
+    return "no module was found: none on USB, no emulator is running"
+
+
+def _stale_entries(machine: Machine) -> str | None:
+    if not machine.stale:
+        return None
+    return f"{machine.run_directory} still holds what emulators left that have died"
+
+
+def _damaged_entries(machine: Machine) -> str | None:
+    if not machine.damaged:
+        return None
+    return "what a running emulator says about its ports cannot be read"
+
+
+MACHINE_CHECKS = (
+    Check(
+        name="modules found",
+        looks_at="USB ids, and the word of running emulators",
+        find=_no_module,
+        remedy="plug one in, run xethru-emulator serve --bare, or name a port with --port",
+    ),
+    Check(
+        name="no dead emulators",
+        looks_at="processes named in the run directory",
+        find=_stale_entries,
+        remedy="start an emulator, which tidies up, or run: rm -r {stale}",
+    ),
+    Check(
+        name="emulators' word readable",
+        looks_at="entries of the run directory",
+        find=_damaged_entries,
+        remedy="stop that emulator and run: rm {damaged}",
+    ),
+)
+
+
+_OLDEST_SOUND_FIRMWARE = (1, 6, 8)  # Protocol reference 15, item 10
+_FEW = 4
+_POWER_CYCLE = "take the module's power away for some seconds"
+
+
+# --- the port ---------------------------------------------------------------------------------
+
+
+def _stale_link(patient: Patient) -> str | None:
+    if patient.is_stale_link:
+        return f"it is a link to {patient.target}, which is gone: its emulator has died"
+    return None
+
+
+def _missing(patient: Patient) -> str | None:
+    return None if patient.exists else "there is no such port"
+
+
+def _no_port(patient: Patient) -> str | None:
+    return None if patient.is_serial_port else "it is no serial port"
+
+
+def _no_rights(patient: Patient) -> str | None:
+    if patient.may_be_opened:
+        return None
+    return f"user {patient.user} may not open it; it belongs to group {patient.group}"
+
+
+def _no_rights_for_the_group(patient: Patient) -> str | None:
+    return None if patient.group_may_open else _no_rights(patient)
+
+
+def _shared(patient: Patient) -> str | None:
+    if len(patient.users) < 2:
+        return None
+    names = " and ".join(map(str, patient.users[:_FEW]))
+    if len(patient.users) > _FEW:
+        names += f" and {len(patient.users) - _FEW} more"
+    return f"{names} have it open at once: each gets only a part of what the module sends"
+
+
+def _in_use(patient: Patient) -> str | None:
+    return f"{patient.users[0]} has it open" if patient.users else None
+
+
+def _cannot_open(patient: Patient) -> str | None:
+    if patient.opens or patient.refusal is None:
+        return None
+    return patient.refusal
+
+
+# --- whether a module answers -------------------------------------------------------------------
+
+
+def _gone(patient: Patient) -> str | None:
+    return "it went away while the module was asked" if patient.contact.gone else None
+
+
+def _bootloader(patient: Patient) -> str | None:
+    if not patient.contact.bootloader:
+        return None
+    return "the module is in its bootloader; more than 15 faults in a row bring it there, too"
+
+
+def _gibberish(patient: Patient) -> str | None:
+    contact = patient.contact
+    if contact.pong is None and contact.damaged:
+        return "it sends bytes, but no XeThru packets, and answers at none of the known rates"
+    return None
+
+
+def _deaf(patient: Patient) -> str | None:
+    contact = patient.contact
+    if contact.pong is None and contact.talks:
+        return "the module sends messages, but does not answer"
+    return None
+
+
+def _silent(patient: Patient) -> str | None:
+    return "nothing answers" if patient.contact.pong is None else None
+
+
+def _echo(patient: Patient) -> str | None:
+    if patient.contact.pong == Ping().seed:
+        return "it sends back what it gets, like a cable whose ends are joined"
+    return None
+
+
+def _stranger(patient: Patient) -> str | None:
+    pong = patient.contact.pong
+    if pong in set(PongCode):
+        return None
+    return f"it answers PING with 0x{pong:08X}, as no XeThru module does"
+
+
+def _other_rate(patient: Patient) -> str | None:
+    rate = patient.contact.baudrate
+    if rate == USUAL_BAUDRATE:
+        return None
+    return f"it answers at {rate} baud, not at {USUAL_BAUDRATE}"
+
+
+# --- the module -------------------------------------------------------------------------------
+
+
+def _not_ready(patient: Patient) -> str | None:
+    if patient.contact.pong == PongCode.XTS_SPRP_NOTREADY:
+        return "the module says it is not ready yet"
+    return None
+
+
+def _safe_mode(patient: Patient) -> str | None:
+    if patient.contact.pong == PongCode.XTS_SPRP_SAFEMODE:
+        return "it is in safe mode: ten faults in a row made it start without its profiles"
+    return None
+
+
+def _bare_xep(patient: Patient) -> str | None:
+    if not patient.is_bare_xep:
+        return None
+    return f"bare {patient.info.firmware_id or 'XEP'} firmware without profiles: raw frames only"
+
+
+def _stale_firmware(patient: Patient) -> str | None:
+    version = patient.version
+    if patient.is_bare_xep or version is None or version >= _OLDEST_SOUND_FIRMWARE:
+        return None
+    return (
+        f"firmware {patient.info.version} sets the chip's DAC settle time wrongly, "
+        "which costs 3 dB of signal"
+    )
+
+
+def _other_product(patient: Patient) -> str | None:
+    code = patient.info.order_code
+    return None if code is None or code == "X4M300" else f"it is an {code}, not an X4M300"
+
+
+def _wrong_profile(patient: Patient) -> str | None:
+    loaded = patient.profile_id
+    if loaded is None or loaded in (ProfileId.XTS_ID_APP_NONE, ProfileId.XTS_ID_APP_PRESENCE_2):
+        return None
+    return f"profile {profile_name(loaded)} is loaded, not PRESENCE_2, the X4M300's own"
+
+
+def _no_profile(patient: Patient) -> str | None:
+    if patient.profile_id == ProfileId.XTS_ID_APP_NONE:
+        return f"no profile is loaded (mode {patient.info.mode}); raw programs leave it so"
+    return None
+
+
+def _stopped(patient: Patient) -> str | None:
+    paused = (SensorMode.XTID_SM_IDLE.label, SensorMode.XTID_SM_STOP.label)
+    if patient.profile_id != ProfileId.XTS_ID_APP_NONE and patient.info.mode in paused:
+        return f"the radar stands still (mode {patient.info.mode})"
+    return None
+
+
+def _transmitter_off(patient: Patient) -> str | None:
+    # asking the chip would disturb a running profile
+    if patient.info.mode not in (None, SensorMode.XTID_SM_MANUAL.label) or patient.tx_power != 0:
+        return None
+    return "the transmitter is off; the module does that itself after 100 frames of zeros"
+
+
+# --- the table ----------------------------------------------------------------------------------
+
+PORT_CHECKS = (
+    Check(
+        name="link leads to a port",
+        looks_at="what the path links to",
+        find=_stale_link,
+        remedy="start the emulator again, or remove the link: rm {path}",
+        ends=True,
+    ),
+    Check(
+        name="port exists",
+        looks_at="the path",
+        find=_missing,
+        remedy="plug the module in; 'xethru list' shows the ports there are",
+        ends=True,
+    ),
+    Check(
+        name="is a serial port",
+        looks_at="what kind of file the path is, and its driver",
+        find=_no_port,
+        remedy="name the module's port, such as /dev/ttyACM0; 'xethru list' shows them",
+        ends=True,
+    ),
+    Check(
+        name="group has rights",
+        looks_at="permissions of the device",
+        find=_no_rights_for_the_group,
+        remedy="its group may not open it either: add a udev rule, or run sudo chmod 660 {target}",
+        ends=True,
+    ),
+    Check(
+        name="user has rights",
+        looks_at="permissions of the device",
+        find=_no_rights,
+        remedy="join the group with sudo usermod -aG {group} {user}, then log in again",
+        ends=True,
+    ),
+    Check(
+        name="no two readers",
+        looks_at="open files of all programs (/proc)",
+        find=_shared,
+        remedy="end all of them but one",
+        ends=True,
+    ),
+    Check(
+        name="nobody else has it open",
+        looks_at="open files of all programs (/proc)",
+        find=_in_use,
+        remedy="end that program; the port was left alone, so nothing else is known",
+        ends=True,
+    ),
+    Check(
+        name="can be opened",
+        looks_at="the answer of the system",
+        find=_cannot_open,
+        remedy="if a program of another user has it, sudo xethru doctor --port {path} names it",
+        ends=True,
+    ),
+    Check(
+        name="stays connected",
+        looks_at="the line while PING is sent",
+        find=_gone,
+        remedy="check plug and cable; a module that has just restarted needs ten seconds",
+        ends=True,
+    ),
+    Check(
+        name="not in the bootloader",
+        looks_at="the answer to a question only the bootloader knows",
+        find=_bootloader,
+        remedy=f"{_POWER_CYCLE}; if it stays there, write its firmware anew",
+        ends=True,
+    ),
+    Check(
+        name="speaks XeThru",
+        looks_at="what comes after PING",
+        find=_gibberish,
+        remedy="is it another device? If it is a module, " + _POWER_CYCLE,
+        ends=True,
+    ),
+    Check(
+        name="listens",
+        looks_at="what comes after PING",
+        find=_deaf,
+        remedy=f"{_POWER_CYCLE}; on a UART, check the line from host to module",
+        ends=True,
+    ),
+    Check(
+        name="answers",
+        looks_at="the answer to PING, at all rates on a UART",
+        find=_silent,
+        remedy="is a module there, and powered? One that has just restarted needs ten seconds; "
+        f"if it stays silent, {_POWER_CYCLE}",
+        ends=True,
+    ),
+    Check(
+        name="no echo",
+        looks_at="the answer to PING",
+        find=_echo,
+        remedy="connect the port to a module",
+        ends=True,
+    ),
+    Check(
+        name="is a module",
+        looks_at="the answer to PING",
+        find=_stranger,
+        remedy="is it another device? 'xethru list' shows the ports there are",
+        ends=True,
+    ),
+    Check(
+        name="usual baud rate",
+        looks_at="the rate at which PING was answered",
+        find=_other_rate,
+        remedy=f"{_POWER_CYCLE} (the rate is not stored), or give "
+        "--baudrate {contact.baudrate} to the other commands",
+    ),
+    Check(
+        name="ready",
+        looks_at="the answer to PING",
+        find=_not_ready,
+        remedy="wait ten seconds; if this stays, xethru reset --port {path}",
+        ends=True,
+    ),
+    Check(
+        name="not in safe mode",
+        looks_at="the answer to PING",
+        find=_safe_mode,
+        remedy=f"xethru reset --port {{path}}, or {_POWER_CYCLE}",
+        ends=True,
+    ),
+    Check(
+        name="has profiles",
+        looks_at="order code and firmware id",
+        find=_bare_xep,
+        remedy="for profiles, write the sensor firmware of the product; raw radar needs nothing",
+        level=Level.NOTE,
+    ),
+    Check(
+        name="is an X4M300",
+        looks_at="order code",
+        find=_other_product,
+        remedy="raw frames work alike; presence needs an X4M300",
+        level=Level.NOTE,
+    ),
+    Check(
+        name="firmware",
+        looks_at="firmware version",
+        find=_stale_firmware,
+        remedy="write firmware 1.6.8 or newer with the vendor's tool",
+    ),
+    Check(
+        name="right profile",
+        looks_at="GET_PROFILEID",
+        find=_wrong_profile,
+        remedy="a program that wants presence must load PRESENCE_2; raw radar needs no profile",
+    ),
+    Check(
+        name="profile loaded",
+        looks_at="GET_PROFILEID",
+        find=_no_profile,
+        remedy="nothing, for raw radar; for presence, load and start PRESENCE_2 with "
+        "xethru record --profile presence",
+        level=Level.NOTE,
+    ),
+    Check(
+        name="radar runs",
+        looks_at="the mode",
+        find=_stopped,
+        remedy="start it: xethru stream --port {path}",
+        level=Level.NOTE,
+    ),
+    Check(
+        name="transmitter on",
+        looks_at="TXPOWER, if no profile runs",
+        find=_transmitter_off,
+        remedy="xethru reset --port {path}; check the antenna side if it happens again",
+    ),
+)
+
 
 _WIDTH = 100
 

@@ -1,12 +1,30 @@
-"""Lines on stdout and stderr."""
+"""What commands print: lines, progress, names for people."""
 
 import json
 import math
 import os
 import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, TextIO
 
-from xethru_protocol.errors import XeThruError
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.recordings import RecordingFault
+from xethru_protocol.wire.codes import ProfileId
+from xethru_protocol.wire.errors import Disconnected, XeThruError
+
+
+def profile_name(profile_id: int) -> str:
+    """Short name of a profile, or its number.
+
+    >>> profile_name(0x014D4AB8), profile_name(5)
+    ('PRESENCE_2', '0x00000005')
+    """
+    for known in ProfileId:
+        if known == profile_id:
+            return known.name.removeprefix("XTS_ID_APP_")
+    return f"0x{profile_id:08X}"
 
 
 class OutputError(XeThruError):
@@ -109,3 +127,149 @@ def _without_nan(value: Any) -> Any:  # noqa: ANN401 - any JSON value
     if isinstance(value, list):
         return [_without_nan(item) for item in value]
     return value
+
+
+_REWRITE_S = 0.2
+_LINE_S = 10.0
+
+
+class Progress:
+    """Shows the newest of many states, not too often.
+
+    Parameters
+    ----------
+    name
+        What to begin lines of a log with, for example ``"xethru record"``.
+    clock
+        Monotonic time [s].
+    """
+
+    def __init__(self, name: str, clock: Callable[[], float] = time.monotonic) -> None:
+        self._name = name
+        self._clock = clock
+        self._rewrites = is_terminal(sys.stderr)
+        self._shown_s = clock()
+        self._is_open = False  # a line is there that ends in no line end
+
+    def show(self, state: Callable[[], str]) -> None:
+        """Show ``state()`` if it is time to."""
+        now_s = self._clock()
+        if now_s - self._shown_s < (_REWRITE_S if self._rewrites else _LINE_S):
+            return
+        self._shown_s = now_s
+        if self._rewrites:
+            show(rewriting(state(), sys.stderr))
+            self._is_open = True
+        else:
+            show(f"{self._name}: {state()}\n")
+
+    def finish(self, state: Callable[[], str]) -> None:
+        """Bring a rewritten line up to date and end it."""
+        if self._is_open:
+            show(rewriting(state(), sys.stderr) + "\n")
+            self._is_open = False
+
+
+def rewriting(line: str, terminal: TextIO) -> str:
+    """Text that replaces the line of a terminal, cut to fit: a longer one would scroll."""
+    try:
+        columns = os.get_terminal_size(terminal.fileno()).columns
+    except (OSError, ValueError):  # it does not tell
+        columns = 0
+    return f"\r{line[: columns - 1] if columns else line}\x1b[K"
+
+
+def counted(count: int, noun: str) -> str:
+    """Write a number of things, for people.
+
+    >>> counted(0, "frame"), counted(1, "frame"), counted(2, "frame")
+    ('0 frames', '1 frame', '2 frames')
+    """
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def bytes_text(count: int) -> str:
+    """Amount of data, for people.
+
+    >>> bytes_text(999), bytes_text(5_747_000)
+    ('999 B', '5.7 MB')
+    """
+    value, unit = float(count), "B"
+    for larger in ("kB", "MB", "GB", "TB"):
+        if value < 1000:
+            break
+        value, unit = value / 1000, larger
+    return f"{value:.0f} B" if unit == "B" else f"{value:.1f} {unit}"
+
+
+_MOST = 10  # lines; a damaged text file has as many faults as lines
+
+
+def warn_of(command: str, faults: Sequence[RecordingFault]) -> None:
+    """Say the first faults one by one, and how many more there are."""
+    for fault in faults[:_MOST]:
+        warn(
+            f"xethru {command}: {one_line(fault.file)}: {one_line(fault.reason)} "
+            f"(at byte {fault.offset})"
+        )
+    if len(faults) > _MOST:
+        warn(f"xethru {command}: and {len(faults) - _MOST} faults more")
+
+
+class CommandFailed(XeThruError):  # noqa: N818 - reads as the event it is
+    """A command came to nothing: the cause, and what followed from it."""
+
+
+@contextmanager
+def module_at(port: str, baudrate: int) -> Iterator[X4M300]:
+    """Open a module, and close it however the block ends.
+
+    What could not be undone at the end is said in one line with the cause of the end; after a
+    good end, or a signal, it is a warning.
+
+    Raises
+    ------
+    CommandFailed
+        If the block failed, and then the module could not be stopped.
+    """
+    radar = X4M300.open(port, baudrate=baudrate)
+    losses = ""
+    try:
+        with radar:
+            try:
+                yield radar
+            finally:
+                losses = _losses(radar)  # what is skipped to stop the module is no loss
+                say_warnings(radar)
+    except Disconnected:  # that it could not be stopped goes without saying
+        raise
+    except XeThruError as error:
+        if radar.warnings:  # of closing
+            raise CommandFailed(f"{error} (and it could not be stopped)") from error
+        raise
+    except BaseException:
+        _say_end(radar, losses)
+        raise
+    _say_end(radar, losses)
+
+
+def say_warnings(radar: X4M300) -> None:
+    """Tell people what the driver warns of, once."""
+    for text in radar.warnings:
+        warn(f"xethru: {one_line(text)}")
+    radar.warnings.clear()
+
+
+def _losses(radar: X4M300) -> str:
+    if not radar.frames_lost and not radar.fault_count:
+        return ""
+    return (
+        f"{counted(radar.frames_lost, 'frame')} lost, "
+        f"{counted(radar.fault_count, 'damaged place')} on the line"
+    )
+
+
+def _say_end(radar: X4M300, losses: str) -> None:
+    say_warnings(radar)
+    if losses:
+        warn(f"xethru: {losses}")

@@ -5,17 +5,445 @@ none comes while a record is half written; a second one insists.
 """
 
 import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
-from types import FrameType
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any, Literal, Protocol, Self
 
-from xethru_protocol.cli.output import one_line, print_json, print_line, warn
-from xethru_protocol.cli.progress import Progress, counted
-from xethru_protocol.cli.recorder import Recorder, Targets
-from xethru_protocol.cli.recording_modes import RecordingMode
-from xethru_protocol.cli.session import CommandFailed, module_at, say_warnings
-from xethru_protocol.driver import X4M300
-from xethru_protocol.errors import ResponseTimeout, XeThruError
+from xethru_protocol.cli.output import (
+    CommandFailed,
+    Progress,
+    bytes_text,
+    counted,
+    module_at,
+    one_line,
+    print_json,
+    print_line,
+    say_warnings,
+    warn,
+)
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.recordings import RecordingError, RecordingWriter, WireCapture
+from xethru_protocol.wire.codes import ProfileId
+from xethru_protocol.wire.errors import ResponseTimeout, XeThruError
+from xethru_protocol.wire.framing import LinkStatistics
+from xethru_protocol.wire.messages import (
+    Ack,
+    Error,
+    Pong,
+    ReplyByte,
+    ReplyFloat,
+    ReplyInt,
+    ReplyNone,
+    ReplyString,
+    ReplyUser,
+    Response,
+    System,
+)
+
+
+def what_must_go(targets: Iterable[Path], *, replace: bool) -> list[Path]:
+    """Files of older recordings where new ones shall be.
+
+    Of a directory only the files of a recording are in the way.
+
+    Raises
+    ------
+    RecordingError
+        If something is there and must stay.
+    """
+    old = [path for target in targets for path in _recording_files(target)]
+    for path in old:
+        if not path.is_file():  # --force is no reason to remove a device
+            raise RecordingError(f"{path} is no file; name a new one")
+    if old and not replace:
+        raise RecordingError(f"there is a recording already: {old[0]}; --force replaces it")
+    return old
+
+
+def is_part_of(source: Path, target: Path) -> bool:
+    """Whether writing to ``target`` would replace ``source``."""
+    return target.exists() and any(
+        path.exists() and path.samefile(source) for path in (target, *_recording_files(target))
+    )
+
+
+def make_room(targets: Iterable[Path], *, replace: bool) -> None:
+    """Remove older recordings where new ones shall be, if that is allowed.
+
+    Raises
+    ------
+    RecordingError
+        If something is there and must stay, or cannot be removed.
+    """
+    for path in what_must_go(targets, replace=replace):
+        try:
+            path.unlink()
+        except OSError as error:
+            raise RecordingError(f"{path} cannot be removed: {error.strerror}") from None
+
+
+@contextmanager
+def set_aside(target: Path, *, replace: bool) -> Iterator[None]:
+    """Keep an older recording under other names meanwhile; back it comes if the block fails.
+
+    What the failed block has written goes: it would pass for a whole recording.
+
+    Raises
+    ------
+    RecordingError
+        If something is there and must stay, or cannot be moved.
+    """
+    was_there = target.exists()
+    kept = [
+        (path, path.with_name(f".{path.name}.old"))
+        for path in what_must_go((target,), replace=replace)
+    ]
+    try:
+        for path, aside in kept:
+            path.replace(aside)
+    except OSError as error:
+        _put_back(kept)
+        raise RecordingError(f"{target} cannot be replaced: {error.strerror}") from None
+    try:
+        yield
+    except BaseException:
+        remove_unfinished(target, was_there=was_there)
+        _put_back(kept)
+        raise
+    for _, aside in kept:
+        with suppress(OSError):
+            aside.unlink()
+
+
+def _put_back(kept: Iterable[tuple[Path, Path]]) -> None:
+    for path, aside in kept:
+        with suppress(OSError):
+            aside.replace(path)
+
+
+def remove_unfinished(target: Path, *, was_there: bool) -> None:
+    """Remove what was written so far and is of no use."""
+    with suppress(OSError):
+        for path in _recording_files(target):
+            if path.is_file():
+                path.unlink()
+        if target.is_dir() and not was_there:
+            target.rmdir()
+
+
+def _recording_files(target: Path) -> list[Path]:
+    if target.is_dir():
+        return sorted(path for path in target.glob("xethru_*") if not path.is_dir())
+    return [target] if target.exists() else []
+
+
+_FRAMES_AT_ONCE = 100
+
+
+class RecordingMode(Protocol):
+    """How to get a module to send what shall be recorded."""
+
+    @property
+    def profile_id(self) -> int | None:
+        """Profile that runs then; None if that is none, or not known."""
+
+    def prepare(self, radar: X4M300) -> None:
+        """Bring the module to where it sends nothing yet; what comes meanwhile is old."""
+
+    def start(self, radar: X4M300) -> float:
+        """Let it send; returns after how much silence [s] something must be wrong."""
+
+    def wait(self, radar: X4M300, timeout_s: float) -> None:
+        """Receive, until something came or the time is over, and let go what the driver keeps."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RawFrames:
+    """Radar frames of raw mode."""
+
+    config: RawConfig
+    fps: float
+    profile_id: int | None = None
+
+    def prepare(self, radar: X4M300) -> None:
+        """Configure the chip."""
+        radar.configure_raw(self.config)
+
+    def start(self, radar: X4M300) -> float:
+        """Start frames."""
+        return max(2.0, 3.0 / radar.start(self.fps))
+
+    def wait(self, radar: X4M300, timeout_s: float) -> None:
+        """Take a frame."""
+        _wait_for_frame(radar, timeout_s)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Presence:
+    """Messages of the X4M300's own profile, about one a second."""
+
+    profile_id: int | None = ProfileId.XTS_ID_APP_PRESENCE_2
+
+    def prepare(self, radar: X4M300) -> None:
+        """Load the profile."""
+        radar.presence.load()
+
+    def start(self, radar: X4M300) -> float:
+        """Run it."""
+        radar.presence.run()
+        return 10.0
+
+    def wait(self, radar: X4M300, timeout_s: float) -> None:
+        """Take a message, and the frames that the profile sends if its outputs are on."""
+        with suppress(ResponseTimeout):
+            next(radar.presence.messages(1, timeout_s))
+        with suppress(ResponseTimeout):
+            for _ in radar.frames(_FRAMES_AT_ONCE, timeout_s=0.0):
+                pass
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Listen:
+    """Whatever the module sends by itself."""
+
+    profile_id: int | None = None
+
+    def prepare(self, radar: X4M300) -> None:
+        """Send nothing."""
+
+    def start(self, radar: X4M300) -> float:
+        """Wait for ever."""
+        return float("inf")
+
+    def wait(self, radar: X4M300, timeout_s: float) -> None:
+        """Take a frame; other messages the driver does not keep."""
+        _wait_for_frame(radar, timeout_s)
+
+
+def _wait_for_frame(radar: X4M300, timeout_s: float) -> None:
+    with suppress(ResponseTimeout):
+        radar.read_frame(timeout_s)
+
+
+def recording_mode(profile: str, config: RawConfig, fps: float) -> RecordingMode:
+    """Mode by its name on the command line: raw, presence or none."""
+    if profile == "raw":
+        return RawFrames(config=config, fps=fps)
+    return Presence() if profile == "presence" else Listen()
+
+
+_ANSWERS = (
+    *(Ack, Error, Pong, System),
+    *(ReplyByte, ReplyFloat, ReplyInt, ReplyNone, ReplyString, ReplyUser),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Targets:
+    """Where a recording goes.
+
+    Attributes
+    ----------
+    directory
+        For the vendor's format; None: not wanted.
+    wire
+        File for all bytes of both directions; None: not wanted.
+    session_id
+        Name kept in the vendor's format.
+    profile_id
+        Profile that runs, kept in the vendor's format; None: none, or not known.
+    port
+        Where the module is, kept in the wire capture.
+    """
+
+    directory: Path | None
+    wire: Path | None
+    session_id: str = ""
+    profile_id: int | None = None
+    port: str = ""
+
+    @property
+    def text(self) -> str:
+        """Both names, for people."""
+        return " and ".join(one_line(str(path)) for path in self.paths)
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """What there is of both."""
+        return tuple(path for path in (self.directory, self.wire) if path is not None)
+
+    def check(self, *, replace: bool) -> None:
+        """Raise RecordingError if something is in the way and must stay."""
+        if self.directory is not None and self.directory.exists() and not self.directory.is_dir():
+            raise RecordingError(f"{self.directory} is no directory; name a new one")
+        if self.wire is not None and self.wire.is_dir():
+            raise RecordingError(f"{self.wire} is a directory; name a file in it")
+        what_must_go(self.paths, replace=replace)
+
+
+class Recorder:
+    """Writes down what a driver hears.
+
+    Files are made, and older ones removed, only by `open`: a module that does not answer must
+    cost nobody an older recording. Bytes that come before that are kept until then.
+
+    An error of a file is kept, not raised: whoever calls is in the middle of receiving.
+
+    Parameters
+    ----------
+    targets
+        Where to.
+    count
+        Messages after which it is enough; None: never.
+
+    Attributes
+    ----------
+    messages
+        Messages taken.
+    failure
+        Why nothing more is written; None: all is well.
+    """
+
+    def __init__(self, targets: Targets, count: int | None) -> None:
+        self.messages = 0
+        self.failure: XeThruError | None = None
+        self._targets = targets
+        self._count = count
+        self._statistics = LinkStatistics()
+        self._began_ns = self._newest_ns = time.monotonic_ns()
+        self._since_1970_ns = time.time_ns() - self._began_ns
+        self._early: list[tuple[Literal["rx", "tx"], bytes, int]] | None = []
+        self._were_there: dict[Path, bool] = {}
+        self._writer: RecordingWriter | None = None
+        self._wire: WireCapture | None = None
+
+    def __enter__(self) -> Self:
+        """Return the recorder itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Complete the files, however it ended; what was recorded into none goes."""
+        for file in (self._writer, self._wire):
+            try:
+                if file is not None:
+                    file.close()
+            except RecordingError as failure:
+                self.fail(failure)
+        if not self.messages:
+            # the wire capture first: it may lie in the directory
+            for path, was_there in reversed(self._were_there.items()):
+                remove_unfinished(path, was_there=was_there)
+
+    def open(self, *, replace: bool) -> None:
+        """Make the files.
+
+        Raises
+        ------
+        RecordingError
+            If something is in the way and must stay, or a file cannot be made.
+        """
+        targets = self._targets
+        make_room(targets.paths, replace=replace)
+        self._were_there = {path: path.exists() for path in targets.paths}
+        if targets.directory is not None:
+            self._writer = RecordingWriter(
+                targets.directory,
+                session_id=targets.session_id,
+                profile_id=targets.profile_id,
+            )
+        if targets.wire is not None:
+            self._wire = WireCapture(targets.wire, {"port": targets.port})
+        early, self._early = self._early or [], None
+        for heard in early:
+            self.take_bytes(*heard)
+
+    def listen_to(self, radar: X4M300) -> None:
+        """Take the module's messages from now on; the time of the recording begins."""
+        self._statistics = radar.statistics
+        self._began_ns = self._newest_ns = time.monotonic_ns()
+        radar.listener = self.take
+
+    def stop_listening(self, radar: X4M300) -> None:
+        """Take nothing more; what the module says while it is stopped counts for nothing."""
+        radar.listener = None
+        self._statistics = deepcopy(radar.statistics)
+
+    def fail(self, error: XeThruError) -> None:
+        """Take nothing more; the first reason is the one that counts."""
+        self.failure = self.failure or error
+
+    def take(self, message: Response, arrival_ns: int) -> None:
+        """Write a message, if it is of a kind that a recording holds."""
+        if self.is_enough or isinstance(message, _ANSWERS):
+            return
+        try:
+            if self._writer is None or self._writer.write(
+                message, arrival_ns + self._since_1970_ns
+            ):
+                self.messages += 1
+                self._newest_ns = arrival_ns
+        except RecordingError as error:
+            self.fail(error)
+
+    def take_bytes(self, direction: Literal["rx", "tx"], data: bytes, t_ns: int) -> None:
+        """Write bytes of the line."""
+        if self._early is not None and self._targets.wire is not None:
+            self._early.append((direction, bytes(data), t_ns))
+        if self._wire is None or self.failure is not None:
+            return
+        try:
+            self._wire.write(direction, data, t_ns + self._since_1970_ns)
+        except RecordingError as error:
+            self.fail(error)
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether nothing more will be taken."""
+        return self.failure is not None or (
+            self._count is not None and self.messages >= self._count
+        )
+
+    @property
+    def elapsed_s(self) -> float:
+        """Time since the recording began."""
+        return (time.monotonic_ns() - self._began_ns) * 1e-9
+
+    @property
+    def silent_s(self) -> float:
+        """Time since the newest message."""
+        return (time.monotonic_ns() - self._newest_ns) * 1e-9
+
+    def numbers(self) -> str:
+        """Say what was recorded so far, for people."""
+        span_s = (self._newest_ns - self._began_ns) * 1e-9
+        rate = f", {self.messages / span_s:.1f}/s" if span_s > 0 else ""
+        return (
+            f"{counted(self.messages, 'message')} in {span_s:.1f} s{rate}, "
+            f"{bytes_text(self._statistics.bytes)}, {self._statistics.frames_lost} lost"
+        )
+
+    def summary(self) -> dict[str, Any]:
+        """Say what was recorded, as JSON."""
+        directory, wire = self._targets.directory, self._targets.wire
+        return {
+            "directory": None if directory is None else str(directory),
+            "wire": None if wire is None else str(wire),
+            "messages": self.messages,
+            "duration_s": (self._newest_ns - self._began_ns) * 1e-9,
+            "link": self._statistics.summary(),
+        }
+
 
 _GLANCE_S = 0.2  # how late a signal, or the end, may be noticed
 

@@ -5,19 +5,24 @@ does; `WireCapture` keeps the bytes of a port; `convert` goes from any to any. T
 modules of this package: layouts and meta file of the vendor's format first.
 """
 
-from xethru_protocol.recordings.convert import Conversion, convert
-from xethru_protocol.recordings.detect import (
+from xethru_protocol.recordings.formats import (
+    Conversion,
     RecordingFormat,
     RecordingSummary,
+    convert,
     describe_recording,
     read_recording,
     recording_facts,
     recording_format,
     recording_radars,
 )
-from xethru_protocol.recordings.errors import RecordingError, RecordingFault
-from xethru_protocol.recordings.records import RadarFacts, RecordingFacts
-from xethru_protocol.recordings.vendor_writer import RecordingWriter, Split
+from xethru_protocol.recordings.records import (
+    RadarFacts,
+    RecordingError,
+    RecordingFacts,
+    RecordingFault,
+)
+from xethru_protocol.recordings.vendor.writer import RecordingWriter, Split
 from xethru_protocol.recordings.wire_capture import Chunk, WireCapture, read_chunks, read_note
 
 __all__ = [

@@ -37,11 +37,17 @@ import numpy as np
 import numpy.typing as npt
 from numpy.lib.format import read_array_header_1_0, read_magic, write_array, write_array_header_1_0
 
-from xethru_protocol.codec import decode_response, describe, encode
-from xethru_protocol.recordings.errors import RecordingError, unreadable, unwritable
-from xethru_protocol.recordings.layouts import LAYOUTS, Layout, layout_of
-from xethru_protocol.recordings.records import RecordingFacts, Timed, TimedMessages
-from xethru_protocol.table import Response
+from xethru_protocol.recordings.records import (
+    RecordingError,
+    RecordingFacts,
+    Timed,
+    TimedMessages,
+    unreadable,
+    unwritable,
+)
+from xethru_protocol.recordings.vendor.layouts import LAYOUTS, Layout, layout_of
+from xethru_protocol.wire.codec import decode_response, describe, encode
+from xethru_protocol.wire.table import Response
 
 FORMAT = "xethru-hil recording 1"
 SUFFIX = ".npz"

@@ -1,11 +1,51 @@
 """What every kind of recording holds: messages with their times, and facts about the whole."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from types import NoneType
 from typing import Any, Self
 
-from xethru_protocol.table import Response
+from xethru_protocol.wire.errors import XeThruError
+from xethru_protocol.wire.table import Response
+
+
+class RecordingError(XeThruError):
+    """A recording cannot be read or written."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordingFault:
+    """A damaged part: what could not be read of ``file`` at byte ``offset``, and why.
+
+    ``minor`` says that no message is lost, only its time or the order among several files.
+    """
+
+    file: str
+    offset: int
+    reason: str
+    minor: bool = False
+
+
+FaultHandler = Callable[[RecordingFault], None]
+
+
+def report(fault: RecordingFault, on_fault: FaultHandler | None) -> None:
+    """Hand a fault over; without a handler, one that costs messages raises `RecordingError`."""
+    if on_fault is not None:
+        on_fault(fault)
+    elif not fault.minor:
+        raise RecordingError(f"{fault.file}: {fault.reason} (at byte {fault.offset})")
+
+
+def unreadable(path: object, error: OSError) -> RecordingError:
+    """Return the error that says why the operating system refused to read ``path``."""
+    return RecordingError(f"{path} cannot be read: {error.strerror or error}")
+
+
+def unwritable(path: object, error: OSError) -> RecordingError:
+    """Return the error that says why the operating system refused to write ``path``."""
+    return RecordingError(f"{path} cannot be written: {error.strerror or error}")
+
 
 MS_NS = 1_000_000
 LATEST_MS = 2**63 // MS_NS - 2**32

@@ -30,19 +30,18 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Literal, Self
 
-from xethru_protocol.codec import decode_response
-from xethru_protocol.framing import PacketReader
-from xethru_protocol.packets import FramingFault, NeedData
-from xethru_protocol.plausibility import Direction
-from xethru_protocol.recordings.errors import (
+from xethru_protocol.recordings.records import (
     FaultHandler,
     RecordingError,
+    RecordingFacts,
     RecordingFault,
+    TimedMessages,
     report,
     unreadable,
     unwritable,
 )
-from xethru_protocol.recordings.records import RecordingFacts, TimedMessages
+from xethru_protocol.wire.codec import decode_response
+from xethru_protocol.wire.framing import Direction, FramingFault, NeedData, PacketReader
 
 MAGIC = b"\x89XTWIRE\n"
 VERSION = 1

@@ -7,13 +7,13 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.chip.chip import CaptureSettings
+from emulator.chip.pace import Pace
 from emulator.device import BootTiming, Device, radar_device
-from emulator.echo_source import CaptureSettings
-from emulator.identity import Identity
-from emulator.pace import Pace
-from xethru_protocol import messages as m
-from xethru_protocol.codes import SensorMode, X4Setting
-from xethru_protocol.connection import Connection, Role
+from emulator.module.memory import Identity
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import SensorMode, X4Setting
+from xethru_protocol.wire.connection import Connection, Role
 
 IDENTITY = Identity(serial="202611210001")
 

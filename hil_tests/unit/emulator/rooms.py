@@ -8,9 +8,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.paths import ScenePaths
-from emulator.scene import LeakageSpec, NoiseSpec, RadarSpec, Scene, TargetSpec
-from emulator.scene_tables import MIRROR_AMPLITUDE_1M, ObjectSpec, WallSpec
+from emulator.echo.echo import ScenePaths
+from emulator.scene.scene import (
+    MIRROR_AMPLITUDE_1M,
+    LeakageSpec,
+    NoiseSpec,
+    ObjectSpec,
+    RadarSpec,
+    Scene,
+    TargetSpec,
+    WallSpec,
+)
 
 C_MPS = 299_792_458.0
 WAVELENGTH_M = C_MPS / 7.29e9

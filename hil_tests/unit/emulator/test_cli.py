@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from emulator.cli import main
-from emulator.path_lock import locked
 from hil_tests.patience import seconds
+from xethru_protocol.system import locked
 
 
 @pytest.mark.parametrize(

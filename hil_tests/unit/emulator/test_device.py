@@ -6,14 +6,14 @@ import re
 
 import pytest
 
+from emulator.chip.clock import ModuleClock
+from emulator.chip.pace import Pace
 from emulator.device import BootTiming, radar_device
-from emulator.identity import Identity
-from emulator.module_clock import ModuleClock
-from emulator.pace import Pace
+from emulator.module.memory import Identity
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource, ramp_device
-from xethru_protocol import messages as m
-from xethru_protocol.codes import SensorMode, X4Setting
-from xethru_protocol.connection import Connection, Role
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import SensorMode, X4Setting
+from xethru_protocol.wire.connection import Connection, Role
 
 SECOND = 1_000_000_000
 PRESENCE_2 = 0x014D4AB8

@@ -7,15 +7,16 @@ import time
 import numpy as np
 import pytest
 
+from emulator.chip.pace import Pace
 from emulator.device import radar_device
-from emulator.echo import echo_source
+from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport
-from emulator.pace import Pace
-from emulator.scene import load_scene
+from emulator.scene.scene import load_scene
 from hil_tests.unit.emulator.doubles import IDENTITY, ramp_device
-from xethru_protocol.codes import PongCode
-from xethru_protocol.driver import X4M300, RawConfig
-from xethru_protocol.errors import Disconnected, ResponseTimeout
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.wire.codes import PongCode
+from xethru_protocol.wire.errors import Disconnected, ResponseTimeout
 
 
 @pytest.mark.parametrize(("downconversion", "bins"), [(False, 1431), (True, 181)])

@@ -10,22 +10,24 @@ import numpy as np
 import pytest
 
 from emulator.device import Device
-from emulator.identity import Identity
 from emulator.loopback import LoopbackTransport
-from emulator.playback import PlayOptions, RecordingError, played_radars
-from hil_tests.golden.vectors import FIXTURES
+from emulator.module.memory import Identity
+from emulator.playback import PlayOptions, played_radars
+from hil_tests.paths import FIXTURES
 from hil_tests.unit.emulator.doubles import BareHost
-from xethru_protocol import messages as m
-from xethru_protocol.codes import X4Setting
-from xethru_protocol.driver import X4M300, RawConfig
-from xethru_protocol.errors import ResponseTimeout
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings import (
+    RecordingError,
     RecordingFault,
     RecordingWriter,
     WireCapture,
     convert,
     read_recording,
 )
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import X4Setting
+from xethru_protocol.wire.errors import ResponseTimeout
 
 IDENTITY = Identity(serial="123456789012")
 RECORDINGS = FIXTURES / "recordings"

@@ -10,18 +10,26 @@ import pytest
 from mcap.writer import Writer
 
 from emulator.loopback import LoopbackTransport
-from emulator.outbox import LosslessOutbox
-from emulator.playback import PlayedRadar, PlayOptions, RecordingError, played_radars
-from emulator.playback_control import kinds
-from emulator.player import NOMINAL_PERIOD_NS, QUIET_NS, PlayStream, schedule
-from hil_tests.golden.vectors import FIXTURES
+from emulator.module.outbox import LosslessOutbox
+from emulator.playback import (
+    NOMINAL_PERIOD_NS,
+    QUIET_NS,
+    PlayedRadar,
+    PlayOptions,
+    PlayStream,
+    kinds,
+    played_radars,
+    schedule,
+)
+from hil_tests.paths import FIXTURES
 from hil_tests.unit.emulator.doubles import BareHost
-from xethru_protocol import messages as m
-from xethru_protocol.codes import InfoItem, X4Setting
-from xethru_protocol.connection import Connection, Role
-from xethru_protocol.driver import X4M300, RawConfig
-from xethru_protocol.recordings import read_recording, recording_radars
-from xethru_protocol.recordings.cdr import FLOAT_ARRAY, pack_array, pack_string
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.recordings import RecordingError, read_recording, recording_radars
+from xethru_protocol.recordings.mcap import FLOAT_ARRAY, pack_array, pack_string
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import InfoItem, X4Setting
+from xethru_protocol.wire.connection import Connection, Role
 
 SECOND = 1_000_000_000
 RECORDS = [m.DataString(content_id=0, info=second, text="") for second in range(5)]

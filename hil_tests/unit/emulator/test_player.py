@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from emulator.chip import Chip
-from emulator.commands import Module
+from emulator.chip.chip import Chip
 from emulator.device import BootTiming, Device
-from emulator.outbox import LosslessOutbox
-from emulator.player import PlayStream, schedule
+from emulator.module.module import Module
+from emulator.module.outbox import LosslessOutbox
+from emulator.playback import PlayStream, schedule
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource
-from xethru_protocol import messages as m
-from xethru_protocol.codes import SensorMode, X4Setting
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import SensorMode, X4Setting
 
 SECOND = 1_000_000_000
 RECORDS = [m.Pong(value=value) for value in range(5)]

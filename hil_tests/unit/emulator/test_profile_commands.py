@@ -9,12 +9,12 @@ from typing import Literal
 import numpy as np
 import pytest
 
+from emulator.chip.pace import Pace
 from emulator.device import Device, radar_device
-from emulator.options import DeviceOptions
-from emulator.pace import Pace
+from emulator.module.settings import DeviceOptions
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource
-from xethru_protocol import messages as m
-from xethru_protocol.codes import OutputFeature, ProfileId, SensorMode
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import OutputFeature, ProfileId, SensorMode
 
 SECOND = 1_000_000_000
 PRESENCE_2, PRESENCE_3 = 0x014D4AB8, 0x114D4AB8

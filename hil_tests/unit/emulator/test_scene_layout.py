@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from emulator.scene import Scene, load_scene
+from emulator.scene.scene import Scene, load_scene
 
 SCENES = ("lab", "classroom", "smoke")
 OTHERS = ("corridor", "two_rooms", "symmetric", "hall", "store", "lab_six")

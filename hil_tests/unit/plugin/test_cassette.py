@@ -8,19 +8,25 @@ from pathlib import Path
 
 import pytest
 
+from emulator.chip.pace import Pace
 from emulator.device import radar_device
-from emulator.echo import echo_source
-from emulator.identity import Identity
-from emulator.options import DeviceOptions
-from emulator.pace import Pace
-from emulator.scene import empty_room
+from emulator.echo.echo import echo_source
+from emulator.module.memory import Identity
+from emulator.module.settings import DeviceOptions
+from emulator.scene.scene import empty_room
 from hil_tests.faulty import PATH, FaultyLine
-from hil_tests.golden.vectors import FIXTURES
-from hil_tests.plugin.cassette import Cassette, CassetteError, Exchange, ask_all, differences
-from hil_tests.plugin.transactions import TRANSACTIONS
-from xethru_protocol.codec import encode
-from xethru_protocol.codes import SensorMode
-from xethru_protocol.messages import Ack, Error, ReplyString, SetMode, SystemGetInfo
+from hil_tests.paths import FIXTURES
+from hil_tests.plugin.cassette import (
+    TRANSACTIONS,
+    Cassette,
+    CassetteError,
+    Exchange,
+    ask_all,
+    differences,
+)
+from xethru_protocol.wire.codec import encode
+from xethru_protocol.wire.codes import SensorMode
+from xethru_protocol.wire.messages import Ack, Error, ReplyString, SetMode, SystemGetInfo
 
 
 def info(text: str, pattern: str | None = r"[0-9]{12}") -> Exchange:

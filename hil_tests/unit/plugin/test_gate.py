@@ -6,8 +6,8 @@ import pytest
 
 from hil_tests.plugin.bench import Bench
 from hil_tests.plugin.gate import FINDINGS, gate
+from hil_tests.plugin.places import TappedTransport
 from hil_tests.plugin.specs import parse_specs
-from hil_tests.plugin.tap import TappedTransport
 
 
 @pytest.mark.requires("profiles")

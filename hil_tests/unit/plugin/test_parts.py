@@ -10,13 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.plugin import tap
-from hil_tests.plugin.locks import PortBusyError, PortLock
+from hil_tests.plugin import places as tap
+from hil_tests.plugin.bench import PortBusyError, PortLock, carried_rate_hz
 from hil_tests.plugin.measurements import Measure
-from hil_tests.plugin.rates import carried_rate_hz
-from hil_tests.plugin.tap import WireTap
-from hil_tests.plugin.tcp_line import TcpTransport
-from xethru_protocol.errors import PortUnavailable
+from hil_tests.plugin.places import TcpTransport, WireTap
+from xethru_protocol.wire.errors import PortUnavailable
 
 
 def test_a_lock_is_for_one_process(tmp_path: Path) -> None:
@@ -24,7 +22,7 @@ def test_a_lock_is_for_one_process(tmp_path: Path) -> None:
     port.touch()
     link = tmp_path / "by-id"
     link.symlink_to(port)
-    program = f"from hil_tests.plugin.locks import PortLock; PortLock({str(link)!r})"
+    program = f"from hil_tests.plugin.bench import PortLock; PortLock({str(link)!r})"
     lock = PortLock(str(port))
     refused = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=False

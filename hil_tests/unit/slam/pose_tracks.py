@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.pipeline import PoseAt
+from slam.paper.pipeline import PoseAt
 
 Array = NDArray[np.float64]
 

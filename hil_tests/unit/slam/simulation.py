@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.detection import Detection
+from slam.frames import Detection
 from slam.geometry import Rig
 
 Array = NDArray[np.float64]

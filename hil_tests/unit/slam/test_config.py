@@ -2,10 +2,12 @@
 
 import pytest
 
-from slam.config import Assignment, EndOfRun, SlamConfig
-from slam.presets import (
+from slam.config import (
     REMOVED_KEYS,
+    Assignment,
     ConfigError,
+    EndOfRun,
+    SlamConfig,
     config_from_tables,
     load_preset,
     override,

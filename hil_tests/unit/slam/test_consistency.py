@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slam.association import Association
-from slam.clustering import Observation
-from slam.consistency import TrueAssociationNis
-from slam.ekf_slam import start
-from slam.pipeline import StepResult
+from slam.evaluation import TrueAssociationNis
+from slam.paper.association import Association
+from slam.paper.clustering import Observation
+from slam.paper.ekf import start
+from slam.paper.pipeline import StepResult
 
 Array = NDArray[np.float64]
 TRUE = np.array([[0.0, 1.0], [0.0, -1.0]])

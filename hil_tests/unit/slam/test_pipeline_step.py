@@ -17,10 +17,9 @@ from slam.config import (
     SlamConfig,
     WindowConfig,
 )
-from slam.detection import Detection
-from slam.frames import RadarFrame
+from slam.frames import Detection, RadarFrame
 from slam.geometry import Mount, Rig, paper_rig
-from slam.pipeline import StepResult, UwbRadarSlam
+from slam.paper.pipeline import StepResult, UwbRadarSlam
 
 Array = NDArray[np.float64]
 

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam.consistency import ECHO_LENGTH_M, true_range_nis
-from slam.detection import Detection
-from slam.ekf_slam import start
-from slam.pipeline import StepResult
-from slam.robust.reports import ExpectedRange, UpdateReport
+from slam.evaluation import ECHO_LENGTH_M, true_range_nis
+from slam.frames import Detection
+from slam.paper.ekf import start
+from slam.paper.pipeline import StepResult
+from slam.results import ExpectedRange, UpdateReport
 
 POSE = np.array([1.0, 2.0, math.pi / 2])
 """Body x is world y."""

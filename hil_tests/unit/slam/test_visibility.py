@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from slam.evaluation import observable_landmarks
 from slam.geometry import paper_rig
-from slam.visibility import observable_landmarks
 
 
 def standing(n: int) -> NDArray[np.float64]:

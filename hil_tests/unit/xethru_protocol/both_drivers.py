@@ -7,8 +7,8 @@ from types import TracebackType
 from typing import Any, Protocol, Self, cast
 
 from hil_tests.unit.xethru_protocol.scripted import Answer, PlainModule, ScriptedTransport
-from xethru_protocol.async_driver import AsyncX4M300
-from xethru_protocol.driver import X4M300
+from xethru_protocol.driver.async_radar import AsyncX4M300
+from xethru_protocol.driver.radar import X4M300
 
 
 class AsyncScripted:

@@ -4,8 +4,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 from hil_tests.unit.xethru_protocol.scripted import Answer, PlainModule, ScriptedTransport
-from xethru_protocol import messages as m
-from xethru_protocol.errors import PortUnavailable
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.errors import PortUnavailable
 
 
 class Machine:

@@ -10,10 +10,10 @@ from types import TracebackType
 from typing import Self
 
 from hil_tests.unit.xethru_protocol.scripted import PlainModule, frame
-from xethru_protocol import messages as m
-from xethru_protocol.codes import X4Setting
-from xethru_protocol.connection import Connection, Role
-from xethru_protocol.packets import NEED_DATA
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import X4Setting
+from xethru_protocol.wire.connection import Connection, Role
+from xethru_protocol.wire.framing import NEED_DATA
 
 
 class PtyModule:

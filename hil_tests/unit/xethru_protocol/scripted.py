@@ -5,11 +5,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from xethru_protocol import messages as m
-from xethru_protocol.codes import PongCode, X4Setting
-from xethru_protocol.connection import Connection, Role
-from xethru_protocol.errors import Disconnected
-from xethru_protocol.packets import NEED_DATA
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import PongCode, X4Setting
+from xethru_protocol.wire.connection import Connection, Role
+from xethru_protocol.wire.errors import Disconnected
+from xethru_protocol.wire.framing import NEED_DATA
 
 Answer = Callable[[m.Message], Sequence[m.Message | bytes]]
 READY = m.Pong(value=PongCode.XTS_SPRP_READY)

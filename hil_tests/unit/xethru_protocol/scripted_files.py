@@ -4,7 +4,7 @@ import struct
 from collections.abc import Sequence
 
 from hil_tests.unit.xethru_protocol.scripted import READY
-from xethru_protocol import messages as m
+from xethru_protocol.wire import messages as m
 
 Name = tuple[int, int]
 STORAGE = 0x18000

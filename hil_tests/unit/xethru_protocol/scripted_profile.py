@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 
 from hil_tests.unit.xethru_protocol.scripted import READY
-from xethru_protocol import messages as m
+from xethru_protocol.wire import messages as m
 
 STEP_M = 0.0514403  # grid of zones
 STOP, RUN, IDLE = 0x13, 0x01, 0x11

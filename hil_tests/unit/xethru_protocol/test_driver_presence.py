@@ -13,9 +13,9 @@ from hil_tests.unit.xethru_protocol.scripted_profile import (
     ProfileModule,
     presence,
 )
-from xethru_protocol import messages as m
-from xethru_protocol.codes import LedMode, NoiseMapControl, OutputFeature
-from xethru_protocol.errors import DeviceError, LocalProtocolError, ResponseTimeout
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import LedMode, NoiseMapControl, OutputFeature
+from xethru_protocol.wire.errors import DeviceError, LocalProtocolError, ResponseTimeout
 
 NO_PRESENCE, PRESENCE, INITIALIZING = 0, 1, 2
 

@@ -9,9 +9,9 @@ import pytest
 
 from hil_tests.unit.xethru_protocol.both_drivers import DriverOn
 from hil_tests.unit.xethru_protocol.scripted import READY, frame
-from xethru_protocol import messages as m
-from xethru_protocol.codes import PongCode, X4Setting
-from xethru_protocol.errors import DeviceError, ResponseTimeout
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import PongCode, X4Setting
+from xethru_protocol.wire.errors import DeviceError, ResponseTimeout
 
 Said = Sequence[m.Message | bytes]
 FIRST = m.X4DriverSet(setting=X4Setting.DACMIN, value=949)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from xethru_protocol import ports
+from xethru_protocol import transport as ports
 from xethru_protocol.transport import UsbSerialPort
 
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 import serial
 
-from xethru_protocol.driver import X4M300
-from xethru_protocol.errors import Disconnected, LocalProtocolError, PortUnavailable
+from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.transport import SerialTransport
+from xethru_protocol.wire.errors import Disconnected, LocalProtocolError, PortUnavailable
 
 
 class Line:

@@ -20,7 +20,7 @@ from importlib import import_module
 from types import MappingProxyType
 from typing import Protocol, cast
 
-from slam.app.stop import StopFlag
+from slam.app.errors import StopFlag
 
 
 class ExperimentModule(Protocol):
@@ -60,7 +60,7 @@ _ROWS: tuple[Experiment, ...] = (
     Experiment(
         name="filter",
         help="what window, minimum count and search radius of the outlier filter trade off",
-        module="slam.app.experiments.filter_tradeoffs",
+        module="slam.app.experiments.filter",
     ),
     Experiment(
         name="limits",

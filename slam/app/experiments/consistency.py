@@ -6,9 +6,75 @@ Light, so that ``--help`` is; the drawing is in ``consistency_picture``.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
-from slam.app.experiments.sweep_result import add_sweep_argument, read_groups
-from slam.app.stop import StopFlag
+from matplotlib.axes import Axes
+
+from slam.app.errors import StopFlag
+from slam.app.experiments.stress import add_sweep_argument, read_groups
+from slam.app.run.pictures import ESTIMATE, GRID, INK, LANDMARK, ODOMETRY, TRUTH, label, picture
+
+_COLOURS = (ESTIMATE, ODOMETRY, LANDMARK, "#2b8a3e", "#7048b8")
+
+
+def draw_consistency(path: Path, groups: Sequence[dict[str, Any]]) -> None:
+    """Draw ANEES above NIS, a column per scene and a line per preset and setting; a PNG file."""
+    scenes = list(dict.fromkeys(group["scene"] for group in groups))
+    with picture(path, width_in=1.2 + 4.6 * len(scenes), height_in=7.2) as figure:
+        figure.suptitle(
+            "Mean over seeds against the 95 % band of an honest filter (simulated)",
+            fontsize=11,
+            color=INK,
+            x=0.01,
+            ha="left",
+        )
+        panels = figure.subplots(2, len(scenes), squeeze=False, sharex="col", sharey="row")
+        for column, scene in zip(panels.T, scenes, strict=True):
+            of_scene = [group for group in groups if group["scene"] == scene]
+            _draw_anees(column[0], of_scene)
+            _draw_nis(column[1], of_scene)
+            seeds = "/".join(str(n) for n in dict.fromkeys(group["runs"] for group in of_scene))
+            label(column[0], f"{scene}, {seeds} seeds: NEES of the pose, 3 dof", "", "ANEES")
+            label(column[1], "NIS of true associations, per dof", "time [s]", "mean NIS / dof")
+            column[0].legend(frameon=False, fontsize=8)
+
+
+def _draw_anees(axes: Axes, groups: Sequence[dict[str, Any]]) -> None:
+    axes.set_yscale("log")
+    for group, colour in zip(groups, _colours(groups), strict=True):
+        axes.axhspan(*group["anees_band_95"], color=GRID, zorder=0)
+        _line(axes, group["anees_pose"], colour, _name(group))
+    for group in groups:
+        if group["bound"] is not None:
+            _line(axes, group["bound"]["anees_pose"], TRUTH, "known association, ISAM2")
+            return  # the same data in every preset
+
+
+def _draw_nis(axes: Axes, groups: Sequence[dict[str, Any]]) -> None:
+    axes.set_yscale("log")
+    axes.axhline(1.0, color=TRUTH, linewidth=0.8)
+    for group, colour in zip(groups, _colours(groups), strict=True):
+        known = [row for row in group["nis_times"] if row[1] is not None]
+        times, means, lows, highs = zip(*known, strict=True) if known else ((), (), (), ())
+        axes.fill_between(times, lows, highs, color=colour, alpha=0.15, linewidth=0)
+        _line(axes, list(zip(times, means, strict=True)), colour, _name(group))
+
+
+def _line(axes: Axes, rows: Sequence[Sequence[float]], colour: str, name: str) -> None:
+    times, values = ([row[column] for row in rows] for column in (0, 1))
+    axes.plot(times, values, marker="o", markersize=4, linewidth=1.4, color=colour, label=name)
+
+
+def _colours(groups: Sequence[dict[str, Any]]) -> list[str]:
+    return [_COLOURS[index % len(_COLOURS)] for index in range(len(groups))]
+
+
+def _name(group: dict[str, Any]) -> str:
+    settings = "".join(f", {key}={value}" for key, value in group["settings"].items())
+    return f"preset {group['preset']}{settings}"
+
 
 NAME = "consistency"
 
@@ -21,11 +87,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
     """Draw the clean groups of a sweep against their bands, and count the times inside."""
     # heavy, see module text
-    from slam.app.experiments.consistency_picture import draw_consistency
-    from slam.app.experiments.results import print_table, write_json
-    from slam.app.stress import CLEAN
-    from slam.app.sweep_groups import group_name
-    from slam.app.sweep_tables import in_band, nis_in_band
+    from slam.app.run.output import print_table, write_json
+    from slam.app.sweep.statistics import group_name, in_band, nis_in_band
+    from slam.app.sweep.stress import CLEAN
 
     result = arguments.out / f"{NAME}.json"
     groups = [group for group in read_groups(arguments.sweep, result) if group["stress"] == CLEAN]

@@ -6,9 +6,394 @@ Light, so that ``--help`` is; the work is in ``range_steps`` and ``figure7_pictu
 from __future__ import annotations
 
 import argparse
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
-from slam.app.arguments import count, seed
-from slam.app.stop import StopFlag
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from numpy.typing import NDArray
+
+from emulator.scene.scene import PathSpec, RadarSpec, Scene, TargetSpec, load_scene
+from slam.app.cli import count, seed
+from slam.app.errors import StopFlag
+from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, open_loopback
+from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label, picture
+from slam.config import DetectionConfig, FrontEnd, SlamConfig, load_preset
+from slam.frames import Detection, RadarFrame
+from slam.front_end.paper import PaperDetector, make_detector
+
+Array = NDArray[np.float64]
+
+STEP_M = 0.01
+FIRST_M, LAST_M = 0.5, 1.4
+ROD_AMPLITUDE_1M = 0.015
+# A peak this far from the truth, two and a half times the pulse's half width, is not the rod's.
+MATCH_M = 0.15
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Steps:
+    """Frames of every position.
+
+    Attributes
+    ----------
+    ranges_m
+        Shape (n_steps,): the rod's true range from the antenna.
+    frames
+        For each position its frames, as SLAM gets them.
+    """
+
+    ranges_m: Array
+    frames: tuple[tuple[RadarFrame, ...], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RangeErrors:
+    """What one front end made of the frames.
+
+    Attributes
+    ----------
+    detections
+        For each position and frame all detections.
+    residuals_m
+        Shape (n_steps, n_frames): the nearest detection's range minus the true one; NaN where
+        none lay within ``MATCH_M``.
+    """
+
+    detections: tuple[tuple[tuple[Detection, ...], ...], ...]
+    residuals_m: Array
+
+    @property
+    def found(self) -> float:
+        """Return the share of frames in which the rod was found."""
+        return float(np.isfinite(self.residuals_m).mean())
+
+    @property
+    def others_per_frame(self) -> float:
+        """Return how many detections per frame were not the rod's, or its second one."""
+        total = sum(len(one) for step in self.detections for one in step)
+        return total / self.residuals_m.size - self.found
+
+    @property
+    def bias_m(self) -> float:
+        """Return the mean residual; NaN where the rod was never found."""
+        return float(np.nanmean(self.residuals_m)) if self.found else math.nan
+
+    @property
+    def std_m(self) -> float:
+        """Return the standard deviation of all residuals."""
+        return float(np.nanstd(self.residuals_m)) if self.found else math.nan
+
+    @property
+    def position_means_m(self) -> Array:
+        """Return the mean residual of each position, shape (n_steps,); NaN where none."""
+        seen = np.isfinite(self.residuals_m)
+        total = np.where(seen, self.residuals_m, 0.0).sum(axis=1)
+        means = np.full(len(total), np.nan)
+        means_m: Array = np.divide(total, seen.sum(axis=1), out=means, where=seen.any(axis=1))
+        return means_m
+
+    @property
+    def noise_std_m(self) -> float:
+        """Return the standard deviation about each position's own mean: noise, not bias."""
+        about = self.residuals_m - self.position_means_m[:, np.newaxis]
+        return float(np.sqrt(np.nanmean(about**2))) if self.found else math.nan
+
+    @property
+    def worst_position_m(self) -> float:
+        """Return the largest mean residual of a position, by amount."""
+        return float(np.nanmax(np.abs(self.position_means_m))) if self.found else math.nan
+
+    def numbers(self) -> dict[str, object]:
+        """Return what goes into the JSON file."""
+        return {
+            "found": self.found,
+            "others_per_frame": self.others_per_frame,
+            "bias_m": _known(self.bias_m),
+            "std_m": _known(self.std_m),
+            "noise_std_m": _known(self.noise_std_m),
+            "worst_position_m": _known(self.worst_position_m),
+            "position_means_m": [_known(value) for value in self.position_means_m.tolist()],
+        }
+
+
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def measure_steps(
+    *,
+    seed: int,
+    frames_per_step: int,
+    ranges_m: Sequence[float] | None = None,
+    scene: Scene | None = None,
+    check: Callable[[], None] = lambda: None,
+) -> Steps:
+    """Take frames of a rod at every range, through an emulated module and its driver.
+
+    Parameters
+    ----------
+    seed
+        Of the receiver noise; every position has noise of its own.
+    frames_per_step
+        Frames taken at each position.
+    ranges_m
+        True ranges; from 0.5 to 1.4 m in 1 cm steps if not given.
+    scene
+        Whose receiver: noise, leakage and the like; the lab if not given.
+    check
+        Asked at every position; may raise to stop.
+    """
+    room = load_scene("lab") if scene is None else scene
+    if ranges_m is None:
+        n_steps = round((LAST_M - FIRST_M) / STEP_M)
+        ranges_m = [FIRST_M + STEP_M * step for step in range(n_steps + 1)]
+    frames = []
+    for number, range_m in enumerate(ranges_m):
+        check()
+        noise_seed = seed * len(ranges_m) + number
+        frames.append(_frames(_rod_at(room, range_m), noise_seed, frames_per_step, check))
+    return Steps(ranges_m=np.array(ranges_m), frames=tuple(frames))
+
+
+def _rod_at(room: Scene, range_m: float) -> Scene:
+    radar = RadarSpec(name="radar", serial="202305070901", x_m=0.0, y_m=0.0, yaw_deg=0.0)
+    rod = TargetSpec(name="rod", kind="rod", x_m=range_m, y_m=0.0, amplitude_1m=ROD_AMPLITUDE_1M)
+    return Scene(
+        name="range_steps",
+        environment=room.environment,
+        description="One radar and one rod.",
+        path=PathSpec(),
+        noise=room.noise,
+        leakage=room.leakage,
+        clutter=room.clutter,
+        jitter=room.jitter,
+        radars=(radar,),
+        targets=(rod,),
+    )
+
+
+def _frames(
+    scene: Scene, seed: int, count: int, check: Callable[[], None]
+) -> tuple[RadarFrame, ...]:
+    with open_loopback(scene, seed) as source:
+        source.start(RAW_CONFIG, FRAME_RATE_HZ)
+        return tuple(scan.frames[0] for scan in source.scans(count, check))
+
+
+def front_ends() -> Mapping[str, SlamConfig]:
+    """Return the preset ``paper`` with each front end in turn, by its name."""
+    paper = load_preset("paper")
+    detection = paper.detection
+    return {
+        str(front_end): paper.model_copy(
+            update={"detection": detection.model_copy(update={"front_end": front_end})}
+        )
+        for front_end in FrontEnd
+    }
+
+
+def range_errors(
+    steps: Steps, *, check: Callable[[], None] = lambda: None
+) -> dict[str, RangeErrors]:
+    """Return what each front end makes of the same frames, by its name."""
+    errors = {}
+    for name, config in front_ends().items():
+        detections = []
+        for frames in steps.frames:
+            check()
+            # a detector may remember frames, and no position is the continuation of another
+            detections.append(tuple(make_detector(config).detect_many(frames, [0.0] * len(frames))))
+        residuals = [
+            [_residual(found, true_m) for found in of_step]
+            for of_step, true_m in zip(detections, steps.ranges_m.tolist(), strict=True)
+        ]
+        errors[name] = RangeErrors(detections=tuple(detections), residuals_m=np.array(residuals))
+    return errors
+
+
+def _residual(detections: tuple[Detection, ...], true_m: float) -> float:
+    nearest = min((each.range_m - true_m for each in detections), key=abs, default=math.nan)
+    return nearest if abs(nearest) <= MATCH_M else math.nan
+
+
+_COLOURS = {"paper": ODOMETRY, "matched_filter": ESTIMATE, "joint": LANDMARK}
+_SHOWN_TO_M = 1.7
+_MILLI = 1e3
+_WATER = LinearSegmentedColormap.from_list("water", ["#ffffff", "#9cc0ea", "#12408a"], N=20)
+
+
+def draw_figure7(path: Path, steps: Steps, errors: Mapping[str, RangeErrors], *, seed: int) -> None:
+    """Draw raw frame, smoothed frame, frames of all positions, residuals; into a PNG file."""
+    config = load_preset("paper").detection
+    middle = len(steps.ranges_m) // 2
+    paper = errors[str(FrontEnd.PAPER)]
+    with picture(path, width_in=9.8, height_in=7.4) as figure:
+        figure.suptitle(
+            "From raw frame to range: the paper's figure of raw observations, repeated on an "
+            f"emulated X4M300 (simulated, seed {seed})",
+            fontsize=11,
+            color=INK,
+            x=0.01,
+            ha="left",
+        )
+        panels = figure.subplots(2, 2)
+        true_m = float(steps.ranges_m[middle])
+        frame = steps.frames[middle][0]
+        _draw_raw(panels[0, 0], frame, true_m)
+        _draw_smoothed(panels[0, 1], frame, true_m, config)
+        _draw_positions(panels[1, 0], steps, paper, config)
+        _draw_residuals(panels[1, 1], steps, errors)
+
+
+def _ranges_m(frame: RadarFrame) -> NDArray[np.float64]:
+    bins = np.arange(len(frame.samples), dtype=np.float64)
+    return frame.range_start_m + frame.bin_length_m * bins
+
+
+def _draw_raw(axes: Axes, frame: RadarFrame, true_m: float) -> None:
+    magnitude = np.abs(frame.samples.astype(np.float64))
+    axes.axvspan(true_m - 0.1, true_m + 0.1, color=TRUTH, alpha=0.18, linewidth=0)
+    axes.plot(_ranges_m(frame), _MILLI * magnitude, color=ESTIMATE, linewidth=0.8)
+    axes.axhline(_MILLI * magnitude.mean(), color=ODOMETRY, linewidth=1.0, linestyle="--")
+    axes.annotate(
+        "dashed: mean,\nless is set to 0",
+        (_SHOWN_TO_M, _MILLI * magnitude.mean()),
+        xytext=(-4, 24),
+        textcoords="offset points",
+        ha="right",
+        fontsize=8.5,
+        color=ODOMETRY,
+    )
+    axes.annotate(
+        "the rod is here",
+        (true_m, 1.0),
+        xycoords=("data", "axes fraction"),
+        xytext=(24, -14),
+        textcoords="offset points",
+        fontsize=8.5,
+        color=PALE_INK,
+    )
+    axes.set_xlim(frame.range_start_m, _SHOWN_TO_M)
+    axes.set_ylim(bottom=0)
+    label(axes, "(a) one raw frame, magnitude", "range [m]", "amplitude [1e-3]")
+
+
+def _draw_smoothed(axes: Axes, frame: RadarFrame, true_m: float, config: DetectionConfig) -> None:
+    detector = PaperDetector(config)
+    smoothed = detector.smooth(frame.samples)
+    axes.axvline(true_m, color=TRUTH, linewidth=3.2, alpha=0.55, label="true range of the rod")
+    axes.plot(_ranges_m(frame), _MILLI * smoothed, color=ESTIMATE, linewidth=1.0, label="smoothed")
+    axes.axhline(
+        _MILLI * config.min_peak_height,
+        color=ODOMETRY,
+        linewidth=1.0,
+        linestyle="--",
+        label="least peak height",
+    )
+    found = detector.detect(frame)
+    axes.plot(
+        [each.range_m for each in found],
+        [_MILLI * each.amplitude for each in found],
+        linestyle="none",
+        marker="v",
+        color=LANDMARK,
+        label="detection",
+    )
+    for each in found:
+        axes.annotate(
+            f"{each.range_m:.3f} m, {_MILLI * (each.range_m - true_m):+.1f} mm off",
+            (each.range_m, _MILLI * each.amplitude),
+            xytext=(10, 2),
+            textcoords="offset points",
+            fontsize=8.5,
+            color=LANDMARK,
+        )
+    axes.set_xlim(frame.range_start_m, _SHOWN_TO_M)
+    axes.margins(y=0.12)
+    axes.legend(loc="upper left", frameon=False, fontsize=8.5)
+    title = (
+        f"(b) mean filter, Savitzky-Golay ({config.smoothing_length_bins}, "
+        f"{config.smoothing_order}), peaks"
+    )
+    label(axes, title, "range [m]", "amplitude [1e-3]")
+
+
+def _draw_positions(axes: Axes, steps: Steps, paper: RangeErrors, config: DetectionConfig) -> None:
+    detector = PaperDetector(config)
+    rows = np.array([detector.smooth(frames[0].samples) for frames in steps.frames])
+    ranges_m = _ranges_m(steps.frames[0][0])
+    shown = ranges_m <= _SHOWN_TO_M
+    image = axes.pcolormesh(
+        ranges_m[shown],
+        steps.ranges_m,
+        np.clip(_MILLI * rows[:, shown], 0, None),
+        cmap=_WATER,
+        vmax=_MILLI * float(np.quantile(rows.max(axis=1), 0.7)),
+        rasterized=True,
+    )
+    axes.figure.colorbar(image, ax=axes, label="smoothed amplitude [1e-3]", extend="max")
+    axes.plot(
+        steps.ranges_m, steps.ranges_m, color=INK, linewidth=0.9, linestyle="--", label="true"
+    )
+    points = [
+        (each.range_m, true_m)
+        for of_step, true_m in zip(paper.detections, steps.ranges_m.tolist(), strict=True)
+        for each in of_step[0]
+    ]
+    axes.plot(
+        *np.array(points).reshape(-1, 2).T,
+        linestyle="none",
+        marker="o",
+        markersize=2.6,
+        color=LANDMARK,
+        label="detection",
+    )
+    axes.legend(loc="upper left", frameon=False, fontsize=8.5)
+    label(
+        axes,
+        "(c) the rod moves away in 1 cm steps: one frame per row",
+        "range [m]",
+        "true range of the rod [m]",
+    )
+
+
+def _draw_residuals(axes: Axes, steps: Steps, errors: Mapping[str, RangeErrors]) -> None:
+    axes.axhline(0.0, color=TRUTH, linewidth=1.0)
+    for name, error in errors.items():
+        spread = f"bias {_MILLI * error.bias_m:+.2f} mm, std {_MILLI * error.std_m:.2f} mm"
+        axes.plot(
+            np.repeat(steps.ranges_m, error.residuals_m.shape[1]),
+            _MILLI * error.residuals_m.ravel(),
+            linestyle="none",
+            marker=".",
+            markersize=2.0,
+            alpha=0.25,
+            color=_COLOURS[name],
+            zorder=1,
+        )
+        axes.plot(
+            steps.ranges_m,
+            _MILLI * error.position_means_m,
+            # on a single echo the joint fit is the matched filter: the first line is wide
+            linewidth=4.0 if name == FrontEnd.MATCHED_FILTER else 1.0,
+            alpha=0.4 if name == FrontEnd.MATCHED_FILTER else 1.0,
+            color=_COLOURS[name],
+            label=f"{name}: {spread}",
+        )
+    axes.legend(loc="upper left", frameon=False, fontsize=8.5)
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.25 * (high - low))  # room for the legend
+    label(
+        axes,
+        "(d) error: dots frames, lines their mean",
+        "true range of the rod [m]",
+        "error [mm]",
+    )
+
 
 NAME = "figure7"
 
@@ -29,9 +414,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
     """Move a rod from 0.5 to 1.4 m in 1 cm steps past one radar of the lab."""
     # heavy, see module text
-    from slam.app.experiments.figure7_picture import draw_figure7
-    from slam.app.experiments.range_steps import measure_steps, range_errors
-    from slam.app.experiments.results import print_table, write_json
+    from slam.app.run.output import print_table, write_json
 
     steps = measure_steps(seed=arguments.seed, frames_per_step=arguments.frames, check=stop.check)
     errors = range_errors(steps, check=stop.check)

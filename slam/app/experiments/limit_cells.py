@@ -1,33 +1,426 @@
-"""The cells of the table of limits: each a number of frames, the front ends, and what they made."""
+"""The cells of the table of limits: each a number of frames, the front ends, and what they made.
+
+Positions in bins, s the envelope's standard deviation in bins, sigma the noise per RF sample.
+
+``chip_frames`` goes the emulator's way: its pulse, its receiver (noise by counter, counting,
+clipping) and the module's normalisation. ``closed_form_frames`` writes the pulse down and adds
+NumPy's noise; neither counts nor clips. That both give the same numbers shows that neither carries
+a mistake of its own.
+
+All see the same windows as `slam.front_end.overlapping.fit_many`, know the same pulse and believe
+one more echo by the same test; they differ in how they look for it. Each works on the correlation
+of the window with pulses on a fine grid of positions, cosine and sine taken as orthogonal.
+
+CLEAN
+    Subtracts the strongest pulse of what is left, again and again (Hogbom 1974). Each is placed as
+    if it were alone.
+OMP
+    Places pulses like CLEAN, but then fits the amplitudes of all of them together (Pati et al.
+    1993). Positions stay where they were first put.
+LASSO
+    Amplitudes for every grid position at once, their absolute sum penalised (Tibshirani 1996;
+    solved by FISTA, Beck and Teboulle 2009); neighbours are merged, weakest first out.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import ncx2
 
-from slam.app.experiments.echo_separators import SEPARATORS
-from slam.app.experiments.limit_bounds import known_pulse, pair_covariance
-from slam.app.experiments.limit_frames import (
-    BIN_LENGTH_M,
-    FULL,
-    NARROW,
-    Echoes,
-    chip_frames,
-    closed_form_frames,
-)
-from slam.close_echoes import SplitTest
-from slam.config import FrontEnd, SlamConfig
-from slam.detection import make_detector
-from slam.detector import Detector
-from slam.frames import RadarFrame
-from slam.presets import override
-from slam.pulse_model import PulseModel
+from emulator.chip.chip import CaptureSettings
+from emulator.echo.pulse import sum_of_pulses
+from emulator.echo.receiver import Receiver
+from emulator.scene.scene import LeakageSpec, NoiseSpec, RadarSpec, Scene
+from slam.app.rig.sources import sampler_limits
+from slam.config import FrontEnd, SlamConfig, override
+from slam.frames import Detector, RadarFrame
+from slam.front_end.overlapping import KnownPulse, SplitTest, split_threshold
+from slam.front_end.paper import make_detector
+from slam.front_end.pulse import PulseModel
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.wire.x4 import Normalisation
 
 Array = NDArray[np.float64]
+
+
+def known_pulse(bin_length_m: float) -> KnownPulse:
+    """Return the emulator's pulse, as the joint fit wants it."""
+    pulse = PulseModel()
+    return KnownPulse(
+        envelope_sigma_bins=pulse.sigma_bins(bin_length_m),
+        carrier_rad_per_bin=pulse.carrier_rad(bin_length_m),
+    )
+
+
+def pair_covariance(
+    distance: Array, ratio: float, turn_rad: Array, *, snr: float, envelope_sigma: float
+) -> Array:
+    """Return the Cramer-Rao bound of the positions of two echoes, amplitudes and phases unknown.
+
+    With d the distance, r = exp(-d**2 / (4 s**2)) the overlap of the pulses, a complex amplitude c
+    per echo (that of its envelope on a common carrier) and sums over n taken as integrals over
+    Gaussians, the Fisher matrix of the positions once both amplitudes are fitted is
+
+        J_kl = E / sigma**2 Re(conj(c_k) c_l) (M_kl - m_k^T R^-1 m_l),   E = s sqrt(pi) / 2
+        M_11 = M_22 = 1 / (2 s**2),   M_12 = r (1 / (2 s**2) - d**2 / (4 s**4))
+        R = [[1, r], [r, 1]],   m_1 = (0, q),  m_2 = (-q, 0),   q = r d / (2 s**2)
+
+    with m_k the correlations of the derivative of pulse k by its position with both pulses.
+
+    Parameters
+    ----------
+    distance
+        Shape (n,), > 0: from the first echo to the second.
+    ratio
+        Amplitude of the second over the first.
+    turn_rad
+        Shape (n,): phase between the two on a common carrier.
+    snr
+        Amplitude of the first over sigma.
+    envelope_sigma
+        s.
+
+    Returns
+    -------
+    Shape (n, 2, 2), squared bins.
+    """
+    s = envelope_sigma
+    d = np.asarray(distance, dtype=np.float64)
+    r = np.exp(-((d / (2 * s)) ** 2))
+    own = np.full_like(d, 1 / (2 * s**2))
+    cross = r * (1 / (2 * s**2) - d**2 / (4 * s**4))
+    q = r * d / (2 * s**2)
+    left = 1 - r**2
+    # derivative by u_1 correlates with pulse 2 by +q, derivative by u_2 with pulse 1 by -q
+    own -= q**2 / left
+    cross -= q**2 * r / left
+    amplitude = snr**2 * s * np.sqrt(np.pi) / 2
+    information = np.empty((*d.shape, 2, 2))
+    information[..., 0, 0] = amplitude * own
+    information[..., 1, 1] = amplitude * ratio**2 * own
+    information[..., 0, 1] = amplitude * ratio * np.cos(turn_rad) * cross
+    information[..., 1, 0] = information[..., 0, 1]
+    covariance: Array = np.linalg.inv(information)
+    return covariance
+
+
+def detection_probability(snr: Array, threshold_sigmas: float, envelope_sigma: float) -> Array:
+    """Return how often the matched filter's output at the echo exceeds a threshold: Marcum's Q.
+
+    Parameters
+    ----------
+    snr
+        Amplitude over sigma, any shape.
+    threshold_sigmas
+        In standard deviations of one quadrature of the filter's output.
+    envelope_sigma
+        s; the filter gains s sqrt(pi) / 2 in power.
+    """
+    noncentrality = np.asarray(snr) ** 2 * envelope_sigma * np.sqrt(np.pi) / 2
+    probability: Array = ncx2.sf(threshold_sigmas**2, 2, noncentrality)
+    return probability
+
+
+N_BINS = 1431
+RANGE_START_M = 0.2
+BIN_LENGTH_M = 299_792_458.0 / (2 * 23.328e9)
+NARROW, FULL = (949, 1100), (0, 2047)
+"""Ends of the DAC sweep: +-0.0742 as radars are used, and everything."""
+_ITERATIONS, _PULSES_PER_STEP = 16, 300
+_TX_CENTER_FREQUENCY = 3
+_BLOCK = 250
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Echoes:
+    """What is in each of n frames: k echoes each; every array has shape (n, k).
+
+    Attributes
+    ----------
+    range_m
+        True metres.
+    amplitude
+        Peak of the envelope, normalised units.
+    phase_rad
+        Phase of the carrier at the pulse's centre.
+    """
+
+    range_m: Array
+    amplitude: Array
+    phase_rad: Array
+
+    @property
+    def position_bins(self) -> Array:
+        """Return where the echoes lie, in bins from sample 0."""
+        return (self.range_m - RANGE_START_M) / BIN_LENGTH_M
+
+    def beside(self, other: Echoes) -> Echoes:
+        """Return frames with the echoes of both."""
+        return Echoes(
+            range_m=np.hstack([self.range_m, other.range_m]),
+            amplitude=np.hstack([self.amplitude, other.amplitude]),
+            phase_rad=np.hstack([self.phase_rad, other.phase_rad]),
+        )
+
+
+def chip_frames(
+    echoes: Echoes, *, noise_sigma: float, seed: int, dac: tuple[int, int] = NARROW
+) -> list[RadarFrame]:
+    """Return frames as the emulated chip takes them and the driver reads them.
+
+    Parameters
+    ----------
+    echoes
+        Their content.
+    noise_sigma
+        White noise per RF sample, normalised units.
+    seed
+        Of the receiver's noise.
+    dac
+        First and last level of the DAC sweep.
+    """
+    capture = CaptureSettings(
+        first_sample_m=RANGE_START_M,
+        n_samples=N_BINS,
+        iterations=_ITERATIONS,
+        pulses_per_step=_PULSES_PER_STEP,
+        dac_min=dac[0],
+        dac_max=dac[1],
+        dac_step=0,
+        tx_power=2,
+        tx_center_frequency=_TX_CENTER_FREQUENCY,
+    )
+    normalisation = Normalisation.of(
+        iterations=_ITERATIONS, pulses_per_step=_PULSES_PER_STEP, dac_min=dac[0], dac_max=dac[1]
+    )
+    limits = sampler_limits(
+        RawConfig(
+            iterations=_ITERATIONS,
+            pulses_per_step=_PULSES_PER_STEP,
+            dac_min=dac[0],
+            dac_max=dac[1],
+        )
+    )
+    radar = RadarSpec(name="radar", serial="000000000001", x_m=0.0, y_m=0.0, yaw_deg=0.0)
+    scene = Scene(
+        name="limits",
+        environment="lab",
+        description="echoes of a front end's test",
+        radars=(radar,),
+        noise=NoiseSpec(
+            rf_sigma=noise_sigma, iterations=_ITERATIONS, pulses_per_step=_PULSES_PER_STEP
+        ),
+        leakage=LeakageSpec(amplitude=0.0, range_m=0.0),
+    )
+    receiver = Receiver(scene, radar, seed)
+    frames = []
+    for start in range(0, len(echoes.range_m), _BLOCK):
+        rows = slice(start, start + _BLOCK)
+        position = echoes.position_bins[rows]
+        n, k = position.shape
+        signal = sum_of_pulses(
+            frame=np.repeat(np.arange(n), k),
+            position=position.ravel(),
+            amplitude=echoes.amplitude[rows].ravel(),
+            phase_rad=echoes.phase_rad[rows].ravel(),
+            tx_center_frequency=_TX_CENTER_FREQUENCY,
+            shape=(n, N_BINS),
+        )
+        counters = np.arange(start, start + n, dtype=np.int64)
+        counts = receiver.counters(signal, counters, counters * 200_000_000, capture, gain=1.0)
+        samples = counts.astype(np.float32) * np.float32(normalisation.quantum)
+        samples -= np.float32(normalisation.dac_offset)
+        frames += [_frame(int(c), row, limits) for c, row in zip(counters, samples, strict=True)]
+    return frames
+
+
+def closed_form_frames(echoes: Echoes, *, noise_sigma: float, seed: int) -> list[RadarFrame]:
+    """Return frames by the formula of the pulse and NumPy's noise; arguments as `chip_frames`."""
+    rng = np.random.default_rng(seed)
+    pulse = PulseModel()
+    sigma_m, wavelength_m = pulse.sigma_m, pulse.wavelength_m
+    labels = RANGE_START_M + BIN_LENGTH_M * np.arange(N_BINS)
+    frames = []
+    for n in range(len(echoes.range_m)):
+        off = labels - echoes.range_m[n, :, np.newaxis]
+        envelope = echoes.amplitude[n, :, np.newaxis] * np.exp(-0.5 * (off / sigma_m) ** 2)
+        turn = math.tau * off / wavelength_m + echoes.phase_rad[n, :, np.newaxis]
+        samples = (envelope * np.cos(turn)).sum(axis=0)
+        samples += noise_sigma * rng.standard_normal(N_BINS)
+        frames.append(_frame(n, samples.astype(np.float32), None))
+    return frames
+
+
+def _frame(
+    counter: int, samples: NDArray[np.float32], limits: tuple[float, float] | None
+) -> RadarFrame:
+    return RadarFrame(
+        radar=0,
+        t_ns=counter * 200_000_000,
+        counter=counter,
+        samples=samples,
+        range_start_m=RANGE_START_M,
+        bin_length_m=BIN_LENGTH_M,
+        limits=limits,
+    )
+
+
+ComplexArray = NDArray[np.complex128]
+
+Separator = Callable[[Array, KnownPulse, Array, SplitTest], list[Array]]
+"""(windows (b, n), pulse, noise sigma (b,), split) -> positions in bins of each window, sorted."""
+
+_FINE_STEP_BINS = 0.25
+_COARSE_STEP_BINS = 1.0
+_LASSO_STEPS = 200
+_MERGED_BINS = 4.0
+"""LASSO spreads one echo over neighbouring grid places; closer ones are taken as one."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Dictionary:
+    """Pulses of norm 1 on a grid, and what of the windows each explains.
+
+    Attributes
+    ----------
+    grid
+        Shape (g,), bins.
+    gram
+        Shape (g, g), float64: correlation of the pulses.
+    matched
+        Shape (b, g), complex128: correlation of the windows, over the noise.
+    """
+
+    grid: Array
+    gram: Array
+    matched: ComplexArray
+
+    @staticmethod
+    def of(windows: Array, pulse: KnownPulse, noise_sigma: Array, step_bins: float) -> _Dictionary:
+        n = np.arange(windows.shape[1])
+        sigma = pulse.envelope_sigma_bins
+        grid = np.arange(1.5 * sigma, len(n) - 1 - 1.5 * sigma, step_bins)
+        envelopes = np.exp(-0.5 * ((n - grid[:, np.newaxis]) / sigma) ** 2)
+        envelopes /= np.sqrt((envelopes**2).sum(axis=1, keepdims=True))
+        angle = pulse.carrier_rad_per_bin * n
+        # a cosine of envelope norm 1 has norm sqrt(1/2)
+        whitened = windows * (math.sqrt(2) / noise_sigma[:, np.newaxis])
+        matched = (whitened * np.cos(angle)) @ envelopes.T - 1j * (
+            (whitened * np.sin(angle)) @ envelopes.T
+        )
+        return _Dictionary(grid=grid, gram=envelopes @ envelopes.T, matched=matched)
+
+
+def clean(windows: Array, pulse: KnownPulse, noise_sigma: Array, split: SplitTest) -> list[Array]:
+    """Return positions by CLEAN; arguments as in `Separator`."""
+    dictionary = _Dictionary.of(windows, pulse, noise_sigma, _FINE_STEP_BINS)
+    return [
+        _greedy(dictionary, matched, split, pulse.envelope_sigma_bins, refit=False)
+        for matched in dictionary.matched
+    ]
+
+
+def omp(windows: Array, pulse: KnownPulse, noise_sigma: Array, split: SplitTest) -> list[Array]:
+    """Return positions by orthogonal matching pursuit; arguments as in `Separator`."""
+    dictionary = _Dictionary.of(windows, pulse, noise_sigma, _FINE_STEP_BINS)
+    return [
+        _greedy(dictionary, matched, split, pulse.envelope_sigma_bins, refit=True)
+        for matched in dictionary.matched
+    ]
+
+
+def _greedy(
+    dictionary: _Dictionary, matched: ComplexArray, split: SplitTest, sigma: float, *, refit: bool
+) -> Array:
+    left, chosen, explained = matched, list[int](), 0.0
+    root_h = math.sqrt(_threshold(dictionary, split, sigma))
+    while len(chosen) < split.max_echoes:
+        power = left.real**2 + left.imag**2
+        best = int(power.argmax())
+        if chosen and power[best] <= (root_h + split.model_error * math.sqrt(explained)) ** 2:
+            break
+        if best in chosen:  # what is left is no pulse
+            break
+        chosen.append(best)
+        if refit:
+            linear = np.linalg.solve(dictionary.gram[np.ix_(chosen, chosen)], matched[chosen])
+            left = matched - dictionary.gram[:, chosen] @ linear
+            explained = float((matched[chosen].conj() @ linear).real)
+        else:
+            explained += float(power[best])
+            left = left - dictionary.gram[:, best] * left[best]
+    return np.sort(dictionary.grid[chosen])
+
+
+def lasso(windows: Array, pulse: KnownPulse, noise_sigma: Array, split: SplitTest) -> list[Array]:
+    """Return positions by LASSO on a grid; arguments as in `Separator`."""
+    dictionary = _Dictionary.of(windows, pulse, noise_sigma, _COARSE_STEP_BINS)
+    gram, matched = dictionary.gram, dictionary.matched
+    root_h = math.sqrt(_threshold(dictionary, split, pulse.envelope_sigma_bins))
+    # The penalty at which noise, and what the pulse leaves of itself, stays at zero.
+    strongest = np.abs(matched).max(axis=1, keepdims=True)
+    penalty = root_h + split.model_error * strongest
+    rate = 1 / float(np.linalg.eigvalsh(gram)[-1])
+    amplitudes = ahead = np.zeros_like(matched)
+    momentum = 1.0
+    for _ in range(_LASSO_STEPS):
+        moved = ahead + rate * (matched - ahead @ gram)
+        size = np.abs(moved)
+        shrunk = moved * np.maximum(0.0, 1 - rate * penalty / np.maximum(size, 1e-300))
+        following = (1 + math.sqrt(1 + 4 * momentum**2)) / 2
+        ahead = shrunk + (momentum - 1) / following * (shrunk - amplitudes)
+        amplitudes, momentum = shrunk, following
+    return [
+        _pruned(_merged(dictionary.grid, np.abs(row)), dictionary, each, split, root_h)
+        for row, each in zip(amplitudes, matched, strict=True)
+    ]
+
+
+def _merged(grid: Array, size: Array) -> Array:
+    """Return the centres of runs of grid places in use, weighted by their amplitudes."""
+    used = np.flatnonzero(size > 0.02 * size.max())
+    runs = np.split(used, np.flatnonzero(np.diff(grid[used]) > _MERGED_BINS) + 1)
+    return np.array([np.average(grid[run], weights=size[run]) for run in runs])
+
+
+def _pruned(
+    positions: Array,
+    dictionary: _Dictionary,
+    matched: ComplexArray,
+    split: SplitTest,
+    root_h: float,
+) -> Array:
+    """Drop the echo that explains least while the others explain nearly as much without it."""
+
+    def energy(kept: Array) -> float:
+        places = np.searchsorted(dictionary.grid, kept).clip(0, len(dictionary.grid) - 1)
+        linear = np.linalg.lstsq(dictionary.gram[np.ix_(places, places)], matched[places])[0]
+        return float((matched[places].conj() @ linear).real)
+
+    while len(positions) > 1:
+        whole = energy(positions)
+        without = [energy(np.delete(positions, k)) for k in range(len(positions))]
+        weakest = int(np.argmax(without))
+        needed = (root_h + split.model_error * math.sqrt(max(0.0, without[weakest]))) ** 2
+        if len(positions) <= split.max_echoes and whole - without[weakest] > needed:
+            break
+        positions = np.delete(positions, weakest)
+    return positions
+
+
+def _threshold(dictionary: _Dictionary, split: SplitTest, sigma: float) -> float:
+    length = float(dictionary.grid[-1] - dictionary.grid[0])
+    return split_threshold(split.false_split, length / sigma)
+
+
+SEPARATORS: Mapping[str, Separator] = MappingProxyType({"clean": clean, "omp": omp, "lasso": lasso})
+
 
 AMPLITUDE = 0.015
 NOISE_SIGMA = 5e-4

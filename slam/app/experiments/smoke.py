@@ -1,14 +1,313 @@
 """The paper's smoke experiment, and its figure of the outlier filter on odometry poses.
 
+What smoke does to a radar: its particles, at most micrometres, are far smaller than the 41 mm
+wavelength, so they absorb by volume and scatter next to nothing (Rayleigh regime; Bohren and
+Huffman 1983, section 5.1). Of spheres that fill the share f of space the power is lost at
+
+    alpha = (6 pi / wavelength) f Im((eps - 1) / (eps + 2))  <=  3 pi f / wavelength   per metre,
+
+because the last factor cannot exceed 1/2 for a permittivity whose real part is 1 or more. The runs
+in smoke weaken every echo by this bound at the largest range SLAM uses. Chains of soot can absorb
+more than spheres; ten times more would change nothing here. What it does to light: 8.7 m2 of
+extinction per gram of smoke from flames (Mulholland and Croarkin 2000, Fire and Materials 24).
+
 Light, so that ``--help`` is; the work is in ``smoke_runs`` and ``smoke_picture``.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
-from slam.app.arguments import seed
-from slam.app.stop import StopFlag
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from emulator.scene.scene import Scene
+from emulator.scene.wheels import scene_odometry
+from slam.app.cli import seed
+from slam.app.errors import StopFlag
+from slam.app.odometry.track import OdometryTrack
+from slam.app.rig.emulated import (
+    FRAME_RATE_HZ,
+    RAW_CONFIG,
+    end_counter,
+    open_loopback,
+    rig_of,
+    scene_and_config,
+    true_landmarks_m,
+)
+from slam.app.run.output import mm_text
+from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, TRUTH, label, picture
+from slam.app.run.runner import RunRecord, run_slam
+from slam.config import SlamConfig
+from slam.geometry import transform
+from slam.paper.clustering import Observation
+from slam.paper.pipeline import StepResult, UwbRadarSlam
+from slam.paper.trilateration import Fix
+
+Array = NDArray[np.float64]
+
+SMOKE_G_PER_M3 = 5.0
+"""Assumed: dense, a lit exit sign is lost within half a metre."""
+_PARTICLE_G_PER_M3 = 1.8e6
+"""Soot; droplets of fog fluid are lighter, and fill more: 1.1e6."""
+_WAVELENGTH_M = 299_792_458.0 / 7.29e9
+_LIGHT_EXTINCTION_M2_PER_G = 8.7
+_LARGEST_RANGE_M = 1.5
+_LAB_LAPS = 2
+_DB_PER_NEPER_OF_POWER = 10 / math.log(10)
+
+
+def smoke_attenuation_db(range_m: float, g_per_m3: float = SMOKE_G_PER_M3) -> float:
+    """Return the most that smoke can take from an echo there and back [dB]."""
+    per_metre = 3 * math.pi / _WAVELENGTH_M * g_per_m3 / _PARTICLE_G_PER_M3
+    return _DB_PER_NEPER_OF_POWER * per_metre * 2 * range_m
+
+
+def light_attenuation_db(range_m: float, g_per_m3: float = SMOKE_G_PER_M3) -> float:
+    """Return what smoke takes from a lidar's pulse there and back [dB]."""
+    return _DB_PER_NEPER_OF_POWER * _LIGHT_EXTINCTION_M2_PER_G * g_per_m3 * 2 * range_m
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ObservedRun:
+    """What one run observed, on the poses that odometry gives.
+
+    Attributes
+    ----------
+    name
+        What the run is called.
+    n_detections
+        Ranges, over all radars and states.
+    same_detections
+        Share of the states at which all ranges are equal to those in clear air, to the last bit;
+        None in another scene.
+    raw_m, filtered_m
+        Shape (n, 2) each, world frame: every fix, and what the outlier filter made of them.
+    raw_rms_m, filtered_rms_m
+        Root mean square distance to the nearest true landmark on *true* poses: of the observation
+        alone, without the drift of odometry. None where nothing was seen.
+    odometry_m, truth_m
+        Shape (n, 2) each, world frame: the path.
+    landmarks_m
+        Shape (m, 2), world frame.
+    """
+
+    name: str
+    n_detections: int
+    same_detections: float | None
+    raw_m: Array
+    filtered_m: Array
+    raw_rms_m: float | None
+    filtered_rms_m: float | None
+    odometry_m: Array
+    truth_m: Array
+    landmarks_m: Array
+
+    def numbers(self) -> dict[str, object]:
+        """Return what goes into the JSON file."""
+        return {
+            "name": self.name,
+            "detections": self.n_detections,
+            "states_with_the_detections_of_clear_air": self.same_detections,
+            "raw_fixes": len(self.raw_m),
+            "filtered_observations": len(self.filtered_m),
+            "raw_rms_m": self.raw_rms_m,
+            "filtered_rms_m": self.filtered_rms_m,
+        }
+
+
+def drive_in_clear_air_and_smoke(
+    *,
+    seed: int,
+    laps: int | None = None,
+    check: Callable[[], None] = lambda: None,
+) -> tuple[ObservedRun, ...]:
+    """Return the runs: clear air, smoke, smoke under other receiver noise, and the lab.
+
+    The first two share receiver noise and odometry, so what differs is the smoke's doing; the
+    third tells how much another noise of the receivers does. The lab, in clear air, is there for
+    its ghosts: with one landmark there are none.
+
+    Parameters
+    ----------
+    seed
+        Of the odometry's drift and the receivers' noise.
+    laps
+        How many laps to drive; in the smoke scene all, in the lab two if not given.
+    check
+        Asked at every scan; may raise to stop.
+    """
+    clear, config = scene_and_config("smoke", "paper")
+    lab, lab_config = scene_and_config("lab", "paper")
+    clear, lab = _laps(clear, laps), _laps(lab, _LAB_LAPS if laps is None else laps)
+    smoke = in_smoke(clear)
+    cells = (
+        ("clear air", clear, config, seed),
+        ("smoke", smoke, config, seed),
+        ("smoke, other noise", smoke, config, seed + 1),
+        ("lab, clear air", lab, lab_config, seed),
+    )
+    runs: list[ObservedRun] = []
+    for name, scene, settings, noise_seed in cells:
+        record = _drive(scene, settings, seed=seed, noise_seed=noise_seed, check=check)
+        if not runs:
+            reference = record
+        runs.append(_observed(name, scene, record, reference if scene is not lab else None))
+    return tuple(runs)
+
+
+def in_smoke(scene: Scene) -> Scene:
+    """Return a scene whose targets echo as weakly as smoke can make them."""
+    factor = 10 ** (-smoke_attenuation_db(_LARGEST_RANGE_M) / 20)
+    return scene.model_copy(
+        update={
+            "targets": tuple(
+                target.model_copy(update={"amplitude_1m": factor * target.amplitude_1m})
+                for target in scene.targets
+            )
+        }
+    )
+
+
+def _laps(scene: Scene, laps: int | None) -> Scene:
+    path = scene.path.model_copy(update={"laps": scene.path.laps[:laps]})
+    return scene.model_copy(update={"path": path})
+
+
+def _drive(
+    scene: Scene, config: SlamConfig, *, seed: int, noise_seed: int, check: Callable[[], None]
+) -> RunRecord:
+    trajectory = scene.trajectory()
+    odometry = OdometryTrack.from_lines(scene_odometry(scene, seed))
+    with open_loopback(scene, noise_seed) as source:
+        source.start(RAW_CONFIG, FRAME_RATE_HZ)
+        scans = source.scans(end_counter(trajectory.duration_ns), check)
+        slam = UwbRadarSlam(config, rig_of(scene))
+        return run_slam(scans, odometry, slam, trajectory.poses)
+
+
+def _observed(
+    name: str, scene: Scene, record: RunRecord, reference: RunRecord | None
+) -> ObservedRun:
+    landmarks_m = true_landmarks_m(scene)
+    results = record.results
+    start = record.world_from_map
+    raw = [result.fixes for result in results]
+    filtered = [result.observations for result in results]
+    on_odometry = np.array([result.odometry_pose for result in results])
+    return ObservedRun(
+        name=name,
+        n_detections=sum(len(result.detections) for result in results),
+        same_detections=None if reference is None else _same(results, reference.results),
+        raw_m=transform(start, _placed(on_odometry, raw)),
+        filtered_m=transform(start, _placed(on_odometry, filtered)),
+        raw_rms_m=_rms_m(_placed(record.truth, raw), landmarks_m),
+        filtered_rms_m=_rms_m(_placed(record.truth, filtered), landmarks_m),
+        odometry_m=transform(start, on_odometry[:, :2]),
+        truth_m=record.truth[:, :2],
+        landmarks_m=landmarks_m,
+    )
+
+
+def _same(results: Sequence[StepResult], reference: Sequence[StepResult]) -> float:
+    ranges = {
+        result.t_ns: [(each.radar, each.range_m) for each in result.detections]
+        for result in reference
+    }
+    same = [
+        ranges.get(result.t_ns) == [(each.radar, each.range_m) for each in result.detections]
+        for result in results
+    ]
+    return float(np.mean(same))
+
+
+def _placed(poses: Array, points: Sequence[Sequence[Fix | Observation]]) -> Array:
+    """Return the points of all poses in the frame of the poses, shape (n, 2)."""
+    placed = [
+        transform(pose, np.array([(each.x_m, each.y_m) for each in of_pose]))
+        for pose, of_pose in zip(poses, points, strict=True)
+        if of_pose
+    ]
+    return np.concatenate(placed) if placed else np.empty((0, 2))
+
+
+def _rms_m(points: Array, landmarks_m: Array) -> float | None:
+    if not len(points):
+        return None
+    gaps = np.linalg.norm(points[:, np.newaxis] - landmarks_m[np.newaxis], axis=2).min(axis=1)
+    return float(np.sqrt(np.mean(gaps**2)))
+
+
+_SHOWN = ("clear air", "smoke", "lab, clear air")
+
+
+def draw_smoke(path: Path, runs: Sequence[ObservedRun], *, seed: int) -> None:
+    """Draw raw observations above filtered ones, run by run, on odometry poses; a PNG file."""
+    shown = [run for run in runs if run.name in _SHOWN]
+    with picture(path, width_in=10.4, height_in=7.4) as figure:
+        figure.suptitle(
+            "Observations on wheel-odometry poses, before and after the paper's DBSCAN filter "
+            f"(simulated, seed {seed})",
+            fontsize=11,
+            color=INK,
+            x=0.01,
+            ha="left",
+        )
+        panels = figure.subplots(2, len(shown), sharex="col", sharey="col")
+        for column, run in zip(panels.T, shown, strict=True):
+            for axes, points, colour, what, error_m in (
+                (column[0], run.raw_m, ESTIMATE, "raw", run.raw_rms_m),
+                (column[1], run.filtered_m, LANDMARK, "filtered", run.filtered_rms_m),
+            ):
+                _draw(axes, run, points, colour)
+                label(
+                    axes,
+                    f"{run.name}: {len(points)} {what}, {mm_text(error_m)} off",
+                    "x [m]" if axes is column[1] else "",
+                    "y [m]" if run is shown[0] else "",
+                )
+        handles = [*panels[0, 0].get_legend_handles_labels()[0]]
+        handles.append(panels[1, 0].get_lines()[-1])
+        figure.legend(
+            handles,
+            ["wheel odometry", "true path", "true landmark", "raw fix", "filtered observation"],
+            loc="outside lower center",
+            ncols=5,
+            frameon=False,
+            title="off: root mean square distance to the nearest landmark, seen from the true pose",
+            title_fontsize=9,
+        )
+
+
+def _draw(axes: Axes, run: ObservedRun, points: NDArray[np.float64], colour: str) -> None:
+    axes.set_aspect("equal", adjustable="box")
+    axes.plot(*run.odometry_m.T, color=ODOMETRY, linewidth=0.8, label="odometry")
+    axes.plot(*run.truth_m.T, color=TRUTH, linewidth=2.4, alpha=0.5, label="truth")
+    axes.plot(
+        *run.landmarks_m.T,
+        linestyle="none",
+        marker="+",
+        markersize=12,
+        markeredgewidth=1.4,
+        color=INK,
+        zorder=4,
+        label="landmark",
+    )
+    axes.plot(
+        *points.T,
+        linestyle="none",
+        marker=".",
+        markersize=3.0,
+        alpha=0.5,
+        color=colour,
+        label="seen",
+    )
+
 
 NAME = "smoke"
 
@@ -26,15 +325,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
     """Drive round one point feature in clear air and in smoke; filter what was observed."""
     # heavy, see module text
-    from slam.app.experiments.results import print_table, write_json
-    from slam.app.experiments.smoke_picture import draw_smoke
-    from slam.app.experiments.smoke_runs import (
-        SMOKE_G_PER_M3,
-        drive_in_clear_air_and_smoke,
-        light_attenuation_db,
-        smoke_attenuation_db,
-    )
-    from slam.app.report_table import mm_text
+    from slam.app.run.output import mm_text, print_table, write_json
 
     runs = drive_in_clear_air_and_smoke(seed=arguments.seed, check=stop.check)
     radar_db, light_db = smoke_attenuation_db(1.5), light_attenuation_db(1.5)

@@ -1,15 +1,548 @@
 """The robust back end on real data: Victoria Park, with and without the trees' ids.
 
-Light, so that ``--help`` is; the work is in ``slam.app.victoria_park_runs`` and
+The file has one line per odometry step and one per tree seen::
+
+    ODOMETRY before after dx dy turn  C11 C12 C13 C22 C23 C33
+    LANDMARK pose landmark x y        C11 C12 C22
+
+in metres and radians, body frame of the earlier pose, with covariances (upper triangles). Poses
+and landmarks share one sequence of ids, so poses are numbered anew here. There is no ground
+truth. Source: the data of Guivant and Nebot, University of Sydney, in iSAM's format.
+
+Light, so that ``--help`` is; the work is in ``slam.app.experiments.victoria_park`` and
 ``victoria_park_picture``.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
 
-from slam.app.arguments import count
-from slam.app.stop import StopFlag
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from slam.app.cli import count
+from slam.app.errors import AppError, StopFlag
+from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, TRUTH, label, picture
+from slam.app.sweep.bound import load_gtsam
+from slam.evaluation import ate_rmse_m
+from slam.geometry import Rig, compose, wrap_angle
+from slam.robust.back_end import RobustBackEnd
+from slam.robust.initialisation import RangeBearing
+from slam.robust.parameters import BackEndParameters, RelinearisationRule, WheelNoise
+from slam.robust.state import CALIBRATION
+
+Array = NDArray[np.float64]
+
+FILE = "victoria_park.txt"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Drive:
+    """Odometry and landmarks seen.
+
+    Attributes
+    ----------
+    increments, covariances
+        shapes (k, 3) and (k, 3, 3): dx, dy [m], turn [rad] in the body frame before the step.
+    seen
+        One entry per pose, k + 1 of them: the points seen from there, labelled with their ids.
+    """
+
+    increments: Array
+    covariances: Array
+    seen: tuple[tuple[RangeBearing, ...], ...]
+
+    @property
+    def n_observations(self) -> int:
+        """Return how often a landmark was seen."""
+        return sum(len(points) for points in self.seen)
+
+    @property
+    def labels(self) -> frozenset[int]:
+        """Return the ids of all landmarks."""
+        return frozenset(
+            point.label for points in self.seen for point in points if point.label is not None
+        )
+
+    def first(self, n_steps: int) -> Drive:
+        """Return the drive up to a pose."""
+        return Drive(
+            increments=self.increments[:n_steps],
+            covariances=self.covariances[:n_steps],
+            seen=self.seen[: n_steps + 1],
+        )
+
+
+def shipped_file() -> Path:
+    """Return where GTSAM keeps the data.
+
+    Raises
+    ------
+    AppError
+        GTSAM is not installed, or its wheel has no such file.
+    """
+    path = Path(load_gtsam("Victoria Park").__file__).parent / "Data" / FILE
+    if not path.is_file():
+        raise AppError(
+            f"{path.name}: this installation of GTSAM has no such data; "
+            "pip install 'gtsam>=4.3,<4.4' has"
+        )
+    return path
+
+
+def read_drive(path: Path) -> Drive:
+    """Read the file.
+
+    Raises
+    ------
+    AppError
+        It cannot be read, or a line is not as the module's text says; file and line are named.
+    """
+    increments: list[list[float]] = []
+    covariances: list[Array] = []
+    seen: list[list[RangeBearing]] = [[]]
+    pose_of: dict[int, int] = {}
+    try:
+        lines = path.read_text(encoding="ascii").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise AppError(f"{path}: cannot be read: {error}") from None
+    for number, line in enumerate(lines, start=1):
+        try:
+            kind, first, second, *rest = line.split()
+            before, after, values = int(first), int(second), [float(word) for word in rest]
+            if not all(math.isfinite(value) for value in values):
+                raise ValueError
+            if kind == "ODOMETRY":
+                pose_of.setdefault(before, len(seen) - 1)
+                if pose_of[before] != len(seen) - 1:
+                    raise ValueError
+                dx, dy, turn, c11, c12, c13, c22, c23, c33 = values
+                increments.append([dx, dy, turn])
+                covariances.append(np.array([[c11, c12, c13], [c12, c22, c23], [c13, c23, c33]]))
+                pose_of[after] = len(seen)
+                seen.append([])
+            elif kind == "LANDMARK":
+                x, y, c11, c12, c22 = values
+                covariance = np.array([[c11, c12], [c12, c22]])
+                seen[pose_of[before]].append(range_bearing(x, y, covariance, label=after))
+            else:
+                raise ValueError
+        except (ValueError, KeyError):
+            raise AppError(f"{path}, line {number}: no line of a Victoria Park file") from None
+    return Drive(
+        increments=np.array(increments).reshape(-1, 3),
+        covariances=np.array(covariances).reshape(-1, 3, 3),
+        seen=tuple(tuple(points) for points in seen),
+    )
+
+
+def range_bearing(x_m: float, y_m: float, covariance: Array, label: int | None) -> RangeBearing:
+    """Return a relative position as range and bearing, its covariance to first order.
+
+    With r = |(x, y)| and G = d(r, bearing) / d(x, y) = [[x/r, y/r], [-y/r^2, x/r^2]] the
+    covariance is G C G^T.
+
+    Raises
+    ------
+    ValueError
+        The point is at the origin, where it has no bearing.
+    """
+    r = math.hypot(x_m, y_m)
+    if r == 0.0:
+        raise ValueError("a point at the origin has no bearing")
+    G = np.array([[x_m / r, y_m / r], [-y_m / r**2, x_m / r**2]])
+    return RangeBearing(
+        range_m=r,
+        bearing_rad=math.atan2(y_m, x_m),
+        covariance=G @ covariance @ G.T,
+        label=label,
+    )
+
+
+_CALIBRATION_COLUMNS = np.arange(CALIBRATION.start, CALIBRATION.stop)
+
+# A park is a hundred times wider than a room, and its trees are known to half a metre.
+# Nothing is left out as an outlier: a tree seen twice would be left without a place.
+PARK_RULE = RelinearisationRule(
+    turn_rad=0.02, shift_m=0.5, every=100, most_poses=10_000, outlier_sigmas=math.inf
+)
+
+# Wheels of which nothing is known: a tenth in distance and turn, a degree per two metres.
+UNKNOWN_WHEELS = WheelNoise(scale_sigma=0.1, turn_scale_sigma=0.1, curvature_sigma_rad_per_m=0.01)
+PERFECT_WHEELS = WheelNoise(scale_sigma=0.0, turn_scale_sigma=0.0, curvature_sigma_rad_per_m=0.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ParkRun:
+    """What came out of a drive.
+
+    Attributes
+    ----------
+    poses
+        shape (k + 1, 3): x, y [m], heading [rad]; of the causal path, each as it was known then.
+    landmarks_m
+        shape (n, 2).
+    given
+        One entry per observation: (true id, id it was given, or None where left out).
+    calibration, calibration_sigmas
+        shape (3,): scale, turn scale and curvature errors of the wheels at the end.
+    seconds
+        Processor time.
+    """
+
+    poses: Array
+    landmarks_m: Array
+    calibration: Array
+    calibration_sigmas: Array
+    given: tuple[tuple[int, int | None], ...]
+    seconds: float
+
+
+def drive_back_end(
+    drive: Drive,
+    *,
+    with_ids: bool,
+    wheels: WheelNoise = PERFECT_WHEELS,
+    check: Callable[[], None] = lambda: None,
+) -> ParkRun:
+    """Run a drive through the robust back end's public interface.
+
+    Parameters
+    ----------
+    drive
+        The data; the noise of each step is in it.
+    with_ids
+        Whether the back end is told which tree each observation is of.
+    wheels
+        Standard deviations of the wheels' calibration errors; the reference's model has none.
+    check
+        Called once per step; may raise to stop.
+    """
+    began = time.process_time()
+    back_end = RobustBackEnd(
+        Rig(mounts=()), BackEndParameters(wheels=wheels, relinearisation=PARK_RULE)
+    )
+    given: list[tuple[int, int | None]] = []
+    path = [back_end.pose]
+    for step, points in enumerate(drive.seen):
+        check()
+        if step > 0:
+            back_end.predict(drive.increments[step - 1], drive.covariances[step - 1])
+        told = points if with_ids else [replace(point, label=None) for point in points]
+        ids = back_end.update_points(told)
+        given += [
+            (point.label, id_)
+            for point, id_ in zip(points, ids, strict=True)
+            if point.label is not None
+        ]
+        if step > 0:
+            path.append(back_end.pose)
+    return ParkRun(
+        poses=np.array(path),
+        landmarks_m=back_end.state.landmarks_m.copy(),
+        calibration=back_end.state.calibration.copy(),
+        calibration_sigmas=np.sqrt(np.diag(back_end.state.P.block(_CALIBRATION_COLUMNS))),
+        given=tuple(given),
+        seconds=time.process_time() - began,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Reference:
+    """GTSAM's solutions with true ids.
+
+    Attributes
+    ----------
+    poses
+        shape (k + 1, 3), of the batch solution.
+    causal
+        The same of ISAM2, each pose as it was known then: what a causal path can be.
+    landmarks_m, labels
+        shape (n, 2), of the batch solution, and their ids.
+    chi_square, dof
+        Sum of squared white residuals of the batch solution, and what it should be on average.
+    seconds
+        Processor time.
+    """
+
+    poses: Array
+    causal: Array
+    landmarks_m: Array
+    labels: tuple[int, ...]
+    chi_square: float
+    dof: int
+    seconds: float
+
+
+def batch_reference(drive: Drive, check: Callable[[], None] = lambda: None) -> Reference:
+    """Solve for all poses and landmarks with GTSAM: ISAM2 for a start, Levenberg-Marquardt then.
+
+    The start matters: odometry alone ends far enough away to lead into another valley.
+    """
+    gtsam = load_gtsam("Victoria Park")
+    began = time.process_time()
+    pose_key, landmark_key = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L
+    isam = gtsam.ISAM2(gtsam.ISAM2Params())
+    whole = gtsam.NonlinearFactorGraph()
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    start = gtsam.PriorFactorPose2(
+        pose_key(0), gtsam.Pose2(), gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
+    )
+    graph.add(start)
+    whole.add(start)
+    values.insert(pose_key(0), gtsam.Pose2())
+    pose = np.zeros(3)
+    known: set[int] = set()
+    causal: list[Array] = []
+    for step, points in enumerate(drive.seen):
+        check()
+        if step > 0:
+            increment = drive.increments[step - 1]
+            noise = gtsam.noiseModel.Gaussian.Covariance(drive.covariances[step - 1])
+            factor = gtsam.BetweenFactorPose2(
+                pose_key(step - 1), pose_key(step), gtsam.Pose2(*increment), noise
+            )
+            graph.add(factor)
+            whole.add(factor)
+            pose = compose(pose, increment)
+            values.insert(pose_key(step), gtsam.Pose2(*pose))
+        for point in points:
+            assert point.label is not None
+            if point.label not in known:
+                known.add(point.label)
+                place = compose(pose, np.array([*point.body_point(0).point_m, 0.0]))[:2]
+                values.insert(landmark_key(point.label), place)
+            # GTSAM orders bearing, range
+            noise = gtsam.noiseModel.Gaussian.Covariance(point.covariance[::-1, ::-1])
+            factor = gtsam.BearingRangeFactor2D(
+                pose_key(step),
+                landmark_key(point.label),
+                gtsam.Rot2(point.bearing_rad),
+                point.range_m,
+                noise,
+            )
+            graph.add(factor)
+            whole.add(factor)
+        isam.update(graph, values)
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        pose = _vector(isam.calculateEstimatePose2(pose_key(step)))
+        causal.append(pose)
+    solution = gtsam.LevenbergMarquardtOptimizer(whole, isam.calculateEstimate()).optimize()
+    labels = tuple(sorted(known))
+    return Reference(
+        poses=np.array(
+            [_vector(solution.atPose2(pose_key(step))) for step in range(len(drive.seen))]
+        ),
+        causal=np.array(causal),
+        landmarks_m=np.array([solution.atPoint2(landmark_key(label)) for label in labels]).reshape(
+            -1, 2
+        ),
+        labels=labels,
+        chi_square=2.0 * whole.error(solution),
+        dof=2 * drive.n_observations - 2 * len(labels),
+        seconds=time.process_time() - began,
+    )
+
+
+def _vector(pose: Any) -> Array:  # noqa: ANN401 - GTSAM's own types, see gtsam_door
+    return np.array([pose.x(), pose.y(), wrap_angle(pose.theta())])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PathScore:
+    """One path against the batch solution.
+
+    Attributes
+    ----------
+    ate_m
+        Time-associated, SE(2)-aligned.
+    rmse_m, max_m
+        Root mean square and largest distance, both paths from the same start, not aligned.
+    n_landmarks
+        Landmarks in the map.
+    right_share
+        Share of the observations taken in whose landmark is the one that its tree is mostly
+        called, and is mostly called so for its tree; None where the ids were told.
+    left_out
+        Observations that were in doubt and not taken in.
+    seconds
+        Processor time.
+    """
+
+    name: str
+    ate_m: float
+    rmse_m: float
+    max_m: float
+    n_landmarks: int | None = None
+    right_share: float | None = None
+    left_out: int | None = None
+    seconds: float | None = None
+
+    def numbers(self) -> dict[str, object]:
+        """Return the fields for a JSON file."""
+        return asdict(self)
+
+
+def scores(drive: Drive, reference: Reference, runs: Mapping[str, ParkRun]) -> list[PathScore]:
+    """Return the scores of odometry, of ISAM2's causal path, and of our runs."""
+    rows = [
+        _score("odometry", odometry_path(drive), reference),
+        _score("ISAM2, true ids", reference.causal, reference),
+    ]
+    for name, run in runs.items():
+        told = name.startswith("true ids")
+        rows.append(
+            _score(
+                f"robust, {name}",
+                run.poses,
+                reference,
+                n_landmarks=len(run.landmarks_m),
+                right_share=None if told else right_share(run.given),
+                left_out=sum(given is None for _, given in run.given),
+                seconds=run.seconds,
+            )
+        )
+    return rows
+
+
+def odometry_path(drive: Drive) -> Array:
+    """Return where the increments alone lead, shape (k + 1, 3)."""
+    poses = [np.zeros(3)]
+    for increment in drive.increments:
+        poses.append(compose(poses[-1], increment))
+    return np.array(poses)
+
+
+def right_share(given: Sequence[tuple[int, int | None]]) -> float | None:
+    """Return how many observations that were taken in have the right landmark, of all of them.
+
+    A tree and a landmark belong together if each is mostly the other's.
+
+    >>> right_share([(7, 0), (7, 0), (7, 1), (8, 1), (8, 1), (9, None)])
+    0.8
+    """
+    taken = Counter(pair for pair in given if pair[1] is not None)
+    if not taken:
+        return None
+    landmark_of: dict[int, tuple[int, int | None]] = {}
+    tree_of: dict[int | None, tuple[int, int]] = {}
+    for (tree, landmark), n in taken.items():
+        landmark_of[tree] = max(landmark_of.get(tree, (0, None)), (n, landmark), key=_count)
+        tree_of[landmark] = max(tree_of.get(landmark, (0, -1)), (n, tree), key=_count)
+    right = sum(
+        n
+        for (tree, landmark), n in taken.items()
+        if landmark_of[tree][1] == landmark and tree_of[landmark][1] == tree
+    )
+    return right / taken.total()
+
+
+def _count(pair: tuple[int, int | None] | tuple[int, int]) -> int:
+    return pair[0]
+
+
+def _score(name: str, poses: Array, reference: Reference, **more: object) -> PathScore:
+    away = np.hypot(*(poses - reference.poses)[:, :2].T)
+    return PathScore(
+        name=name,
+        ate_m=ate_rmse_m(poses[:, :2], reference.poses[:, :2]),
+        rmse_m=float(np.sqrt(np.mean(away**2))),
+        max_m=float(away.max()),
+        **more,  # type: ignore[arg-type] # the caller's keywords are the fields' own
+    )
+
+
+_ISAM = "#2f9e44"
+_MAPS = ("true ids", "unknown ids")
+
+
+def draw_park(
+    path: Path,
+    drive: Drive,
+    reference: Reference,
+    runs: Mapping[str, ParkRun],
+    rows: Sequence[PathScore],
+) -> None:
+    """Draw one map per run beside the batch solution, and distances to it below; a PNG file."""
+    odometry = odometry_path(drive)
+    ate = {row.name: row.ate_m for row in rows}
+    with picture(path, width_in=11.0, height_in=9.2) as figure:
+        figure.suptitle(
+            "Victoria Park (real data): causal paths of the robust back end "
+            "against GTSAM's batch solution",
+            fontsize=11,
+            color=INK,
+            x=0.01,
+            ha="left",
+        )
+        grid = figure.add_gridspec(2, 2, height_ratios=(2.4, 1.0))
+        for column, name in enumerate(_MAPS):
+            run = runs[name]
+            axes = figure.add_subplot(grid[0, column])
+            _map(axes, odometry, reference, run)
+            label(
+                axes,
+                f"{name}: {len(run.landmarks_m)} landmarks for {len(reference.labels)} trees, "
+                f"ATE {ate[f'robust, {name}']:.2f} m",
+                "x [m]",
+                "y [m]",
+            )
+            if column == 0:
+                axes.legend(loc="lower left", fontsize=8, frameon=False)
+        axes = figure.add_subplot(grid[1, :])
+        gone_m = np.concatenate(
+            [[0.0], np.cumsum(np.hypot(*np.diff(reference.poses[:, :2], axis=0).T))]
+        )
+        paths = {"ISAM2, true ids": reference.causal} | {
+            f"robust, {name}": runs[name].poses for name in _MAPS
+        }
+        for (name, poses), colour in zip(paths.items(), (_ISAM, ESTIMATE, LANDMARK), strict=True):
+            away = np.hypot(*(poses - reference.poses)[:, :2].T)
+            axes.semilogy(gone_m, np.maximum(away, 1e-3), color=colour, linewidth=0.9, label=name)
+        axes.set_ylim(1e-2, None)
+        axes.legend(loc="lower right", fontsize=8, frameon=False, ncols=3)
+        label(
+            axes,
+            "distance to the batch solution, not aligned (batch also knows what came later)",
+            "distance driven [m]",
+            "distance [m]",
+        )
+
+
+def _map(axes: Axes, odometry: np.ndarray, reference: Reference, run: ParkRun) -> None:
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.plot(*odometry[:, :2].T, color=ODOMETRY, linewidth=0.6, alpha=0.8, label="odometry")
+    axes.plot(
+        *reference.poses[:, :2].T, color=TRUTH, linewidth=2.6, alpha=0.6, label="batch, true ids"
+    )
+    axes.plot(*run.poses[:, :2].T, color=ESTIMATE, linewidth=0.9, label="causal path")
+    axes.plot(
+        *reference.landmarks_m.T,
+        linestyle="none",
+        marker="o",
+        markersize=5,
+        markerfacecolor="none",
+        color=INK,
+        markeredgewidth=0.7,
+        label="tree, batch",
+    )
+    axes.plot(
+        *run.landmarks_m.T,
+        linestyle="none",
+        marker="x",
+        markersize=4,
+        color=LANDMARK,
+        label="landmark",
+    )
+
 
 NAME = "victoria-park"
 
@@ -29,17 +562,7 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
     # heavy, see module text
     import sys
 
-    from slam.app.experiments.results import print_table, write_json
-    from slam.app.experiments.victoria_park_picture import draw_park
-    from slam.app.experiments.victoria_park_scores import scores
-    from slam.app.report_table import share_text
-    from slam.app.victoria_park import read_drive, shipped_file
-    from slam.app.victoria_park_runs import (
-        PERFECT_WHEELS,
-        UNKNOWN_WHEELS,
-        batch_reference,
-        drive_back_end,
-    )
+    from slam.app.run.output import print_table, share_text, write_json
 
     def tell(what: str) -> None:
         sys.stderr.write(f"{what}\n")

@@ -7,14 +7,15 @@ from typing import Any
 
 import pytest
 
-from emulator.faults.catalogue import KINDS
-from hil_tests.faulty import SERIAL, FaultyLine, fault, faulty_line
+from emulator.faults.faulty_device import fault
+from emulator.faults.plan import KINDS
+from hil_tests.faulty import SERIAL, FaultyLine, faulty_line
 from hil_tests.unit.emulator.faults.witnesses import FPS, WITNESSES
-from xethru_protocol import messages as m
-from xethru_protocol.codes import PongCode, SensorMode, X4Setting
-from xethru_protocol.driver import X4M300
-from xethru_protocol.errors import DeviceError, ResponseTimeout
-from xethru_protocol.packets import FaultKind
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import PongCode, SensorMode, X4Setting
+from xethru_protocol.wire.errors import DeviceError, ResponseTimeout
+from xethru_protocol.wire.framing import FaultKind
 
 __all__ = ["faulty_line"]  # a fixture
 

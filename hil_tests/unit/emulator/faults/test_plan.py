@@ -6,9 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from emulator.faults.catalogue import KINDS, described, example
 from emulator.faults.plan import (
+    KINDS,
     FaultPlanError,
+    described,
+    example,
     fault_spec,
     load_plan,
     parse_plan,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hil_tests.faulty import FaultyLine
-from xethru_protocol.frames import Frame
+from xethru_protocol.driver.frames import Frame
 
 FPS = 20.0
 Witness = Callable[[list[Frame], list[Frame], FaultyLine], None]

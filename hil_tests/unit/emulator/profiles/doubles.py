@@ -6,18 +6,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, cast
 
-from emulator.echo import SceneEcho
-from emulator.filesystem import FileSystem
-from emulator.modes import ModeMachine
-from emulator.module_clock import ModuleClock
-from emulator.options import DeviceOptions
-from emulator.pace import Pace
-from emulator.people import PersonSpec
-from emulator.profile_settings import ProfileSettings
-from emulator.profiles.stream import ProfileStream
-from emulator.scene import LeakageSpec, NoiseSpec, Scene, empty_room
-from xethru_protocol import messages as m
-from xethru_protocol.codes import SensorMode
+from emulator.chip.clock import ModuleClock
+from emulator.chip.pace import Pace
+from emulator.echo.echo import SceneEcho
+from emulator.module.memory import FileSystem
+from emulator.module.modes import ModeMachine
+from emulator.module.settings import DeviceOptions, ProfileSettings
+from emulator.profiles.run import ProfileStream
+from emulator.scene.motion import PersonSpec
+from emulator.scene.scene import LeakageSpec, NoiseSpec, Scene, empty_room
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import SensorMode
 
 SECOND = 1_000_000_000
 DEFAULT_MAP = 6  # protocol reference 4.6: default map, no extra initialisation

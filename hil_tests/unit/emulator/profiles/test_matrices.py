@@ -19,8 +19,8 @@ from hil_tests.unit.emulator.profiles.doubles import (
     standing,
     walking,
 )
-from xethru_protocol import messages as m
-from xethru_protocol.codes import OutputFeature
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import OutputFeature
 
 C_MPS = 299_792_458.0
 WAVELENGTH_M = C_MPS / 7.29e9

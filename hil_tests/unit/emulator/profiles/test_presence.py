@@ -17,8 +17,8 @@ from hil_tests.unit.emulator.profiles.doubles import (
     standing,
     walking,
 )
-from xethru_protocol import messages as m
-from xethru_protocol.codes import OutputFeature, PresenceDirection, PresenceState
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import OutputFeature, PresenceDirection, PresenceState
 
 BIN_M = 8 * 1.5e8 / 23.328e9
 MODULE_PER_METRE = 3.0e8 / 299_792_458.0

@@ -7,13 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from emulator.chip import Chip
-from emulator.chip_stream import ChipStream
-from emulator.module import Module
-from emulator.module_clock import ModuleClock
-from emulator.pace import Pace
-from emulator.profile_settings import ProfileSettings
-from emulator.profiles.combined_stream import CombinedStream
+from emulator.chip.chip import Chip
+from emulator.chip.clock import ModuleClock
+from emulator.chip.pace import Pace
+from emulator.device import ChipStream, CombinedStream
+from emulator.module.module import Module
+from emulator.module.settings import ProfileSettings
 from hil_tests.unit.emulator.doubles import IDENTITY, RampSource
 from hil_tests.unit.emulator.profiles.doubles import (
     FRAME_HZ,
@@ -25,9 +24,9 @@ from hil_tests.unit.emulator.profiles.doubles import (
     standing,
     walking,
 )
-from xethru_protocol import messages as m
-from xethru_protocol.codes import OutputFeature, PresenceState, SensorMode, X4Setting
-from xethru_protocol.connection import Connection, Role
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import OutputFeature, PresenceState, SensorMode, X4Setting
+from xethru_protocol.wire.connection import Connection, Role
 
 BIN_M = 8 * 1.5e8 / 23.328e9
 IQ, AP = OutputFeature.BASEBAND_IQ, OutputFeature.BASEBAND_AMPLITUDE_PHASE

@@ -8,7 +8,7 @@ import numpy as np
 from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader
 
-from slam.app.session import LogLine, RadarInfo, Scan, SessionInfo, SessionObserver, Snapshot
+from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.frames import RadarFrame
 
 FRAME_NS = 199_261_498

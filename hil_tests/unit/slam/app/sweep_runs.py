@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from slam.app.known_bound import BoundSummary
-from slam.app.summary import LandmarkSummary
-from slam.app.sweep_run import Case, SweepRun
+from slam.app.run.evaluation import LandmarkSummary
+from slam.app.sweep.bound import BoundSummary
+from slam.app.sweep.run import Case, SweepRun
 
 
 def run_of(case: Case) -> SweepRun:

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from emulator.path_lock import locked
 from hil_tests.unit.slam.app.sessions import session_info
 from slam.app.cli import main
-from slam.app.session_log import SessionLog
+from slam.app.session.log import SessionLog
+from xethru_protocol.system import locked
 
 HEAVY = {
     "numpy",
@@ -26,7 +26,6 @@ HEAVY = {
     "rich",
     "serial",
     "emulator",
-    "xethru_protocol",
 }
 
 

@@ -10,13 +10,12 @@ from dataclasses import fields, is_dataclass
 import numpy as np
 import pytest
 
-from slam.app import ros_messages as ros
-from slam.app.cli import main
+from slam.app.cli import CSV_TO_TUM, main
+from slam.app.commands.run import parse_clock
 from slam.app.errors import UsageError
-from slam.app.odometry_source import parse_source
-from slam.app.run import parse_clock
-from slam.app.run_arguments import CSV_TO_TUM
-from slam.app.tum import TumSample, parse_tum_line
+from slam.app.odometry.live import parse_source
+from slam.app.odometry.tum import TumSample, parse_tum_line
+from slam.app.session import messages as ros
 
 
 def csv_of(message: object) -> str:

@@ -7,7 +7,7 @@ import threading
 import pytest
 
 from hil_tests.patience import seconds
-from slam.app.stop import StopFlag, StopRequestedError
+from slam.app.errors import StopFlag, StopRequestedError
 
 
 @pytest.mark.parametrize(

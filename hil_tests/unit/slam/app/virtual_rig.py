@@ -13,20 +13,27 @@ from queue import Empty
 
 import numpy as np
 
+from emulator.chip.pace import Pace
 from emulator.device import radar_device
-from emulator.echo import echo_source
-from emulator.identity import Identity
+from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport
-from emulator.odometry import scene_odometry
-from emulator.odometry_feed import stamp_ns
-from emulator.pace import Pace
-from emulator.scene import Scene
-from slam.app.emulated_rig import FRAME_RATE_HZ, RAW_CONFIG, rig_of
-from slam.app.run_events import Event, FrameCame, LinkSaid, OdometryEnded, OdometryLine, WireCame
-from slam.app.session import RadarInfo
-from slam.app.sources import RadarLink, RigSource
-from slam.app.tum import TumSample
-from xethru_protocol.driver import X4M300
+from emulator.module.memory import Identity
+from emulator.ports.odometry import stamp_ns
+from emulator.scene.scene import Scene
+from emulator.scene.wheels import scene_odometry
+from slam.app.odometry.tum import TumSample
+from slam.app.records import RadarInfo
+from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, rig_of
+from slam.app.rig.sources import RadarLink, RigSource
+from slam.app.run.live_source import (
+    Event,
+    FrameCame,
+    LinkSaid,
+    OdometryEnded,
+    OdometryLine,
+    WireCame,
+)
+from xethru_protocol.driver.radar import X4M300
 
 NS_PER_S = 1_000_000_000
 

@@ -25,10 +25,9 @@ from hil_tests.unit.slam.robust.range_world import (
     parameters_for,
     simulate,
 )
+from slam.evaluation import align_se2, ate_rmse_m, landmark_metrics, nees_pose, observable_landmarks
 from slam.geometry import Rig, paper_rig, transform
-from slam.metrics import align_se2, ate_rmse_m, landmark_metrics, nees_pose
 from slam.robust.back_end import RobustBackEnd
-from slam.visibility import observable_landmarks
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

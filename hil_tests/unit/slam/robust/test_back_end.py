@@ -16,8 +16,8 @@ from hil_tests.unit.slam.robust.range_world import (
 )
 from slam.geometry import Mount, Rig, paper_rig
 from slam.robust.back_end import RobustBackEnd
+from slam.robust.initialisation import RangeBearing
 from slam.robust.parameters import BackEndParameters
-from slam.robust.points import RangeBearing
 from slam.robust.ranges import RangeScan, sides_of
 
 SIGMA_M = 7.4e-3

@@ -15,12 +15,12 @@ from hil_tests.unit.slam.robust.range_world import (
     reported,
     scans_of,
 )
+from slam.evaluation import nees_pose
 from slam.geometry import between, compose, paper_rig, transform
-from slam.metrics import nees_pose
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.births import BodyPoint, give_birth
-from slam.robust.existence import Existence
-from slam.robust.motion import calibrated_motion, predict
+from slam.robust.initialisation import BodyPoint, give_birth
+from slam.robust.kidnapping import Surprise, Trial, Whereabouts, apply_join, find_join, set_down
+from slam.robust.map import Existence
 from slam.robust.parameters import (
     BackEndParameters,
     MapRule,
@@ -28,12 +28,8 @@ from slam.robust.parameters import (
     SurpriseRule,
     WheelNoise,
 )
-from slam.robust.relocation import apply_join, find_join, set_down
 from slam.robust.run_log import RunLog
-from slam.robust.state import State
-from slam.robust.surprise import Surprise, Trial
-from slam.robust.symmetric import Array
-from slam.robust.whereabouts import Whereabouts
+from slam.robust.state import Array, State, calibrated_motion, predict
 
 SIGMA_M = 7.4e-3
 PLACES = np.array(

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from slam.robust.classification import Law, Sightings, compare
-from slam.robust.symmetric import Array
+from slam.robust.map import Law, Sightings, compare
+from slam.robust.state import Array
 
 SIGMA_M = 1e-3
 REACH_M = 0.15

@@ -15,16 +15,12 @@ from hil_tests.property.robust_oracles import derivative
 from hil_tests.unit.slam.robust.range_world import LAB, parameters_for, simulate
 from slam.geometry import paper_rig
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.condensed import Condensed
-from slam.robust.motion import calibrated_motion, predict
+from slam.robust.initialisation import RangeBearing
 from slam.robust.parameters import RelinearisationRule, WheelNoise
-from slam.robust.points import RangeBearing
-from slam.robust.prior import first_values, prior_cost, prior_terms
-from slam.robust.problem import Estimate, Prior, Problem, start_prior
 from slam.robust.ranges import RangeScan
-from slam.robust.run_log import RunLog
-from slam.robust.smoother import Smoother
-from slam.robust.state import State
+from slam.robust.run_log import Condensed, Estimate, Prior, Problem, RunLog, start_prior
+from slam.robust.smoother import Smoother, first_values, prior_cost, prior_terms
+from slam.robust.state import State, calibrated_motion, predict
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

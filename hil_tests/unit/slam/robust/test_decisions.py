@@ -15,16 +15,19 @@ from hil_tests.unit.slam.robust.range_world import (
 )
 from slam.geometry import paper_rig
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.births import BodyPoint, give_birth
-from slam.robust.existence import Existence
-from slam.robust.leftovers import Leftovers
-from slam.robust.merging import find_merge
-from slam.robust.motion import calibrated_motion
+from slam.robust.initialisation import (
+    BodyPoint,
+    Leftovers,
+    Tracker,
+    Tracklet,
+    find_tracklets,
+    give_birth,
+    pair_guesses,
+)
+from slam.robust.map import Existence, find_merge
 from slam.robust.parameters import MapRule, RangeNoise, TrackletRule, WheelNoise
 from slam.robust.ranges import RangeScan, antennas_of
-from slam.robust.state import State
-from slam.robust.symmetric import Array, SymmetricMatrix
-from slam.robust.tracklets import Tracker, Tracklet, find_tracklets, pair_guesses
+from slam.robust.state import Array, State, SymmetricMatrix, calibrated_motion
 
 SIGMA_M = 5e-3
 NOISE = RangeNoise(sigma_m=SIGMA_M)

@@ -8,8 +8,8 @@ import pytest
 
 from hil_tests.unit.slam.robust.test_roundness import RODS, SIGMA_M, drive
 from slam.robust.parameters import RelinearisationRule, WheelNoise
-from slam.robust.problem import start_prior
-from slam.robust.relinearisation import is_determined, relinearise
+from slam.robust.run_log import start_prior
+from slam.robust.smoother import is_determined, relinearise
 from slam.robust.state import State
 
 

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from hil_tests.unit.slam.robust.test_walls import antennas, state_with_map
+from slam.evaluation import nees_pose
 from slam.geometry import paper_rig
-from slam.metrics import nees_pose
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.continuation import landmarks_in_view
-from slam.robust.leftovers import Leftovers
-from slam.robust.motion import at_rest
+from slam.robust.initialisation import Leftovers
+from slam.robust.kidnapping import Surprise, Trial
+from slam.robust.map import arc_of, radius_of
+from slam.robust.matching import landmarks_in_view
 from slam.robust.parameters import (
     BackEndParameters,
     ContinuationRule,
@@ -21,13 +22,10 @@ from slam.robust.parameters import (
     SurpriseRule,
     WheelNoise,
 )
-from slam.robust.problem import start_prior
 from slam.robust.ranges import RangeScan, antennas_of, view
-from slam.robust.relinearisation import give_radius
-from slam.robust.roundness import arc_of, radius_of
-from slam.robust.run_log import RunLog
-from slam.robust.state import State
-from slam.robust.surprise import Surprise, Trial
+from slam.robust.run_log import RunLog, start_prior
+from slam.robust.smoother import give_radius
+from slam.robust.state import State, at_rest
 
 SIGMA_M, STEP_M = 2e-3, 0.01
 WIDE = RangeNoise(min_range_m=0.0, max_range_m=10.0)

@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg.blas import dsyrk
 
-from slam.robust import symmetric
-from slam.robust.symmetric import SymmetricMatrix
+from slam.robust import state as symmetric
+from slam.robust.state import SymmetricMatrix
 
 Array = NDArray[np.float64]
 

@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 
+from slam.evaluation import nees_pose
 from slam.geometry import paper_rig
-from slam.metrics import nees_pose
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.leftovers import Leftover, Slot
+from slam.robust.initialisation import Leftover, Slot
 from slam.robust.parameters import BackEndParameters, RangeNoise, WallRule
 from slam.robust.ranges import RangeScan
-from slam.robust.symmetric import Array
-from slam.robust.wall_tracklets import WallTracker, WallTracklet
+from slam.robust.state import Array
+from slam.robust.walls import WallTracker, WallTracklet
 
 SIGMA_M = 2e-3
 STEP_M = 0.01

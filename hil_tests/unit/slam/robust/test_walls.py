@@ -7,18 +7,14 @@ import numpy as np
 import pytest
 
 from hil_tests.unit.slam.robust.range_world import LAB, odometry_path, reported, true_path
+from slam.evaluation import nees_pose
 from slam.geometry import paper_rig
-from slam.metrics import nees_pose
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.motion import calibrated_motion, predict
 from slam.robust.parameters import BackEndParameters, RangeNoise, WallRule, WheelNoise
-from slam.robust.prior import prior_about, prior_cost, prior_terms
-from slam.robust.problem import Estimate, start_prior
 from slam.robust.ranges import Antennas, RangeScan, antennas_of, rows_of, view
-from slam.robust.residuals import measurement_residuals
-from slam.robust.run_log import RunLog
-from slam.robust.state import State
-from slam.robust.symmetric import Array, SymmetricMatrix
+from slam.robust.run_log import Estimate, RunLog, start_prior
+from slam.robust.smoother import measurement_residuals, prior_about, prior_cost, prior_terms
+from slam.robust.state import Array, State, SymmetricMatrix, calibrated_motion, predict
 from slam.robust.walls import (
     BodyWall,
     WallCells,

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from slam.robust.back_end import huber_weighted_sigmas_m
 from slam.robust.ranges import RangeScan
-from slam.robust.weights import huber_weighted_sigmas_m
 
 positive = st.floats(1e-4, 1e-1)
 

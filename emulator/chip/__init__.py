@@ -1,0 +1,1 @@
+"""The X4 chip: settings, registers, clocks, downconversion, streams of frames."""

@@ -1,0 +1,1 @@
+"""Echo physics: from a scene and the true pose to integer chip counters."""

@@ -1,0 +1,271 @@
+"""What a radar hears: from a scene and the robot's true pose to integer chip counters.
+
+This is the page on the model: each term, its formula, its source, what it leaves out. The world is
+a floor plan seen from one phase centre per radar. In normalised units (full scale of the 11 bit
+DAC is +-1) RF sample n of a frame at true time t is
+
+    x[n] = sum_i a_i p(n - u_i; phase_i + j(t)) + c[n](t) + sigma w[n]
+
+with the leakage among the paths i, and the chip counts ``clip(round((x[n] + N / 2048) / q), 0,
+max)``. Floor, ceiling, elevation, polarisation, and paths of more bounces than named here are left
+out.
+
+Pulse p
+    Gaussian envelope on the carrier (``emulator.echo.pulse``). The real pulse is a little
+    asymmetric.
+Time t
+    Nominal time of the counter, made earlier by the module's fast clock and later by its start
+    skew (``emulator.chip.clock``). The robot stands still within a frame: a sweep at 5 cm/s
+    moves it by micrometres per pulse.
+Position u = 2 fs (1 + ppm 1e-6) (R + offset) / c - 2 fs L / c_module
+    R is half the length of the path; c = 299 792 458 m/s; offset is the module's range error; L is
+    the label of sample 0 in module metres (c_module = 3.0e8 m/s, protocol reference 9.1).
+Amplitude a of rod, point, person (``emulator.echo.reflections``)
+    amplitude_1m R**-1.5 (rod) or R**-2 (point), times the beam cos(angle)**n, the root of TX power
+    and the module's gain. Radar equation for amplitudes (Skolnik, Introduction to Radar Systems):
+    a point spreads twice as a sphere, a long rod once as a sphere and once as a cylinder. The
+    beam's n makes the two-way -3 dB full width 65 degrees; no hard edge, nothing from behind.
+    Aspect is left out, and the law is held at 5 cm from there inwards. People move
+    (``emulator.scene.motion``) and are placed anew for every frame, like the robot.
+Cylinder
+    Its surface, at R - radius, weakened by (1 / s) sqrt((1 + radius) / (s + radius)) over the
+    distance s to it: geometric optics of a convex mirror.
+Wall, face of a box (``emulator.echo.walls``)
+    A mirror at the distance R of its line: amplitude_1m / R, phase pi. |reflection| is
+    amplitude_1m / (0.06 sqrt(pi)), because an image at 2 R equals a cross section of pi R**2 and
+    0.06 is the echo of 1 m**2 (``emulator.scene.motion``). Roughness, thickness and the
+    reflection's dependence on angle are left out.
+Edge of a wall (``emulator.echo.walls``)
+    Kirchhoff's half-plane at the carrier (Born and Wolf, Principles of Optics, 8.7): the echo fades
+    over the first Fresnel zone as the mirror point leaves the wall, and half of it is left where
+    that point is the end. The edge's wave is weakened by the cosine of its angle off the normal.
+Corner
+    Image of image in two walls, both orders of bouncing. At 90 degrees each passes half of the
+    aperture, so together they are one image at the apex.
+Ghosts (``emulator.echo.walls``)
+    Radar, wall, target, radar and its reverse, and by walls both ways: half path (L_out + L_back)
+    / 2, 1 / (s_1 s_2) for a point, sqrt(2 / (s_1 s_2 (s_1 + s_2))) for a rod; doubled where out
+    and back differ, phase pi per mirror, the beam once per leg.
+Shadow and transmission (``emulator.echo.walls``)
+    Each leg is multiplied, per face it crosses, by |t + (1 - t) (E_a + E_b)|: what passes through
+    and what bends round both ends (single knife edge, ITU-R P.526). The bent way's own delay is
+    left out; people, rods and cylinders cast no shadow. Ends count as free edges also where two
+    walls meet, so an opaque joint lets some -12 dB past it; and where a leg's end crosses the line
+    of a wall beyond its end, what bends round that end appears at once, by up to -6 dB.
+Phase
+    Each reflector's is fixed by its name (SHA-256), for every radar, aspect and seed.
+Phase jitter j
+    White (by frame counter) and slow (by time), common to all echoes and the leakage of a frame
+    (``emulator.echo.noise``): figures of the strongest reflector of a real X4 recording. The
+    envelope is not moved; amplitude jitter is left out.
+Leakage
+    The direct pulse at the scene's range and amplitude; antenna ringing is left out.
+Clutter c
+    Slow, correlated, inside the transmitted band (``emulator.echo.receiver``): every 8 samples a
+    complex Gaussian scatterer that answers with the pulse, of equal strength at all ranges, times
+    TX power and gain; in time three stationary processes (``emulator.echo.noise``) fitted to the
+    ten farthest bins of that recording. It ignores where the robot is, and radars do not share it.
+Noise w
+    White and Gaussian (``emulator.scene.philox``), keyed by seed and the radar's serial, selected
+    by the frame counter. sigma is given at a working point and falls with the root of
+    iterations x pulses per step; neither gain nor TX power change it. Flicker and interference
+    are left out.
+Count q = 2**dac_step / (iterations pulses_per_step) / 1024, N = dac_max - dac_min + 1
+    Protocol reference 9.7; outside the DAC window the counter saturates.
+Smoke
+    Nothing. Particles far smaller than the wavelength absorb by their volume (Bohren and Huffman,
+    chapter 5): (6 pi / wavelength) (mass per m**3 / density) Im((m**2 - 1) / (m**2 + 2)), whose
+    last factor is 1/2 at most; for 1 g/m**3 and water's density 2.3e-4 of the power per metre,
+    0.001 dB.
+
+Determinism: float64 throughout, no BLAS, no float32 function. A last-bit difference of a cosine
+or a power moves an echo by 1e-11 counts before it is rounded to an integer.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.chip.chip import CaptureSettings, EchoSource
+from emulator.echo.noise import CarrierJitter
+from emulator.echo.pulse import sum_of_pulses
+from emulator.echo.receiver import Receiver, one_count
+from emulator.echo.reflections import (
+    Reflections,
+    Viewpoint,
+    direct_reflections,
+    person_scatterer,
+    reflection_phase_rad,
+    target_scatterers,
+    viewpoint,
+)
+from emulator.echo.walls import (
+    corner_pairs,
+    corner_reflections,
+    direct_share,
+    face_reflections,
+    faces_of,
+    ghost_reflections,
+)
+from emulator.scene.scene import RadarSpec, Scene
+from xethru_protocol.wire import x4
+
+
+class ScenePaths:
+    """The paths of one radar of a scene. What does not move is worked out once."""
+
+    def __init__(self, scene: Scene, radar: RadarSpec) -> None:
+        self._scene = scene
+        self._radar = radar
+        self._trajectory = scene.trajectory()
+        self._targets = target_scatterers(scene.targets)
+        self._leakage_phase_rad = np.array([reflection_phase_rad("leakage")])
+        self._faces = faces_of(scene.walls, scene.objects)
+        self._pairs = corner_pairs(self._faces)
+
+    def reflections(self, t_ns: NDArray[np.int64], wavelength_m: float) -> Reflections:
+        """Return all paths at true sample times of shape (n_frames,), int64.
+
+        Amplitudes are at TX power 2 and before the receiver; a path that does not exist in a
+        frame has amplitude 0.
+        """
+        view = viewpoint(self._radar, self._trajectory.poses(t_ns))
+        scatterers = [
+            self._targets,
+            *(person_scatterer(person, t_ns) for person in self._scene.people),
+        ]
+        direct = [direct_reflections(each, view) for each in scatterers]
+        if not len(self._faces):
+            return _together([direct[0], self._leakage(len(t_ns)), *direct[1:]])
+
+        behind: list[Reflections] = []
+        for number, each in enumerate(scatterers):
+            share = direct_share(self._faces, each, view, wavelength_m)
+            direct[number] = replace(
+                direct[number], amplitude=direct[number].amplitude * share * share
+            )
+            if self._scene.multipath.double_bounce:
+                behind.append(ghost_reflections(self._faces, each, view, share, wavelength_m))
+        return _together(
+            [
+                direct[0],
+                self._leakage(len(t_ns)),
+                *direct[1:],
+                *self._of_walls(view, wavelength_m),
+                *behind,
+            ]
+        )
+
+    def _of_walls(self, view: Viewpoint, wavelength_m: float) -> list[Reflections]:
+        found = [face_reflections(self._faces, view, wavelength_m)]
+        if self._scene.multipath.corners:
+            found.append(corner_reflections(self._faces, self._pairs, view, wavelength_m))
+        return found
+
+    def _leakage(self, n_frames: int) -> Reflections:
+        leakage = self._scene.leakage
+        return Reflections(
+            range_m=np.full((n_frames, 1), leakage.range_m),
+            amplitude=np.full((n_frames, 1), leakage.amplitude),
+            phase_rad=self._leakage_phase_rad,
+        )
+
+
+def _together(terms: list[Reflections]) -> Reflections:
+    phases = [term.phase_rad for term in terms]
+    if any(phase.ndim > 1 for phase in phases):
+        phases = [np.broadcast_to(term.phase_rad, term.range_m.shape) for term in terms]
+    return Reflections(
+        range_m=np.concatenate([term.range_m for term in terms], axis=1),
+        amplitude=np.concatenate([term.amplitude for term in terms], axis=1),
+        phase_rad=np.concatenate(phases, axis=-1),
+    )
+
+
+SPEED_OF_LIGHT_MPS = 299_792_458.0
+_SAMPLES_PER_M = 2 * x4.SAMPLING_RATE_HZ / SPEED_OF_LIGHT_MPS
+_SAMPLES_PER_MODULE_M = 2 * x4.SAMPLING_RATE_HZ / x4.MODULE_SPEED_MPS
+
+# Assumed: the X4 documents its power steps by name only (off, low, medium, high); 3 dB apart.
+_TX_AMPLITUDE = {0: 0.0, 1: math.sqrt(0.5), 2: 1.0, 3: math.sqrt(2.0)}
+
+
+class SceneEcho:
+    """The echo of one radar of a scene: an :class:`~emulator.chip.chip.EchoSource`."""
+
+    def __init__(self, scene: Scene, radar: RadarSpec, seed: int) -> None:
+        self._radar = radar
+        self._paths = ScenePaths(scene, radar)
+        self._clock = radar.clock
+        self._gain = 10.0 ** (radar.gain_db / 20)
+        self._jitter = CarrierJitter(scene.jitter, seed=seed, serial=int(radar.serial))
+        self._receiver = Receiver(scene, radar, seed)
+
+    def echo(
+        self,
+        capture: CaptureSettings,
+        scene_times_ns: NDArray[np.int64],
+        carrier_phase_rad: NDArray[np.float64] | None = None,
+    ) -> NDArray[np.float64]:
+        """Return the noise-free signal before quantisation, leakage included.
+
+        Shape (n_frames, capture.n_samples), float64, normalised units. A reflection weaker than
+        one count is skipped. ``carrier_phase_rad`` of shape (n_frames,) is added to all echoes
+        of a frame.
+        """
+        wavelength_m = SPEED_OF_LIGHT_MPS / x4.CARRIER_HZ[capture.tx_center_frequency]
+        paths = self._paths.reflections(self._clock.scene_times_ns(scene_times_ns), wavelength_m)
+        amplitude = paths.amplitude * (_TX_AMPLITUDE[capture.tx_power] * self._gain)
+        position = (paths.range_m + self._radar.range_offset_m) * (
+            _SAMPLES_PER_M * self._clock.rate
+        )
+        position -= capture.first_sample_m * _SAMPLES_PER_MODULE_M
+        frame, path = np.nonzero(amplitude >= one_count(capture))
+        of_each_frame = paths.phase_rad.ndim > 1
+        phase_rad = paths.phase_rad[frame, path] if of_each_frame else paths.phase_rad[path]
+        if carrier_phase_rad is not None:
+            phase_rad = phase_rad + carrier_phase_rad[frame]
+        return sum_of_pulses(
+            frame=frame,
+            position=position[frame, path],
+            amplitude=amplitude[frame, path],
+            phase_rad=phase_rad,
+            tx_center_frequency=capture.tx_center_frequency,
+            shape=(len(amplitude), capture.n_samples),
+        )
+
+    def rf_counters(
+        self,
+        capture: CaptureSettings,
+        frame_counters: NDArray[np.int64],
+        scene_times_ns: NDArray[np.int64],
+    ) -> NDArray[np.int64]:
+        """Return raw RF chip counters, shape (n_frames, n_samples); see ``EchoSource``."""
+        times_ns = self._clock.scene_times_ns(scene_times_ns)
+        jitter_rad = self._jitter.phases_rad(frame_counters, times_ns)
+        return self._receiver.counters(
+            self.echo(capture, scene_times_ns, jitter_rad),
+            frame_counters,
+            times_ns,
+            capture,
+            gain=_TX_AMPLITUDE[capture.tx_power] * self._gain,
+        )
+
+
+def echo_source(scene: Scene, radar_index: int, seed: int) -> EchoSource:
+    """Return the echo source of one of the scene's radars.
+
+    Parameters
+    ----------
+    scene
+        The scene; its order of radars changes only which index means which radar.
+    radar_index
+        Index into ``scene.radars``.
+    seed
+        0 ... 2**64 - 1; selects receiver noise, clutter and jitter.
+    """
+    return SceneEcho(scene, scene.radars[radar_index], seed)

@@ -1,0 +1,200 @@
+"""Paths from a radar to reflectors and back: how long, how strong, in which phase.
+
+Formulas and sources are on the model page, ``emulator.echo.echo``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.scene.motion import (
+    AMPLITUDE_OF_1_M2,
+    PersonSpec,
+    chest_displacement_m,
+    positions_m,
+    present,
+)
+from emulator.scene.scene import RadarSpec, TargetSpec
+
+__all__ = [
+    "BEAM_EXPONENT",
+    "NEAREST_M",
+    "Reflections",
+    "Scatterers",
+    "Viewpoint",
+    "beam_gain",
+    "direct_reflections",
+    "person_scatterer",
+    "reflection_phase_rad",
+    "target_scatterers",
+    "viewpoint",
+]
+
+BEAM_EXPONENT = math.log(math.sqrt(0.5)) / math.log(math.cos(math.radians(65 / 2)))
+"""n of the two-way amplitude pattern cos(angle)**n: 2.0354."""
+NEAREST_M = 0.05
+"""Amplitude laws are held from here inwards."""
+_RANGE_EXPONENT = {"rod": 1.5, "point": 2.0, "cylinder": 1.0}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Reflections:
+    """Paths from transmitter to receiver, frame by frame.
+
+    Attributes
+    ----------
+    range_m
+        Shape (n_frames, k), float64: half the path's length, true metres.
+    amplitude
+        Shape (n_frames, k), float64: of the envelope, normalised units, at TX power 2.
+    phase_rad
+        Shape (k,) or (n_frames, k), float64: carrier phase added by the reflection.
+    """
+
+    range_m: NDArray[np.float64]
+    amplitude: NDArray[np.float64]
+    phase_rad: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Scatterers:
+    """Reflectors that send an echo everywhere: points, rods, cylinders, people.
+
+    Arrays have the shape (k,), or (n_frames, k) for what moves.
+
+    Attributes
+    ----------
+    x_m, y_m
+        Positions of their axes, world frame.
+    strength
+        Echo on boresight at 1 m, normalised units.
+    exponent
+        Shape (k,): the echo falls with range**-exponent; 2 for a point, 1.5 for a rod, 1 (and a
+        factor of its own) for a cylinder.
+    radius_m
+        Shape (k,): of a cylinder; 0 for the others.
+    swell_m
+        How far the reflecting surface stands out towards the radar.
+    phase_rad
+        Shape (k,): carrier phase added by the reflection.
+    """
+
+    x_m: NDArray[np.float64]
+    y_m: NDArray[np.float64]
+    strength: NDArray[np.float64]
+    exponent: NDArray[np.float64]
+    radius_m: NDArray[np.float64]
+    swell_m: NDArray[np.float64]
+    phase_rad: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Viewpoint:
+    """Where a radar's phase centre is and where it looks: shape (n_frames, 1) each, world frame.
+
+    Attributes
+    ----------
+    x_m, y_m
+        Phase centre.
+    boresight_x, boresight_y
+        Unit vector.
+    """
+
+    x_m: NDArray[np.float64]
+    y_m: NDArray[np.float64]
+    boresight_x: NDArray[np.float64]
+    boresight_y: NDArray[np.float64]
+
+
+def reflection_phase_rad(name: str) -> float:
+    """Return the fixed reflection phase of a named reflector, in [0, 2 pi).
+
+    >>> round(reflection_phase_rad("rod_01"), 6) == round(reflection_phase_rad("rod_02"), 6)
+    False
+    """
+    fraction = int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "big") / 2**32
+    return math.tau * fraction
+
+
+def beam_gain(cos_angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the two-way amplitude pattern for cosines of the angle off boresight, any shape."""
+    gain: NDArray[np.float64] = np.maximum(cos_angle, 0.0) ** BEAM_EXPONENT
+    return gain
+
+
+def viewpoint(radar: RadarSpec, robot_poses: NDArray[np.float64]) -> Viewpoint:
+    """Return where a radar is, from robot poses (x [m], y [m], heading [rad]) of shape (n, 3)."""
+    x, y, heading = robot_poses.T[:, :, np.newaxis]
+    cosine, sine = np.cos(heading), np.sin(heading)
+    yaw_rad = math.radians(radar.yaw_deg)
+    return Viewpoint(
+        x_m=x + cosine * radar.x_m - sine * radar.y_m,
+        y_m=y + sine * radar.x_m + cosine * radar.y_m,
+        boresight_x=cosine * math.cos(yaw_rad) - sine * math.sin(yaw_rad),
+        boresight_y=sine * math.cos(yaw_rad) + cosine * math.sin(yaw_rad),
+    )
+
+
+def target_scatterers(targets: tuple[TargetSpec, ...]) -> Scatterers:
+    """Return targets as arrays of shape (k,)."""
+    radius_m = np.array([target.radius_m for target in targets])
+    return Scatterers(
+        x_m=np.array([target.x_m for target in targets]),
+        y_m=np.array([target.y_m for target in targets]),
+        strength=np.array([target.amplitude_1m for target in targets]),
+        exponent=np.array([_RANGE_EXPONENT[target.kind] for target in targets]),
+        radius_m=radius_m,
+        swell_m=radius_m,
+        phase_rad=np.array([reflection_phase_rad(target.name) for target in targets]),
+    )
+
+
+def person_scatterer(person: PersonSpec, t_ns: NDArray[np.int64]) -> Scatterers:
+    """Return a person at scene times of shape (n_frames,), int64: k = 1."""
+    position = positions_m(person, t_ns)
+    strength = AMPLITUDE_OF_1_M2 * math.sqrt(person.rcs_m2)
+    return Scatterers(
+        x_m=position[:, :1],
+        y_m=position[:, 1:],
+        strength=np.where(present(person, t_ns), strength, 0.0)[:, np.newaxis],
+        exponent=np.array([_RANGE_EXPONENT["point"]]),
+        radius_m=np.array([0.0]),
+        swell_m=chest_displacement_m(person, t_ns)[:, np.newaxis],
+        phase_rad=np.array([reflection_phase_rad(person.name)]),
+    )
+
+
+def direct_reflections(scatterers: Scatterers, view: Viewpoint) -> Reflections:
+    """Return the echoes by the straight way there and back; nothing stands in between.
+
+    Parameters
+    ----------
+    scatterers
+        Targets or a person, k of them.
+    view
+        The radar in n_frames frames.
+    """
+    dx = scatterers.x_m - view.x_m
+    dy = scatterers.y_m - view.y_m
+    range_m = np.sqrt(dx * dx + dy * dy)
+    near_m = np.maximum(range_m, NEAREST_M)
+    cos_angle = (dx * view.boresight_x + dy * view.boresight_y) / near_m
+    surface_m = near_m
+    round_ones = scatterers.radius_m > 0
+    strength = scatterers.strength
+    if round_ones.any():
+        radius_m = scatterers.radius_m
+        surface_m = np.maximum(range_m - radius_m, NEAREST_M)
+        # Its mirror image is nearer the smaller the radius; inside it, nothing is heard.
+        spread = np.sqrt((1 + radius_m) / (surface_m + radius_m)) * (range_m > radius_m)
+        strength = strength * np.where(round_ones, spread, 1.0)
+    return Reflections(
+        range_m=range_m - scatterers.swell_m,
+        amplitude=strength * surface_m**-scatterers.exponent * beam_gain(cos_angle),
+        phase_rad=scatterers.phase_rad,
+    )

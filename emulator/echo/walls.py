@@ -1,0 +1,735 @@
+"""Walls and boxes: their mirrors, edges, corners, echoes, and what passes through them.
+
+A wave that passes an edge by a detour of ``d`` (its way over the edge less its straight or
+mirrored way) does so at ``v = sqrt(4 d / wavelength)`` Fresnel parameters from the edge: for a
+wall at R with the edge h beside the foot that is ``sqrt(2) h / sqrt(wavelength R / 2)``, the
+first Fresnel zone. What gets past the edge into its shadow is (Kirchhoff; Born and Wolf,
+Principles of Optics, 8.7.3; ITU-R P.526, 4.1)
+
+    E(v) = 1 / (1 - j) integral_v^inf exp(-j pi u**2 / 2) du,    E(-v) = 1 - E(v),  E(0) = 1/2.
+
+With ``E(v) = Q(v) exp(-j pi v**2 / 2)`` and the exponential written as a delay, Q is the wave
+that comes from the edge itself: 1/2 at the boundary, 1 / (sqrt(2) pi v) far from it. All is taken
+at the carrier: over the pulse's bandwidth, v changes by a tenth.
+
+A face is a straight segment of the floor plan from ``a`` over its length along the unit vector
+``t``; its normal ``n = (-t_y, t_x)`` is on its left. ``along`` and ``height`` are a point's
+coordinates on t and n, from a. Faces of boxes are given clockwise, so that n points outwards.
+
+Formulas and sources are on the model page, ``emulator.echo.echo``. A radar sees itself in a flat
+face: the transmitter's image is as far behind as the radar is in front.
+
+Formulas and sources are on the model page, ``emulator.echo.echo``. Seen from the target, the radar
+stands where it is and once more behind every face that shows it: legs from there to the target,
+one for the way out and one for the way back, make every path with at most one mirror each way.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import fresnel
+
+from emulator.echo.reflections import NEAREST_M, Reflections, Scatterers, Viewpoint, beam_gain
+from emulator.scene.scene import MIRROR_AMPLITUDE_1M, ObjectSpec, WallSpec
+
+
+def edge_wave(
+    detour_m: NDArray[np.float64], wavelength_m: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return magnitude and phase [rad] of Q for detours >= 0 of any shape."""
+    f, g = _auxiliary(_parameter(detour_m, wavelength_m))
+    # Q = (g - j f) / (1 - j)
+    return np.sqrt(0.5 * (f * f + g * g)), np.arctan2(g - f, g + f)
+
+
+def past_edge(
+    detour_m: NDArray[np.float64], beyond: NDArray[np.bool_], wavelength_m: float
+) -> NDArray[np.complex128]:
+    """Return E: what passes an edge, at the carrier, any shape.
+
+    Parameters
+    ----------
+    detour_m
+        How much longer the way over the edge is, >= 0.
+    beyond
+        Whether the straight way is on the open side of the edge, so that v is negative.
+    wavelength_m
+        Of the carrier.
+    """
+    v = _parameter(detour_m, wavelength_m)
+    sine, cosine = fresnel(v)
+    dark = ((0.5 - cosine) - 1j * (0.5 - sine)) / (1 - 1j)
+    return np.where(beyond, 1 - dark, dark)
+
+
+def _parameter(detour_m: NDArray[np.float64], wavelength_m: float) -> NDArray[np.float64]:
+    v: NDArray[np.float64] = np.sqrt(np.maximum(detour_m, 0.0) * (4 / wavelength_m))
+    return v
+
+
+def _auxiliary(v: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the auxiliary functions f and g of the Fresnel integrals (DLMF 7.4)."""
+    sine, cosine = fresnel(v)
+    turn = 0.5 * np.pi * v * v
+    s, c = 0.5 - sine, 0.5 - cosine
+    cos, sin = np.cos(turn), np.sin(turn)
+    return s * cos - c * sin, c * cos + s * sin
+
+
+Array = NDArray[np.float64]
+
+TOUCHING_M = 0.02
+"""Ends that come this near to another face meet it: nobody draws a plan to the millimetre."""
+ON_THE_FACE_M = 1e-3
+"""What is nearer to a face than this stands on it: neither before it nor behind."""
+_RIGHT_ANGLE_TOLERANCE = math.sin(math.radians(1.0))
+_LEGS_TIMES_FACES = 200_000  # of one block of `passing`: bounds its memory
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Closure:
+    """An end of a face that stands on another one at a right angle.
+
+    For a radar in the quarter between the two they are an inner corner: with the corner's mirror
+    image the field is complete, and there is no edge to be heard. From behind an L it is one.
+
+    Attributes
+    ----------
+    face, end
+        Whose end it is, and which: 0 is a, 1 is b.
+    other
+        The face it stands on.
+    side
+        +1.0 or -1.0: sign of the height over ``other`` where the corner is an inner one.
+    own_sides
+        Signs of the height over ``face`` where it is: both if the other goes on beyond the end.
+    """
+
+    face: int
+    end: int
+    other: int
+    side: float
+    own_sides: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Faces:
+    """Flat reflectors, world frame; every array has the shape (n_faces,).
+
+    Attributes
+    ----------
+    a_x, a_y, b_x, b_y
+        Ends [m].
+    t_x, t_y, length_m
+        Unit vector from a to b, and their distance.
+    reflection
+        Magnitude of the reflection coefficient, 0 ... 1; its phase is pi.
+    transmission
+        Factor on the amplitude of what passes through, one way.
+    body
+        Which wall or box a face belongs to.
+    outward_only
+        Whether it reflects on the side of its normal only.
+    closures
+        Ends that are no edges.
+    """
+
+    a_x: Array
+    a_y: Array
+    b_x: Array
+    b_y: Array
+    t_x: Array
+    t_y: Array
+    length_m: Array
+    reflection: Array
+    transmission: Array
+    body: NDArray[np.int64]
+    outward_only: NDArray[np.bool_]
+    closures: tuple[Closure, ...]
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self.length_m)
+
+    def along(self, x: Array, y: Array) -> Array:
+        """Return coordinates along t [m]; the last axis of x and y is that of the faces, or 1."""
+        return (x - self.a_x) * self.t_x + (y - self.a_y) * self.t_y
+
+    def height(self, x: Array, y: Array) -> Array:
+        """Return coordinates along n [m]; the last axis of x and y is that of the faces, or 1."""
+        return (y - self.a_y) * self.t_x - (x - self.a_x) * self.t_y
+
+    def at(self, along_m: Array) -> tuple[Array, Array]:
+        """Return x and y [m] of points on the faces' lines; the last axis is that of the faces."""
+        return self.a_x + along_m * self.t_x, self.a_y + along_m * self.t_y
+
+    def mirrored(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Return x and y [m] of mirror images; the last axis is that of the faces."""
+        twice = 2 * self.height(x, y)
+        return x + twice * self.t_y, y - twice * self.t_x
+
+    def take(self, index: NDArray[np.int64]) -> Faces:
+        """Return some of the faces, in the order asked for; closures stay behind."""
+        return Faces(
+            a_x=self.a_x[index],
+            a_y=self.a_y[index],
+            b_x=self.b_x[index],
+            b_y=self.b_y[index],
+            t_x=self.t_x[index],
+            t_y=self.t_y[index],
+            length_m=self.length_m[index],
+            reflection=self.reflection[index],
+            transmission=self.transmission[index],
+            body=self.body[index],
+            outward_only=self.outward_only[index],
+            closures=(),
+        )
+
+
+def faces_of(walls: tuple[WallSpec, ...], objects: tuple[ObjectSpec, ...]) -> Faces:
+    """Return the faces of all walls, then of all boxes."""
+    ends: list[tuple[tuple[float, float], tuple[float, float]]] = []
+    bodies: list[WallSpec | ObjectSpec] = []
+    body: list[int] = []
+    for wall in walls:
+        ends.append((wall.from_m, wall.to_m))
+        bodies.append(wall)
+        body.append(len(body))
+    for number, box in enumerate(objects, start=len(walls)):
+        corners = _clockwise_corners(box)
+        ends.extend(zip(corners, corners[1:] + corners[:1], strict=True))
+        bodies.extend([box] * 4)
+        body.extend([number] * 4)
+    a_x, a_y, b_x, b_y = np.array(ends, dtype=np.float64).reshape(-1, 4).T
+    length_m = np.sqrt((b_x - a_x) ** 2 + (b_y - a_y) ** 2)
+    plain = Faces(
+        a_x=a_x,
+        a_y=a_y,
+        b_x=b_x,
+        b_y=b_y,
+        t_x=(b_x - a_x) / length_m,
+        t_y=(b_y - a_y) / length_m,
+        length_m=length_m,
+        reflection=np.array([each.reflection for each in bodies], dtype=np.float64),
+        transmission=np.array([each.transmission for each in bodies], dtype=np.float64),
+        body=np.array(body, dtype=np.int64),
+        outward_only=np.array([isinstance(each, ObjectSpec) for each in bodies], dtype=np.bool_),
+        closures=(),
+    )
+    return _with_closures(plain)
+
+
+def _clockwise_corners(box: ObjectSpec) -> list[tuple[float, float]]:
+    yaw = math.radians(box.yaw_deg)
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    half_x, half_y = box.width_m / 2, box.depth_m / 2
+    return [
+        (box.x_m + cosine * x - sine * y, box.y_m + sine * x + cosine * y)
+        for x, y in ((-half_x, -half_y), (-half_x, half_y), (half_x, half_y), (half_x, -half_y))
+    ]
+
+
+def _with_closures(faces: Faces) -> Faces:
+    upright = np.abs(_outer(faces.t_x, faces.t_x) + _outer(faces.t_y, faces.t_y))
+    # A box has no inner corners of its own.
+    meets = (upright < _RIGHT_ANGLE_TOLERANCE) & (faces.body[:, np.newaxis] != faces.body)
+    ends = [(faces.a_x[:, np.newaxis], faces.a_y[:, np.newaxis])]
+    ends.append((faces.b_x[:, np.newaxis], faces.b_y[:, np.newaxis]))
+    # Heights of other faces' ends over a face: [other, face, end].
+    reaches = np.stack([faces.height(x, y) for x, y in ends], axis=-1)
+    found: list[Closure] = []
+    for end, (x, y) in enumerate(ends):
+        along = faces.along(x, y)
+        beside = np.maximum(np.maximum(-along, along - faces.length_m), 0.0)
+        touches = meets & (length(beside, faces.height(x, y)) <= TOUCHING_M)
+        other_end = faces.height(*ends[1 - end])
+        found.extend(
+            Closure(
+                face=face,
+                end=end,
+                other=other,
+                side=math.copysign(1.0, other_end[face, other]),
+                own_sides=tuple(
+                    own
+                    for own in (1.0, -1.0)
+                    if float((own * reaches[other, face]).max()) > TOUCHING_M
+                ),
+            )
+            for face, other in np.argwhere(touches).tolist()
+        )
+    return replace(faces, closures=tuple(found))
+
+
+def _outer(one: Array, other: Array) -> Array:
+    return one[:, np.newaxis] * other
+
+
+def closed_ends(faces: Faces, height_m: Array) -> NDArray[np.bool_]:
+    """Return which ends are no edges for a radar, shape (n_frames, n_faces, 2).
+
+    Parameters
+    ----------
+    faces
+        The faces.
+    height_m
+        Shape (n_frames, n_faces): the radar's height over each of them.
+    """
+    closed = np.zeros((*height_m.shape, 2), dtype=np.bool_)
+    for closure in faces.closures:
+        inside = height_m[:, closure.other] * closure.side > 0
+        for own in closure.own_sides:
+            before = height_m[:, closure.face] * own > 0
+            closed[:, closure.face, closure.end] |= inside & before
+    return closed
+
+
+def passing(
+    faces: Faces,
+    from_x: Array,
+    from_y: Array,
+    to_x: Array,
+    to_y: Array,
+    *,
+    but: tuple[NDArray[np.int64], ...] = (),
+    wavelength_m: float,
+) -> Array:
+    """Return what share of the amplitude arrives at the far end of straight legs, shape (m,).
+
+    A face between the ends lets ``|t + (1 - t) (E(v_a) + E(v_b))|`` pass: its transmission, and
+    what bends round its two ends. A leg that ends on a face does not cross it.
+
+    Parameters
+    ----------
+    faces
+        What may stand in the way.
+    from_x, from_y, to_x, to_y
+        Shape (m,) each, world frame [m].
+    but
+        Bodies that do not count, shape (m,) each: those a leg was reflected by; -1 is none.
+    wavelength_m
+        Of the carrier.
+    """
+    share = np.ones(len(from_x))
+    step = max(_LEGS_TIMES_FACES // max(len(faces), 1), 1)
+    for first in range(0, len(from_x), step):
+        part = slice(first, first + step)
+        x0, y0 = from_x[part, np.newaxis], from_y[part, np.newaxis]
+        x1, y1 = to_x[part, np.newaxis], to_y[part, np.newaxis]
+        h0, h1 = faces.height(x0, y0), faces.height(x1, y1)
+        crosses = (h0 * h1 < 0) & (np.minimum(np.abs(h0), np.abs(h1)) > ON_THE_FACE_M)
+        for body in but:
+            crosses &= faces.body != body[part, np.newaxis]
+        leg, face = np.nonzero(crosses)
+        one = faces.take(face)
+        x0, y0, x1, y1 = x0[leg, 0], y0[leg, 0], x1[leg, 0], y1[leg, 0]
+        height0, height1 = h0[leg, face], h1[leg, face]
+        start, stop = one.along(x0, y0), one.along(x1, y1)
+        at = start + (stop - start) * (height0 / (height0 - height1))
+        way = length(x1 - x0, y1 - y0)
+        over_a = length(one.a_x - x0, one.a_y - y0) + length(x1 - one.a_x, y1 - one.a_y)
+        over_b = length(one.b_x - x0, one.b_y - y0) + length(x1 - one.b_x, y1 - one.b_y)
+        lit = past_edge(over_a - way, at < 0, wavelength_m)
+        lit += past_edge(over_b - way, at > one.length_m, wavelength_m)
+        factor = np.abs(one.transmission + (1 - one.transmission) * lit)
+        np.multiply.at(share[part], leg, factor)
+    return share
+
+
+def length(dx: Array, dy: Array) -> Array:
+    """Return lengths of vectors, any shape; not ``hypot``, whose last bit is the platform's."""
+    return np.sqrt(dx * dx + dy * dy)
+
+
+_PARALLEL = math.sin(math.radians(5.0))
+_WEAKEST_CORNER = 1e-2  # of one whose edges are far: the rest is deep in Fresnel's shadow
+
+
+def face_reflections(faces: Faces, view: Viewpoint, wavelength_m: float) -> Reflections:
+    """Return mirror images and edge waves of single faces.
+
+    Shape (n_frames, 3 n_faces): all mirrors, all ends a, all ends b.
+    """
+    height = faces.height(view.x_m, view.y_m)
+    along = faces.along(view.x_m, view.y_m)
+    mirror_m = np.abs(height)
+    heard = MIRROR_AMPLITUDE_1M * faces.reflection * ((height > 0) | ~faces.outward_only)
+    closed = closed_ends(faces, height)
+    foot_x, foot_y = faces.at(along)
+    on_it = (along >= 0) & (along <= faces.length_m)
+
+    range_m = [mirror_m]
+    amplitude = [heard * on_it / np.maximum(mirror_m, NEAREST_M)]
+    phase_rad = [np.full(height.shape, np.pi)]
+    at_x, at_y = [foot_x], [foot_y]
+    for end, end_x, end_y, beyond in (
+        (0, faces.a_x, faces.a_y, along < 0),
+        (1, faces.b_x, faces.b_y, along > faces.length_m),
+    ):
+        end_m = length(end_x - view.x_m, end_y - view.y_m)
+        size, lag_rad = edge_wave(2 * (end_m - mirror_m), wavelength_m)
+        obliquity = mirror_m / np.maximum(end_m, NEAREST_M)
+        range_m.append(end_m)
+        amplitude.append(
+            heard * size * obliquity * ~closed[:, :, end] / np.maximum(end_m, NEAREST_M)
+        )
+        # Within the face an edge takes away from the mirror, beyond it an edge stands for it.
+        phase_rad.append(lag_rad + np.where(beyond, np.pi, 0.0))
+        at_x.append(np.broadcast_to(end_x, height.shape))
+        at_y.append(np.broadcast_to(end_y, height.shape))
+
+    strength = np.concatenate(amplitude, axis=1)
+    x, y = np.concatenate(at_x, axis=1), np.concatenate(at_y, axis=1)
+    ranges = np.concatenate(range_m, axis=1)
+    strength *= beam_gain(_cos_angle(view, x, y))
+    frame, path = np.nonzero(strength)
+    strength[frame, path] *= (
+        passing(
+            faces,
+            view.x_m[frame, 0],
+            view.y_m[frame, 0],
+            x[frame, path],
+            y[frame, path],
+            but=(faces.body[path % len(faces)],),
+            wavelength_m=wavelength_m,
+        )
+        ** 2
+    )
+    return Reflections(
+        range_m=ranges, amplitude=strength, phase_rad=np.concatenate(phase_rad, axis=1)
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CornerPairs:
+    """Ordered pairs of faces that may form a corner, both orders of each: shape (k,).
+
+    Attributes
+    ----------
+    first, second
+        The face reflected by first, and the other one.
+    meet_first_m, meet_second_m
+        Where their lines meet, along each of them.
+    """
+
+    first: NDArray[np.int64]
+    second: NDArray[np.int64]
+    meet_first_m: Array
+    meet_second_m: Array
+
+
+def corner_pairs(faces: Faces) -> CornerPairs:
+    """Return the pairs of faces of different bodies that reflect and are not parallel."""
+    cross = faces.t_x[:, np.newaxis] * faces.t_y - faces.t_y[:, np.newaxis] * faces.t_x
+    reflect = (faces.reflection[:, np.newaxis] * faces.reflection) > 0
+    apart = faces.body[:, np.newaxis] != faces.body
+    first, second = np.nonzero(apart & reflect & (np.abs(cross) > _PARALLEL))
+    one, two = faces.take(first), faces.take(second)
+    dx, dy = two.a_x - one.a_x, two.a_y - one.a_y
+    return CornerPairs(
+        first=first,
+        second=second,
+        meet_first_m=(dx * two.t_y - dy * two.t_x) / cross[first, second],
+        meet_second_m=(dx * one.t_y - dy * one.t_x) / cross[first, second],
+    )
+
+
+def corner_reflections(
+    faces: Faces, pairs: CornerPairs, view: Viewpoint, wavelength_m: float
+) -> Reflections:
+    """Return the double bounces radar - first - second - radar, shape (n_frames, k)."""
+    one, two = faces.take(pairs.first), faces.take(pairs.second)
+    x, y = view.x_m, view.y_m
+    height1, height2 = one.height(x, y), two.height(x, y)
+    once_x, once_y = one.mirrored(x, y)
+    height_once = two.height(once_x, once_y)
+    twice_x, twice_y = two.mirrored(once_x, once_y)
+    path_m = length(twice_x - x, twice_y - y)
+
+    open1, open2 = ~one.outward_only | (height1 > 0), ~two.outward_only | (height2 > 0)
+    near1, far1, apex1 = _seen_part(one, pairs.meet_first_m, two, height2)
+    near2, far2, apex2 = _seen_part(two, pairs.meet_second_m, one, height1)
+    exists = (height_once * height2 > 0) & open1 & open2 & (near1 != far1) & (near2 != far2)
+    exists &= np.minimum(np.abs(height1), np.abs(height2)) > ON_THE_FACE_M
+
+    share2 = height_once / np.where(exists, height_once + height2, 1.0)
+    along_once = two.along(once_x, once_y)
+    bounce2 = along_once + (two.along(x, y) - along_once) * share2
+    held2 = _between(bounce2, near2, far2)
+    x2, y2 = two.at(held2)
+    # Bounce 2 is held on the radar's side of the first face, so the way to it bounces there.
+    rise = np.abs(one.height(x2, y2))
+    share1 = np.abs(height1) / np.maximum(np.abs(height1) + rise, 1e-12)
+    start1 = one.along(x, y)
+    bounce1 = start1 + (one.along(x2, y2) - start1) * share1
+    x1, y1 = one.at(_between(bounce1, near1, far1))
+
+    # Edges, one by one: the way over the edge against the way of the mirrors.
+    back_x, back_y = two.mirrored(x, y)
+    window = np.ones_like(path_m)
+    for face, edge, inwards, counts, start, stop in (
+        (two, near2, (bounce2 - near2) * np.sign(far2 - near2), exists, (once_x, once_y), (x, y)),
+        (two, far2, (far2 - bounce2) * np.sign(far2 - near2), exists, (once_x, once_y), (x, y)),
+        (one, far1, (far1 - bounce1) * np.sign(far1 - near1), exists, (x, y), (back_x, back_y)),
+        (
+            one,
+            near1,
+            (bounce1 - near1) * np.sign(far1 - near1),
+            exists & ~(apex1 & apex2),  # the apex is one edge, not two
+            (x, y),
+            (back_x, back_y),
+        ),
+    ):
+        edge_x, edge_y = face.at(edge)
+        over_m = length(edge_x - start[0], edge_y - start[1]) + length(
+            stop[0] - edge_x, stop[1] - edge_y
+        )
+        passes = np.abs(past_edge(over_m - path_m, inwards > 0, wavelength_m))
+        window *= np.where(counts, passes, 1.0)
+
+    half_m = path_m / 2
+    amplitude = MIRROR_AMPLITUDE_1M * one.reflection * two.reflection * window
+    amplitude *= exists & (window > _WEAKEST_CORNER)
+    amplitude /= np.maximum(half_m, NEAREST_M)
+    amplitude *= np.sqrt(beam_gain(_cos_angle(view, x1, y1)))
+    amplitude *= np.sqrt(beam_gain(_cos_angle(view, x2, y2)))
+    frame, pair = np.nonzero(amplitude)
+    here_x, here_y = x[frame, 0], y[frame, 0]
+    body1, body2 = one.body[pair], two.body[pair]
+    at1 = x1[frame, pair], y1[frame, pair]
+    at2 = x2[frame, pair], y2[frame, pair]
+    both = (body1, body2)
+    for a_x, a_y, b_x, b_y, but in (
+        (here_x, here_y, *at1, (body1,)),
+        (*at1, *at2, both),
+        (*at2, here_x, here_y, (body2,)),
+    ):
+        amplitude[frame, pair] *= passing(
+            faces, a_x, a_y, b_x, b_y, but=but, wavelength_m=wavelength_m
+        )
+    return Reflections(range_m=half_m, amplitude=amplitude, phase_rad=np.zeros(half_m.shape[1]))
+
+
+def _seen_part(
+    face: Faces, meet_m: Array, other: Faces, radar_height: Array
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return the part of a face on the radar's side of another: near and far end, and its kind.
+
+    Near and far are from where the faces' lines meet; they are equal where nothing is left: what
+    is thinner than ``ON_THE_FACE_M`` is the rounding of faces that share an end. The kind is
+    whether the near end is the apex of the corner.
+    """
+    slope = other.t_x * face.t_y - other.t_y * face.t_x  # of the height over the other, along t
+    upwards = slope * radar_height > 0
+    near = np.where(upwards, np.maximum(meet_m, 0.0), np.minimum(meet_m, face.length_m))
+    far = np.where(upwards, face.length_m, 0.0)
+    gone = np.where(upwards, far - near, near - far) <= ON_THE_FACE_M
+    return near, np.where(gone, near, far), np.abs(near - meet_m) <= TOUCHING_M
+
+
+def _between(value: Array, one: Array, other: Array) -> Array:
+    return np.clip(value, np.minimum(one, other), np.maximum(one, other))
+
+
+def _cos_angle(view: Viewpoint, x: Array, y: Array) -> Array:
+    dx, dy = x - view.x_m, y - view.y_m
+    range_m = np.maximum(length(dx, dy), NEAREST_M)
+    cosine: Array = (dx * view.boresight_x + dy * view.boresight_y) / range_m
+    return cosine
+
+
+WEAKEST_LEG = 1e-3
+"""A leg by way of a mirror counts from this share of a free one on boresight: -60 dB."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Legs:
+    """Ways from the radar to the target: shape (n_frames, n_targets, n_legs) each.
+
+    The first is the straight one, the others go by way of a mirror each. ``gain`` is the share of
+    a free leg's amplitude on boresight, and 0 where there is no leg; ``to_x``, ``to_y`` is the
+    unit vector from the target back along the leg.
+    """
+
+    length_m: Array
+    gain: Array
+    to_x: Array
+    to_y: Array
+
+
+def direct_share(
+    faces: Faces, scatterers: Scatterers, view: Viewpoint, wavelength_m: float
+) -> Array:
+    """Return what share of the amplitude gets from the radar to each scatterer: (n_frames, k)."""
+    x, y = _targets(scatterers, view)
+    share = passing(
+        faces,
+        np.broadcast_to(view.x_m, x.shape).ravel(),
+        np.broadcast_to(view.y_m, x.shape).ravel(),
+        x.ravel(),
+        y.ravel(),
+        wavelength_m=wavelength_m,
+    )
+    return share.reshape(x.shape)
+
+
+def ghost_reflections(
+    faces: Faces, scatterers: Scatterers, view: Viewpoint, share: Array, wavelength_m: float
+) -> Reflections:
+    """Return target echoes with at least one mirror on the way, shape (n_frames, any).
+
+    Parameters
+    ----------
+    faces
+        The mirrors.
+    scatterers
+        Targets or a person, k of them.
+    view
+        The radar.
+    share
+        Shape (n_frames, k): of the straight leg, from `direct_share`.
+    wavelength_m
+        Of the carrier.
+    """
+    legs = _legs(faces, scatterers, view, share, wavelength_m)
+    swell_m = np.broadcast_to(scatterers.swell_m, share.shape)
+    range_m, amplitude, phase_rad = [], [], []
+    n_legs = legs.gain.shape[2]
+    for out in range(n_legs):
+        for back in range(max(out, 1), n_legs):
+            cosine = (
+                legs.to_x[:, :, out] * legs.to_x[:, :, back]
+                + legs.to_y[:, :, out] * legs.to_y[:, :, back]
+            )
+            half_cosine = np.sqrt(np.clip(0.5 * (1 + cosine), 0.0, 1.0))
+            length_out, length_back = legs.length_m[:, :, out], legs.length_m[:, :, back]
+            # Out by one and back by the other, and the reverse: equally long, so they add.
+            both_ways = 1.0 if out == back else 2.0
+            amplitude.append(
+                both_ways
+                * legs.gain[:, :, out]
+                * legs.gain[:, :, back]
+                * spread(scatterers, length_out, length_back, half_cosine)
+            )
+            range_m.append(0.5 * (length_out + length_back) - swell_m * half_cosine)
+            mirrors = 1 if out == 0 else 2
+            phase_rad.append(scatterers.phase_rad + np.pi * mirrors)
+    if not range_m:
+        empty = np.empty((len(share), 0))
+        return Reflections(range_m=empty, amplitude=empty, phase_rad=np.empty(0))
+    return Reflections(
+        range_m=np.concatenate(range_m, axis=1),
+        amplitude=np.concatenate(amplitude, axis=1),
+        phase_rad=np.concatenate(phase_rad),
+    )
+
+
+def spread(scatterers: Scatterers, out_m: Array, back_m: Array, half_cosine: Array) -> Array:
+    """Return the echo's amplitude for two different legs, shape (n_frames, k), beam left aside.
+
+    With equal legs it is that of `emulator.echo.reflections.direct_reflections`.
+
+    Parameters
+    ----------
+    scatterers
+        k of them.
+    out_m, back_m
+        Shape (n_frames, k): lengths of the legs, to the scatterer's axis.
+    half_cosine
+        Shape (n_frames, k): cosine of half the angle between the legs at the scatterer.
+    """
+    radius_m = scatterers.radius_m
+    s1 = np.maximum(out_m - radius_m, NEAREST_M)
+    s2 = np.maximum(back_m - radius_m, NEAREST_M)
+    around = np.where(radius_m > 0, half_cosine, 1.0)  # a thin rod sends the same everywhere
+    bent = radius_m * around * (s1 + s2) + 2 * s1 * s2
+    line = np.sqrt(4 * (1 + radius_m) * around / ((s1 + s2) * bent))
+    outside = (out_m > radius_m) & (back_m > radius_m)
+    return scatterers.strength * np.where(scatterers.exponent == 2.0, 1 / (s1 * s2), line) * outside
+
+
+def _legs(
+    faces: Faces, scatterers: Scatterers, view: Viewpoint, share: Array, wavelength_m: float
+) -> _Legs:
+    x, y = _targets(scatterers, view)
+    straight_x, straight_y = view.x_m - x, view.y_m - y
+    straight_m = np.maximum(length(straight_x, straight_y), NEAREST_M)
+    straight_cos = -(straight_x * view.boresight_x + straight_y * view.boresight_y) / straight_m
+    straight_gain = share * np.sqrt(beam_gain(straight_cos))
+
+    # All candidates as flat lists in the order frame, target, face.
+    x_all, y_all = x[:, :, np.newaxis], y[:, :, np.newaxis]
+    radar_height = faces.height(view.x_m, view.y_m)
+    target_height = faces.height(x_all, y_all)
+    seen = (radar_height > 0) | ~faces.outward_only
+    candidate = (radar_height * seen)[:, np.newaxis, :] * target_height > 0
+    candidate &= faces.reflection > WEAKEST_LEG
+    # What stands on a face has no image in it: its strength is that of both together.
+    candidate &= np.abs(target_height) > ON_THE_FACE_M
+    candidate &= np.abs(radar_height)[:, np.newaxis, :] > ON_THE_FACE_M
+    candidate &= (scatterers.strength > 0)[..., np.newaxis]
+    frame, target, number = np.nonzero(candidate)
+    face = faces.take(number)
+    radar_x, radar_y = view.x_m[frame, 0], view.y_m[frame, 0]
+    target_x, target_y = x[frame, target], y[frame, target]
+    image_x, image_y = face.mirrored(radar_x, radar_y)
+    to_x, to_y = image_x - target_x, image_y - target_y
+    length_m = length(to_x, to_y)
+
+    height_r = np.abs(radar_height[frame, number])
+    height_t = np.abs(target_height[frame, target, number])
+    start = face.along(radar_x, radar_y)
+    bounce = start + (face.along(target_x, target_y) - start) * height_r / (height_r + height_t)
+    closed = closed_ends(faces, radar_height)[frame, number]
+    over_a = length(face.a_x - radar_x, face.a_y - radar_y)
+    over_a += length(face.a_x - target_x, face.a_y - target_y)
+    over_b = length(face.b_x - radar_x, face.b_y - radar_y)
+    over_b += length(face.b_x - target_x, face.b_y - target_y)
+    lost = past_edge(over_a - length_m, bounce < 0, wavelength_m) * ~closed[:, 0]
+    lost += past_edge(over_b - length_m, bounce > face.length_m, wavelength_m) * ~closed[:, 1]
+    bounce_x, bounce_y = face.at(np.clip(bounce, 0.0, face.length_m))
+    dx, dy = bounce_x - radar_x, bounce_y - radar_y
+    cos_angle = dx * view.boresight_x[frame, 0] + dy * view.boresight_y[frame, 0]
+    cos_angle /= np.maximum(length(dx, dy), NEAREST_M)
+    gain = face.reflection * np.abs(1 - lost) * np.sqrt(beam_gain(cos_angle))
+
+    kept = np.flatnonzero(gain > WEAKEST_LEG)
+    for end_x, end_y in ((radar_x, radar_y), (target_x, target_y)):
+        gain[kept] *= passing(
+            faces,
+            bounce_x[kept],
+            bounce_y[kept],
+            end_x[kept],
+            end_y[kept],
+            but=(face.body[kept],),
+            wavelength_m=wavelength_m,
+        )
+        kept = kept[gain[kept] > WEAKEST_LEG]
+
+    # Back to one row for each target, with as many places as the richest needs.
+    frame, target = frame[kept], target[kept]
+    row = frame * x.shape[1] + target
+    first_of_row = np.searchsorted(row, row, side="left")
+    place = 1 + np.arange(len(row)) - first_of_row
+    shape = (*x.shape, 1 + int(place.max(initial=0)))
+    legs = _Legs(
+        length_m=np.ones(shape), gain=np.zeros(shape), to_x=np.ones(shape), to_y=np.zeros(shape)
+    )
+    for table, straight, mirrored in (
+        (legs.length_m, straight_m, length_m[kept]),
+        (legs.gain, straight_gain, gain[kept]),
+        (legs.to_x, straight_x / straight_m, to_x[kept] / length_m[kept]),
+        (legs.to_y, straight_y / straight_m, to_y[kept] / length_m[kept]),
+    ):
+        table[:, :, 0] = straight
+        table[frame, target, place] = mirrored
+    return legs
+
+
+def _targets(scatterers: Scatterers, view: Viewpoint) -> tuple[Array, Array]:
+    """Return positions of shape (n_frames, k), moving or not."""
+    shape = (len(view.x_m), scatterers.x_m.shape[-1])
+    return np.broadcast_to(scatterers.x_m, shape), np.broadcast_to(scatterers.y_m, shape)

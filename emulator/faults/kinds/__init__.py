@@ -1,0 +1,1 @@
+"""Every kind of fault, one file per layer that it hits."""

@@ -1,0 +1,279 @@
+"""Faults of the byte layer: what a bad line does to bytes, whatever they mean."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+from pydantic import Field
+
+from emulator.faults.kind import Context, Kind, Layer, Parameters, Piece, Target
+from emulator.module.settings import what_is_heard
+from emulator.scene.philox import Dice
+from xethru_protocol.wire.framing import ESCAPE, START
+
+__all__ = ["KINDS"]
+
+_FLOW_CONTROL = b"\x11\x13"
+_CALM = bytes(code for code in range(256) if code not in b"\x7c\x7d\x7e\x7f")
+
+
+class _At(Parameters):
+    at: Annotated[
+        int | None, Field(ge=0, le=65_535, description="byte of the packet; random if not given")
+    ] = None
+
+    def place(self, data: bytes, dice: Dice) -> int:
+        """Return an index into the data, which is not empty."""
+        return dice.below(len(data)) if self.at is None else min(self.at, len(data) - 1)
+
+
+class _Several(_At):
+    bytes: Annotated[int, Field(ge=1, le=4096, description="how many bytes")] = 1
+
+
+class _Flip(_At):
+    bits: Annotated[int, Field(ge=1, le=64, description="how many bits, anywhere from `at` on")] = 1
+
+
+class _Burst(Parameters):
+    enter: Annotated[float, Field(ge=0, le=1, description="chance per byte that it starts")] = 0.01
+    leave: Annotated[float, Field(gt=0, le=1, description="chance per byte that it ends")] = 0.2
+    flip: Annotated[float, Field(gt=0, le=1, description="chance per bit within it")] = 0.3
+
+
+class _Gap(Parameters):
+    gap_us: Annotated[float, Field(ge=0, le=100_000, description="pause between writes, us")] = 0.0
+
+
+class _Split(_Gap):
+    bytes: Annotated[int, Field(ge=1, le=65_536, description="bytes per write")] = 4095
+
+
+class _Baud(Parameters):
+    sent: Annotated[int, Field(ge=300, le=4_000_000, description="rate of the sender, baud")] = (
+        921_600
+    )
+    heard: Annotated[int, Field(ge=300, le=4_000_000, description="rate of the host, baud")] = (
+        115_200
+    )
+
+
+def _drop(data: bytes, wanted: _Several, dice: Dice, context: Context) -> Sequence[Piece]:
+    del context
+    at = wanted.place(data, dice)
+    return [Piece(data[:at] + data[at + wanted.bytes :])]
+
+
+def _duplicate(data: bytes, wanted: _Several, dice: Dice, context: Context) -> Sequence[Piece]:
+    del context
+    end = wanted.place(data, dice) + 1
+    return [Piece(data[:end] + data[max(end - wanted.bytes, 0) : end] + data[end:])]
+
+
+def _flip(data: bytes, wanted: _Flip, dice: Dice, context: Context) -> Sequence[Piece]:
+    del context
+    flipped = bytearray(data)
+    first = 0 if wanted.at is None else wanted.place(data, dice)
+    room = 8 * (1 if wanted.at is not None and wanted.bits <= 8 else len(data) - first)
+    places: set[int] = set()
+    while len(places) < min(wanted.bits, room):
+        places.add(dice.below(room))
+    for place in places:
+        flipped[first + place // 8] ^= 1 << place % 8
+    return [Piece(bytes(flipped))]
+
+
+def _insert(data: bytes, wanted: _Several, dice: Dice, context: Context) -> Sequence[Piece]:
+    del context
+    at = wanted.place(data, dice)
+    return [Piece(data[:at] + dice.data(wanted.bytes) + data[at:])]
+
+
+def _noise_between(data: bytes, wanted: _Several, dice: Dice, context: Context) -> Sequence[Piece]:
+    del context
+    noise = bytes(_CALM[dice.below(len(_CALM))] for _ in range(wanted.bytes))
+    return [Piece(noise + data)]
+
+
+def _burst(data: bytes, wanted: _Burst, dice: Dice, context: Context) -> Sequence[Piece] | None:
+    del context
+    bad = False
+    damaged = bytearray(data)
+    for index in range(len(damaged)):
+        bad = not dice.chance(wanted.leave) if bad else dice.chance(wanted.enter)
+        if bad:
+            damaged[index] ^= sum(1 << bit for bit in range(8) if dice.chance(wanted.flip))
+    return None if damaged == data else [Piece(bytes(damaged))]
+
+
+def _escape_lost(
+    data: bytes, wanted: Parameters, dice: Dice, context: Context
+) -> Sequence[Piece] | None:
+    del wanted, context
+    if data[:1] != bytes((START,)):
+        return None
+    places, index = [], 1
+    while index < len(data):
+        if data[index] == ESCAPE:
+            places.append(index)
+            index += 1  # what follows is literal
+        index += 1
+    if not places:
+        return None
+    at = places[dice.below(len(places))]
+    return [Piece(data[:at] + data[at + 1 :])]
+
+
+def _flow_control(
+    data: bytes, wanted: Parameters, dice: Dice, context: Context
+) -> Sequence[Piece] | None:
+    del wanted, dice, context
+    left = data.translate(None, _FLOW_CONTROL)
+    return None if left == data else [Piece(left)]
+
+
+def _seven_bits(
+    data: bytes, wanted: Parameters, dice: Dice, context: Context
+) -> Sequence[Piece] | None:
+    del wanted, dice, context
+    left = bytes(byte & 0x7F for byte in data)
+    return None if left == data else [Piece(left)]
+
+
+def _split(data: bytes, wanted: _Split, dice: Dice, context: Context) -> Sequence[Piece]:
+    del dice, context
+    return _cut(data, wanted.bytes, wanted.gap_us)
+
+
+def _one_byte(data: bytes, wanted: _Gap, dice: Dice, context: Context) -> Sequence[Piece]:
+    del dice, context
+    return _cut(data, 1, wanted.gap_us)
+
+
+def _cut(data: bytes, size: int, gap_us: float) -> Sequence[Piece]:
+    return [
+        Piece(data[at : at + size], delay_ns=round(at // size * gap_us * 1000))
+        for at in range(0, len(data), size)
+    ]
+
+
+def _wrong_baud(data: bytes, wanted: _Baud, dice: Dice, context: Context) -> Sequence[Piece] | None:
+    del dice, context
+    if wanted.sent == wanted.heard:
+        return None
+    return [Piece(what_is_heard(data, wanted.sent, wanted.heard))]
+
+
+_DAMAGE = "one damaged place, of the kind that the byte's role makes it"
+_SAME_BYTES = "The bytes are the same; a receiver that depended on how they are cut would be wrong."
+
+KINDS = (
+    Kind(
+        name="drop_bytes",
+        layer=Layer.BYTE,
+        target=Target.PACKET,
+        summary="Bytes of a packet are lost.",
+        counted=_DAMAGE,
+        effect=_drop,
+        parameters=_Several,
+    ),
+    Kind(
+        name="duplicate_bytes",
+        layer=Layer.BYTE,
+        target=Target.PACKET,
+        summary="Bytes of a packet come twice.",
+        counted=_DAMAGE,
+        effect=_duplicate,
+        parameters=_Several,
+    ),
+    Kind(
+        name="flip_bits",
+        layer=Layer.BYTE,
+        target=Target.PACKET,
+        summary="Bits of a packet are inverted.",
+        counted=f"{_DAMAGE}; in a frame's samples off_lattice_samples",
+        effect=_flip,
+        parameters=_Flip,
+    ),
+    Kind(
+        name="insert_bytes",
+        layer=Layer.BYTE,
+        target=Target.PACKET,
+        summary="Random bytes appear inside a packet.",
+        counted=_DAMAGE,
+        effect=_insert,
+        parameters=_Several,
+    ),
+    Kind(
+        name="noise_between",
+        layer=Layer.BYTE,
+        target=Target.PACKET,
+        summary="Random bytes without a start appear before a packet.",
+        counted="1 fault 'bytes between packets' and junk_bytes = bytes",
+        effect=_noise_between,
+        parameters=_Several,
+    ),
+    Kind(
+        name="burst_errors",
+        layer=Layer.BYTE,
+        target=Target.PACKET,
+        summary="Bursts of bit errors after Gilbert and Elliott.",
+        counted=f"{_DAMAGE}; in a frame's samples off_lattice_samples",
+        effect=_burst,
+        parameters=_Burst,
+    ),
+    Kind(
+        name="escape_lost",
+        layer=Layer.BYTE,
+        target=Target.PACKET,
+        summary="An escape byte of a Normal packet is lost.",
+        counted="1 fault; 2 where the byte behind it was 7D, which is a start now",
+        effect=_escape_lost,
+    ),
+    Kind(
+        name="flow_control_swallowed",
+        layer=Layer.BYTE,
+        target=Target.PACKET,
+        summary="A line with XON/XOFF swallows bytes 11 and 13.",
+        counted=_DAMAGE,
+        effect=_flow_control,
+    ),
+    Kind(
+        name="seven_bits",
+        layer=Layer.BYTE,
+        target=Target.PACKET,
+        summary="A line of seven bits clears the highest bit of every byte.",
+        counted=_DAMAGE,
+        effect=_seven_bits,
+    ),
+    Kind(
+        name="split_writes",
+        layer=Layer.BYTE,
+        target=Target.PACKET,
+        summary="A packet comes in several writes.",
+        counted="nothing",
+        effect=_split,
+        parameters=_Split,
+        hidden=_SAME_BYTES,
+    ),
+    Kind(
+        name="one_byte_writes",
+        layer=Layer.BYTE,
+        target=Target.PACKET,
+        summary="A packet comes byte by byte.",
+        counted="nothing",
+        effect=_one_byte,
+        parameters=_Gap,
+        hidden=_SAME_BYTES,
+    ),
+    Kind(
+        name="wrong_baud",
+        layer=Layer.BYTE,
+        target=Target.PACKET,
+        summary="Sender and host disagree on the UART's rate; computed from the bits on the line.",
+        counted="the packet is missing; what is heard of it counts as junk",
+        effect=_wrong_baud,
+        parameters=_Baud,
+    ),
+)

@@ -1,0 +1,664 @@
+"""What a module answers to each command.
+
+A handler is ``(module, command) -> response``; it raises `Refusal` for an ERROR and `Silence` for
+no answer at all.
+
+Source: protocol reference 4.1 to 4.3, 4.5 and 4.12.
+
+Source: protocol reference 4.10 and 4.11.
+
+Source: protocol reference 4.8.
+
+Source: protocol reference 4.4 to 4.7, 11 and 16.
+
+Source: protocol reference 4.10.
+
+Source: protocol reference 4.9, 11 and 16.
+
+To add a command, write a function ``(module, command) -> response`` under ``@answers(Command)`` in
+the ``handlers_*`` module of its section, and name its group in `permissions`. Commands without a
+handler get ERROR 1, as the firmware does.
+
+Source: protocol reference 3, 4 and 5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from emulator.chip.chip import Refusal, Silence
+from emulator.module.modes import State, check_permission
+from emulator.module.module import CRASH_DUMP, NOISE_MAPS, Module
+from emulator.module.settings import ZONE_LIMITS_M, accepted_baudrate
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire import x4
+from xethru_protocol.wire.codes import (
+    I2C_REGISTER,
+    AppObject,
+    BootloaderKey,
+    DirCode,
+    ErrorCode,
+    FileType,
+    FramePostprocessing,
+    IoPinCode,
+    NoiseMapCode,
+    OutputFeature,
+    PongCode,
+    SensorMode,
+    TestCode,
+    TraceLevel,
+    X4Error,
+    X4Setting,
+)
+
+Handler = Callable[[Module, Any], m.Response]
+HANDLERS: dict[type[m.Message], Handler] = {}
+HandlerT = TypeVar("HandlerT", bound=Handler)
+
+
+def answers(*commands: type[m.Command[Any]]) -> Callable[[HandlerT], HandlerT]:
+    """Enter a handler into the table."""
+
+    def enter(handler: HandlerT) -> HandlerT:
+        HANDLERS.update(dict.fromkeys(commands, handler))
+        return handler
+
+    return enter
+
+
+HIGHEST_TRACE_LEVEL = 9
+
+
+@answers(m.Ping)
+def _ping(module: Module, command: m.Ping) -> m.Response:
+    safe = module.state is State.SAFE
+    return m.Pong(value=PongCode.XTS_SPRP_SAFEMODE if safe else PongCode.XTS_SPRP_READY)
+
+
+@answers(m.ModReset)
+def _reset(module: Module, command: m.ModReset) -> m.Response:
+    module.request_restart()
+    return m.Ack()
+
+
+@answers(m.StartBootloader)
+def _start_bootloader(module: Module, command: m.StartBootloader) -> m.Response:
+    if command.key != BootloaderKey.CURRENT:
+        module.notices.append(m.DataString(text="Wrong bootloader key."))
+        raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
+    module.request_restart(into_bootloader=True)
+    return m.Ack()
+
+
+@answers(m.SetMode)
+def _set_mode(module: Module, command: m.SetMode) -> m.Response:
+    options, modes = module.options, module.modes
+    if options.profile_switch == "restart" and modes.switches_profile(command.mode):
+        modes.restart_with_profile()
+        module.save()
+        module.request_restart()
+        raise Refusal(ErrorCode.XTS_SPRE_RESTARTING)
+    before = module.state
+    module.set_mode(command.mode)
+    entered = module.state is not before
+    if entered and module.state is State.MANUAL and options.manual_settings == "init":
+        module.chip.init()
+    module.trace(TraceLevel.INFO, f"Mode {SensorMode(command.mode).label}.")
+    return m.Ack()
+
+
+@answers(m.GetMode)
+def _get_mode(module: Module, command: m.GetMode) -> m.Response:
+    return m.ReplyByte(values=bytes([module.modes.mode]))
+
+
+@answers(m.LoadApp)
+def _load_app(module: Module, command: m.LoadApp) -> m.Response:
+    module.load_profile(command.profile_id)
+    module.trace(TraceLevel.INFO, f"Profile {command.profile_id:08X} loaded.")
+    return m.Ack()
+
+
+@answers(m.GetProfileId)
+def _get_profile_id(module: Module, command: m.GetProfileId) -> m.Response:
+    profile_id = module.modes.profile_id
+    return m.ReplyInt(values=(profile_id - (1 << 32) if profile_id >> 31 else profile_id,))
+
+
+@answers(m.DebugLevel)
+def _debug_level(module: Module, command: m.DebugLevel) -> m.Response:
+    if command.level > HIGHEST_TRACE_LEVEL:
+        raise Refusal(module.options.bad_value_error)
+    module.trace_level = command.level
+    return m.Ack()
+
+
+@answers(m.BootloaderGetDeviceInfo, m.BootloaderWritePage)
+def _bootloader(module: Module, command: m.Message) -> m.Response:
+    # Assumed: written pages are taken and forgotten; the firmware of an emulator is its program.
+    return _status(module)
+
+
+@answers(m.BootloaderStartApp)
+def _start_app(module: Module, command: m.BootloaderStartApp) -> m.Response:
+    module.request_restart()
+    return _status(module)
+
+
+def _status(module: Module) -> m.Response:
+    status = module.options.bootloader_status
+    return m.UnknownMessage(code=status, payload=bytes([status]))
+
+
+def _signed(value: int) -> int:
+    return value - (1 << 32) if value >> 31 else value
+
+
+@answers(m.SearchFileType)
+def _search(module: Module, command: m.SearchFileType) -> m.Response:
+    found = (identifier for kind, identifier in module.files.names() if kind == command.file_type)
+    return m.ReplyInt(values=tuple(_signed(identifier) for identifier in found))
+
+
+@answers(m.FindAllFiles)
+def _find_all(module: Module, command: m.FindAllFiles) -> m.Response:
+    keys = module.files.names()
+    types = [kind for kind, _ in keys]
+    identifiers = [identifier for _, identifier in keys]
+    return m.ReplyInt(values=tuple(_signed(value) for value in types + identifiers))
+
+
+@answers(m.CreateFile)
+def _create(module: Module, command: m.CreateFile) -> m.Response:
+    module.files.create((command.file_type, command.identifier), command.length)
+    module.save()
+    return m.Ack()
+
+
+@answers(m.OpenFile)
+def _open(module: Module, command: m.OpenFile) -> m.Response:
+    module.files.open((command.file_type, command.identifier))
+    return m.Ack()
+
+
+@answers(m.SetFileData)
+def _write(module: Module, command: m.SetFileData) -> m.Response:
+    module.files.write((command.file_type, command.identifier), command.offset, command.data)
+    module.save()
+    return m.Ack()
+
+
+@answers(m.CloseFile)
+def _close(module: Module, command: m.CloseFile) -> m.Response:
+    module.files.close((command.file_type, command.identifier))
+    return m.Ack()
+
+
+@answers(m.GetFileLength)
+def _length(module: Module, command: m.GetFileLength) -> m.Response:
+    return m.ReplyInt(values=(module.files.length((command.file_type, command.identifier)),))
+
+
+@answers(m.GetFileData)
+def _read(module: Module, command: m.GetFileData) -> m.Response:
+    key = command.file_type, command.identifier
+    return m.ReplyByte(values=module.files.read(key, command.offset, command.length))
+
+
+@answers(m.DeleteFile)
+def _delete(module: Module, command: m.DeleteFile) -> m.Response:
+    module.files.delete((command.file_type, command.identifier))
+    module.reply_delay_ns = module.options.file_delete_ns
+    module.save()
+    return m.Ack()
+
+
+@answers(m.FormatFilesystem)
+def _format(module: Module, command: m.FormatFilesystem) -> m.Response:
+    module.files.format(command.key)
+    module.save()
+    return m.Ack()
+
+
+@answers(m.GetCrashDumpLength)
+def _crash_dump_length(module: Module, command: m.GetCrashDumpLength) -> m.Response:
+    dump = module.files.get(CRASH_DUMP) or b""
+    return m.ReplyInt(content_id=DirCode.XTS_SDC_GET_CRASH_DUMP_LENGTH, values=(len(dump),))
+
+
+@answers(m.ClearCrashDump)
+def _clear_crash_dump(module: Module, command: m.ClearCrashDump) -> m.Response:
+    if module.files.is_open(CRASH_DUMP):
+        raise Refusal(ErrorCode.XTS_SPRE_BUSY)
+    if module.files.get(CRASH_DUMP) is not None:
+        module.files.delete(CRASH_DUMP)
+        module.save()
+    return m.Ack()
+
+
+@answers(m.GetCrashDump)
+def _crash_dump(module: Module, command: m.GetCrashDump) -> m.Response:
+    dump = module.files.get(CRASH_DUMP)
+    if dump is None:
+        raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
+    end = command.offset + command.length
+    if end > len(dump):
+        raise Refusal(ErrorCode.XTS_SPRE_USER)
+    content_id = DirCode.XTS_SDC_GET_CRASH_DUMP
+    return m.ReplyByte(content_id=content_id, values=dump[command.offset : end])
+
+
+@answers(m.IoPinSetControl)
+def _set_control(module: Module, command: m.IoPinSetControl) -> m.Response:
+    module.pins.set_control(command.pin_id, command.pin_setup, command.pin_feature)
+    return m.Ack()
+
+
+@answers(m.IoPinGetControl)
+def _get_control(module: Module, command: m.IoPinGetControl) -> m.Response:
+    control = module.pins.control(command.pin_id)
+    values = (control.setup, control.feature)
+    return m.ReplyInt(content_id=IoPinCode.XTS_SPCIOP_GETCONTROL, values=values)
+
+
+@answers(m.IoPinSetValue)
+def _set_value(module: Module, command: m.IoPinSetValue) -> m.Response:
+    module.pins.set_value(command.pin_id, command.pin_value)
+    return m.Ack()
+
+
+@answers(m.IoPinGetValue)
+def _get_value(module: Module, command: m.IoPinGetValue) -> m.Response:
+    level = module.pins.value(command.pin_id)
+    return m.ReplyInt(content_id=IoPinCode.XTS_SPCIOP_GETVALUE, values=(level,))
+
+
+PARAMETER_FILE = (int(FileType.PARAMETER_FILE), 0)
+
+
+@answers(m.SetDetectionZone)
+def _set_zone(module: Module, command: m.SetDetectionZone) -> m.Response:
+    module.profile.set_zone(command.start_m, command.end_m, module.options)
+    return m.Ack()
+
+
+@answers(m.GetDetectionZone)
+def _get_zone(module: Module, command: m.GetDetectionZone) -> m.Response:
+    return m.ReplyFloat(content_id=AppObject.DETECTION_ZONE, values=module.profile.zone_m)
+
+
+@answers(m.GetDetectionZoneLimits)
+def _get_zone_limits(module: Module, command: m.GetDetectionZoneLimits) -> m.Response:
+    values = (*ZONE_LIMITS_M, x4.BASEBAND_BIN_M)
+    return m.ReplyFloat(content_id=AppObject.DETECTION_ZONE_LIMITS, values=values)
+
+
+@answers(m.SetSensitivity)
+def _set_sensitivity(module: Module, command: m.SetSensitivity) -> m.Response:
+    module.profile.set_sensitivity(command.sensitivity, module.options)
+    return m.Ack()
+
+
+@answers(m.GetSensitivity)
+def _get_sensitivity(module: Module, command: m.GetSensitivity) -> m.Response:
+    return m.ReplyInt(content_id=AppObject.SENSITIVITY, values=(module.profile.sensitivity,))
+
+
+@answers(m.SetTxCenterFrequency)
+def _set_band(module: Module, command: m.SetTxCenterFrequency) -> m.Response:
+    module.profile.set_band(command.tx_center_frequency, module.options)
+    return m.Ack()
+
+
+@answers(m.GetTxCenterFrequency)
+def _get_band(module: Module, command: m.GetTxCenterFrequency) -> m.Response:
+    band = module.profile.tx_center_frequency
+    return m.ReplyInt(content_id=AppObject.TX_CENTER_FREQ, values=(band,))
+
+
+@answers(m.AppSetLedControl, m.SetLedControl)
+def _set_led(module: Module, command: m.AppSetLedControl | m.SetLedControl) -> m.Response:
+    module.profile.set_led(command.mode, module.options)
+    return m.Ack()
+
+
+@answers(m.AppGetLedControl)
+def _get_led(module: Module, command: m.AppGetLedControl) -> m.Response:
+    return m.ReplyByte(content_id=AppObject.LED_CONTROL, values=bytes([module.profile.led]))
+
+
+@answers(m.FactoryPreset)
+def _factory_preset(module: Module, command: m.FactoryPreset) -> m.Response:
+    module.restore_factory_settings()
+    return m.Ack()
+
+
+@answers(m.SetParameterFile)
+def _set_parameter_file(module: Module, command: m.SetParameterFile) -> m.Response:
+    module.files.replace(PARAMETER_FILE, _as_bytes(command.data))
+    module.parameter_file_name = _as_text(command.name)
+    module.save()
+    return m.Ack()
+
+
+@answers(m.GetParameterFile)
+def _get_parameter_file(module: Module, command: m.GetParameterFile) -> m.Response:
+    data, name = module.files.get(PARAMETER_FILE), _as_text(command.name)
+    if data is None or name != module.parameter_file_name:
+        raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
+    text, content_id = data.decode("latin-1"), AppObject.PROFILE_PARAMETERFILE
+    replies: dict[str, m.Response] = {
+        "string": m.ReplyString(content_id=content_id, text=text),
+        "appdata": m.ParameterFile(name=name, data=text),
+        "byte": m.ReplyByte(content_id=content_id, values=data),
+    }
+    return replies[module.options.parameter_file_reply]
+
+
+@answers(m.NoiseMapSetControl)
+def _set_noise_map_control(module: Module, command: m.NoiseMapSetControl) -> m.Response:
+    module.profile.set_noise_map_control(command.control)
+    return m.Ack()
+
+
+@answers(m.NoiseMapGetControl)
+def _get_noise_map_control(module: Module, command: m.NoiseMapGetControl) -> m.Response:
+    values = (module.profile.noise_map_control,)
+    return m.ReplyInt(content_id=NoiseMapCode.XTS_SPCN_GETCONTROL, values=values)
+
+
+@answers(m.NoiseMapSetPeriodicStore)
+def _set_periodic_store(module: Module, command: m.NoiseMapSetPeriodicStore) -> m.Response:
+    module.profile.noise_map_interval_min = command.interval_min & 0x7FFFFFFF
+    return m.Ack()
+
+
+@answers(m.NoiseMapGetPeriodicStore)
+def _get_periodic_store(module: Module, command: m.NoiseMapGetPeriodicStore) -> m.Response:
+    values = (module.profile.noise_map_interval_min, 0)
+    return m.ReplyInt(content_id=NoiseMapCode.GET_PERIODIC_STORE, values=values)
+
+
+@answers(m.StoreNoiseMap)
+def _store_noise_map(module: Module, command: m.StoreNoiseMap) -> m.Response:
+    module.store_noise_maps()
+    return m.Ack()
+
+
+@answers(m.LoadNoiseMap)
+def _load_noise_map(module: Module, command: m.LoadNoiseMap) -> m.Response:
+    return m.Ack()  # without effect in released firmware
+
+
+@answers(m.DeleteNoiseMap)
+def _delete_noise_map(module: Module, command: m.DeleteNoiseMap) -> m.Response:
+    for key in NOISE_MAPS:
+        if module.files.get(key) is not None:
+            module.files.delete(key)
+    module.save()
+    return m.Ack()
+
+
+_FEATURES: frozenset[int] = frozenset(OutputFeature)
+
+
+@answers(m.OutputSetControl)
+def _set_output(module: Module, command: m.OutputSetControl) -> m.Response:
+    module.profile.set_output(_known(command.feature), command.control)
+    return m.Ack()
+
+
+@answers(m.OutputGetControl)
+def _get_output(module: Module, command: m.OutputGetControl) -> m.Response:
+    return _control_reply(module.profile.outputs.get(_known(command.feature), 0))
+
+
+@answers(m.DebugOutputSetControl)
+def _set_debug_output(module: Module, command: m.DebugOutputSetControl) -> m.Response:
+    module.profile.set_debug_output(_known(command.feature), command.control)
+    return m.Ack()
+
+
+@answers(m.DebugOutputGetControl)
+def _get_debug_output(module: Module, command: m.DebugOutputGetControl) -> m.Response:
+    return _control_reply(module.profile.debug_outputs.get(_known(command.feature), 0))
+
+
+def _known(feature: int) -> int:
+    if feature not in _FEATURES:
+        raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
+    return feature
+
+
+def _control_reply(bits: int) -> m.Response:
+    return m.ReplyInt(values=(bits - (1 << 32) if bits >> 31 else bits,))
+
+
+def _as_text(value: str | bytes) -> str:
+    return value if isinstance(value, str) else value.decode("latin-1")
+
+
+def _as_bytes(value: str | bytes) -> bytes:
+    return value if isinstance(value, bytes) else value.encode("latin-1", errors="replace")
+
+
+TEST_REPLY_BYTES = 256
+_TEST_CONTENT_ID = 0x5090
+
+
+@answers(m.SystemGetInfo)
+def _system_get_info(module: Module, command: m.SystemGetInfo) -> m.Response:
+    text = module.identity.info(command.item, base_firmware=module.base_firmware)
+    if text is None:
+        raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
+    return m.ReplyString(content_id=DirCode.XTS_SDC_SYSTEM_GET_INFO, info=command.item, text=text)
+
+
+@answers(m.SetBaudRate)
+def _set_baud_rate(module: Module, command: m.SetBaudRate) -> m.Response:
+    module.change_baudrate(accepted_baudrate(command.baudrate, module.uart_baudrate))
+    return m.Ack()
+
+
+@answers(m.PrepareInjectFrame, m.InjectFrame)
+def _inject(module: Module, command: m.Message) -> m.Response:
+    return m.Ack()  # accepted; this emulator's frames come from its scene
+
+
+@answers(m.SystemTest)
+def _system_test(module: Module, command: m.SystemTest) -> m.Response:
+    if command.code in _ACKNOWLEDGED:
+        _ACKNOWLEDGED[command.code](module)
+        return m.Ack()
+    test = _TESTS.get(command.code)
+    if test is None:
+        raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
+    data = test(module)
+    return m.ReplyByte(
+        content_id=_TEST_CONTENT_ID,
+        info=command.code | data[0] << 8,
+        values=data.ljust(TEST_REPLY_BYTES, b"\x00"),
+    )
+
+
+def _external_ram(module: Module) -> bytes:
+    return b"\x01"
+
+
+def _read_io_pins(module: Module) -> bytes:
+    return b"\x01" + module.pins.levels().to_bytes(4, "little")
+
+
+def _x4_connection(module: Module) -> bytes:
+    if module.chip.powered:
+        return b"\x01"
+    return bytes([0, X4Error.REGISTER_TIMEOUT, 0])
+
+
+def _certification(on: bool) -> Callable[[Module], bytes]:
+    def switch(module: Module) -> bytes:
+        module.certification = on
+        module.save()
+        return b"\x00"  # "not passed" although it worked, as the firmware says
+
+    return switch
+
+
+def _hardware_config(module: Module) -> bytes:
+    return b"\x01" + module.identity.serial.encode("ascii")
+
+
+def _sleep(module: Module) -> None:
+    module.asleep = True
+
+
+def _transmitter_off(module: Module) -> None:
+    module.chip.set(X4Setting.TXPOWER, 0)
+
+
+_TESTS: dict[int, Callable[[Module], bytes]] = {
+    TestCode.EXTERNAL_RAM: _external_ram,
+    TestCode.READ_IO_PINS: _read_io_pins,
+    TestCode.X4_CONNECTION: _x4_connection,
+    TestCode.CERTIFICATION_ON: _certification(on=True),
+    TestCode.CERTIFICATION_OFF: _certification(on=False),
+    TestCode.HARDWARE_CONFIG: _hardware_config,
+}
+"""Data of each test; the first byte is 1 if it passed."""
+_ACKNOWLEDGED: dict[int, Callable[[Module], None]] = {
+    TestCode.TX_ONLY: _sleep,
+    TestCode.TX_ONLY_TX_OFF: _sleep,
+    TestCode.STREAM_TX_OFF: _transmitter_off,
+}
+
+
+LONGEST_READ = 4096
+"""Register bytes one READ may ask for; the firmware checks nothing, its reply buffer would end."""
+
+
+@answers(m.X4DriverInit)
+def _x4_init(module: Module, command: m.X4DriverInit) -> m.Response:
+    module.chip.init()
+    module.reply_delay_ns = module.options.x4_init_ns
+    return m.Ack()
+
+
+@answers(m.X4DriverSet)
+def _x4_set(module: Module, command: m.X4DriverSet) -> m.Response:
+    module.chip.set(command.setting, command.value)
+    return m.Ack()
+
+
+_BYTE_REPLIES = frozenset(
+    {
+        X4Setting.DOWNCONVERSION,
+        X4Setting.DACSTEP,
+        X4Setting.TXCENTERFREQUENCY,
+        X4Setting.TXPOWER,
+        X4Setting.PRFDIV,
+    }
+)
+
+
+@answers(m.X4DriverGet)
+def _x4_get(module: Module, command: m.X4DriverGet) -> m.Response:
+    setting = command.setting
+    if command.address is not None:
+        byte = module.chip.read_register(setting, command.address)
+        return m.ReplyByte(content_id=setting, values=bytes([byte]))
+    value = module.chip.get(setting)
+    if isinstance(value, tuple):
+        return m.ReplyFloat(content_id=setting, values=(float(value[0]), float(value[1])))
+    if isinstance(value, float):
+        return m.ReplyFloat(content_id=setting, values=(value,))
+    if setting in _BYTE_REPLIES:
+        return m.ReplyByte(content_id=setting, values=bytes([value]))
+    return m.ReplyInt(content_id=setting, values=(value,))
+
+
+@answers(m.X4DriverWrite)
+def _x4_write(module: Module, command: m.X4DriverWrite) -> m.Response:
+    _check_block_access(command.setting)
+    # Assumed: consecutive registers, wrapping at 256; the reference names only the first.
+    for address, byte in enumerate(command.values, start=command.address):
+        module.chip.write_register(command.setting, address, byte)
+    return m.Ack()
+
+
+@answers(m.X4DriverRead)
+def _x4_read(module: Module, command: m.X4DriverRead) -> m.Response:
+    _check_block_access(command.setting)
+    if command.length > LONGEST_READ:
+        raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
+    addresses = range(command.address, command.address + command.length)  # as in WRITE
+    values = bytes(module.chip.read_register(command.setting, address) for address in addresses)
+    return m.ReplyByte(content_id=command.setting, values=values)
+
+
+def _check_block_access(setting: X4Setting) -> None:
+    if setting is not X4Setting.SPIREGISTER:
+        raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
+
+
+@answers(m.X4DriverWriteI2c)
+def _write_i2c(module: Module, command: m.X4DriverWriteI2c) -> m.Response:
+    module.i2c[command.address] = command.values
+    module.i2c_address = command.address
+    return m.Ack()
+
+
+@answers(m.X4DriverReadI2c)
+def _read_i2c(module: Module, command: m.X4DriverReadI2c) -> m.Response:
+    """Answer what was written last, as a device that keeps its registers; zeros beyond."""
+    if command.length > LONGEST_READ:
+        raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
+    values = module.i2c.get(module.i2c_address, b"").ljust(command.length, b"\x00")
+    return m.ReplyByte(content_id=I2C_REGISTER, values=values[: command.length])
+
+
+@answers(m.FramePostprocessingSet)
+def _set_postprocessing(module: Module, command: m.FramePostprocessingSet) -> m.Response:
+    module.postprocessing[command.setting] = command.value
+    return m.Ack()
+
+
+_POSTPROCESSING_DEFAULTS: dict[int, m.PostprocessingValue] = {
+    FramePostprocessing.NORMALIZATION: 1,
+    FramePostprocessing.PHASE_NOISE_CORRECTION: (0, 0.0),
+    FramePostprocessing.DECIMATION_FACTOR: 1,
+    FramePostprocessing.NUMBER_FORMAT: 0,
+    FramePostprocessing.LEGACY_OUTPUT: 0,
+}
+"""Assumed: what leaves frames as chapter 6 describes them."""
+
+
+@answers(m.FramePostprocessingGet)
+def _get_postprocessing(module: Module, command: m.FramePostprocessingGet) -> m.Response:
+    setting = command.setting
+    value = module.postprocessing.get(setting, _POSTPROCESSING_DEFAULTS[setting])
+    if isinstance(value, tuple):
+        return m.ReplyFloat(content_id=setting, values=(value[1],))
+    if setting is FramePostprocessing.DECIMATION_FACTOR:
+        return m.ReplyInt(content_id=setting, values=(value - (1 << 32) if value >> 31 else value,))
+    return m.ReplyByte(content_id=setting, values=bytes([value]))
+
+
+# Each of these enters its handlers into the table.
+
+
+def answer(module: Module, command: m.Message) -> m.Response | None:
+    """Carry out one command and return its reply, None if it gets none.
+
+    Never raises on anything a host can send.
+    """
+    try:
+        check_permission(command, module.state, module.options)
+        handler = HANDLERS.get(type(command))
+        if handler is None:
+            return m.Error(code=ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
+        return handler(module, command)
+    except Refusal as refusal:
+        return m.Error(code=refusal.code)
+    except Silence:
+        return None

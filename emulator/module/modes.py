@@ -1,0 +1,413 @@
+"""The mode machine of an X4M300, and which commands it takes in which state.
+
+`TRANSITIONS` is the machine; ``python -m emulator.module.modes`` prints it as a Mermaid state
+diagram. The reference leaves open what follows here from assumptions: MANUAL and REG unload the
+profile (their GETs answer as if none were loaded), IDLE pauses a profile that was loaded but never
+run, and is refused like RUN when none is loaded. The direct jump from RUN to MANUAL is an option.
+
+Source: protocol reference 4.2, 4.3, 8.2 and 8.3.
+
+Rows and columns are those of protocol reference 8.3, with columns for certification mode (as
+MANUAL), the bare base firmware (2) and the bootloader (4.12) added. What the reference leaves
+open is an option; a verdict names it. ``python -m emulator.module.modes`` prints the table.
+
+Source: protocol reference 2, 8.3, 8.5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+
+from emulator.chip.chip import Refusal, Silence
+from emulator.module.settings import VOLATILE, DeviceOptions
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import ErrorCode, ProfileId, SensorMode
+
+
+class State(Enum):
+    """What a module is doing, as far as commands can tell."""
+
+    RUN = "profile runs"
+    IDLE = "profile paused"
+    LOADED = "stopped, profile loaded"
+    STOPPED = "stopped, no profile"
+    MANUAL = "raw radar"
+    REG = "certification"
+    XEP = "base firmware"
+    SAFE = "safe mode"
+    BOOTLOADER = "bootloader"
+
+
+class Request(Enum):
+    """What asks for another state."""
+
+    RUN = "SETMODE RUN"
+    IDLE = "SETMODE IDLE"
+    MANUAL = "SETMODE MANUAL"
+    STOP = "SETMODE STOP"
+    REG = "SETMODE REG"
+    LOAD = "LOADAPP"
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """Where a request leads, and which options say no to it.
+
+    Attributes
+    ----------
+    target
+        State entered; None if the request is always refused.
+    refusal
+        Name of the option that holds the ERROR of a refusal; empty if there is none.
+    refused_if
+        Option and value that make a step with a target a refusal.
+    """
+
+    target: State | None
+    refusal: str = ""
+    refused_if: tuple[str, str] | None = None
+
+
+_NO_PROFILE = Step(None, "run_without_profile_error")
+_JUMP = Step(State.MANUAL, "busy_profile_error", ("run_to_manual", "refuse"))
+_ANYWHERE = {
+    Request.STOP: Step(State.STOPPED),
+    Request.LOAD: Step(State.LOADED),
+    Request.REG: Step(State.REG),
+}
+_WITH_PROFILE = {Request.RUN: Step(State.RUN), Request.IDLE: Step(State.IDLE)}
+_WITHOUT = {Request.RUN: _NO_PROFILE, Request.IDLE: _NO_PROFILE}
+_RAW = {Request.MANUAL: Step(State.MANUAL)}
+
+TRANSITIONS: dict[State, dict[Request, Step]] = {
+    State.RUN: _ANYWHERE | _WITH_PROFILE | {Request.MANUAL: _JUMP},
+    State.IDLE: _ANYWHERE | _WITH_PROFILE | {Request.MANUAL: _JUMP},
+    State.LOADED: _ANYWHERE | _WITH_PROFILE | _RAW,
+    State.STOPPED: _ANYWHERE | _WITHOUT | _RAW,
+    State.MANUAL: _ANYWHERE | _WITHOUT | _RAW,
+    State.REG: _ANYWHERE | _WITHOUT | _RAW,
+}
+"""The machine of the sensor firmware, by state and request; the other states know no modes."""
+
+_REQUESTS: dict[int, Request] = {
+    SensorMode.XTID_SM_RUN: Request.RUN,
+    SensorMode.XTID_SM_IDLE: Request.IDLE,
+    SensorMode.XTID_SM_MANUAL: Request.MANUAL,
+    SensorMode.XTID_SM_STOP: Request.STOP,
+    SensorMode.XTID_SM_REG: Request.REG,
+}
+_MODES: dict[State, SensorMode] = {
+    State.RUN: SensorMode.XTID_SM_RUN,
+    State.IDLE: SensorMode.XTID_SM_IDLE,
+    State.LOADED: SensorMode.XTID_SM_STOP,
+    State.STOPPED: SensorMode.XTID_SM_STOP,
+    State.MANUAL: SensorMode.XTID_SM_MANUAL,
+    State.REG: SensorMode.XTID_SM_REG,
+    # without modes a module streams its radar frames, as in MANUAL
+    State.XEP: SensorMode.XTID_SM_MANUAL,
+    State.SAFE: SensorMode.XTID_SM_MANUAL,
+    State.BOOTLOADER: SensorMode.XTID_SM_STOP,
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Start:
+    """What a module remembers of its modes over a reset.
+
+    Attributes
+    ----------
+    state
+        RUN, LOADED or STOPPED; what the next power-up enters.
+    profile_id
+        Profile that ran last.
+    """
+
+    state: State = State.RUN
+    profile_id: int = int(ProfileId.XTS_ID_APP_PRESENCE_2)
+
+
+class ModeMachine:
+    """Mode and profile of one module, as a stock X4M300 powers up: its profile runs.
+
+    Attributes
+    ----------
+    state
+        Current state.
+    profile_id
+        Loaded profile, 0 for none.
+    start
+        What the next power-up enters.
+    """
+
+    def __init__(self, options: DeviceOptions | None = None, start: Start | None = None) -> None:
+        self._options = options or DeviceOptions()
+        self.start = start or Start()
+        self.power_up(None)
+
+    @property
+    def mode(self) -> SensorMode:
+        """Current mode, as GETMODE answers it."""
+        return _MODES[self.state]
+
+    def power_up(self, into: State | None) -> None:
+        """Enter a state after a restart; None for the one that the start asks for."""
+        self.state = into or self.start.state
+        loaded = self.state in (State.RUN, State.LOADED)
+        self.profile_id = self.start.profile_id if loaded else int(ProfileId.XTS_ID_APP_NONE)
+
+    def set_mode(self, mode: int) -> None:
+        """Change the mode, or raise `Refusal`."""
+        request = _REQUESTS.get(mode)
+        if request is None:
+            raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
+        self._enter(request)
+        if self.state is State.RUN:
+            self.start = Start(state=State.RUN, profile_id=self.profile_id)
+        elif request is Request.STOP:
+            self.start = Start(state=State.STOPPED, profile_id=self.start.profile_id)
+        if self.state not in (State.RUN, State.IDLE):
+            self.profile_id = int(ProfileId.XTS_ID_APP_NONE)
+
+    def load_profile(self, profile_id: int) -> None:
+        """Load a profile without running it, or raise `Refusal` for one this product lacks."""
+        if profile_id not in self._options.profiles:
+            raise Refusal(ErrorCode.XTS_SPRE_APP_INVALID)
+        self._enter(Request.LOAD)
+        self.profile_id = profile_id
+        self.start = Start(state=State.STOPPED, profile_id=self.start.profile_id)
+
+    def switches_profile(self, mode: int) -> bool:
+        """Whether a SETMODE would run another profile than the last one."""
+        return (
+            mode == SensorMode.XTID_SM_RUN
+            and self.state is State.LOADED
+            and self.profile_id != self.start.profile_id
+        )
+
+    def restart_with_profile(self) -> None:
+        """Let the next power-up find the loaded profile loaded."""
+        self.start = Start(state=State.LOADED, profile_id=self.profile_id)
+
+    def _enter(self, request: Request) -> None:
+        step = TRANSITIONS[self.state][request]
+        refused = step.refused_if is not None and (
+            getattr(self._options, step.refused_if[0]) == step.refused_if[1]
+        )
+        if step.target is None or refused:
+            raise Refusal(getattr(self._options, step.refusal))
+        self.state = step.target
+
+
+def state_diagram() -> str:
+    """Return the machine as a Mermaid state diagram; refused requests are its notes.
+
+    Examples
+    --------
+    >>> print(state_diagram().splitlines()[1])
+        [*] --> RUN: power-up as shipped, or was running
+    """
+    lines = [
+        "stateDiagram-v2",
+        "    [*] --> RUN: power-up as shipped, or was running",
+        "    [*] --> STOPPED: power-up, was stopped",
+    ]
+    notes: list[str] = []
+    for state, steps in TRANSITIONS.items():
+        by_target: dict[State, list[str]] = {}
+        refused: list[str] = []
+        for request, step in steps.items():
+            if step.target is None:
+                refused.append(request.value)
+            else:
+                condition = "" if step.refused_if is None else " (option)"
+                by_target.setdefault(step.target, []).append(request.value + condition)
+        lines += [
+            f"    {state.name} --> {target.name}: {', '.join(requests)}"
+            for target, requests in by_target.items()
+        ]
+        if refused:
+            notes.append(f"    note right of {state.name}: {', '.join(refused)} get ERROR")
+    return "\n".join(lines + notes)
+
+
+class Group(Enum):
+    """Commands that are taken in the same states."""
+
+    BASIC = "ping, info, reset, bootloader entry, files, IO pins"
+    SENSOR = "what the base firmware lacks, in any mode"
+    MODES = "modes and profiles"
+    PROFILE_SET = "profile settings"
+    PROFILE_ACTION = "noise map store, load, delete"
+    PROFILE_GET = "profile GETs of sensitivity and band"
+    QUIET_GET = "other profile GETs"
+    PRESENCE_OUTPUT = "output control of presence messages"
+    STREAM_OUTPUT = "output control of baseband, pulse-Doppler, noise maps"
+    RADAR = "X4 driver"
+    BOOTLOADER = "bootloader"
+    UNHANDLED = "handled by no firmware"
+
+
+class Verdict(Enum):
+    """What becomes of a command; all but TAKEN end it."""
+
+    TAKEN = "ok"
+    UNKNOWN = "ERROR 1"
+    BUSY_PROFILE = "ERROR, option busy_profile_error"
+    NO_PROFILE = "ERROR, option no_profile_error"
+    QUIET = "option get_without_profile"
+    RUNNING_OUTPUT = "option presence_output_while_running"
+    DEAF = "no answer"
+
+
+_OK, _UNKNOWN, _DEAF = Verdict.TAKEN, Verdict.UNKNOWN, Verdict.DEAF
+_BUSY, _NONE, _QUIET = Verdict.BUSY_PROFILE, Verdict.NO_PROFILE, Verdict.QUIET
+_ORDER = (
+    State.RUN,
+    State.IDLE,
+    State.LOADED,
+    State.STOPPED,
+    State.MANUAL,
+    State.REG,
+    State.SAFE,
+    State.XEP,
+    State.BOOTLOADER,
+)
+_FIRMWARE_LACKS = (_UNKNOWN, _UNKNOWN, _DEAF)
+_EVERYWHERE = (_OK,) * 8 + (_DEAF,)
+_NOWHERE = (_UNKNOWN,) * 8 + (_DEAF,)
+_SENSOR_ONLY = (_OK,) * 6 + _FIRMWARE_LACKS
+# fmt: off
+_ROWS: dict[Group, tuple[Verdict, ...]] = {
+    #                      RUN    IDLE   LOADED STOPPED MANUAL REG
+    Group.BASIC:           _EVERYWHERE,
+    Group.RADAR:           _EVERYWHERE,
+    Group.SENSOR:          _SENSOR_ONLY,
+    Group.MODES:           _SENSOR_ONLY,
+    Group.PROFILE_SET:     (_BUSY, _BUSY, _OK,   _NONE,  _BUSY, _BUSY, *_FIRMWARE_LACKS),
+    Group.PROFILE_ACTION:  (_OK,   _OK,   _OK,   _NONE,  _BUSY, _BUSY, *_FIRMWARE_LACKS),
+    Group.PROFILE_GET:     (_OK,   _OK,   _OK,   _UNKNOWN, _UNKNOWN, _UNKNOWN, *_FIRMWARE_LACKS),
+    Group.QUIET_GET:       (_OK,   _OK,   _OK,   _QUIET, _QUIET, _QUIET, *_FIRMWARE_LACKS),
+    Group.PRESENCE_OUTPUT: (Verdict.RUNNING_OUTPUT,
+                                   _OK,   _OK,   _NONE,  _BUSY, _BUSY, *_FIRMWARE_LACKS),
+    Group.STREAM_OUTPUT:   (_OK,   _OK,   _OK,   _NONE,  _BUSY, _BUSY, *_FIRMWARE_LACKS),
+    Group.BOOTLOADER:      (_UNKNOWN,) * 8 + (_OK,),
+    Group.UNHANDLED:       _NOWHERE,
+}
+# fmt: on
+
+PERMISSIONS: dict[Group, dict[State, Verdict]] = {
+    group: dict(zip(_ORDER, verdicts, strict=True)) for group, verdicts in _ROWS.items()
+}
+"""The table, by group and state."""
+
+
+def _group_of_output(command: m.OutputSetControl | m.DebugOutputSetControl) -> Group:
+    return Group.STREAM_OUTPUT if command.feature in VOLATILE else Group.PRESENCE_OUTPUT
+
+
+GROUPS: dict[type[m.Message], Group] = {
+    m.GetMode: Group.MODES,
+    m.SetMode: Group.MODES,
+    m.LoadApp: Group.MODES,
+    m.GetProfileId: Group.MODES,
+    m.SetDetectionZone: Group.PROFILE_SET,
+    m.SetSensitivity: Group.PROFILE_SET,
+    m.SetTxCenterFrequency: Group.PROFILE_SET,
+    m.AppSetLedControl: Group.PROFILE_SET,
+    m.SetLedControl: Group.PROFILE_SET,
+    m.NoiseMapSetControl: Group.PROFILE_SET,
+    m.NoiseMapSetPeriodicStore: Group.PROFILE_SET,
+    m.SetParameterFile: Group.PROFILE_SET,
+    m.FactoryPreset: Group.PROFILE_SET,
+    m.StoreNoiseMap: Group.PROFILE_ACTION,
+    m.LoadNoiseMap: Group.PROFILE_ACTION,
+    m.DeleteNoiseMap: Group.PROFILE_ACTION,
+    m.GetSensitivity: Group.PROFILE_GET,
+    m.GetTxCenterFrequency: Group.PROFILE_GET,
+    m.GetDetectionZone: Group.QUIET_GET,
+    m.GetDetectionZoneLimits: Group.QUIET_GET,
+    m.AppGetLedControl: Group.QUIET_GET,
+    m.NoiseMapGetControl: Group.QUIET_GET,
+    m.NoiseMapGetPeriodicStore: Group.QUIET_GET,
+    m.GetParameterFile: Group.QUIET_GET,
+    m.OutputGetControl: Group.QUIET_GET,
+    m.DebugOutputGetControl: Group.QUIET_GET,
+    m.DebugLevel: Group.SENSOR,
+    m.IoPinGetControl: Group.SENSOR,
+    m.InjectFrame: Group.SENSOR,
+    m.PrepareInjectFrame: Group.SENSOR,
+    m.X4DriverWriteI2c: Group.SENSOR,
+    m.X4DriverReadI2c: Group.SENSOR,
+    m.FramePostprocessingSet: Group.SENSOR,
+    m.FramePostprocessingGet: Group.SENSOR,
+    m.X4DriverInit: Group.RADAR,
+    m.X4DriverSet: Group.RADAR,
+    m.X4DriverGet: Group.RADAR,
+    m.X4DriverWrite: Group.RADAR,
+    m.X4DriverRead: Group.RADAR,
+    m.BootloaderGetDeviceInfo: Group.BOOTLOADER,
+    m.BootloaderWritePage: Group.BOOTLOADER,
+    m.BootloaderStartApp: Group.BOOTLOADER,
+    m.AppPoll: Group.UNHANDLED,
+    m.Hil: Group.UNHANDLED,
+    m.SetCom: Group.UNHANDLED,
+    m.SystemGetDebugData: Group.UNHANDLED,
+    m.LegacyGetVersion: Group.UNHANDLED,
+    m.LegacyGetVarInt: Group.UNHANDLED,
+    m.LegacyDirCommand: Group.UNHANDLED,
+    m.UnknownMessage: Group.UNHANDLED,
+}
+"""Group of each command; those not named are BASIC, OUTPUT control depends on the message."""
+
+
+def group_of(command: m.Message) -> Group:
+    """Return the group of a command."""
+    if isinstance(command, m.OutputSetControl | m.DebugOutputSetControl):
+        return _group_of_output(command)
+    return GROUPS.get(type(command), Group.BASIC)
+
+
+def check_permission(command: m.Message, state: State, options: DeviceOptions) -> None:
+    """Return if a command is taken in a state; raise `Refusal` or `Silence` if not."""
+    verdict = PERMISSIONS[group_of(command)][state]
+    if verdict is Verdict.TAKEN:
+        return
+    if verdict is Verdict.RUNNING_OUTPUT and options.presence_output_while_running:
+        return
+    silent = verdict is Verdict.QUIET and options.get_without_profile == "silence"
+    if verdict is Verdict.DEAF or silent:
+        raise Silence
+    raise Refusal(_ERRORS[verdict](options))
+
+
+def permission_table() -> str:
+    """Return the table as Markdown, a row per group and a column per state.
+
+    Examples
+    --------
+    >>> permission_table().splitlines()[0].split("|")[2]
+    ' RUN '
+    """
+    lines = [
+        "| Commands | " + " | ".join(state.name for state in _ORDER) + " |",
+        "|" + "---|" * (len(_ORDER) + 1),
+    ]
+    for group, verdicts in PERMISSIONS.items():
+        cells = (verdicts[state].value for state in _ORDER)
+        lines.append(f"| {group.value} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+_ERRORS: dict[Verdict, Callable[[DeviceOptions], int]] = {
+    Verdict.UNKNOWN: lambda options: ErrorCode.XTS_SPRE_NOT_RECOGNIZED,
+    Verdict.QUIET: lambda options: ErrorCode.XTS_SPRE_NOT_RECOGNIZED,
+    Verdict.NO_PROFILE: lambda options: options.no_profile_error,
+    Verdict.BUSY_PROFILE: lambda options: options.busy_profile_error,
+    Verdict.RUNNING_OUTPUT: lambda options: options.busy_profile_error,
+}
+
+
+if __name__ == "__main__":
+    print(state_diagram() + "\n\n" + permission_table())  # noqa: T201 - this is what running the module is for

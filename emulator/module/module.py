@@ -1,0 +1,278 @@
+"""The state of one module that commands act on, and what it keeps over a reset.
+
+Source: protocol reference 4, 8.2 and 8.5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+
+from emulator.chip.chip import Chip, Refusal
+from emulator.module.memory import (
+    FaultCounter,
+    FileSystem,
+    Identity,
+    Memory,
+    SavedState,
+    VolatileMemory,
+)
+from emulator.module.modes import ModeMachine, State
+from emulator.module.pins import IoPins
+from emulator.module.settings import DEFAULT_BAUDRATE, DeviceOptions, ProfileSettings
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import (
+    ErrorCode,
+    FileType,
+    PresenceDirection,
+    PresenceState,
+    TraceLevel,
+)
+
+__all__ = ["CRASH_DUMP", "NOISE_MAPS", "Module", "Restart"]
+
+CRASH_DUMP = (int(FileType.CRASH_DUMP), 0)
+NOISE_MAPS = ((int(FileType.NOISEMAP_SLOW), 0), (int(FileType.NOISEMAP_FAST), 0))
+NS_PER_MIN = 60_000_000_000
+BAUDRATE_DELAY_NS = 500_000_000
+"""From the ACK of SETBAUDRATE to the switch."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Restart:
+    """A restart that is due.
+
+    Attributes
+    ----------
+    into_bootloader
+        Whether the bootloader stays in charge.
+    at_ns
+        When, as after a fault; None for half a second after the ACK.
+    """
+
+    into_bootloader: bool = False
+    at_ns: int | None = None
+
+
+def _placeholder_noise_maps() -> tuple[bytes, bytes]:
+    return b"\x00" * 64, b"\x00" * 64
+
+
+class Module:
+    """The state of one X4M300.
+
+    Parameters
+    ----------
+    identity
+        What it says about itself.
+    chip
+        Its radar chip.
+    options
+        How it answers what the reference leaves open; the documented defaults if None.
+    memory
+        Where its flash is kept; None forgets it with the module.
+
+    Attributes
+    ----------
+    modes
+        Its mode machine.
+    profile
+        Settings of the profile loaded last.
+    files
+        Its file system.
+    pins
+        Its IO pins.
+    faults
+        Consecutive faults.
+    postprocessing
+        Frame post-processing settings by id; kept, without effect on frames.
+    i2c
+        Bytes last written to each I2C address.
+    uart_baudrate
+        Rate of its UART; a change takes effect half a second after its ACK.
+    trace_level
+        How much it tells as DATA STRING.
+    certification
+        Whether it starts in certification mode.
+    parameter_file_name
+        Name of the parameter file.
+    noise_maps
+        Returns the current noise maps, slow and fast, as bytes; whoever computes them sets it.
+    now_ns
+        Time of the current command.
+    restart
+        A restart asked for; whoever keeps the time carries it out.
+    notices
+        Messages to send before the reply.
+    reply_delay_ns
+        How long the current command's reply takes.
+    asleep
+        Whether nothing but a power cycle brings it back.
+    """
+
+    def __init__(
+        self,
+        identity: Identity,
+        chip: Chip,
+        options: DeviceOptions | None = None,
+        memory: Memory | None = None,
+    ) -> None:
+        self.identity = identity
+        self.chip = chip
+        self.options = options or DeviceOptions()
+        self._memory = memory or VolatileMemory()
+        saved = self._memory.load() or SavedState()
+        self._saved_profiles = {key: value.copy() for key, value in saved.profiles.items()}
+        self.modes = ModeMachine(self.options, saved.start)
+        self.files = FileSystem(self.options.storage_bytes, saved.files)
+        self.certification = saved.certification
+        self.parameter_file_name = saved.parameter_file_name
+        self.pins = IoPins(base_firmware=self.options.firmware == "xep")
+        self.faults = FaultCounter(self.options.watchdog_memory_ns)
+        self.noise_maps: Callable[[], tuple[bytes, bytes]] = _placeholder_noise_maps
+        self.now_ns = 0
+        self.restart: Restart | None = None
+        self._baudrate_change: tuple[int, int] | None = None
+        self._noise_map_busy_until_ns = 0
+        self._noise_map_stored_ns = 0
+        self._power_up_parts(into_bootloader=False)
+
+    @property
+    def state(self) -> State:
+        """What it is doing."""
+        return self.modes.state
+
+    @property
+    def base_firmware(self) -> bool:
+        """Whether only the base firmware runs: option "xep", or safe mode."""
+        return self.state in (State.XEP, State.SAFE)
+
+    def power_up(self, *, into_bootloader: bool = False) -> None:
+        """Restart: chip defaults, saved settings, and the mode the module was left in."""
+        self.chip.init()
+        self._power_up_parts(into_bootloader=into_bootloader)
+
+    def power_cycle(self, now_ns: int) -> None:
+        """Ask for a restart as after a power cut: at once, and faults are forgotten."""
+        self.faults.clear()
+        self.restart = Restart(at_ns=now_ns)
+
+    def advance(self, now_ns: int) -> None:
+        """Let time pass."""
+        self.now_ns = now_ns
+        if self._baudrate_change is not None and now_ns >= self._baudrate_change[0]:
+            self.uart_baudrate = self._baudrate_change[1]
+            self._baudrate_change = None
+        interval_ns = self.profile.noise_map_interval_min * NS_PER_MIN
+        running = self.state is State.RUN
+        if running and interval_ns and now_ns - self._noise_map_stored_ns >= interval_ns:
+            with suppress(Refusal):  # no room: the next interval tries again
+                self.store_noise_maps()
+            self._noise_map_stored_ns = now_ns
+
+    def store_noise_maps(self) -> None:
+        """Store the noise maps as files, or raise `Refusal`."""
+        if self.now_ns < self._noise_map_busy_until_ns:
+            raise Refusal(ErrorCode.XTS_SPRE_BUSY)
+        for key, data in zip(NOISE_MAPS, self.noise_maps(), strict=True):
+            self.files.replace(key, data)
+        self._noise_map_busy_until_ns = self.now_ns + self.options.noise_map_store_ns
+        self.save()
+
+    def change_baudrate(self, baudrate: int) -> None:
+        """Change the UART's rate once the ACK has left."""
+        self._baudrate_change = (self.now_ns + BAUDRATE_DELAY_NS, baudrate)
+
+    def request_restart(self, *, into_bootloader: bool = False) -> None:
+        """Ask for a restart on the host's wish; it ends a series of faults."""
+        self.faults.clear()
+        self.restart = Restart(into_bootloader=into_bootloader)
+
+    def crash(self, reason: str, now_ns: int) -> None:
+        """Fail as by a watchdog or a hard fault: leave a crash dump and restart at once."""
+        if self.state is State.BOOTLOADER or self.asleep:
+            return
+        self.faults.fault(now_ns)
+        dump = f"{reason}\nat {now_ns} ns\nfault {self.faults.count} in a row\n".encode()
+        self.files.close_all()
+        with suppress(Refusal):  # no room for a dump: the firmware has nowhere else to put it
+            self.files.replace(CRASH_DUMP, dump)
+        self.save()
+        self.restart = Restart(into_bootloader=self.faults.hopeless, at_ns=now_ns)
+        if self.faults.hopeless:
+            self.faults.clear()
+
+    def load_profile(self, profile_id: int) -> None:
+        """Load a profile with its own last settings, or raise `Refusal`."""
+        self.modes.load_profile(profile_id)
+        self.profile = self._settings_of(profile_id)
+        self.save()
+
+    def set_mode(self, mode: int) -> None:
+        """Change the mode, or raise `Refusal`; starting a profile saves its settings."""
+        self.modes.set_mode(mode)
+        if self.state is State.RUN:
+            self._saved_profiles[self.modes.profile_id] = self.profile.copy()
+            self._noise_map_stored_ns = self.now_ns
+        else:
+            self.pins.follow(PresenceState.UNKNOWN, PresenceDirection.STILL)
+        self.save()
+
+    def restore_factory_settings(self) -> None:
+        """Set the loaded profile back to what it was shipped with."""
+        self.profile = ProfileSettings.shipped(self.options)
+        self._working[self.modes.profile_id] = self.profile
+
+    def save(self) -> None:
+        """Keep what the flash holds."""
+        self._memory.save(
+            SavedState(
+                start=self.modes.start,
+                profiles={key: value.after_reset() for key, value in self._saved_profiles.items()},
+                files=self.files.contents,
+                parameter_file_name=self.parameter_file_name,
+                certification=self.certification,
+            )
+        )
+
+    def trace(self, level: TraceLevel, text: str) -> None:
+        """Tell something as DATA STRING, if the host wants to know that much."""
+        if level <= self.trace_level:
+            self.notices.append(m.DataString(text=text))
+
+    def _power_up_parts(self, *, into_bootloader: bool) -> None:
+        self.restart = None
+        self.notices: list[m.Response] = []
+        self.reply_delay_ns = 0
+        self.asleep = False
+        self.uart_baudrate = DEFAULT_BAUDRATE
+        self._baudrate_change = None
+        self.trace_level: int = TraceLevel.NONE
+        self.postprocessing: dict[int, m.PostprocessingValue] = {}
+        self.i2c: dict[int, bytes] = {}
+        self.i2c_address = 0
+        self._noise_map_busy_until_ns = 0
+        self._noise_map_stored_ns = self.now_ns
+        self.files.close_all()
+        self.pins.reset()
+        self._working: dict[int, ProfileSettings] = {}
+        self.modes.power_up(self._first_state(into_bootloader))
+        self.profile = self._settings_of(self.modes.start.profile_id)
+
+    def _first_state(self, into_bootloader: bool) -> State | None:
+        if into_bootloader:
+            return State.BOOTLOADER
+        if self.faults.safe:
+            return State.SAFE
+        if self.options.firmware == "xep":
+            return State.XEP
+        return State.REG if self.certification else None
+
+    def _settings_of(self, profile_id: int) -> ProfileSettings:
+        """Return the settings a profile works with: changed, else saved, else as shipped."""
+        if profile_id not in self._working:
+            saved = self._saved_profiles.get(profile_id)
+            fresh = ProfileSettings.shipped(self.options) if saved is None else saved.after_reset()
+            self._working[profile_id] = fresh
+        return self._working[profile_id]

@@ -1,0 +1,406 @@
+"""Settings of a profile: detection zone, sensitivity, band, LED, noise map, messages.
+
+A question the reference answers is no option. Where it marks a guess, the default is that guess;
+where it reports an observation of hardware, the default is the observation.
+
+Source: protocol reference, the rows marked [INF], 4.3, 4.4, 8.3, 8.5 and chapter 15.
+
+Source: protocol reference 4.10 and chapter 10.
+
+Line levels are bytes of 0 and 1, one per bit time of the sender; between characters, before the
+first and after the last the line is high. Eight data bits, least significant first, no parity.
+
+A table of bits by message id holds only messages that are on.
+
+Source: protocol reference 4.7 and 11, row 5.
+
+`ProfileSettings` is what commands change and what a running profile obeys. Values out of range
+raise `Refusal` or are clamped, as the options say.
+
+Source: protocol reference 4.4 to 4.7.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from operator import itemgetter
+from typing import Literal
+
+from emulator.chip.chip import Refusal
+from xethru_protocol.wire import x4
+from xethru_protocol.wire.codes import (
+    ErrorCode,
+    LedMode,
+    MatrixControl,
+    NoiseMapControl,
+    OutputControl,
+    OutputFeature,
+    ProfileId,
+    TxCenterFrequency,
+)
+
+X4M300_PROFILES = frozenset({ProfileId.XTS_ID_APP_PRESENCE_2})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeviceOptions:
+    """How one emulated module behaves where the reference allows more than one answer.
+
+    Attributes
+    ----------
+    firmware
+        "sensor": a stock X4M300. "xep": the bare base firmware, which has no profiles and no
+        modes.
+    profiles
+        Profiles that LOADAPP accepts (4.3).
+    default_output
+        The presence message that is on in a module as shipped (15, question 3).
+    port_on_reset
+        Whether a reset keeps the port ("stay") or takes it away until the USB is back ("vanish").
+    bad_value
+        What a profile setting out of its range gets (15, question 1): "refuse" answers
+        `bad_value_error`, "clamp" takes the nearest value.
+    bad_value_error
+        ERROR of a refused value.
+    busy_profile_error
+        ERROR of a profile setting while the profile runs, is paused, or in MANUAL (8.3).
+    no_profile_error
+        ERROR of a profile setting without a loaded profile (8.3).
+    run_without_profile_error
+        ERROR of RUN and IDLE without a loaded profile (8.3).
+    get_without_profile
+        Whether GETs other than of sensitivity and band stay without answer ("silence", as
+        observed) or get ERROR 1 ("error") when no profile is loaded (4.4).
+    presence_output_while_running
+        Whether OUTPUT control takes presence messages while the profile runs; baseband,
+        pulse-Doppler and noise maps are taken in any case (8.3).
+    run_to_manual
+        Whether SETMODE MANUAL is taken from a running profile ("accept") or answered with
+        `busy_profile_error` ("refuse") (8.3).
+    profile_switch
+        "direct", or "restart": RUN of another profile than the last one answers 22h, and the
+        module resets itself (8.2).
+    manual_settings
+        Whether X4 settings survive MANUAL, STOP, MANUAL ("keep") or INIT is carried out on
+        entering MANUAL ("init") (15, question 4).
+    parameter_file_reply
+        As what a parameter file is answered (4.4, 16).
+    baseband_sampling_hz
+        Sampling-frequency field of baseband messages [Hz] (15, question 9).
+    storage_bytes
+        Size of the file storage: 0x48000, or 0x18000 with the small microcontroller (4.11).
+    bootloader_status
+        Status byte of the bootloader for a command carried out (15, question 8).
+    noise_map_store_ns
+        How long a noise map takes to store; another store meanwhile is refused (4.4).
+    x4_init_ns
+        How long INIT takes to answer (4.9); 0 because emulated time is the host's time too.
+    file_delete_ns
+        How long DELETE_FILE takes to answer (4.11).
+    watchdog_memory_ns
+        Time without fault after which the count of consecutive faults is cleared (8.5).
+    """
+
+    firmware: Literal["sensor", "xep"] = "sensor"
+    profiles: frozenset[int] = X4M300_PROFILES
+    default_output: OutputFeature = OutputFeature.PRESENCE_SINGLE
+    port_on_reset: Literal["stay", "vanish"] = "stay"
+    bad_value: Literal["refuse", "clamp"] = "refuse"
+    bad_value_error: int = ErrorCode.XTS_SPRE_COMMAND_FAILED
+    busy_profile_error: int = ErrorCode.XTS_SPRE_COMMAND_FAILED
+    no_profile_error: int = ErrorCode.XTS_SPRE_NOT_RECOGNIZED
+    run_without_profile_error: int = ErrorCode.XTS_SPRE_APP_INVALID
+    get_without_profile: Literal["silence", "error"] = "silence"
+    presence_output_while_running: bool = False
+    run_to_manual: Literal["accept", "refuse"] = "accept"
+    profile_switch: Literal["direct", "restart"] = "direct"
+    manual_settings: Literal["keep", "init"] = "keep"
+    parameter_file_reply: Literal["string", "appdata", "byte"] = "string"
+    baseband_sampling_hz: float = 2.916e9
+    storage_bytes: int = 0x48000
+    bootloader_status: int = 0
+    noise_map_store_ns: int = 100_000_000
+    x4_init_ns: int = 0
+    file_delete_ns: int = 100_000_000
+    watchdog_memory_ns: int = 300_000_000_000
+
+
+DEFAULT_BAUDRATE = 115_200
+"""After every power-up; a rate is never saved."""
+_SLOWEST, _FASTEST = 600, 10_000_000
+
+
+def accepted_baudrate(wanted: int, current: int) -> int:
+    """Return the rate after SETBAUDRATE; one the firmware ignores changes nothing.
+
+    Examples
+    --------
+    >>> accepted_baudrate(921_600, 115_200), accepted_baudrate(599, 115_200)
+    (921600, 115200)
+    """
+    return wanted if _SLOWEST <= wanted <= _FASTEST else current
+
+
+BITS_PER_BYTE = 10
+"""Start, eight data bits, stop."""
+_FALLING = b"\x01\x00"
+_CHARACTERS = tuple(bytes((0, *(byte >> bit & 1 for bit in range(8)), 1)) for byte in range(256))
+
+
+def line_levels(data: bytes) -> bytes:
+    """Return the levels of bytes sent one right after the other.
+
+    Examples
+    --------
+    >>> line_levels(bytes([0x55])).hex(" ")
+    '00 01 00 01 00 01 00 01 00 01'
+    """
+    return b"".join(map(_CHARACTERS.__getitem__, data))
+
+
+def sampled(levels: bytes, sent_baud: int, read_baud: int) -> bytes:
+    """Return the bytes a receiver makes of line levels.
+
+    It waits for a falling edge, looks in the middle of its own bit time whether the line is still
+    low, else it was no start bit; then it takes eight bits, each in its middle, and the stop bit,
+    which it does not judge, as a terminal in raw mode does not. Then it waits for the line to be
+    high and to fall again.
+
+    Parameters
+    ----------
+    levels
+        One per bit time of the sender.
+    sent_baud, read_baud
+        Rates of sender and receiver, bit/s.
+
+    Examples
+    --------
+    At half the rate, bits 3, 5 and 7 of the line are data bits 0 to 2 of 00, then comes its stop
+    bit and the idle line.
+
+    >>> sampled(line_levels(bytes([0x00])), 115200, 57600).hex()
+    'f8'
+    """
+    # an edge lies at the beginning of a sent bit: the samples' places behind it are always the same
+    middles = [(2 * bit + 1) * sent_baud // (2 * read_baud) for bit in range(BITS_PER_BYTE)]
+    data_bits = itemgetter(*middles[1:9])
+    start, stop = middles[0], middles[9]
+    line = b"\x01" + levels + b"\x01" * (stop + 2)
+    heard = bytearray()
+    at = line.find(_FALLING)
+    while at >= 0:
+        edge = at + 1
+        if line[edge + start]:
+            at = line.find(_FALLING, edge)
+            continue
+        bits = data_bits(line[edge : edge + stop + 1])
+        heard.append(sum(level << place for place, level in enumerate(bits)))
+        at = line.find(_FALLING, edge + stop)
+    return bytes(heard)
+
+
+def what_is_heard(data: bytes, sent_baud: int, read_baud: int) -> bytes:
+    """Return what arrives of bytes sent one right after the other; nothing at a rate of 0."""
+    if sent_baud == read_baud:
+        return data
+    if sent_baud <= 0 or read_baud <= 0:
+        return b""
+    return sampled(line_levels(data), sent_baud, read_baud)
+
+
+_BASEBAND = frozenset({OutputFeature.BASEBAND_IQ, OutputFeature.BASEBAND_AMPLITUDE_PHASE})
+_RIVALS: dict[int, OutputFeature] = {
+    OutputFeature.PULSEDOPPLER_FLOAT: OutputFeature.PULSEDOPPLER_BYTE,
+    OutputFeature.PULSEDOPPLER_BYTE: OutputFeature.PULSEDOPPLER_FLOAT,
+    OutputFeature.NOISEMAP_FLOAT: OutputFeature.NOISEMAP_BYTE,
+    OutputFeature.NOISEMAP_BYTE: OutputFeature.NOISEMAP_FLOAT,
+}
+"""Messages of the same matrices; an instance is sent as one of them."""
+
+MATRIX: frozenset[int] = frozenset(_RIVALS)
+"""Messages whose control has a bit per instance, `MatrixControl`."""
+VOLATILE: frozenset[int] = MATRIX | _BASEBAND
+"""Messages that are off after every reset."""
+
+
+def set_output(outputs: Mapping[int, int], feature: int, control: int) -> dict[int, int]:
+    """Return the table after one message was switched.
+
+    Examples
+    --------
+    >>> set_output({0x0C: 1}, 0x0D, 1)
+    {13: 1}
+    >>> set_output({0x10: 3}, 0x11, 2)
+    {16: 1, 17: 2}
+    """
+    changed = dict(outputs)
+    if feature in _BASEBAND:
+        for excluded in _BASEBAND:  # switching either off switches both off
+            changed.pop(excluded, None)
+        _keep(changed, feature, control & _SWITCH, control & OutputControl.ON)
+    elif feature in MATRIX:
+        instances = _instances(control)
+        rival = _RIVALS[feature]
+        left = changed.get(rival, 0) & ~instances
+        _keep(changed, rival, left, left & _INSTANCES)
+        _keep(changed, feature, instances | control & MatrixControl.DEBUG_ROUTING, instances)
+    else:
+        _keep(changed, feature, control & _SWITCH, control & OutputControl.ON)
+    return changed
+
+
+def without_volatile(outputs: Mapping[int, int]) -> dict[int, int]:
+    """Return the table as a reset leaves it."""
+    return {feature: bits for feature, bits in outputs.items() if feature not in VOLATILE}
+
+
+_SWITCH = OutputControl.ON | OutputControl.DEBUG_ROUTING
+_INSTANCES = MatrixControl.SLOW | MatrixControl.FAST
+
+
+def _instances(control: int) -> int:
+    fast = MatrixControl.FAST if MatrixControl(control).fast else MatrixControl(0)
+    return int(control & MatrixControl.SLOW | fast)
+
+
+def _keep(table: dict[int, int], feature: int, bits: int, on: int) -> None:
+    table.pop(feature, None)
+    if on:
+        table[int(feature)] = int(bits)
+
+
+ZONE_LIMITS_M = (0.40, 9.40)
+"""Smallest start and largest end of a detection zone, module metres."""
+ZONE_SIZE_M = (0.20, 9.00)
+"""Smallest and largest size of a detection zone, module metres."""
+MAX_SENSITIVITY = 9
+_NOISE_MAP_BITS = (
+    NoiseMapControl.NO_DEFAULT | NoiseMapControl.ADAPTIVE | NoiseMapControl.IGNORE_STORED
+)
+_GRID_TOLERANCE = 1e-3
+"""Part of a grid step: float32 values that were read back are on the grid."""
+
+
+def snapped_zone(start_m: float, end_m: float) -> tuple[float, float]:
+    """Return a zone widened to the grid of the baseband bins, module metres.
+
+    Examples
+    --------
+    >>> [round(limit_m, 6) for limit_m in snapped_zone(0.4, 5.0)]
+    [0.385761, 5.015391]
+    """
+    step_m, origin_m = x4.BASEBAND_BIN_M, x4.DEFAULT_OFFSET_M
+    first = math.floor((start_m - origin_m) / step_m + _GRID_TOLERANCE)
+    last = math.ceil((end_m - origin_m) / step_m - _GRID_TOLERANCE)
+    return origin_m + first * step_m, origin_m + last * step_m
+
+
+@dataclass(slots=True, kw_only=True)
+class ProfileSettings:
+    """What one profile is set to; as shipped unless told otherwise.
+
+    Attributes
+    ----------
+    zone_m
+        Actual detection zone, start and end, on the grid [module metres].
+    sensitivity
+        0...9.
+    tx_center_frequency
+        Band: 3 low, 4 high.
+    led
+        `LedMode`.
+    noise_map_control
+        `NoiseMapControl` bits.
+    noise_map_interval_min
+        Interval at which the noise map is stored, 0 for never [min].
+    outputs
+        Control bits by message id; what is off is absent.
+    debug_outputs
+        The same for the debug line.
+    """
+
+    zone_m: tuple[float, float] = snapped_zone(*ZONE_LIMITS_M)
+    sensitivity: int = 5
+    tx_center_frequency: int = int(TxCenterFrequency.LOW_BAND)
+    led: int = int(LedMode.FULL)
+    noise_map_control: int = int(_NOISE_MAP_BITS)
+    noise_map_interval_min: int = 0
+    outputs: dict[int, int] = field(default_factory=lambda: {int(OutputFeature.PRESENCE_SINGLE): 1})
+    debug_outputs: dict[int, int] = field(default_factory=dict)
+
+    @classmethod
+    def shipped(cls, options: DeviceOptions) -> ProfileSettings:
+        """Return the settings a module leaves the factory with."""
+        return cls(outputs={int(options.default_output): 1})
+
+    def copy(self) -> ProfileSettings:
+        """Return settings that change independently."""
+        return replace(self, outputs=dict(self.outputs), debug_outputs=dict(self.debug_outputs))
+
+    def after_reset(self) -> ProfileSettings:
+        """Return a copy without the messages that every reset switches off."""
+        return replace(
+            self,
+            outputs=without_volatile(self.outputs),
+            debug_outputs=without_volatile(self.debug_outputs),
+        )
+
+    def set_zone(self, start_m: float, end_m: float, options: DeviceOptions) -> None:
+        """Choose the zone; what was read back of a zone may be written again."""
+        if not (math.isfinite(start_m) and math.isfinite(end_m)):
+            raise Refusal(options.bad_value_error)
+        lowest_m, highest_m = snapped_zone(*ZONE_LIMITS_M)
+        tolerance_m = _GRID_TOLERANCE * x4.BASEBAND_BIN_M
+        if abs(start_m - lowest_m) < tolerance_m:
+            start_m = ZONE_LIMITS_M[0]
+        if abs(end_m - highest_m) < tolerance_m:
+            end_m = ZONE_LIMITS_M[1]
+        start_m = _checked(start_m, *ZONE_LIMITS_M, options)
+        end_m = _checked(end_m, *ZONE_LIMITS_M, options)
+        if options.bad_value == "clamp":
+            end_m = max(end_m, start_m)
+            start_m = min(start_m, ZONE_LIMITS_M[1] - ZONE_SIZE_M[0])
+            end_m = max(end_m, start_m + ZONE_SIZE_M[0])
+        elif not ZONE_SIZE_M[0] - tolerance_m <= end_m - start_m:
+            raise Refusal(options.bad_value_error)
+        self.zone_m = snapped_zone(start_m, end_m)
+
+    def set_sensitivity(self, value: int, options: DeviceOptions) -> None:
+        """Choose the sensitivity, 0...9."""
+        self.sensitivity = int(_checked(value, 0, MAX_SENSITIVITY, options))
+
+    def set_band(self, value: int, options: DeviceOptions) -> None:
+        """Choose the band, 3 or 4."""
+        lowest, highest = TxCenterFrequency.LOW_BAND, TxCenterFrequency.HIGH_BAND
+        self.tx_center_frequency = int(_checked(value, lowest, highest, options))
+
+    def set_led(self, value: int, options: DeviceOptions) -> None:
+        """Choose what the LED shows, 0...2."""
+        self.led = int(_checked(value, LedMode.OFF, LedMode.FULL, options))
+
+    def set_noise_map_control(self, control: int) -> None:
+        """Choose where the noise map comes from; unknown bits are not kept."""
+        self.noise_map_control = int(control & _NOISE_MAP_BITS)
+
+    def set_output(self, feature: int, control: int) -> None:
+        """Switch a message, and with it those it excludes."""
+        self.outputs = set_output(self.outputs, feature, control)
+
+    def set_debug_output(self, feature: int, control: int) -> None:
+        """Switch a message of the debug line, and with it those it excludes."""
+        self.debug_outputs = set_output(self.debug_outputs, feature, control)
+
+
+def _checked(value: float, lowest: float, highest: float, options: DeviceOptions) -> float:
+    """Return a value within limits, or what the options say of one outside.
+
+    Limits are met in float32: 9.4 arrives as 9.3999996185.
+    """
+    tolerance = 1e-6 * max(abs(highest), 1.0)
+    if lowest - tolerance <= value <= highest + tolerance:
+        return min(max(value, lowest), highest)
+    if options.bad_value == "clamp":
+        return min(max(value, lowest), highest)
+    raise Refusal(options.bad_value_error)

@@ -1,0 +1,383 @@
+"""The unix socket of live control: lines in, lines out; `emulator.ports.control` says which.
+
+| verb | keys | does |
+|---|---|---|
+| state | | what every radar does: port, faults, playback |
+| fault add | fault, radar | arms a fault, written as in a scenario file |
+| fault list | radar | armed faults, and how often each was injected |
+| fault clear | id, radar | disarms one, or all |
+| unplug | radar, seconds | takes the port away, for good or for a while |
+| plug | radar | gives it back; the module starts anew |
+| reset | radar | restarts the module, as by its watchdog |
+| pause, resume | radar | of a playback |
+| rate | value, radar | multiple of real time; 0: as fast as the port takes it |
+| seek | seconds, radar | time of the recording |
+| loop | value, radar | true or false |
+| filter | kinds, radar | which kinds of messages are played; null: all |
+
+Without ``radar`` all are meant. The answer is ``{"ok":true,...}``, or
+``{"ok":false,"error":"..."}`` with the remedy. No I/O here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import selectors
+import socket
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from emulator.faults.faulty_device import FaultyDevice
+from emulator.faults.plan import FaultPlanError, parse_fault
+from emulator.playback import PlayStream, kinds
+from emulator.ports.pty import LinkError
+from emulator.ports.server import Service
+
+NS_PER_S = 1_000_000_000
+_LONGEST_S = 86_400.0 * 365
+_KEYS = ("verb", "radar", "fault", "id", "seconds", "value", "kinds")
+
+
+class _RefusedError(Exception):
+    """What was asked cannot be done; the message is the answer."""
+
+
+class Control:
+    """Carries out what is asked.
+
+    Parameters
+    ----------
+    devices
+        The radars by name.
+    players
+        Playbacks by the names of their radars.
+    """
+
+    def __init__(
+        self,
+        devices: Mapping[str, FaultyDevice],
+        players: Mapping[str, PlayStream] | None = None,
+    ) -> None:
+        self._devices = devices
+        self._players = {} if players is None else players
+
+    def answer(self, line: bytes, now_ns: int) -> bytes:
+        """Return the answer to a line, with its line end; never raises."""
+        try:
+            said = {"ok": True, **self._carry_out(line, now_ns)}
+        except (_RefusedError, FaultPlanError, ValueError) as error:
+            said = {"ok": False, "error": " ".join(str(error).split())}
+        return json.dumps(said, separators=(",", ":")).encode() + b"\n"
+
+    def _carry_out(self, line: bytes, now_ns: int) -> dict[str, Any]:
+        try:
+            asked = json.loads(line)
+        except (ValueError, RecursionError):
+            raise _RefusedError("a line must be one JSON object") from None
+        if not isinstance(asked, dict):
+            raise _RefusedError("a line must be one JSON object")
+        for key in asked:
+            if key not in _KEYS:
+                raise _RefusedError(f"{key}: unknown key; allowed are {', '.join(_KEYS)}")
+        verb = VERBS.get(str(asked.get("verb")))
+        if verb is None:
+            raise _RefusedError(f"verb: must be one of {', '.join(VERBS)}")
+        return verb(self, asked, now_ns)
+
+    def _named(self, asked: Mapping[str, Any]) -> list[FaultyDevice]:
+        name = asked.get("radar")
+        if name is None:
+            return list(self._devices.values())
+        if not isinstance(name, str) or name not in self._devices:
+            raise _RefusedError(f"radar: must be one of {', '.join(self._devices)}")
+        return [self._devices[name]]
+
+    def _played(self, asked: Mapping[str, Any]) -> list[PlayStream]:
+        names = [device.name for device in self._named(asked)]
+        players = [self._players[name] for name in names if name in self._players]
+        if not players:
+            raise _RefusedError("nothing is played here; this verb is for `xethru-emulator play`")
+        return players
+
+    # --- verbs ----------------------------------------------------------------------------------
+
+    def _state(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        return {
+            "t_ns": now_ns,
+            "radars": {
+                device.name: {
+                    "present": device.port_present(now_ns),
+                    "faults": _faults(device),
+                    "injected": device.injected_by_kind,
+                    "playback": self._playback(device.name, now_ns),
+                }
+                for device in self._named(asked)
+            },
+        }
+
+    def _playback(self, name: str, now_ns: int) -> dict[str, Any] | None:
+        player = self._players.get(name)
+        if player is None:
+            return None
+        state = player.state(now_ns)
+        return {
+            "playing": state.playing,
+            "paused": state.paused,
+            "position_s": state.position_ns / NS_PER_S,
+            "rate": state.rate,
+            "loop": state.loop,
+            "kinds": None if state.kinds is None else sorted(state.kinds),
+        }
+
+    def _fault_add(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        del now_ns
+        spec = parse_fault(asked.get("fault"))
+        chosen = [
+            device for device in self._named(asked) if not spec.radar or device.name in spec.radar
+        ]
+        if not chosen:
+            raise _RefusedError(f"fault.radar: must be some of {', '.join(self._devices)}")
+        return {"ids": {device.name: device.add(spec) for device in chosen}}
+
+    def _fault_list(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        del now_ns
+        return {"faults": {device.name: _faults(device) for device in self._named(asked)}}
+
+    def _fault_clear(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        del now_ns
+        number = asked.get("id")
+        if number is not None and (not isinstance(number, int) or isinstance(number, bool)):
+            raise _RefusedError("id: must be the number that `fault add` gave")
+        cleared = sum(device.clear(number) for device in self._named(asked))
+        if number is not None and not cleared:
+            raise _RefusedError(f"id: no armed fault has number {number}")
+        return {"cleared": cleared}
+
+    def _unplug(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        seconds = None if asked.get("seconds") is None else _number(asked, "seconds", _LONGEST_S)
+        for device in self._named(asked):
+            device.unplug(now_ns, None if seconds is None else round(seconds * NS_PER_S))
+        return {}
+
+    def _plug(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        for device in self._named(asked):
+            device.plug(now_ns)
+        return {}
+
+    def _reset(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        for device in self._named(asked):
+            device.restart(now_ns)
+        return {}
+
+    def _pause(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        for player in self._played(asked):
+            player.pause(now_ns)
+        return {}
+
+    def _resume(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        for player in self._played(asked):
+            player.resume(now_ns)
+        return {}
+
+    def _rate(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        rate = _number(asked, "value", 1e9)
+        for player in self._played(asked):
+            player.set_rate(rate, now_ns)
+        return {}
+
+    def _seek(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        position_ns = round(_number(asked, "seconds", _LONGEST_S) * NS_PER_S)
+        for player in self._played(asked):
+            player.seek(position_ns, now_ns)
+        return {}
+
+    def _loop(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        value = asked.get("value")
+        if not isinstance(value, bool):
+            raise _RefusedError("value: must be true or false")
+        for player in self._played(asked):
+            player.set_loop(value, now_ns)
+        return {}
+
+    def _filter(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+        names = asked.get("kinds")
+        if names is not None and not (
+            isinstance(names, list) and all(isinstance(name, str) for name in names)
+        ):
+            raise _RefusedError("kinds: must be a list of names, or null for all")
+        chosen = None if names is None else kinds(names)
+        for player in self._played(asked):
+            player.set_filter(chosen, now_ns)
+        return {}
+
+
+VERBS: dict[str, Callable[[Control, Mapping[str, Any], int], dict[str, Any]]] = {
+    "state": Control._state,
+    "fault add": Control._fault_add,
+    "fault list": Control._fault_list,
+    "fault clear": Control._fault_clear,
+    "unplug": Control._unplug,
+    "plug": Control._plug,
+    "reset": Control._reset,
+    "pause": Control._pause,
+    "resume": Control._resume,
+    "rate": Control._rate,
+    "seek": Control._seek,
+    "loop": Control._loop,
+    "filter": Control._filter,
+}
+"""What each verb does."""
+
+
+def _faults(device: FaultyDevice) -> list[dict[str, Any]]:
+    return [
+        {
+            "id": armed.number,
+            "kind": armed.kind.name,
+            "parameters": armed.parameters.model_dump(),
+            "injected": armed.firings,
+            "count": armed.spec.count,
+        }
+        for armed in device.armed
+    ]
+
+
+def _number(asked: Mapping[str, Any], key: str, most: float) -> float:
+    value = asked.get(key)
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | float)
+        or not 0 <= value <= most  # so not-a-number and infinity, too
+    ):
+        raise _RefusedError(f"{key}: must be a number from 0 to {most:g}")
+    return float(value)
+
+
+MOST_CLIENTS = 16
+LONGEST_LINE = 65_536
+"""Bytes; who sends more without a line end is hung up on."""
+MOST_UNREAD = 1 << 20
+"""Bytes of answers that wait for a client; then it is hung up on."""
+_READ = 65_536
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class _Client:
+    connection: socket.socket
+    asked: bytes = b""
+    unsent: bytes = b""
+    speaks: bool = True
+    watched: int = selectors.EVENT_READ
+
+
+class ControlSocket(Service):
+    """A listening unix socket, as a `Service` of the server's loop.
+
+    Parameters
+    ----------
+    path
+        Where the socket appears, readable by its owner only.
+    control
+        Carries out what is asked.
+
+    Raises
+    ------
+    LinkError
+        When the socket cannot be made.
+    """
+
+    def __init__(self, path: Path, control: Control) -> None:
+        self.path = path
+        self._control = control
+        self._clients: list[_Client] = []
+        self._selector: selectors.BaseSelector | None = None
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            if path.is_socket():
+                path.unlink()  # left behind by a killed emulator: the directory is ours
+            self._listener.bind(os.fspath(path))
+            path.chmod(0o600)
+            self._listener.listen()
+            self._listener.setblocking(False)
+        except OSError as error:
+            self._listener.close()
+            reason = error.strerror or str(error)
+            raise LinkError(f"{path}: cannot offer the control socket: {reason}") from error
+
+    def register(self, selector: selectors.BaseSelector) -> None:
+        """Register with the loop."""
+        self._selector = selector
+        selector.register(self._listener, selectors.EVENT_READ, self._accept)
+
+    def close(self) -> None:
+        """Close everything and remove the socket; the loop may be gone."""
+        self._selector = None
+        for client in list(self._clients):
+            self._drop(client)
+        with contextlib.suppress(OSError):
+            self.path.unlink()
+        self._listener.close()
+
+    def _accept(self, events: int, now_ns: int) -> None:
+        del events, now_ns
+        try:
+            connection, _ = self._listener.accept()
+        except OSError:
+            return  # the client gave up, or descriptors have run out
+        connection.setblocking(False)
+        if len(self._clients) >= MOST_CLIENTS or self._selector is None:
+            connection.close()
+            return
+        client = _Client(connection=connection)
+        self._clients.append(client)
+
+        def ready(events: int, now_ns: int) -> None:
+            if events & selectors.EVENT_READ:
+                self._read(client, now_ns)
+            self._write(client)
+
+        self._selector.register(connection, selectors.EVENT_READ, ready)
+
+    def _read(self, client: _Client, now_ns: int) -> None:
+        try:
+            data = client.connection.recv(_READ)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        client.speaks = bool(data)
+        *lines, client.asked = (client.asked + data).split(b"\n")
+        for line in lines:
+            if line.strip():
+                client.unsent += self._control.answer(line, now_ns)
+        if len(client.asked) > LONGEST_LINE or len(client.unsent) > MOST_UNREAD:
+            client.speaks, client.unsent = False, b""
+
+    def _write(self, client: _Client) -> None:
+        if client not in self._clients:
+            return
+        try:
+            client.unsent = client.unsent[client.connection.send(client.unsent) :]
+        except BlockingIOError:
+            pass
+        except OSError:
+            client.speaks, client.unsent = False, b""
+        if not client.speaks and not client.unsent:
+            self._drop(client)
+            return
+        wanted = selectors.EVENT_READ if client.speaks else 0
+        wanted |= selectors.EVENT_WRITE if client.unsent else 0
+        if self._selector is not None and wanted != client.watched:
+            key = self._selector.get_key(client.connection)
+            self._selector.modify(client.connection, wanted, key.data)
+            client.watched = wanted
+
+    def _drop(self, client: _Client) -> None:
+        if self._selector is not None:
+            self._selector.unregister(client.connection)
+        client.connection.close()
+        self._clients.remove(client)

@@ -1,0 +1,315 @@
+"""Folders of a running emulator: links and sockets, where it announces itself, saved flash.
+
+The run directory (`xethru_protocol.transport.run_directory`) holds one ``<pid>.json`` per running
+emulator: its ready line with a ``pid`` added; and the ports of those that were given no directory.
+What belongs to a process that is gone is stale, and removed by the next emulator that starts.
+
+A document is replaced as a whole, so that a crash of the emulator leaves the old one or the new
+one. What cannot be read is told in one line and left alone until the module saves; the module
+starts as shipped.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import shutil
+import stat
+import tempfile
+from base64 import b64decode, b64encode
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from emulator.module.memory import MAX_FILES, SavedState
+from emulator.module.modes import Start, State
+from emulator.module.settings import ProfileSettings
+from emulator.ports.pty import LinkError
+from xethru_protocol.system import PathInUseError, locked
+from xethru_protocol.transport import is_running, run_directory
+
+_PORTS = "ports-"
+
+
+def fresh_port_folder() -> Path:
+    """Create an empty directory for the ports of this process."""
+    return Path(tempfile.mkdtemp(prefix=f"{_PORTS}{os.getpid()}-", dir=_private_run_directory()))
+
+
+def _private_run_directory() -> Path | None:
+    """Create the folder; None when it cannot be made or belongs to somebody else."""
+    folder = run_directory()
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        status = folder.lstat()
+    except OSError:
+        return None
+    return folder if stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() else None
+
+
+class Announcement:
+    """The entry of this process, until closed.
+
+    Without a usable folder nothing is announced: the ports work all the same.
+    """
+
+    def __init__(self, ready: dict[str, Any]) -> None:
+        self._path: Path | None = None
+        folder = _private_run_directory()
+        if folder is None:
+            return
+        _remove_stale(folder)
+        self._path = folder / f"{os.getpid()}.json"
+        self.update(ready)
+
+    def update(self, ready: dict[str, Any]) -> None:
+        """Say something else from now on; who reads it sees the old word or the new one."""
+        if self._path is None:
+            return
+        with contextlib.suppress(OSError):
+            fresh = self._path.with_suffix(".new")
+            fresh.write_text(json.dumps({"pid": os.getpid(), **ready}) + "\n")
+            fresh.replace(self._path)
+
+    def close(self) -> None:
+        """Remove the entry."""
+        if self._path is not None:
+            with contextlib.suppress(OSError):
+                self._path.unlink()
+            self._path = None
+
+
+def _remove_stale(folder: Path) -> None:
+    # one that was killed while it wrote leaves a .new
+    for entry in (*folder.glob("*.json"), *folder.glob("*.new")):
+        if _is_dead(entry.stem):
+            with contextlib.suppress(OSError):
+                entry.unlink()
+    for ports in folder.glob(f"{_PORTS}*"):
+        if _is_dead(ports.name.removeprefix(_PORTS).partition("-")[0]):
+            shutil.rmtree(ports, ignore_errors=True)
+
+
+def _is_dead(pid: str) -> bool:
+    # What bears no process number is not ours: leave it alone.
+    return pid.isdigit() and not is_running(int(pid))
+
+
+LONGEST_SOCKET_PATH = 100  # bytes; Linux takes 107, macOS 103
+
+
+@contextlib.contextmanager
+def link_folder(wanted: Path | None) -> Iterator[Path]:
+    """Provide the directory of the links; remove it afterwards if we made it and it is empty.
+
+    A given directory serves one running emulator: a second one would take its names over.
+    """
+    if wanted is None:
+        folder = fresh_port_folder()
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+        return
+    existed = wanted.exists()
+    with contextlib.ExitStack() as held:
+        try:
+            wanted.mkdir(parents=True, exist_ok=True)
+            held.enter_context(locked(wanted))
+        except OSError as error:
+            raise LinkError(
+                f"{wanted}: cannot make the link directory: {error.strerror}"
+            ) from error
+        except PathInUseError as error:
+            raise LinkError(
+                f"{wanted}: a running emulator has its links there; choose another --link-dir"
+            ) from error
+        try:
+            yield wanted.absolute()
+        finally:
+            if not existed:
+                with contextlib.suppress(OSError):  # somebody else uses it too
+                    wanted.rmdir()
+
+
+def socket_path(folder: Path, cleanup: contextlib.ExitStack, name: str) -> Path:
+    """Return where a socket goes: among the links, if the kernel takes such a path."""
+    path = folder / name
+    if _fits(path):
+        return path
+    for parent in (tempfile.gettempdir(), "/tmp"):  # the former may be as long
+        if _fits(Path(parent) / "xethru-12345678" / name):
+            with contextlib.suppress(OSError):
+                short = Path(tempfile.mkdtemp(prefix="xethru-", dir=parent))
+                cleanup.callback(shutil.rmtree, short, ignore_errors=True)
+                return short / name
+    raise LinkError(
+        f"{path}: too long for the {path.stem} socket, {LONGEST_SOCKET_PATH} bytes at most; "
+        "choose a shorter --link-dir or TMPDIR"
+    )
+
+
+def _fits(path: Path) -> bool:
+    return len(os.fsencode(path)) <= LONGEST_SOCKET_PATH
+
+
+U32 = Annotated[int, Field(ge=0, lt=1 << 32)]
+
+
+class _Document(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+
+class _Profile(_Document):
+    profile_id: U32
+    zone_m: list[Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]] = Field(
+        min_length=2, max_length=2
+    )
+    sensitivity: int = Field(ge=0, le=9)
+    tx_center_frequency: int = Field(ge=3, le=4)
+    led: int = Field(ge=0, le=2)
+    noise_map_control: int = Field(ge=0, le=7)
+    noise_map_interval_min: int = Field(ge=0, lt=1 << 31)
+    outputs: list[tuple[U32, U32]]
+    debug_outputs: list[tuple[U32, U32]]
+
+
+class _File(_Document):
+    type: U32
+    identifier: U32
+    base64: str
+
+
+class _State(_Document):
+    format: Literal["xethru-emulator state"] = "xethru-emulator state"
+    version: Literal[1] = 1
+    serial: str
+    start: Literal["RUN", "LOADED", "STOPPED"]
+    profile_id: U32
+    profiles: list[_Profile]
+    files: list[_File] = Field(max_length=MAX_FILES)
+    parameter_file_name: str
+    certification: bool
+
+
+def make_state_directory(directory: Path) -> None:
+    """Make a directory of states, if it is missing.
+
+    Raises
+    ------
+    OSError
+        When nothing could be kept there: told before the start, not at the first save.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    if not os.access(directory, os.R_OK | os.W_OK | os.X_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+
+class DirectoryMemory:
+    """Keeps the flash of one module in a directory.
+
+    Parameters
+    ----------
+    directory
+        Where the documents of all modules are; made if it is missing.
+    serial
+        Serial number of this module, the name of its document.
+    warn
+        Called with one line about what cannot be read or written.
+    """
+
+    def __init__(self, directory: Path, serial: str, warn: Callable[[str], None]) -> None:
+        self._path = directory / f"{serial}.json"
+        self._serial = serial
+        self._warn = warn
+        self._last: SavedState | None = None
+
+    def load(self) -> SavedState | None:
+        """Return what was saved; None, after one line, if it is unreadable or another's."""
+        try:
+            state = _State.model_validate_json(self._path.read_bytes(), strict=False)
+            if state.serial != self._serial:
+                raise ValueError(f"it is of module {state.serial}")
+            return _saved(state)
+        except FileNotFoundError:
+            return None
+        except ValidationError as error:
+            reason = error.errors()[0]["msg"]
+        except (OSError, ValueError) as error:
+            reason = str(error)
+        self._warn(f"{self._path}: not the state of this module, which starts new: {reason}")
+        return None
+
+    def save(self, state: SavedState) -> None:
+        """Replace the document, if anything changed."""
+        if state == self._last:
+            return
+        self._last = state
+        text = _document(state, self._serial).model_dump_json(indent=1)
+        unfinished = self._path.with_name(f".{self._path.name}.{os.getpid()}")
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            unfinished.write_text(text)
+            os.replace(unfinished, self._path)
+        except OSError as error:
+            self._warn(f"{self._path}: the state of the module is not kept: {error}")
+            with suppress(OSError):
+                unfinished.unlink(missing_ok=True)
+
+
+def _document(state: SavedState, serial: str) -> _State:
+    return _State(
+        serial=serial,
+        start=state.start.state.name,  # type: ignore[arg-type] # the model checks it
+        profile_id=state.start.profile_id,
+        profiles=[
+            _Profile(
+                profile_id=profile_id,
+                zone_m=list(settings.zone_m),
+                sensitivity=settings.sensitivity,
+                tx_center_frequency=settings.tx_center_frequency,
+                led=settings.led,
+                noise_map_control=settings.noise_map_control,
+                noise_map_interval_min=settings.noise_map_interval_min,
+                outputs=list(settings.outputs.items()),
+                debug_outputs=list(settings.debug_outputs.items()),
+            )
+            for profile_id, settings in state.profiles.items()
+        ],
+        files=[
+            _File(type=kind, identifier=identifier, base64=b64encode(data).decode("ascii"))
+            for (kind, identifier), data in state.files.items()
+        ],
+        parameter_file_name=state.parameter_file_name,
+        certification=state.certification,
+    )
+
+
+def _saved(state: _State) -> SavedState:
+    return SavedState(
+        start=Start(state=State[state.start], profile_id=state.profile_id),
+        profiles={
+            profile.profile_id: ProfileSettings(
+                zone_m=(profile.zone_m[0], profile.zone_m[1]),
+                sensitivity=profile.sensitivity,
+                tx_center_frequency=profile.tx_center_frequency,
+                led=profile.led,
+                noise_map_control=profile.noise_map_control,
+                noise_map_interval_min=profile.noise_map_interval_min,
+                outputs=dict(profile.outputs),
+                debug_outputs=dict(profile.debug_outputs),
+            )
+            for profile in state.profiles
+        },
+        files={
+            (file.type, file.identifier): b64decode(file.base64, validate=True)
+            for file in state.files
+        },
+        parameter_file_name=state.parameter_file_name,
+        certification=state.certification,
+    )

@@ -1,0 +1,368 @@
+"""Which lines lead to each emulated module, and what they are called.
+
+A module talks to one host at a time. While a guest is connected, the port is deaf and dumb: what a
+host writes there is lost, as on a line that leads nowhere.
+
+What a host sees is what a real unplug shows: its open port hangs up, the name is gone; later there
+is a fresh port, under the same name or another one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import selectors
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from emulator.module.settings import DEFAULT_BAUDRATE
+from emulator.ports.lines import UartLine, UsbLine
+from emulator.ports.pty import LinkError, PortWatch, PtyLink
+from emulator.ports.server import ByteDevice, Port, Service
+from emulator.ports.tcp import TcpLink
+
+
+class SharedDevice:
+    """A device and who has it.
+
+    Parameters
+    ----------
+    device
+        The module.
+
+    Attributes
+    ----------
+    port, guest
+        The two sides, each a `emulator.ports.server.ByteDevice`.
+    guest_present
+        Whether the guest has the module.
+    """
+
+    def __init__(self, device: ByteDevice) -> None:
+        self.device = device
+        self.guest_present = False
+        self.port = DeviceSide(self, guest=False)
+        self.guest = DeviceSide(self, guest=True)
+
+
+class DeviceSide:
+    """The module as one of its two lines sees it."""
+
+    def __init__(self, shared: SharedDevice, *, guest: bool) -> None:
+        self._shared = shared
+        self._guest = guest
+
+    @property
+    def wants_data(self) -> bool:
+        """Whether to read from the host; what is read without having the module is thrown away."""
+        return not self._has_it or self._shared.device.wants_data
+
+    def receive_data(self, data: bytes, now_ns: int) -> None:
+        """Take bytes from the host."""
+        if self._has_it:
+            self._shared.device.receive_data(data, now_ns)
+
+    def advance(self, now_ns: int) -> None:
+        """Let time pass, whoever has the module."""
+        self._shared.device.advance(now_ns)
+
+    def next_packet(self, now_ns: int) -> bytes | None:
+        """Return the next packet to send now; None without the module."""
+        return self._shared.device.next_packet(now_ns) if self._has_it else None
+
+    def wake_ns(self, now_ns: int) -> int | None:
+        """Return when time alone changes something; None without the module."""
+        return self._shared.device.wake_ns(now_ns) if self._has_it else None
+
+    @property
+    def _has_it(self) -> bool:
+        return self._shared.guest_present is self._guest
+
+
+LOOK_AGAIN_NS = 20_000_000
+"""How often to look whether the port is back; a host looks less often."""
+
+
+class Plug(Service):
+    """Takes the lines to one module away and brings them back: a service of the loop.
+
+    Parameters
+    ----------
+    link
+        The module's pseudo-terminal.
+    present
+        Whether the module's own port is there at a time, ns.
+    tcp
+        Its TCP port; a client is hung up on, and none admitted before the module is back.
+    watch
+        Who has the terminal open.
+    renames
+        Whether it returns under another name every time: NAME-2, NAME-3 and so on, so that a host
+        finds the module by its serial number only.
+    moved
+        Called when the port is back.
+
+    Attributes
+    ----------
+    pulled
+        Set to take the port away, whatever the module does, and unset to allow it back.
+    """
+
+    def __init__(
+        self,
+        link: PtyLink,
+        present: Callable[[int], bool],
+        *,
+        tcp: TcpLink | None = None,
+        watch: PortWatch | None = None,
+        renames: bool = False,
+        moved: Callable[[], None],
+    ) -> None:
+        self._link = link
+        self._present = present
+        self._tcp = tcp
+        self._watch = watch
+        self._first_path = link.path
+        self._renames = renames
+        self._returns = 0
+        self._moved = moved
+        self._selector: selectors.BaseSelector | None = None
+        self.pulled = False
+
+    @property
+    def is_in(self) -> bool:
+        """Whether the port is there."""
+        return self._link.fileno() >= 0
+
+    def register(self, selector: selectors.BaseSelector) -> None:
+        """Remember the loop's selector: a port that goes away is no longer waited for."""
+        self._selector = selector
+
+    def advance(self, now_ns: int) -> None:
+        """Take the port away, or bring it back, when the time has come."""
+        wanted = self._present(now_ns) and not self.pulled
+        if self.is_in and not wanted:
+            self._take_away()
+        elif wanted and not self.is_in:
+            self._bring_back()
+
+    def wake_ns(self, now_ns: int) -> int | None:
+        """Return when to look again; None while the port is there and nothing says when it goes."""
+        return None if self.is_in else now_ns + LOOK_AGAIN_NS
+
+    def _take_away(self) -> None:
+        if self._selector is not None:
+            with contextlib.suppress(KeyError):  # not waited for just now
+                self._selector.unregister(self._link.fileno())
+        self._link.close()
+        if self._tcp is not None:
+            self._tcp.hang_up()
+
+    def _bring_back(self) -> None:
+        path: Path = self._first_path
+        if self._renames:
+            path = path.with_name(f"{path.name}-{self._returns + 2}")
+        try:
+            self._link.reopen(path)
+        except LinkError:
+            return  # no terminal is free, or a file is in the way: look again
+        self._returns += 1
+        if self._watch is not None:
+            self._watch.follow(self._link.terminal)
+        self._moved()
+
+
+def _power_up_baud() -> int:
+    return DEFAULT_BAUDRATE
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NamedDevice:
+    """A device and what the ready line says about it.
+
+    Attributes
+    ----------
+    name, serial
+        For the ready line.
+    device
+        The module.
+    start_skew_ns
+        Scene time at which it takes the frame of counter 0; None where nobody knows.
+    present
+        Whether its own port is there at a time, ns; None if it always is.
+    uart_baud
+        The rate of its UART now, bit/s.
+    """
+
+    name: str
+    serial: str
+    device: ByteDevice
+    start_skew_ns: int | None = None
+    present: Callable[[int], bool] | None = None
+    uart_baud: Callable[[], int] = _power_up_baud
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkOptions:
+    """What leads to the modules beside or instead of a plain pseudo-terminal.
+
+    Attributes
+    ----------
+    kind
+        What the module is connected by.
+    usb_latency_ns
+        How long USB transfers of at most 512 bytes are under way; None: bytes pass at once.
+    host_baud
+        Rate of the host's side of a UART, bit/s; None: what it sets its terminal to, and for a
+        TCP client the module's.
+    port_on_reset
+        Whether a restart keeps the port, takes it away for a while, or has it return under
+        another name.
+    tcp_base
+        TCP port of the first module, the others' follow; 0: any that are free; None: no TCP.
+    tcp_host
+        Address to listen at.
+    """
+
+    kind: Literal["usb", "uart"] = "usb"
+    usb_latency_ns: int | None = None
+    host_baud: int | None = None
+    port_on_reset: Literal["stay", "vanish", "rename"] = "stay"
+    tcp_base: int | None = None
+    tcp_host: str = "127.0.0.1"
+
+
+def _nothing_moved() -> None:
+    """Nobody wants to know that a port came back."""
+
+
+@dataclass(slots=True, kw_only=True)
+class DevicePorts:
+    """Everything that leads to the modules of one emulator.
+
+    Attributes
+    ----------
+    ports
+        For the server's loop.
+    services
+        Likewise.
+    plugs
+        What takes the ports away, by the modules' names.
+    moved
+        Called when a port came back, maybe under another name.
+    """
+
+    ports: list[Port] = field(default_factory=list)
+    services: list[Service] = field(default_factory=list)
+    plugs: dict[str, Plug] = field(default_factory=dict)
+    moved: Callable[[], None] = _nothing_moved
+    _words: list[tuple[NamedDevice, PtyLink, TcpLink | None]] = field(default_factory=list)
+
+    def entries(self) -> list[dict[str, object]]:
+        """Return what the ready line says about the modules."""
+        return [
+            {
+                "name": named.name,
+                "path": os.fspath(link.path),
+                "serial": named.serial,
+                "start_skew_ns": named.start_skew_ns,
+                "tcp": None if tcp is None else tcp.port,
+            }
+            for named, link, tcp in self._words
+        ]
+
+    def add(
+        self,
+        named: NamedDevice,
+        path: Path,
+        tcp_port: int | None,
+        options: LinkOptions,
+        cleanup: contextlib.ExitStack,
+    ) -> None:
+        """Open the lines to one more module.
+
+        Raises
+        ------
+        LinkError
+            When one cannot be had.
+        """
+        line = _line(named, options)
+        flushed = line.flush_output if isinstance(line, UartLine) else None
+        link = cleanup.enter_context(PtyLink(path, flushed=flushed))
+        if isinstance(line, UartLine) and options.host_baud is None:
+            line.host_baud = link.host_baud
+        tcp, watch, device = None, None, named.device
+        if tcp_port is not None:
+            watch = PortWatch(link.terminal, opened=_unheard, closed=_unheard)
+            cleanup.callback(watch.close)
+            shared = SharedDevice(device)
+            tcp = _tcp_link(shared, link, watch, tcp_port, options)
+            cleanup.callback(tcp.close)
+            device = shared.port
+            self.ports.append(Port(tcp, shared.guest, _line(named, options)))
+            self.services += [watch, tcp]
+        self.ports.append(Port(link, device, line))
+        plug = Plug(
+            link,
+            named.present or _always,
+            tcp=tcp,
+            watch=watch,
+            renames=options.port_on_reset == "rename",
+            moved=lambda: self.moved(),
+        )
+        self.services.append(plug)
+        self.plugs[named.name] = plug
+        self._words.append((named, link, tcp))
+
+
+def open_ports(
+    devices: Sequence[NamedDevice],
+    folder: Path,
+    options: LinkOptions,
+    cleanup: contextlib.ExitStack,
+) -> DevicePorts:
+    """Open the lines to all modules; what was opened is closed with ``cleanup``.
+
+    Raises
+    ------
+    LinkError
+        When one cannot be had.
+    """
+    opened = DevicePorts()
+    for index, named in enumerate(devices):
+        base = options.tcp_base
+        tcp_port = base + index if base else base
+        opened.add(named, folder / named.name, tcp_port, options, cleanup)
+    return opened
+
+
+def _line(named: NamedDevice, options: LinkOptions) -> UsbLine | UartLine | None:
+    if options.kind == "uart":
+        return UartLine(named.uart_baud, lambda: options.host_baud)
+    return None if options.usb_latency_ns is None else UsbLine(options.usb_latency_ns)
+
+
+def _tcp_link(
+    shared: SharedDevice, link: PtyLink, watch: PortWatch, tcp_port: int, options: LinkOptions
+) -> TcpLink:
+    def set_guest(present: bool) -> None:
+        shared.guest_present = present
+
+    return TcpLink(
+        options.tcp_host,
+        tcp_port,
+        admits=lambda: link.fileno() >= 0 and not watch.in_use,
+        came=lambda: set_guest(True),
+        left=lambda: set_guest(False),
+    )
+
+
+def _unheard(now_ns: int) -> None:
+    """Who opens a terminal matters only when somebody else wants the module."""
+
+
+def _always(now_ns: int) -> bool:
+    del now_ns
+    return True

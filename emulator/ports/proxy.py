@@ -1,0 +1,214 @@
+"""A real module behind a pseudo-terminal: its bytes pass through, spoiled only if faults are armed.
+
+The module's bytes are cut into packets on their way, because faults are of packets; what stays
+incomplete for 50 ms goes on as it is. Nothing is added, removed or reordered by that.
+"""
+
+from __future__ import annotations
+
+import os
+import selectors
+import termios
+import tty
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+from emulator.ports.pty import LinkError
+from emulator.ports.server import Service
+from xethru_protocol.wire.framing import Direction, NeedData, PacketReader
+
+__all__ = ["ModuleLine", "open_module"]
+
+Tap = Callable[[Literal["rx", "tx"], bytes], None]
+HOLD_NS = 50_000_000
+"""How long an incomplete packet waits for the rest of it."""
+MOST_UNSENT = 65_536
+MOST_WAITING = 1 << 20
+_READ = 65_536
+
+
+class ModuleLine(Service):
+    """A module's port as a device, and as a `Service` of the server's loop.
+
+    Parameters
+    ----------
+    descriptor
+        Non-blocking, of the open port; closed by `close`.
+    tap
+        Called with the direction and every chunk of bytes as they pass the port.
+    gone
+        Called once when the port vanished.
+    """
+
+    def __init__(self, descriptor: int, tap: Tap, gone: Callable[[], None]) -> None:
+        self._descriptor = descriptor
+        self._tap = tap
+        self._gone = gone
+        self._selector: selectors.BaseSelector | None = None
+        self._watched = selectors.EVENT_READ
+        self._unsent = b""
+        self._reader = PacketReader(Direction.FROM_MODULE)
+        self._unjudged = bytearray()
+        self._passed = 0  # bytes of it that went on before they were judged
+        self._since_ns: int | None = None
+        self._packets: deque[bytes] = deque()
+        self._waiting = 0
+        self._alive = True
+
+    # --- as a device ----------------------------------------------------------------------------
+
+    @property
+    def wants_data(self) -> bool:
+        """Whether the port has taken what came before."""
+        return len(self._unsent) < MOST_UNSENT
+
+    def receive_data(self, data: bytes, now_ns: int) -> None:
+        """Send bytes to the module."""
+        del now_ns
+        if not self._alive or not data:
+            return
+        self._tap("tx", data)
+        self._unsent += data
+        self._write()
+
+    def advance(self, now_ns: int) -> None:
+        """Let what stays incomplete go on."""
+        if self._since_ns is not None and now_ns - self._since_ns >= HOLD_NS:
+            self._put(bytes(self._unjudged[self._passed :]))
+            self._passed = len(self._unjudged)
+            self._since_ns = None
+
+    def next_packet(self, now_ns: int) -> bytes | None:
+        """Return what the module sent next."""
+        del now_ns
+        if not self._packets:
+            return None
+        packet = self._packets.popleft()
+        self._waiting -= len(packet)
+        self._watch()
+        return packet
+
+    def wake_ns(self, now_ns: int) -> int | None:
+        """Return when what is incomplete has waited long enough."""
+        del now_ns
+        return None if self._since_ns is None else self._since_ns + HOLD_NS
+
+    def port_opened(self, now_ns: int) -> None:
+        """Change nothing: the module does not see who uses the proxy."""
+
+    def port_closed(self, now_ns: int) -> None:
+        """Change nothing."""
+
+    def port_present(self, now_ns: int) -> bool:
+        """Whether the module's own port is there."""
+        del now_ns
+        return self._alive
+
+    # --- as a service ---------------------------------------------------------------------------
+
+    def register(self, selector: selectors.BaseSelector) -> None:
+        """Register the module's port with the loop."""
+        self._selector = selector
+        selector.register(self._descriptor, selectors.EVENT_READ, self._ready)
+
+    def close(self) -> None:
+        """Close the port; the loop may be gone."""
+        self._selector = None
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+    def _ready(self, events: int, now_ns: int) -> None:
+        if events & selectors.EVENT_WRITE:
+            self._write()
+        if events & selectors.EVENT_READ:
+            self._read(now_ns)
+
+    def _read(self, now_ns: int) -> None:
+        try:
+            data = os.read(self._descriptor, _READ)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self._lost()
+            return
+        self._tap("rx", data)
+        self._unjudged += data
+        self._reader.receive_data(data)
+        while not isinstance(self._reader.next_packet(), NeedData):
+            end = len(self._unjudged) - self._reader.buffered
+            self._put(bytes(self._unjudged[self._passed : end]))
+            self._passed = max(self._passed - end, 0)
+            del self._unjudged[:end]
+        self._since_ns = now_ns if len(self._unjudged) > self._passed else None
+        self._watch()
+
+    def _put(self, data: bytes) -> None:
+        if data:
+            self._packets.append(data)
+            self._waiting += len(data)
+
+    def _write(self) -> None:
+        try:
+            self._unsent = self._unsent[os.write(self._descriptor, self._unsent) :]
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._lost()
+            return
+        self._watch()
+
+    def _watch(self) -> None:
+        """Wait for room when there is something to send, for bytes while they are taken."""
+        if self._selector is None or not self._alive:
+            return
+        wanted = selectors.EVENT_WRITE if self._unsent else 0
+        wanted |= selectors.EVENT_READ if self._waiting < MOST_WAITING else 0
+        if wanted == self._watched:
+            return
+        if not wanted:
+            self._selector.unregister(self._descriptor)
+        elif self._watched:
+            self._selector.modify(self._descriptor, wanted, self._ready)
+        else:
+            self._selector.register(self._descriptor, wanted, self._ready)
+        self._watched = wanted
+
+    def _lost(self) -> None:
+        if self._selector is not None and self._watched:
+            self._selector.unregister(self._descriptor)
+        self._watched = 0
+        self._alive = False
+        self._unsent = b""
+        self._gone()
+
+
+def open_module(path: Path, baud: int) -> int:
+    """Open a serial port, raw, and return its descriptor.
+
+    Raises
+    ------
+    LinkError
+        When it cannot be opened or set up.
+    """
+    speed = getattr(termios, f"B{baud}", None)
+    if speed is None:
+        raise LinkError(f"{path}: {baud} baud is no rate of this system's serial ports")
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    except OSError as error:
+        raise LinkError(f"{path}: cannot open the port: {error.strerror}") from error
+    try:
+        tty.setraw(descriptor)
+        settings = termios.tcgetattr(descriptor)
+        settings[4] = settings[5] = speed
+        termios.tcsetattr(descriptor, termios.TCSANOW, settings)
+        termios.tcflush(descriptor, termios.TCIOFLUSH)
+    except termios.error as error:
+        os.close(descriptor)
+        raise LinkError(f"{path}: is no serial port: {error.args[-1]}") from error
+    return descriptor

@@ -1,0 +1,485 @@
+"""Scene files: who stands where, how the robot drives, what its radars and wheels are like.
+
+Lengths are true metres, angles degrees, amplitudes normalised X4 units (full scale of the 11 bit
+DAC is +-1). What each number does to an echo is on the model page, ``emulator.echo.echo``; to the
+odometry, in ``emulator.scene.wheels``.
+
+A scene is TOML that a person reads and writes; ``load_scene`` turns it into frozen, validated
+models or one :class:`SceneError` line naming file, key and what is allowed. Lengths are true
+metres, angles in the file degrees, amplitudes normalised X4 units (full scale of the 11 bit DAC
+is +-1). Nothing here computes echoes or odometry.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StrictBool,
+    StrictFloat,
+    StrictInt,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+
+from emulator.chip.clock import ModuleClock
+from emulator.scene.motion import AMPLITUDE_OF_1_M2, PersonSpec, Trajectory, carried, drive
+from xethru_protocol.system import read_bounded
+
+MIRROR_AMPLITUDE_1M = AMPLITUDE_OF_1_M2 * math.sqrt(math.pi)
+"""Echo of a large perfect mirror on boresight at 1 m: 0.106, as strong as pi R**2 at R."""
+SHORTEST_FACE_M = 0.01
+
+
+def _finite(value: object) -> object:
+    """Refuse TOML's inf and nan with words a person can act on."""
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError("must be a finite number")
+    return value
+
+
+Metres = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-1000, le=1000)]
+Degrees = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-360, le=360)]
+Sigma = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=1)]
+Seconds = Annotated[StrictFloat, BeforeValidator(_finite), Field(gt=0, le=86_400)]
+CorrelationTime = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=1e-3, le=86_400)]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
+
+
+class Table(BaseModel):
+    """One TOML table: frozen, and an unknown key is an error."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class RadarSpec(Table):
+    """One X4M300 on the robot.
+
+    ``x_m``, ``y_m`` and ``yaw_deg`` place the antennas' phase centre and boresight in the body
+    frame (x forward, y left, yaw counter-clockwise). ``range_offset_m`` is added to every true
+    range (the module's own delay error; positive reads too far). ``gain_db`` is the error of its
+    receiver's gain: it scales echoes, leakage and clutter, not the counts. ``start_skew_ms`` is
+    how much later than the nominal scene time of counter 0 this radar samples, and ``clock_ppm``
+    how fast its clock is: its frames come earlier and its bins are shorter
+    (``emulator.chip.clock``).
+    """
+
+    name: Name
+    serial: Annotated[str, Field(pattern=r"^[0-9]{12}$")]
+    x_m: Metres
+    y_m: Metres
+    yaw_deg: Degrees
+    range_offset_m: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-1, le=1)] = 0.0
+    gain_db: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-40, le=40)] = 0.0
+    start_skew_ms: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=10_000)] = 0.0
+    clock_ppm: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-1000, le=1000)] = 0.0
+
+    @property
+    def clock(self) -> ModuleClock:
+        """Return the clock that this module's skew and error make."""
+        return ModuleClock(skew_ns=round(self.start_skew_ms * 1e6), ppm=self.clock_ppm)
+
+
+class TargetSpec(Table):
+    """One reflector, in the world frame.
+
+    ``kind`` selects the amplitude law: a ``rod`` falls with R**-1.5, a ``point`` with R**-2, and
+    a ``cylinder`` of ``radius_m`` is seen at the point of its surface nearest to the radar.
+    ``amplitude_1m`` is the echo's amplitude on boresight at 1 m (of a cylinder: 1 m from its
+    surface). The reflection phase is fixed by the name (``emulator.echo.echo``).
+    """
+
+    name: Name
+    kind: Literal["rod", "point", "cylinder"]
+    x_m: Metres
+    y_m: Metres
+    amplitude_1m: Annotated[StrictFloat, BeforeValidator(_finite), Field(gt=0, le=10)] = 0.015
+    radius_m: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=10)] = 0.0
+
+    @model_validator(mode="after")
+    def _radius_belongs_to_a_cylinder(self) -> TargetSpec:
+        if (self.kind == "cylinder") != (self.radius_m > 0):
+            raise ValueError(
+                "radius_m: a cylinder needs one greater than 0, a rod or a point has none"
+            )
+        return self
+
+
+class _Surface(Table):
+    """What walls and boxes are made of.
+
+    ``amplitude_1m`` is the echo of a large flat one on boresight at 1 m; it falls with R**-1, and
+    a perfect mirror's is ``MIRROR_AMPLITUDE_1M``. ``transmission`` is the factor on the
+    amplitude of what passes through, one way. What is reflected and what passes cannot carry
+    more than what arrives.
+    """
+
+    amplitude_1m: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=1)] = 0.035
+    transmission: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=1)] = 0.0
+
+    @property
+    def reflection(self) -> float:
+        """Return the magnitude of the reflection coefficient, 0 ... 1."""
+        return self.amplitude_1m / MIRROR_AMPLITUDE_1M
+
+    @model_validator(mode="after")
+    def _creates_no_energy(self) -> _Surface:
+        most = MIRROR_AMPLITUDE_1M * math.sqrt(1 - self.transmission**2)
+        if self.amplitude_1m > most * (1 + 1e-9):
+            raise ValueError(
+                f"amplitude_1m: at most {most:.4f} beside a transmission of "
+                f"{self.transmission:g}; a perfect mirror gives {MIRROR_AMPLITUDE_1M:.4f}"
+            )
+        return self
+
+
+class WallSpec(_Surface):
+    """A straight wall from one end to the other, in the world frame; it reflects on both sides."""
+
+    name: Name
+    from_m: tuple[Metres, Metres]
+    to_m: tuple[Metres, Metres]
+
+    @model_validator(mode="after")
+    def _has_a_length(self) -> WallSpec:
+        if math.dist(self.from_m, self.to_m) < SHORTEST_FACE_M:
+            raise ValueError(f"to_m: must be at least {SHORTEST_FACE_M} m from from_m")
+        return self
+
+
+class ObjectSpec(_Surface):
+    """A box: centred at ``x_m``, ``y_m`` in the world frame, turned by ``yaw_deg``.
+
+    ``width_m`` lies along its own x axis, ``depth_m`` along its own y axis. Its four faces are
+    like walls; its edges are weak points.
+    """
+
+    name: Name
+    x_m: Metres
+    y_m: Metres
+    width_m: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=SHORTEST_FACE_M, le=100)]
+    depth_m: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=SHORTEST_FACE_M, le=100)]
+    yaw_deg: Degrees = 0.0
+
+
+class MultipathSpec(Table):
+    """Which paths of more than one reflection are heard, where there are walls or objects.
+
+    ``double_bounce`` is by way of a wall and a target or a person, ``corners`` of two walls.
+    """
+
+    double_bounce: StrictBool = True
+    corners: StrictBool = True
+
+
+class ClutterSpec(Table):
+    """Slow correlated clutter (``emulator.echo.receiver``).
+
+    ``sigma`` is its standard deviation per RF sample at TX power 2, normalised units;
+    ``correlation_s`` the lag at which its autocorrelation has fallen to 1/e.
+    """
+
+    sigma: Sigma = 0.0
+    correlation_s: CorrelationTime = 4.8
+
+
+class JitterSpec(Table):
+    """Jitter of the carrier's phase, common to all echoes of a frame (``emulator.echo.noise``).
+
+    ``white_rad`` and ``slow_rad`` are the standard deviations of a part that is new with every
+    frame and of one that falls to 1/e after ``slow_correlation_s``.
+    """
+
+    white_rad: Sigma = 0.0
+    slow_rad: Sigma = 0.0
+    slow_correlation_s: CorrelationTime = 4.0
+
+
+class CarriedSpec(Table):
+    """Somebody picks the robot up and sets it down further on along its course.
+
+    At ``at_s`` of scene time it is lifted, for ``takes_s`` it moves straight to where it would
+    have been ``skips_s`` later, turned likewise, and drives on from there. Its radars see where
+    it really is; its wheels hang in the air and report nothing.
+    """
+
+    at_s: Seconds
+    skips_s: Seconds
+    takes_s: Seconds = 3.0
+
+
+class PathSpec(Table):
+    """A closed course of waypoints driven in laps, turning on the spot.
+
+    ``laps`` lists the direction of every lap: ``forward`` visits the waypoints as written and
+    returns to the first, ``backward`` the other way round. No laps: the robot stands.
+    """
+
+    waypoints_m: tuple[tuple[Metres, Metres], ...] = ((0.0, 0.0),)
+    laps: tuple[Literal["forward", "backward"], ...] = ()
+    speed_mps: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=1e-3, le=10)] = 0.05
+    turn_rate_deg_per_s: Annotated[
+        StrictFloat, BeforeValidator(_finite), Field(ge=0.1, le=3600)
+    ] = 28.125
+    carried: CarriedSpec | None = None
+
+    @field_validator("waypoints_m")
+    @classmethod
+    def _starts_at_origin(
+        cls, value: tuple[tuple[float, float], ...]
+    ) -> tuple[tuple[float, float], ...]:
+        along_x = len(value) < 2 or (value[1][0] > 0 and value[1][1] == 0)
+        if not value or value[0] != (0.0, 0.0) or not along_x:
+            raise ValueError(
+                "the world frame is the robot's start pose: "
+                "begin with [0.0, 0.0] and go on to a point on the positive x axis"
+            )
+        return value
+
+    def stops_m(self) -> tuple[tuple[float, float], ...]:
+        """Return every stop of the whole drive in order, (x, y) [m], world frame."""
+        first, *others = self.waypoints_m
+        stops = [first]
+        for lap in self.laps:
+            stops.extend(others if lap == "forward" else reversed(others))
+            stops.append(first)
+        return tuple(stops)
+
+
+class OdometrySpec(Table):
+    """How the wheels drift: standard deviations of the model in ``emulator.scene.wheels``.
+
+    ``walk_per_sqrt_s`` lets scale, turn scale and curvature wander during a run: by this many of
+    their own standard deviations per square root of a second.
+    """
+
+    rate_hz: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0.1, le=1000)] = 5.0
+    scale_sigma: Sigma = 0.0
+    turn_scale_sigma: Sigma = 0.0
+    curvature_sigma_rad_per_m: Sigma = 0.0
+    along_sigma_m_per_sqrt_m: Sigma = 0.0
+    across_sigma_m_per_sqrt_m: Sigma = 0.0
+    heading_sigma_rad_per_sqrt_m: Sigma = 0.0
+    heading_sigma_rad_per_rad: Sigma = 0.0
+    walk_per_sqrt_s: Sigma = 0.0
+
+
+class NoiseSpec(Table):
+    """White receiver noise: ``rf_sigma`` per RF sample at the named working point."""
+
+    rf_sigma: Sigma = 5e-4
+    iterations: Annotated[StrictInt, Field(ge=1, le=255)] = 16
+    pulses_per_step: Annotated[StrictInt, Field(ge=1, le=65535)] = 300
+
+
+class LeakageSpec(Table):
+    """The direct pulse from transmitter to receiver, at TX power 2."""
+
+    amplitude: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=10)] = 0.06
+    range_m: Metres = 0.05
+
+
+LONGEST_DRIVE_S = 24 * 3600
+MOST_ODOMETRY_LINES = 500_000
+"""A day at the default rate; all lines are computed before the ports open."""
+
+# Beside this package, in the repository and in the wheel alike. Not importlib.resources on the
+# name "fixtures": a folder of that name in the user's own project would come first.
+_SHIPPED_SCENES = Path(__file__).parents[2] / "fixtures" / "scenes"
+
+
+class SceneError(ValueError):
+    """A scene that cannot be used; the message is one line naming file, key and the remedy."""
+
+
+class UnknownSceneError(SceneError):
+    """A name that is none of the shipped scenes: wrong usage, while a bad file is a failure."""
+
+
+class Scene(Table):
+    """A whole scene. ``environment`` names the preset values a SLAM run should use for it."""
+
+    name: Name
+    environment: Literal["lab", "classroom"]
+    description: str
+    radars: Annotated[tuple[RadarSpec, ...], Field(min_length=1, max_length=64)]
+    targets: tuple[TargetSpec, ...] = ()
+    people: Annotated[tuple[PersonSpec, ...], Field(max_length=32)] = ()
+    walls: Annotated[tuple[WallSpec, ...], Field(max_length=64)] = ()
+    objects: Annotated[tuple[ObjectSpec, ...], Field(max_length=64)] = ()
+    multipath: MultipathSpec = MultipathSpec()
+    path: PathSpec = PathSpec()
+    odometry: OdometrySpec = OdometrySpec()
+    noise: NoiseSpec = NoiseSpec()
+    leakage: LeakageSpec = LeakageSpec()
+    clutter: ClutterSpec = ClutterSpec()
+    jitter: JitterSpec = JitterSpec()
+
+    @model_validator(mode="after")
+    def _names_are_unique(self) -> Scene:
+        for key, values in (
+            ("radars.name", [radar.name for radar in self.radars]),
+            ("radars.serial", [radar.serial for radar in self.radars]),
+            ("targets.name", [target.name for target in self.targets]),
+            ("people.name", [person.name for person in self.people]),
+            ("walls.name", [wall.name for wall in self.walls]),
+            ("objects.name", [box.name for box in self.objects]),
+        ):
+            twice = sorted({value for value in values if values.count(value) > 1})
+            if twice:
+                raise ValueError(f"{key}: each must be unique, {twice[0]!r} is used twice")
+        return self
+
+    @model_validator(mode="after")
+    def _ends_some_day(self) -> Scene:
+        try:
+            duration_s = self.trajectory().duration_ns / 1e9
+        except ValueError as error:
+            raise ValueError(f"path.carried: {error}") from None
+        if duration_s > LONGEST_DRIVE_S:
+            raise ValueError(
+                f"path: the drive takes {duration_s / 3600:.1f} h, at most "
+                f"{LONGEST_DRIVE_S // 3600} h are allowed; drive faster or fewer laps"
+            )
+        lines = int(duration_s * self.odometry.rate_hz) + 1
+        if lines > MOST_ODOMETRY_LINES:
+            raise ValueError(
+                f"odometry.rate_hz: {lines} lines of odometry in the whole drive, at most "
+                f"{MOST_ODOMETRY_LINES} are allowed; lower the rate"
+            )
+        return self
+
+    def trajectory(self) -> Trajectory:
+        """Return the robot's true path, world frame (the start pose is the origin)."""
+        path = drive(
+            self.path.stops_m(),
+            speed_mps=self.path.speed_mps,
+            turn_rate_rad_per_s=math.radians(self.path.turn_rate_deg_per_s),
+        )
+        lift = self.path.carried
+        if lift is None:
+            return path
+        return carried(
+            path,
+            at_ns=round(lift.at_s * 1e9),
+            skips_ns=round(lift.skips_s * 1e9),
+            takes_ns=round(lift.takes_s * 1e9),
+        )
+
+
+def empty_room(count: int = 1) -> Scene:
+    """Return a scene of ``count`` stock modules in a room without any reflector.
+
+    The robot stands at the origin; leakage and receiver noise are the defaults.
+    """
+    return Scene(
+        name="empty_room",
+        environment="lab",
+        description="Stock modules in an empty room.",
+        radars=tuple(
+            RadarSpec(
+                name=f"radar_{index + 1}",
+                serial=f"{100_000_000_000 + index:012d}",
+                x_m=0.0,
+                y_m=0.0,
+                yaw_deg=0.0,
+            )
+            for index in range(count)
+        ),
+    )
+
+
+def scene_names() -> tuple[str, ...]:
+    """Return the names of the scenes that ship with the package, sorted."""
+    return tuple(sorted(path.stem for path in _SHIPPED_SCENES.glob("*.toml")))
+
+
+def load_scene(path_or_name: str | Path) -> Scene:
+    """Return the scene in a TOML file, or a shipped one by its name ("lab").
+
+    A string without a path separator and without ``.toml`` is a name.
+
+    Raises
+    ------
+    UnknownSceneError
+        No scene of this name ships with the package.
+    SceneError
+        File missing or unreadable, TOML broken, key unknown, or value refused.
+    """
+    text = str(path_or_name)
+    is_name = isinstance(path_or_name, str) and not text.endswith(".toml") and "/" not in text
+    if is_name and text not in scene_names():
+        raise UnknownSceneError(
+            f"{text}: no such scene; known are {', '.join(scene_names())}, "
+            "or give the path of a .toml file"
+        )
+    source = _SHIPPED_SCENES / f"{text}.toml" if is_name else Path(path_or_name)
+    try:
+        table = tomllib.loads(read_bounded(source).decode())
+    except OSError as error:
+        raise SceneError(f"{text}: cannot read the scene file: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise SceneError(f"{text}: not UTF-8 text at byte {error.start}") from error
+    except ValueError as error:  # not TOML, or an integer of thousands of digits
+        raise SceneError(f"{text}: not valid TOML: {error}") from error
+    except RecursionError as error:
+        raise SceneError(f"{text}: brackets are nested too deep for a scene") from error
+    try:
+        return Scene.model_validate(table)
+    except ValidationError as error:
+        raise SceneError(f"{text}: {_one_line(error)}") from error
+
+
+def _one_line(error: ValidationError) -> str:
+    """Say the first problem in one line, and how many more there are."""
+    found = error.errors(include_url=False)
+    # A refused row makes its list too short as well: that is no problem of its own.
+    refused = {each["loc"][:depth] for each in found for depth in range(len(each["loc"]))}
+    problems = [e for e in found if e["type"] != "too_short" or e["loc"] not in refused]
+    first = problems[0]
+    location = first["loc"]
+    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
+    match first["type"]:
+        case "extra_forbidden":
+            allowed = ", ".join(_allowed_keys(location[:-1]))
+            said = f"unknown key; allowed are {allowed}"
+        case "tuple_type" if isinstance(first["input"], dict):
+            name = location[-1]
+            said = f"must be a list of tables; begin each with [[{name}]], not [{name}]"
+        case "missing":
+            said = "missing; this key is required"
+        case "value_error":
+            said = str(first["ctx"]["error"])
+        case _:
+            said = f"{first['msg']}, got {_short(first['input'])}"
+    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    return f"{key.removeprefix('.')}: {said}{more}" if key else f"{said}{more}"
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _allowed_keys(location: tuple[int | str, ...]) -> list[str]:
+    """Return the keys of the table at a location, by walking the models' fields."""
+    model: type[BaseModel] = Scene
+    for part in location:
+        if isinstance(part, str):
+            model = _table_type(model.model_fields[part].annotation)
+    return list(model.model_fields)
+
+
+def _table_type(annotation: Any) -> type[BaseModel]:  # noqa: ANN401 - any type expression
+    """Return the table model inside ``Table`` or ``tuple[Table, ...]``."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return _table_type(annotation.__args__[0])

@@ -1,0 +1,409 @@
+"""Which range is of which landmark, by the robust back end: against brute force and chi-square."""
+
+import math
+from collections.abc import Iterator, Sequence
+from copy import deepcopy
+from dataclasses import replace
+from itertools import product
+from random import Random
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from hil_tests.property.robust_oracles import N_RADARS, random_state, seeds, values
+from hil_tests.property.trilateration_oracles import NO_RANGES
+from slam.geometry import paper_rig
+from slam.robust.back_end import RobustBackEnd
+from slam.robust.initialisation import (
+    BodyPoint,
+    RangeBearing,
+    assign,
+    match,
+    point_rows,
+    range_bearing_rows,
+)
+from slam.robust.matching import (
+    SureLandmarks,
+    cheapest,
+    continue_tracks,
+    options_of,
+    sure_landmarks,
+)
+from slam.robust.parameters import (
+    BackEndParameters,
+    ContinuationRule,
+    MapRule,
+    PointRule,
+    RangeNoise,
+    WheelNoise,
+)
+from slam.robust.ranges import RangeScan, antennas_of, fix_of_pair, view
+from slam.robust.state import State, SymmetricMatrix, calibrated_motion, rotation
+
+Array = NDArray[np.float64]
+
+RULE = ContinuationRule()
+NOISE = RangeNoise(sigma_m=0.02, clutter_per_m=0.5)
+LEFT = (0, 1)
+few = settings(max_examples=settings().max_examples // 3)
+fewer = settings(max_examples=settings().max_examples // 6)  # brute force takes its time
+
+
+def ahead_of_the_left_radars(seed: int, n: int) -> State:
+    """Return a rather sure state and n landmarks close together in the left radars' view."""
+    rng = np.random.default_rng(seed)
+    state = random_state(seed, n, float(rng.uniform(-math.pi, math.pi)))
+    body = np.array([0.0, 1.0]) + rng.uniform(-0.15, 0.15, (n, 2))
+    state.landmarks_m = state.position_m + body @ rotation(state.heading_rad).T
+    state.P = SymmetricMatrix(0.02 * state.P.full())
+    return state
+
+
+def seen_from(state: State, noise: RangeNoise) -> SureLandmarks | None:
+    still = calibrated_motion(np.zeros(3), np.zeros(3), WheelNoise())
+    return sure_landmarks(
+        state, view(state, antennas_of(paper_rig(), (), still)), LEFT, noise, RULE
+    )
+
+
+def scans_of(sure: SureLandmarks, rng: np.random.Generator) -> list[RangeScan]:
+    """Return up to five ranges per radar: some of the landmarks', some of nothing."""
+    scans = []
+    for radar in LEFT:
+        own = sure.rows.predicted_m[sure.rows.radars == radar]
+        own = own[rng.random(len(own)) < 0.8]
+        ranges = np.concatenate(
+            [own + 0.04 * rng.standard_normal(len(own)), rng.uniform(0.6, 1.2, 2)]
+        )[:5]
+        scans.append(RangeScan(radar=radar, ranges_m=tuple(rng.permutation(ranges).tolist())))
+    return scans
+
+
+Choice = dict[tuple[int, int], int]
+"""Which landmark each (radar, index of the range) is of."""
+
+
+def all_assignments(
+    sure: SureLandmarks, scans: Sequence[RangeScan], noise: RangeNoise
+) -> Iterator[tuple[float, Choice]]:
+    """Yield every one-to-one assignment inside the gates, and its cost by the formula."""
+    per_landmark: list[list[tuple[float, Choice]]] = []
+    for place, landmark in enumerate(sure.landmarks.tolist()):
+        found: list[tuple[float, Choice]] = [(0.0, {})]
+        at = [place * len(LEFT) + k for k in range(len(LEFT))]
+        for picks in product(*([None, *range(len(scan.ranges_m))] for scan in scans)):
+            used = [(k, pick) for k, pick in enumerate(picks) if pick is not None]
+            m = len(used)
+            if m == 0:
+                continue
+            rows = [at[k] for k, _ in used]
+            nu = np.array([scans[k].ranges_m[pick] for k, pick in used])
+            nu = nu - sure.rows.predicted_m[rows]
+            S = sure.prior[np.ix_(rows, rows)] + noise.sigma_m**2 * np.eye(m)
+            squared = float(nu @ np.linalg.inv(S) @ nu)
+            if squared > RULE.gates[m - 1]:
+                continue
+            odds = noise.detection_probability / (1 - noise.detection_probability)
+            cost = squared + math.log(np.linalg.det(math.tau * S))
+            cost += 2 * m * math.log(noise.clutter_per_m) - 2 * m * math.log(odds)
+            found.append((cost, {(scans[k].radar, pick): landmark for k, pick in used}))
+        per_landmark.append(found)
+    yield from _disjoint(per_landmark)
+
+
+def _disjoint(per_landmark: list[list[tuple[float, Choice]]]) -> Iterator[tuple[float, Choice]]:
+    if not per_landmark:
+        yield 0.0, {}
+        return
+    for cost, rest in _disjoint(per_landmark[1:]):
+        for own_cost, own in per_landmark[0]:
+            if own.keys().isdisjoint(rest):
+                yield cost + own_cost, {**rest, **own}
+
+
+@fewer
+@given(seeds, st.integers(1, 5), st.randoms(use_true_random=False))
+def test_tracks_are_continued_as_the_best_of_all_assignments(
+    seed: int, n: int, shuffler: Random
+) -> None:
+    sure = seen_from(ahead_of_the_left_radars(seed, n), NOISE)
+    if sure is None:
+        return
+    scans = scans_of(sure, np.random.default_rng(seed))
+    found = continue_tracks(sure, scans, NOISE, RULE)
+    choice = {(c.radar, c.index): c.row for c in found}
+    assert len(choice) == len(found)  # no range twice
+    ordered = sorted(all_assignments(sure, scans, NOISE), key=lambda entry: entry[0])
+    costs = [cost for cost, _ in ordered]
+    if len(costs) == 1 or costs[1] - costs[0] > 1e-9:  # no tie
+        assert choice == ordered[0][1]
+    # In whatever order the ranges come, the same ones are of the same landmarks.
+    orders = [shuffler.sample(range(len(scan.ranges_m)), len(scan.ranges_m)) for scan in scans]
+    shuffled = [
+        replace(scan, ranges_m=tuple(scan.ranges_m[i] for i in order))
+        for scan, order in zip(scans, orders, strict=True)
+    ]
+    again = continue_tracks(sure, shuffled, NOISE, RULE)
+    of_radar = dict(zip(LEFT, orders, strict=True))
+    assert {(c.radar, of_radar[c.radar][c.index]): c.row for c in again} == choice
+
+
+def test_the_brute_force_has_work_to_do() -> None:
+    """Most of the examples above have several landmarks and contested ranges."""
+    contested = 0
+    for seed in range(20):
+        sure = seen_from(ahead_of_the_left_radars(seed, 4), NOISE)
+        assert sure is not None
+        scans = scans_of(sure, np.random.default_rng(seed))
+        options = []
+        for place in range(len(sure.landmarks)):
+            mine = slice(2 * place, 2 * place + 2)
+            options.append(
+                options_of(scans, sure.rows.predicted_m[mine], sure.prior[mine, mine], NOISE, RULE)
+            )
+        cost = sum(option.cost for option in cheapest(options))
+        contested += cost > sum(each[0].cost for each in options) + 1e-9
+    assert contested >= 5
+
+
+# --- gates ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("gate", "dof", "share"),
+    [
+        (PointRule().gate, 2, 0.99),
+        (RULE.gates[0], 1, 0.9973),
+        (RULE.gates[1], 2, 0.999),
+        (MapRule().match_gate, 2, 0.999),
+        (MapRule().merge_gate, 2, 0.9973),
+        (MapRule().merge_gate_joint, 4, 0.999),
+    ],
+)
+def test_gates_are_quantiles_of_chi_square(gate: float, dof: int, share: float) -> None:
+    assert chi2.cdf(gate, dof) == pytest.approx(share, abs=1e-4)
+
+
+TRIALS = 10_000
+
+
+@pytest.mark.parametrize(("n_radars", "share"), [(1, 0.9973), (2, 0.999)])
+def test_true_ranges_pass_their_gates_as_often_as_they_say(n_radars: int, share: float) -> None:
+    rng = np.random.default_rng(11)
+    prior = 1e-4 * np.array([[1.0, 0.6], [0.6, 2.0]])[:n_radars, :n_radars]
+    # So little clutter that the gate alone decides.
+    noise = replace(NOISE, clutter_per_m=1e-12)
+    predicted = np.array([1.0, 1.1])[:n_radars]
+    root = np.linalg.cholesky(prior + noise.sigma_m**2 * np.eye(n_radars))
+    whole = 0
+    for z in predicted + rng.standard_normal((TRIALS, n_radars)) @ root.T:
+        scans = [RangeScan(radar=k, ranges_m=(range_m,)) for k, range_m in enumerate(z.tolist())]
+        best = options_of(scans, predicted, prior, noise, RULE)[0]
+        whole += len(best.used) == n_radars
+    assert whole / TRIALS == pytest.approx(share, abs=0.003)
+
+
+@pytest.mark.parametrize(("sigmas", "n_used"), [(2.62, 2), (2.64, 1), (2.99, 1), (3.01, 0)])
+def test_a_gate_ends_where_it_says(sigmas: float, n_used: int) -> None:
+    """Two ranges so far off: 2 * 2.63^2 = 13.8 for both together, 3^2 = 9 for one alone."""
+    noise = replace(NOISE, clutter_per_m=1e-12)
+    range_m = 1.0 + sigmas * math.hypot(0.01, noise.sigma_m)
+    scans = [RangeScan(radar=radar, ranges_m=(range_m,)) for radar in LEFT]
+    best = options_of(scans, np.ones(2), 1e-4 * np.eye(2), noise, RULE)[0]
+    assert len(best.used) == n_used
+
+
+def test_true_points_pass_the_gate_of_99_percent_as_often_as_it_says() -> None:
+    """Drawn from the distribution of the state's own errors, by its own formulas."""
+    rng = np.random.default_rng(12)
+    state = random_state(1, 1, 0.4)
+    state.P = SymmetricMatrix(1e-4 * state.P.full())
+    C = np.diag([1e-3, 2e-3]) ** 2
+    seen = RangeBearing(range_m=1.0, bearing_rad=0.0, covariance=C)
+    rows = range_bearing_rows(state, 0, seen)
+    expected = seen.values - rows.residual
+    noisy = expected + rng.standard_normal((TRIALS // 4, 2)) @ np.linalg.cholesky(rows.S).T
+    rule = PointRule()
+    passed = 0
+    for range_m, bearing in noisy.tolist():
+        point = RangeBearing(range_m=range_m, bearing_rad=bearing, covariance=C)
+        passed += assign(state, [point], rule.gate, rule.new_gate, rule.reach_m) == [0]
+    assert passed / len(noisy) == pytest.approx(0.99, abs=0.006)
+
+
+@few
+@given(seeds, st.integers(1, 5), st.integers(1, 5))
+def test_points_are_assigned_as_the_best_of_all_assignments(
+    seed: int, n: int, n_points: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    state = ahead_of_the_left_radars(seed, n)
+    points = [
+        RangeBearing(
+            range_m=float(rng.uniform(0.8, 1.2)),
+            bearing_rad=float(math.pi / 2 + rng.uniform(-0.2, 0.2)),
+            covariance=np.diag([4e-4, 9e-4]),
+        )
+        for _ in range(n_points)
+    ]
+    rule = PointRule()
+    table = np.array(
+        [[range_bearing_rows(state, k, point).mahalanobis_sq for k in range(n)] for point in points]
+    )
+
+    def cost(choice: Sequence[int | None]) -> float:
+        return sum(rule.gate if k is None else table[i, k] for i, k in enumerate(choice))
+
+    best = min(
+        cost(choice)
+        for choice in product([None, *range(n)], repeat=n_points)
+        if len(used := [k for k in choice if k is not None]) == len(set(used))
+        and all(k is None or table[i, k] < rule.gate for i, k in enumerate(choice))
+    )
+    found = assign(state, points, rule.gate, rule.new_gate, rule.reach_m)
+    assert cost([None if k in (None, -1) else k for k in found]) == pytest.approx(best, abs=1e-9)
+    for i, k in enumerate(found):
+        assert (k == -1) <= (table[i].min() > rule.new_gate)
+
+
+@few
+@given(seeds, st.integers(1, 5))
+def test_a_point_is_matched_by_the_rule_written_out(seed: int, n: int) -> None:
+    """Gate, density of what is not yet mapped, and a lead over the next."""
+    rng = np.random.default_rng(seed)
+    state, rule = ahead_of_the_left_radars(seed, n), MapRule()
+    point = BodyPoint(
+        point_m=np.array([0.0, 1.0]) + rng.uniform(-0.15, 0.15, 2),
+        covariance=1e-4 * np.eye(2),
+        by_offsets=0.1 * rng.standard_normal((2, N_RADARS)),
+    )
+    scores = []
+    for row in range(n):
+        rows = point_rows(state, row, point)
+        squared = float(rows.residual @ np.linalg.inv(rows.S) @ rows.residual)
+        density = math.exp(-squared / 2) / math.sqrt(np.linalg.det(math.tau * rows.S))
+        scores.append((squared + math.log(np.linalg.det(rows.S)), squared, density, row))
+    scores.sort()
+    _, squared, density, best = scores[0]
+    clear = len(scores) == 1 or scores[1][0] - scores[0][0] >= rule.match_lead
+    wanted = squared <= rule.match_gate and density > rule.unmapped_per_m2 and clear
+    assert match(state, point, rule) == (best if wanted else None)
+
+
+def sure_point(sigma_m: float, *landmarks_m: tuple[float, float]) -> tuple[State, BodyPoint]:
+    """Return a state that is sure of everything, and a point 1 m ahead that is not."""
+    state = random_state(0, len(landmarks_m), 0.3)
+    state.P = SymmetricMatrix(1e-18 * np.eye(state.P.size))
+    state.landmarks_m = state.position_m + np.array(landmarks_m) @ rotation(state.heading_rad).T
+    point = BodyPoint(
+        point_m=np.array([1.0, 0.0]),
+        covariance=sigma_m**2 * np.eye(2),
+        by_offsets=np.zeros((2, N_RADARS)),
+    )
+    return state, point
+
+
+@pytest.mark.parametrize(("sigma_m", "row"), [(0.39, 0), (0.41, None)])
+def test_a_point_that_is_likelier_new_is_no_match(sigma_m: float, row: int | None) -> None:
+    """1 / (2 pi sigma^2) exceeds one landmark per square metre below 0.399 m."""
+    state, point = sure_point(sigma_m, (1.0, 0.0))
+    assert match(state, point, MapRule(unmapped_per_m2=1.0)) == row
+
+
+@pytest.mark.parametrize(("apart_m", "row"), [(0.244, None), (0.246, 1)])
+def test_a_point_between_two_landmarks_is_neither(apart_m: float, row: int | None) -> None:
+    """(0.245 m / 0.1 m)^2 = 6 is the likelihood margin."""
+    state, point = sure_point(0.1, (1.0, apart_m), (1.0, 0.0))
+    assert match(state, point, MapRule(match_lead=6.0)) == row
+
+
+# --- what is left alone ---------------------------------------------------------------------------
+
+
+def lone_landmark() -> RobustBackEnd:
+    """Return a back end that knows one landmark, ahead of the left radars."""
+    back_end = RobustBackEnd(paper_rig(), BackEndParameters())
+    point = BodyPoint(
+        point_m=np.array([0.0, 1.0]), covariance=1e-6 * np.eye(2), by_offsets=np.zeros((2, 4))
+    )
+    for k in range(12):
+        back_end.predict(np.array([1e-3, 0.0, 0.0]))
+        at = np.array([1e-3 * (k + 1), 0.0])
+        scans = []
+        for radar in LEFT:
+            mount = paper_rig().mounts[radar]
+            away = point.point_m - at - [mount.x_m, mount.y_m]
+            scans.append(RangeScan(radar=radar, ranges_m=(float(np.hypot(*away)),)))
+        back_end.update(scans)
+    assert len(back_end.state.landmark_ids) == 1
+    return back_end
+
+
+LONE = lone_landmark()
+
+
+@few
+@given(st.lists(st.one_of(st.floats(0.2, 0.6), st.floats(1.1, 1.5)), max_size=4), st.booleans())
+def test_ranges_of_nothing_known_alter_no_landmark(ranges: list[float], left: bool) -> None:
+    back_end = deepcopy(LONE)
+    report = back_end.update([RangeScan(radar=0 if left else 2, ranges_m=tuple(ranges))])
+    assert len(report.continued) == len(report.born) == len(report.seen_again) == 0
+    assert np.array_equal(values(back_end.state), values(LONE.state))
+    assert np.array_equal(back_end.state.P.full(), LONE.state.P.full())
+
+
+# --- the fix of two ranges ------------------------------------------------------------------------
+
+HERE, THERE, AHEAD = np.array([-0.1, 0.2]), np.array([0.1, 0.2]), np.array([0.0, 1.0])
+
+
+@given(st.floats(-1.5, 1.5), st.floats(0.21, 1.7), st.floats(-math.pi, math.pi))
+def test_fix_of_two_ranges_is_where_they_were_measured_to(x: float, y: float, turn: float) -> None:
+    R = rotation(turn)
+    target = np.array([x, y])
+    first_m, second_m = (float(np.hypot(*(target - antenna))) for antenna in (HERE, THERE))
+    found = fix_of_pair(R @ HERE, R @ THERE, first_m, second_m, R @ AHEAD)
+    # Beside the antennas, where the circles almost touch, digits are lost.
+    square = (y - 0.2) ** 2
+    if found is None:
+        assert square < 1e-12
+    else:
+        assert math.dist(found, R @ target) <= 1e-12 / max(y - 0.2, 1e-3)
+
+
+NONSENSE = st.one_of(NO_RANGES, st.floats(max_value=0.0), st.floats(min_value=1e150))
+
+
+@given(st.one_of(NONSENSE, st.floats()), st.one_of(NONSENSE, st.floats(0.2, 1.5)))
+def test_impossible_ranges_have_no_fix(first_m: float, second_m: float) -> None:
+    possible = 0 < first_m < 1e150 and 0 < second_m < 1e150
+    if possible and abs(first_m - second_m) <= 0.2 <= first_m + second_m:
+        return
+    assert fix_of_pair(HERE, THERE, first_m, second_m, AHEAD) is None
+    assert fix_of_pair(HERE, THERE, second_m, first_m, AHEAD) is None
+
+
+@few
+@given(
+    st.lists(NONSENSE.filter(lambda x: not 1e150 < abs(x) < math.inf), min_size=1, max_size=4),
+    st.integers(0, 3),
+)
+def test_impossible_ranges_change_nothing(nonsense: list[float], radar: int) -> None:
+    """Neither a landmark nor a tracklet comes of them, and good ranges beside them count."""
+    back_end = deepcopy(LONE)
+    good = [
+        float(np.hypot(0.0 - mount.x_m - back_end.state.position_m[0], 1.0 - mount.y_m))
+        for mount in paper_rig().mounts[:2]
+    ]
+    clean, spoilt = deepcopy(back_end), deepcopy(back_end)
+    scans = [RangeScan(radar=k, ranges_m=(good[k],) if k < 2 else ()) for k in range(4)]
+    clean.update(scans)
+    bad = replace(scans[radar], ranges_m=(*scans[radar].ranges_m, *nonsense))
+    report = spoilt.update([bad if k == radar else scans[k] for k in range(4)])
+    assert len(report.continued) == 2
+    assert np.array_equal(values(spoilt.state), values(clean.state))
+    assert np.array_equal(spoilt.state.P.full(), clean.state.P.full())

@@ -1,0 +1,375 @@
+"""Laws of single steps of the robust filter: updates, births, predictions, frames and names."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from hil_tests.property.ekf_oracles import relative_error, turn_between
+from hil_tests.property.robust_oracles import (
+    N_RADARS,
+    Array,
+    increments,
+    random_state,
+    seeds,
+    turn,
+    twin,
+    values,
+)
+from slam.geometry import paper_rig
+from slam.robust.initialisation import BodyPoint, give_birth, point_rows, update_with_point
+from slam.robust.map import apply_merge
+from slam.robust.parameters import WheelNoise
+from slam.robust.ranges import Rows, antennas_of, rows_of, view
+from slam.robust.state import State, SymmetricMatrix, calibrated_motion, predict, quarter_turn
+
+WHEELS = WheelNoise()
+ANTENNAS = antennas_of(paper_rig(), (), calibrated_motion(np.zeros(3), np.zeros(3), WHEELS))
+SIGMA_M = 0.01
+few = settings(max_examples=settings().max_examples // 3)
+
+
+def surrounded(seed: int, n: int) -> State:
+    """Return a state with everything unknown, and landmarks 0.5 to 2 m off the robot."""
+    rng = np.random.default_rng(seed)
+    state = random_state(seed, n, float(rng.uniform(-math.pi, math.pi)))
+    direction, away = rng.uniform(-math.pi, math.pi, n), rng.uniform(0.5, 2.0, n)
+    spread = np.column_stack([np.cos(direction), np.sin(direction)])
+    state.landmarks_m = state.position_m + away[:, None] * spread
+    return state
+
+
+def rows_for(state: State, radars: list[int], landmarks: list[int]) -> Rows:
+    return rows_of(state, view(state, ANTENNAS), np.array(radars), np.array(landmarks))
+
+
+def dense(rows: Rows, size: int) -> Array:
+    H = np.zeros((len(rows.H), size))
+    H[:, rows.at] = rows.H
+    return H
+
+
+def see(state: State, radar: int, landmark: int, range_m: float, sigma_m: float = SIGMA_M) -> float:
+    """Update with one range and return its NIS."""
+    rows = rows_for(state, [radar], [landmark])
+    residual = np.array([range_m]) - rows.predicted_m
+    return state.update(rows.at, rows.H, residual, np.array([sigma_m**2]))[0]
+
+
+def foreseen(state: State, radar: int, landmark: int) -> float:
+    return float(rows_for(state, [radar], [landmark]).predicted_m[0])
+
+
+def go(state: State, increment: Array) -> None:
+    predict(state, calibrated_motion(increment, state.calibration, WHEELS), WHEELS)
+
+
+def apart(one: State, other: State) -> float:
+    """Return the largest difference of two means, headings modulo one turn."""
+    a, b = values(one), values(other)
+    return max(turn_between(a[0], b[0]), float(np.abs(a[1:] - b[1:]).max()))
+
+
+# --- updates --------------------------------------------------------------------------------------
+
+
+@few
+@given(seeds)
+def test_update_is_joseph_s_and_the_information_form(seed: int) -> None:
+    state = surrounded(seed, 4)
+    rows = rows_for(state, [0, 1, 2, 3], [0, 0, 1, 3])
+    rng = np.random.default_rng(seed)
+    residual, variances = 0.02 * rng.standard_normal(4), rng.uniform(1e-5, 1e-3, 4)
+    P, H, R = state.P.full(), dense(rows, state.P.size), np.diag(variances)
+    S = H @ P @ H.T + R
+    K = P @ H.T @ np.linalg.inv(S)
+    rest = np.eye(len(P)) - K @ H
+    wanted = twin(state)
+    wanted.correct(K @ residual)
+    nis, _ = state.update(rows.at, rows.H, residual, variances)
+    after = state.P.full()
+    assert relative_error(after, rest @ P @ rest.T + K @ R @ K.T) <= 1e-9
+    assert (
+        relative_error(after, np.linalg.inv(np.linalg.inv(P) + H.T @ (H.T / variances).T)) <= 1e-8
+    )
+    # One triangle in place, or two full matrices multiplied.
+    assert relative_error(after, P - K @ S @ K.T) <= 1e-10
+    assert apart(state, wanted) <= 1e-10
+    assert nis == pytest.approx(residual @ np.linalg.solve(S, residual), rel=1e-9)
+
+
+@few
+@given(seeds)
+def test_update_makes_nothing_less_sure(seed: int) -> None:
+    state = surrounded(seed, 3)
+    rng = np.random.default_rng(seed)
+    for _ in range(5):
+        before = state.P.full()
+        radar, landmark = int(rng.integers(N_RADARS)), int(rng.integers(3))
+        see(state, radar, landmark, foreseen(state, radar, landmark) + 0.02 * rng.normal())
+        after = state.P.full()
+        gained = np.linalg.eigvalsh(before - after)
+        assert gained[0] >= -1e-12 * np.trace(before)
+        assert gained[-1] > 0.0
+        for row in range(3):
+            at = np.ix_(*[state.landmark_columns(np.array([row]))] * 2)
+            assert np.trace(after[at]) <= np.trace(before[at]) * (1 + 1e-12)
+            assert np.linalg.det(after[at]) <= np.linalg.det(before[at]) * (1 + 1e-9)
+
+
+@settings(max_examples=settings().max_examples // 10)
+@given(seeds, st.integers(20, 40))
+def test_no_landmark_becomes_surer_than_the_start(seed: int, n_steps: int) -> None:
+    """Dissanayake 2001: what is doubtful about the frame at the start stays in every landmark."""
+    rng = np.random.default_rng(seed)
+    state = State((0.02, 0.02, 0.01), (0.0,) * N_RADARS)
+    start = np.diag([0.05**2, 0.02**2, 0.03**2])
+    P = state.P.full()
+    P[:3, :3] = start
+    state.P = SymmetricMatrix(P)
+    truth = np.array([1.0, 0.5])
+    point = BodyPoint(point_m=truth, covariance=1e-4 * np.eye(2), by_offsets=np.zeros((2, 4)))
+    give_birth(state, point)
+    for _ in range(n_steps):
+        radar = int(rng.integers(N_RADARS))
+        see(state, radar, 0, foreseen(state, radar, 0) + 0.01 * rng.normal())
+        if rng.random() < 0.5:
+            go(state, np.array([0.01, 0.0, 0.05 * rng.normal()]))
+        G = np.column_stack([quarter_turn(state.landmarks_m[0]), np.eye(2)])
+        surer = np.linalg.eigvalsh(state.landmark_covariance(0) - G @ start @ G.T)[0]
+        assert surer >= -1e-12
+
+
+@few
+@given(seeds)
+def test_observation_without_information_changes_nothing(seed: int) -> None:
+    state = surrounded(seed, 2)
+    before = twin(state)
+    see(state, 1, 0, foreseen(state, 1, 0) + 0.1, sigma_m=1e8)
+    assert apart(state, before) <= 1e-9
+    assert relative_error(state.P.full(), before.P.full()) <= 1e-9
+
+
+@few
+@given(seeds, st.integers(1, 15))
+def test_repeating_an_exact_range_equals_one_of_smaller_noise(seed: int, k: int) -> None:
+    once, many = surrounded(seed, 2), surrounded(seed, 2)
+    range_m = foreseen(once, 2, 1)
+    see(once, 2, 1, range_m, SIGMA_M / math.sqrt(k))
+    for _ in range(k):
+        see(many, 2, 1, range_m)
+    assert apart(once, many) <= 1e-9
+    assert relative_error(many.P.full(), once.P.full()) <= 1e-9
+
+
+@few
+@given(seeds)
+def test_order_of_independent_ranges_does_not_matter_to_first_order(seed: int) -> None:
+    state = surrounded(seed, 2)
+    surprise = np.random.default_rng(seed).uniform(-1, 1, 2)
+    expected = [foreseen(state, 0, 0), foreseen(state, 3, 1)]
+
+    def difference(size_m: float) -> float:
+        one, two = twin(state), twin(state)
+        z = np.array(expected) + size_m * surprise
+        see(one, 0, 0, z[0])
+        see(one, 3, 1, z[1])
+        see(two, 3, 1, z[1])
+        see(two, 0, 0, z[0])
+        if size_m == 0.0:
+            assert relative_error(one.P.full(), two.P.full()) <= 1e-9
+        return apart(one, two)
+
+    assert difference(0.0) <= 1e-12  # the linear case
+    # The difference is of second order: a tenth of the surprise leaves a hundredth of it.
+    assert difference(1e-4) <= 0.02 * difference(1e-3) + 1e-13
+
+
+@few
+@given(seeds)
+def test_landmark_without_correlation_is_not_touched(seed: int) -> None:
+    state = surrounded(seed, 3)
+    P, far = state.P.full(), state.landmark_columns(np.array([2]))
+    # The heading is sure too: its correction turns the whole map.
+    for sure in (np.array([0]), far):
+        P[sure, :] = 0.0
+        P[:, sure] = 0.0
+    P[far, far] = 1.0
+    state.P = SymmetricMatrix(P)
+    place, others = state.landmarks_m[2].copy(), state.landmarks_m[:2].copy()
+    see(state, 0, 0, foreseen(state, 0, 0) + 0.05)
+    see(state, 1, 1, foreseen(state, 1, 1) - 0.05)
+    assert np.array_equal(state.landmarks_m[2], place)
+    assert np.array_equal(state.P.full()[far], P[far])
+    assert (state.landmarks_m[:2] != others).all()
+
+
+# --- prediction and birth -------------------------------------------------------------------------
+
+
+@few
+@given(seeds, increments)
+def test_motion_without_noise_leaves_landmarks_alone(seed: int, increment: Array) -> None:
+    """Right-invariant errors of landmarks change with the heading's, their places' do not."""
+    state = surrounded(seed, 3)
+    before, T = twin(state), state.additive_transform()
+    motion = calibrated_motion(increment, state.calibration, WHEELS, np.zeros((3, 3)))
+    predict(state, motion, WHEELS)
+    assert np.array_equal(values(state)[3:], values(before)[3:])
+    after_T = state.additive_transform()
+    after = after_T @ state.P.full() @ after_T.T
+    wanted = T @ before.P.full() @ T.T
+    assert np.abs(after[3:, 3:] - wanted[3:, 3:]).max() <= 1e-12
+    # The odometry's own errors are known only if calibration is; else the pose is less sure.
+    assert not np.array_equal(state.P.full()[:3], before.P.full()[:3])
+
+
+Birth = Callable[[State, BodyPoint], int]
+
+
+def identity_birth(state: State, point: BodyPoint) -> int:
+    """Give a new landmark P = I and no correlation with anything."""
+    give_birth(state, point)
+    P = state.P.full()
+    P[-2:, :] = P[:, -2:] = 0.0
+    P[-2:, -2:] = np.eye(2)
+    state.P = SymmetricMatrix(P)
+    return state.landmark_ids[-1]
+
+
+def uncorrelated_birth(state: State, point: BodyPoint) -> int:
+    """Forget the covariance of a new landmark with the rest."""
+    give_birth(state, point)
+    P = state.P.full()
+    P[-2:, :-2] = P[:-2, -2:] = 0.0
+    state.P = SymmetricMatrix(P)
+    return state.landmark_ids[-1]
+
+
+def check_birth(birth: Birth, law: settings) -> None:
+    """Compare with a prior of 1e12 m^2 and one update, in information form."""
+
+    @law
+    @given(seeds)
+    def born(seed: int) -> None:
+        state = surrounded(seed, 2)
+        rng = np.random.default_rng(seed)
+        point = BodyPoint(
+            point_m=rng.uniform(-1, 1, 2),
+            covariance=1e-4 * np.eye(2),
+            by_offsets=rng.standard_normal((2, N_RADARS)),
+        )
+        P, size = state.P.full(), state.P.size
+        birth(state, point)
+        rows = point_rows(state, 2, point)
+        H = np.zeros((2, size + 2))
+        H[:, rows.at] = rows.H
+        information = np.zeros((size + 2, size + 2))
+        information[:size, :size] = np.linalg.inv(P)
+        information[size:, size:] = 1e-12 * np.eye(2)
+        information += H.T @ np.linalg.inv(point.covariance) @ H
+        assert relative_error(state.P.full(), np.linalg.inv(information)) <= 1e-5
+        assert np.array_equal(state.P.full()[:size, :size], P)
+        # Seen again without noise it surprises nobody.
+        assert rows.mahalanobis_sq <= 1e-20
+        assert update_with_point(state, 2, point) <= 1e-20
+
+    born()
+
+
+def test_new_landmark_is_the_limit_of_a_prior_of_1e12() -> None:
+    check_birth(give_birth, few)
+
+
+@pytest.mark.parametrize("mutant", [identity_birth, uncorrelated_birth])
+def test_birth_of_existing_filters_fails(mutant: Birth) -> None:
+    with pytest.raises(AssertionError):
+        check_birth(mutant, settings(few, phases=(Phase.generate,)))
+
+
+# --- frames and names -----------------------------------------------------------------------------
+
+
+@few
+@given(seeds, st.floats(-4, 4), st.floats(-4, 4), st.floats(-math.pi, math.pi))
+def test_moving_the_world_moves_the_estimate_and_keeps_the_innovations(
+    seed: int, x: float, y: float, angle: float
+) -> None:
+    """A world turned by R and moved by t has errors e_p' = R e_p - J t e_th, exactly."""
+    R, t = turn(angle).real, np.array([x, y])
+
+    def moved(state: State) -> State:
+        A = np.eye(state.P.size)
+        for first in (1, *range(state.offsets.stop, state.P.size, 2)):
+            A[first : first + 2, first : first + 2] = R
+            A[first : first + 2, 0] = -quarter_turn(t)
+        there = twin(state)
+        there.heading_rad = math.remainder(state.heading_rad + angle, math.tau)
+        there.position_m = R @ state.position_m + t
+        there.landmarks_m = state.landmarks_m @ R.T + t
+        there.P = SymmetricMatrix(A @ state.P.full() @ A.T)
+        return there
+
+    rng = np.random.default_rng(seed)
+    here = surrounded(seed, 3)
+    there = moved(here)
+    for _ in range(5):
+        increment = rng.uniform(-0.1, 0.1, 3)
+        go(here, increment)
+        go(there, increment)
+        radar, landmark = int(rng.integers(N_RADARS)), int(rng.integers(3))
+        z = foreseen(here, radar, landmark) + 0.02 * rng.normal()
+        ours, theirs = see(here, radar, landmark, z), see(there, radar, landmark, z)
+        assert theirs == pytest.approx(ours, rel=1e-9, abs=1e-9)
+    assert apart(there, moved(here)) <= 1e-9
+    assert relative_error(there.P.full(), moved(here).P.full()) <= 1e-9
+
+
+@few
+@given(seeds, st.permutations(range(4)))
+def test_other_names_permute_the_state_and_nothing_else(seed: int, order: list[int]) -> None:
+    def renamed(state: State) -> State:
+        other = twin(state)
+        other.landmarks_m = state.landmarks_m[order]
+        at = np.concatenate(
+            [np.arange(state.offsets.stop), state.landmark_columns(np.array(order))]
+        )
+        other.P = SymmetricMatrix(state.P.full()[np.ix_(at, at)])
+        return other
+
+    rng = np.random.default_rng(seed)
+    here = surrounded(seed, 4)
+    there = renamed(here)
+    for _ in range(3):
+        increment = rng.uniform(-0.1, 0.1, 3)
+        go(here, increment)
+        go(there, increment)
+        radar, landmark = int(rng.integers(N_RADARS)), int(rng.integers(4))
+        z = foreseen(here, radar, landmark) + 0.02 * rng.normal()
+        ours = see(here, radar, landmark, z)
+        assert see(there, radar, order.index(landmark), z) == pytest.approx(ours, rel=1e-9)
+    assert apart(there, renamed(here)) <= 1e-12
+    assert relative_error(there.P.full(), renamed(here).P.full()) <= 1e-12
+
+
+# --- merging --------------------------------------------------------------------------------------
+
+
+@few
+@given(seeds, st.integers(1, 3))
+def test_merging_exact_copies_changes_nothing(seed: int, n_copies: int) -> None:
+    """What is one already is not made surer by saying so again."""
+    state = surrounded(seed, 3)
+    state.landmarks_m[2] = state.landmarks_m[0] + 0.01
+    apply_merge(state, ((0, 2),), 1e-5)
+    before = twin(state)
+    for _ in range(n_copies):
+        own = state.landmark_columns(np.array([0]))
+        state.augment(state.landmarks_m[0], state.P.columns(own), state.P.block(own))
+        apply_merge(state, ((0, len(state.landmark_ids) - 1),), 1e-5)
+    assert apart(state, before) <= 1e-9
+    assert relative_error(state.P.full(), before.P.full()) <= 1e-9
+    assert state.landmark_ids == before.landmark_ids

@@ -1,0 +1,358 @@
+"""Laws of the robust filter and smoother, against dense algebra and scipy as oracles."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import least_squares
+
+from hil_tests.property.robust_oracles import (
+    N_RADARS,
+    Array,
+    random_covariance,
+    random_state,
+    seeds,
+    twin,
+)
+from slam.robust.initialisation import BodyPoint, give_birth, point_rows, update_with_point
+from slam.robust.map import apply_merge, merge_rows
+from slam.robust.matching import NOTHING, Option, cheapest
+from slam.robust.parameters import RelinearisationRule, WheelNoise
+from slam.robust.ranges import Antennas, rows_of, view
+from slam.robust.run_log import Estimate, Problem, start_prior
+from slam.robust.smoother import Smoother
+from slam.robust.state import Indices, State, SymmetricMatrix, calibrated_motion, predict
+
+WHEELS = WheelNoise(walk_per_sqrt_m=0.1)
+ANTENNAS = Antennas(
+    position_m=np.array([[-0.1, 0.2], [0.1, 0.2], [0.1, -0.2], [-0.1, -0.2]]),
+    yaw_rad=np.array([1.0, 1.0, -1.0, -1.0]) * math.pi / 2,
+    heard=np.ones(4, dtype=bool),
+)
+few = settings(max_examples=30, deadline=None)
+
+
+def go(state: State, increment: Array) -> None:
+    predict(state, calibrated_motion(increment, state.calibration, WHEELS), WHEELS)
+
+
+def measure(
+    state: State, radars: Indices, landmarks: Indices, residual: Array, sigma: float
+) -> float:
+    rows = rows_of(state, view(state, ANTENNAS), radars, landmarks)
+    nis, _ = state.update(rows.at, rows.H, residual, np.full(len(residual), sigma**2))
+    return nis
+
+
+@few
+@given(seeds)
+def test_the_triangle_does_what_a_full_matrix_does(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    P = random_covariance(9, rng)
+    stored = SymmetricMatrix(P)
+    a, b, W = rng.standard_normal(9), rng.standard_normal(9), rng.standard_normal((9, 3))
+    at = np.array([1, 4, 8])
+    assert np.array_equal(stored.columns(at), P[:, at])
+    assert np.array_equal(stored.block(at), P[np.ix_(at, at)])
+    stored.add_products(a, b)
+    stored.subtract_gram(W)
+    wanted = P + np.outer(a, b) + np.outer(b, a) - W @ W.T
+    assert np.abs(stored.full() - wanted).max() <= 1e-12
+    stored.keep(at)
+    assert np.abs(stored.full() - wanted[np.ix_(at, at)]).max() <= 1e-12
+
+
+def test_covariance_stays_symmetric_and_positive_over_ten_thousand_operations() -> None:
+    rng = np.random.default_rng(5)
+    state = random_state(5, 4, 0.3)
+    for _ in range(10_000):
+        n, choice = len(state.landmark_ids), rng.random()
+        if choice < 0.55 or n < 2:
+            go(state, np.array([0.01, 0.0, 0.02 * rng.standard_normal()]))
+        elif choice < 0.95:
+            landmarks = rng.integers(0, n, 2)
+            measure(state, rng.integers(0, 4, 2), landmarks, 1e-3 * rng.standard_normal(2), 1e-3)
+        elif choice < 0.97 and n < 10:
+            place = BodyPoint(
+                point_m=rng.uniform(-1, 1, 2),
+                covariance=1e-4 * np.eye(2),
+                by_offsets=rng.standard_normal((2, N_RADARS)),
+            )
+            give_birth(state, place)
+        elif choice < 0.98:
+            state.remove(int(rng.integers(0, n)))
+        elif choice < 0.985 and n > 3:
+            apply_merge(state, ((0, 1),), 1e-5)
+    P = state.P.full()
+    assert np.array_equal(P, P.T)
+    assert np.linalg.eigvalsh(P)[0] >= -1e-12 * np.trace(P)
+
+
+def test_three_directions_stay_unobservable_whatever_the_filter_believes() -> None:
+    """Doubt about the frame itself passes through motions, updates and corrections untouched."""
+    certain, doubtful = random_state(3, 3, 3.1), random_state(3, 3, 3.1)
+    N = np.zeros((certain.P.size, 3))
+    N[0, 0] = 1.0
+    N[1:3, 1:] = np.eye(2)
+    N[certain.offsets.stop :, 1:] = np.tile(np.eye(2), (3, 1))
+    added = N @ np.diag([4.0, 9.0, 16.0]) @ N.T
+    doubtful.P = SymmetricMatrix(certain.P.full() + added)
+    rng = np.random.default_rng(3)
+    for _ in range(30):
+        increment = np.array([0.05, 0.0, 0.2 * rng.standard_normal()])
+        residual = 0.05 * rng.standard_normal(2)
+        pair = rng.integers(0, 4, 2), rng.integers(0, 3, 2)
+        for state in (certain, doubtful):
+            go(state, increment)
+        assert measure(certain, *pair, residual, 0.01) == pytest.approx(
+            measure(doubtful, *pair, residual, 0.01), rel=1e-6
+        )
+    difference = doubtful.P.full() - certain.P.full()
+    # Predictions rotate the heading's doubt about the origin of the map: N is constant.
+    assert np.abs(difference - added).max() <= 1e-9 * np.abs(added).max()
+    assert int(np.sum(np.linalg.svd(difference)[1] > 1e-9)) == 3
+
+
+@few
+@given(seeds)
+def test_a_new_landmark_is_the_limit_of_a_boundless_prior(seed: int) -> None:
+    state = random_state(seed, 2, 1.0)
+    rng = np.random.default_rng(seed)
+    point = BodyPoint(
+        point_m=rng.uniform(-1, 1, 2),
+        covariance=1e-4 * np.eye(2),
+        by_offsets=rng.standard_normal((2, N_RADARS)),
+    )
+    born = twin(state)
+    give_birth(born, point)
+    # The same by an update of a landmark with a huge prior, where its birth would put it.
+    limit = twin(born)
+    size = state.P.size
+    P = np.zeros((size + 2, size + 2))
+    P[:size, :size] = state.P.full()
+    P[size:, size:] = 1e6 * np.eye(2)
+    limit.P = SymmetricMatrix(P)
+    update_with_point(limit, 2, point)
+    assert np.abs(limit.P.full() - born.P.full()).max() <= 1e-7
+    # Seen again without noise it is where it was expected, bit by bit of rounding.
+    residual = point_rows(born, 2, point).residual
+    assert np.abs(residual).max() <= 1e-12
+
+
+@few
+@given(seeds)
+def test_a_merge_is_the_statement_that_the_difference_is_zero(seed: int) -> None:
+    state = random_state(seed, 4, 0.5)
+    state.landmarks_m[2] = state.landmarks_m[0] + 0.01
+    at, H, residual, R = merge_rows(state, ((0, 2),), 1e-3)
+    P = state.P.full()
+    dense = np.zeros((2, len(P)))
+    dense[:, at] = H
+    K = P @ dense.T @ np.linalg.inv(dense @ P @ dense.T + R)
+    rest = np.eye(len(P)) - K @ dense
+    wanted = rest @ P @ rest.T + K @ R @ K.T
+    moved = twin(state)
+    moved.correct(K @ residual)
+    merged = twin(state)
+    apply_merge(merged, ((0, 2),), 1e-3)
+    gone = [state.offsets.stop + 4, state.offsets.stop + 5]
+    keep = np.delete(np.arange(len(P)), gone)
+    assert np.abs(merged.P.full() - wanted[np.ix_(keep, keep)]).max() <= 1e-9
+    assert merged.landmarks_m == pytest.approx(np.delete(moved.landmarks_m, 2, 0), abs=1e-9)
+    assert merged.landmark_ids == [0, 1, 3]
+
+
+@few
+@given(seeds, st.integers(0, 3))
+def test_deleting_is_marginalising_bit_for_bit(seed: int, row: int) -> None:
+    state = random_state(seed, 4, 0.0)
+    first = state.offsets.stop + 2 * row
+    keep = np.delete(np.arange(state.P.size), [first, first + 1])
+    wanted = state.P.full()[np.ix_(keep, keep)]
+    state.remove(row)
+    assert np.array_equal(state.P.full(), wanted)
+
+
+def test_with_a_known_heading_the_filter_is_weighted_least_squares() -> None:
+    """No turn, no calibration errors: everything is linear, and batch WLS has the answer."""
+    rng = np.random.default_rng(0)
+    wheels = WheelNoise(scale_sigma=0.0, turn_scale_sigma=0.0, curvature_sigma_rad_per_m=0.0)
+    state = State((0.0, 0.0, 0.0), (0.0,) * N_RADARS)
+    Q, C = np.diag([1e-4, 2e-4, 0.0]), 1e-4 * np.array([[2.0, 0.5], [0.5, 1.0]])
+    nothing = np.zeros((2, N_RADARS))
+    n_steps, n_marks = 6, 2
+    size = 2 * (n_steps + n_marks)
+    rows: list[Array] = []
+    right: list[Array] = []
+
+    def observe(columns: Array, value: Array, covariance: Array) -> None:
+        root = np.linalg.inv(np.linalg.cholesky(covariance))
+        rows.append(root @ columns)
+        right.append(root @ value)
+
+    def pick(place: int) -> Array:
+        columns = np.zeros((2, size))
+        columns[:, 2 * place : 2 * place + 2] = np.eye(2)
+        return columns
+
+    for k in range(n_steps):
+        u = np.array([0.1, 0.05, 0.0]) + np.append(0.01 * rng.standard_normal(2), 0.0)
+        predict(state, calibrated_motion(u, state.calibration, wheels, Q), wheels)
+        before = pick(k - 1) if k else np.zeros((2, size))
+        observe(pick(k) - before, u[:2], Q[:2, :2])
+        for mark in range(n_marks):
+            y = np.array([1.0, mark]) + 0.01 * rng.standard_normal(2)
+            point = BodyPoint(point_m=y, covariance=C, by_offsets=nothing)
+            if k == 0:
+                give_birth(state, point)
+            else:
+                update_with_point(state, mark, point)
+            observe(pick(n_steps + mark) - pick(k), y, C)
+    A, b = np.vstack(rows), np.concatenate(right)
+    covariance = np.linalg.inv(A.T @ A)
+    solution = covariance @ A.T @ b
+    keep = np.arange(2 * (n_steps - 1), size)
+    at = np.concatenate([[1, 2], np.arange(state.offsets.stop, state.P.size)])
+    found = np.concatenate([state.position_m, state.landmarks_m.ravel()])
+    assert np.abs(found - solution[keep]).max() <= 1e-8
+    assert np.abs(state.P.block(at) - covariance[np.ix_(keep, keep)]).max() <= 1e-8
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_continuation_is_the_best_of_all_assignments(data: st.DataObject) -> None:
+    n = data.draw(st.integers(1, 5))
+    rng = np.random.default_rng(data.draw(seeds))
+    options: list[list[Option]] = []
+    for _ in range(n):
+        own = [
+            Option(((int(radar), int(index)),), -float(cost))
+            for radar, index, cost in zip(
+                rng.integers(0, 2, 4), rng.integers(0, 5, 4), rng.random(4), strict=True
+            )
+        ]
+        own.append(Option(((0, int(rng.integers(5))), (1, int(rng.integers(5)))), -rng.random()))
+        options.append([*sorted(own, key=lambda option: option.cost), NOTHING])
+
+    def cost_of(choice: tuple[Option, ...]) -> float:
+        used = [range_ for option in choice for range_ in option.used]
+        return math.inf if len(used) > len(set(used)) else sum(option.cost for option in choice)
+
+    best = min(cost_of(choice) for choice in itertools.product(*options))
+    found = cheapest(options)
+    assert cost_of(tuple(found)) == pytest.approx(best, abs=1e-12)
+    order = rng.permutation(n)
+    again = cheapest([options[i] for i in order])
+    assert [again[int(np.flatnonzero(order == i)[0])] for i in range(n)] == found
+
+
+def wandering(seed: int, walk: float) -> tuple[Problem, Estimate]:
+    """Return a short run past three landmarks, and values to start from."""
+    rng = np.random.default_rng(seed)
+    k, landmarks = 12, np.array([[0.3, 1.0], [0.9, -0.9], [1.4, 1.2]])
+    poses = np.array([[0.12 * i, 0.02 * i, 0.03 * i] for i in range(k + 1)])
+    increments = np.tile([0.121, 0.0, 0.03], (k, 1)) + 1e-3 * rng.standard_normal((k, 3))
+    at = np.repeat(np.arange(1, k + 1), 6)
+    radars = np.tile([0, 1, 2, 3, 0, 1], k)
+    marks = np.tile([0, 0, 1, 1, 2, 2], k)
+    c, s = np.cos(poses[at, 2]), np.sin(poses[at, 2])
+    m = ANTENNAS.position_m[radars]
+    arm = np.column_stack([c * m[:, 0] - s * m[:, 1], s * m[:, 0] + c * m[:, 1]])
+    z = np.linalg.norm(landmarks[marks] - poses[at, :2] - arm, axis=1)
+    problem = Problem(
+        increments=increments,
+        covariances=np.tile(np.diag([1e-4, 1e-5, 1e-4]), (k, 1, 1)),
+        walks=np.full((k, 3), walk),
+        prior=start_prior((0.02, 0.02, 0.01), (0.005,) * N_RADARS, 3, pose_sigma=1e-3),
+        range_poses=at,
+        range_radars=radars,
+        range_landmarks=marks,
+        range_antennas=m,
+        ranges_m=z + 2e-3 * rng.standard_normal(len(z)),
+        range_sigmas_m=np.full(len(z), 5e-3),
+        point_poses=np.zeros(0, dtype=np.intp),
+        point_landmarks=np.zeros(0, dtype=np.intp),
+        points=np.zeros((0, 2)),
+        point_roots=np.zeros((0, 2, 2)),
+    )
+    start = Estimate(
+        poses=poses + 0.02 * rng.standard_normal(poses.shape),
+        calibration=np.zeros((k + 1 if walk else 1, 3)),
+        offsets_m=np.zeros(N_RADARS),
+        landmarks_m=landmarks + 0.05 * rng.standard_normal((3, 2)),
+    )
+    return problem, start
+
+
+@pytest.mark.parametrize("walk", [0.0, 1e-5])
+def test_the_smoother_is_least_squares_and_its_complement_the_marginal(walk: float) -> None:
+    problem, start = wandering(1, walk)
+    rule = RelinearisationRule(iterations=30, outliers_from=2, outlier_sigmas=50.0)
+    solution = Smoother(problem, rule).solve(start, tolerance=1e-14)
+    assert solution is not None
+    n_poses, n_cal = len(start.poses), len(start.calibration)
+    prior_sigmas = np.diag(problem.prior.information)[:10] ** -0.5
+
+    def unpack(x: Array) -> tuple[Array, Array, Array, Array]:
+        poses, rest = x[: 3 * n_poses].reshape(-1, 3), x[3 * n_poses :]
+        calibration = rest[: 3 * n_cal].reshape(-1, 3)
+        rest = rest[3 * n_cal :]
+        return poses, calibration, rest[:N_RADARS], rest[N_RADARS:].reshape(-1, 2)
+
+    def residuals(x: Array) -> Array:
+        poses, calibration, offsets, marks = unpack(x)
+        result = []
+        for k, u in enumerate(problem.increments):
+            s, w, kappa = calibration[k if n_cal > 1 else 0]
+            d = u[:2] / (1 + s)
+            a = (u[2] - kappa * math.hypot(*d)) / (1 + w)
+            c, sn = math.cos(poses[k, 2]), math.sin(poses[k, 2])
+            gone = np.array([[c, sn], [-sn, c]]) @ (poses[k + 1, :2] - poses[k, :2])
+            sigmas = np.sqrt(np.diag(problem.covariances[k]))
+            turned = poses[k + 1, 2] - poses[k, 2] - a
+            result.append(np.append(gone - d, turned) / sigmas)
+            if n_cal > 1:
+                result.append((calibration[k + 1] - calibration[k]) / math.sqrt(walk))
+        pose = poses[problem.range_poses]
+        cosines, sines = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+        m = problem.range_antennas
+        antenna = pose[:, :2] + np.column_stack(
+            [cosines * m[:, 0] - sines * m[:, 1], sines * m[:, 0] + cosines * m[:, 1]]
+        )
+        expected = np.linalg.norm(marks[problem.range_landmarks] - antenna, axis=1)
+        expected = expected + offsets[problem.range_radars]
+        result.append((expected - problem.ranges_m) / problem.range_sigmas_m)
+        first = np.concatenate([poses[0], calibration[0], offsets])
+        result.append(first / prior_sigmas)
+        return np.concatenate(result)
+
+    x = np.concatenate(
+        [
+            start.poses.ravel(),
+            start.calibration.ravel(),
+            start.offsets_m,
+            start.landmarks_m.ravel(),
+        ]
+    )
+    oracle = least_squares(residuals, x, xtol=1e-15, ftol=1e-15, gtol=1e-12, x_scale="jac")
+    poses, calibration, offsets, marks = unpack(oracle.x)
+    found = solution.estimate
+    assert np.abs(found.poses - poses).max() <= 1e-6
+    assert np.abs(found.calibration - calibration).max() <= 1e-6
+    assert np.abs(found.offsets_m - offsets).max() <= 1e-6
+    assert np.abs(found.landmarks_m - marks).max() <= 1e-6
+    jacobian = np.asarray(oracle.jac, dtype=np.float64)
+    dense = np.linalg.inv(jacobian.T @ jacobian)
+    keep = np.concatenate(
+        [
+            np.arange(3 * n_poses - 3, 3 * n_poses),
+            3 * n_poses + np.arange(3 * n_cal - 3, 3 * n_cal),
+            np.arange(3 * n_poses + 3 * n_cal, len(x)),
+        ]
+    )
+    marginal = np.linalg.inv(solution.information)
+    wanted = dense[np.ix_(keep, keep)]
+    assert np.abs(marginal - wanted).max() <= 1e-4 * np.abs(wanted).max()

@@ -1,0 +1,296 @@
+"""Laws of the metrics, and their values against evo and closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from slam.evaluation import (
+    align_se2,
+    associate_times,
+    ate_rmse_m,
+    icp_align_se2,
+    icp_ate_rmse_m,
+    landmark_metrics,
+    nees_pose,
+    rmse_m,
+)
+from slam.geometry import transform
+
+Array = NDArray[np.float64]
+
+poses = st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.floats(-math.pi, math.pi)).map(np.array)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def path(seed: int, n: int = 80) -> Array:
+    """Return a smooth random path, shape (n, 2)."""
+    rng = np.random.default_rng(seed)
+    return np.cumsum(np.cumsum(0.002 * rng.standard_normal((n, 2)), axis=0) + 0.02, axis=0)
+
+
+def drifted(xy: Array, seed: int) -> Array:
+    """Return the path with a growing error and some noise."""
+    rng = np.random.default_rng(seed + 1)
+    drift = np.linspace(0, 1, len(xy))[:, None] * rng.uniform(-0.1, 0.1, 2)
+    return xy + drift + 0.01 * rng.standard_normal(xy.shape)
+
+
+def lissajous() -> tuple[Array, Array]:
+    k = np.arange(60)
+    reference = np.column_stack([2 * np.cos(0.11 * k), 1.3 * np.sin(0.17 * k)])
+    wiggle = np.column_stack([0.05 * np.sin(1.3 * k), 0.04 * np.cos(2.1 * k) + 0.001 * k])
+    return transform(np.array([0.7, -1.9, 0.8]), reference + wiggle), reference
+
+
+def test_ate_equals_evo() -> None:
+    # evo 1.38.1: evo_ape tum ref.tum est.tum -a, both written with repr floats.
+    assert ate_rmse_m(*lissajous()) == pytest.approx(0.04804433714655651, abs=1e-9)
+
+
+@given(seeds, poses)
+def test_ate_ignores_where_the_estimate_lies(seed: int, moved: Array) -> None:
+    reference = path(seed)
+    estimate = drifted(reference, seed)
+    ate = ate_rmse_m(estimate, reference)
+    assert ate_rmse_m(transform(moved, estimate), reference) == pytest.approx(ate, abs=1e-9)
+    assert ate_rmse_m(transform(moved, reference), reference) <= 1e-9
+    assert ate <= rmse_m(estimate, reference) + 1e-12
+
+
+@given(seeds, poses)
+def test_alignment_is_a_minimum(seed: int, nudge: Array) -> None:
+    reference = path(seed)
+    estimate = drifted(reference, seed)
+    best = align_se2(estimate, reference)
+    other = transform(best + 0.01 * nudge, estimate)
+    assert rmse_m(other, reference) >= ate_rmse_m(estimate, reference) - 1e-12
+
+
+def test_alignment_is_orthogonal_procrustes() -> None:
+    estimate, reference = lissajous()
+    e, r = estimate - estimate.mean(axis=0), reference - reference.mean(axis=0)
+    U, _, Vt = np.linalg.svd(r.T @ e)  # Umeyama 1991, eq. 40 to 42 without scale
+    rotation = U @ np.diag([1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt
+    residual = r - e @ rotation.T
+    assert ate_rmse_m(estimate, reference) == pytest.approx(
+        math.sqrt(np.mean(np.sum(residual**2, axis=1))), abs=1e-12
+    )
+
+
+@given(seeds)
+def test_nearest_neighbour_residual_never_exceeds_the_error_by_time(seed: int) -> None:
+    reference = path(seed)
+    estimate = drifted(reference, seed)
+    aligned = transform(icp_align_se2(estimate, reference), estimate)
+    by_time = math.sqrt(np.mean(np.sum((aligned - reference) ** 2, axis=1)))
+    assert icp_ate_rmse_m(estimate, reference) <= by_time + 1e-12
+
+
+@given(seeds)
+def test_icp_never_ends_worse_than_it_began(seed: int) -> None:
+    reference = path(seed)
+    estimate = drifted(reference, seed)
+
+    def residual(xy: Array) -> float:
+        distances = np.linalg.norm(xy[:, None, :] - reference[None, :, :], axis=2).min(axis=1)
+        return math.sqrt(float(np.mean(distances**2)))
+
+    aligned = transform(icp_align_se2(estimate, reference), estimate)
+    assert residual(aligned) <= residual(estimate) + 1e-12
+
+
+def test_where_neighbours_are_those_by_time_icp_is_the_alignment_by_time() -> None:
+    # Steps of 1 m with errors of 1 cm: nearest neighbour and time agree before and after.
+    reference = np.column_stack([np.arange(30.0), (np.arange(30.0) % 3) ** 2])
+    estimate = reference + 0.01 * np.random.default_rng(0).standard_normal(reference.shape)
+    ate = ate_rmse_m(estimate, reference)
+    assert icp_ate_rmse_m(estimate, reference) == pytest.approx(ate, rel=1e-6)
+
+
+@given(seeds, st.integers(2, 80))
+def test_ate_has_a_closed_form_in_complex_numbers(seed: int, n: int) -> None:
+    """Centred on their means, |r - a e|^2 is least over |a| = 1 where a e and r are in phase."""
+    reference = path(seed, n)
+    estimate = transform(np.array([3.0, -2.0, 2.5]), drifted(reference, seed))
+    e, r = (xy[:, 0] + 1j * xy[:, 1] for xy in (estimate, reference))
+    e, r = e - e.mean(), r - r.mean()
+    a = np.vdot(e, r) / abs(np.vdot(e, r))
+    # evo 1.38.1 computes the same: `evo_ape tum ref est -a` of such paths, compared to 1e-9
+    assert ate_rmse_m(estimate, reference) == pytest.approx(
+        math.sqrt(np.mean(np.abs(r - a * e) ** 2)), abs=1e-9
+    )
+
+
+@given(seeds, poses, st.floats(-0.5, 1.0))
+def test_ate_is_zero_of_rigid_motions_alone(seed: int, moved: Array, stretch: float) -> None:
+    """A scale or a mirror is not aligned away: closed forms in the principal spreads."""
+    reference = path(seed)
+    centred = reference - reference.mean(axis=0)
+    spreads = np.linalg.svd(centred, compute_uv=False) ** 2 / len(centred)
+    scaled = transform(moved, (1 + stretch) * reference)
+    wanted = abs(stretch) * math.sqrt(spreads.sum())
+    assert ate_rmse_m(scaled, reference) == pytest.approx(wanted, abs=1e-9)
+    mirrored = transform(moved, reference * np.array([1.0, -1.0]))
+    assert ate_rmse_m(mirrored, reference) == pytest.approx(2 * math.sqrt(spreads[1]), abs=1e-7)
+
+
+def test_two_points_have_a_closed_form() -> None:
+    # Lengths 2 and 2.2 on one line: both ends are 0.1 off after alignment.
+    reference = np.array([[0.0, 0.0], [2.0, 0.0]])
+    estimate = np.array([[5.0, 1.0], [5.0, 3.2]])
+    assert ate_rmse_m(estimate, reference) == pytest.approx(0.1, abs=1e-12)
+
+
+def displaced_curve() -> tuple[Array, Array, Array]:
+    """Return a curve, the same curve moved rigidly, and the motion that brings it back."""
+    k = np.arange(120)
+    reference = np.column_stack([2 * np.cos(0.03 * k), 1.3 * np.sin(0.05 * k)])
+    back = np.array([0.03, -0.02, 0.05])
+    return reference, transform(invert(back), reference), back
+
+
+def test_icp_goes_on_until_a_displaced_curve_lies_on_itself() -> None:
+    reference, estimate, back = displaced_curve()
+    assert icp_align_se2(estimate, reference) == pytest.approx(back, abs=1e-9)
+    assert icp_ate_rmse_m(estimate, reference) <= 1e-9
+
+
+@pytest.mark.parametrize(("off_m", "pulls"), [(0.52, False), (0.48, True)])
+def test_points_beyond_half_a_metre_do_not_pull(off_m: float, pulls: bool) -> None:
+    reference = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 3.0], [0.0, 3.0]])
+    stray = np.array([[3.0, 3.0 + off_m]])
+    aligned = icp_align_se2(np.vstack([reference, stray]), reference)
+    assert (np.abs(aligned).max() > 0.01) == pulls
+
+
+def test_mismatched_trajectories_are_refused_with_the_remedy() -> None:
+    with pytest.raises(ValueError, match="associate them by time first"):
+        ate_rmse_m(np.zeros((3, 2)), np.zeros((4, 2)))
+    with pytest.raises(ValueError, match="no common stamps"):
+        ate_rmse_m(np.zeros((0, 2)), np.zeros((0, 2)))
+
+
+@given(st.sets(st.integers(0, 1000), max_size=40), st.sets(st.integers(0, 1000), max_size=40))
+def test_associated_stamps_are_close_distinct_and_in_order(a: set[int], b: set[int]) -> None:
+    estimate, reference = (np.array(sorted(s), dtype=np.int64) for s in (a, b))
+    left, right = associate_times(estimate, reference, tolerance_ns=10)
+    assert len(left) == len(right)
+    assert np.all(np.diff(left) > 0)
+    assert np.all(np.diff(right) > 0)
+    assert np.all(np.abs(estimate[left] - reference[right]) <= 10)
+    assert {k for k in a if k in b} <= set(estimate[left].tolist())
+    for k in set(a) - set(estimate[left].tolist()):
+        # A stamp is left out only if nothing is near or a closer one took its partner.
+        near = [r for r in b if abs(r - k) <= 10]
+        assert not near or set(near) & set(reference[right].tolist())
+
+
+# --- landmarks ----------------------------------------------------------------------------------
+
+TRUE = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 1.0]])
+HERE = np.zeros(3)
+
+
+def test_map_is_scored_after_the_trajectory_alignment() -> None:
+    moved = np.array([0.5, -0.25, 1.0])
+    score = landmark_metrics(transform(moved, TRUE + np.array([0.03, 0.04])), TRUE, invert(moved))
+    assert (score.true, score.estimated, score.matched, score.duplicates) == (3, 3, 3, 0)
+    assert (score.precision, score.recall) == (1.0, 1.0)
+    assert score.rmse_m == pytest.approx(0.05, abs=1e-12)
+
+
+def invert(pose: Array) -> Array:
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    return np.array([-c * pose[0] - s * pose[1], s * pose[0] - c * pose[1], -pose[2]])
+
+
+def test_second_estimate_beside_a_match_is_a_duplicate_and_a_far_one_is_false() -> None:
+    estimated = np.array([[0.01, 0.0], [0.1, 0.0], [1.0, 0.02], [5.0, 5.0]])
+    score = landmark_metrics(estimated, TRUE, HERE)
+    assert (score.matched, score.duplicates) == (2, 1)
+    assert score.precision == 0.5
+    assert score.recall == pytest.approx(2 / 3)
+    assert score.rmse_m == pytest.approx(math.sqrt((0.01**2 + 0.02**2) / 2))
+
+
+def test_matching_is_joint_not_greedy() -> None:
+    # The nearest estimate of the second truth is the only one in reach of the first.
+    true = np.array([[0.0, 0.0], [0.2, 0.0]])
+    estimated = np.array([[0.12, 0.0], [0.32, 0.0]])
+    assert landmark_metrics(estimated, true, HERE).matched == 2
+
+
+@pytest.mark.parametrize(("off_m", "matched"), [(0.149, 1), (0.151, 0)])
+def test_fifteen_centimetres_are_a_match(off_m: float, matched: int) -> None:
+    estimated = TRUE[:1] + np.array([0.6, 0.8]) * off_m
+    assert landmark_metrics(estimated, TRUE, HERE).matched == matched
+    # A second estimate at that distance from a matched truth is a duplicate, or false.
+    both = np.vstack([TRUE[:1], estimated])
+    assert landmark_metrics(both, TRUE, HERE).duplicates == matched
+
+
+@pytest.mark.parametrize(("n", "m"), [(0, 3), (2, 0), (0, 0)])
+def test_empty_maps_have_no_ratio(n: int, m: int) -> None:
+    score = landmark_metrics(np.zeros((n, 2)), np.zeros((m, 2)) + 9, HERE)
+    assert (score.matched, score.duplicates, score.rmse_m) == (0, 0, None)
+    assert score.precision == (0.0 if n else None)
+    assert score.recall == (0.0 if m else None)
+
+
+# --- consistency --------------------------------------------------------------------------------
+
+
+def test_nees_of_a_diagonal_covariance() -> None:
+    truth = np.array([1.0, 2.0, math.pi - 0.01])
+    estimate = np.array([1.1, 1.8, -math.pi + 0.01])  # 0.02 rad off, through pi
+    covariance = np.diag([0.01, 0.04, 0.0004])
+    assert nees_pose(estimate, covariance, truth) == pytest.approx(1.0 + 1.0 + 1.0)
+
+
+@settings(max_examples=settings().max_examples // 10)  # the next but one holds each value
+@given(seeds)
+def test_nees_of_matched_errors_averages_its_degrees_of_freedom(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    root = rng.standard_normal((3, 3))
+    covariance = 1e-4 * (root @ root.T + 0.1 * np.eye(3))
+    assume(np.linalg.cond(covariance) < 1e6)
+    errors = rng.multivariate_normal(np.zeros(3), covariance, 2000)
+    mean = np.mean([nees_pose(error, covariance, np.zeros(3)) for error in errors])
+    assert mean == pytest.approx(3.0, abs=5 * math.sqrt(6 / 2000))  # variance of chi2_3 is 6
+
+
+TURNED = np.diag([0.0, 0.0, 1e-6])  # a turn on the spot from a perfect start
+
+
+@pytest.mark.parametrize(
+    ("error", "covariance", "nees"),
+    [
+        ((0.0, 0.0, 2e-3), TURNED, 4.0),
+        ((1e-15, 0.0, 2e-3), TURNED, 4.0),
+        ((1e-4, 0.0, 2e-3), TURNED, math.inf),
+        ((0.0, 0.0, 0.0), np.zeros((3, 3)), 0.0),
+        ((0.0, 0.0, 1e-6), np.zeros((3, 3)), math.inf),
+        # x and y fully correlated: an error along the line x = y, and one across it.
+        ((0.01, 0.01, 0.0), np.array([[1e-4, 1e-4, 0], [1e-4, 1e-4, 0], [0, 0, 1e-6]]), 1.0),
+        ((0.01, -0.01, 0.0), np.array([[1e-4, 1e-4, 0], [1e-4, 1e-4, 0], [0, 0, 1e-6]]), math.inf),
+    ],
+)
+def test_nees_where_a_direction_has_no_variance(
+    error: tuple[float, float, float], covariance: Array, nees: float
+) -> None:
+    assert nees_pose(np.array(error), covariance, np.zeros(3)) == pytest.approx(nees)
+
+
+@given(seeds, st.floats(1e-6, 1e3))
+def test_nees_equals_the_quadratic_form_and_ignores_units(seed: int, metres: float) -> None:
+    rng = np.random.default_rng(seed)
+    root = rng.standard_normal((3, 3))
+    covariance, error = root @ root.T + 0.1 * np.eye(3), 0.1 * rng.standard_normal(3)
+    wanted = float(error @ np.linalg.inv(covariance) @ error)
+    scale = np.array([metres, metres, 1.0])
+    scaled = covariance * np.outer(scale, scale)
+    assert nees_pose(error * scale, scaled, np.zeros(3)) == pytest.approx(wanted, rel=1e-9)

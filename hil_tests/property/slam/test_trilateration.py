@@ -1,0 +1,388 @@
+"""Laws of trilateration, each a check on any implementation, so that mutants can fail them.
+
+Expected values come from forward geometry (ranges computed from a target) or from the paper's own
+equations, never from the code under test.
+"""
+
+import itertools
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, Phase, assume, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from hil_tests.property.trilateration_oracles import (
+    HALF_VIEW_RAD,
+    NO_RANGES,
+    Array,
+    distance,
+    off_boresight,
+)
+from slam.geometry import Mount, RadarPair, Rig, paper_rig
+from slam.paper.trilateration import bilaterate
+
+Check = Callable[..., None]
+Bilaterate = Callable[[Array, Array, RadarPair, float], tuple[Array, NDArray[np.bool_]]]
+
+FIELD_OF_VIEW_RAD = math.radians(65.0)
+GAMMA_RAD = (math.pi - FIELD_OF_VIEW_RAD) / 2
+MIN_RANGE_M, MAX_RANGE_M = 0.2, 1.5
+# One failure is enough to condemn a mutant, and nobody needs its simplest form.
+thorough = settings(
+    report_multiple_bugs=False,
+    suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],
+)
+condemning = settings(thorough, phases=(Phase.generate,))
+
+
+@st.composite
+def pairs(draw: st.DrawFn) -> tuple[Rig, RadarPair]:
+    """Draw two mounts side by side on a robot, looking the same way square to their base."""
+    baseline_m = draw(st.floats(0.1, 0.3))
+    yaw_rad = draw(st.floats(-math.pi, math.pi))
+    x_m, y_m = draw(st.floats(-0.3, 0.3)), draw(st.floats(-0.3, 0.3))
+    half = np.array([math.sin(yaw_rad), -math.cos(yaw_rad)]) * baseline_m / 2
+    mounts = [
+        Mount(name="a", x_m=x_m + half[0], y_m=y_m + half[1], yaw_rad=yaw_rad),
+        Mount(name="b", x_m=x_m - half[0], y_m=y_m - half[1], yaw_rad=yaw_rad),
+    ]
+    rig = Rig(mounts=tuple(mounts if draw(st.booleans()) else mounts[::-1]))
+    (pair,) = rig.pairs()
+    return rig, pair
+
+
+@st.composite
+def views(draw: st.DrawFn) -> tuple[Rig, RadarPair, Array]:
+    """Draw a pair and a target both of its radars see, straight from forward geometry."""
+    rig, pair = draw(pairs())
+    first, second = rig.mounts[pair.first], rig.mounts[pair.second]
+    off = draw(st.floats(-HALF_VIEW_RAD + 1e-6, HALF_VIEW_RAD - 1e-6))
+    range_m = draw(st.floats(MIN_RANGE_M, MAX_RANGE_M))
+    target = np.array([first.x_m, first.y_m]) + range_m * np.array(
+        [math.cos(first.yaw_rad + off), math.sin(first.yaw_rad + off)]
+    )
+    assume(MIN_RANGE_M <= distance(second, target) <= MAX_RANGE_M)
+    assume(abs(off_boresight(second, target)) < HALF_VIEW_RAD - 1e-6)
+    return rig, pair, target
+
+
+def ranges_to(rig: Rig, pair: RadarPair, target: Array) -> tuple[Array, Array]:
+    return (
+        np.array([distance(rig.mounts[pair.first], target)]),
+        np.array([distance(rig.mounts[pair.second], target)]),
+    )
+
+
+def random_joint_targets(n: int) -> tuple[RadarPair, Array, Array]:
+    """Ranges of uniform targets in the joint view of the paper's left pair."""
+    rig = paper_rig()
+    pair = rig.pairs()[0]
+    rng = np.random.default_rng(1)
+    xy = rng.uniform([-1.2, 0.2], [1.2, 1.8], (8 * n, 2))
+    offsets = xy[:, None, :] - np.array(
+        [(rig.mounts[k].x_m, rig.mounts[k].y_m) for k in (pair.first, pair.second)]
+    )
+    ranges = np.hypot(offsets[..., 0], offsets[..., 1])
+    off = np.abs(np.arctan2(offsets[..., 0], offsets[..., 1]))
+    seen = np.all((ranges > MIN_RANGE_M) & (ranges < MAX_RANGE_M) & (off < HALF_VIEW_RAD), axis=1)
+    kept = ranges[seen][:n]
+    assert len(kept) == n
+    return pair, kept[:, 0], kept[:, 1]
+
+
+# --- the laws -----------------------------------------------------------------------------------
+
+
+def check_round_trip(implementation: Bilaterate, law: settings = thorough) -> None:
+    @law
+    @given(views())
+    def round_trip(view: tuple[Rig, RadarPair, Array]) -> None:
+        rig, pair, target = view
+        xy, accepted = implementation(*ranges_to(rig, pair, target), pair, FIELD_OF_VIEW_RAD)
+        assert accepted.tolist() == [True]
+        assert math.dist(xy[0], target) <= 1e-12
+
+    round_trip()
+
+
+@st.composite
+def looks(draw: st.DrawFn) -> tuple[Rig, RadarPair, Array]:
+    """Draw a pair and a target ahead of it: anywhere, or 1e-9 to 1e-6 rad beside an edge of view.
+
+    The edge is that of one radar; the other one may see the target or not.
+    """
+    rig, pair = draw(pairs())
+    near = rig.mounts[draw(st.sampled_from([pair.first, pair.second]))]
+    beside = 10 ** draw(st.floats(-8.99, -6.0)) * draw(st.sampled_from([-1, 1]))
+    edge = draw(st.sampled_from([-1, 1])) * (HALF_VIEW_RAD + beside)
+    off = edge if draw(st.booleans()) else draw(st.floats(-1.57, 1.57))
+    range_m = draw(st.floats(0.05, 1.6))
+    direction = near.yaw_rad + off
+    antenna = np.array([near.x_m, near.y_m])
+    return rig, pair, antenna + range_m * np.array([math.cos(direction), math.sin(direction)])
+
+
+def check_gate(implementation: Bilaterate, law: settings = thorough) -> None:
+    """Judge from where the target is: ranges follow from it, never it from ranges."""
+
+    @law
+    @given(looks())
+    def gate(look: tuple[Rig, RadarPair, Array]) -> None:
+        rig, pair, target = look
+        margins = [
+            HALF_VIEW_RAD - abs(off_boresight(rig.mounts[k], target))
+            for k in (pair.first, pair.second)
+        ]
+        assume(all(abs(margin) > 1e-9 for margin in margins))
+        _, accepted = implementation(*ranges_to(rig, pair, target), pair, FIELD_OF_VIEW_RAD)
+        assert accepted.tolist() == [min(margins) > 0]
+
+    gate()
+
+
+def check_gate_edges(implementation: Bilaterate, law: settings = thorough) -> None:
+    """Every edge of view of the paper's rig, from 2e-9 rad inside to 2e-7 rad outside.
+
+    Random targets hit so thin a strip too rarely to condemn a mutant every time.
+    """
+    del law  # nothing is drawn
+    rig = paper_rig()
+    for pair in rig.pairs():
+        for near, side, beside in itertools.product(
+            (pair.first, pair.second), (-1, 1), (-2e-7, -2e-8, -2e-9, 2e-9, 2e-8, 2e-7)
+        ):
+            mount = rig.mounts[near]
+            direction = mount.yaw_rad + side * (HALF_VIEW_RAD + beside)
+            target = np.array(
+                [mount.x_m + math.cos(direction), mount.y_m + math.sin(direction)], dtype=np.float64
+            )
+            seen = all(
+                abs(off_boresight(rig.mounts[k], target)) < HALF_VIEW_RAD
+                for k in (pair.first, pair.second)
+            )
+            _, accepted = implementation(*ranges_to(rig, pair, target), pair, FIELD_OF_VIEW_RAD)
+            assert accepted.tolist() == [seen]
+
+
+def check_triangle(implementation: Bilaterate, law: settings = thorough) -> None:
+    """Circles that do not meet, by 1e-9 m or by more."""
+
+    @law
+    @given(pairs(), st.floats(0.05, 1.6), st.floats(1e-9, 1.0), st.booleans())
+    def triangle(built: tuple[Rig, RadarPair], l1: float, gap_m: float, inside: bool) -> None:
+        _, pair = built
+        d = pair.baseline_m
+        l2 = l1 + d + gap_m if inside else d - l1 - gap_m
+        assume(l2 > 0)
+        for a, b in ((l1, l2), (l2, l1)):
+            _, accepted = implementation(np.array([a]), np.array([b]), pair, FIELD_OF_VIEW_RAD)
+            assert accepted.tolist() == [False]
+
+    triangle()
+
+
+def check_impossible_ranges(implementation: Bilaterate, law: settings = thorough) -> None:
+    """No output, no exception and no warning, also of ranges that overflow when squared."""
+
+    @law
+    @given(st.one_of(NO_RANGES, st.floats()), st.one_of(NO_RANGES, st.floats(0.2, 1.5)))
+    def impossible(l1: float, l2: float) -> None:
+        pair = paper_rig().pairs()[0]
+        d = pair.baseline_m
+        possible = 0 < l1 < 1e150 and 0 < l2 < 1e150
+        assume(not possible or abs(l1 - l2) > d or l1 + l2 < d)
+        for a, b in ((l1, l2), (l2, l1)):
+            _, accepted = implementation(np.array([a]), np.array([b]), pair, FIELD_OF_VIEW_RAD)
+            assert accepted.tolist() == [False]
+
+    impossible()
+
+
+def check_paper_equations(implementation: Bilaterate, law: settings = thorough) -> None:
+    @law
+    @given(st.floats(0.2, 1.5), st.floats(0.2, 1.5))
+    def equations(l1: float, l2: float) -> None:
+        left, right = paper_rig().pairs()
+        d = s = 0.2
+        assume(abs(l1 - l2) < d - 1e-9)
+        alpha = math.acos((l1**2 + d**2 - l2**2) / (2 * l1 * d))
+        beta = math.acos((l2**2 + d**2 - l1**2) / (2 * l2 * d))
+        assume(alpha > GAMMA_RAD + 1e-9 and beta > GAMMA_RAD + 1e-9)
+        x, y = l1 * math.cos(alpha) - d / 2, l1 * math.sin(alpha) + s
+        ranges = np.array([l1]), np.array([l2])
+        xy, accepted = implementation(*ranges, left, FIELD_OF_VIEW_RAD)
+        assert accepted.tolist() == [True]
+        assert xy[0] == pytest.approx([x, y], abs=1e-12)
+        xy, accepted = implementation(*ranges, right, FIELD_OF_VIEW_RAD)
+        assert accepted.tolist() == [True]
+        assert xy[0] == pytest.approx([-x, -y], abs=1e-12)  # bearing pi + phi
+
+    equations()
+
+
+LAWS = (
+    check_round_trip,
+    check_gate,
+    check_gate_edges,
+    check_triangle,
+    check_impossible_ranges,
+    check_paper_equations,
+)
+
+
+@pytest.mark.parametrize("check", LAWS)
+def test_law_holds(check: Check) -> None:
+    check(bilaterate)
+
+
+# --- mutants ------------------------------------------------------------------------------------
+
+
+def literal_cosine(
+    first_m: Array, second_m: Array, pair: RadarPair, field_of_view_rad: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Eq. 2 as printed: the cosines themselves compared with an angle above 1."""
+    xy, _ = bilaterate(first_m, second_m, pair, field_of_view_rad)
+    d, gamma = pair.baseline_m, (math.pi - field_of_view_rad) / 2
+    with np.errstate(all="ignore"):
+        alpha = (first_m**2 + d**2 - second_m**2) / (2 * first_m * d)
+        beta = (second_m**2 + d**2 - first_m**2) / (2 * second_m * d)
+    return xy, (alpha > gamma) & (beta > gamma)
+
+
+def mirrored_right(
+    first_m: Array, second_m: Array, pair: RadarPair, field_of_view_rad: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Take the right side as a mirror image instead of a rotation: first and second swapped."""
+    swap = pair.midpoint[1] < 0
+    ranges = (second_m, first_m) if swap else (first_m, second_m)
+    return bilaterate(*ranges, pair, field_of_view_rad)
+
+
+def wedge_of_first_only(
+    first_m: Array, second_m: Array, pair: RadarPair, field_of_view_rad: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Only alpha compared with gamma, beta forgotten."""
+    xy, accepted = bilaterate(first_m, second_m, pair, math.pi)
+    d, gamma = pair.baseline_m, (math.pi - field_of_view_rad) / 2
+    with np.errstate(all="ignore"):
+        alpha = np.arccos((first_m**2 + d**2 - second_m**2) / (2 * first_m * d))
+    return xy, accepted & (alpha > gamma)
+
+
+def slightly_wider_view(
+    first_m: Array, second_m: Array, pair: RadarPair, field_of_view_rad: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Let in what lies up to 5e-8 rad outside the wedge."""
+    return bilaterate(first_m, second_m, pair, field_of_view_rad + 1e-7)
+
+
+def circles_that_almost_meet(
+    first_m: Array, second_m: Array, pair: RadarPair, field_of_view_rad: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Stretch the ranges until their circles meet."""
+    d = pair.baseline_m
+    l1, l2 = np.maximum(first_m, second_m - d), np.maximum(second_m, first_m - d)
+    return bilaterate(l1, l2, pair, math.pi)
+
+
+@pytest.mark.parametrize(
+    ("mutant", "check"),
+    [
+        (literal_cosine, check_round_trip),
+        (literal_cosine, check_gate),
+        (literal_cosine, check_paper_equations),
+        (mirrored_right, check_paper_equations),
+        (wedge_of_first_only, check_gate),
+        (slightly_wider_view, check_gate_edges),
+        (circles_that_almost_meet, check_triangle),
+    ],
+)
+def test_mutant_fails(mutant: Bilaterate, check: Check) -> None:
+    with pytest.raises(AssertionError):
+        check(mutant, condemning)
+
+
+# --- symmetries and bounds ----------------------------------------------------------------------
+
+
+@given(st.floats(0.2, 1.5), st.floats(0.2, 1.5))
+def test_swapping_ranges_reverses_the_base_exactly(l1: float, l2: float) -> None:
+    pair = paper_rig().pairs()[0]
+    a, b = np.array([l1]), np.array([l2])
+    (one,), kept_one = bilaterate(a, b, pair, FIELD_OF_VIEW_RAD)
+    (two,), kept_two = bilaterate(b, a, pair, FIELD_OF_VIEW_RAD)
+    assert kept_one.tolist() == kept_two.tolist()
+    if kept_one[0]:
+        assert (one[0], one[1]) == (-two[0], two[1])
+
+
+@given(st.floats(0.2, 1.5), st.floats(0.2, 1.5))
+def test_mirrored_sides_flip_only_the_sign_of_the_bearing(l1: float, l2: float) -> None:
+    left, right = paper_rig().pairs()
+    a, b = np.array([l1]), np.array([l2])
+    ((x, y),), kept = bilaterate(a, b, left, FIELD_OF_VIEW_RAD)
+    # On the right the first radar is the front one: the mirror image swaps the ranges too.
+    ((x_mirror, y_mirror),), kept_mirror = bilaterate(b, a, right, FIELD_OF_VIEW_RAD)
+    assert kept.tolist() == kept_mirror.tolist()
+    if kept[0]:
+        assert math.hypot(x, y) == math.hypot(x_mirror, y_mirror)
+        assert math.atan2(y, x) == pytest.approx(-math.atan2(y_mirror, x_mirror), abs=1e-15)
+
+
+@given(views(), st.floats(0.1, 10.0))
+def test_scaling_all_lengths_scales_range_and_keeps_bearing(
+    view: tuple[Rig, RadarPair, Array], k: float
+) -> None:
+    rig, pair, target = view
+    scaled = Rig(
+        mounts=tuple(
+            Mount(name=m.name, x_m=k * m.x_m, y_m=k * m.y_m, yaw_rad=m.yaw_rad) for m in rig.mounts
+        )
+    )
+    l1, l2 = ranges_to(rig, pair, target)
+    (xy,), _ = bilaterate(l1, l2, pair, FIELD_OF_VIEW_RAD)
+    (xy_scaled,), accepted = bilaterate(k * l1, k * l2, scaled.pairs()[0], FIELD_OF_VIEW_RAD)
+    assert accepted[0]
+    assert math.dist(xy_scaled, k * xy) <= 1e-12 * k
+
+
+def test_accepted_points_lie_where_the_paper_rig_can_see() -> None:
+    grid = np.linspace(0.2, 1.5, 1301)
+    l1, l2 = (axis.ravel() for axis in np.meshgrid(grid, grid))
+    for pair in paper_rig().pairs():
+        xy, accepted = bilaterate(l1, l2, pair, FIELD_OF_VIEW_RAD)
+        seen = xy[accepted]
+        r = np.hypot(seen[:, 0], seen[:, 1])
+        from_forward = np.abs(np.degrees(np.arctan2(seen[:, 1], seen[:, 0])))
+        # Both extremes lie straight ahead: equal ranges of 0.2 m and of 1.5 m.
+        assert r.min() == pytest.approx(math.sqrt(0.2**2 - 0.1**2) + 0.2, abs=1e-12)
+        assert r.max() == pytest.approx(math.sqrt(1.5**2 - 0.1**2) + 0.2, abs=1e-12)
+        # Farthest forward: on the edge of the rear radar's view at its full range.
+        edge = math.atan2(0.2 + 1.5 * math.sin(GAMMA_RAD), 1.5 * math.cos(GAMMA_RAD) - 0.1)
+        assert math.degrees(edge) <= from_forward.min() <= math.degrees(edge) + 0.2
+        assert from_forward.max() == pytest.approx(180.0 - from_forward.min(), abs=1e-9)
+    # The nearest equal ranges that both see: d / (2 cos gamma).
+    nearest = 0.2 / (2 * math.cos(GAMMA_RAD))
+    assert nearest == pytest.approx(0.186, abs=5e-4)
+    around = np.array([nearest - 1e-6, nearest + 1e-6])
+    assert bilaterate(around, around, pair, FIELD_OF_VIEW_RAD)[1].tolist() == [False, True]
+
+
+# --- sensitivity --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("offset_m", "bearing_deg"), [(0.02, 0.21), (0.1, 0.9), (0.2, 1.6)])
+def test_common_range_offset_moves_range_not_bearing(offset_m: float, bearing_deg: float) -> None:
+    pair, l1, l2 = random_joint_targets(100_000)
+    true_xy, accepted = bilaterate(l1, l2, pair, FIELD_OF_VIEW_RAD)
+    assert accepted.all()
+    shifted_xy, _ = bilaterate(l1 + offset_m, l2 + offset_m, pair, math.pi)
+    shift = np.linalg.norm(shifted_xy, axis=1) - np.linalg.norm(true_xy, axis=1)
+    assert (shift / offset_m).min() >= 1.0
+    assert (shift / offset_m).max() <= 1.14
+    turn = np.arctan2(shifted_xy[:, 1], shifted_xy[:, 0]) - np.arctan2(true_xy[:, 1], true_xy[:, 0])
+    assert np.degrees(np.abs(turn)).max() <= bearing_deg

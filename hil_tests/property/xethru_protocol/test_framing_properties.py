@@ -1,0 +1,154 @@
+"""The receiver on any bytes in any chunks."""
+
+from contextlib import AbstractContextManager
+from unittest import mock
+
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from hil_tests.property.wire_streams import STREAMS, oracle, packets
+from xethru_protocol.wire import framing
+from xethru_protocol.wire.framing import (
+    NEED_DATA,
+    FramingFault,
+    Packet,
+    PacketReader,
+    encode_no_escape,
+    encode_normal,
+)
+
+Found = list[Packet | FramingFault]
+
+
+def marking_windows(size: int) -> AbstractContextManager[object]:
+    """Let the receiver mark terminators in windows of ``size`` bytes, also in short streams."""
+    return mock.patch.multiple(framing, _NEAR=2, _WORTH_MARKING=3, _WINDOW=size)
+
+
+def read_all(data: bytes, cuts: list[int], *, ended: bool = False) -> Found:
+    reader = PacketReader()
+    found: Found = []
+    previous = 0
+    for cut in [*sorted(cuts), len(data)]:
+        reader.receive_data(data[previous:cut])
+        previous = cut
+        if ended and cut == len(data):
+            reader.end_data()
+        while (item := reader.next_packet()) is not NEED_DATA:
+            assert isinstance(item, Packet | FramingFault)
+            found.append(item)
+    return found
+
+
+def packets_in(found: Found) -> list[tuple[int, bytes]]:
+    return [(item.offset, item.payload) for item in found if isinstance(item, Packet)]
+
+
+@settings(max_examples=400)
+@given(STREAMS, st.data())
+@example(b"\x01" + b"\x7c" * 12 + b"\x09", None)  # found when a run of 7C was reported twice
+def test_any_chunking_gives_the_same_events(stream: bytes, data: st.DataObject | None) -> None:
+    cuts = [] if data is None else data.draw(st.lists(st.integers(0, len(stream)), max_size=6))
+    for ended in (False, True):
+        whole = read_all(stream, [], ended=ended)
+        assert read_all(stream, list(range(len(stream))), ended=ended) == whole
+        assert read_all(stream, cuts, ended=ended) == whole
+
+
+@settings(max_examples=600)
+@given(STREAMS)
+def test_packets_are_those_of_the_rescan_rule(stream: bytes) -> None:
+    assert packets_in(read_all(stream, [])) == oracle(stream)
+
+
+@settings(max_examples=400)
+@given(STREAMS, st.integers(2, 70), st.lists(st.integers(0, 300), max_size=3))
+def test_marking_terminators_in_windows_changes_nothing(
+    stream: bytes, size: int, cuts: list[int]
+) -> None:
+    expected = read_all(stream, [], ended=True)
+    with marking_windows(size):
+        assert read_all(stream, [cut for cut in cuts if cut < len(stream)], ended=True) == expected
+
+
+@settings(max_examples=300)
+@given(
+    st.lists(st.sampled_from([0x10, 0x7D, 0x7E, 0x7F]), max_size=60).map(bytes),
+    st.integers(2, 20),
+    st.integers(1, 60),
+)
+def test_terminators_are_those_that_a_reader_of_single_bytes_stops_at(
+    stream: bytes, size: int, chunk: int
+) -> None:
+    finder = framing.TerminatorFinder()
+    with marking_windows(size):
+        start = stream.find(b"\x7d")
+        for limit in range(chunk, len(stream) + chunk, chunk):
+            while 0 <= start < min(limit, len(stream)):
+                end = finder.after(stream[:limit], 0, start, 1000)
+                assert end == _stops_at(stream[:limit], start)
+                if end < 0:
+                    break
+                between = stream[start + 1 : end]
+                literal = bytes(byte for byte, is_literal in _literals(between) if is_literal)
+                assert finder.content(stream[:limit], 0, start) == literal
+                start = stream.find(b"\x7d", start + 1)
+
+
+def _literals(between: bytes) -> list[tuple[int, bool]]:
+    marked, escaped = [], False
+    for byte in between:
+        escaped = byte == 0x7F and not escaped
+        marked.append((byte, not escaped))
+    return marked
+
+
+def _stops_at(stream: bytes, start: int) -> int:
+    at = start + 1
+    while at < len(stream):
+        if stream[at] in (0x7D, 0x7E):
+            return at
+        at += 2 if stream[at] == 0x7F else 1
+    return -1
+
+
+@given(st.lists(packets(), max_size=6))
+def test_intact_packets_are_all_found_without_a_fault(sent: list[bytes]) -> None:
+    found = read_all(b"".join(sent), [])
+    assert len(found) == len(sent)
+    assert all(isinstance(item, Packet) for item in found)
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.binary(max_size=30).map(lambda raw: raw.translate(None, b"\x7c\x7d")), packets()
+        ),
+        max_size=6,
+    )
+)
+def test_garbage_without_start_bytes_hides_nothing(parts: list[tuple[bytes, bytes]]) -> None:
+    stream = b"".join(junk + packet for junk, packet in parts)
+    found = read_all(stream, [])
+    offsets, at = [], 0
+    for junk, packet in parts:
+        offsets.append(at + len(junk))
+        at += len(junk) + len(packet)
+    assert [offset for offset, _ in packets_in(found)] == offsets
+
+
+@given(STREAMS)
+def test_after_the_end_nothing_is_left_over(stream: bytes) -> None:
+    reader = PacketReader()
+    reader.receive_data(stream)
+    reader.end_data()
+    while reader.next_packet() is not NEED_DATA:
+        pass
+    assert reader.buffered == 0
+
+
+@given(st.binary(min_size=1, max_size=200))
+def test_what_is_framed_is_read_back(payload: bytes) -> None:
+    assert packets_in(read_all(encode_normal(payload), [])) == [(0, payload)]
+    frame = b"\xa0\x10" + bytes(8) + len(payload).to_bytes(4, "little") + payload
+    assert packets_in(read_all(encode_no_escape(frame), [])) == [(0, frame)]

@@ -1,0 +1,197 @@
+"""What is written is read, in every format; a cut anywhere leaves a prefix and one fault."""
+
+from __future__ import annotations
+
+import tempfile
+from datetime import UTC
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from hil_tests.property.message_strategies import messages, of_type
+from xethru_protocol.recordings import (
+    RecordingError,
+    RecordingFacts,
+    RecordingFault,
+    RecordingWriter,
+    Split,
+    WireCapture,
+    convert,
+    read_recording,
+)
+from xethru_protocol.recordings.mcap import read_mcap, write_mcap
+from xethru_protocol.recordings.npz import read_npz, write_npz
+from xethru_protocol.recordings.vendor.layouts import BY_MESSAGE, CSV_KINDS, LAYOUTS
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codec import encode
+from xethru_protocol.wire.connection import Connection, Role
+from xethru_protocol.wire.table import RESPONSES
+
+STORED = [
+    *(kind.message for kind in CSV_KINDS),
+    *(RESPONSES.types[layout.prefix] for layout in LAYOUTS),
+]
+"""Message types that the vendor's format has a place for."""
+MS = 1_000_000
+TIMES_MS = st.integers(0, 2**31)
+
+
+def payloads(timed: list[tuple[m.Response, int | None]]) -> list[tuple[bytes, int | None]]:
+    """Compare by bytes: unlike floats, they tell NaN from NaN and 0 from -0."""
+    return [(encode(message, bulk=True), t_ns) for message, t_ns in timed]
+
+
+@st.composite
+def stored_messages(draw: st.DrawFn) -> list[tuple[m.Response, int | None]]:
+    """Messages of any kinds the vendor's format has, with times that never decrease."""
+    kinds = draw(st.lists(st.sampled_from(STORED), max_size=8))
+    times = sorted(draw(st.lists(TIMES_MS, min_size=len(kinds), max_size=len(kinds))))
+    return [(draw(of_type(kind)), time * MS) for kind, time in zip(kinds, times, strict=True)]
+
+
+@settings(deadline=None, max_examples=80)
+@given(
+    timed=stored_messages(),
+    limit=st.none() | st.integers(1, 3),
+    header=st.binary(max_size=5),
+)
+def test_vendor_directories_give_back_what_was_written(
+    timed: list[tuple[m.Response, int | None]], limit: int | None, header: bytes
+) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "recording"
+        with RecordingWriter(
+            path, user_header=header, split=Split(records=limit), timezone=UTC
+        ) as writer:
+            for message, t_ns in timed:
+                assert t_ns is not None
+                assert writer.write(message, t_ns)
+        if timed:
+            assert payloads(list(read_recording(path))) == payloads(timed)
+
+
+def test_every_stored_kind_is_a_response_of_the_table() -> None:
+    assert len(set(STORED)) == len(LAYOUTS) + len(CSV_KINDS)
+    bits = [layout.data_type for layout in LAYOUTS] + [kind.data_type for kind in CSV_KINDS]
+    assert len(set(bits)) == len(bits)
+    assert set(BY_MESSAGE) <= set(STORED)
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    st.lists(
+        st.tuples(messages(m.Response), st.none() | st.integers(0, 2**62)),
+        max_size=6,
+    )
+)
+def test_archives_mcap_and_captures_give_back_what_was_written(
+    timed: list[tuple[m.Response, int | None]],
+) -> None:
+    facts = RecordingFacts(session_id="s", user_header=b"\xff")
+    with tempfile.TemporaryDirectory() as folder:
+        write_npz(Path(folder) / "x.npz", timed, facts)
+        assert payloads(list(read_npz(Path(folder) / "x.npz"))) == payloads(timed)
+        write_mcap(Path(folder) / "x.mcap", timed, facts)
+        if timed:
+            assert payloads(list(read_mcap(Path(folder) / "x.mcap", None))) == payloads(timed)
+        module = Connection(Role.MODULE)
+        with WireCapture(Path(folder) / "x.xtwire") as capture:
+            for message, t_ns in timed:
+                capture.write("rx", module.send(message), t_ns)
+        assert payloads(list(read_recording(Path(folder) / "x.xtwire"))) == payloads(timed)
+
+
+@cache
+def _examples() -> dict[str, tuple[dict[str, bytes], list[tuple[bytes, int | None]]]]:
+    """One small recording in each format that can be cut: its files, and its messages."""
+    timed: list[tuple[m.Response, int]] = []
+    for counter in range(4):
+        values = np.arange(counter + 1, dtype=np.float32)
+        timed.append((m.DataFloat(info=counter, values=values), (2 * counter + 1) * MS))
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        with RecordingWriter(root / "vendor", timezone=UTC) as writer:
+            for message, t_ns in timed:
+                writer.write(message, t_ns)
+        with RecordingWriter(root / "csv", timezone=UTC) as writer:
+            for counter in range(4):
+                single = m.PresenceSingle(
+                    counter=counter, state=1, distance_m=0.5, direction=1, signal_quality=9
+                )
+                writer.write(single, counter * MS)
+        with WireCapture(root / "x.xtwire") as capture:
+            for message, t_ns in timed:
+                capture.write("rx", Connection(Role.MODULE).send(message), t_ns)
+        convert(root / "vendor", root / "x.mcap")
+        found = {}
+        for name in ("vendor", "csv", "x.xtwire", "x.mcap"):
+            path = root / name
+            files = path.iterdir() if path.is_dir() else [path]
+            contents = {str(file.relative_to(root)): file.read_bytes() for file in files}
+            found[name] = contents, payloads(list(read_recording(path)))
+    return found
+
+
+@pytest.mark.parametrize("name", ["vendor", "csv", "x.xtwire", "x.mcap"])
+def test_a_cut_anywhere_leaves_a_prefix_and_at_most_one_fault(name: str, tmp_path: Path) -> None:
+    contents, whole = _examples()[name]
+    for file, data in contents.items():
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).write_bytes(data)
+    for file, data in contents.items():
+        if file.endswith("meta.dat"):
+            continue  # below
+        step = 1 if len(data) < 500 else 7  # MCAP's own head and index are long
+        for at in range(0, len(data), step):
+            (tmp_path / file).write_bytes(data[:at])
+            faults: list[RecordingFault] = []
+            found, error = _read(tmp_path / name, faults)
+            assert found == whole[: len(found)], (file, at)
+            assert len(faults) + len(error) <= 1, (file, at, faults, error)
+            if found != whole and at not in _chunk_ends(data):
+                assert faults or error, (file, at)
+
+
+def _chunk_ends(data: bytes) -> set[int]:
+    """Where a wire capture may end without anybody seeing that it was longer."""
+    if not data.startswith(b"\x89XTWIRE"):
+        return set()
+    ends = {16 + int.from_bytes(data[12:16], "little")}
+    while (last := max(ends)) < len(data):
+        ends.add(last + 13 + int.from_bytes(data[last + 9 : last + 13], "little"))
+    return ends
+
+
+def _read(
+    path: Path, faults: list[RecordingFault]
+) -> tuple[list[tuple[bytes, int | None]], list[str]]:
+    found: list[tuple[m.Response, int | None]] = []
+    try:
+        for timed in read_recording(path, faults.append):
+            found.append(timed)  # noqa: PERF402 - what came before an error counts
+    except RecordingError as error:
+        return payloads(found), [str(error)]
+    return payloads(found), []
+
+
+@settings(deadline=None, max_examples=120)
+@given(at=st.integers(0, 2**16), to=st.binary(min_size=1, max_size=8), cut=st.booleans())
+@example(at=0x1D, to=b"\xff" * 8, cut=False)
+@example(at=0x55, to=b"\xff" * 4, cut=False)
+def test_a_damaged_meta_never_costs_a_message(at: int, to: bytes, cut: bool) -> None:
+    contents, whole = _examples()["vendor"]
+    with tempfile.TemporaryDirectory() as folder:
+        for name, data in contents.items():
+            path = Path(folder) / name
+            path.parent.mkdir(exist_ok=True)
+            if name.endswith("meta.dat"):
+                at %= len(data)
+                data = data[:at] if cut else (data[:at] + to + data[at + len(to) :])
+            path.write_bytes(data)
+        found, error = _read(Path(folder) / "vendor", [])
+    assert error == []
+    assert [payload for payload, _ in found] == [payload for payload, _ in whole]

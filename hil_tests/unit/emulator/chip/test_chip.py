@@ -1,0 +1,358 @@
+"""Settings, checks and frames of the chip against the protocol reference's tables."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from emulator.chip.chip import CaptureSettings, Chip, Refusal
+from hil_tests.unit.emulator.doubles import FormulaSource, RampSource
+from xethru_protocol.wire.codes import X4Setting
+from xethru_protocol.wire.messages import X4Value
+
+
+def working_point(chip: Chip) -> None:
+    chip.set(X4Setting.DACMIN, 949)
+    chip.set(X4Setting.DACMAX, 1100)
+    chip.set(X4Setting.ITERATIONS, 16)
+    chip.set(X4Setting.PULSESPERSTEP, 300)
+    chip.set(X4Setting.FRAMEAREA, (0.2, 9.4))
+
+
+class OneEchoSource(RampSource):
+    """Zeros but for one frame."""
+
+    def __init__(self, counter: int) -> None:
+        super().__init__()
+        self._counter = counter
+
+    def rf_counters(
+        self,
+        capture: CaptureSettings,
+        frame_counters: NDArray[np.int64],
+        scene_times_ns: NDArray[np.int64],
+    ) -> NDArray[np.int64]:
+        ramp = super().rf_counters(capture, frame_counters, scene_times_ns)
+        ramp[frame_counters != self._counter] = 0
+        return ramp
+
+
+# Protocol reference 9.3, column "After INIT/boot".
+DEFAULTS: list[tuple[X4Setting, X4Value]] = [
+    (X4Setting.FPS, 0.0),
+    (X4Setting.PULSESPERSTEP, 10),
+    (X4Setting.ITERATIONS, 8),
+    (X4Setting.DOWNCONVERSION, 0),
+    (X4Setting.DACMIN, 0),
+    (X4Setting.DACMAX, 2047),
+    (X4Setting.DACSTEP, 0),
+    (X4Setting.TXPOWER, 2),
+    (X4Setting.TXCENTERFREQUENCY, 3),
+    (X4Setting.PRFDIV, 16),
+    (X4Setting.FRAMEBINCOUNT, 1467),
+]
+
+
+@pytest.mark.parametrize(("setting", "value"), DEFAULTS)
+def test_init_restores_every_default(setting: X4Setting, value: X4Value) -> None:
+    chip = Chip(RampSource())
+    working_point(chip)
+    chip.set(X4Setting.FPS, 17.0)
+    chip.init()
+    assert chip.get(setting) == value
+
+
+def test_default_area_reads_back_as_documented() -> None:
+    start_m, end_m = Chip(RampSource()).area.start_m, Chip(RampSource()).area.end_m
+    assert (start_m, end_m) == pytest.approx((-0.0000411, 9.4328289), abs=5e-8)
+
+
+# Protocol reference 4.9, column "Range / check (error)".
+REFUSED: list[tuple[X4Setting, X4Value, int]] = [
+    (X4Setting.FRAMEAREA, (5.0, 0.4), 17),
+    (X4Setting.FRAMEAREA, (math.nan, 1.0), 17),
+    (X4Setting.DACSTEP, 4, 12),
+    (X4Setting.DACMIN, 2048, 1),
+    (X4Setting.DACMAX, 2048, 1),
+    (X4Setting.TXCENTERFREQUENCY, 2, 20),
+    (X4Setting.TXCENTERFREQUENCY, 5, 20),
+    (X4Setting.TXPOWER, 4, 21),
+    (X4Setting.PRFDIV, 3, 18),
+    (X4Setting.FRAMEBINCOUNT, 7, 1),
+]
+
+
+@pytest.mark.parametrize(("setting", "value", "code"), REFUSED)
+def test_bad_value_is_refused_and_changes_nothing(
+    setting: X4Setting, value: X4Value, code: int
+) -> None:
+    chip = Chip(RampSource())
+    before = chip.settings
+    with pytest.raises(Refusal) as refusal:
+        chip.set(setting, value)
+    assert refusal.value.code == code
+    assert chip.settings == before
+
+
+@pytest.mark.parametrize(
+    ("setting", "value", "kept"),
+    [
+        (X4Setting.PULSESPERSTEP, 0x1012C, 300),
+        (X4Setting.PULSESPERSTEP, 1101004800, 0),  # the document's float form of 20
+        (X4Setting.ITERATIONS, 0x110, 16),
+        (X4Setting.DACMIN, 0x10005, 5),
+        (X4Setting.DACSTEP, 0x102, 2),
+    ],
+)
+def test_only_the_documented_bits_are_kept(setting: X4Setting, value: int, kept: int) -> None:
+    chip = Chip(RampSource())
+    chip.set(setting, value)
+    assert chip.get(setting) == kept
+
+
+def test_enable_has_no_getter_and_off_needs_init() -> None:
+    chip = Chip(RampSource())
+    chip.set(X4Setting.FPS, 17.0)
+    with pytest.raises(Refusal) as refusal:
+        chip.get(X4Setting.ENABLE)
+    assert refusal.value.code == 1
+    chip.set(X4Setting.ENABLE, 0)
+    assert not chip.running
+    chip.set(X4Setting.ENABLE, 1)
+    with pytest.raises(Refusal) as refusal:
+        chip.set(X4Setting.ITERATIONS, 16)
+    assert refusal.value.code == 4
+    chip.init()
+    chip.set(X4Setting.ITERATIONS, 16)
+
+
+def test_real_frame_rate_is_read_back() -> None:
+    chip = Chip(RampSource())
+    for requested, read_back in (
+        (17.0, 17.049379),
+        (17.9, 17.049379),
+        (0.5, 1.004108),
+        (40.5, 40.5),
+    ):
+        chip.set(X4Setting.FPS, requested)
+        assert chip.get(X4Setting.FPS) == pytest.approx(read_back, abs=1e-6)
+    chip.set(X4Setting.FPS, -1.0)
+    assert chip.get(X4Setting.FPS) == -1.0
+    assert not chip.running
+
+
+def test_rf_values_are_counter_times_quantum_minus_half_range_in_float32() -> None:
+    """Protocol reference 9.7: n = 2.03450526e-07 and offset 0.07421875 at 16 x 300, 949-1100."""
+    chip = Chip(RampSource())
+    working_point(chip)
+    frame = chip.next_frame()
+    counters = np.arange(1431) % 1000
+    expected = counters.astype(np.float32) * np.float32(2.03450526e-07) - np.float32(0.07421875)
+    assert frame.values.dtype == np.float32
+    np.testing.assert_array_equal(frame.values, expected)
+
+
+def test_full_counter_range_spans_the_documented_output_range() -> None:
+    """0 ... 16 * 300 * 152 counts are -0.07421875 ... +0.07421875."""
+    top = 16 * 300 * 152
+    chip = Chip(FormulaSource(lambda index: np.where(index % 2 == 0, 0.0, top)))
+    working_point(chip)
+    values = chip.next_frame().values
+    assert values.min() == np.float32(-0.07421875)
+    assert values.max() == pytest.approx(0.07421875, rel=1e-6)
+
+
+def test_frame_area_offset_moves_labels_and_not_echoes() -> None:
+    source = RampSource()
+    chip = Chip(source)
+    working_point(chip)
+    chip.next_frame()
+    # one RF bin further in both request and offset: the same samples under other labels
+    step_m = 1.5e8 / 23.328e9
+    chip.set(X4Setting.FRAMEAREAOFFSET, float(np.float32(0.18 + step_m)))
+    chip.set(X4Setting.FRAMEAREA, (0.2 + step_m, 9.4 + step_m))
+    chip.next_frame()
+    before, after = source.captures
+    assert after.first_sample_m == pytest.approx(before.first_sample_m, abs=1e-9)
+    assert after.n_samples == before.n_samples == 1431
+    # i0 = 3 of the reference's worked example: sample 0 of the frame is 3 bins behind 0.18 m
+    assert before.first_sample_m == pytest.approx(0.18 + 3 * step_m, abs=1e-9)
+
+
+def test_a_setting_takes_effect_with_the_next_frame() -> None:
+    chip = Chip(RampSource())
+    working_point(chip)
+    lengths: list[int] = []
+    for area in ((0.2, 9.4), (0.4, 5.0), (0.0, 1.0)):
+        lengths += [len(chip.next_frame().values) for _ in range(3)]
+        chip.set(X4Setting.FRAMEAREA, area)
+    assert lengths == [1431] * 6 + [716] * 3
+
+
+def test_blocks_grow_but_never_change_a_value() -> None:
+    source = RampSource()
+    chip = Chip(source)
+    working_point(chip)
+    values = [chip.next_frame().values for _ in range(70)]
+    assert max(source.blocks) > 1
+    for counter, row in enumerate(values):
+        alone = Chip(RampSource())
+        working_point(alone)
+        alone.timeline.next_counter = counter
+        np.testing.assert_array_equal(alone.next_frame().values, row)
+
+
+def test_counter_wraps_at_32_bits() -> None:
+    chip = Chip(RampSource())
+    chip.timeline.next_counter = 2**32 - 1
+    assert [chip.next_frame().counter for _ in range(2)] == [2**32 - 1, 0]
+
+
+def test_a_hundred_all_zero_frames_switch_the_transmitter_off() -> None:
+    """Protocol reference 8.4, transmitter guard."""
+    chip = Chip(FormulaSource(lambda index: 0 * index))
+    working_point(chip)
+    chip.set(X4Setting.FPS, 17.0)
+    for _ in range(99):
+        chip.next_frame()
+    assert chip.get(X4Setting.TXPOWER) == 2
+    chip.next_frame()
+    assert not chip.running
+    assert chip.get(X4Setting.TXPOWER) == 0
+
+
+def test_zero_frames_that_do_not_follow_each_other_switch_nothing_off() -> None:
+    """Frame 50 alone is not zero: 99 zero frames behind it are allowed, and 50 before it."""
+    chip = Chip(OneEchoSource(50))
+    working_point(chip)
+    chip.set(X4Setting.FPS, 17.0)
+    for _ in range(150):
+        chip.next_frame()
+    assert (chip.running, chip.get(X4Setting.TXPOWER)) == (True, 2)
+    chip.next_frame()
+    assert (chip.running, chip.get(X4Setting.TXPOWER)) == (False, 0)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [(X4Setting.ITERATIONS, 0), (X4Setting.PULSESPERSTEP, 0), (X4Setting.DACMIN, 1101)],
+)
+@pytest.mark.parametrize("downconversion", [0, 1])
+def test_settings_without_a_sweep_give_finite_frames(
+    setting: X4Setting, value: int, downconversion: int
+) -> None:
+    chip = Chip(RampSource())
+    working_point(chip)
+    chip.set(X4Setting.DOWNCONVERSION, downconversion)
+    chip.set(setting, value)
+    assert np.isfinite(chip.next_frame().values).all()
+
+
+def test_coupled_registers_are_the_settings() -> None:
+    """Protocol reference 4.9: PIF 53 iterations, 48/49 dac max, 2E/2F pulses, 101, 117, 15."""
+    chip = Chip(RampSource())
+    working_point(chip)
+    pif = X4Setting.PIFREGISTER
+    read = {address: chip.read_register(pif, address) for address in (0x35, 0x2E, 0x2F, 0x30, 0x31)}
+    assert read == {0x35: 16, 0x2E: 300 >> 8, 0x2F: 300 & 255, 0x30: 1100 >> 3, 0x31: 1100 & 7}
+    chip.set(pif, (0x35, 24))
+    assert chip.get(X4Setting.ITERATIONS) == 24
+    chip.set(pif, (0x0F, 1))
+    assert chip.get(X4Setting.FRAMEBINCOUNT) == 181
+
+
+# Protocol reference 4.9, table of X4 registers: address, byte written, and what it sets.
+REGISTER_WRITES: list[tuple[int, int, X4Setting, X4Value]] = [
+    (0x2C, 40, X4Setting.PRFDIV, 40),
+    (0x2E, 0x02, X4Setting.PULSESPERSTEP, 0x022C),  # 300 is 012Ch
+    (0x2F, 0x02, X4Setting.PULSESPERSTEP, 0x0102),
+    (0x30, 0x20, X4Setting.DACMAX, 0x104),  # 1100 is 89h * 8 + 4
+    (0x31, 0x03, X4Setting.DACMAX, 1099),
+    (0x32, 0x20, X4Setting.DACMIN, 0x105),  # 949 is 76h * 8 + 5
+    (0x33, 0x03, X4Setting.DACMIN, 947),
+    (0x34, 0x22, X4Setting.DACSTEP, 2),
+    (0x35, 24, X4Setting.ITERATIONS, 24),
+    (0x65, 0x40, X4Setting.TXCENTERFREQUENCY, 4),
+    (0x75, 0x70, X4Setting.TXPOWER, 3),
+    (0x75, 0x10, X4Setting.TXPOWER, 0),
+    (0x0F, 0x01, X4Setting.DOWNCONVERSION, 1),
+]
+
+
+@pytest.mark.parametrize(("address", "byte", "setting", "value"), REGISTER_WRITES)
+def test_writing_a_coupled_register_sets_its_setting_and_reads_back(
+    address: int, byte: int, setting: X4Setting, value: X4Value
+) -> None:
+    chip = Chip(RampSource())
+    working_point(chip)
+    chip.set(X4Setting.PIFREGISTER, (address, byte))
+    assert chip.get(setting) == value
+    assert chip.read_register(X4Setting.PIFREGISTER, address) == byte
+
+
+def test_registers_that_follow_from_settings() -> None:
+    """Protocol reference 4.9 and 9.4: bytes per counter, and rx wait = 1 + delay steps."""
+    chip = Chip(RampSource())
+    pif = X4Setting.PIFREGISTER
+    # (start - 0.18 m) / 0.6173 m: -0.3, 0.03 and 7.8 coarse steps
+    for start_m, rx_wait in ((0.0, 0), (0.2, 1), (5.0, 8)):
+        chip.set(X4Setting.FRAMEAREA, (start_m, 9.4))
+        assert chip.read_register(pif, 0x42) == rx_wait
+    assert chip.read_register(pif, 0x1B) == 3
+    chip.set(X4Setting.DOWNCONVERSION, 1)
+    assert chip.read_register(pif, 0x1B) == 6
+    chip.set(pif, (0x1B, 3))
+    assert chip.read_register(pif, 0x1B) == 6
+    assert chip.get(X4Setting.DOWNCONVERSION) == 1
+
+
+def test_registers_start_as_the_driver_leaves_them() -> None:
+    """Protocol reference 4.9, last paragraph: after INIT."""
+    chip = Chip(RampSource())
+    pif = {
+        47: 10,
+        46: 0,
+        53: 8,
+        44: 16,
+        45: 16,
+        67: 1,
+        106: 96,
+        115: 16,
+        73: 8,
+        15: 0,
+        14: 128,
+        66: 0,
+    }
+    # 117 = 80 and 101 = 48 hold TX power 2 and centre frequency 3 of the board defaults
+    pif |= {49: 7, 48: 255, 51: 0, 50: 0, 117: 80, 101: 48, 27: 3}
+    for address, value in pif.items():
+        assert chip.read_register(X4Setting.PIFREGISTER, address) == value, address
+    spi = [chip.read_register(X4Setting.SPIREGISTER, address) for address in range(4)]
+    assert spi == [0x00, 0xFF, 0x01, 0x02]
+    assert chip.read_register(X4Setting.XIFREGISTER, 3) == 63
+    chip.set(X4Setting.SPIREGISTER, (2, 99))
+    assert chip.read_register(X4Setting.SPIREGISTER, 2) == 1
+    chip.set(X4Setting.XIFREGISTER, (9, 99))
+    assert chip.read_register(X4Setting.XIFREGISTER, 9) == 99
+    chip.init()
+    assert chip.read_register(X4Setting.XIFREGISTER, 9) == 0
+
+
+def test_of_modules_in_step_few_make_a_block_at_a_time() -> None:
+    """Eight neighbours: once the blocks have grown, one of them synthesises per frame."""
+    sources = [RampSource() for _ in range(8)]
+    chips = [Chip(source, 8, block_phase=phase) for phase, source in enumerate(sources)]
+    for chip in chips:
+        chip.set(X4Setting.FPS, 17.0)
+    made = []
+    for _ in range(64):
+        before = [len(source.blocks) for source in sources]
+        frames = [chip.next_frame() for chip in chips]
+        made.append(sum(len(s.blocks) - n for s, n in zip(sources, before, strict=True)))
+        assert all(np.array_equal(frame.values, frames[0].values) for frame in frames)
+    assert made[0] == 8
+    assert made[24:] == [1] * 40
+    assert [source.blocks[-1] for source in sources] == [8] * 8

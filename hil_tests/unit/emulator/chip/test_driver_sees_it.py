@@ -1,0 +1,75 @@
+"""A host's view, through the driver and in virtual time: a person in the corridor."""
+
+from __future__ import annotations
+
+import math
+
+from emulator.chip.pace import Pace
+from emulator.device import radar_device
+from emulator.echo.echo import echo_source
+from emulator.loopback import LoopbackTransport
+from emulator.module.memory import Identity
+from emulator.scene.scene import load_scene
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import NoiseMapControl, PresenceState
+
+SECOND = 1_000_000_000
+
+
+def expected_state(time_s: float) -> PresenceState | None:
+    """Return the state at a time, None in the seconds when it changes."""
+    if time_s < 119:
+        return PresenceState.INITIALIZING
+    if 121 < time_s < 130:
+        return PresenceState.NO_PRESENCE
+    return PresenceState.PRESENCE if time_s > 132.5 else None
+
+
+def test_a_stock_module_sees_the_visitor_of_the_corridor() -> None:
+    """It powers up with its profile running; the visitor comes after 130 s, at 5.5 m."""
+    scene = load_scene("visitor")
+    device = radar_device(
+        Identity(serial=scene.radars[0].serial), echo_source(scene, 0, 0), Pace.REALTIME
+    )
+    transport = LoopbackTransport(device)
+    with X4M300(transport, clock=transport.clock_ns) as radar:
+        seen = []
+        for message in radar.presence.messages(140):
+            assert isinstance(message, m.PresenceSingle)
+            seen.append((transport.clock_ns() / SECOND, message))
+    for time_s, message in seen:
+        expected = expected_state(time_s)
+        if expected is not None:
+            assert message.state == expected, time_s
+        if expected is PresenceState.PRESENCE:
+            walked_m = 0.8 * (time_s - 130.0) % 8.0
+            x_m = 5.5 - walked_m if walked_m < 4 else walked_m - 2.5
+            if abs(walked_m - 4) > 0.3:  # not in the moment it turns round
+                assert abs(message.distance_m - math.hypot(x_m, 0.2)) < 0.11
+    assert seen[-1][0] > 138
+
+
+def test_settings_of_a_host_reach_the_profile() -> None:
+    """A zone that ends before the visitor's path, then one that holds it."""
+    scene = load_scene("visitor")
+    device = radar_device(
+        Identity(serial=scene.radars[0].serial), echo_source(scene, 0, 0), Pace.REALTIME
+    )
+    transport = LoopbackTransport(device)
+    with X4M300(transport, clock=transport.clock_ns) as radar:
+        states = {}
+        for zone in ((0.5, 1.2), (0.5, 6.0)):
+            radar.presence.stop()
+            radar.presence.load()
+            radar.presence.set_noise_map(NoiseMapControl(6))
+            radar.presence.set_zone(*zone)
+            radar.presence.run()
+            while True:
+                (message,) = radar.presence.messages(1)
+                clock_s = transport.clock_ns() / SECOND
+                if clock_s > (145 if zone[1] < 2 else 175):
+                    break
+            assert isinstance(message, m.PresenceSingle)
+            states[zone] = message.state
+    assert list(states.values()) == [PresenceState.NO_PRESENCE, PresenceState.PRESENCE]

@@ -1,0 +1,98 @@
+"""A module's clock: when it samples, how short its bins are, and how loud its receiver is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emulator.chip.clock import ModuleClock
+from emulator.echo.echo import SceneEcho
+from emulator.scene.scene import LeakageSpec, NoiseSpec, PathSpec, RadarSpec, Scene
+from hil_tests.captures import PAPER
+from hil_tests.unit.emulator.rooms import radar_at, room, target
+
+DAY_NS = 86_400_000_000_000
+CAPTURE = replace(PAPER, first_sample_m=0.0, n_samples=1400, dac_min=0, dac_max=2047)
+
+
+@given(
+    nominal_ns=st.integers(0, DAY_NS),
+    skew_ns=st.integers(0, 10_000_000_000),
+    ppm=st.floats(-1000, 1000),
+)
+def test_a_frame_is_taken_when_the_modules_clock_says_so(
+    nominal_ns: int, skew_ns: int, ppm: float
+) -> None:
+    """Against exact fractions; and the clock shows the same time when it is read back."""
+    clock = ModuleClock(skew_ns=skew_ns, ppm=ppm)
+    exact = Fraction(nominal_ns) / (1 + Fraction(ppm) / 1_000_000) + skew_ns
+    assert abs(clock.scene_time_ns(nominal_ns) - exact) <= Fraction(51, 100)
+    assert abs(clock.nominal_ns(clock.scene_time_ns(nominal_ns)) - nominal_ns) <= 1
+    many = clock.scene_times_ns(np.array([nominal_ns, 0]))
+    assert many.tolist() == [clock.scene_time_ns(nominal_ns), skew_ns]
+
+
+def test_a_perfect_clock_changes_no_bit() -> None:
+    times = np.array([0, 1, DAY_NS - 1, DAY_NS])
+    np.testing.assert_array_equal(ModuleClock(skew_ns=7).scene_times_ns(times), times + 7)
+
+
+def driving(radar: RadarSpec, target_x_m: float) -> Scene:
+    path = PathSpec(waypoints_m=((0.0, 0.0), (50.0, 0.0)), laps=("forward",), speed_mps=0.05)
+    return room(radar, path=path, targets=(target(target_x_m, 0.0, amplitude_1m=5.0),))
+
+
+def test_a_fast_module_samples_earlier_with_shorter_bins() -> None:
+    """A frame at +100 ppm is a perfect module's of T / 1.0001, on bins shorter by 1.0001.
+
+    After 900 s of its own it is 0.09 s early; the target 7 m ahead seems 0.7 mm farther, by a
+    carrier that is as much shorter: to the bin, an echo from there.
+    """
+    perfect, fast = radar_at(0, 0, 0), radar_at(0, 0, 0, clock_ppm=100.0)
+    nominal_ns, true_ns = np.array([900_090_000_000]), np.array([900_000_000_000])
+    got = SceneEcho(driving(fast, 52.0), fast, 0).echo(CAPTURE, nominal_ns)[0]
+    ahead_m = 52.0 - 0.05 * 900
+    stretched = driving(perfect, 52.0 + ahead_m * 1e-4)
+    same = SceneEcho(stretched, perfect, 0).echo(CAPTURE, true_ns)[0]
+    np.testing.assert_allclose(got * 1.0001**-2, same, atol=1e-9)
+    assert np.abs(got).max() > 0.05
+    late = SceneEcho(stretched, perfect, 0).echo(CAPTURE, nominal_ns)[0]
+    assert np.abs(got - late).max() > 0.1 * np.abs(got).max()
+
+
+@pytest.mark.parametrize("gain_db", [-6.0, 3.0])
+def test_gain_scales_what_arrives_and_not_the_noise(gain_db: float) -> None:
+    now = np.array([0])
+    scene = Scene(
+        name="room",
+        environment="lab",
+        description="",
+        radars=(radar_at(0, 0, 0),),
+        targets=(target(1.0, 0.0),),
+        leakage=LeakageSpec(amplitude=0.01),
+        noise=NoiseSpec(rf_sigma=1e-3),
+    )
+    plain, loud = radar_at(0, 0, 0), radar_at(0, 0, 0, gain_db=gain_db)
+    factor = 10 ** (gain_db / 20)
+    expected = factor * SceneEcho(scene, plain, 0).echo(CAPTURE, now)
+    np.testing.assert_allclose(SceneEcho(scene, loud, 0).echo(CAPTURE, now), expected, atol=1e-9)
+    silent = scene.model_copy(update={"targets": (), "leakage": LeakageSpec(amplitude=0.0)})
+    np.testing.assert_array_equal(
+        SceneEcho(silent, loud, 0).rf_counters(CAPTURE, now, now),
+        SceneEcho(silent, plain, 0).rf_counters(CAPTURE, now, now),
+    )
+
+
+def test_the_phase_of_a_frame_turns_all_of_its_echoes() -> None:
+    """A quarter turn each for two frames a half turn apart: the signal changes its sign."""
+    scene = room(radar_at(0, 0, 0), targets=(target(1.0, 0.0), target(2.0, 0.3, name="other")))
+    source = SceneEcho(scene, scene.radars[0], 0)
+    two = source.echo(CAPTURE, np.array([0, 0]), np.array([0.3, 0.3 + math.pi]))
+    np.testing.assert_allclose(two[0], -two[1], atol=1e-15)
+    assert not np.array_equal(two[0], source.echo(CAPTURE, np.array([0]))[0])

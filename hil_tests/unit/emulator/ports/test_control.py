@@ -1,0 +1,176 @@
+"""Live control: what is asked is done, what cannot be done is one line with the remedy."""
+
+from __future__ import annotations
+
+import json
+import selectors
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emulator.cli import request_of
+from emulator.ports.control import LONGEST_LINE, Control, ControlSocket
+from hil_tests.faulty import FaultyLine
+from hil_tests.patience import seconds
+from xethru_protocol.wire.errors import Disconnected
+
+
+def ask(line: FaultyLine, **asked: Any) -> dict[str, Any]:  # noqa: ANN401 - JSON
+    control = Control({"radar_1": line.device})
+    answer = control.answer(json.dumps(asked).encode(), line.clock_ns())
+    assert answer.endswith(b"\n")
+    said: dict[str, Any] = json.loads(answer)
+    return said
+
+
+def test_a_fault_is_added_listed_counted_and_cleared() -> None:
+    line = FaultyLine()
+    radar = line.streaming()
+    fault = {"kind": "missing_frames", "count": 2, "every": 3, "parameters": {"frames": 1}}
+    added = ask(line, verb="fault add", fault=fault)
+    assert added == {"ok": True, "ids": {"radar_1": 1}}
+    list(radar.frames(20))
+    (listed,) = ask(line, verb="fault list")["faults"]["radar_1"]
+    assert (listed["kind"], listed["injected"], listed["count"]) == ("missing_frames", 2, 2)
+    assert radar.frames_lost == 2
+    assert ask(line, verb="fault clear", id=1) == {"ok": True, "cleared": 1}
+    state = ask(line, verb="state")["radars"]["radar_1"]
+    assert state == {
+        "present": True,
+        "faults": [],
+        "injected": {"missing_frames": 2},
+        "playback": None,
+    }
+
+
+def test_a_port_is_unplugged_and_plugged_again() -> None:
+    line = FaultyLine()
+    radar = line.streaming()
+    ask(line, verb="unplug")
+    assert not ask(line, verb="state")["radars"]["radar_1"]["present"]
+    with pytest.raises(Disconnected):
+        list(radar.frames(100))
+    ask(line, verb="plug")
+    assert ask(line, verb="state")["radars"]["radar_1"]["present"]
+
+
+def test_a_port_that_is_unplugged_for_a_while_comes_back() -> None:
+    line = FaultyLine()
+    radar = line.streaming(reconnect_s=15.0)
+    ask(line, verb="unplug", seconds=1.0)
+    assert len(list(radar.frames(10))) == 10
+    assert radar.reconnects == 1
+
+
+def test_a_reset_is_a_reboot() -> None:
+    line = FaultyLine()
+    radar = line.radar()
+    ask(line, verb="reset", radar="radar_1")
+    line.sleep(5.0)
+    radar.ping()
+    assert radar.reboots == 1
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({}, "verb: must be one of state, fault add"),
+        ({"verb": "sing"}, "verb: must be one of state, fault add"),
+        ({"verb": "state", "colour": 1}, "colour: unknown key; allowed are verb, radar"),
+        ({"verb": "state", "radar": "nose"}, "radar: must be one of radar_1"),
+        ({"verb": "fault add"}, "fault: Input should be"),
+        ({"verb": "fault add", "fault": {"kind": "crc"}}, "no kind of fault is called 'crc'"),
+        ({"verb": "fault add", "fault": {"kind": "stall", "radar": ["x"]}}, "must be some of"),
+        ({"verb": "fault clear", "id": 9}, "id: no armed fault has number 9"),
+        ({"verb": "unplug", "seconds": -1}, "seconds: must be a number from 0"),
+        ({"verb": "unplug", "seconds": 10**400}, "seconds: must be a number from 0"),
+        ({"verb": "unplug", "seconds": float("nan")}, "seconds: must be a number from 0"),
+        ({"verb": "unplug", "seconds": float("inf")}, "seconds: must be a number from 0"),
+        ({"verb": "rate", "value": 10**400}, "value: must be a number from 0"),
+        ({"verb": "pause"}, "nothing is played here"),
+        ({"verb": "rate", "value": "fast"}, "value: must be a number from 0"),
+        ({"verb": "loop", "value": 1}, "value: must be true or false"),
+        ({"verb": "filter", "kinds": [1]}, "kinds: must be a list of names"),
+    ],
+)
+def test_what_cannot_be_done_is_told(asked: dict[str, Any], said: str) -> None:
+    answer = ask(FaultyLine(), **asked)
+    assert answer["ok"] is False
+    assert said in answer["error"]
+
+
+@given(line=st.binary(max_size=200))
+def test_no_line_breaks_it(line: bytes) -> None:
+    device = FaultyLine()
+    answer = Control({"radar_1": device.device}).answer(line, 0)
+    assert json.loads(answer)["ok"] is False
+
+
+@pytest.mark.parametrize("depth", [100_000])
+def test_nesting_breaks_nothing(depth: int) -> None:
+    answer = Control({"radar_1": FaultyLine().device}).answer(b"[" * depth, 0)
+    assert json.loads(answer)["ok"] is False
+
+
+@pytest.mark.parametrize(
+    ("words", "request_line"),
+    [
+        ("state", {"verb": "state"}),
+        ("unplug 2.5", {"verb": "unplug", "seconds": 2.5}),
+        ("fault clear 3", {"verb": "fault clear", "id": 3}),
+        ("rate 0", {"verb": "rate", "value": 0.0}),
+        ("loop off", {"verb": "loop", "value": False}),
+        ("filter", {"verb": "filter", "kinds": None}),
+        ("filter data-float", {"verb": "filter", "kinds": ["data-float"]}),
+    ],
+)
+def test_words_become_requests(words: str, request_line: dict[str, Any]) -> None:
+    assert request_of(words.split()) == request_line
+
+
+@pytest.mark.parametrize("words", ["sing", "rate fast", "fault add stall seconds", "loop maybe"])
+def test_unknown_words_are_refused(words: str) -> None:
+    with pytest.raises(ValueError, match=r"see --help|is not a number|must be KEY=VALUE"):
+        request_of(words.split())
+
+
+def turn(selector: selectors.BaseSelector) -> None:
+    for _ in range(20):
+        for key, events in selector.select(0.0):
+            key.data(events, 0)
+
+
+def test_clients_of_the_socket_are_served_one_line_after_the_other(tmp_path: Path) -> None:
+    line = FaultyLine()
+    path = tmp_path / "control.sock"
+    offered = ControlSocket(path, Control({"radar_1": line.device}))
+    selector = selectors.DefaultSelector()
+    offered.register(selector)
+    assert path.stat().st_mode & 0o077 == 0
+    with socket.socket(socket.AF_UNIX) as one, socket.socket(socket.AF_UNIX) as flood:
+        one.connect(str(path))
+        flood.connect(str(path))
+        one.settimeout(seconds(1))
+        flood.setblocking(False)
+        one.sendall(b'{"verb":"state"}\n{"verb":"reset"}\n{"verb":')
+        turn(selector)
+        answers = one.recv(65536).splitlines()
+        assert [json.loads(answer)["ok"] for answer in answers] == [True, True]
+        for _ in range(3 * LONGEST_LINE // 4096):
+            try:
+                flood.send(b"x" * 4096)
+            except (BlockingIOError, BrokenPipeError):
+                break
+            turn(selector)
+        one.sendall(b'"state"}\n')
+        turn(selector)
+        assert json.loads(one.recv(65536))["ok"]
+    turn(selector)
+    offered.close()
+    assert not path.exists()
+    assert list(selector.get_map().values())[1:] == []
+    selector.close()

@@ -1,0 +1,328 @@
+"""The loop, turn by turn: fairness, back-pressure, bounded reply latency.
+
+Most tests use a socket pair as the line: what is written on one side can be read on the other at
+once. A pseudo-terminal moves bytes in a kernel worker of its own, at no certain time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from emulator.chip.pace import Pace
+from emulator.device import Device
+from emulator.ports.pty import PtyLink
+from emulator.ports.server import PACKETS_PER_TURN, Port, Server
+from hil_tests.bench.pair_line import PairLine
+from hil_tests.patience import seconds
+from hil_tests.unit.emulator.doubles import ramp_device
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import SensorMode, X4Setting
+from xethru_protocol.wire.connection import Connection, Role
+from xethru_protocol.wire.framing import NeedData
+
+
+@dataclass
+class Clock:
+    now_ns: int = 0
+
+    def __call__(self) -> int:
+        return self.now_ns
+
+
+LIMIT_S = seconds(60)
+
+
+class PairLink(PairLine):
+    """A line without a terminal, which holds a few packets."""
+
+    def host_fd(self) -> int:
+        return os.dup(self.host_fileno())
+
+
+class TerminalLink(PtyLink):
+    """The real thing."""
+
+    def host_fd(self) -> int:
+        return os.open(self.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+
+
+class Host:
+    """A host on the other side of a line, stepping the server as it waits."""
+
+    def __init__(self, link: PairLink | TerminalLink, server: Server) -> None:
+        self.server = server
+        self.fd = link.host_fd()
+        self.line = Connection(Role.HOST)
+
+    def send(self, command: m.Command[m.Response]) -> None:
+        os.write(self.fd, self.line.send(command))
+
+    def hear(self) -> m.Message:
+        deadline = time.monotonic() + LIMIT_S
+        while time.monotonic() < deadline:
+            event = self.line.next_event()
+            if isinstance(event, m.Message):
+                return event
+            assert isinstance(event, NeedData), event
+            try:
+                self.line.receive_data(os.read(self.fd, 65536))
+            except BlockingIOError:
+                self.server.turn(longest_wait_s=0.01)
+        raise AssertionError("the device says nothing")
+
+    def ask(self, command: m.Command[m.Response]) -> tuple[m.Message, int]:
+        """Return the reply and how many frames came before it."""
+        self.send(command)
+        frames = 0
+        while isinstance(message := self.hear(), m.DataFloat):
+            frames += 1
+        return message, frames
+
+    def stream(self, fps: float = 17.0) -> None:
+        commands: list[m.Command[m.Response]] = [
+            m.SetMode(mode=SensorMode.XTID_SM_MANUAL),
+            m.X4DriverInit(),
+            m.X4DriverSet(setting=X4Setting.FPS, value=fps),
+        ]
+        for command in commands:
+            assert self.ask(command) == (m.Ack(), 0)
+
+    def close(self) -> None:
+        os.close(self.fd)
+
+
+@dataclass
+class Bench:
+    clock: Clock
+    server: Server
+    links: list[PairLink] | list[TerminalLink]
+    devices: list[Device]
+    hosts: list[Host] = field(default_factory=list)
+
+    def host(self, index: int) -> Host:
+        host = Host(self.links[index], self.server)
+        self.hosts.append(host)
+        return host
+
+
+@contextlib.contextmanager
+def served(links: list[PairLink] | list[TerminalLink], pace: Pace) -> Iterator[Bench]:
+    devices = [ramp_device(pace) for _ in links]
+    clock = Clock()
+    ports = [Port(links[index], device) for index, device in enumerate(devices)]
+    server = Server(ports, clock_ns=clock)
+    made = Bench(clock=clock, server=server, links=links, devices=devices)
+    yield made
+    for host in made.hosts:
+        host.close()
+    server.close()
+    for link in links:
+        link.close()
+
+
+@pytest.fixture(params=list(Pace))
+def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
+    with served([PairLink() for _ in range(3)], request.param) as made:
+        yield made
+
+
+@pytest.fixture
+def asap() -> Iterator[Bench]:
+    with served([PairLink()], Pace.ASAP) as made:
+        yield made
+
+
+@pytest.fixture(params=list(Pace))
+def terminal(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bench]:
+    with served([TerminalLink(tmp_path / "radar")], request.param) as made:
+        yield made
+
+
+def test_commands_are_answered(bench: Bench) -> None:
+    host = bench.host(1)
+    assert host.ask(m.Ping()) == (m.Pong(value=0xAAEEAEEA), 0)
+
+
+def test_commands_are_answered_through_a_terminal(terminal: Bench) -> None:
+    assert terminal.host(0).ask(m.Ping()) == (m.Pong(value=0xAAEEAEEA), 0)
+
+
+def test_nothing_is_lost_when_the_host_reads_slowly(asap: Bench) -> None:
+    host = asap.host(0)
+    host.stream()
+    counters = []
+    for step in range(200):
+        if step % 10 == 0:
+            for _ in range(20):
+                asap.server.turn(longest_wait_s=0)
+        message = host.hear()
+        assert isinstance(message, m.DataFloat)
+        counters.append(message.info)
+    assert counters == list(range(200))
+
+
+def test_back_pressure_stops_the_chip(asap: Bench) -> None:
+    host = asap.host(0)
+    host.stream()
+    for _ in range(100):
+        asap.server.turn(longest_wait_s=0)
+    made = asap.devices[0].module.chip.timeline.next_counter
+    for _ in range(100):
+        asap.server.turn(longest_wait_s=0)
+    assert asap.devices[0].module.chip.timeline.next_counter == made
+    assert made < 20, "no more than the line holds"
+
+
+def test_a_reply_overtakes_all_but_what_is_in_the_line(asap: Bench) -> None:
+    host = asap.host(0)
+    host.stream()
+    for _ in range(50):
+        asap.server.turn(longest_wait_s=0)
+    made = asap.devices[0].module.chip.timeline.next_counter
+    reply, frames = host.ask(m.X4DriverSet(setting=X4Setting.FPS, value=0.0))
+    assert reply == m.Ack()
+    assert frames <= made + 2, "what was made before, and a packet that was half sent"
+    for _ in range(20):
+        asap.server.turn(longest_wait_s=0)
+    with pytest.raises(BlockingIOError):
+        os.read(host.fd, 1)
+
+
+def test_a_host_that_dies_while_streaming_leaves_a_usable_module(terminal: Bench) -> None:
+    first = terminal.host(0)
+    first.stream(fps=90.0)
+    for _ in range(200):
+        terminal.clock.now_ns += 10_000_000
+        terminal.server.turn(longest_wait_s=0)
+    terminal.hosts.remove(first)
+    first.close()
+    for _ in range(200):
+        terminal.clock.now_ns += 10_000_000
+        terminal.server.turn(longest_wait_s=0)
+    second = terminal.host(0)
+    second.send(m.X4DriverSet(setting=X4Setting.FPS, value=0.0))
+    deadline = time.monotonic() + LIMIT_S
+    while time.monotonic() < deadline:  # the old frames, at worst one cut in two, then the reply
+        event = second.line.next_event()
+        if isinstance(event, m.Ack):
+            break
+        if isinstance(event, NeedData):
+            try:
+                second.line.receive_data(os.read(second.fd, 65536))
+            except BlockingIOError:
+                terminal.server.turn(longest_wait_s=0.01)
+    else:
+        pytest.fail("no answer after a host died")
+    assert second.ask(m.Ping()) == (m.Pong(value=0xAAEEAEEA), 0)
+
+
+def test_one_greedy_port_does_not_hold_up_another(bench: Bench) -> None:
+    bench.host(0).stream(fps=1e6)
+    quiet = bench.host(2)
+    quiet.ask(m.SetMode(mode=SensorMode.XTID_SM_STOP))  # ends the profile
+    bench.clock.now_ns += 10**9
+    quiet.send(m.Ping())
+    bench.server.turn(longest_wait_s=0)  # one turn serves every port, whatever the others want
+    quiet.line.receive_data(os.read(quiet.fd, 4096))
+    assert quiet.line.next_event() == m.Pong(value=0xAAEEAEEA)
+
+
+def test_random_bytes_on_one_port_leave_the_others_alone(bench: Bench) -> None:
+    noisy, quiet = bench.host(0), bench.host(1)
+    for seed in range(50):
+        os.write(noisy.fd, bytes((seed * 7 + step * step) % 256 for step in range(400)))
+        bench.server.turn(longest_wait_s=0)
+        assert quiet.ask(m.Ping()) == (m.Pong(value=0xAAEEAEEA), 0)
+
+
+def test_a_host_that_never_reads_replies_is_held_back(asap: Bench) -> None:
+    host = asap.host(0)
+    question = host.line.send(m.SystemGetInfo(item=4))
+    total = 20_000  # far more than the line holds in either direction
+    unsent = question * total
+    deadline = time.monotonic() + LIMIT_S
+    while asap.devices[0].wants_data and time.monotonic() < deadline:
+        with contextlib.suppress(BlockingIOError):
+            unsent = unsent[os.write(host.fd, unsent) :]
+        asap.server.turn(longest_wait_s=0)
+    assert not asap.devices[0].wants_data
+    assert unsent, "the line back to the host fills up, too"
+    # whole, in order, nothing dropped: one reply per complete command
+    for _ in range(total - len(unsent) // len(question) - 1):
+        assert isinstance(host.hear(), m.ReplyString)
+
+
+def test_stop_before_run_ends_it_at_once(asap: Bench) -> None:
+    asap.server.stop()
+    asap.server.run()
+
+
+def test_stop_ends_a_waiting_loop(asap: Bench) -> None:
+    loop = threading.Thread(target=asap.server.run, daemon=True)
+    loop.start()
+    time.sleep(0.2)  # nothing is due and nobody speaks: by now it waits without a limit
+    asap.server.stop()
+    loop.join(LIMIT_S)
+    assert not loop.is_alive()
+
+
+def test_a_turn_sends_a_bounded_share() -> None:
+    class Endless:
+        wants_data = True
+        sent = 0
+
+        def receive_data(self, data: bytes, now_ns: int) -> None: ...
+
+        def advance(self, now_ns: int) -> None: ...
+
+        def next_packet(self, now_ns: int) -> bytes | None:
+            self.sent += 1
+            return b"x"
+
+        def wake_ns(self, now_ns: int) -> int | None:
+            return None
+
+    class Bottomless:
+        def fileno(self) -> int:
+            return -1
+
+        def read(self) -> bytes:
+            return b""
+
+        def write(self, data: memoryview) -> int:
+            return len(data)
+
+    device = Endless()
+    assert Port(Bottomless(), device).send(0)
+    assert device.sent == PACKETS_PER_TURN
+
+
+def test_a_deadline_beyond_what_the_system_waits_for_is_no_error() -> None:
+    class Distant:
+        wants_data = True
+
+        def receive_data(self, data: bytes, now_ns: int) -> None: ...
+
+        def advance(self, now_ns: int) -> None: ...
+
+        def next_packet(self, now_ns: int) -> bytes | None:
+            return None
+
+        def wake_ns(self, now_ns: int) -> int | None:
+            return 10**24
+
+    link = PairLink()
+    server = Server([Port(link, Distant())], clock_ns=lambda: 0)
+    server.stop()  # its wait ends at once, if it begins
+    server.turn()
+    server.turn(longest_wait_s=0)
+    server.close()
+    link.close()

@@ -1,0 +1,116 @@
+"""People: where they are, how their chest moves, what a radar hears of it, and bad files."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from emulator.echo.reflections import direct_reflections, person_scatterer, viewpoint
+from emulator.scene.motion import PersonSpec, chest_displacement_m, positions_m
+from emulator.scene.scene import RadarSpec, SceneError, load_scene
+
+SECOND = 1_000_000_000
+FORWARD = RadarSpec(name="only", serial="000000000007", x_m=0.0, y_m=0.0, yaw_deg=0.0)
+L_SHAPE = ((0.0, 0.0), (3.0, 0.0), (3.0, 4.0))
+
+
+def person(**changes: Any) -> PersonSpec:  # noqa: ANN401 - any field
+    return PersonSpec.model_validate({"name": "somebody", "waypoints_m": L_SHAPE} | changes)
+
+
+def times(*seconds: float) -> np.ndarray[Any, np.dtype[np.int64]]:
+    return np.array([round(s * SECOND) for s in seconds], dtype=np.int64)
+
+
+@pytest.mark.parametrize(
+    ("walk", "at_s", "expected"),
+    [
+        ("once", [0, 1, 5, 7, 100], [(0, 0), (1, 0), (3, 2), (3, 4), (3, 4)]),
+        ("to_and_fro", [7, 8, 13, 14, 15], [(3, 4), (3, 3), (1, 0), (0, 0), (1, 0)]),
+        ("round", [7, 9.5, 12, 13], [(3, 4), (1.5, 2), (0, 0), (1, 0)]),
+    ],
+)
+def test_walks(walk: str, at_s: list[float], expected: list[tuple[float, float]]) -> None:
+    """7 m at 1 m/s; the way round closes with 5 m."""
+    assert positions_m(person(walk=walk), times(*at_s)) == pytest.approx(np.array(expected))
+
+
+def test_a_walk_begins_when_the_person_enters() -> None:
+    late = positions_m(person(enters_s=10.0, speed_mps=0.5), times(5, 10, 14))
+    assert late == pytest.approx(np.array([(0, 0), (0, 0), (2, 0)]))
+
+
+def test_somebody_with_one_waypoint_stands() -> None:
+    for walk in ("once", "to_and_fro", "round"):
+        stands = person(waypoints_m=((1.0, 2.0),), walk=walk)
+        assert positions_m(stands, times(0, 50)).tolist() == [[1.0, 2.0]] * 2
+
+
+def test_the_chest_moves_as_a_sine() -> None:
+    breath = chest_displacement_m(
+        person(breaths_per_min=15.0, breath_amplitude_m=0.005), times(0, 1, 2, 3, 4, 3601)
+    )
+    assert breath == pytest.approx([0, 0.005, 0, -0.005, 0, 0.005], abs=1e-12)
+
+
+def test_the_echo_of_a_person() -> None:
+    """Radar equation for a point: root of the cross section, R**-2; the chest shortens the way."""
+    stands = person(
+        waypoints_m=((2.0, 0.0),), rcs_m2=0.25, enters_s=1.0, leaves_s=10.0, breaths_per_min=15.0
+    )
+    t_ns = times(0.5, 1, 2, 10)
+    view = viewpoint(FORWARD, np.zeros((4, 3)))
+    echo = direct_reflections(person_scatterer(stands, t_ns), view)
+    assert echo.amplitude[:, 0] == pytest.approx([0, *([0.06 * 0.5 / 4] * 2), 0])
+    chest_m = 0.004 * np.sin(math.tau * 0.25 * np.array([0.5, 1, 2, 10]))
+    assert echo.range_m[:, 0] == pytest.approx(2.0 - chest_m)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"leaves_s": 3.0, "enters_s": 3.0}, "leaves_s: must be later than enters_s"),
+        ({"waypoints_m": ()}, "at least 1"),
+        ({"walk": "run"}, "'once', 'to_and_fro' or 'round'"),
+        ({"speed_mps": 0.0}, "greater than or equal to 0.001"),
+        ({"speed_mps": math.inf}, "must be a finite number"),
+        ({"rcs_m2": 0.0}, "greater than 0"),
+        ({"heart": 70}, "Extra inputs"),
+    ],
+)
+def test_a_bad_person_is_refused(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValidationError, match=words):
+        person(**changes)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("pulse = 70", "people[0].pulse: unknown key; allowed are name, waypoints_m, speed_mps"),
+        ("leaves_s = 2.0\nenters_s = 2.0", "people[0]: leaves_s: must be later than enters_s"),
+        ('[[people]]\nname = "a"\nwaypoints_m = [[1.0, 0.0]]', "people.name: each must be unique"),
+    ],
+)
+def test_a_bad_file_is_one_clear_line(tmp_path: Path, line: str, words: str) -> None:
+    file = tmp_path / "room.toml"
+    file.write_text(
+        'name = "room"\nenvironment = "lab"\ndescription = "x"\n'
+        '[[radars]]\nname = "r"\nserial = "000000000001"\nx_m = 0.0\ny_m = 0.0\nyaw_deg = 0.0\n'
+        '[[people]]\nname = "a"\nwaypoints_m = [[1.0, 0.0]]\n' + line
+    )
+    with pytest.raises(SceneError) as caught:
+        load_scene(file)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_visitor_is_somebody_who_comes_when_the_noise_map_is_made() -> None:
+    scene = load_scene("visitor")
+    (visitor,) = scene.people
+    assert visitor.enters_s > 120
+    assert len(scene.radars) == 2

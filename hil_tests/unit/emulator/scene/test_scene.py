@@ -1,0 +1,180 @@
+"""Scene files load into frozen models, or say in one line what is wrong with them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from emulator.scene.scene import Scene, SceneError, empty_room, load_scene, scene_names
+
+RADAR = '[[radars]]\nname = "left"\nserial = "000000000001"\nx_m = 0.0\ny_m = 0.2\nyaw_deg = 90.0\n'
+HEAD = 'name = "mine"\nenvironment = "lab"\ndescription = "a scene"\n'
+GOOD = HEAD + RADAR
+FAR = '[path]\nwaypoints_m = [[0, 0], [1000, 0]]\nlaps = ["forward"]\n'
+OUT_OF_BOUNDS = [
+    ("path", "speed_mps", "0", "0.001"),
+    ("path", "speed_mps", "1e-12", "0.001"),
+    ("path", "speed_mps", "1e-310", "0.001"),
+    ("path", "speed_mps", "1e300", "10"),
+    ("path", "turn_rate_deg_per_s", "1e-310", "0.1"),
+    ("path", "turn_rate_deg_per_s", "1e300", "3600"),
+    ("odometry", "rate_hz", "1e-300", "0.1"),
+    ("odometry", "rate_hz", "1001", "1000"),
+    ("odometry", "scale_sigma", "1e300", "1"),
+    ("odometry", "heading_sigma_rad_per_rad", "1.1", "1"),
+    ("noise", "rf_sigma", "1e300", "1"),
+    ("leakage", "amplitude", "1e300", "10"),
+    ("leakage", "range_m", "-1e300", "-1000"),
+]
+
+
+def write(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    return path
+
+
+def test_the_shipped_scenes_are_known_by_name() -> None:
+    assert {"lab", "classroom", "smoke"} <= set(scene_names())
+
+
+@pytest.mark.parametrize("name", scene_names())
+def test_every_shipped_scene_loads_under_its_own_name(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert load_scene(name).name == name
+
+
+@pytest.mark.parametrize("as_text", [str, Path])
+def test_a_file_loads_by_its_path(tmp_path: Path, as_text: type[str] | type[Path]) -> None:
+    scene = load_scene(as_text(write(tmp_path, GOOD)))
+    assert scene.name == "mine"
+    assert scene.radars[0].yaw_deg == 90.0
+    assert (scene.radars[0].range_offset_m, scene.radars[0].start_skew_ms) == (0.0, 0.0)
+    assert scene.trajectory().duration_ns == 0
+
+
+def test_whole_numbers_are_numbers(tmp_path: Path) -> None:
+    assert load_scene(write(tmp_path, GOOD.replace("90.0", "90"))).radars[0].yaw_deg == 90.0
+
+
+def test_a_scene_is_frozen() -> None:
+    with pytest.raises(ValidationError, match="frozen"):
+        load_scene("lab").name = "other"  # type: ignore[misc] # assigning is what is tested
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (GOOD + "speed = 1\n", ["radars[0].speed", "unknown key", "yaw_deg", "start_skew_ms"]),
+        ("colour = 1\n" + GOOD, ["colour: unknown key", "environment", "targets"]),
+        (GOOD + "[path]\nspede_mps = 0.1\n", ["path.spede_mps", "unknown key", "speed_mps"]),
+        (HEAD, ["radars: missing"]),
+        (GOOD.replace('"lab"', '"office"'), ["environment", "'lab' or 'classroom'", "'office'"]),
+        (GOOD.replace("90.0", '"90"'), ["radars[0].yaw_deg", "number", "'90'"]),
+        (
+            GOOD.replace("90.0", "900.0"),
+            ["radars[0].yaw_deg", "less than or equal to 360", "900.0"],
+        ),
+        (GOOD.replace("0.2", "nan"), ["radars[0].y_m", "must be a finite number"]),
+        (GOOD.replace("0.2", "inf"), ["radars[0].y_m", "must be a finite number"]),
+        (GOOD.replace("0.2", "true"), ["radars[0].y_m", "number", "True"]),
+        (GOOD.replace("000000000001", "1"), ["radars[0].serial", "[0-9]{12}", "'1'"]),
+        (GOOD + RADAR, ["radars.name", "unique", "'left'"]),
+        (GOOD + RADAR.replace("left", "right"), ["radars.serial", "unique", "'000000000001'"]),
+        (HEAD + "radars = []\n", ["radars", "at least 1"]),
+        *(
+            (
+                GOOD + f"[{table}]\n{key} = {value}\n",
+                [f"{table}.{key}", "than or equal to", limit],
+            )
+            for table, key, value, limit in OUT_OF_BOUNDS
+        ),
+        (
+            GOOD + "[path.carried]\nat_s = 1.0\nskips_s = 2.0\n",
+            ["path.carried: the robot is set down 3 s into a drive of 0 s"],
+        ),
+        (
+            GOOD + "[path.carried]\nat_s = 1.0\nskips_s = 2.0\nfor_s = 1.0\n",
+            ["path.carried.for_s", "unknown key", "takes_s"],
+        ),
+        (GOOD + "[path]\nspeed_mps = 1e400\n", ["path.speed_mps", "must be a finite number"]),
+        (GOOD + f"[path]\nspeed_mps = 1{'0' * 400}\n", ["path.speed_mps"]),
+        (GOOD + f"[path]\nspeed_mps = 1{'0' * 5000}\n", ["not valid TOML"]),
+        # 2 km at 2 mm/s are 277.8 h
+        (
+            GOOD + FAR + "speed_mps = 0.002\n",
+            ["path: the drive takes 277.8 h", "at most 24 h", "drive faster"],
+        ),
+        # 2 km at 1 m/s and a U-turn of 1 s at the far end
+        (
+            GOOD + FAR + "speed_mps = 1\nturn_rate_deg_per_s = 180\n[odometry]\nrate_hz = 1000\n",
+            ["odometry.rate_hz: 2001001 lines", "at most 500000", "lower the rate"],
+        ),
+        (GOOD + '[path]\nlaps = ["up"]\n', ["path.laps[0]", "'forward' or 'backward'", "'up'"]),
+        (GOOD + "[path]\nwaypoints_m = [[1.0, 0.0]]\n", ["path.waypoints_m", "[0.0, 0.0]"]),
+        (GOOD + "[path]\nwaypoints_m = [[0, 0], [0, 1]]\n", ["waypoints_m", "positive x axis"]),
+        (GOOD + "[path]\nwaypoints_m = [[0, 0, 0]]\n", ["path.waypoints_m[0]", "2 items"]),
+        (GOOD + "[path]\nwaypoints_m = []\n", ["path.waypoints_m", "[0.0, 0.0]"]),
+        (GOOD + "[noise]\nrf_sigma = -1.0\n", ["noise.rf_sigma", "greater than or equal to 0"]),
+        (GOOD + "[noise]\niterations = 1.5\n", ["noise.iterations", "integer", "1.5"]),
+        (GOOD + '[[targets]]\nname = "Bad Name"\n', ["targets[0].name", "pattern", "(and 3 more)"]),
+        (GOOD + "[path\n", ["not valid TOML", "line"]),
+        ("a = " + "[" * 100_000, ["brackets are nested too deep"]),
+        ("radars = 3\n" + HEAD, ["radars", "tuple", "got 3"]),
+        ("", ["missing", "(and 3 more)"]),
+        (GOOD + '[walls]\nname = "w"\n', ["walls: must be a list", "begin each with [[walls]]"]),
+    ],
+)
+def test_a_bad_scene_is_one_clear_line(tmp_path: Path, text: str, words: list[str]) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(SceneError) as caught:
+        load_scene(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+    for word in words:
+        assert word in message, message
+
+
+def test_one_bad_value_is_one_problem(tmp_path: Path) -> None:
+    """That the only radar is refused is no second problem of the list of radars."""
+    path = write(tmp_path, GOOD.replace("000000000001", "1"))
+    with pytest.raises(SceneError) as caught:
+        load_scene(path)
+    assert str(caught.value).endswith("got '1'")
+
+
+def test_an_unknown_name_lists_the_known_ones() -> None:
+    message = r"labb: no such scene; known are .*classroom, .*lab, .*or give the path of"
+    with pytest.raises(SceneError, match=message):
+        load_scene("labb")
+
+
+@pytest.mark.parametrize("make", ["missing.toml", "folder.toml"])
+def test_an_unreadable_file_is_one_clear_line(tmp_path: Path, make: str) -> None:
+    path = tmp_path / make
+    if make == "folder.toml":
+        path.mkdir()
+    with pytest.raises(SceneError, match=f"{make}: cannot read the scene file: ") as caught:
+        load_scene(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_not_text_is_one_clear_line(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_bytes(GOOD.encode() + b"\xff")
+    with pytest.raises(SceneError, match=f"not UTF-8 text at byte {len(GOOD)}"):
+        load_scene(path)
+
+
+@pytest.mark.parametrize("count", [1, 4, 9])
+def test_an_empty_room_has_modules_and_nothing_else(count: int) -> None:
+    scene = empty_room(count)
+    assert len(scene.radars) == count
+    assert not scene.targets
+    assert scene.trajectory().duration_ns == 0
+    assert Scene.model_validate(scene.model_dump()) == scene

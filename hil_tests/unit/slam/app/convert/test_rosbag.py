@@ -1,0 +1,355 @@
+"""Bags of ROS 1 and ROS 2: sessions there and back, and the authors' layout as we generate it."""
+
+from __future__ import annotations
+
+import math
+import signal
+import sqlite3
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import StoragePlugin
+
+from hil_tests.unit.slam.app.authors_bag import AuthorsBag
+from hil_tests.unit.slam.app.sessions import FRAME_NS, feed, scan, session_info, snapshot
+from slam.app.cli import main
+from slam.app.convert.rosbag import BagOptions, convert_bag, write_bag
+from slam.app.errors import StopRequestedError
+from slam.app.odometry.track import OdometryTrack
+from slam.app.odometry.tum import format_tum_line
+from slam.app.records import Scan
+from slam.app.session.log import SessionLog
+from slam.app.session.messages import SlamSettings
+from slam.app.session.reader import RecordedSession, open_session
+
+N_SCANS = 12
+N_BINS = 1431
+START_NS = 1_690_000_000_000_000_000
+STEP_NS = 200_000_000
+KINDS = ("bag.bag", "bag")
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    code = main(["convert", *map(str, arguments)])
+    said = capsys.readouterr()
+    return code, said.out, said.err
+
+
+def facts(session: RecordedSession) -> list[tuple[object, ...]]:
+    return [
+        (
+            one.counter,
+            one.t_ns,
+            one.used,
+            [(f.radar, f.counter, f.t_ns, f.samples.tobytes()) for f in one.frames],
+        )
+        for one, _ in session.scans()
+    ]
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Path:
+    lines = [format_tum_line(k * 150_000_000, np.array([k / 3, k / 7, k / 11])) for k in range(30)]
+    path = tmp_path / "session.mcap"
+    log = SessionLog(
+        path,
+        replace(session_info(), config_json='{"a": 1}', wheels={"scale_sigma": 0.1}),
+        OdometryTrack.from_lines(lines),
+        truth_at=lambda t_ns: np.array([snapshot(int(t) // FRAME_NS).truth for t in t_ns]),
+    )
+    feed(log, N_SCANS)
+    log.close()
+    return path
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_session_comes_back_from_a_bag(
+    kind: str, recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag, again = tmp_path / kind, tmp_path / "again.mcap"
+    code, out, err = run(capsys, recorded, bag)
+    assert (code, err) == (0, "")
+    assert f"{2 * N_SCANS} frames" in out
+    assert run(capsys, bag, again)[::2] == (0, "")
+    first, second = open_session(recorded), open_session(again)
+    assert facts(second) == facts(first)
+    assert second.odometry().samples == first.odometry().samples
+    for (_, one), (_, other) in zip(first.scans(), second.scans(), strict=True):
+        assert one is not None
+        assert other is not None
+        np.testing.assert_allclose(other, one, rtol=0, atol=1e-12)
+    assert second.info.radars == first.info.radars
+    assert second.info.seed == 7
+    assert second.info.config_json == '{"a": 1}'
+    assert second.info.wheels == {"scale_sigma": 0.1}
+    np.testing.assert_array_equal(second.info.true_landmarks_m, first.info.true_landmarks_m)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_bag_has_the_topics_and_types_of_the_data_set(
+    kind: str, recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run(capsys, recorded, tmp_path / kind)
+    with AnyReader([tmp_path / kind]) as reader:
+        types = {c.topic: (c.msgtype, c.msgcount) for c in reader.connections}
+        connection = next(c for c in reader.connections if c.topic == "/UWBradar2/readings")
+        (_, t_ns, raw), *_ = list(reader.messages([connection]))[3:]
+        message: Any = reader.deserialize(raw, connection.msgtype)
+    assert types["/UWBradar1/readings"] == ("std_msgs/msg/Float32MultiArray", N_SCANS)
+    assert types["/UWBradar2/readings"] == ("std_msgs/msg/Float32MultiArray", N_SCANS)
+    assert types["/odom"][0] == "nav_msgs/msg/Odometry"
+    assert types["/slam_out_pose"] == ("geometry_msgs/msg/PoseStamped", N_SCANS)
+    assert t_ns == 3 * FRAME_NS
+    np.testing.assert_array_equal(message.data, scan(3).frames[1].samples)
+
+
+def jittered_ns(radar: int, number: int) -> int:
+    """When a laptop would have recorded a frame of a radar that is not synchronised."""
+    late_ns = int(np.random.default_rng((radar, number)).integers(0, 20_000_000))
+    return START_NS + number * STEP_NS + radar * 30_000_000 + late_ns
+
+
+def samples(radar: int, number: int, n_bins: int = N_BINS) -> NDArray[np.float32]:
+    rng = np.random.default_rng((radar, number))
+    return rng.normal(0, 1e-3, n_bins).astype(np.float32)
+
+
+def authors_bag(
+    path: Path,
+    *,
+    topics: str = "/UWBradar{}/readings",
+    n_bins: int = N_BINS,
+    odometry: bool = True,
+    jump_back: bool = False,
+    truth: bool = True,
+    storage: StoragePlugin = StoragePlugin.SQLITE3,
+) -> Path:
+    """Write a bag of noise and a straight drive as the authors' recorder would have."""
+    bag = AuthorsBag(path, topics, storage)
+    for number in range(N_SCANS):
+        for radar in range(4):
+            bag.add_frame(jittered_ns(radar, number), radar + 1, samples(radar, number, n_bins))
+    for k in range(6 * N_SCANS):
+        t_ns = START_NS - 300_000_000 + k * STEP_NS // 5
+        stamp_ns = t_ns - 300_000_000 if jump_back and k == 20 else t_ns
+        if odometry:
+            bag.add_odometry(t_ns + 3_000_000, stamp_ns, (0.01 * k, -0.5, 0.2))
+        if truth:
+            bag.add_truth(t_ns + 9_000_000, t_ns, (0.01 * k + 2.0, -0.5, 0.2))
+    bag.write()
+    return path
+
+
+@pytest.mark.parametrize("topics", ["/UWBradar{}/readings", "/UWBradar{}"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_authors_layout_becomes_a_session(
+    kind: str, topics: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = authors_bag(tmp_path / kind, topics=topics)
+    code, out, err = run(capsys, bag, tmp_path / "s.mcap")
+    assert (code, err) == (0, "")
+    assert f"{4 * N_SCANS} frames of 4 radars in {N_SCANS} scans" in out
+    session = open_session(tmp_path / "s.mcap")
+    assert [(m.name, m.x_m, m.y_m, round(math.degrees(m.yaw_rad))) for m in session.rig.mounts] == [
+        ("UWBradar1", 0.1, -0.2, -90),
+        ("UWBradar2", -0.1, 0.2, 90),
+        ("UWBradar3", -0.1, -0.2, -90),
+        ("UWBradar4", 0.1, 0.2, 90),
+    ]
+    radar = session.info.radars[0]
+    # the module's own answer to 0.2 .. 9.4 m: protocol reference 9.4
+    assert radar.range_start_m == pytest.approx(0.19929012656, abs=1e-9)
+    assert radar.range_start_m + 1431 * radar.bin_length_m == pytest.approx(9.40067863, abs=1e-6)
+    assert radar.rate_hz == pytest.approx(5.0, rel=0.1)
+    assert (session.info.seed, session.info.simulated) == (None, False)
+    for number, (one, truth) in enumerate(session.scans()):
+        assert [(f.radar, f.counter, f.t_ns) for f in one.frames] == [
+            (radar, number, jittered_ns(radar, number)) for radar in range(4)
+        ]
+        for frame in one.frames:
+            np.testing.assert_array_equal(frame.samples, samples(frame.radar, number))
+        assert one.used
+        assert truth is not None
+        passed_s = (one.t_ns - START_NS + 300_000_000) / 1e9
+        np.testing.assert_allclose(truth, [2.0 + passed_s / 4, -0.5, 0.2], atol=1e-9)
+    # stamps are those of the headers, not of the recording 3 ms later
+    assert session.odometry().first_ns == START_NS - 300_000_000
+
+
+def problem(capsys: pytest.CaptureFixture[str], bag: Path, *options: object, code: int = 1) -> str:
+    out = bag.parent / "s.mcap"
+    found, said, err = run(capsys, bag, out, *options)
+    assert (found, said) == (code, "")
+    assert len(err.splitlines()) == 1
+    assert not out.exists()
+    return err
+
+
+def test_what_a_bag_lacks_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    blind = authors_bag(tmp_path / "blind.bag", odometry=False)
+    assert "holds no pose on /odom, nav_msgs/Odometry" in problem(capsys, blind)
+    other = authors_bag(tmp_path / "other.bag", topics="/radar{}")
+    assert "holds no frames; they are looked for on /UWBradar1/readings" in problem(capsys, other)
+    five = authors_bag(tmp_path / "five.bag", topics="/UWBradar{}0")
+    assert "radar UWBradar10 is not in the rig (UWBradar1, UWBradar2" in problem(capsys, five)
+    short = authors_bag(tmp_path / "short.bag", n_bins=500)
+    assert "frames of 500 bins, not the paper's 1431; say --frame-area" in problem(capsys, short)
+    wrong = problem(capsys, short, "--frame-area", 0.2, 9.4)
+    assert "but a frame area of 0.2 to 9.4 m has 1431; say another" in wrong
+    assert "unknown preset 'mine'" in problem(capsys, short, "--preset", "mine", code=2)
+
+
+def test_another_frame_area(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    short = authors_bag(tmp_path / "short.bag", n_bins=500)
+    assert run(capsys, short, tmp_path / "s.mcap", "--frame-area", 0.2, 3.41)[0] == 0
+    (radar, *_) = open_session(tmp_path / "s.mcap").info.radars
+    assert (radar.n_bins, round(radar.range_start_m, 2)) == (500, 0.2)
+    for area_m in ((9.4, 0.2), ("nan", 9.4)):
+        (tmp_path / "s.mcap").unlink(missing_ok=True)
+        said = problem(capsys, short, "--frame-area", *area_m)
+        assert said.startswith("uwb-slam: --frame-area: ")
+
+
+def test_what_is_odd_is_said_and_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = authors_bag(tmp_path / "odd.bag", jump_back=True, truth=False)
+    code, _, err = run(capsys, bag, tmp_path / "s.mcap")
+    assert code == 0
+    assert err.splitlines() == [
+        f"uwb-slam: {bag}: poses that went back in time and are left out: 1",
+        f"uwb-slam: {bag}: no truth on /slam_out_pose: numbers that need it will be null",
+    ]
+    assert [truth for _, truth in open_session(tmp_path / "s.mcap").scans()] == [None] * N_SCANS
+
+
+def test_scans_that_odometry_does_not_reach_are_not_used(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    poses = [format_tum_line(k * FRAME_NS + 5, np.zeros(3)) for k in range(1, 5)]
+    short = tmp_path / "short.mcap"
+    log = SessionLog(short, session_info(), OdometryTrack.from_lines(poses))
+    for counter in range(8):
+        log.on_scan(scan(counter))
+    log.close()
+    run(capsys, short, tmp_path / "bag")
+    code, _, err = run(capsys, tmp_path / "bag", tmp_path / "again.mcap")
+    assert code == 0
+    assert "5 scans lie outside the odometry" in err
+    used = [one.used for one, _ in open_session(tmp_path / "again.mcap").scans()]
+    assert used == [False, False, True, True, True, False, False, False]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_cut_bag_is_one_line(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = authors_bag(tmp_path / kind)
+    file = bag if bag.is_file() else bag / "bag.db3"
+    content = file.read_bytes()
+    for share in (0.0, 0.01, 0.5, 0.98):
+        file.write_bytes(content[: round(share * len(content))])
+        assert f"uwb-slam: {bag}: no bag of ROS 1 or 2, or a damaged one" in problem(capsys, bag)
+
+
+def test_wrong_names_are_one_line(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "none.bag: no bag is there" in problem(capsys, tmp_path / "none.bag")
+    (tmp_path / "text.bag").write_text("hello\n" * 99)
+    assert "no bag of ROS 1 or 2" in problem(capsys, tmp_path / "text.bag")
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert "empty: no bag is there" in problem(capsys, empty)
+    code, _, err = run(capsys, recorded, empty)
+    assert (code, err) == (1, f"uwb-slam: {empty}: exists; choose another name\n")
+    bag = authors_bag(tmp_path / "a.bag")
+    code, _, err = run(capsys, bag, tmp_path / "b.bag")
+    assert code == 2
+    assert "of a bag or MATLAB file a session is made; give a name that ends in .mcap" in err
+    assert not (tmp_path / "b.bag").exists()
+
+
+def test_a_session_without_frames_leaves_no_bag(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    SessionLog(tmp_path / "s.mcap", session_info()).close()
+    code, _, err = run(capsys, tmp_path / "s.mcap", tmp_path / "bag")
+    assert code == 1
+    assert "holds no frame" in err
+    assert not (tmp_path / "bag").exists()
+
+
+def test_a_topic_of_another_type_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = AuthorsBag(tmp_path / "a.bag", topics="/odom{}")
+    bag.add_truth(START_NS, START_NS, (0.0, 0.0, 0.0))
+    bag.add_frame(START_NS, 1, samples(0, 0))
+    bag.write()
+    said = problem(capsys, bag.path, "--truth", "/odom1")
+    assert "/odom1 is std_msgs/msg/Float32MultiArray, must be geometry_msgs/msg/PoseSta" in said
+    plain = authors_bag(tmp_path / "b.bag", topics="/slam_out_pose{}")
+    assert "holds no frames" in problem(capsys, plain)
+
+
+def test_a_signal_stops_a_conversion_and_leaves_nothing(recorded: Path, tmp_path: Path) -> None:
+    bag = authors_bag(tmp_path / "a.bag")
+
+    def stop() -> None:
+        raise StopRequestedError(signal.SIGINT)
+
+    with pytest.raises(StopRequestedError):
+        convert_bag(bag, tmp_path / "s.mcap", BagOptions(settings=SlamSettings()), stop)
+    with pytest.raises(StopRequestedError):
+        write_bag(open_session(recorded), tmp_path / "out", stop)
+    assert not (tmp_path / "out").exists()
+    assert not (tmp_path / "s.mcap").exists()
+
+
+@pytest.mark.parametrize(
+    "error",
+    [OSError(28, "No space left on device"), sqlite3.OperationalError("disk is full")],
+    ids=["OSError", "SQLite"],
+)
+def test_a_disk_that_fills_up_is_one_line_and_leaves_nothing(
+    error: Exception,
+    recorded: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def full(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("slam.app.convert.rosbag._fill", full)
+    for out in (tmp_path / kind for kind in KINDS):
+        code, said, err = run(capsys, recorded, out)
+        assert (code, said) == (1, "")
+        (line,) = err.splitlines()
+        assert line.startswith(f"uwb-slam: {out}: cannot be written: ")
+        assert not out.exists()
+
+
+def test_frames_of_one_period_are_one_scan_even_if_one_is_lost(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "s.mcap"
+    poses = [format_tum_line(k * FRAME_NS, np.zeros(3)) for k in range(12)]
+    log = SessionLog(path, session_info(), OdometryTrack.from_lines(poses))
+    for counter in range(8):
+        one = scan(counter)
+        frames = one.frames[1:] if counter == 3 else one.frames
+        log.on_scan(Scan(counter=counter, t_ns=one.t_ns, frames=frames))
+    log.close()
+    run(capsys, path, tmp_path / "bag")
+    run(capsys, tmp_path / "bag", tmp_path / "again.mcap")
+    taken = [one for one, _ in open_session(tmp_path / "again.mcap").scans()]
+    assert [[f.radar for f in one.frames] for one in taken] == [
+        [1] if counter == 3 else [0, 1] for counter in range(8)
+    ]

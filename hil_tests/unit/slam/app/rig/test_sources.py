@@ -1,0 +1,276 @@
+"""Scans from drivers: true metres, time by the counter, gaps, silence, and the real driver."""
+
+import dataclasses
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emulator.scene.scene import PathSpec, Scene, load_scene
+from hil_tests.system.short_scene import write_short_scene
+from slam.app.errors import AppError, RadarSilentError
+from slam.app.rig import sources
+from slam.app.rig.emulated import RAW_CONFIG, end_counter, open_loopback, rig_of
+from slam.app.rig.sources import RadarLink, RigSource, radar_frame
+from slam.geometry import Mount
+from xethru_protocol.driver.frames import Frame, FrameGeometry
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.wire.errors import DeviceError, Disconnected, ResponseTimeout
+
+MS = 1_000_000
+GEOMETRY = FrameGeometry(range_start_m=0.3, bin_length_m=0.0064, n_bins=4, downconversion=False)
+
+
+def frame(counter: int) -> Frame:
+    samples = np.full(4, counter, dtype=np.float32)
+    return Frame(counter=counter, samples=samples, geometry=GEOMETRY, arrival_ns=0)
+
+
+class Canned:
+    """A driver that gives prepared frames, then what a dead or unplugged radar gives."""
+
+    def __init__(self, counters: Sequence[int], end: type[Exception] = ResponseTimeout) -> None:
+        self._counters = list(counters)
+        self._end = end
+        self.closed = 0
+
+    def configure_raw(self, config: RawConfig) -> FrameGeometry:
+        if self._end is DeviceError:
+            raise DeviceError(5, "X4DRIVER_SET FRAMEAREA")
+        return GEOMETRY
+
+    def start(self, fps: float) -> float:
+        return 5.0
+
+    def read_frame(self, timeout_s: float) -> Frame:
+        if not self._counters:
+            raise self._end("the port is gone")
+        return frame(self._counters.pop(0))
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def rig_source(*drivers: Canned, skews_ns: Sequence[int] = ()) -> RigSource:
+    skews_ns = skews_ns or [0] * len(drivers)
+    return RigSource(
+        [
+            RadarLink(
+                mount=Mount(name=f"radar{index}", x_m=0.0, y_m=0.0, yaw_rad=0.0),
+                port=f"port{index}",
+                serial="000000000001",
+                driver=cast(X4M300, driver),
+                start_skew_ns=skew_ns,
+            )
+            for index, (driver, skew_ns) in enumerate(zip(drivers, skews_ns, strict=True))
+        ]
+    )
+
+
+def counters_of(source: RigSource, end: int) -> list[tuple[int, list[int]]]:
+    source.start(RAW_CONFIG, 5)
+    return [
+        (scan.counter, [f.radar for f in scan.frames]) for scan in source.scans(end, lambda: None)
+    ]
+
+
+def test_module_metres_become_true_metres() -> None:
+    made = radar_frame(2, frame(10), rate_hz=5.0)
+    # light travels 299 792 458 m/s, the module reckons with 300 000 000
+    assert made.range_start_m == pytest.approx(0.299792458, rel=1e-15)
+    assert made.bin_length_m == pytest.approx(0.0064 * 0.99930819333, rel=1e-10)
+    assert (made.radar, made.counter, made.t_ns) == (2, 10, 2_000_000_000)
+
+
+def test_frames_of_one_counter_make_one_scan() -> None:
+    source = rig_source(Canned(range(5)), Canned(range(5)))
+    assert counters_of(source, 4) == [(k, [0, 1]) for k in range(4)]
+    assert source.lost_frames == 0
+
+
+def test_a_lost_frame_is_counted_and_its_scan_lacks_the_radar() -> None:
+    source = rig_source(Canned([0, 1, 4, 5]), Canned([0, 1, 2, 3, 4, 5]))
+    assert counters_of(source, 5) == [(0, [0, 1]), (1, [0, 1]), (2, [1]), (3, [1]), (4, [0, 1])]
+    assert source.lost_frames == 2
+
+
+def test_a_counter_that_every_radar_lost_gives_no_scan() -> None:
+    source = rig_source(Canned([1, 2, 9]), Canned([1, 2, 9]))
+    assert counters_of(source, 5) == [(1, [0, 1]), (2, [0, 1])]
+    assert source.lost_frames == 2 * 3
+
+
+def times_of(source: RigSource, end: int) -> list[tuple[int, int, list[tuple[int, int, int]]]]:
+    """Return tick and time [ms] of each scan, with radar, counter and time [ms] of its frames."""
+    source.start(RAW_CONFIG, 5)
+    return [
+        (
+            scan.counter,
+            scan.t_ns // MS,
+            [(one.radar, one.counter, one.t_ns // MS) for one in scan.frames],
+        )
+        for scan in source.scans(end, lambda: None)
+    ]
+
+
+def test_frames_are_stamped_with_their_own_radars_time() -> None:
+    drivers = [Canned(range(4)) for _ in range(4)]
+    source = rig_source(*drivers, skews_ns=[0, 190 * MS, 100 * MS, 150 * MS])
+    assert times_of(source, 2) == [
+        (0, 0, [(0, 0, 0), (1, 0, 190), (2, 0, 100), (3, 0, 150)]),
+        (1, 200, [(0, 1, 200), (1, 1, 390), (2, 1, 300), (3, 1, 350)]),
+    ]
+    assert source.lost_frames == 0
+
+
+def test_a_scans_time_is_the_ticks_whichever_radars_answered() -> None:
+    source = rig_source(Canned([0, 2, 3]), Canned([0, 1, 3]), skews_ns=[0, 190 * MS])
+    assert times_of(source, 3) == [
+        (0, 0, [(0, 0, 0), (1, 0, 190)]),
+        (1, 200, [(1, 1, 390)]),
+        (2, 400, [(0, 2, 400)]),
+    ]
+    assert source.lost_frames == 2
+
+
+def test_a_radar_that_started_periods_late_joins_the_scans_of_its_time() -> None:
+    """Counter 0 at 500 ms, 5 frames/s: it lies in the tick that begins at 400 ms."""
+    source = rig_source(Canned(range(9)), Canned([0, 2, 3, 4]), skews_ns=[0, 500 * MS])
+    assert times_of(source, 5) == [
+        (0, 0, [(0, 0, 0)]),
+        (1, 200, [(0, 1, 200)]),
+        (2, 400, [(0, 2, 400), (1, 0, 500)]),
+        (3, 600, [(0, 3, 600)]),
+        (4, 800, [(0, 4, 800), (1, 2, 900)]),
+    ]
+    assert source.lost_frames == 1
+
+
+def test_a_radar_that_starts_after_the_end_loses_nothing() -> None:
+    source = rig_source(Canned(range(9)), Canned([0, 1]), skews_ns=[0, 10_000 * MS])
+    assert [scan[0] for scan in times_of(source, 3)] == [0, 1, 2]
+    assert source.lost_frames == 0
+
+
+@given(st.integers(0, 10**11), st.floats(1.0, 400.0))
+def test_every_frame_lies_in_the_period_of_its_scan(start_skew_ns: int, rate_hz: float) -> None:
+    period = Fraction(10**9) / Fraction(rate_hz)
+    late_ns = start_skew_ns - sources.whole_periods(start_skew_ns, rate_hz) * period
+    assert -1 < late_ns < period + 1  # times are rounded to nanoseconds
+
+
+def test_silence_names_radar_port_and_last_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sources, "SILENCE_S", 0.0)
+    source = rig_source(Canned(range(9)), Canned(range(3)))
+    with pytest.raises(RadarSilentError, match="radar1 at port1: no frame for 0 s after frame 2"):
+        counters_of(source, 9)
+
+
+def test_an_unplugged_radar_is_named() -> None:
+    source = rig_source(Canned(range(2), Disconnected))
+    with pytest.raises(RadarSilentError, match="radar0 at port0: the port is gone after frame 1"):
+        counters_of(source, 9)
+
+
+def test_a_refused_setting_is_named() -> None:
+    with pytest.raises(AppError, match="radar0 at port0: the module refused X4DRIVER_SET FRAME"):
+        counters_of(rig_source(Canned([], DeviceError)), 1)
+
+
+def test_stopping_is_asked_for_while_waiting() -> None:
+    class StoppedError(Exception):
+        pass
+
+    def check() -> None:
+        raise StoppedError
+
+    source = rig_source(Canned([]))
+    source.start(RAW_CONFIG, 5)
+    with pytest.raises(StoppedError):
+        next(source.scans(1, check))
+
+
+def test_drivers_are_closed_once() -> None:
+    driver = Canned([])
+    source = rig_source(driver)
+    with source, source:
+        pass
+    assert driver.closed == 1
+
+
+def loud_scene(short_scene: Scene) -> Scene:
+    """Let leakage drive the sampler over both ends of its range."""
+    leakage = short_scene.leakage.model_copy(update={"amplitude": 9.0, "range_m": 0.7})
+    return short_scene.model_copy(update={"leakage": leakage})
+
+
+@pytest.mark.parametrize(
+    ("settings", "limit"),
+    [
+        ({}, 152 / 2048),  # protocol reference 9.7: 949 ... 1100 are 152 levels
+        ({"dac_min": 0, "dac_max": 2047}, 1.0),
+        ({"iterations": 7, "pulses_per_step": 11, "dac_min": 900, "dac_max": 1110}, 211 / 2048),
+        ({"iterations": 3, "pulses_per_step": 25, "dac_step": 2}, 152 / 2048),
+        # 15 pulses over 151 levels in steps of 8: the counter ends at 283, not at 283.125
+        ({"iterations": 3, "pulses_per_step": 5, "dac_max": 1099, "dac_step": 3}, 151 / 2048),
+    ],
+)
+def test_limits_are_what_the_sampler_gives_at_its_ends(
+    short_scene: Scene, settings: dict[str, Any], limit: float
+) -> None:
+    config = dataclasses.replace(RAW_CONFIG, **settings)
+    with open_loopback(loud_scene(short_scene), 0) as source:
+        source.start(config, 1)
+        (scan,) = source.scans(1, lambda: None)
+    for one in scan.frames:
+        assert one.limits is not None
+        assert one.limits == (one.samples.min(), one.samples.max())  # the same floats
+        assert one.limits == pytest.approx((-limit, limit), rel=1e-3)
+
+
+def test_the_counter_knows_a_radars_skew_but_not_its_clocks_rate(short_scene: Scene) -> None:
+    standing = short_scene.model_copy(update={"path": PathSpec()})
+    late = standing.radars[1].model_copy(update={"start_skew_ms": 190.0, "clock_ppm": 50.0})
+    skewed = standing.model_copy(update={"radars": (standing.radars[0], late)})
+    with open_loopback(skewed, 0) as source:
+        source.start(RAW_CONFIG, 5)
+        scans = list(source.scans(3, lambda: None))
+    assert source.radars[1].start_skew_ns == 190 * MS
+    assert [[f.t_ns - scan.t_ns for f in scan.frames] for scan in scans] == [[0, 190 * MS]] * 3
+
+
+@pytest.fixture
+def short_scene(tmp_path: Path) -> Scene:
+    return load_scene(write_short_scene(tmp_path))
+
+
+def test_the_real_driver_in_process_gives_1431_bins_at_the_chips_rate(short_scene: Scene) -> None:
+    with open_loopback(short_scene, 0) as source:
+        source.start(RAW_CONFIG, 5)
+        scans = list(source.scans(3, lambda: None))
+    assert [info.name for info in source.radars] == [m.name for m in rig_of(short_scene).mounts]
+    for info in source.radars:
+        assert info.n_bins == 1431
+        assert info.rate_hz == pytest.approx(5.018533, abs=1e-6)
+    # protocol reference 9.6: one frame takes 1 / 5.018533 s
+    assert [scan.t_ns for scan in scans] == pytest.approx([0, 199261419, 398522835], abs=200)
+    assert all(f.samples.shape == (1431,) for scan in scans for f in scan.frames)
+
+
+def test_the_last_frame_is_the_last_one_within_the_scene() -> None:
+    # 10 s at 5.018533 frames/s: counters 0 ... 50, as frame 50 comes at 9.963 s
+    assert end_counter(10_000_000_000) == 51
+    assert end_counter(0) == 1
+
+
+def test_the_rig_is_nominal_whatever_the_modules_are_like(short_scene: Scene) -> None:
+    skewed = short_scene.radars[0].model_copy(update={"range_offset_m": 0.02})
+    scene = short_scene.model_copy(update={"radars": (skewed, *short_scene.radars[1:])})
+    assert rig_of(scene).mounts[0].range_offset_m == 0.0
+    assert rig_of(scene).mounts[0].yaw_rad == pytest.approx(np.pi / 2)

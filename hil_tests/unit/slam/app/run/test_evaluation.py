@@ -1,0 +1,217 @@
+"""Numbers of a run whose errors are known: perfect, offset, and without any landmark."""
+
+import cmath
+
+import numpy as np
+import pytest
+
+from slam.app.run.evaluation import NEES_AT, Summary, summarise
+from slam.app.run.runner import RunRecord
+from slam.geometry import Mount, Rig
+from slam.paper.association import Association
+from slam.paper.clustering import Observation
+from slam.paper.ekf import Belief
+from slam.paper.pipeline import StepResult
+
+N = 201
+PERIOD_NS = 200_000_000
+LANDMARKS = np.array([[1.0, 1.0], [2.0, 1.1], [50.0, 50.0]])
+RIG = Rig(
+    mounts=(
+        Mount(name="rear", x_m=-0.1, y_m=0.2, yaw_rad=np.pi / 2),
+        Mount(name="front", x_m=0.1, y_m=0.2, yaw_rad=np.pi / 2),
+    )
+)
+
+
+def run(offset_m: float, drift: float, variance: float) -> Summary:
+    """Drive 3 m along x; the estimate is off by a constant and a share of the way in y."""
+    truth = np.zeros((N, 3))
+    truth[:, 0] = np.linspace(0, 3, N)
+    found = LANDMARKS[:2] + np.array([0.0, 0.03])
+    results = []
+    for k in range(N):
+        pose = truth[k] + np.array([0.0, offset_m, 0.0])
+        mean = np.concatenate([pose, found.ravel()])
+        results.append(
+            StepResult(
+                t_ns=k * PERIOD_NS,
+                odometry_pose=truth[k] + np.array([0.0, drift * (k % 2 - 0.5), 0.0]),
+                belief=Belief(
+                    mean=mean,
+                    covariance=np.eye(len(mean)) * variance,
+                    landmark_ids=(0, 1),
+                    next_id=2,
+                ),
+                detections=(),
+                fixes=(),
+                observations=(),
+                associations=(),
+                rejected=(),
+            )
+        )
+    record = RunRecord(
+        results=tuple(results),
+        truth=truth,
+        world_from_map=np.zeros(3),
+        n_frames=2 * N,
+        duration_ns=(N - 1) * PERIOD_NS,
+        wall_s=0.5,
+    )
+    summary = summarise(
+        record,
+        scene="made_up",
+        preset="paper",
+        seed=0,
+        rig=RIG,
+        true_landmarks_m=LANDMARKS,
+    )
+    assert summary is not None
+    return summary
+
+
+def test_a_constant_offset_is_aligned_away_in_the_ate_and_counts_in_nees_and_final_error() -> None:
+    summary = run(offset_m=0.05, drift=0.02, variance=0.01)
+    assert summary.ate_rmse_m == pytest.approx(0.0, abs=1e-9)
+    assert summary.odometry_ate_rmse_m == pytest.approx(0.01, rel=1e-2)
+    assert summary.final_error_m == pytest.approx(0.05)
+    # 0.05^2 / 0.01, at ten parts of 40 s
+    expected = [(40.0 * part, 0.25) for part in NEES_AT]
+    np.testing.assert_allclose(summary.nees_pose, expected)
+    assert summary.realtime_factor == pytest.approx(80.0)
+    assert summary.nis_mean is None
+
+
+def test_landmarks_are_judged_after_the_trajectorys_alignment_and_only_if_seen() -> None:
+    # the map is 30 mm off in y, the path 30 mm too: aligned, nothing is left
+    score = run(offset_m=0.03, drift=0.0, variance=0.01).landmarks
+    assert (score.true, score.estimated, score.precision, score.recall) == (2, 2, 1.0, 1.0)
+    assert score.rmse_m == pytest.approx(0.0, abs=1e-9)
+    # the path is right, the map is 30 mm off
+    assert run(offset_m=0.0, drift=0.0, variance=0.01).landmarks.rmse_m == pytest.approx(0.03)
+
+
+PLACE = np.array([5.0, -3.0, 0.8])
+HEADING_RAD = 0.3
+"""Of the robot in the map frame, while it moves along the map's x axis."""
+
+
+def in_world(point: complex) -> complex:
+    return complex(*PLACE[:2]) + cmath.rect(1.0, PLACE[2]) * point
+
+
+def seen(landmark: complex, x_m: float) -> Observation:
+    """Observe a landmark of the map frame without error, from x on the path."""
+    body = (landmark - x_m) * cmath.rect(1.0, -HEADING_RAD)
+    return Observation(x_m=body.real, y_m=body.imag, n_fixes=4, n_poses=4, fixes=())
+
+
+def associated(landmark_id: int, *distances_sq: float, is_new: bool = False) -> Association:
+    return Association(
+        landmark_id=landmark_id,
+        is_new=is_new,
+        mahalanobis_sq=np.array(distances_sq),
+        candidate_ids=tuple(range(len(distances_sq))),
+    )
+
+
+@pytest.fixture(scope="module")
+def turned() -> Summary:
+    """Drive from somewhere in the world; path, map and filter have unequal headings.
+
+    The estimate is 50 mm to the side and 0.02 rad off; every second state of it also runs 60 mm
+    ahead or behind, always onto a place where the robot was at another time.
+    """
+    x_m = np.linspace(0, 3, N)  # 15 mm per state
+    places = [in_world(complex(x)) for x in x_m]
+    truth = np.array([(p.real, p.imag, PLACE[2] + HEADING_RAD) for p in places])
+    first, second = 1.0 + 1.0j, 2.0 + 1.1j
+    # What was seen truly, and what the filter made of it.
+    events = {
+        10: (first, associated(0, is_new=True)),
+        11: (first, associated(0, 3.0)),
+        12: (first, associated(1, 25.0, is_new=True)),  # refused by the gate
+        13: (second, associated(2, 70.0, 80.0, is_new=True)),
+        14: (first, associated(0, 8.0, 1.0, 90.0)),
+    }
+    ahead = np.zeros(N, dtype=int)
+    ahead[5:-5:4], ahead[7:-5:4] = 4, -4
+    results = []
+    for k in range(N):
+        observed = [(seen(what, x_m[k]), how) for at, (what, how) in events.items() if at == k]
+        results.append(
+            StepResult(
+                t_ns=k * PERIOD_NS,
+                odometry_pose=np.array([x_m[k], 0.1 * (k % 2), HEADING_RAD]),
+                belief=Belief(
+                    mean=np.array([x_m[k + ahead[k]], 0.05, HEADING_RAD + 0.02]),
+                    covariance=np.diag([0.04, 0.0025, 0.0004]),
+                    landmark_ids=(),
+                    next_id=0,
+                ),
+                detections=(),
+                fixes=(),
+                observations=tuple(observation for observation, _ in observed),
+                associations=tuple(association for _, association in observed),
+                rejected=(),
+            )
+        )
+    record = RunRecord(
+        results=tuple(results),
+        truth=truth,
+        world_from_map=PLACE,
+        n_frames=2 * N,
+        duration_ns=(N - 1) * PERIOD_NS + PERIOD_NS // 10,
+        wall_s=0.5,
+    )
+    summary = summarise(
+        record,
+        scene="turned",
+        preset="paper",
+        seed=0,
+        rig=RIG,
+        true_landmarks_m=np.array([(w.real, w.imag) for w in map(in_world, (first, second))]),
+    )
+    assert summary is not None
+    return summary
+
+
+def test_icp_forgets_time_and_the_ate_does_not(turned: Summary) -> None:
+    # 96 of 201 states are 60 mm along the path from where they belong
+    assert turned.ate_rmse_m == pytest.approx(0.06 * np.sqrt(96 / 201), rel=0.01)
+    assert turned.ate_icp_rmse_m == pytest.approx(0.0, abs=1e-9)
+
+
+def test_nees_is_of_the_map_frame_and_carries_its_states_time(turned: Summary) -> None:
+    times, values = np.array(turned.nees_pose).T
+    # the run ends a little after its last state, and each time lies a little after a state
+    np.testing.assert_allclose(times, [40.0 * part for part in NEES_AT])
+    # 0.05^2 / 0.0025 + 0.02^2 / 0.0004
+    np.testing.assert_allclose(values, 2.0)
+    assert turned.final_error_m == pytest.approx(0.05)
+
+
+def test_nis_is_of_true_associations_before_the_gate_per_degree_of_freedom(
+    turned: Summary,
+) -> None:
+    assert turned.nis_mean == pytest.approx((3.0 + 25.0 + 8.0) / 3 / 2)
+
+
+def test_a_run_without_a_state_has_no_summary() -> None:
+    record = RunRecord(
+        results=(),
+        truth=np.zeros((0, 3)),
+        world_from_map=np.zeros(3),
+        n_frames=4,
+        duration_ns=0,
+        wall_s=1.0,
+    )
+    nothing = summarise(
+        record,
+        scene="s",
+        preset="paper",
+        seed=0,
+        rig=RIG,
+        true_landmarks_m=LANDMARKS,
+    )
+    assert nothing is None

@@ -1,0 +1,187 @@
+"""What `uwb-slam repair` says and refuses; what it keeps is tested in property/."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from hil_tests.unit.slam.app.sessions import feed, session_info
+from slam.app.cli import main
+from slam.app.errors import StopRequestedError
+from slam.app.session.log import SessionLog
+from slam.app.session.reader import open_session
+from slam.app.session.repair import repair
+from xethru_protocol.system import locked
+
+
+@pytest.fixture
+def cut(tmp_path: Path) -> Path:
+    path = tmp_path / "session.mcap"
+    log = SessionLog(path, session_info())
+    feed(log, 30)
+    log.close()
+    path.write_bytes(path.read_bytes()[:-200_000])
+    return path
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: Path | str) -> tuple[int, str, str]:
+    code = main(["repair", *map(str, arguments)])
+    said = capsys.readouterr()
+    return code, said.out, said.err
+
+
+def test_it_says_what_is_kept_and_where_the_old_file_is(
+    cut: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    size = cut.stat().st_size
+    code, out, err = run(capsys, cut)
+    assert (code, err) == (0, "")
+    first, second, third = out.splitlines()
+    n_scans = sum(1 for _ in open_session(cut).scans())
+    assert first.startswith(f"{cut}: ")
+    assert f" messages, {(n_scans - 1) * 0.199261498:.1f} s" in first
+    assert second.startswith("  it ended too early, at byte ")
+    assert third == f"  as it was: {cut}.unrepaired"
+    assert Path(f"{cut}.unrepaired").stat().st_size == size
+    code, out, _ = run(capsys, cut)
+    assert code == 0
+    assert "whole, nothing to repair" in out
+
+
+def test_it_never_overwrites_what_it_did_not_write(
+    cut: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = cut.read_bytes()
+    kept = Path(f"{cut}.unrepaired")
+    kept.write_text("precious")
+    assert run(capsys, cut)[:2] == (1, "")
+    assert run(capsys, cut, "--out", kept)[0] == 1
+    assert (cut.read_bytes(), kept.read_text()) == (before, "precious")
+    assert sorted(tmp_path.iterdir()) == [cut, kept]
+
+
+def test_a_folder_in_which_a_run_is_recording_is_left_alone(
+    cut: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = cut.read_bytes()
+    with locked(tmp_path):
+        code, out, err = run(capsys, cut)
+    assert (code, out) == (1, "")
+    assert err == f"uwb-slam: {cut}: a run is still writing it; wait for its end\n"
+    assert cut.read_bytes() == before
+
+
+def test_a_signal_leaves_everything_as_it_was(cut: Path, tmp_path: Path) -> None:
+    before = cut.read_bytes()
+
+    def check() -> None:
+        if (tmp_path / f".{cut.name}.repairing").exists():  # while the new file is written
+            raise StopRequestedError(signal.SIGTERM)
+
+    with pytest.raises(StopRequestedError):
+        repair(cut, None, check)
+    assert list(tmp_path.iterdir()) == [cut]
+    assert cut.read_bytes() == before
+
+
+FOREIGN = {
+    "view.rrd": (b"RRF2\x00\x57\x00\x00rest", "is a Rerun recording (.rrd), a view that other"),
+    "old.bag": (b"#ROSBAG V2.0\n", "is a bag of ROS 1; `uwb-slam convert`"),
+    "a.db3": (b"SQLite format 3\0", "give that folder to `uwb-slam convert`"),
+    "port.xtwire": (b"\x89XTWIRE\n", "is a wire capture of one port"),
+    "found.mat": (b"MATLAB 5.0 MAT-file, Platform", "is a MATLAB file"),
+    "packed.gz": (b"\x1f\x8b\x08", "is a gzip file; unpack it first"),
+    "notes.txt": (b"hello", "give the session.mcap of a run"),
+    "empty": (b"", "is no MCAP file, it is empty; whatever"),
+}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_a_foreign_file_is_called_what_it_is(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content, expected = FOREIGN[name]
+    path = tmp_path / name
+    path.write_bytes(content)
+    code, out, err = run(capsys, path)
+    assert (code, out) == (1, "")
+    assert len(err.splitlines()) == 1
+    assert err.startswith(f"uwb-slam: {path}: is no MCAP file")
+    assert expected in err
+    assert path.read_bytes() == content
+
+
+def test_missing_files_and_folders_are_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for path, expected in (
+        (tmp_path / "none.mcap", "cannot read: No such file"),
+        (tmp_path / "no" / "where.mcap", "No such file"),
+        (tmp_path, "is a directory; give the session.mcap in it"),
+    ):
+        code, out, err = run(capsys, path)
+        assert (code, out) == (1, "")
+        assert len(err.splitlines()) == 1
+        assert expected in err
+
+
+def test_a_file_with_nothing_in_it_stays_as_it_is(
+    cut: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cut.write_bytes(cut.read_bytes()[:100])
+    code, _, err = run(capsys, cut)
+    assert code == 1
+    assert "nothing in it can be kept" in err
+    assert list(tmp_path.iterdir()) == [cut]
+
+
+def test_a_link_to_itself_and_a_pipe_are_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (loop := tmp_path / "loop.mcap").symlink_to("loop.mcap")
+    assert run(capsys, loop) == (
+        1,
+        "",
+        f"uwb-slam: {loop}: cannot read: Too many levels of symbolic links\n",
+    )
+    os.mkfifo(pipe := tmp_path / "pipe.mcap")
+    assert run(capsys, pipe) == (
+        1,
+        "",
+        f"uwb-slam: {pipe}: is a pipe; give a file, the session.mcap of a run\n",
+    )
+
+
+@pytest.mark.parametrize("has_second_names", [True, False], ids=["hard links", "none, as on FAT"])
+def test_a_file_that_cannot_take_its_place_leaves_everything_as_it_was(
+    has_second_names: bool,
+    cut: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    before = cut.read_bytes()
+    replace = Path.replace
+
+    def fail(path: Path, target: Path) -> Path:
+        if path.suffix == ".repairing":
+            raise OSError(errno.EIO, "Input/output error", str(path))
+        return replace(path, target)
+
+    def no_names(path: Path, target: Path) -> None:
+        raise OSError(errno.EPERM, "Operation not permitted", str(path))
+
+    monkeypatch.setattr(Path, "replace", fail)
+    if not has_second_names:
+        monkeypatch.setattr(Path, "hardlink_to", no_names)
+    code, _, err = run(capsys, cut)
+    assert (code, err.count("\n")) == (1, 1)
+    assert f"{cut} is as it was" in err
+    assert (list(tmp_path.iterdir()), cut.read_bytes()) == ([cut], before)
+    monkeypatch.setattr(Path, "replace", replace)
+    assert run(capsys, cut)[0] == 0
+    assert Path(f"{cut}.unrepaired").read_bytes() == before

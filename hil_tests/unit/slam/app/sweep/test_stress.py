@@ -1,0 +1,210 @@
+"""The stress table does what its rows say, as hard as they say, and the same every time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cache
+
+import numpy as np
+import pytest
+
+from emulator.scene.scene import Scene, load_scene
+from emulator.scene.wheels import scene_odometry
+from slam.app.odometry.track import OdometryTrack
+from slam.app.records import Scan
+from slam.app.sweep.run import OutlierDetector, stressed_scans, stressed_scene
+from slam.app.sweep.stress import CLEAN, STRESSES, Stress
+from slam.frames import Detection, RadarFrame
+
+PERIOD_NS = 200_000_000
+N_TICKS, N_RADARS = 1000, 4
+SAMPLES = np.zeros(1, dtype=np.float32)
+
+
+def frame(radar: int, counter: int) -> RadarFrame:
+    return RadarFrame(
+        radar=radar,
+        t_ns=counter * PERIOD_NS,
+        counter=counter,
+        samples=SAMPLES,
+        range_start_m=0.0,
+        bin_length_m=1.0,
+    )
+
+
+@cache
+def whole_run() -> tuple[Scan, ...]:
+    return tuple(
+        Scan(
+            counter=tick,
+            t_ns=tick * PERIOD_NS,
+            frames=tuple(frame(radar, tick) for radar in range(N_RADARS)),
+        )
+        for tick in range(N_TICKS)
+    )
+
+
+def heard(name: str, seed: int) -> np.ndarray[tuple[int, int], np.dtype[np.bool_]]:
+    """Return which frames are left, shape (ticks, radars); every tick must still be there."""
+    scans = list(stressed_scans(whole_run(), STRESSES[name], seed, N_TICKS * PERIOD_NS))
+    assert [scan.counter for scan in scans] == list(range(N_TICKS))
+    left = np.zeros((N_TICKS, N_RADARS), dtype=bool)
+    for scan in scans:
+        for kept in scan.frames:
+            left[scan.counter, kept.radar] = True
+    return left
+
+
+def test_clean_changes_nothing() -> None:
+    scans = whole_run()
+    clean = stressed_scans(scans, STRESSES[CLEAN], 3, N_TICKS * PERIOD_NS)
+    assert all(new is old for new, old in zip(clean, scans, strict=True))
+    assert stressed_scene(load_scene("lab"), STRESSES[CLEAN], 3) == load_scene("lab")
+
+
+def test_a_tenth_of_the_frames_is_dropped_each_by_itself() -> None:
+    left = heard("dropped", 0)
+    # 4000 frames: 0.5 % standard deviation
+    assert left.mean() == pytest.approx(0.9, abs=0.015)
+    lost = ~left
+    # neighbours in time and on the robot know nothing of each other
+    assert abs(np.corrcoef(lost[1:, 0], lost[:-1, 0])[0, 1]) < 0.1
+    assert abs(np.corrcoef(lost[:, 0], lost[:, 1])[0, 1]) < 0.1
+    assert (heard("dropped", 0) == left).all()
+    assert (heard("dropped", 1) != left).any()
+
+
+def test_silence_is_one_piece_of_a_tenth_for_all_radars() -> None:
+    begins = []
+    for seed in range(8):
+        left = heard("silent", seed)
+        silent = np.flatnonzero(~left.any(axis=1))
+        assert len(silent) == pytest.approx(N_TICKS / 10, abs=1)
+        assert silent[-1] - silent[0] == len(silent) - 1
+        assert left.sum() == N_RADARS * (N_TICKS - len(silent))
+        begins.append(silent[0] / N_TICKS)
+    assert 0.15 <= min(begins) < 0.35
+    assert 0.55 < max(begins) <= 0.75
+
+
+def test_a_dead_radar_is_never_heard() -> None:
+    assert heard("dead", 0).all(axis=0).tolist() == [False, True, True, True]
+    assert not heard("dead", 0)[:, 0].any()
+
+
+@pytest.mark.parametrize("name", STRESSES)
+def test_a_stressed_scene_is_a_valid_scene_and_the_same_every_time(name: str) -> None:
+    lab = load_scene("lab")
+    scene = stressed_scene(lab, STRESSES[name], 5)
+    assert Scene.model_validate(scene.model_dump()) == scene
+    assert stressed_scene(lab, STRESSES[name], 5) == scene
+
+
+def test_rows_plant_what_they_say() -> None:
+    lab = load_scene("lab")
+    skewed = stressed_scene(lab, STRESSES["skew"], 0)
+    assert [radar.start_skew_ms for radar in skewed.radars] == [0.0, 190.0, 100.0, 150.0]
+    offsets = np.array(
+        [
+            [r.range_offset_m for r in stressed_scene(lab, STRESSES["offsets"], seed).radars]
+            for seed in range(200)
+        ]
+    )
+    # 800 of them: 2.5 % standard deviation of a deviation, 0.7 mm of a mean
+    assert offsets.std() == pytest.approx(0.02, rel=0.1)
+    assert abs(offsets.mean()) < 0.0025
+    duration_s = lab.trajectory().duration_ns / 1e9
+    walk = stressed_scene(lab, STRESSES["walk"], 0).odometry.walk_per_sqrt_s
+    assert walk * math.sqrt(duration_s) == pytest.approx(1.0)
+
+
+def test_a_carried_robot_goes_on_elsewhere_and_its_wheels_do_not_know() -> None:
+    lab = load_scene("lab")
+    carried = stressed_scene(lab, STRESSES["carried"], 0)
+    at_ns, down_ns = carried.trajectory().carried_ns or (0, 0)
+    assert at_ns == pytest.approx(0.4 * lab.trajectory().duration_ns, abs=1)
+    lifted, down = carried.trajectory().poses(np.array([at_ns, down_ns]))
+    assert math.dist(lifted[:2], down[:2]) > 1.0
+    before = (at_ns - PERIOD_NS) // PERIOD_NS
+    tracks = [OdometryTrack.from_lines(scene_odometry(scene, 0)) for scene in (carried, lab)]
+    times_ns = [tick * PERIOD_NS for tick in range(0, before, 50)]
+    poses = [[track.pose_at(t_ns) for t_ns in times_ns] for track in tracks]
+    np.testing.assert_allclose(poses[0], poses[1], atol=1e-9)
+    in_the_air = [tracks[0].pose_at(t_ns) for t_ns in (at_ns + PERIOD_NS, down_ns - PERIOD_NS)]
+    np.testing.assert_array_equal(in_the_air[0], in_the_air[1])
+
+
+def test_all_is_the_first_five_together() -> None:
+    values = {
+        field.name: max(getattr(STRESSES[name], field.name) for name in FIVE)
+        for field in fields(Stress)
+        if field.name not in ("name", "help", "dead_radars")
+    }
+    assert {name: getattr(STRESSES["all"], name) for name in values} == values
+    assert STRESSES["all"].dead_radars == frozenset()
+
+
+FIVE = ("outliers", "dropped", "skew", "walk", "silent")
+
+
+@dataclass(frozen=True)
+class ThreeEchoes:
+    """A front end that sees the same everywhere."""
+
+    phase_rad: float = 0.5
+
+    def detect(self, frame: RadarFrame, range_offset_m: float = 0.0) -> tuple[Detection, ...]:
+        return self.detect_many([frame], [range_offset_m])[0]
+
+    def detect_many(
+        self, frames: Sequence[RadarFrame], offsets_m: Sequence[float]
+    ) -> list[tuple[Detection, ...]]:
+        return [
+            tuple(
+                Detection(
+                    radar=one.radar,
+                    t_ns=one.t_ns,
+                    range_m=range_m,
+                    amplitude=range_m,
+                    phase_rad=self.phase_rad,
+                )
+                for range_m in (0.5, 0.7, 0.9)
+            )
+            for one in frames
+        ]
+
+
+def outliers(true: ThreeEchoes, seed: int = 0) -> OutlierDetector:
+    return OutlierDetector(detector=true, share=0.2, min_range_m=0.2, max_range_m=1.5, seed=seed)
+
+
+def test_a_fifth_of_the_detections_gets_a_random_range_and_looks_as_before() -> None:
+    frames = [frame(radar, tick) for tick in range(N_TICKS) for radar in range(N_RADARS)]
+    mixed = outliers(ThreeEchoes()).detect_many(frames, [0.0] * len(frames))
+    assert all(sorted(d.amplitude for d in of_one) == [0.5, 0.7, 0.9] for of_one in mixed)
+    assert all([d.range_m for d in of_one] == sorted(d.range_m for d in of_one) for of_one in mixed)
+    wrong = [d for of_one in mixed for d in of_one if d.range_m != d.amplitude]
+    # 12 000 detections: 0.37 % standard deviation
+    assert len(wrong) / (3 * len(frames)) == pytest.approx(0.2, abs=0.012)
+    ranges = np.array([d.range_m for d in wrong])
+    assert 0.2 <= ranges.min() < 0.21
+    assert 1.49 < ranges.max() <= 1.5
+    # uniform: 2400 of them know a quartile to 1 % of the span
+    quartiles = np.quantile(ranges, [0.25, 0.5, 0.75])
+    np.testing.assert_allclose(quartiles, [0.525, 0.85, 1.175], atol=0.05)
+    assert np.std([d.phase_rad for d in wrong]) == pytest.approx(math.pi / math.sqrt(3), rel=0.05)
+
+
+def test_outliers_depend_on_frame_and_seed_alone() -> None:
+    frames = [frame(radar, tick) for tick in range(30) for radar in range(N_RADARS)]
+    together = outliers(ThreeEchoes()).detect_many(frames, [0.0] * len(frames))
+    alone = [outliers(ThreeEchoes()).detect(one) for one in reversed(frames)]
+    assert together == alone[::-1]
+    assert together != outliers(ThreeEchoes(), seed=1).detect_many(frames, [0.0] * len(frames))
+
+
+def test_without_a_phase_an_outlier_has_none_either() -> None:
+    mixed = [outliers(ThreeEchoes(phase_rad=math.nan)).detect(frame(0, n)) for n in range(20)]
+    assert all(math.isnan(d.phase_rad) for of_one in mixed for d in of_one)

@@ -1,0 +1,298 @@
+"""The robust pipeline around its back end: which ranges it takes, from where, and what it says."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from slam.app.rig.emulated import scene_and_config, wheels_of
+from slam.config import RobustConfig, SlamConfig, load_preset, override
+from slam.evaluation import nees_pose
+from slam.frames import Detection, RadarFrame
+from slam.geometry import between, compose, paper_rig, transform
+from slam.paper.ekf import Belief
+from slam.paper.pipeline import PoseAt, UwbRadarSlam
+from slam.robust.parameters import WheelNoise
+from slam.robust.pipeline import RobustSlam, back_end_parameters, belief_of, make_slam
+
+Array = NDArray[np.float64]
+
+NS = 1_000_000_000
+TICK_NS = NS // 5
+RIG = paper_rig()
+RODS = np.array([[0.3, 0.9], [0.9, 1.1], [1.2, 0.7], [0.4, -0.8], [1.0, -1.0]])
+ROBUST = load_preset("robust")
+
+
+def straight(t_ns: int) -> Array:
+    """5 cm/s along x."""
+    return np.array([0.05 * t_ns / NS, 0.0, 0.0])
+
+
+def echoes(pose: Array, radar: int, t_ns: int, *, misfit: float = 0.5) -> list[Detection]:
+    """Return what one radar detects of the rods, exactly, from a true pose."""
+    mount = RIG.mounts[radar]
+    antenna = transform(pose, np.array([mount.x_m, mount.y_m]))
+    found = []
+    for rod in RODS:
+        away = rod - antenna
+        off = math.atan2(away[1], away[0]) - pose[2] - mount.yaw_rad
+        if abs(math.remainder(off, math.tau)) < math.radians(32.5) and np.hypot(*away) < 1.5:
+            found.append(
+                Detection(
+                    radar=radar,
+                    t_ns=t_ns,
+                    range_m=float(np.hypot(*away)),
+                    amplitude=0.015,
+                    sigma_m=1e-3,
+                    misfit=misfit,
+                )
+            )
+    return found
+
+
+def drive(slam: RobustSlam, n: int, odometry: PoseAt, *, misfit: float = 0.5) -> list[Belief]:
+    """Drive n ticks straight ahead, truth as `straight` has it."""
+    beliefs = []
+    for tick in range(n):
+        t_ns = tick * TICK_NS
+        seen = [
+            detection
+            for radar in range(len(RIG.mounts))
+            for detection in echoes(straight(t_ns), radar, t_ns, misfit=misfit)
+        ]
+        beliefs += [row.belief for row in slam.step_detections(seen, odometry, t_ns)]
+    return beliefs
+
+
+def robust(config: SlamConfig = ROBUST) -> RobustSlam:
+    return RobustSlam(config, RIG, WheelNoise())
+
+
+def test_the_configuration_says_which_pipeline_runs() -> None:
+    assert isinstance(make_slam(ROBUST, RIG, WheelNoise()), RobustSlam)
+    assert isinstance(make_slam(load_preset("paper"), RIG, WheelNoise()), UwbRadarSlam)
+
+
+@pytest.mark.parametrize("environment", ["lab", "classroom", "cellar"])
+def test_the_preset_is_one_for_all_environments(environment: str) -> None:
+    assert load_preset("robust", environment) == ROBUST
+
+
+def test_a_setting_without_a_table_can_be_overridden() -> None:
+    config = override(SlamConfig(), {"back_end": "robust", "robust.range_sigma_m": "0.004"})
+    assert isinstance(make_slam(config, RIG, WheelNoise()), RobustSlam)
+    assert config.robust.range_sigma_m == 0.004
+
+
+def test_wheels_are_those_of_the_scenes_specification() -> None:
+    scene, _ = scene_and_config("classroom", "robust")
+    odometry = scene.odometry.model_copy(update={"turn_scale_sigma": 0.031})
+    wheels = wheels_of(scene.model_copy(update={"odometry": odometry}))
+    assert wheels.calibration_sigmas == (0.023, 0.031, 0.0139)
+    assert wheels.heading_rad_per_rad == 0.01
+    start = RobustSlam(ROBUST, RIG, wheels).back_end.state.P.full().diagonal()[3:6]
+    np.testing.assert_allclose(np.sqrt(start), [0.023, 0.031, 0.0139])
+
+
+def test_ranges_correct_wheels_that_report_too_much() -> None:
+    def odometry(t_ns: int) -> Array:
+        return straight(t_ns) * 1.02
+
+    calibrated = override(ROBUST, {"robust.offset_sigma_m": "0"})  # or offsets may explain it
+    beliefs = drive(robust(calibrated), 130, odometry)
+    assert len(beliefs) == 129
+    end = straight(129 * TICK_NS)
+    assert abs(beliefs[-1].pose[0] - end[0]) < 0.1 * abs(odometry(129 * TICK_NS)[0] - end[0])
+    gaps = np.linalg.norm(beliefs[-1].landmarks[:, None] - RODS[None], axis=2)
+    assert len(gaps) == len(RODS)
+    assert gaps.min(axis=0).max() < 0.01
+    assert nees_pose(beliefs[-1].pose, beliefs[-1].pose_covariance, end) < 11.3
+
+
+def test_the_belief_is_the_back_ends_with_additive_errors() -> None:
+    slam = robust()
+    belief = drive(slam, 40, straight)[-1]
+    state = slam.back_end.state
+    T, P = state.additive_transform(), state.P.full()
+    additive = T @ P @ T.T
+    rows = slam.back_end.reported_rows()
+    columns = state.landmark_columns(np.array(rows, dtype=np.intp))
+    at = np.concatenate([[1, 2, 0], columns])
+    np.testing.assert_allclose(belief.covariance, additive[np.ix_(at, at)], rtol=1e-12, atol=1e-18)
+    np.testing.assert_array_equal(belief.covariance, belief.covariance.T)
+    np.testing.assert_array_equal(belief.landmarks, state.landmarks_m[rows])
+    assert belief.landmark_ids == tuple(state.landmark_ids[row] for row in rows)
+    assert belief_of(slam.back_end).mean.tobytes() == belief.mean.tobytes()
+
+
+def test_echoes_of_several_targets_are_left_out_and_told() -> None:
+    slam = robust()
+    beliefs = drive(slam, 40, straight, misfit=ROBUST.robust.max_misfit * 1.01)
+    assert beliefs[-1].landmark_ids == ()
+    assert drive(robust(), 40, straight, misfit=ROBUST.robust.max_misfit)[-1].landmark_ids
+    t_ns = 40 * TICK_NS
+    good, bad = echoes(straight(t_ns), 0, t_ns), echoes(straight(t_ns), 1, t_ns, misfit=9.0)
+    (result,) = slam.step_detections([*good, *bad], straight, t_ns)
+    assert result.range_sigmas_m[len(good) :] == (math.inf,) * len(bad)
+
+
+@pytest.mark.parametrize(
+    ("misfit", "variance_mm2"), [(0.0, 4.5), (0.5, 5.0), (1.4, 8.42), (math.nan, 4.5)]
+)
+def test_a_range_is_as_sure_as_its_misfit_tells(misfit: float, variance_mm2: float) -> None:
+    """Variance (share + share of misfit^2) sigma^2 + floor^2, sigma 1 mm, by hand."""
+    told = {"predicted_share": 0.5, "misfit_share": 2.0, "range_floor_m": 2e-3}
+    slam = robust(override(ROBUST, {f"robust.{key}": value for key, value in told.items()}))
+    slam.step_detections((), straight, 0)
+    (result,) = slam.step_detections(
+        echoes(straight(TICK_NS), 0, TICK_NS, misfit=misfit), straight, TICK_NS
+    )
+    expected_m = 1e-3 * math.sqrt(variance_mm2)
+    assert result.range_sigmas_m == pytest.approx([expected_m] * len(result.detections))
+
+
+def test_a_blurred_echo_is_no_miss_of_what_it_may_hide_and_an_empty_frame_is() -> None:
+    """Echoes of all rods run together for 6 s, or nothing is heard: only the latter is strange."""
+    hidden, gone = robust(), robust()
+    for slam in (hidden, gone):
+        drive(slam, 60, straight)
+    assert hidden.back_end.reported_rows()
+    known, carried = len(hidden.back_end.landmarks()), 0
+    for tick in range(60, 90):
+        t_ns = tick * TICK_NS
+        blurred = [
+            found for radar in range(4) for found in echoes(straight(t_ns), radar, t_ns, misfit=9.0)
+        ]
+        (result,) = hidden.step_detections(blurred, straight, t_ns)
+        (unheard,) = gone.step_detections((), straight, t_ns)
+        assert result.report is not None
+        assert unheard.report is not None
+        assert not result.report.carried
+        carried += unheard.report.carried
+    assert len(hidden.back_end.landmarks()) == known
+    assert carried == 1
+
+
+def test_a_front_end_that_predicts_nothing_is_taken_as_the_table_says() -> None:
+    slam = robust(override(ROBUST, {"robust.range_sigma_m": 5e-3}))
+    seen = [Detection(radar=0, t_ns=0, range_m=1.0, amplitude=0.01)]
+    slam.step_detections(seen, straight, 0)
+    (result,) = slam.step_detections(seen, straight, TICK_NS)
+    assert result.range_sigmas_m == (5e-3,)
+
+
+def test_ranges_are_taken_from_where_each_radar_was_at_its_own_time() -> None:
+    """Radars 0 to 190 ms late on a turn: taken at face value they would be 5 cm off."""
+    late_ns = (0, 190_000_000, 100_000_000, 150_000_000)
+
+    def turning(t_ns: int) -> Array:
+        return compose(np.array([0.3, 0.0, 0.0]), np.array([0.0, 0.0, 0.4 * t_ns / NS]))
+
+    def path(t_ns: int) -> Array:
+        ahead = straight(min(t_ns, 6 * NS))
+        return ahead if t_ns <= 6 * NS else turning(t_ns - 6 * NS)
+
+    slam = robust()
+    beliefs = []
+    for tick in range(46):
+        t_ns = tick * TICK_NS
+        seen = []
+        for radar, late in enumerate(late_ns):
+            seen += echoes(path(t_ns + late), radar, t_ns + late)
+        beliefs += [(t_ns, row.belief) for row in slam.step_detections(seen, path, t_ns)]
+    for t_ns, belief in beliefs:
+        assert np.hypot(*between(path(t_ns), belief.pose)[:2]) < 1e-3
+
+
+def test_standing_still_makes_no_states_and_no_evidence() -> None:
+    def odometry(t_ns: int) -> Array:
+        return straight(min(t_ns, 20 * TICK_NS))
+
+    slam = robust()
+    assert len(drive(slam, 20, odometry)) == 19
+    before = slam.back_end.state.P.full()
+    here = straight(20 * TICK_NS)
+    seen = [found for radar in range(4) for found in echoes(here, radar, 20 * TICK_NS)]
+    (moved,) = slam.step_detections(seen, odometry, 20 * TICK_NS)
+    after = slam.back_end.state.P.full()
+    assert not np.array_equal(before, after)
+    for tick in range(21, 30):
+        assert slam.step_detections(seen, odometry, tick * TICK_NS) == ()
+    np.testing.assert_array_equal(slam.back_end.state.P.full(), after)
+    assert moved.report is not None
+
+
+def test_a_tick_without_frames_goes_on_by_odometry() -> None:
+    slam = robust()
+    slam.step((), straight, 0)
+    (result,) = slam.step((), straight, TICK_NS)
+    np.testing.assert_allclose(result.belief.pose, straight(TICK_NS), atol=1e-15)
+    assert result.nis_per_dof == ()
+    assert slam.flush() == ()
+
+
+def test_another_front_end_can_be_brought_and_is_told_each_radars_range_offset() -> None:
+    class Fixed:
+        def detect(self, frame: RadarFrame, range_offset_m: float = 0.0) -> tuple[Detection, ...]:
+            range_m = 0.7 - range_offset_m
+            return (Detection(radar=frame.radar, t_ns=frame.t_ns, range_m=range_m, amplitude=0.01),)
+
+        def detect_many(
+            self, frames: Sequence[RadarFrame], offsets_m: Sequence[float]
+        ) -> list[tuple[Detection, ...]]:
+            return [self.detect(*row) for row in zip(frames, offsets_m, strict=True)]
+
+    def frame(t_ns: int, radar: int) -> RadarFrame:
+        return RadarFrame(
+            radar=radar,
+            t_ns=t_ns,
+            counter=0,
+            samples=np.zeros(8, dtype=np.float32),
+            range_start_m=0.2,
+            bin_length_m=0.0064,
+        )
+
+    mounts = [replace(mount, range_offset_m=0.01 * k) for k, mount in enumerate(RIG.mounts)]
+    slam = make_slam(ROBUST, replace(RIG, mounts=tuple(mounts)), WheelNoise(), Fixed())
+    slam.step([frame(0, 2)], straight, 0)
+    (result,) = slam.step([frame(TICK_NS, 2), frame(TICK_NS, 1)], straight, TICK_NS)
+    assert [found.radar for found in result.detections] == [2, 1]
+    assert [found.range_m for found in result.detections] == pytest.approx([0.68, 0.69])
+
+
+def test_a_map_without_walls_has_none() -> None:
+    assert robust().wall_spans_m().shape == (0, 2, 2)
+    assert UwbRadarSlam(load_preset("paper"), RIG).wall_spans_m().shape == (0, 2, 2)
+
+
+def test_every_key_of_the_table_reaches_the_back_end() -> None:
+    settings = {
+        "robust.field_of_view_deg": 50.0,
+        "robust.range_sigma_m": 4e-3,
+        "robust.offset_sigma_m": 0.02,
+        "robust.detection_probability": 0.7,
+        "robust.false_ranges_per_frame": 0.26,
+        "robust.wheel_walk_per_sqrt_m": 0.15,
+        "robust.association_doubt_m": 3e-3,
+        "robust.huber_sigmas": 2.5,
+        "detection.min_range_m": 0.2,
+        "detection.max_range_m": 1.5,
+    }
+    told = back_end_parameters(override(ROBUST, settings), WheelNoise(scale_sigma=0.01))
+    ranges = told.ranges
+    assert ranges.field_of_view_rad == math.radians(50.0)
+    assert (ranges.sigma_m, ranges.offset_sigma_m) == (4e-3, 0.02)
+    assert ranges.detection_probability == 0.7
+    assert (ranges.doubt_m, ranges.huber_sigmas) == (3e-3, 2.5)
+    assert ranges.clutter_per_m == pytest.approx(0.2)
+    assert (ranges.min_range_m, ranges.max_range_m) == (0.2, 1.5)
+    assert (told.wheels.scale_sigma, told.wheels.walk_per_sqrt_m) == (0.01, 0.15)
+
+
+def test_the_table_refuses_what_makes_no_sense() -> None:
+    with pytest.raises(ValueError, match="detection_probability"):
+        RobustConfig(detection_probability=1.0)

@@ -1,0 +1,218 @@
+"""``xethru`` with a module: output, exit codes, and how it ends."""
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hil_tests.unit.xethru_protocol.pty_module import PtyModule
+from xethru_protocol.cli import main
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import SensorMode, X4Setting
+
+XETHRU = [sys.executable, "-m", "xethru_protocol.cli"]
+
+
+@pytest.fixture
+def module() -> Iterator[PtyModule]:
+    with PtyModule() as module:
+        yield module
+
+
+def stopped(module: PtyModule) -> bool:
+    stop = m.X4DriverSet(setting=X4Setting.FPS, value=0.0)
+    return module.received[-2:] == [stop, m.SetMode(mode=SensorMode.XTID_SM_STOP)]
+
+
+def lines_of(capsys: pytest.CaptureFixture[str]) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+
+
+def test_stream_prints_one_object_per_frame_and_stops_the_module(
+    module: PtyModule, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["stream", "--port", module.path, "--count", "3"]) == 0
+    frames = lines_of(capsys)
+    assert [frame["counter"] for frame in frames] == [0, 1, 2]
+    assert list(frames[0]) == ["counter", "t_ns", "bins", "range_start_m", "bin_length_m"]
+    assert frames[0]["bins"] == 1431
+    assert stopped(module)
+    area = m.X4DriverSet(
+        setting=X4Setting.FRAMEAREA, value=(0.20000000298023224, 9.399999618530273)
+    )
+    assert area in module.received
+
+
+def test_stream_with_samples(module: PtyModule, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["stream", "--port", module.path, "--count", "2", "--samples"]) == 0
+    assert lines_of(capsys)[1]["samples"] == [1.0] * 1431
+
+
+def test_rate_above_the_possible_is_a_warning(
+    module: PtyModule, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["stream", "--port", module.path, "--count", "1", "--fps", "30"]) == 0
+    assert "more than the 19.8" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["SIGINT", "SIGTERM"]
+)
+def test_stream_ends_cleanly_by_a_signal(
+    module: PtyModule, number: signal.Signals, code: int
+) -> None:
+    command = [*XETHRU, "stream", "--port", module.path]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert json.loads(process.stdout.readline())["counter"] == 0
+        process.send_signal(number)
+        process.stdout.read()
+        assert process.stderr.read() == b""
+        assert process.wait() == code
+    assert stopped(module)
+
+
+def test_stream_ends_cleanly_when_nobody_reads_it(module: PtyModule) -> None:
+    command = [*XETHRU, "stream", "--port", module.path]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.readline()
+        process.stdout.close()
+        assert process.stderr.read() == b""
+        assert process.wait() == 0
+    assert stopped(module)
+
+
+def test_ping_and_info(module: PtyModule, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["ping", "--port", module.path]) == 0
+    assert capsys.readouterr().out.startswith(f"{module.path}: ready (")
+    assert main(["info", "--port", module.path, "--json"]) == 0
+    (info,) = lines_of(capsys)
+    assert info["serial_number"] == "123456789012"
+    assert info["mode"] == "MANUAL"
+    assert info["x4"]["FRAMEBINCOUNT"] == 1431
+    assert main(["info", "--port", module.path]) == 0
+    text = capsys.readouterr().out
+    assert "serial number        123456789012\n" in text
+    assert "X4 FRAMEAREA         0.1992901 ... 9.400679\n" in text
+
+
+def test_reset(module: PtyModule, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["reset", "--port", module.path, "--json"]) == 0
+    assert lines_of(capsys) == [{"port": module.path, "reset": True}]
+    assert module.received == [m.ModReset()]
+
+
+@pytest.mark.parametrize("command", ["ping", "info", "reset", "stream"])
+def test_missing_port_is_one_clear_line(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([command, "--port", str(tmp_path / "radar")]) == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err == (
+        f"xethru {command}: there is no port {tmp_path / 'radar'}; "
+        "'xethru list' shows the ports there are\n"
+    )
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["nonsense"],
+        ["ping"],
+        ["stream", "--port", "p", "--fps", "0"],
+        ["stream", "--port", "p", "--count", "0"],
+        ["stream", "--port", "p", "--frame-area", "5", "1"],
+        ["stream", "--port", "p", "--frame-area", "nan", "1"],
+        ["stream", "--port", "p", "--frame-area", "1", "inf"],
+        ["decode", "--from", "nobody"],
+    ],
+)
+def test_wrong_usage_exits_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+    assert "usage: xethru" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("option", "values", "message"),
+    [
+        ("--fps", ["fast"], "argument --fps: 'fast' must be a number between 0 and 65536"),
+        ("--fps", ["nan"], "argument --fps: 'nan' must be a number between 0 and 65536"),
+        ("--count", ["2.5"], "argument --count: '2.5' must be a whole number from 1 on"),
+        ("--count", ["0"], "argument --count: '0' must be a whole number from 1 on"),
+        (
+            "--frame-area",
+            ["near", "1"],
+            "argument --frame-area: 'near' must be metres between -1000 and 1000",
+        ),
+    ],
+)
+def test_wrong_values_say_what_is_allowed(
+    option: str, values: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["stream", "--port", "p", option, *values])
+    assert capsys.readouterr().err.endswith(f"xethru stream: error: {message}\n")
+
+
+def test_list_shows_running_emulators_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    folder = tmp_path / "xethru"
+    folder.mkdir()
+    port = tmp_path / "left"
+    port.touch()
+    here = {"path": str(port), "name": "left", "serial": "42", "tcp": None}
+    gone = {"path": str(tmp_path / "gone"), "name": "gone", "serial": "43", "tcp": None}
+    running = {"ready": True, "pid": 1, "devices": [here, gone]}
+    (folder / "1.json").write_text(json.dumps(running))
+    (folder / "2.json").write_text(json.dumps(running | {"pid": 1 << 22}))  # above any pid
+    (folder / "3.json").write_text("{")
+    for number, pid in enumerate(["1e999", str(1 << 70), "-1", "0"], start=4):
+        word = json.dumps(running | {"pid": "PID"}).replace('"PID"', pid)
+        (folder / f"{number}.json").write_text(word)
+    assert main(["list", "--json"]) == 0
+    (found,) = lines_of(capsys)
+    assert [port for port in found["ports"] if port["kind"] == "emulated"] == [
+        {"path": str(port), "kind": "emulated", "description": "emulated left", "serial": "42"}
+    ]
+
+
+def test_help_and_import_load_nothing_heavy() -> None:
+    code = (
+        "import sys; import xethru_protocol; from xethru_protocol.cli.arguments import parse\n"
+        "try: parse(['--help'])\n"
+        "except SystemExit: pass\n"
+        "heavy = {'numpy', 'serial', 'scipy', 'sklearn', 'rerun'} & set(sys.modules)\n"
+        "sys.exit(f'loaded {heavy}' if heavy else 0)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+
+
+@pytest.mark.parametrize(
+    "path", ["x" * 5000, "\0", "\ud800", "a\nb"], ids=["long", "NUL", "surrogate", "line end"]
+)
+def test_list_passes_over_what_can_be_no_path(
+    path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    folder = tmp_path / "xethru"
+    folder.mkdir()
+    device = {"path": path, "name": "left", "serial": "42"}
+    (folder / "1.json").write_text(json.dumps({"pid": 1, "devices": [device]}))
+    (folder / "2.json").write_text("[" * 100_000)
+    assert main(["list", "--json"]) == 0
+    (found,) = lines_of(capsys)
+    assert [port for port in found["ports"] if port["kind"] == "emulated"] == []

@@ -1,0 +1,409 @@
+"""``xethru doctor``: each row of its tables finds its fault, names a remedy, disturbs nobody."""
+
+import json
+import os
+import subprocess
+import sys
+import termios
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hil_tests.unit.xethru_protocol.sick_module import (
+    IDLE,
+    MANUAL,
+    NOT_READY,
+    SAFE_MODE,
+    STOP,
+    Said,
+    SickModule,
+    silent,
+    stock,
+)
+from xethru_protocol.cli import main
+from xethru_protocol.cli import port_probe as patient
+from xethru_protocol.cli.doctor import MACHINE_CHECKS, PORT_CHECKS
+from xethru_protocol.cli.port_probe import PortUser, port_users
+from xethru_protocol.transport import SerialTransport
+from xethru_protocol.wire import messages as m
+
+Capture = pytest.CaptureFixture[str]
+FRAME = m.DataFloat(info=1, values=np.zeros(8, np.float32))
+UNCHECKED = bytes.fromhex("7D 01 02 03 7E")  # XOR of 7D 01 02 is 7E, not 03
+
+
+@pytest.fixture(autouse=True)
+def only_own_emulators(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+
+@pytest.fixture
+def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait less for modules that never answer, and longer at a rate at which one may."""
+    monkeypatch.setattr(patient, "_PATIENCE_S", 0.3)
+    monkeypatch.setattr(patient, "_GLANCE_S", 1.0)
+
+
+def examined(capsys: Capture, *arguments: str) -> tuple[int, list[dict[str, Any]]]:
+    """Exit code, and the reports of one `doctor --json`."""
+    code = main(["doctor", *arguments, "--json"])
+    (line,) = capsys.readouterr().out.splitlines()
+    result = json.loads(line)
+    assert result["ok"] == (code == 0)
+    return code, result["reports"]
+
+
+def not_well(report: dict[str, Any]) -> list[dict[str, str]]:
+    return [check for check in report["checks"] if check["level"] != "ok"]
+
+
+def only_finding(capsys: Capture, path: str) -> tuple[int, dict[str, str]]:
+    code, (report,) = examined(capsys, "--port", path)
+    (finding,) = not_well(report)
+    assert finding["remedy"]
+    return code, finding
+
+
+def test_a_module_as_it_comes_from_the_factory_is_well(capsys: Capture) -> None:
+    with SickModule(stock()) as module:
+        code, (report,) = examined(capsys, "--port", module.path)
+    assert (code, not_well(report)) == (0, [])
+    assert [check["check"] for check in report["checks"]] == [row.name for row in PORT_CHECKS]
+    assert report["about"] == (
+        "X4M300, serial 123456789012, firmware 1.6.8, mode RUN, profile PRESENCE_2"
+    )
+    disturbing = (m.SetMode, m.X4DriverSet, m.X4DriverInit, m.LoadApp, m.ModReset)
+    assert not any(isinstance(command, disturbing) for command in module.received)
+
+
+# --- the module: name of the row, what the module does, level, a word of what is found ------------
+
+
+def gone(command: m.Message) -> Sequence[Said]:
+    return [b""]
+
+
+def only_bootloader(command: m.Message) -> Sequence[Said]:
+    # payload 00, whose checksum 7D is escaped
+    is_known = isinstance(command, m.BootloaderGetDeviceInfo)
+    return [bytes.fromhex("7D 00 7F 7D 7E")] if is_known else []
+
+
+SILENT_MODULES = [
+    ("not in the bootloader", lambda: SickModule(only_bootloader), "fault", "bootloader"),
+    ("speaks XeThru", lambda: SickModule(silent, unasked=UNCHECKED), "fault", "no XeThru packets"),
+    ("listens", lambda: SickModule(silent, unasked=FRAME), "fault", "does not answer"),
+    ("answers", lambda: SickModule(silent), "fault", "nothing answers"),
+]
+ANSWERING_MODULES = [
+    ("stays connected", lambda: SickModule(gone), "fault", "went away"),
+    ("no echo", lambda: SickModule(silent, echoes=True), "fault", "sends back"),
+    ("is a module", lambda: SickModule(stock(pong=0x12345678)), "fault", "0x12345678"),
+    ("ready", lambda: SickModule(stock(pong=NOT_READY)), "fault", "not ready"),
+    ("not in safe mode", lambda: SickModule(stock(pong=SAFE_MODE)), "fault", "safe mode"),
+    (
+        "has profiles",
+        lambda: SickModule(stock(order_code=None, firmware_id="XEP", mode=None, profile=None)),
+        "note",
+        "bare XEP firmware",
+    ),
+    ("is an X4M300", lambda: SickModule(stock(order_code="X4M200")), "note", "X4M200"),
+    ("firmware", lambda: SickModule(stock(version="1.6.7")), "fault", "1.6.7"),
+    ("right profile", lambda: SickModule(stock(profile=0x064E57AD)), "fault", "RESPIRATION_2"),
+    ("profile loaded", lambda: SickModule(stock(mode=STOP, profile=0)), "note", "mode STOP"),
+    ("radar runs", lambda: SickModule(stock(mode=IDLE)), "note", "mode IDLE"),
+    ("transmitter on", lambda: SickModule(stock(mode=MANUAL, tx_power=0)), "fault", "off"),
+]
+
+
+Make = Callable[[], SickModule]
+
+
+@pytest.mark.parametrize(
+    ("check", "make", "level", "word"), ANSWERING_MODULES, ids=[row[0] for row in ANSWERING_MODULES]
+)
+def test_what_is_wrong_with_a_module(
+    check: str, make: Make, level: str, word: str, capsys: Capture
+) -> None:
+    with make() as module:
+        code, finding = only_finding(capsys, module.path)
+    assert (finding["check"], finding["level"]) == (check, level)
+    assert code == (1 if level == "fault" else 0)
+    assert word in finding["found"]
+
+
+@pytest.mark.usefixtures("hurried")
+@pytest.mark.parametrize(
+    ("check", "make", "level", "word"), SILENT_MODULES, ids=[row[0] for row in SILENT_MODULES]
+)
+def test_what_is_wrong_with_a_module_that_does_not_answer(
+    check: str, make: Make, level: str, word: str, capsys: Capture
+) -> None:
+    test_what_is_wrong_with_a_module(check, make, level, word, capsys)
+
+
+@pytest.mark.parametrize("version", ["1.6.8", "1.6.10", "1.10.0", "2.0.0", "new"])
+def test_firmware_that_is_not_stale(version: str, capsys: Capture) -> None:
+    with SickModule(stock(version=version)) as module:
+        code, (report,) = examined(capsys, "--port", module.path)
+    assert (code, not_well(report)) == (0, [])
+
+
+@pytest.mark.usefixtures("hurried")
+def test_a_module_at_another_baud_rate(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(patient, "ignores_baudrate", lambda path: False)
+    with SickModule(stock(), baudrate=termios.B460800) as module:
+        code, finding = only_finding(capsys, module.path)
+    assert (code, finding["check"]) == (1, "usual baud rate")
+    assert finding["found"] == "it answers at 460800 baud, not at 115200"
+    assert "--baudrate 460800" in finding["remedy"]
+
+
+@pytest.mark.parametrize(
+    ("path", "ignores"),
+    [
+        ("/dev/ttyACM0", True),
+        ("/dev/pts/3", True),
+        ("/dev/ttyUSB0", False),
+        ("/dev/ttyS1", False),
+        ("/dev/ttyAMA0", False),
+    ],
+)
+def test_only_real_uarts_are_tried_at_other_rates(path: str, ignores: bool) -> None:
+    assert patient.ignores_baudrate(path) is ignores
+
+
+def test_a_module_that_stops_answering_half_way(capsys: Capture) -> None:
+    healthy = stock()
+
+    def answer(command: m.Message) -> Sequence[Said]:
+        return [b""] if isinstance(command, m.GetProfileId) else healthy(command)
+
+    with SickModule(answer) as module:
+        code, finding = only_finding(capsys, module.path)
+    assert (code, finding["check"]) == (1, "right profile")
+    assert "disconnected" in finding["found"]
+
+
+# --- the port ---------------------------------------------------------------------------------
+
+
+def test_a_link_to_nothing(tmp_path: Path, capsys: Capture) -> None:
+    link = tmp_path / "radar"
+    link.symlink_to(tmp_path / "gone")
+    code, finding = only_finding(capsys, str(link))
+    assert (code, finding["check"]) == (1, "link leads to a port")
+    assert str(tmp_path / "gone") in finding["found"]
+    assert finding["remedy"].endswith(f"rm {link}")
+
+
+def test_names_in_remedies_can_be_given_to_a_shell(tmp_path: Path, capsys: Capture) -> None:
+    link = tmp_path / "my {radar} $(id)"
+    link.symlink_to(tmp_path / "gone")
+    _, finding = only_finding(capsys, str(link))
+    assert finding["remedy"].endswith(f"rm '{link}'")
+
+
+def test_a_port_that_vanishes_while_it_is_examined(
+    capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(patient.Patient, "exists", True)
+    _, finding = only_finding(capsys, "/dev/none")
+    assert finding["check"] == "is a serial port"
+    assert finding["found"] == "this could not be found out: No such file or directory"
+
+
+def test_no_such_port(tmp_path: Path, capsys: Capture) -> None:
+    code, finding = only_finding(capsys, str(tmp_path / "radar"))
+    assert (code, finding["check"]) == (1, "port exists")
+
+
+@pytest.mark.parametrize("path", [".", __file__, "/dev/null"])
+def test_what_is_no_serial_port(path: str, capsys: Capture) -> None:
+    code, finding = only_finding(capsys, path)
+    assert (code, finding["check"]) == (1, "is a serial port")
+
+
+@pytest.mark.parametrize(
+    ("mode", "check", "remedy"),
+    [(0o620, "group has rights", "udev"), (0o660, "user has rights", "usermod -aG")],
+)
+def test_no_rights(
+    mode: int, check: str, remedy: str, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with SickModule(stock()) as module:
+        os.chmod(module.path, mode)
+        # root may open everything, and tests may run as root
+        monkeypatch.setattr("os.access", lambda path, wanted: False)
+        code, finding = only_finding(capsys, module.path)
+        group = patient.Patient(module.path).group
+    assert (code, finding["check"]) == (1, check)
+    assert f"group {group}" in finding["found"]
+    assert remedy in finding["remedy"]
+    assert module.received == []
+
+
+@contextmanager
+def reader(path: str) -> Iterator[int]:
+    """Another program that has a port open, without a lock; its process id."""
+    code = "import os, sys; os.open(sys.argv[1], os.O_RDWR); print(flush=True); sys.stdin.read()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        yield process.pid
+        process.kill()
+
+
+needs_proc = pytest.mark.skipif(not Path("/proc/self/fdinfo").exists(), reason="asks Linux's /proc")
+
+
+@needs_proc
+def test_a_port_that_another_program_has_open_is_left_alone(
+    capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr(patient, "SerialTransport", opened.append)
+    with SickModule(stock()) as module, reader(module.path) as pid:
+        code, finding = only_finding(capsys, module.path)
+    assert (code, finding["check"]) == (1, "nobody else has it open")
+    assert f"(pid {pid}) has it open" in finding["found"]
+    assert opened == []
+
+
+@needs_proc
+def test_two_programs_that_split_the_stream(capsys: Capture) -> None:
+    with ExitStack() as stack:
+        module = stack.enter_context(SickModule(stock()))
+        pids = [stack.enter_context(reader(module.path)) for _ in range(2)]
+        code, finding = only_finding(capsys, module.path)
+    assert (code, finding["check"]) == (1, "no two readers")
+    assert all(f"pid {pid}" in finding["found"] for pid in pids)
+    assert module.received == []
+
+
+@needs_proc
+def test_whoever_serves_a_port_is_no_user_of_it() -> None:
+    with SickModule(stock()) as module:
+        assert port_users(module.path) == ()
+        with reader(module.path) as pid:
+            (user,) = port_users(module.path)
+            assert user.pid == pid
+            assert user.name.startswith("-c import os")
+    assert port_users("/no/such/port") == ()
+    assert port_users(__file__) == ()
+
+
+def test_a_port_locked_by_a_program_that_cannot_be_seen(
+    capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(patient, "port_users", lambda path: ())
+    with SickModule(stock()) as module:
+        other = SerialTransport(module.path)
+        code, finding = only_finding(capsys, module.path)
+        other.close()
+    assert (code, finding["check"]) == (1, "can be opened")
+    assert "in use by another program" in finding["found"]
+    assert f"sudo xethru doctor --port {module.path}" in finding["remedy"]
+
+
+def test_many_readers_are_not_all_named(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    users = tuple(PortUser(pid=number, name="reader") for number in range(10, 20))
+    monkeypatch.setattr(patient, "port_users", lambda path: users)
+    with SickModule(stock()) as module:
+        _, finding = only_finding(capsys, module.path)
+    assert "(pid 13) and 6 more have it open" in finding["found"]
+
+
+# --- the machine --------------------------------------------------------------------------------
+
+
+def test_a_machine_without_modules(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("xethru_protocol.cli.doctor.find_ports", lambda: ())
+    code, (report,) = examined(capsys)
+    (finding,) = not_well(report)
+    assert (code, report["subject"], finding["check"]) == (1, "this machine", "modules found")
+
+
+def test_what_dead_emulators_left(
+    tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "xethru"
+    folder.mkdir()
+    dead = 1 << 22  # above any process id
+    stale = [folder / f"{dead}.json", folder / f"ports-{dead}-abc"]
+    stale[0].write_text("{}")
+    stale[1].mkdir()
+    (folder / "notes.txt").touch()  # not an emulator's
+    (folder / f"{os.getpid()}.json").write_text("[" * 100_000)
+    code, reports = examined(capsys)
+    findings = {check["check"]: check for check in not_well(reports[-1])}
+    assert code == 1
+    found = findings["no dead emulators"]
+    assert found["remedy"].endswith(f"rm -r {stale[0]} {stale[1]}")
+    assert f"rm {folder / f'{os.getpid()}.json'}" in findings["emulators' word readable"]["remedy"]
+
+
+def test_all_found_ports_are_examined(
+    tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "xethru").mkdir()
+    with SickModule(stock()) as module:
+        device = {"path": module.path, "name": "left", "serial": "1", "tcp": None}
+        word = json.dumps({"pid": os.getpid(), "ready": True, "devices": [device]})
+        (tmp_path / "xethru" / f"{os.getpid()}.json").write_text(word)
+        code, reports = examined(capsys)
+    assert [report["subject"] for report in reports][-2:] == [module.path, "this machine"]
+    assert reports[-2]["about"].startswith("emulated left, X4M300")
+    assert code == (0 if len(reports) == 2 else code)
+
+
+# --- the report -------------------------------------------------------------------------------
+
+
+def test_the_report_for_people(capsys: Capture, tmp_path: Path) -> None:
+    missing = str(tmp_path / "radar")
+    with SickModule(stock(pong=SAFE_MODE)) as module:
+        assert main(["doctor", "--port", module.path, "--port", missing]) == 1
+    assert capsys.readouterr().out == (
+        f"{module.path}\n"
+        "  ok     17 checks\n"
+        "  fault  it is in safe mode: ten faults in a row made it start without its profiles\n"
+        f"      -> xethru reset --port {module.path}, or take the module's power away for some "
+        "seconds\n"
+        "\n"
+        f"{missing}\n"
+        "  ok     1 check\n"
+        "  fault  there is no such port\n"
+        "      -> plug the module in; 'xethru list' shows the ports there are\n"
+        "\n"
+        "2 faults\n"
+    )
+
+
+def test_every_row_says_what_it_needs_to() -> None:
+    for table in (PORT_CHECKS, MACHINE_CHECKS):
+        names = [row.name for row in table]
+        assert len(set(names)) == len(names)
+        assert all(row.looks_at and row.remedy for row in table)
+
+
+def test_every_row_about_a_port_has_a_test() -> None:
+    elsewhere = {
+        "link leads to a port",
+        "port exists",
+        "is a serial port",
+        "group has rights",
+        "user has rights",
+        "no two readers",
+        "nobody else has it open",
+        "can be opened",
+        "usual baud rate",
+    }
+    modules = {row[0] for row in SILENT_MODULES + ANSWERING_MODULES}
+    assert modules | elsewhere == {row.name for row in PORT_CHECKS}

@@ -1,0 +1,343 @@
+"""``xethru dump`` and ``convert`` on recordings that the vendor's own library wrote."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hil_tests.paths import FIXTURES
+from hil_tests.unit.emulator.test_playback_control import samples, write_session
+from xethru_protocol.cli import main
+from xethru_protocol.recordings import RecordingError, WireCapture, convert, read_recording
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.connection import Connection, Role
+
+Capture = pytest.CaptureFixture[str]
+RECORDINGS = FIXTURES / "recordings"
+IQ = RECORDINGS / "iq"
+IQ_FILE = "xethru_baseband_iq_20261121_003557.dat"
+
+
+def dumped(capsys: Capture, path: Path) -> list[dict[str, Any]]:
+    assert main(["dump", str(path), "--json"]) == 0
+    printed, errors = capsys.readouterr()
+    assert errors == ""
+    return [json.loads(line) for line in printed.splitlines()]
+
+
+def test_for_people(capsys: Capture) -> None:
+    assert main(["dump", str(RECORDINGS / "single")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[:8] == [
+        f"{RECORDINGS / 'single'}: vendor recording, 40 messages, 3.5 kB",
+        "  40 PRESENCE_SINGLE",
+        "  from 2026-11-21 00:36:04.739 UTC, 1.949 s",
+        "  session session-single",
+        "  profile PRESENCE_2",
+        "  parameter file xethru_parameter_file.par",
+        "",
+        "    0.000000  PRESENCE_SINGLE counter=164 presence_state=2 distance=21.75 direction=2 "
+        "signal_quality=10",
+    ]
+    assert len(lines) == 7 + 40
+
+
+def test_arrays_are_cut_unless_asked_for(capsys: Capture) -> None:
+    assert main(["dump", str(IQ)]) == 0
+    short = capsys.readouterr().out
+    assert "range_offset=0.4 i=[0.044, 0.088, 0.132, ... 10 in all] q=[-0.088, " in short
+    assert main(["dump", str(IQ), "--samples"]) == 0
+    whole = capsys.readouterr().out
+    assert "i=[0.044, 0.088, 0.132, 0.176, 0.22, 0.264, 0.308, 0.352, 0.396, 0.44] q=[" in whole
+    assert "in all" not in whole
+
+
+def test_as_json_each_message_has_the_shape_of_decode_and_its_time(capsys: Capture) -> None:
+    messages = dumped(capsys, IQ)
+    assert len(messages) == 40
+    # protocol reference 7.1: 50, id 0C, counter 44, 10 bins, then the floats; 1 + 4 + 24 + 80 bytes
+    first = messages[0]
+    assert first["payload_hex"].startswith("50 0C 00 00 00 2C 00 00 00 0A 00 00 00")
+    assert len(bytes.fromhex(first["payload_hex"])) == 109
+    assert (first["framing"], first["message"]) == ("noescape", "BASEBAND_IQ")
+    assert first["t_ns"] == 1795221357928 * 1_000_000
+    assert first["fields"]["counter"] == 44
+    assert list(first) == ["framing", "payload_hex", "message", "fields", "t_ns"]
+    np.testing.assert_allclose(first["fields"]["i"], np.arange(1, 11) * 0.044, rtol=1e-6)
+
+
+def test_decode_reads_the_payloads_that_dump_prints(tmp_path: Path, capsys: Capture) -> None:
+    """Framed by hand, as reference 1.1 says, `decode` shows of them what `dump` did."""
+    messages = dumped(capsys, RECORDINGS / "single")
+    lines = []
+    for message in messages[:5]:
+        assert message["framing"] == "normal"
+        payload = bytes.fromhex(message["payload_hex"])
+        checksum = 0x7D
+        for byte in payload:
+            checksum ^= byte
+        escaped = b"".join(
+            bytes([0x7F, byte]) if byte in (0x7D, 0x7E, 0x7F) else bytes([byte])
+            for byte in [*payload, checksum]
+        )
+        lines.append((b"\x7d" + escaped + b"\x7e").hex())
+    file = tmp_path / "packets"
+    file.write_text("\n".join(lines))
+    assert main(["decode", "--hex", str(file)]) == 0
+    decoded = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert decoded == [
+        {key: value for key, value in message.items() if key != "t_ns"} for message in messages[:5]
+    ]
+
+
+def test_a_damaged_recording_is_read_as_far_as_it_goes(tmp_path: Path, capsys: Capture) -> None:
+    cut = tmp_path / "cut"
+    shutil.copytree(IQ, cut)
+    data = (cut / IQ_FILE).read_bytes()
+    (cut / IQ_FILE).write_bytes(data[:-50])
+    for option in ([], ["--json"]):
+        assert main(["dump", str(cut), *option]) == 1
+        printed, errors = capsys.readouterr()
+        assert (
+            sum('BASEBAND_IQ"' in line or " counter=" in line for line in printed.split("\n")) == 39
+        )
+        assert errors == (
+            f"xethru dump: {IQ_FILE}: the last record is cut: 54 bytes of it are there "
+            "(at byte 4056)\n"
+        )
+
+
+def test_answers_and_unknown_messages_in_a_wire_capture(tmp_path: Path, capsys: Capture) -> None:
+    wire = tmp_path / "port.xtwire"
+    module = Connection(Role.MODULE)
+    with WireCapture(wire) as capture:
+        capture.write("tx", bytes.fromhex("7D 01 AE EA AA EE 00 7E"), 1_000_000_000)
+        for number, said in enumerate((m.Ack(), m.UnknownMessage(code=0x77, payload=b"\x77" * 50))):
+            capture.write("rx", module.send(said), 2_000_000_000 + number)
+        capture.write(
+            "rx", module.send(m.DataFloat(info=1, values=np.array([np.nan, np.inf]))), None
+        )
+    assert main(["dump", str(wire)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-3] == "    0.000000  ACK"
+    assert lines[-2].startswith("    0.000000  UNKNOWN code=119 payload=77 77 77")
+    assert lines[-2].endswith("...")
+    assert lines[-1].startswith("           -  DATA FLOAT")
+    found = dumped(capsys, wire)
+    assert [message["t_ns"] for message in found] == [2_000_000_000, 2_000_000_001, None]
+    assert found[1]["payload_hex"] == " ".join(["77"] * 50)
+    assert found[2]["fields"]["data"] == [None, None]
+
+
+@pytest.mark.parametrize("command", [["dump"], ["convert"]])
+def test_what_is_no_recording(command: list[str], tmp_path: Path, capsys: Capture) -> None:
+    target = [str(tmp_path / "target")] if command == ["convert"] else []
+    for source in (tmp_path / "none", tmp_path, Path(__file__)):
+        assert main([*command, str(source), *target]) == 1
+        printed, errors = capsys.readouterr()
+        assert printed == ""
+        assert errors.startswith(f"xethru {command[0]}: ")
+        assert errors.count("\n") == 1
+        assert str(source) in errors
+
+
+def test_a_reader_that_has_enough_ends_it() -> None:
+    command = [sys.executable, "-m", "xethru_protocol.cli", "dump", str(IQ), "--json", "--samples"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.readline()
+        process.stdout.close()
+        assert process.stderr.read() == b""
+        assert process.wait() == 0
+
+
+# --- convert --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["c.npz", "c.mcap", "c.xtwire", "c"])
+@pytest.mark.parametrize("source", ["iq", "float", "single"])
+def test_every_format_gives_the_same_messages_back(
+    source: str, name: str, tmp_path: Path, capsys: Capture
+) -> None:
+    target = tmp_path / name
+    assert main(["convert", str(RECORDINGS / source), str(target)]) == 0
+    assert capsys.readouterr() == (f"{target}: 40 messages\n", "")
+    assert dumped(capsys, target) == dumped(capsys, RECORDINGS / source)
+
+
+def test_a_target_is_not_overwritten_unless_told(tmp_path: Path, capsys: Capture) -> None:
+    for name in ("c.npz", "c"):
+        target = tmp_path / name
+        assert main(["convert", str(IQ), str(target)]) == 0
+        assert main(["convert", str(RECORDINGS / "single"), str(target)]) == 1
+        assert "there is a recording already: " in capsys.readouterr().err
+        assert len(dumped(capsys, target)) == 40
+        assert main(["convert", str(RECORDINGS / "single"), str(target), "--force"]) == 0
+        capsys.readouterr()
+        assert {message["message"] for message in dumped(capsys, target)} == {"PRESENCE_SINGLE"}
+
+
+def test_a_recording_is_not_converted_into_itself(tmp_path: Path, capsys: Capture) -> None:
+    source = tmp_path / "c"
+    shutil.copytree(IQ, source)
+    (tmp_path / "link").symlink_to(source)
+    for target in (source, tmp_path / "link"):
+        assert main(["convert", str(source), str(target), "--force"]) == 1
+        assert "cannot be converted into itself" in capsys.readouterr().err
+    assert len(dumped(capsys, source)) == 40
+
+
+def test_a_source_that_cannot_be_read_costs_no_target(tmp_path: Path, capsys: Capture) -> None:
+    target = tmp_path / "c.npz"
+    assert main(["convert", str(IQ), str(target)]) == 0
+    assert main(["convert", str(tmp_path / "none"), str(target), "--force"]) == 1
+    capsys.readouterr()
+    assert len(dumped(capsys, target)) == 40
+
+
+def test_what_was_left_out_and_what_was_damaged_is_said(tmp_path: Path, capsys: Capture) -> None:
+    wire = tmp_path / "port.xtwire"
+    module = Connection(Role.MODULE)
+    frame = module.send(m.DataFloat(info=1, values=np.zeros(8, np.float32)))
+    with WireCapture(wire) as capture:
+        for data in (module.send(m.Ack()), frame, frame):
+            capture.write("rx", data, 10**18)
+    wire.write_bytes(wire.read_bytes()[:-4])
+    assert main(["convert", str(wire), str(tmp_path / "c"), "--json"]) == 1
+    printed, errors = capsys.readouterr()
+    result = json.loads(printed)
+    assert (result["messages"], result["skipped"]) == (1, {"ACK": 1})
+    assert [fault["file"] for fault in result["faults"]] == ["port.xtwire"]
+    assert "1 ACK left out: the format has no place for them" in errors
+    assert "the last chunk is cut" in errors
+
+
+def test_a_conversion_that_fails_leaves_nothing(
+    tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(source: object, target: str, show: object, *, radar: object) -> None:
+        Path(target).write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("xethru_protocol.cli.recordings.convert_recording", stopped)
+    assert main(["convert", str(IQ), str(tmp_path / "c.npz")]) == 130
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_faults_by_the_hundred_are_not_all_told(tmp_path: Path, capsys: Capture) -> None:
+    (tmp_path / "xethru_sleep_20261121_003557.csv").write_bytes(b"no;such;row\n" * 200)
+    for command in (["dump", str(tmp_path)], ["convert", str(tmp_path), f"{tmp_path}.mcap"]):
+        assert main(command) == 1
+        lines = capsys.readouterr().err.splitlines()
+        assert len([line for line in lines if "a line cannot be read" in line]) < 11
+        assert lines[-1].startswith(f"xethru {command[0]}: and ")
+        assert lines[-1].endswith(" faults more")
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path, capsys: Capture) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for command in (["dump", f"{tmp_path}/pipe"], ["convert", f"{tmp_path}/pipe", "target.mcap"]):
+        assert main(command) == 1
+        assert capsys.readouterr().err == (
+            f"xethru {command[0]}: {tmp_path}/pipe is no file; "
+            "a recording is read from files only\n"
+        )
+
+
+@pytest.mark.parametrize("name", ["copy.mcap", "copy"])
+def test_a_conversion_that_fails_brings_the_older_one_back(
+    name: str, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = tmp_path / name
+    assert main(["convert", str(RECORDINGS / "single"), str(target)]) == 0
+    before = snapshot(tmp_path)
+
+    def fails(source: str, target: str, on_progress: object, *, radar: object) -> None:
+        convert(IQ, target)
+        raise RecordingError("the disk is full")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("xethru_protocol.cli.recordings.convert_recording", fails)
+        assert main(["convert", str(IQ), str(target), "--force"]) == 1
+    assert snapshot(tmp_path) == before
+    assert main(["convert", str(IQ), str(target), "--force"]) == 0
+    after = snapshot(tmp_path)
+    assert after != before
+    assert not [path for path in after if path.name.endswith(".old")]
+
+
+def test_a_part_of_a_recording_is_not_converted_into_it(tmp_path: Path, capsys: Capture) -> None:
+    own = tmp_path / "own"
+    shutil.copytree(IQ, own)
+    before = snapshot(own)
+    for source in (own, own / IQ_FILE, own / "xethru_recording_meta.dat"):
+        assert main(["convert", str(source), str(own), "--force"]) == 1
+        assert capsys.readouterr().err == (
+            f"xethru convert: {source} cannot be converted into itself\n"
+        )
+    assert snapshot(own) == before
+    assert main(["convert", str(own), str(tmp_path / "copy.npz")]) == 0
+    assert main(["convert", str(tmp_path / "copy.npz"), str(tmp_path)]) == 0
+
+
+def snapshot(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+NAMES = ("left", "middle", "right")
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Path:
+    path = tmp_path / "session.mcap"
+    write_session(path, {name: 10**9 for name in NAMES}, n_frames=3)
+    return path
+
+
+@pytest.mark.parametrize("words", ["dump", "dump --json", "convert"])
+def test_a_session_of_several_radars_asks_which(words: str, session: Path, capsys: Capture) -> None:
+    command, *options = words.split()
+    target = [str(session.with_suffix(".npz"))] if command == "convert" else []
+    assert main([command, str(session), *target, *options]) == 1
+    printed, errors = capsys.readouterr()
+    assert printed == ""
+    assert errors == (
+        f"xethru {command}: {session} holds several radars (left, middle, right), not one; "
+        "choose one: --radar NAME, in Python radar=\n"
+    )
+    assert list(session.parent.iterdir()) == [session]
+
+
+def test_one_radar_of_a_session_is_dumped_and_converted(session: Path, capsys: Capture) -> None:
+    expected = [samples(1, counter).tolist() for counter in range(3)]
+    assert main(["dump", str(session), "--radar", "middle", "--json"]) == 0
+    told = [json.loads(line)["fields"] for line in capsys.readouterr().out.splitlines()]
+    assert [fields["data"] for fields in told] == [pytest.approx(row) for row in expected]
+    assert main(["dump", str(session), "--radar", "middle"]) == 0
+    assert "  3 DATA FLOAT" in capsys.readouterr().out.splitlines()
+    target = session.with_suffix(".npz")
+    assert main(["convert", str(session), str(target), "--radar", "middle"]) == 0
+    rows = [
+        message.values.tolist()
+        for message, _ in read_recording(target)
+        if isinstance(message, m.DataFloat)
+    ]
+    assert rows == expected
+
+
+def test_an_unknown_radar_is_told_with_those_there_are(
+    session: Path, capsys: Capture, tmp_path: Path
+) -> None:
+    assert main(["dump", str(session), "--radar", "top"]) == 1
+    said = f"{session} holds no radar 'top'; it holds left, middle, right"
+    assert capsys.readouterr().err == f"xethru dump: {said}\n"
+    shutil.copytree(RECORDINGS / "single", tmp_path / "r")
+    assert main(["dump", str(tmp_path / "r"), "--radar", "top"]) == 1
+    assert "is of one radar and names none; leave the name out" in capsys.readouterr().err

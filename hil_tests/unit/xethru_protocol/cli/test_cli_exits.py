@@ -1,0 +1,209 @@
+"""How ``xethru`` ends when its output is closed or full, and what it says when a module hangs."""
+
+import io
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from hil_tests.patience import seconds, wait_until
+from hil_tests.unit.xethru_protocol.pty_module import PtyModule
+from xethru_protocol.cli import main, output
+from xethru_protocol.cli import output as session
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.recordings import describe_recording
+from xethru_protocol.wire.errors import Disconnected, ResponseTimeout
+
+XETHRU = f"{sys.executable} -m xethru_protocol.cli"
+DECODE = f"printf '7D 10 6D 7E\\n7D 10 6D 7E\\n' | {XETHRU} decode --hex"
+ACK = '{"framing": "normal", "payload_hex": "10", "message": "ACK", "fields": {}}\n'
+
+
+def shell(command: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        ["bash", "-o", "pipefail", "-c", command], capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.parametrize(
+    ("redirection", "code", "out", "err"),
+    [
+        ("", 0, 2 * ACK, ""),
+        (">&-", 1, "", "xethru decode: standard output is closed; nothing can be printed\n"),
+        ("2>&-", 0, 2 * ACK, ""),
+        (">&- 2>&-", 1, "", ""),
+        (
+            ">/dev/full",
+            1,
+            "",
+            "xethru decode: standard output cannot be written: No space left on device\n",
+        ),
+        (">/dev/full 2>/dev/full", 1, "", ""),
+        ("| head -1", 0, ACK, ""),
+    ],
+)
+def test_output_that_takes_nothing(redirection: str, code: int, out: str, err: str) -> None:
+    if "/dev/full" in redirection and not os.path.exists("/dev/full"):
+        pytest.skip("needs /dev/full")
+    result = shell(f"{DECODE} {redirection}")
+    assert (result.returncode, result.stdout, result.stderr) == (code, out, err)
+
+
+def test_errors_that_nobody_can_see_are_still_errors(tmp_path: Path) -> None:
+    for redirection in ("2>&-", "2>/dev/full"):
+        result = shell(f"{XETHRU} ping --port {tmp_path}/none {redirection}")
+        assert (result.returncode, result.stdout, result.stderr) == (1, "", "")
+
+
+def test_a_port_is_not_opened_in_place_of_a_closed_stream(tmp_path: Path) -> None:
+    """Else what Python itself writes there would go to the module."""
+    with PtyModule() as module:
+        result = shell(f"{XETHRU} ping --port {module.path} <&- 2>&-")
+    assert (result.returncode, result.stderr) == (0, "")
+    assert result.stdout.startswith(f"{module.path}: ready (")
+
+
+def test_input_that_is_closed() -> None:
+    result = shell(f"{XETHRU} decode <&-")
+    assert (result.returncode, result.stdout, result.stderr) == (
+        *(1, ""),
+        "xethru decode: standard input is closed; there is nothing to decode\n",
+    )
+
+
+def test_a_dash_is_standard_input() -> None:
+    result = shell(f"{DECODE} -")
+    assert (result.returncode, result.stdout, result.stderr) == (0, 2 * ACK, "")
+
+
+# --- a terminal that closes -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("before", "code"),
+    [(signal.SIG_DFL, 129), (signal.SIG_IGN, 0)],
+    ids=["without nohup", "with nohup"],
+)
+def test_the_module_is_stopped_when_the_terminal_closes(
+    before: signal.Handlers, code: int, tmp_path: Path
+) -> None:
+    out = tmp_path / "recording"
+    command = [*XETHRU.split(), "record", "--out", str(out), "--count", "100", "--port"]
+    with (
+        PtyModule() as module,
+        subprocess.Popen(
+            [*command, module.path],
+            stderr=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            preexec_fn=lambda: signal.signal(signal.SIGHUP, before),
+        ) as process,
+    ):
+        files = "xethru_datafloat_*"
+        wait_until(lambda: any(path.stat().st_size for path in out.glob(files)), process)
+        process.send_signal(signal.SIGHUP)
+        _, errors = process.communicate(timeout=seconds(10))
+        assert module.fps == 0
+    assert (process.returncode, errors) == (code, b"")
+    kept = describe_recording(out)  # complete: no faults
+    assert (kept.faults, kept.messages["DATA FLOAT"] == 100) == ((), code == 0)
+
+
+@pytest.mark.parametrize("name", ["line\nend", "tab\tbell\a", "\udcff\udcfe", "größer ☃"])
+def test_odd_names_are_one_readable_line(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for command in (["ping", "--port"], ["dump"], ["record", "--out", f"{tmp_path}/o", "--port"]):
+        assert main([*command, str(tmp_path / name)]) == 1
+        printed, errors = capsys.readouterr()
+        (line,) = errors.splitlines()
+        assert (printed, line.isprintable()) == ("", True)
+        assert output.one_line(name) in line
+
+
+def test_results_that_the_terminal_has_no_letters_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    raw = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(raw, encoding="ascii"))
+    output.print_line("größer \udcff")
+    assert raw.getvalue() == b"gr\\xf6\\xdfer \\udcff\n"
+
+
+# --- a module that hangs ------------------------------------------------------------------------
+
+
+class Hanging:
+    """A driver whose module can no longer be stopped."""
+
+    def __init__(self) -> None:
+        self.warnings: list[str] = []
+        self.frames_lost = 2
+        self.fault_count = 1
+
+    def __enter__(self) -> "Hanging":
+        """Open."""
+        return self
+
+    def __exit__(self, *reason: object) -> None:
+        """Fail to stop it."""
+        self.warnings.append("the module was not stopped: no answer")
+
+
+class Stoppable(Hanging):
+    """A driver whose module is stopped at the end."""
+
+    def __exit__(self, *reason: object) -> None:
+        """Stop it."""
+
+
+@contextmanager
+def opened(driver: Hanging, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(X4M300, "open", lambda port, baudrate: driver)
+    with session.module_at("port", 115200):
+        yield
+
+
+def test_the_cause_comes_first_and_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with (
+        pytest.raises(session.CommandFailed, match=r"^no frame came \(and it could not be stopp"),
+        opened(Hanging(), monkeypatch),
+    ):
+        raise ResponseTimeout("no frame came")
+    assert capsys.readouterr().err == ""
+
+
+def test_of_a_port_that_went_only_that_is_said(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(Disconnected, match=r"^unplugged$"), opened(Hanging(), monkeypatch):
+        raise Disconnected("unplugged")
+    assert capsys.readouterr().err == ""
+
+
+def test_a_warning_of_before_is_no_failure_to_stop(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    radar = Stoppable()
+    radar.warnings.append("30 frames/s are many")
+    with (
+        pytest.raises(ResponseTimeout, match=r"^no frame came$"),
+        opened(radar, monkeypatch),
+    ):
+        raise ResponseTimeout("no frame came")
+    assert capsys.readouterr().err == "xethru: 30 frames/s are many\n"
+
+
+def test_after_a_signal_it_is_a_warning(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(KeyboardInterrupt), opened(Hanging(), monkeypatch):
+        raise KeyboardInterrupt
+    assert capsys.readouterr().err == (
+        "xethru: the module was not stopped: no answer\n"
+        "xethru: 2 frames lost, 1 damaged place on the line\n"
+    )

@@ -1,0 +1,299 @@
+"""``xethru record`` with scripted modules: what is written, when it ends, what it says."""
+
+import io
+import json
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from hil_tests.unit.xethru_protocol.pty_module import PtyModule
+from hil_tests.unit.xethru_protocol.scripted import frame
+from hil_tests.unit.xethru_protocol.sick_module import Said, SickModule, silent
+from xethru_protocol.cli import main, record
+from xethru_protocol.cli.output import Progress
+from xethru_protocol.cli.record import Recorder
+from xethru_protocol.recordings import describe_recording, read_note, read_recording
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import ProfileId, SensorMode, X4Setting
+
+Capture = pytest.CaptureFixture[str]
+PRESENCE = m.PresenceSingle(counter=3, state=1, distance_m=1.5, direction=0, signal_quality=7)
+
+
+@pytest.fixture
+def module() -> Iterator[PtyModule]:
+    with PtyModule() as module:
+        yield module
+
+
+def counters(path: Path) -> list[int]:
+    found = []
+    for message, _ in read_recording(path):
+        if isinstance(message, m.DataFloat):
+            found.append(message.info)
+    return found
+
+
+def test_count_is_kept_to_the_message(module: PtyModule, tmp_path: Path, capsys: Capture) -> None:
+    out = tmp_path / "new" / "recording"
+    assert main(["record", "--port", module.path, "--out", str(out), "--count", "5"]) == 0
+    assert counters(out) == [0, 1, 2, 3, 4]
+    printed, errors = capsys.readouterr()
+    assert printed.startswith(f"{out}: 5 messages in ")
+    assert printed.endswith(", 0 lost\n")
+    assert errors == ""
+    stop = m.X4DriverSet(setting=X4Setting.FPS, value=0.0)
+    assert module.received[-2:] == [stop, m.SetMode(mode=SensorMode.XTID_SM_STOP)]
+
+
+def test_duration_ends_it(
+    module: PtyModule, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    of_the_frames = property(lambda recorder: 0.05 * recorder.messages)
+    monkeypatch.setattr(Recorder, "elapsed_s", of_the_frames)
+    out = tmp_path / "recording"
+    arguments = ["--out", str(out), "--duration", "0.3", "--json", "--session-id", "first try"]
+    assert main(["record", "--port", module.path, *arguments]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["ended_by"] == "duration"
+    assert summary["directory"] == str(out)
+    assert summary["wire"] is None
+    assert counters(out) == list(range(summary["messages"]))
+    assert summary["messages"] >= 6
+    assert summary["link"]["frames_lost"] == 0
+    assert b"first try" in (out / "xethru_recording_meta.dat").read_bytes()
+
+
+def test_a_recording_is_not_overwritten_unless_told(
+    module: PtyModule, tmp_path: Path, capsys: Capture
+) -> None:
+    out, wire = tmp_path / "recording", tmp_path / "port.xtwire"
+    command = ["record", "--port", module.path, "--out", str(out), "--wire", str(wire)]
+    assert main([*command, "--count", "2"]) == 0
+    before = {path: path.read_bytes() for path in [*out.iterdir(), wire]}
+    asked = len(module.received)
+    (out / "notes.txt").write_text("mine")
+    capsys.readouterr()
+
+    for only in (command[:5], [*command[:3], *command[5:]]):
+        assert main([*only, "--count", "2"]) == 1
+        assert "there is a recording already: " in capsys.readouterr().err
+    assert len(module.received) == asked, "the module was left alone"
+    assert {path: path.read_bytes() for path in before} == before
+
+    assert main([*command, "--count", "3", "--force"]) == 0
+    assert len(counters(out)) == 3
+    assert len(list(out.glob("xethru_datafloat_*"))) == 1
+    assert (out / "notes.txt").read_text() == "mine"
+
+
+def test_force_removes_no_device(module: PtyModule, capsys: Capture) -> None:
+    arguments = ["record", "--port", module.path, "--wire", "/dev/null", "--force"]
+    assert main(arguments) == 1
+    assert capsys.readouterr().err == ("xethru record: /dev/null is no file; name a new one\n")
+    assert Path("/dev/null").exists()
+
+
+def test_force_takes_a_file_for_no_directory_and_back(tmp_path: Path, capsys: Capture) -> None:
+    file, directory = tmp_path / "thesis", tmp_path / "recording"
+    file.write_text("years of work")
+    directory.mkdir()
+    (directory / "xethru_recording_meta.dat").touch()
+    for option, path in (("--out", file), ("--wire", directory)):
+        assert main(["record", "--port", "p", option, str(path), "--force"]) == 1
+        assert f"xethru record: {path} is " in capsys.readouterr().err
+    assert file.read_text() == "years of work"
+    assert len(list(directory.iterdir())) == 1
+
+
+def test_a_module_that_does_not_answer_costs_no_older_recording(
+    module: PtyModule, tmp_path: Path, capsys: Capture
+) -> None:
+    out = tmp_path / "recording"
+    assert main(["record", "--port", module.path, "--out", str(out), "--count", "2"]) == 0
+    before = {path: path.read_bytes() for path in out.iterdir()}
+    assert main(["record", "--port", str(tmp_path / "none"), "--out", str(out), "--force"]) == 1
+    with SickModule(silent) as deaf:
+        assert main(["record", "--port", deaf.path, "--out", str(out), "--force"]) == 1
+    assert {path: path.read_bytes() for path in out.iterdir()} == before
+
+
+def test_a_file_that_cannot_be_made_leaves_nothing(
+    module: PtyModule, tmp_path: Path, capsys: Capture
+) -> None:
+    out, wire = tmp_path / "recording", tmp_path / "none" / "port.xtwire"
+    arguments = ["--out", str(out), "--wire", str(wire)]
+    assert main(["record", "--port", module.path, *arguments]) == 1
+    assert capsys.readouterr().err.startswith(f"xethru record: {wire} cannot be written: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_wire_capture_within_the_directory(module: PtyModule, tmp_path: Path) -> None:
+    out = tmp_path / "recording"
+    arguments = ["--out", str(out), "--wire", str(out / "port.xtwire")]
+    assert main(["record", "--port", module.path, *arguments, "--count", "2"]) == 0
+    assert counters(out) == [0, 1]
+    assert counters(out / "port.xtwire")[:2] == [0, 1]
+
+
+def test_the_wire_alone(module: PtyModule, tmp_path: Path) -> None:
+    wire = tmp_path / "port.xtwire"
+    assert main(["record", "--port", module.path, "--wire", str(wire), "--count", "3"]) == 0
+    assert counters(wire)[:3] == [0, 1, 2]
+    assert read_note(wire) == {"port": module.path}
+    # what the host sent is there, too: PING comes first (reference 4.1)
+    assert bytes.fromhex("7D 01 AE EA AA EE") in wire.read_bytes()
+
+
+def test_listening_sends_nothing(tmp_path: Path) -> None:
+    out = tmp_path / "recording"
+    with SickModule(silent, unasked=frame(7)) as module:
+        arguments = ["--out", str(out), "--profile", "none", "--count", "4"]
+        assert main(["record", "--port", module.path, *arguments]) == 0
+        assert module.received == []
+    assert counters(out) == [7, 7, 7, 7]
+
+
+def test_presence_is_loaded_run_and_recorded(tmp_path: Path, capsys: Capture) -> None:
+    def answer(command: m.Message) -> Sequence[Said]:
+        if isinstance(command, m.Ping):
+            return [m.Pong(value=0xAAEEAEEA)]
+        is_run = command == m.SetMode(mode=SensorMode.XTID_SM_RUN)
+        return [m.Ack(), PRESENCE, PRESENCE] if is_run else [m.Ack()]
+
+    out = tmp_path / "recording"
+    with SickModule(answer) as module:
+        arguments = ["--out", str(out), "--profile", "presence", "--count", "2"]
+        assert main(["record", "--port", module.path, *arguments]) == 0
+        asked = [command for command in module.received if not isinstance(command, m.Ping)]
+    assert asked == [
+        m.SetMode(mode=SensorMode.XTID_SM_STOP),
+        m.LoadApp(profile_id=ProfileId.XTS_ID_APP_PRESENCE_2),
+        m.SetMode(mode=SensorMode.XTID_SM_RUN),
+    ]
+    messages = [message for message, _ in read_recording(out)]
+    assert messages == [PRESENCE, PRESENCE]
+    assert describe_recording(out).profile_id == 0x014D4AB8
+
+
+def test_nothing_to_record_leaves_nothing(tmp_path: Path, capsys: Capture) -> None:
+    out, wire = tmp_path / "recording", tmp_path / "port.xtwire"
+    with SickModule(silent) as module:
+        arguments = ["--out", str(out), "--wire", str(wire), "--profile", "none"]
+        assert main(["record", "--port", module.path, *arguments, "--duration", "0.2"]) == 1
+    assert capsys.readouterr().err == (
+        "xethru record: the module sent nothing to record in 0.2 s\n"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_missing_port_leaves_nothing(tmp_path: Path, capsys: Capture) -> None:
+    out = tmp_path / "recording"
+    assert main(["record", "--port", str(tmp_path / "none"), "--out", str(out)]) == 1
+    assert capsys.readouterr().err.startswith("xethru record: there is no port ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_module_that_falls_silent(
+    module: PtyModule, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "recording"
+    monkeypatch.setattr("xethru_protocol.cli.record.RawFrames.start", lambda self, radar: 0.2)
+    assert main(["record", "--port", module.path, "--out", str(out)]) == 1
+    assert "the module sent nothing to record for 0.2 s; did it stop?" in capsys.readouterr().err
+
+
+def test_a_full_disk_keeps_what_is_there(module: PtyModule, tmp_path: Path) -> None:
+    out = tmp_path / "recording"
+    command = [sys.executable, "-m", "xethru_protocol.cli", "record", "--port", module.path]
+    result = subprocess.run(
+        [*command, "--out", str(out), "--json"],
+        capture_output=True,
+        text=True,
+        check=False,
+        # the nearest to a full disk that needs no rights
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000)),
+    )
+    assert result.returncode == 1
+    (line,) = result.stderr.splitlines()
+    assert "cannot be written: File too large; kept 3 messages in" in line
+    assert json.loads(result.stdout)["ended_by"] == "failure"
+    assert counters(out) == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["--out", ""],
+        ["--out", "o", "--wire", "o"],
+        ["--out", "o", "--session-id", "\udcff"],
+        ["--out", "o", "--duration", "0"],
+        ["--out", "o", "--duration", "nan"],
+        ["--out", "o", "--count", "0"],
+        ["--out", "o", "--profile", "sleep"],
+        ["--out", "o", "--frame-area", "3", "2"],
+        ["--out", "o", "--baudrate", "fast"],
+        ["--out", "o", "--baudrate", "300"],
+        ["--out", "o", "--baudrate", "99999999999"],
+    ],
+)
+def test_wrong_usage(arguments: list[str], capsys: Capture) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["record", "--port", "p", *arguments])
+    assert caught.value.code == 2
+    assert "usage: xethru record" in capsys.readouterr().err
+
+
+def test_the_second_signal_insists() -> None:
+    noted: list[int] = []
+
+    def twice() -> None:
+        with record._noted(noted):
+            signal.raise_signal(signal.SIGINT)
+            assert noted == [signal.SIGINT]
+            signal.raise_signal(signal.SIGINT)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            twice()
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+# --- progress -------------------------------------------------------------------------------------
+
+
+class Screen(io.StringIO):
+    """A terminal."""
+
+    def isatty(self) -> bool:
+        """Be one."""
+        return True
+
+
+def test_progress_rewrites_one_line_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = Screen()
+    monkeypatch.setattr(sys, "stderr", screen)
+    times = iter([0.0, 0.05, 0.25, 0.3, 0.5])
+    progress = Progress("xethru record", lambda: next(times))
+    for number in range(4):
+        progress.show(lambda number=number: f"{number} frames")  # type: ignore[misc] # mypy has no type for it
+    progress.finish(lambda: "done")
+    assert screen.getvalue() == "\r1 frames\x1b[K\r3 frames\x1b[K\rdone\x1b[K\n"
+
+
+def test_progress_is_a_line_now_and_then_elsewhere(capsys: Capture) -> None:
+    times = iter([0.0, 5.0, 10.5, 15.0, 21.0])
+    progress = Progress("xethru record", lambda: next(times))
+    for number in range(4):
+        progress.show(lambda number=number: f"{number} frames")  # type: ignore[misc] # mypy has no type for it
+    progress.finish(lambda: "done")
+    assert capsys.readouterr().err == "xethru record: 1 frames\nxethru record: 3 frames\n"

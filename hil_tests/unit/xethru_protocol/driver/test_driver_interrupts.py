@@ -1,0 +1,99 @@
+"""What interrupts and sick modules leave behind, and how the methods of drivers are documented."""
+
+import inspect
+from collections.abc import Sequence
+
+import pytest
+
+from hil_tests.unit.xethru_protocol.both_drivers import DriverOn
+from hil_tests.unit.xethru_protocol.scripted import PlainModule, frame
+from xethru_protocol.driver.async_radar import AsyncX4M300
+from xethru_protocol.driver.files import AsyncFiles, AsyncPresence, Files, Presence
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import PongCode
+
+Said = Sequence[m.Message | bytes]
+
+
+def test_what_is_cut_by_closing_is_no_damage(driver_on: DriverOn) -> None:
+    radar, line = driver_on()
+    with radar:
+        radar.configure_raw()
+        radar.start(17.0)
+        line.say(b"\x7c\x7c\x7c\x7c\x6a\x16\x00\x00\x00\xa0")
+        radar._pump(0.0)
+        line.say(bytes(5736))
+    assert radar.fault_count == 0
+    assert radar.statistics.clean
+
+
+class Interrupted(BaseException):
+    """As KeyboardInterrupt, which a test runner would take for its own."""
+
+
+def test_interrupt_while_bytes_are_sorted_leaves_a_driver_that_works(driver_on: DriverOn) -> None:
+    radar, line = driver_on()
+    radar.configure_raw()
+
+    def interrupt(message: m.Message, arrival_ns: int) -> None:
+        raise Interrupted
+
+    radar.listener = interrupt
+    line.say(b"".join(line._bytes(frame(k)) for k in (1, 2)) + line._bytes(frame(3))[:100])
+    with pytest.raises(Interrupted):
+        radar.read_frame()
+    radar.listener = None
+    line.say(line._bytes(frame(3))[100:], frame(4))
+    assert radar.read_frame().counter == 4
+    assert radar.ping() is PongCode.XTS_SPRP_READY
+    assert radar.statistics.faults  # the rest of frame 3
+
+
+def test_interrupted_request_waits_for_nothing_any_more(driver_on: DriverOn) -> None:
+    """What answers it later is a stray, also where others send such messages unasked."""
+    plain = PlainModule()
+
+    def module(command: m.Message) -> Said:
+        if isinstance(command, m.GetMode):
+            raise Interrupted
+        return plain(command)
+
+    radar, line = driver_on(module)
+    radar.configure_raw()
+    with pytest.raises(Interrupted):
+        radar.request(m.GetMode())
+    line.say(m.ReplyByte(values=b"\x12"), frame(1))
+    assert radar.read_frame().counter == 1
+    assert radar.stray_count == 1
+
+
+def test_answers_to_nothing_are_counted_and_not_kept(driver_on: DriverOn) -> None:
+    radar, line = driver_on()
+    radar.configure_raw()
+    line.say(*[m.Ack()] * 1000, frame(1))
+    radar.read_frame()
+    assert radar.stray_count == 1000
+    assert not radar._core.conversation._answers
+
+
+def test_warnings_are_kept_up_to_a_thousand(driver_on: DriverOn) -> None:
+    radar, _ = driver_on()
+    radar.configure_raw()
+    for _ in range(1000):
+        radar.start(25.0)
+    radar.start(26.0)
+    assert len(radar.warnings) == 1000
+    assert radar.warnings[-1].startswith("26 frames/s")
+
+
+@pytest.mark.parametrize("radar", [X4M300, AsyncX4M300])
+def test_methods_are_documented_as_they_are_called(radar: type) -> None:
+    assert str(inspect.signature(radar.start)) == "(self, fps: float) -> float"  # type: ignore[attr-defined] # both
+    assert inspect.getdoc(radar.start).startswith("Start frames")  # type: ignore[attr-defined, union-attr] # both
+    members = inspect.getmembers(radar, inspect.isfunction)
+    for cls in (Presence, AsyncPresence, Files, AsyncFiles):
+        members += inspect.getmembers(cls, inspect.isfunction)
+    for name, method in members:
+        parameters = inspect.signature(method).parameters
+        assert "core" not in parameters or name == "__init__", name

@@ -1,0 +1,395 @@
+"""Modules that restart, vanish and come back, on a virtual clock. Protocol reference 8.1, 10."""
+
+from collections.abc import Sequence
+
+import pytest
+
+from hil_tests.unit.xethru_protocol.both_drivers import DriverOn
+from hil_tests.unit.xethru_protocol.machine import Machine, UartModule
+from hil_tests.unit.xethru_protocol.scripted import PlainModule, ScriptedTransport, frame
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import OutputFeature, PongCode, SensorMode, X4Setting
+from xethru_protocol.wire.errors import DeviceError, Disconnected, ResponseTimeout
+
+Said = Sequence[m.Message | bytes]
+BOOTING, READY = m.System(code=0x10), m.System(code=0x11)
+HOME, DECOY, ELSEWHERE = "/dev/ttyACM0", "/dev/ttyACM1", "/dev/ttyACM2"
+
+
+@pytest.fixture
+def machine() -> Machine:
+    """Three ports; behind one of them another module."""
+    machine = Machine(DECOY, ELSEWHERE, HOME)
+    machine.plug(DECOY, PlainModule("999999999999"))
+    return machine
+
+
+def unplug(line: ScriptedTransport) -> None:
+    line.pending.clear()
+    line.gone = True
+
+
+def settings_sent(line: ScriptedTransport) -> list[tuple[str, m.X4Value]]:
+    return [(c.setting.name, c.value) for c in line.received if isinstance(c, m.X4DriverSet)]
+
+
+# --- reset --------------------------------------------------------------------------------------
+
+
+def test_reset_returns_at_the_ack_unless_told_to_wait(driver_on: DriverOn) -> None:
+    radar, line = driver_on()
+    radar.reset()
+    assert line.now_ns < 1_000_000
+
+
+def test_reset_waits_for_ready_on_a_port_that_stays(driver_on: DriverOn) -> None:
+    plain = PlainModule()
+
+    def module(command: m.Message) -> Said:
+        if isinstance(command, m.ModReset):
+            line.say_later(2.5, BOOTING, READY)
+        return plain(command)
+
+    radar, line = driver_on(module)
+    radar.reset(wait=True)
+    assert line.now_ns == pytest.approx(2.5e9, abs=1e7)
+    assert (radar.reboots, radar.reconnects, radar.warnings) == (1, 0, [])
+
+
+def test_reset_polls_where_ready_was_lost(driver_on: DriverOn) -> None:
+    plain = PlainModule()
+    deaf_until_ns = 0
+
+    def module(command: m.Message) -> Said:
+        nonlocal deaf_until_ns
+        if line.now_ns < deaf_until_ns:
+            return []
+        if isinstance(command, m.ModReset):
+            deaf_until_ns = line.now_ns + 6_000_000_000
+        return plain(command)
+
+    radar, line = driver_on(module)
+    radar.reset(wait=True)
+    assert 6.0e9 <= line.now_ns < 7.5e9
+    assert radar.ping() is PongCode.XTS_SPRP_READY
+
+
+def test_reset_gives_up_in_time(driver_on: DriverOn) -> None:
+    plain = PlainModule()
+    is_off = False
+
+    def module(command: m.Message) -> Said:
+        nonlocal is_off
+        answer = [] if is_off else plain(command)
+        is_off |= isinstance(command, m.ModReset)
+        return answer
+
+    radar, line = driver_on(module)
+    with pytest.raises(ResponseTimeout, match="no READY after the reset from the port"):
+        radar.reset(wait=True, timeout_s=10.0)
+    assert 10.0e9 <= line.now_ns < 11e9
+
+
+@pytest.mark.parametrize("path", [HOME, ELSEWHERE])
+def test_reset_follows_a_port_that_vanishes(
+    driver_on: DriverOn, machine: Machine, path: str
+) -> None:
+    plain = PlainModule()
+    machine.plug(path, plain, from_s=3.0)
+
+    def module(command: m.Message) -> Said:
+        if isinstance(command, m.ModReset):
+            line.vanish_later(0.5)
+        return plain(command)
+
+    radar, line = driver_on(module, ports=machine.ports, name=HOME)
+    machine.runs_on(line)
+    radar.reset(wait=True)
+    assert 3.0e9 <= line.now_ns < 4.0e9
+    assert radar.port == path
+    assert (radar.reconnects, radar.warnings) == (1, [])
+    # the other module was asked who it is and let alone
+    assert machine.asked(DECOY)
+    assert all(isinstance(c, m.Ping | m.SystemGetInfo) for c in machine.asked(DECOY))
+
+
+def test_module_that_does_not_come_back_is_disconnected(
+    driver_on: DriverOn, machine: Machine
+) -> None:
+    radar, line = driver_on(ports=machine.ports, name=HOME)
+    machine.runs_on(line)
+    line.vanish_later(0.5)
+    with pytest.raises(
+        Disconnected, match=f"module of {HOME} did not come back within 15 s: there is no port"
+    ):
+        radar.reset(wait=True)
+    assert 15.0e9 <= line.now_ns < 17e9
+    assert len([1 for opened in machine.lines if opened.name == DECOY]) < 8  # not every 0.2 s
+
+
+# --- reconnect ----------------------------------------------------------------------------------
+
+
+def test_vanished_module_is_disconnected_unless_asked_otherwise(driver_on: DriverOn) -> None:
+    radar, line = driver_on()
+    radar.configure_raw()
+    unplug(line)
+    with pytest.raises(Disconnected):
+        radar.read_frame()
+    with pytest.raises(Disconnected):
+        radar.ping()
+
+
+def test_stream_goes_on_after_an_unplug_under_another_name(
+    driver_on: DriverOn, machine: Machine
+) -> None:
+    back = PlainModule()
+    back.stream = (frame(0), frame(1))
+    machine.plug(ELSEWHERE, back, from_s=5.0)
+    radar, line = driver_on(ports=machine.ports, name=HOME, reconnect_s=20.0)
+    machine.runs_on(line)
+    radar.configure_raw(RawConfig(iterations=8, dac_step=1))
+    radar.start(17.0)
+    line.say(frame(40), frame(41))
+    assert radar.read_frame().counter == 40
+    unplug(line)
+    assert [got.counter for got in radar.frames(2)] == [0, 1]
+    assert radar.port == ELSEWHERE
+    assert (radar.reconnects, radar.frames_lost) == (1, 0)
+    assert settings_sent(machine.lines[-1]) == settings_sent(line)  # with iterations and rate
+    assert any("looking for the module for 20 s" in text for text in radar.warnings)
+
+
+def test_counters_on_either_side_of_an_outage_make_no_gap(
+    driver_on: DriverOn, machine: Machine
+) -> None:
+    """Whether the counter restarts is an open question of the reference (15, 5)."""
+    back = PlainModule()
+    back.stream = (frame(900),)
+    machine.plug(HOME, lambda c: [frame(500), *back(c)] if isinstance(c, m.Ping) else back(c))
+    radar, line = driver_on(ports=machine.ports, name=HOME, reconnect_s=9.0)
+    machine.runs_on(line)
+    radar.configure_raw()
+    radar.start(17.0)
+    line.say(frame(40))
+    radar.read_frame()
+    unplug(line)
+    counters: list[int] = []
+    while 900 not in counters:
+        counters.append(radar.read_frame().counter)
+    assert radar.frames_lost == 0
+
+
+def test_packet_cut_by_an_outage_is_counted_as_junk(driver_on: DriverOn, machine: Machine) -> None:
+    machine.plug(HOME, PlainModule(), from_s=2.0)
+    radar, line = driver_on(ports=machine.ports, name=HOME, reconnect_s=10.0)
+    machine.runs_on(line)
+    radar.configure_raw()
+    line.say(line._bytes(frame(7))[:100])
+    radar._pump(0.0)
+    unplug(line)
+    radar.ping()
+    assert (radar.reconnects, radar.statistics.junk_bytes) == (1, 100)
+
+
+def test_request_is_repeated_on_the_new_line_and_waiting_frames_are_kept(
+    driver_on: DriverOn, machine: Machine
+) -> None:
+    back = PlainModule()
+    machine.plug(HOME, back, from_s=2.0)
+    radar, line = driver_on(ports=machine.ports, name=HOME, reconnect_s=10.0)
+    machine.runs_on(line)
+    radar.configure_raw()
+    line.say(frame(7))
+    radar.ping()  # takes the frame in
+    unplug(line)
+    power = m.X4DriverSet(setting=X4Setting.TXPOWER, value=1)
+    radar.request(power)
+    assert machine.lines[-1].received[-1] == power
+    assert radar.read_frame().counter == 7
+    assert radar.reconnects == 1
+
+
+def test_stopped_radar_is_not_started_by_a_reconnect(driver_on: DriverOn, machine: Machine) -> None:
+    machine.plug(HOME, PlainModule())
+    radar, line = driver_on(ports=machine.ports, name=HOME)
+    machine.runs_on(line)
+    radar.configure_raw()
+    radar.start(17.0)
+    radar.stop()
+    unplug(line)
+    assert radar.reconnect() == HOME
+    assert "FPS" not in [name for name, _ in settings_sent(machine.lines[-1])]
+
+
+def test_module_of_another_number_at_the_same_port_is_not_taken(
+    driver_on: DriverOn, machine: Machine
+) -> None:
+    machine.plug(HOME, PlainModule("888888888888"))
+    radar, line = driver_on(ports=machine.ports, name=HOME)
+    machine.runs_on(line)
+    line.vanish_later(0.5)
+    with pytest.raises(Disconnected, match="is another module"):
+        radar.reset(wait=True)
+
+
+def test_module_without_a_number_is_known_by_its_port_only(
+    driver_on: DriverOn, machine: Machine
+) -> None:
+    machine.plug(HOME, PlainModule(None), from_s=3.0)
+    machine.plug(ELSEWHERE, PlainModule(None))
+    radar, line = driver_on(PlainModule(None), ports=machine.ports, name=HOME, reconnect_s=9.0)
+    machine.runs_on(line)
+    radar.configure_raw()
+    assert "does not tell its serial number" in radar.warnings[0]
+    unplug(line)
+    radar.ping()
+    assert radar.port == HOME
+    assert machine.asked(ELSEWHERE) == []
+    assert any("by its port only" in text for text in radar.warnings)
+
+
+def test_module_that_came_back_in_safe_mode_is_taken_and_told_of(
+    driver_on: DriverOn, machine: Machine
+) -> None:
+    broken = PlainModule(None)  # the profile layer, which knows the number, is not started
+
+    def safe_mode(command: m.Message) -> Said:
+        if isinstance(command, m.Ping):
+            return [m.Pong(value=PongCode.XTS_SPRP_SAFEMODE)]
+        return broken(command)
+
+    machine.plug(HOME, safe_mode)
+    radar, line = driver_on(ports=machine.ports, name=HOME, reconnect_s=9.0)
+    machine.runs_on(line)
+    radar.configure_raw()
+    unplug(line)
+    assert radar.ping() is PongCode.XTS_SPRP_SAFEMODE
+    assert any("safe mode" in text for text in radar.warnings)
+
+
+def test_module_that_vanishes_again_while_it_is_set_up_is_waited_for(
+    driver_on: DriverOn, machine: Machine
+) -> None:
+    back = PlainModule()
+
+    def brown_out(command: m.Message) -> Said:
+        if command == rate and len(machine.lines) == 1:
+            unplug(machine.lines[0])
+            return []
+        return back(command)
+
+    rate = m.X4DriverSet(setting=X4Setting.FPS, value=17.0)
+    machine.plug(HOME, brown_out)
+    radar, line = driver_on(ports=machine.ports, name=HOME, reconnect_s=9.0)
+    machine.runs_on(line)
+    radar.configure_raw()
+    radar.start(17.0)
+    unplug(line)
+    radar.ping()
+    assert len([1 for opened in machine.lines if opened.name == HOME]) == 2
+    assert radar.reconnects == 1
+    assert rate in machine.lines[-1].received  # what was wanted is not forgotten midway
+
+
+def test_module_in_a_restart_loop_is_given_up(driver_on: DriverOn, machine: Machine) -> None:
+    plain = PlainModule()
+
+    def loop(command: m.Message) -> Said:
+        if isinstance(command, m.GetMode):
+            unplug(machine.lines[-1])
+            return []
+        return plain(command)
+
+    machine.plug(HOME, loop)
+    radar, line = driver_on(ports=machine.ports, name=HOME, reconnect_s=9.0)
+    machine.runs_on(line)
+    radar.ping()
+    unplug(line)
+    with pytest.raises(Disconnected):
+        radar.request(m.GetMode())
+    assert radar.reconnects == 3
+
+
+def test_module_that_refuses_its_settings_after_a_return_says_so(
+    driver_on: DriverOn, machine: Machine
+) -> None:
+    plain = PlainModule()
+    machine.plug(
+        HOME,
+        lambda c: [m.Error(code=5)] if isinstance(c, m.X4DriverInit) else plain(c),
+    )
+    radar, line = driver_on(ports=machine.ports, name=HOME, reconnect_s=9.0)
+    machine.runs_on(line)
+    radar.configure_raw()
+    unplug(line)
+    with pytest.raises(DeviceError, match="OSCILLATOR_LOCK_FAILED"):
+        radar.ping()
+
+
+def test_profile_is_set_up_again_after_a_return(driver_on: DriverOn, machine: Machine) -> None:
+    machine.plug(HOME, PlainModule())
+    radar, line = driver_on(ports=machine.ports, name=HOME, reconnect_s=9.0)
+    machine.runs_on(line)
+    radar.presence.load()
+    radar.presence.set_output(OutputFeature.PULSEDOPPLER_BYTE, 1)
+    radar.presence.set_sensitivity(3)
+    radar.presence.set_sensitivity(7)
+    radar.presence.set_output(OutputFeature.PULSEDOPPLER_BYTE, 3)
+    radar.presence.run()
+    unplug(line)
+    radar.ping()
+    said = machine.lines[-1].received
+    begin = said.index(m.SetMode(mode=SensorMode.XTID_SM_STOP))
+    assert said[begin:] == [
+        m.SetMode(mode=SensorMode.XTID_SM_STOP),
+        m.LoadApp(profile_id=0x014D4AB8),
+        m.SetSensitivity(sensitivity=7),
+        m.OutputSetControl(feature=0x11, control=3),
+        m.SetMode(mode=SensorMode.XTID_SM_RUN),
+        m.Ping(),
+    ]
+
+
+def test_uart_is_talked_to_at_its_own_rate_again_after_a_reset(driver_on: DriverOn) -> None:
+    """It starts at 115200 whatever it was set to. Protocol reference 10."""
+    uart = UartModule()
+    radar, line = driver_on(uart)
+    uart.connect(line, 115200)
+    radar.set_baud_rate(921600)
+    assert (uart.baudrate, radar.ping()) == (921600, PongCode.XTS_SPRP_READY)
+    radar.reset(wait=True)
+    assert (uart.baudrate, radar.ping()) == (921600, PongCode.XTS_SPRP_READY)
+
+
+@pytest.mark.parametrize("rate", [115200, 921600], ids=["restarted", "kept its power"])
+def test_uart_is_found_again_at_either_rate(
+    driver_on: DriverOn, machine: Machine, rate: int
+) -> None:
+    uart, back = UartModule(), UartModule()
+    back.baudrate = rate
+    machine.plug(HOME, back)
+    radar, line = driver_on(uart, ports=machine.ports, name=HOME, reconnect_s=9.0)
+    machine.runs_on(line)
+    uart.connect(line, 115200)
+    radar._core.bytes_per_s = line.bytes_per_s
+    radar.set_baud_rate(921600)
+    radar.ping()
+    unplug(line)
+    assert radar.ping() is PongCode.XTS_SPRP_READY
+    assert back.baudrate == 921600
+    assert radar.reconnects == 1
+
+
+def test_closing_after_the_module_vanished_does_not_look_for_it(
+    driver_on: DriverOn, machine: Machine
+) -> None:
+    radar, line = driver_on(ports=machine.ports, name=HOME, reconnect_s=9.0)
+    machine.runs_on(line)
+    with radar:
+        radar.configure_raw()
+        began_ns = line.now_ns
+        unplug(line)
+    assert line.now_ns - began_ns < 1_000_000
+    assert machine.lines == []

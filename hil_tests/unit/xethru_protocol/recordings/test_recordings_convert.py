@@ -1,0 +1,384 @@
+"""Conversion among vendor directories, wire captures, MCAP and npz, and each format by itself."""
+
+from __future__ import annotations
+
+import json
+import struct
+import subprocess
+import sys
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from rosbags.typesys import Stores, get_typestore
+
+from hil_tests.paths import FIXTURES
+from hil_tests.unit.slam.app.sessions import scan, session_info
+from slam.app.odometry.track import OdometryTrack
+from slam.app.odometry.tum import format_tum_line
+from slam.app.session.log import SessionLog
+from xethru_protocol.recordings import (
+    RecordingError,
+    RecordingFault,
+    RecordingWriter,
+    WireCapture,
+    convert,
+    describe_recording,
+    read_chunks,
+    read_note,
+    read_recording,
+    recording_facts,
+    recording_format,
+)
+from xethru_protocol.recordings.mcap import FLOAT_ARRAY, pack_array
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import X4Setting
+from xethru_protocol.wire.connection import Connection, Role
+
+RECORDINGS = FIXTURES / "recordings"
+TARGETS = ("a.mcap", "b.npz", "c.xtwire", "vendor")
+
+
+def frame(counter: int, n_bins: int = 3) -> m.DataFloat:
+    return m.DataFloat(info=counter, values=np.arange(n_bins, dtype=np.float32) + counter)
+
+
+def read_with_faults(
+    path: Path,
+) -> tuple[list[tuple[m.Response, int | None]], list[RecordingFault]]:
+    faults: list[RecordingFault] = []
+    return list(read_recording(path, faults.append)), faults
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    """Write a capture with commands, answers and data of several kinds by hand."""
+    path = tmp_path / "port.xtwire"
+    with WireCapture(path, {"port": "/dev/somewhere"}) as file:
+        file.write("tx", bytes.fromhex("7D 01 AE EA AA EE 90 7E"), 1_000_000_001)
+        file.write("rx", bytes.fromhex("7D 01 EA AE"), 1_000_000_002)
+        file.write("rx", bytes.fromhex("EE AA 7C 7E"), 1_000_000_003)
+        rf = struct.pack("<IIIff", 0, 7, 2, 0.25, -0.5)
+        file.write("rx", b"\x7c" * 4 + struct.pack("<I", 22) + b"\0\xa0\x12" + rf, 1_000_000_004)
+        iq = struct.pack("<II4f4f", 8, 2, 0.05, 2.3e10, 7.29e9, 0.4, 1, 2, 3, 4)
+        header = b"\x7c" * 4 + struct.pack("<I", 45) + b"\0\x50\x0c\0\0\0"
+        file.write("rx", header + iq, 1_000_000_005)
+    return path
+
+
+def test_a_capture_gives_messages_with_the_time_of_their_last_byte(capture: Path) -> None:
+    messages = list(read_recording(capture))
+    assert [t_ns for _, t_ns in messages] == [1_000_000_003, 1_000_000_004, 1_000_000_005]
+    pong, rf, iq = (message for message, _ in messages)
+    assert pong == m.Pong(value=0xAAEEAEEA)
+    assert rf == m.DataFloat(info=7, values=np.array([0.25, -0.5], np.float32))
+    assert isinstance(iq, m.BasebandIq)
+    assert (iq.counter, iq.q.tolist()) == (8, [3.0, 4.0])
+
+
+def test_a_capture_is_laid_out_as_documented(tmp_path: Path) -> None:
+    with WireCapture(tmp_path / "x.xtwire") as file:
+        file.write("tx", b"ab", 5)
+        file.write("rx", b"c", None)
+        file.write("rx", b"", 9)
+    assert (tmp_path / "x.xtwire").read_bytes() == bytes.fromhex(
+        "89 58 54 57 49 52 45 0A  01 00 00 00  02 00 00 00 7B 7D"
+        "3E 05 00 00 00 00 00 00 00  02 00 00 00 61 62"
+        "3C 00 00 00 00 00 00 00 80  01 00 00 00 63"
+    )
+    chunks = [(chunk.way, chunk.data, chunk.t_ns) for chunk in read_chunks(tmp_path / "x.xtwire")]
+    assert chunks == [("tx", b"ab", 5), ("rx", b"c", None)]
+    assert read_note(tmp_path / "x.xtwire") == {}
+
+
+def test_a_capture_is_never_written_over(capture: Path) -> None:
+    with pytest.raises(RecordingError, match="File exists"):
+        WireCapture(capture)
+
+
+def test_damage_on_the_line_is_a_fault_with_the_offset_of_the_line(tmp_path: Path) -> None:
+    with WireCapture(tmp_path / "x.xtwire") as file:
+        file.write("rx", bytes.fromhex("7D 10 6D 7E FF FF 7D 10 6D 7E"), 5)
+    found, faults = read_with_faults(tmp_path / "x.xtwire")
+    assert found == [(m.Ack(), 5), (m.Ack(), 5)]
+    assert [fault.offset for fault in faults] == [4]
+    assert "on the line: bytes between packets" in faults[0].reason
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (b"\x89XTWIRE\n", "is cut"),
+        (b"\x89XTWIRE\n" + struct.pack("<II", 2, 0), "of version 2, known is 1"),
+        (b"\x89XTWIRE\n" + struct.pack("<II", 1, 9) + b"{}", "cut or damaged"),
+        (b"\x89XTWIRE\n" + struct.pack("<II", 1, 2) + b"[]", "cut or damaged"),
+    ],
+)
+def test_a_damaged_head_of_a_capture_is_named(tmp_path: Path, content: bytes, reason: str) -> None:
+    (tmp_path / "x.xtwire").write_bytes(content)
+    with pytest.raises(RecordingError, match=reason):
+        list(read_recording(tmp_path / "x.xtwire"))
+
+
+def test_a_chunk_that_claims_much_comes_in_pieces(tmp_path: Path) -> None:
+    """A damaged length must not make the reader take the rest of a large file at once."""
+    path = tmp_path / "a.xtwire"
+    with WireCapture(path) as capture:
+        capture.write("rx", bytes(3_000_000), 7)
+    chunks = list(read_chunks(path))
+    assert {(chunk.way, chunk.t_ns) for chunk in chunks} == {("rx", 7)}
+    assert max(len(chunk.data) for chunk in chunks) == 1 << 20
+    assert sum(len(chunk.data) for chunk in chunks) == 3_000_000
+
+
+def test_a_chunk_that_is_none_ends_the_reading(capture: Path) -> None:
+    whole = len(list(read_recording(capture)))
+    capture.write_bytes(capture.read_bytes() + b"\x00" * 20)
+    found, faults = read_with_faults(capture)
+    assert len(found) == whole
+    assert [fault.reason for fault in faults] == ["no chunk begins with byte 00"]
+
+
+@pytest.mark.parametrize("name", ["iq", "float", "single"])
+def test_vendor_recordings_survive_every_way_around(name: str, tmp_path: Path) -> None:
+    """Each format in turn, then once more in the other order: nothing is lost at any step."""
+    source = RECORDINGS / name
+    expected = list(read_recording(source))
+    facts = recording_facts(source)
+    previous = source
+    for number, target in enumerate((*TARGETS, *reversed(TARGETS))):
+        path = tmp_path / f"{number}{target}"
+        done = convert(previous, path)
+        assert (done.messages, done.skipped, done.faults) == (40, {}, ())
+        assert list(read_recording(path)) == expected
+        assert recording_facts(path) == facts
+        previous = path
+    assert recording_format(previous) == "mcap"
+
+
+@pytest.mark.parametrize("target", ["a.mcap", "b.npz", "c.xtwire"])
+def test_nanoseconds_and_answers_survive_where_there_is_room(
+    capture: Path, tmp_path: Path, target: str
+) -> None:
+    expected = list(read_recording(capture))
+    convert(capture, tmp_path / target)
+    assert list(read_recording(tmp_path / target)) == expected
+    assert describe_recording(tmp_path / target).messages == {
+        "PONG": 1,
+        "DATA FLOAT": 1,
+        "BASEBAND_IQ": 1,
+    }
+
+
+def test_what_the_vendors_format_has_no_room_for_is_counted(capture: Path, tmp_path: Path) -> None:
+    done = convert(capture, tmp_path / "vendor")
+    assert (done.messages, done.skipped) == (2, {"PONG": 1})
+    expected = [(message, 1_000_000_000) for message, _ in read_recording(capture)]
+    assert list(read_recording(tmp_path / "vendor")) == expected[1:], "times have milliseconds"
+
+
+@pytest.mark.parametrize("target", ["a.mcap", "b.npz", "c.xtwire"])
+def test_unknown_times_stay_unknown(tmp_path: Path, target: str) -> None:
+    source = tmp_path / "xethru_datafloat_20261121_003602.dat"
+    whole = (RECORDINGS / "float" / source.name).read_bytes()
+    source.write_bytes(whole)
+    convert(source, tmp_path / target)
+    found = list(read_recording(tmp_path / target))
+    assert len(found) == 40
+    assert {t_ns for _, t_ns in found} == {None}
+
+
+def test_frames_of_several_sizes_survive(tmp_path: Path) -> None:
+    messages: list[m.Response] = [
+        frame(1, 3),
+        frame(2, 0),
+        m.PresenceSingle(counter=1, state=0, distance_m=1, direction=0, signal_quality=0),
+        frame(3, 4),
+        m.DataFloat(content_id=4, info=4, values=np.array([np.nan], np.float32)),
+        m.DataByte(info=5, values=b"\x7d\x7e\x7f"),
+        m.UnknownMessage(code=0x77, payload=b"\x77\x01"),
+    ]
+    source = tmp_path / "source.xtwire"
+    with WireCapture(source) as capture:
+        for number, message in enumerate(messages):
+            capture.write("rx", Connection(Role.MODULE).send(message), number)
+    expected = [(message, number) for number, message in enumerate(messages)]
+    assert list(read_recording(source)) == expected
+    for target in ("a.mcap", "b.npz"):
+        convert(source, tmp_path / target)
+        assert list(read_recording(tmp_path / target)) == expected
+
+
+def test_an_archive_is_plain_numpy(tmp_path: Path, capture: Path) -> None:
+    convert(RECORDINGS / "float", tmp_path / "f.npz")
+    with np.load(tmp_path / "f.npz") as arrays:
+        assert arrays["frame_samples"].shape == (40, 94)
+        assert arrays["frame_samples"].dtype == np.float32
+        assert arrays["frame_counter"].tolist() == list(range(124, 164))
+        assert arrays["frame_t_ns"][0] == 1795221362468_000_000
+    convert(capture, tmp_path / "c.npz")
+    with np.load(tmp_path / "c.npz") as arrays:
+        assert arrays["baseband_iq_samples"].tolist() == [[[1.0, 2.0], [3.0, 4.0]]]
+        assert arrays["message_name"].tolist() == ["PONG"]
+        assert json.loads(arrays["message_fields"][0]) == {"value": "0xAAEEAEEA"}
+
+
+def test_samples_are_not_held_in_memory(tmp_path: Path) -> None:
+    n_frames, n_bins = 2000, 1000
+    with RecordingWriter(tmp_path / "long") as writer:
+        for counter in range(n_frames):
+            writer.write(frame(counter, n_bins), counter * 1_000_000)
+    for source, target in [("long", "x.npz"), ("x.npz", "y.xtwire")]:
+        tracemalloc.start()
+        try:
+            convert(tmp_path / source, tmp_path / target)
+            _, peak = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+        assert peak < 4 * n_frames * n_bins / 2
+    expected = list(read_recording(tmp_path / "long"))
+    assert list(read_recording(tmp_path / "y.xtwire")) == expected
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["long", "x.npz", "y.xtwire"]
+
+
+def test_other_archives_are_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    with pytest.raises(RecordingError, match="no recording of this program"):
+        list(read_recording(tmp_path / "other.npz"))
+
+
+def test_an_independent_ros_reader_reads_the_frames(tmp_path: Path) -> None:
+    """Topics, types and the counter's place are those of this project's sessions."""
+    convert(RECORDINGS / "float", tmp_path / "f.mcap")
+    ros: Any = get_typestore(Stores.ROS2_HUMBLE)
+    with (tmp_path / "f.mcap").open("rb") as stream:
+        records = list(make_reader(stream, validate_crcs=True).iter_messages())
+    frames = [record for record in records if record[1].topic == "/radar/module/frame"]
+    assert [message.sequence for _, _, message in frames] == list(range(124, 164))
+    expected = [message for message, _ in read_recording(RECORDINGS / "float")]
+    for (schema, channel, message), told in zip(frames, expected, strict=True):
+        assert isinstance(told, m.DataFloat)
+        assert schema is not None
+        assert (schema.name, schema.encoding) == ("std_msgs/msg/Float32MultiArray", "ros2msg")
+        assert channel.message_encoding == "cdr"
+        array = ros.deserialize_cdr(message.data, schema.name)
+        np.testing.assert_array_equal(array.data, told.values)
+        dimension = array.layout.dim[0]
+        assert (dimension.label, dimension.size, dimension.stride) == ("range_bin", 94, 94)
+        # byte for byte what the library that writes the sessions makes of it
+        assert message.data == ros.serialize_cdr(array, schema.name)
+    infos = [record for record in records if record[1].topic == "/radar/module/info"]
+    assert len(infos) == 1
+    facts = json.loads(ros.deserialize_cdr(infos[0][2].data, "std_msgs/msg/String").data)
+    # 94 bins of RF or 47 of baseband, and where: this recording does not tell
+    assert (facts["n_bins"], facts["range_start_m"]) == (None, None)
+
+
+def test_the_module_s_own_answers_say_where_the_bins_lie(tmp_path: Path) -> None:
+    module = Connection(Role.MODULE)
+    answers = [
+        m.ReplyFloat(content_id=X4Setting.FRAMEAREA, values=(0.5, 0.75)),
+        m.ReplyInt(content_id=X4Setting.FRAMEBINCOUNT, values=(10,)),
+    ]
+    with WireCapture(tmp_path / "x.xtwire") as capture:
+        for message in (*answers, frame(1, 10)):
+            capture.write("rx", module.send(message), 1)
+    convert(tmp_path / "x.xtwire", tmp_path / "x.mcap")
+    ros: Any = get_typestore(Stores.ROS2_HUMBLE)
+    with (tmp_path / "x.mcap").open("rb") as stream:
+        found = list(make_reader(stream).iter_messages(["/radar/module/info"]))
+    facts = json.loads(ros.deserialize_cdr(found[0][2].data, "std_msgs/msg/String").data)
+    assert (facts["range_start_m"], facts["n_bins"]) == (0.5, 10)
+    assert facts["bin_length_m"] == pytest.approx(0.025)
+    assert facts["settings"] == {"FRAMEAREA": [0.5, 0.75], "FRAMEBINCOUNT": 10}
+
+
+def test_the_definitions_in_the_file_are_those_of_ros(tmp_path: Path) -> None:
+    convert(RECORDINGS / "single", tmp_path / "s.mcap")
+    ros: Any = get_typestore(Stores.ROS2_HUMBLE)
+    with (tmp_path / "s.mcap").open("rb") as stream:
+        for schema, channel, message in make_reader(stream).iter_messages():
+            assert schema is not None
+            text, _ = ros.generate_msgdef(schema.name, ros_version=2)
+            assert schema.data.decode().split() == text.split()
+            data = ros.deserialize_cdr(message.data, schema.name).data
+            if channel.topic == "/radar/module/message":
+                assert json.loads(data)["message"] == "PRESENCE_SINGLE"
+            else:
+                assert (channel.topic, data[0]) == ("/radar/module/payload", 0x50)
+
+
+@pytest.mark.parametrize("n_radars", [1, 2])
+def test_a_session_of_one_radar_is_a_recording(n_radars: int, tmp_path: Path) -> None:
+    poses = [format_tum_line(k * 200_000_000, np.zeros(3)) for k in range(2)]
+    track = OdometryTrack.from_lines(poses)
+    log = SessionLog(tmp_path / "s.mcap", session_info(n_radars), track)
+    for counter in range(3):
+        log.on_scan(scan(counter, n_radars))
+    log.close()
+    if n_radars == 2:
+        with pytest.raises(RecordingError, match=r"several radars \(radar0, radar1\)"):
+            describe_recording(tmp_path / "s.mcap")
+        return
+    sent = [scan(counter, 1).frames[0] for counter in range(3)]
+    assert list(read_recording(tmp_path / "s.mcap")) == [
+        (m.DataFloat(info=frame.counter, values=frame.samples), frame.t_ns) for frame in sent
+    ]
+
+
+def test_a_file_of_several_radars_is_refused(tmp_path: Path) -> None:
+    with (tmp_path / "x.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for name in ("left", "right"):
+            channel = writer.register_channel(f"/radar/{name}/frame", "cdr", 0)
+            writer.add_message(channel, 0, pack_array(FLOAT_ARRAY, np.zeros(2, np.float32)), 0)
+        writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
+    with pytest.raises(RecordingError, match=r"several radars \(left, right\)"):
+        list(read_recording(tmp_path / "x.mcap"))
+
+
+def test_a_target_that_is_there_or_unknown_is_refused(tmp_path: Path) -> None:
+    for target in ("a.mcap", "b.npz", "c.xtwire"):
+        (tmp_path / target).write_bytes(b"mine")
+        with pytest.raises(RecordingError, match="exists already"):
+            convert(RECORDINGS / "iq", tmp_path / target)
+        assert (tmp_path / target).read_bytes() == b"mine"
+    with pytest.raises(RecordingError, match=r"no format has the suffix \.wav"):
+        convert(RECORDINGS / "iq", tmp_path / "x.wav")
+    with RecordingWriter(tmp_path / "vendor"):
+        pass
+    convert(RECORDINGS / "iq", tmp_path / "vendor")
+    with pytest.raises(RecordingError, match="already holds a recording"):
+        convert(RECORDINGS / "iq", tmp_path / "vendor")
+
+
+@pytest.mark.parametrize("target", ["a.mcap", "b.npz", "c.xtwire", "vendor"])
+def test_a_source_that_is_none_leaves_no_target(tmp_path: Path, target: str) -> None:
+    with pytest.raises(RecordingError, match="there is no recording"):
+        convert(tmp_path / "nothing", tmp_path / target)
+    assert not (tmp_path / target).exists()
+
+
+def test_progress_is_told(tmp_path: Path) -> None:
+    told: list[int] = []
+    convert(RECORDINGS / "iq", tmp_path / "x.npz", told.append)
+    assert told == [40]
+
+
+def test_faults_of_the_source_are_passed_on(tmp_path: Path, capture: Path) -> None:
+    capture.write_bytes(capture.read_bytes()[:-1])
+    done = convert(capture, tmp_path / "x.mcap")
+    assert (done.messages, len(done.faults)) == (2, 1)
+
+
+def test_reading_recordings_loads_no_mcap() -> None:
+    script = (
+        "import sys, xethru_protocol.recordings\n"
+        "assert not {'mcap', 'zstandard'} & {name.split('.')[0] for name in sys.modules}"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True)

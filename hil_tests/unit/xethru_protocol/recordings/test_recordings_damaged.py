@@ -1,0 +1,392 @@
+"""Recordings that are damaged, incomplete, refused or cut off: those of the vendor first."""
+
+from __future__ import annotations
+
+import os
+import resource
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+import tracemalloc
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil_tests.paths import FIXTURES
+from xethru_protocol.recordings import (
+    RecordingError,
+    RecordingFault,
+    RecordingWriter,
+    convert,
+    read_recording,
+    recording_facts,
+)
+from xethru_protocol.wire import messages as m
+
+RECORDINGS = FIXTURES / "recordings"
+META = "xethru_recording_meta.dat"
+MS = 1_000_000
+
+
+def frame(counter: int, n_bins: int = 3) -> m.DataFloat:
+    return m.DataFloat(info=counter, values=np.arange(n_bins, dtype=np.float32) + counter)
+
+
+def presence(counter: int) -> m.PresenceSingle:
+    return m.PresenceSingle(counter=counter, state=1, distance_m=1.5, direction=2, signal_quality=7)
+
+
+def copy_of(name: str, tmp_path: Path) -> Path:
+    copy = Path(shutil.copytree(RECORDINGS / name, tmp_path / "copy"))
+    for path in (copy, *copy.iterdir()):
+        path.chmod(0o755)
+    return copy
+
+
+def read_with_faults(
+    path: Path,
+) -> tuple[list[tuple[m.Response, int | None]], list[RecordingFault]]:
+    faults: list[RecordingFault] = []
+    return list(read_recording(path, faults.append)), faults
+
+
+def test_the_meta_file_names_the_recording(tmp_path: Path) -> None:
+    assert len(list(read_recording(RECORDINGS / "float" / META))) == 40
+    copy = copy_of("single", tmp_path)
+    next(copy.glob("*.csv")).rename(copy / "elsewhere.csv")
+    with pytest.raises(RecordingError, match="holds no recording"):
+        list(read_recording(copy / META))
+
+
+def test_a_user_header_is_found_without_an_index(tmp_path: Path) -> None:
+    whole = [message for message, _ in read_recording(RECORDINGS / "float")]
+    copy = copy_of("float", tmp_path)
+    (copy / META).unlink()
+    found, faults = read_with_faults(copy)
+    assert [message for message, _ in found] == whole
+    assert {t_ns for _, t_ns in found} == {None}
+    assert [(fault.file, fault.minor) for fault in faults] == [(META, True)]
+    assert "missing" in faults[0].reason
+
+
+@pytest.mark.parametrize("header", [b"hello", b"two\nlines\n", bytes(range(256)) * 3])
+@pytest.mark.parametrize("message", [frame(7, 50), presence(7)])
+def test_any_user_header_is_found_without_an_index(
+    header: bytes, message: m.Response, tmp_path: Path
+) -> None:
+    with RecordingWriter(tmp_path / "r", user_header=header) as writer:
+        for number in range(3):
+            writer.write(message, number * MS)
+    assert recording_facts(tmp_path / "r").user_header == header
+    (tmp_path / "r" / META).unlink()
+    assert [found for found, _ in read_recording(tmp_path / "r")] == [message] * 3
+
+
+def test_text_files_have_times_of_their_own(tmp_path: Path) -> None:
+    copy = copy_of("single", tmp_path)
+    (copy / META).unlink()
+    found, _ = read_with_faults(copy)
+    assert len(found) == 40
+    assert found[0][1] == 1795221364739 * MS
+    assert found[-1][1] == 1795221366688 * MS
+
+
+@pytest.mark.parametrize("cut", [1, 10, 46])
+def test_a_cut_line_is_reported_after_all_whole_ones(tmp_path: Path, cut: int) -> None:
+    copy = copy_of("single", tmp_path)
+    file = next(copy.glob("*.csv"))
+    file.write_bytes(file.read_bytes()[:-cut])
+    found, faults = read_with_faults(copy)
+    assert len(found) == 39
+    assert [(fault.file, fault.offset) for fault in faults] == [(file.name, 1909 - 47)]
+
+
+def test_a_line_that_makes_no_sense_costs_itself_only(tmp_path: Path) -> None:
+    copy = copy_of("single", tmp_path)
+    file = next(copy.glob("*.csv"))
+    file.write_bytes(file.read_bytes().replace(b";182;2;24;", b";182;two;24;"))
+    found, faults = read_with_faults(copy)
+    assert len(found) == 39
+    assert [fault.file for fault in faults] == [file.name, file.name]
+    assert "a line cannot be read" in faults[0].reason
+    assert "the index gives this record 43 bytes, it has 45" in faults[1].reason
+
+
+@pytest.mark.parametrize(
+    ("column", "cell", "reason"),
+    [
+        (0, "9999-12-31T23:59:59+00:00", "64 bits"),
+        (0, "0001-01-01T00:00:00+23:59", "64 bits"),
+        (1, "-1", "counter=-1"),
+        (1, "4294967296", "counter=4294967296"),
+        (4, "256", "direction=256"),
+    ],
+)
+def test_a_line_that_fits_no_message_costs_itself_only(
+    column: int, cell: str, reason: str, tmp_path: Path
+) -> None:
+    copy = copy_of("single", tmp_path)
+    file = next(copy.glob("*.csv"))
+    lines = file.read_text().splitlines(keepends=True)
+    cells = lines[1].split(";")
+    lines[1] = ";".join([*cells[:column], cell, *cells[column + 1 :]])
+    file.write_text("".join(lines))
+    found, faults = read_with_faults(copy)
+    whole = [message for message, _ in read_recording(RECORDINGS / "single")]
+    assert [message for message, _ in found] == whole[1:]
+    assert [reason in fault.reason for fault in faults if not fault.minor] == [True]
+
+
+def test_a_stamp_without_zone_is_in_that_of_this_machine(tmp_path: Path) -> None:
+    line = "2026-07-21T12:00:00.500;1;2;1.5;0;7\n"
+    file = tmp_path / "xethru_presence_single_20260721_120000.csv"
+    file.write_text("TimeStamp;Counter;PresenceState;Distance;Direction;SignalQuality\n" + line)
+    ((_, t_ns),) = read_recording(file)
+    assert t_ns == round(datetime(2026, 7, 21, 12).timestamp()) * 1000 * MS + 500 * MS
+
+
+@pytest.mark.parametrize(
+    ("offset", "damage"),
+    [
+        (0x55, b"\xff\xff\xff\xff"),  # length of the session id
+        (0x1D, b"\x01" + bytes(7)),  # where the index ends
+        (0x08, b"\xff" * 7 + b"\x7f"),  # start
+        (0x08, bytes(7) + b"\x80"),
+    ],
+)
+def test_a_damaged_head_of_the_meta_file_costs_no_message(
+    offset: int, damage: bytes, tmp_path: Path
+) -> None:
+    """The recording has a user header, whose length only the index tells."""
+    copy = copy_of("float", tmp_path)
+    meta = bytearray((copy / META).read_bytes())
+    meta[offset : offset + len(damage)] = damage
+    (copy / META).write_bytes(meta)
+    found, faults = read_with_faults(copy)
+    whole = [message for message, _ in read_recording(RECORDINGS / "float")]
+    assert found == [(message, None) for message in whole]
+    assert [(fault.file, fault.minor) for fault in faults] == [(META, True)]
+
+
+def test_a_long_index_stays_packed_in_memory(tmp_path: Path) -> None:
+    n_messages = 20_000
+    with RecordingWriter(tmp_path / "long") as writer:
+        for counter in range(n_messages):
+            writer.write(frame(counter, 1), counter * MS)
+    tracemalloc.start()
+    try:
+        counters = [message.info for message, _ in read_recording(tmp_path / "long")]  # type: ignore[attr-defined]  # frames only
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert counters == list(range(n_messages))
+    # 33 bytes in the file, 40 of the list above, and a block of entries at work
+    assert peak < n_messages * 100 + 2_000_000
+
+
+def test_other_columns_are_reported_and_not_guessed_at(tmp_path: Path) -> None:
+    copy = copy_of("single", tmp_path)
+    file = next(copy.glob("*.csv"))
+    file.write_bytes(file.read_bytes().replace(b"Counter;PresenceState", b"PresenceState;Counter"))
+    found, faults = read_with_faults(copy)
+    assert found == []
+    assert "its columns are not those known" in faults[0].reason
+
+
+@pytest.mark.parametrize(
+    ("at", "replacement", "reason"),
+    [
+        (0, b"\0", "does not begin like a meta file"),
+        (4, b"\x0e", "its format version is 14, known is 13"),
+        (0x85, b"\x05", "the index gives this record"),  # size of the first record
+    ],
+)
+def test_a_meta_that_is_wrong_costs_times_only(
+    tmp_path: Path, at: int, replacement: bytes, reason: str
+) -> None:
+    copy = copy_of("iq", tmp_path)
+    meta = copy / META
+    data = bytearray(meta.read_bytes())
+    if at == 0x85:
+        at = data.index(struct.pack("<BII", 1, 2, 104)) + 5
+    data[at : at + len(replacement)] = replacement
+    meta.write_bytes(data)
+    found, faults = read_with_faults(copy)
+    assert len(found) == 40
+    assert len(list(read_recording(copy))) == 40, "nobody asked for faults, no message is lost"
+    assert reason in faults[0].reason
+    assert found[-1][1] is None
+
+
+@pytest.mark.parametrize("damaged", [0, 7, 39])
+def test_a_damaged_count_costs_its_record_where_the_index_tells_the_size(
+    damaged: int, tmp_path: Path
+) -> None:
+    whole = list(read_recording(RECORDINGS / "iq"))
+    copy = copy_of("iq", tmp_path)
+    file = next(copy.glob("xethru_baseband_iq_*"))
+    data = bytearray(file.read_bytes())
+    begin = len(data) // 40 * damaged  # 40 records of one size
+    data[begin + 4 : begin + 8] = b"\xff\xff\xff\x7f"
+    file.write_bytes(data)
+    found, faults = read_with_faults(copy)
+    assert found == whole[:damaged] + whole[damaged + 1 :]
+    assert [(fault.file, fault.offset) for fault in faults] == [(file.name, begin)]
+    with pytest.raises(RecordingError, match="a record is damaged"):
+        list(read_recording(copy))
+
+
+def test_an_index_that_is_too_short_or_too_long_is_reported(tmp_path: Path) -> None:
+    copy = copy_of("iq", tmp_path)
+    file = next(copy.glob("*iq*.dat"))
+    data = file.read_bytes()
+    file.write_bytes(data + data[-104:])
+    found, faults = read_with_faults(copy)
+    assert [t_ns for _, t_ns in found[-2:]] == [1795221359876 * MS, None]
+    assert faults == []
+    file.write_bytes(data[:-104])
+    found, faults = read_with_faults(copy)
+    assert len(found) == 39
+    assert [fault.reason for fault in faults] == ["the index lists more records than it holds"]
+
+
+def test_a_missing_data_file_is_reported(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "two", timezone=UTC) as writer:
+        writer.write(frame(1), 0)
+        writer.write(presence(2), 0)
+    next((tmp_path / "two").glob("*.csv")).unlink()
+    found, faults = read_with_faults(tmp_path / "two")
+    assert found == [(frame(1), 0)]
+    assert [fault.file for fault in faults] == ["xethru_presence_single_19700101_000000.csv"]
+    with pytest.raises(RecordingError, match="it is missing"):
+        list(read_recording(tmp_path / "two"))
+
+
+def test_foreign_files_are_left_alone_or_refused(tmp_path: Path) -> None:
+    copy = copy_of("iq", tmp_path)
+    (copy / "notes.txt").write_text("hello")
+    (copy / "xethru_unheard_of_20261121_003557.dat").write_bytes(b"\0" * 100)
+    found, faults = read_with_faults(copy)
+    assert (len(found), faults) == (40, [])
+    with pytest.raises(RecordingError, match="is no recording this can read"):
+        list(read_recording(copy / "notes.txt"))
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root reads everything")
+def test_what_may_not_be_read_is_named(tmp_path: Path) -> None:
+    copy = copy_of("iq", tmp_path)
+    copy.chmod(0)
+    try:
+        with pytest.raises(RecordingError, match="Permission denied"):
+            list(read_recording(copy))
+    finally:
+        copy.chmod(0o755)
+
+
+def test_the_system_refusing_is_an_error_of_ours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy = copy_of("iq", tmp_path)
+
+    def refuse(self: Path) -> None:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    with pytest.raises(RecordingError, match="cannot be read: Permission denied"):
+        list(read_recording(copy))
+    with pytest.raises(RecordingError, match="cannot be written: Permission denied"):
+        RecordingWriter(tmp_path / "new")
+
+
+def test_a_full_disk_keeps_whole_records_and_says_so(tmp_path: Path) -> None:
+    """A limit on the size of files stands for the disk: it, too, takes a part of a record."""
+    folder = tmp_path / "full"
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    writer = RecordingWriter(folder)
+    written = 0
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
+        with pytest.raises(RecordingError, match="File too large"):  # noqa: PT012 - until it is full
+            for counter in range(100):
+                writer.write(frame(counter, 100), counter * MS)
+                written += 1
+        writer.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert written == 10_000 // 412
+    found, faults = read_with_faults(folder)
+    assert found == [(frame(counter, 100), counter * MS) for counter in range(written)]
+    assert faults == []
+
+
+_KILLED = """
+import os, signal, sys
+import numpy as np
+from xethru_protocol.wire.messages import DataFloat
+from xethru_protocol.recordings import RecordingWriter
+writer = RecordingWriter(sys.argv[1], session_id="killed", user_header=b"hello")
+for counter in range(7):
+    writer.write(DataFloat(info=counter, values=np.zeros(5, np.float32)), counter * 10**9)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_killed_recorder_leaves_every_message_and_every_time(tmp_path: Path) -> None:
+    script = subprocess.run([sys.executable, "-c", _KILLED, tmp_path / "r"], check=False)
+    assert script.returncode == -signal.SIGKILL
+    found, faults = read_with_faults(tmp_path / "r")
+    assert [
+        (message.info, t_ns) for message, t_ns in found if isinstance(message, m.DataFloat)
+    ] == [(counter, counter * 10**9) for counter in range(7)]
+    assert len(list(read_recording(tmp_path / "r"))) == 7
+    assert [(fault.file, fault.minor) for fault in faults] == [(META, True)]
+    assert "never completed" in faults[0].reason
+    facts = recording_facts(tmp_path / "r")
+    assert facts.session_id == "killed"
+    assert facts.closed_ns is None
+
+
+@pytest.mark.parametrize(
+    "note",
+    [
+        b"[" * 100_000,
+        b'{"facts": 5}',
+        b'{"facts": {"session_id": 7}}',
+        b'{"facts": {"stopped_ns": "late"}}',
+        b'{"facts": {"user_header": "no hex"}}',
+    ],
+    ids=["deep", "number", "session id", "time", "bytes"],
+)
+def test_a_note_that_makes_no_sense_is_named(note: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "a.xtwire"
+    path.write_bytes(b"\x89XTWIRE\n" + struct.pack("<II", 1, len(note)) + note)
+    with pytest.raises(RecordingError, match="damaged"):
+        convert(path, tmp_path / "copy")
+
+
+def test_a_damaged_archive_gives_no_message(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)  # so that the samples cannot be compressed
+    with RecordingWriter(tmp_path / "long") as writer:
+        for counter in range(300):
+            values = rng.random(1000, np.float32)
+            writer.write(m.DataFloat(info=counter, values=values), counter * 1_000_000)
+    convert(tmp_path / "long", tmp_path / "x.npz")
+    data = bytearray((tmp_path / "x.npz").read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 1000] = bytes(1000)
+    (tmp_path / "x.npz").write_bytes(data)
+    with pytest.raises(RecordingError, match="is cut or damaged"):
+        next(read_recording(tmp_path / "x.npz"))
+
+
+def test_a_record_of_mcap_that_claims_more_than_the_file_is_not_waited_for(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(b"\x89MCAP0\r\n\x06" + struct.pack("<Q", 3_000_000_000))
+    with pytest.raises(RecordingError, match="exceeds limit 17"):
+        list(read_recording(path))

@@ -1,0 +1,195 @@
+"""What a row of the message table can say, and how wrong messages and codes are named."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import pytest
+
+from hil_tests.golden.test_protocol_vectors import KNOWN
+from hil_tests.golden.vectors import Vector
+from xethru_protocol.wire import fields
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codec import decode_command, decode_response, describe, encode
+from xethru_protocol.wire.codes import ErrorSpace, MatrixControl, error_name
+from xethru_protocol.wire.errors import LocalProtocolError
+from xethru_protocol.wire.table import ROWS, Command, Prefixes, command
+
+# Every row of 5.1 as (code, name by space); "" where the reference has no meaning.
+X4, FILES, PINS = ErrorSpace.X4_DRIVER, ErrorSpace.FILES, ErrorSpace.IO_PINS
+
+
+@pytest.mark.parametrize(
+    ("code", "space", "name"),
+    [
+        (1, ErrorSpace.PROTOCOL, "NOT_RECOGNIZED"),
+        (1, X4, "X4 GENERAL_FAILURE"),
+        (1, FILES, "FILE INVALID_PARAMETER"),
+        (1, PINS, "IOPIN WRONG_PIN"),
+        (3, ErrorSpace.PROTOCOL, "BUSY"),
+        (3, FILES, "FILE ALREADY_EXISTS"),
+        (3, PINS, "IOPIN INTERRUPT_NOT_AVAILABLE"),
+        (4, ErrorSpace.PROTOCOL, "X4 REGISTER_TIMEOUT"),
+        (4, FILES, "FILE BUSY"),
+        (5, PINS, ""),
+        (14, FILES, "FILE NOT_SUPPORTED"),
+        (15, FILES, ""),
+        (17, ErrorSpace.PROTOCOL, "X4 FRAME_AREA_END_OUT_OF_SCOPE"),
+        (17, FILES, ""),
+        (0x21, ErrorSpace.PROTOCOL, "COMMAND_FAILED"),
+        (0x21, FILES, "FILE OUT_OF_RANGE"),
+        (0x22, X4, "RESTARTING"),
+        (999, X4, "X4 HAL_ERROR"),
+        (0xFFFFFFFF, X4, "X4 UNINITIALIZED (-1)"),
+        (0xFFFFFFFF, FILES, ""),
+        (100, ErrorSpace.PROTOCOL, ""),
+    ],
+)
+def test_an_errors_name_depends_on_the_command_that_failed(
+    code: int, space: ErrorSpace, name: str
+) -> None:
+    assert error_name(code, space) == name
+
+
+@pytest.mark.parametrize(
+    ("cls", "space"),
+    [
+        (m.X4DriverSet, X4),
+        (m.X4DriverInit, X4),
+        (m.X4DriverReadI2c, X4),
+        (m.OpenFile, FILES),
+        (m.FormatFilesystem, FILES),
+        (m.IoPinSetValue, PINS),
+        (m.IoPinGetControl, PINS),
+        (m.SetMode, ErrorSpace.PROTOCOL),
+        (m.OutputSetControl, ErrorSpace.PROTOCOL),
+    ],
+)
+def test_a_commands_row_names_its_errors(cls: type[Command[m.Response]], space: ErrorSpace) -> None:
+    assert ROWS[cls].errors is space
+
+
+@pytest.mark.parametrize(
+    "vector",
+    [v for v in KNOWN if v.message.startswith("REPLY") and v.decoded["trailer"] is not None],
+    ids=lambda v: v.name,
+)
+def test_replies_are_read_without_their_trailer(vector: Vector) -> None:
+    """5.2: accept with or without trailer."""
+    assert vector.payload is not None
+    whole, cut = decode_response(vector.payload), decode_response(vector.payload[:-1])
+    if isinstance(whole, m.ReplyNone):
+        assert cut == m.ReplyNone(content_id=whole.content_id, info=whole.info, trailer=None)
+    else:
+        assert cut == whole
+
+
+@pytest.mark.parametrize(
+    ("message", "reason"),
+    [
+        (
+            m.PresenceMovingList(
+                counter=1,
+                state=1,
+                movement_slow=(1.0, 2.0),
+                movement_fast=(1.0,),
+                detection_distance_m=(),
+                detection_rcs=(),
+                detection_velocity=(),
+            ),
+            "movement_slow and movement_fast must have one length",
+        ),
+        (m.InjectFrame(counter=1, values=(1.0, 2.0, 3.0)), "of whole entries"),
+        (m.DeleteNoiseMap(sub_code=0x14), "another message's"),
+        (m.LegacyDirCommand(sub_code=0x58), "another message's"),
+        (m.SetParameterFile(name="\u20ac", data=""), "latin-1"),
+        (m.HilReply(datatype=0x99, hil_command=0x10), "no such element type"),
+        (m.BootloaderWritePage(page=0x10000, data=b""), "page=65536"),
+        (
+            m.PulseDopplerByte(
+                counter=1,
+                matrix_counter=1,
+                range_idx=0,
+                range_bins=1,
+                frequency_count=3,
+                pulsedoppler_instance=0,
+                byte_step_start_db=0.0,
+                byte_step_size_db=1.0,
+                fps=17.0,
+                fps_decimated=17.0,
+                frequency_start_hz=0.0,
+                frequency_step_hz=1.0,
+                range_m=1.0,
+                levels=b"\x01",
+            ),
+            "frequency_count is 3",
+        ),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_what_does_not_fit_the_wire_is_said(message: m.Message, reason: str) -> None:
+    with pytest.raises(LocalProtocolError, match=reason):
+        encode(message)
+
+
+def test_page_index_is_big_endian() -> None:
+    """4.12: the one exception to little-endian."""
+    assert encode(m.BootloaderWritePage(page=0x0102, data=b"\xff")).hex(" ") == "c0 10 01 02 00 ff"
+
+
+def test_texts_are_terminated_once() -> None:
+    payload = encode(m.GetParameterFile(name=b"a.par"))
+    assert payload.endswith(b"\x06\x00\x00\x00a.par\x00")
+    assert decode_command(payload) == m.GetParameterFile(name="a.par")
+    unterminated = payload[:6] + b"\x05\x00\x00\x00a.par"
+    assert decode_command(unterminated) == m.GetParameterFile(name="a.par")
+
+
+def test_a_damaged_scale_of_levels_is_no_exception() -> None:
+    """A NoEscape packet has no checksum: the steps may be any float."""
+    infinite = bytes.fromhex("00 00 80 7F")
+    payload = bytes.fromhex("50 11 00 00 00") + bytes(16) + b"\x02\x00\x00\x00" + bytes(4)
+    payload += infinite * 2 + bytes(20) + b"\x00\xff"
+    name, fields = describe(decode_response(payload))
+    assert name == "PULSEDOPPLER_BYTE"
+    assert [str(power) for power in fields["decompressed"]] == ["nan", "inf"]
+
+
+def test_either_numbering_switches_the_fast_matrix() -> None:
+    """11 row 5."""
+    assert MatrixControl(2).fast
+    assert MatrixControl(4).fast
+    assert not MatrixControl(1).fast
+    assert not MatrixControl(0x80000001).fast
+
+
+def test_no_two_rows_share_a_prefix() -> None:
+    with pytest.raises(ValueError, match="22 is ModReset already"):
+
+        @command(0x22, name="ANOTHER_RESET")
+        @dataclass(frozen=True, slots=True, kw_only=True)
+        class _AnotherReset(Command[m.Ack]):
+            seed: Annotated[int, fields.U8]
+
+
+def test_the_longest_prefix_wins() -> None:
+    prefixes = Prefixes()
+    prefixes.enter(b"\x10", m.Ack)
+    prefixes.enter(b"\x10\x01\x02", m.Pong)
+    prefixes.enter(b"\x10\x01", m.System)
+    found = [prefixes.find(data) for data in (b"\x10\x01\x02\x03", b"\x10\x01", b"\x10\x02", b"")]
+    assert found == [m.Pong, m.System, m.Ack, None]
+
+
+def test_the_bin_count_cannot_be_set() -> None:
+    """4.9: the firmware answers ERROR 1, as to what it does not know."""
+    payload = bytes.fromhex("50 10 26 00 00 00 01 00 00 00")
+    assert decode_command(payload) == m.UnknownMessage(code=0x50, payload=payload)
+
+
+@pytest.mark.parametrize("count", ["FF FF FF FF", "00 00 00 40", "03 00 00 00"])
+def test_counts_beyond_the_payload_are_not_believed(count: str) -> None:
+    """A damaged count must neither raise nor take memory."""
+    for head in ("50 00 3B 0A 61 01 00 00 00", "90 75 01 00 00 00", "50 02 3B 0A 61 01 00 00 00"):
+        payload = bytes.fromhex(f"{head} {count} 00 00 80 3F 00 00")
+        decode = decode_command if head.startswith("90") else decode_response
+        assert decode(payload) == m.UnknownMessage(code=payload[0], payload=payload)

@@ -1,0 +1,223 @@
+"""X4 arithmetic against the tables of the Protocol reference, section 9."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from xethru_protocol.wire import x4
+from xethru_protocol.wire.errors import LocalProtocolError
+
+# Worked table of 9.4: start, end, offset; RF bins and read-back; baseband bins and read-back.
+TABLE = [
+    (0.2, 9.4, 0.18, 1431, 0.199290, 9.400679, 181, 0.180000, 9.439260),
+    (0.2, 9.4, 0, 1431, 0.199331, 9.400721, 181, 0.154321, 9.413580),
+    (0.2, 9.4, 0.2, 1431, 0.200000, 9.401389, 180, 0.200000, 9.407819),
+    (-0.5, 9.4, 0.18, 1527, -0.437284, 9.381389, 188, -0.437284, 9.182057),
+    (-0.5, 9.4, 0, 1517, -0.501543, 9.252830, 186, -0.514403, 9.002058),
+    (0.4, 5.0, 0.18, 716, 0.398621, 5.002531, 91, 0.385761, 5.015391),
+    (0.4, 5.0, 0, 716, 0.398663, 5.002572, 92, 0.360082, 5.041152),
+    (0.4, 9.4, 0.18, 1400, 0.398621, 9.400679, 177, 0.385761, 9.439260),
+    (-0.5, 5.0, 0.18, 846, -0.437284, 5.002531, 107, -0.437284, 5.015391),
+    (-0.5, 2.0, 0.18, 380, -0.437284, 2.006132, 49, -0.437284, 2.031852),
+    (0, 1.0, 0.18, 156, -0.000041, 1.003045, 21, -0.025761, 1.003045),
+    (0, 9.9, 0.18, 1467, -0.000041, 9.432829, 180, -0.025761, 9.182057),
+    (0, 9.9, 0, 1535, 0, 9.870113, 188, 0, 9.619342),
+    (0.18, 10.1, 0.18, 1535, 0.18, 10.050113, 188, 0.18, 9.799341),
+]
+
+
+@pytest.mark.parametrize("row", TABLE, ids=lambda row: f"{row[0]}..{row[1]} m at {row[2]}")
+@pytest.mark.parametrize("downconversion", [False, True], ids=["rf", "baseband"])
+def test_frame_area_is_quantised_as_in_the_worked_table(
+    row: tuple[float, ...], downconversion: bool
+) -> None:
+    start, end, offset = row[:3]
+    bins, read_start, read_end = row[6:] if downconversion else row[3:6]
+    area = x4.frame_area(start, end, offset, downconversion)
+    assert area.n_bins == bins
+    assert area.start_m == pytest.approx(read_start, abs=6e-7)
+    assert area.end_m == pytest.approx(read_end, abs=6e-7)
+
+
+def test_area_after_init_has_1467_bins() -> None:
+    area = x4.frame_area(*x4.FULL_AREA_M)
+    assert (area.n_bins, area.requested_end_m) == (1467, float(np.float32(9.8765432)))
+
+
+@pytest.mark.parametrize(
+    ("downconversion", "start", "end"),
+    [
+        (False, 0.19929012656211853, 9.400678634643555),
+        (True, 0.18000000715255737, 9.43925952911377),
+    ],
+)
+def test_read_back_has_the_float32_values_of_the_vectors(
+    downconversion: bool, start: float, end: float
+) -> None:
+    area = x4.frame_area(0.2, 9.4, 0.18, downconversion)
+    assert (area.start_m, area.end_m) == (start, end)
+
+
+def test_equal_limits_give_the_bins_of_the_reference() -> None:
+    assert x4.frame_area(1.0, 1.0).n_bins in (0, 1)
+    assert x4.frame_area(1.0, 1.0, downconversion=True).n_bins in (1, 2)
+
+
+@pytest.mark.parametrize(("start", "steps"), [(160.0, 2), (0.2, 0), (-3.0, -1)])
+def test_receive_delay_is_one_byte(start: float, steps: int) -> None:
+    """9.4 step 4: (1 + max(floor((start - 0.18) / 0.6172839506), -1)) mod 256."""
+    assert x4.frame_area(start, start + 5).rx_wait == steps + 1
+
+
+def test_limit_that_is_a_bin_but_for_rounding_is_that_bin() -> None:
+    """9.4 steps 7 and 8: float32(3.325) lies 7e-6 of a bin behind a bin.
+
+    base is 0.2 + 0.6172839506; (0.94 - base) / 0.006430041 = 19.08, (3.325 - base) / 0.006430041
+    = 390.000007: 390 - 19 = 371 bins.
+    """
+    assert x4.frame_area(0.94, 3.325, 0.2).n_bins == 371
+
+
+def test_inverted_area_is_refused() -> None:
+    with pytest.raises(LocalProtocolError, match="swap the limits"):
+        x4.frame_area(5.0, 0.4)
+
+
+@given(st.floats(-1, 12), st.floats(0, 12), st.sampled_from([0.0, 0.18, 0.2]), st.booleans())
+def test_quantised_area_covers_the_request_within_one_frame(
+    start: float, length: float, offset: float, downconversion: bool
+) -> None:
+    area = x4.frame_area(start, start + length, offset, downconversion)
+    assert 0 <= area.n_bins <= (188 if downconversion else 1535)
+    assert 0 <= area.rx_wait < 256
+    spare = area.bin_length_m + 1e-5
+    assert area.start_m <= max(start, area.base_m) + 1e-5
+    assert area.start_m >= max(start, area.base_m) - spare
+    assert area.first_index * area.bin_length_m + area.base_m == pytest.approx(
+        area.start_m, abs=1e-6
+    )
+
+
+@pytest.mark.parametrize(
+    ("requested", "real"),
+    [
+        (1, 1.004108),
+        (0.5, 1.004108),
+        (7, 7.027351),
+        (8, 8.027246),
+        (15, 15.055598),
+        (17, 17.049379),
+        (17.9, 17.049379),
+        (29, 29.107494),
+        (34, 34.040967),
+        (35, 35),
+        (35.9, 35),
+        (50.5, 50),
+        (200.5, 200),
+        (0, 0),
+        (-2, -2),
+    ],
+)
+def test_real_frame_rate_is_the_chip_timers(requested: float, real: float) -> None:
+    assert x4.real_frame_rate(requested) == float(np.float32(real))
+
+
+@pytest.mark.parametrize(
+    ("requested", "answer"),
+    [
+        (0.5, 1.004108),
+        (17.9, 17.049379),
+        (34.99, 34.040967),
+        (35, 35),
+        (50.5, 50.5),
+        (0, 0),
+        (-2.5, -2.5),
+    ],
+)
+def test_frame_rate_reads_back_with_its_fraction_from_35_on(
+    requested: float, answer: float
+) -> None:
+    assert x4.frame_rate_read_back(requested) == float(np.float32(answer))
+
+
+@given(st.floats(0.0078125, 1000, width=32) | st.integers(1, 400))
+def test_host_finds_the_real_rate_from_the_read_back(requested: float) -> None:
+    real = x4.real_frame_rate(requested)
+    assert x4.real_frame_rate(x4.frame_rate_read_back(requested)) == real
+    assert int(real) == max(int(requested), 1)
+
+
+@pytest.mark.parametrize("requested", range(1, 40))
+def test_every_row_of_the_rate_table_survives_its_read_back(requested: int) -> None:
+    real = x4.real_frame_rate(requested)
+    assert x4.real_frame_rate(x4.frame_rate_read_back(requested)) == real
+
+
+@pytest.mark.parametrize(
+    ("sweep", "full", "recommended"),
+    [
+        ((16, 300, 949, 1100), 20.8, 19.8),
+        ((64, 87, 949, 1100), 17.95, 17.05),
+        ((64, 5, 949, 1100), 312, 296),
+        ((8, 10, 0, 2047), 92.7, 88.1),
+        ((16, 26, 0, 2047), 17.8, 16.9),
+    ],
+)
+def test_fps_max_of_the_reference(
+    sweep: tuple[int, int, int, int], full: float, recommended: float
+) -> None:
+    iterations, pulses, low, high = sweep
+
+    def at(duty: float) -> float:
+        return x4.fps_max(
+            iterations=iterations, pulses_per_step=pulses, dac_min=low, dac_max=high, duty=duty
+        )
+
+    assert at(1.0) == pytest.approx(full, rel=4e-3)
+    assert at(0.95) == pytest.approx(recommended, rel=4e-3)
+
+
+def test_no_frame_rate_without_a_sweep() -> None:
+    with pytest.raises(LocalProtocolError, match="without a sweep"):
+        x4.fps_max(iterations=0, pulses_per_step=300, dac_min=949, dac_max=1100)
+
+
+def test_normalisation_of_the_vendors_working_point() -> None:
+    normal = x4.Normalisation.of(iterations=16, pulses_per_step=300, dac_min=949, dac_max=1100)
+    assert normal.quantum == pytest.approx(2.03450526e-07, rel=1e-8)
+    assert normal.dac_offset == 0.07421875
+    assert normal.max_counter == 16 * 300 * 152
+    top = np.float32(normal.max_counter) * np.float32(normal.quantum) - np.float32(
+        normal.dac_offset
+    )
+    assert top == pytest.approx(0.07421875, rel=1e-6)
+
+
+@pytest.mark.parametrize("step", [0, 1, 2, 3])
+def test_full_scale_does_not_depend_on_the_dac_step(step: int) -> None:
+    normal = x4.Normalisation.of(
+        iterations=8, pulses_per_step=10, dac_min=0, dac_max=2047, dac_step=step
+    )
+    assert normal.max_counter * normal.quantum == pytest.approx(2.0, rel=1e-6)
+    assert normal.dac_offset == 1.0
+
+
+def test_bin_lengths_are_those_of_the_reference() -> None:
+    assert pytest.approx(0.006430041152, abs=1e-12) == x4.RF_BIN_M
+    assert pytest.approx(0.05144032922, abs=1e-11) == x4.BASEBAND_BIN_M
+    assert pytest.approx(0.6172839506, abs=1e-10) == x4.COARSE_STEP_M
+
+
+@given(st.integers(0, 1 << 32), st.floats(1, 400))
+def test_frame_time_is_the_nearest_nanosecond(counter: int, rate: float) -> None:
+    assert x4.frame_time_ns(counter, rate) == round(Fraction(counter) * 10**9 / Fraction(rate))
+
+
+@pytest.mark.parametrize(("counter", "even"), [(1, 0), (3, 2), (5, 2), (7, 4)])
+def test_frame_time_in_the_middle_of_two_nanoseconds_is_the_even_one(
+    counter: int, even: int
+) -> None:
+    assert x4.frame_time_ns(counter, 2e9) == even

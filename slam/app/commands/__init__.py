@@ -1,0 +1,1 @@
+"""The commands of `uwb-slam` that put sources, SLAM and views together."""

@@ -1,0 +1,356 @@
+"""`uwb-slam calibrate`: range offsets, mounts and gains from a recorded drive past reflectors."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import tomllib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from emulator.scene.scene import Scene, SceneError, load_scene
+from slam.app.errors import AppError, StopFlag, UsageError
+from slam.app.odometry.track import OdometryTrack
+from slam.app.odometry.tum import TumSample
+from slam.app.records import SessionInfo
+from slam.app.rig.files import RigFile, RigRadar, write_rig
+from slam.app.session.reader import RecordedSession, open_session
+from slam.calibration.calibration import Calibration, Drive, calibrate, make_drive
+from slam.calibration.observability import (
+    OFFSET_LIMIT_M,
+    GainEstimate,
+    WeakDirection,
+    estimate_gains,
+    poor_drive,
+    unseen_reflectors,
+    weak_directions,
+)
+from slam.calibration.tracks import UNASSIGNED, RangeSet
+from slam.config import FrontEnd, SlamConfig, override
+from slam.frames import Detection, RadarFrame
+from slam.front_end.paper import make_detector
+from slam.geometry import Rig
+from xethru_protocol.system import read_bounded
+
+Array = NDArray[np.float64]
+
+_FRONT_END = override(
+    SlamConfig(),
+    {
+        "detection.front_end": FrontEnd.JOINT.value,
+        # the leakage of the antennas ends before, and rods are followed farther than SLAM maps
+        "detection.min_range_m": 0.3,
+        "detection.max_range_m": 2.5,
+    },
+)
+_FRAMES_AT_ONCE = 64
+_YAW_LIMIT_RAD = math.radians(2)
+_GAIN_LIMIT_DB = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrateOptions:
+    """What the command line of `uwb-slam calibrate` says."""
+
+    session: Path
+    reflectors: str | None
+    truth: str | None
+    rig: Path | None
+    as_json: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CalibrationReport:
+    """Everything that is printed."""
+
+    drive: Drive
+    calibration: Calibration
+    gains: GainEstimate
+    weak: tuple[WeakDirection, ...]
+    poor: tuple[str, ...]
+
+
+def run_calibrate(options: CalibrateOptions, stop: StopFlag) -> None:
+    """Calibrate from a session file and print the table; write the rig file if asked for.
+
+    Raises
+    ------
+    AppError
+        The session, the reflectors or the scene of the truth cannot be used; the rig file cannot
+        be written.
+    StopRequestedError
+        A signal arrived.
+    """
+    known = None if options.reflectors is None else read_reflectors(options.reflectors)
+    planted = None if options.truth is None else _scene(options.truth)
+    session = open_session(options.session)
+    # minutes of work: what can be refused is refused before
+    _planted(session.rig, planted)
+    if options.rig is not None:
+        _check_rig_place(options.rig, options.session)
+    report = report_of(drive_of(session, stop.check), known)
+    if session.cut_at_byte is not None:
+        sys.stderr.write(f"{session.path}: cut at byte {session.cut_at_byte}; read up to there\n")
+    if options.as_json:
+        facts = _facts(report, _planted(report.drive.rig, planted))
+        sys.stdout.write(json.dumps(facts, indent=2, allow_nan=False) + "\n")
+    else:
+        sys.stdout.write("".join(f"{line}\n" for line in _lines(report, planted)))
+    if options.rig is not None:
+        write_rig(options.rig, rig_file(session.info, report))
+
+
+def drive_of(session: RecordedSession, check: Callable[[], None]) -> Drive:
+    """Read a session once and detect its echoes.
+
+    Raises
+    ------
+    AppError
+        The file is damaged, or holds no odometry or no frame.
+    """
+    frames: list[RadarFrame] = []
+    samples: list[TumSample] = []
+    detections: list[Detection] = []
+    detector = make_detector(_FRONT_END)
+
+    def detect() -> None:
+        for found in detector.detect_many(frames, [0.0] * len(frames)):
+            detections.extend(each for each in found if not each.saturated)
+        frames.clear()
+        check()
+
+    n_frames = 0
+    for record in session.records():
+        if isinstance(record, RadarFrame):
+            n_frames += 1
+            frames.append(record)
+            if len(frames) == _FRAMES_AT_ONCE:
+                detect()
+        elif isinstance(record, TumSample):
+            samples.append(record)
+    detect()
+    if not n_frames:
+        raise AppError(f"{session.path}: holds no radar frame; record a longer drive")
+    if len(samples) < 2:
+        raise AppError(f"{session.path}: holds no odometry to speak of; record a longer drive")
+    return drive_from(session.rig, OdometryTrack(samples), detections)
+
+
+def drive_from(rig: Rig, odometry: OdometryTrack, detections: Iterable[Detection]) -> Drive:
+    """Put odometry and detections of a run together."""
+    samples = odometry.samples
+    return make_drive(
+        rig,
+        np.array([sample.t_ns for sample in samples], dtype=np.int64),
+        np.array([(sample.x_m, sample.y_m, sample.heading_rad) for sample in samples]),
+        RangeSet.of(list(detections)),
+    )
+
+
+def report_of(drive: Drive, known_m: Array | None) -> CalibrationReport:
+    """Calibrate, and find out what the drive does not tell."""
+    with threadpool_limits(limits=1):
+        calibration = calibrate(drive, known_m=known_m)
+        names = [mount.name for mount in drive.rig.mounts]
+        return CalibrationReport(
+            drive=drive,
+            calibration=calibration,
+            gains=estimate_gains(drive, calibration),
+            weak=weak_directions(calibration, names),
+            poor=poor_drive(drive, calibration)
+            + unseen_reflectors(calibration, 0 if known_m is None else len(known_m)),
+        )
+
+
+def read_reflectors(name: str) -> Array:
+    """Return known reflectors, shape (k, 2) [m], from a TOML file or a scene.
+
+    The file holds `[[reflectors]]` tables with x_m and y_m, in a frame in which the robot starts
+    at the origin and looks along x, to about 10 cm and 6 degrees.
+    """
+    path = Path(name)
+    table: dict[str, Any] = {}
+    if path.suffix == ".toml" and path.is_file():
+        try:
+            table = tomllib.loads(read_bounded(path).decode())
+        except OSError as error:
+            raise AppError(f"{path}: cannot be read: {error.strerror}") from None
+        except ValueError as error:
+            raise AppError(f"{path}: not valid TOML: {error}") from None
+    if "reflectors" not in table:
+        return np.array([(t.x_m, t.y_m) for t in _scene(name).targets]).reshape(-1, 2)
+    places = []
+    rows = table["reflectors"] if isinstance(table["reflectors"], list) else [None]
+    for index, row in enumerate(rows):
+        is_place = isinstance(row, dict) and set(row) <= {"name", "x_m", "y_m"}
+        values = [row.get(key) for key in ("x_m", "y_m")] if is_place else [None]
+        if not all(_is_number(value) for value in values):
+            raise AppError(
+                f"{path}: reflectors[{index}]: must be a table with x_m and y_m, numbers [m] "
+                "(and a name, if you like)"
+            )
+        places.append(values)
+    return np.array(places, dtype=np.float64).reshape(-1, 2)
+
+
+def _is_number(value: object) -> bool:
+    """Tell a finite number from anything else that TOML holds, true and false included."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return math.isfinite(value)
+
+
+def rig_file(info: SessionInfo, report: CalibrationReport) -> RigFile:
+    """Return the calibrated rig as a file; what the drive did not tell stays nominal."""
+    told = report.calibration.offset_sigmas_m <= OFFSET_LIMIT_M
+    radars = []
+    for index, radar in enumerate(info.radars):
+        shift = report.calibration.mount_shifts_m[index] if told[index] else np.zeros(2)
+        heard = report.gains.gain_sigmas_db[index] <= _GAIN_LIMIT_DB
+        radars.append(
+            RigRadar(
+                name=radar.name,
+                serial=radar.serial,
+                x_m=radar.x_m + float(shift[0]),
+                y_m=radar.y_m + float(shift[1]),
+                yaw_deg=math.degrees(radar.yaw_rad),
+                range_offset_m=float(report.calibration.offsets_m[index])
+                if told[index]
+                else radar.range_offset_m,
+                phase_offset_deg=math.degrees(radar.phase_offset_rad),
+                gain_db=float(report.gains.gains_db[index]) if heard else 0.0,
+            )
+        )
+    return RigFile(radars=tuple(radars))
+
+
+def _check_rig_place(rig: Path, session: Path) -> None:
+    """Refuse a rig file that cannot be written, or that would replace the session."""
+    if rig.exists() and rig.samefile(session):
+        raise UsageError(f"--rig: {rig} is the session itself; name another file")
+    if rig.is_dir():
+        raise UsageError(f"--rig: {rig} is a folder; name a file")
+    if not rig.parent.is_dir():
+        raise UsageError(f"--rig: there is no folder {rig.parent} to write into")
+
+
+def _scene(name: str) -> Scene:
+    try:
+        return load_scene(name)
+    except SceneError as error:
+        raise UsageError(str(error)) from None
+
+
+def _planted(rig: Rig, scene: Scene | None) -> Mapping[str, tuple[float, float]]:
+    """Return planted offset [m] and gain less the mean [dB] of each radar of the rig."""
+    if scene is None:
+        return {}
+    specs = {radar.name: radar for radar in scene.radars}
+    unknown = [mount.name for mount in rig.mounts if mount.name not in specs]
+    if unknown:
+        raise UsageError(f"--truth: scene {scene.name} has no radar {unknown[0]}")
+    mean_db = float(np.mean([specs[mount.name].gain_db for mount in rig.mounts]))
+    return {
+        mount.name: (specs[mount.name].range_offset_m, specs[mount.name].gain_db - mean_db)
+        for mount in rig.mounts
+    }
+
+
+def _facts(report: CalibrationReport, planted: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
+    calibration, gains = report.calibration, report.gains
+    radars = []
+    for index, mount in enumerate(report.drive.rig.mounts):
+        row = {
+            "name": mount.name,
+            "range_offset_m": float(calibration.offsets_m[index]),
+            "range_offset_sigma_m": float(calibration.offset_sigmas_m[index]),
+            "mount_shift_m": calibration.mount_shifts_m[index].tolist(),
+            "mount_sigma_m": calibration.mount_sigmas_m[index].tolist(),
+            "gain_db": float(gains.gains_db[index]),
+            "gain_sigma_db": float(gains.gain_sigmas_db[index]),
+            "yaw_shift_deg": math.degrees(gains.yaws_rad[index]),
+            "yaw_sigma_deg": math.degrees(gains.yaw_sigmas_rad[index]),
+            "told": bool(calibration.offset_sigmas_m[index] <= OFFSET_LIMIT_M),
+        }
+        if mount.name in planted:
+            offset_m, gain_db = planted[mount.name]
+            row |= {"planted_offset_m": offset_m, "planted_gain_db": gain_db}
+        radars.append(row)
+    return {
+        "radars": radars,
+        "landmarks": len(calibration.landmarks_m),
+        "ranges": len(report.drive.ranges),
+        "ranges_used": _used(report),
+        "residual_rms_m": None if math.isnan(calibration.sigma_m) else calibration.sigma_m,
+        "limit_m": OFFSET_LIMIT_M,
+        "weak_directions": [
+            {
+                "sigma_m": weak.sigma_m,
+                "direction": weak.direction.tolist(),
+                "words": weak.words,
+                "remedy": weak.remedy,
+            }
+            for weak in report.weak
+        ],
+        "poor_drive": list(report.poor),
+    }
+
+
+def _used(report: CalibrationReport) -> int:
+    return int(np.count_nonzero(report.calibration.landmark != UNASSIGNED))
+
+
+def _lines(report: CalibrationReport, scene: Scene | None) -> Iterable[str]:
+    calibration, gains = report.calibration, report.gains
+    planted = _planted(report.drive.rig, scene)
+    fit = "" if math.isnan(calibration.sigma_m) else f", to {1e3 * calibration.sigma_m:.2f} mm rms"
+    yield (
+        f"{_used(report)} of {len(report.drive.ranges)} ranges fit to "
+        f"{len(calibration.landmarks_m)} reflectors{fit}; beside each value its standard deviation"
+    )
+    head = f"{'radar':<14}{'offset mm':>16}{'mount moved x, y mm':>26}{'gain dB':>16}"
+    head += f"{'turned deg':>16}"
+    yield head + (f"{'planted mm':>12}{'error mm':>10}" if planted else "")
+    for index, mount in enumerate(report.drive.rig.mounts):
+        offset, sigma = 1e3 * calibration.offsets_m[index], 1e3 * calibration.offset_sigmas_m[index]
+        (dx, dy), (sx, sy) = (
+            1e3 * calibration.mount_shifts_m[index],
+            1e3 * calibration.mount_sigmas_m[index],
+        )
+        mark = "?" if sigma > 1e3 * OFFSET_LIMIT_M else " "
+        line = f"{mount.name:<14}{f'{offset:+.2f} +- {sigma:.2f}{mark}':>16}"
+        line += f"{f'{dx:+.1f} +- {sx:.1f}, {dy:+.1f} +- {sy:.1f}':>26}"
+        line += f"{_told(gains.gains_db[index], gains.gain_sigmas_db[index], _GAIN_LIMIT_DB):>16}"
+        yaw, spread = gains.yaws_rad[index], gains.yaw_sigmas_rad[index]
+        line += (
+            f"{_told(math.degrees(yaw), math.degrees(spread), math.degrees(_YAW_LIMIT_RAD)):>16}"
+        )
+        if planted:
+            truth_mm = 1e3 * planted[mount.name][0]
+            line += f"{truth_mm:+12.2f}{offset - truth_mm:+10.2f}"
+        yield line
+    yield "offset: added to every range; moved, turned: off the nominal rig, the turn as amplitudes"
+    yield "show it; gain: over the mean of all radars"
+    marked = bool(np.any(calibration.offset_sigmas_m > OFFSET_LIMIT_M))
+    if marked:
+        yield (
+            f"? not told to {1e3 * OFFSET_LIMIT_M:g} mm (one standard deviation): a rig file keeps "
+            "the nominal offset and mount"
+        )
+    yield from report.poor
+    if marked:
+        yield from dict.fromkeys(weak.words for weak in report.weak)
+        for remedy in dict.fromkeys(weak.remedy for weak in report.weak):
+            yield f"remedy: {remedy}"
+
+
+def _told(value: float, sigma: float, limit: float) -> str:
+    """Write a value with its deviation, or that the drive does not tell it."""
+    return f"{value:+.2f} +- {sigma:.2f}" if sigma <= limit else "not seen"

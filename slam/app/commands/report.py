@@ -1,0 +1,586 @@
+"""`uwb-slam report`: a recorded session as one HTML page that any browser opens."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from html import escape
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from slam.app.commands.view import refuse_overwriting, session_file
+from slam.app.errors import AppError, StopFlag, naming
+from slam.app.odometry.tum import NS_PER_S
+from slam.app.records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
+from slam.app.run.evaluation import (
+    POSE_DOF,
+    Summary,
+    band_95,
+    nis_dof,
+    pose_nees,
+    position_errors_m,
+    summarise,
+    world_from_odom,
+)
+from slam.app.run.output import Progress, run_rows, summary_rows
+from slam.app.run.pictures import ESTIMATE, LANDMARK, ODOMETRY, PALE_INK, label
+from slam.app.run.replay import LostFrames, replay_session, settings_of
+from slam.app.run.results import has_truth
+from slam.app.run.runner import LinkChange, LinkLanes, LinkState, RunRecord
+from slam.app.session.reader import RecordedSession, open_session
+from slam.geometry import transform
+
+_KEPT_WARNINGS = 200
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ReportSeries:
+    """Numbers over the states of a run, each of shape (n_states,); NaN where there is none.
+
+    Attributes
+    ----------
+    t_s
+        Time since the first scan [s].
+    slam_error_m, odometry_error_m
+        Distance of the position to the truth, from the start pose, not aligned.
+    nis_per_dof, nis_dof
+        Of the gated associations together.
+    nees_per_dof
+        Of the pose, over 3.
+    n_landmarks
+        Landmarks of the map.
+    """
+
+    t_s: NDArray[np.float64]
+    slam_error_m: NDArray[np.float64]
+    odometry_error_m: NDArray[np.float64]
+    nis_per_dof: NDArray[np.float64]
+    nis_dof: NDArray[np.float64]
+    nees_per_dof: NDArray[np.float64]
+    n_landmarks: NDArray[np.float64]
+
+
+class ReportData(SessionObserver):
+    """Observes a run, and keeps what its report shows.
+
+    Attributes
+    ----------
+    lanes, changes
+        The links, and every change of their states with its time since the first scan [s].
+    warnings, n_warnings
+        The first warnings of the log, and how many there were.
+    start_ns, end_ns
+        Session time of first and last scan; None and 0 before any.
+    """
+
+    def __init__(self, info: SessionInfo) -> None:
+        self.lanes = LinkLanes(info.radars)
+        self.changes: list[tuple[float, LinkChange]] = []
+        self.warnings: list[LogLine] = []
+        self.n_warnings = 0
+        self.start_ns: int | None = None
+        self.end_ns = 0
+        self._rows: list[tuple[float, ...]] = []
+        self._odom: NDArray[np.float64] | None = None
+
+    @property
+    def duration_s(self) -> float:
+        """Time between first and last scan [s]."""
+        return 0.0 if self.start_ns is None else (self.end_ns - self.start_ns) / NS_PER_S
+
+    def seconds(self, t_ns: int) -> float:
+        """Return a session time as time since the first scan; what was before it counts as 0."""
+        return 0.0 if self.start_ns is None else max(t_ns - self.start_ns, 0) / NS_PER_S
+
+    def on_scan(self, scan: Scan) -> None:
+        """Follow the links."""
+        if self.start_ns is None:
+            self.start_ns = scan.t_ns
+        self.end_ns = scan.t_ns
+        self._note(self.lanes.on_scan(scan))
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        """Keep the numbers of a state."""
+        if self._odom is None:
+            self._odom = world_from_odom(snapshot)
+        nis = float(np.mean(snapshot.nis_per_dof)) if snapshot.nis_per_dof else math.nan
+        self._rows.append(
+            (
+                self.seconds(snapshot.t_ns),
+                *position_errors_m(snapshot, self._odom),
+                nis,
+                float(nis_dof(snapshot) or math.nan),
+                pose_nees(snapshot) / POSE_DOF,
+                float(len(snapshot.landmark_ids)),
+            )
+        )
+
+    def on_log(self, line: LogLine) -> None:
+        """Follow the links, keep warnings."""
+        self._note(self.lanes.on_log(line))
+        if line.warning:
+            self.n_warnings += 1
+            if len(self.warnings) < _KEPT_WARNINGS:
+                self.warnings.append(line)
+
+    def close(self) -> None:
+        """End the lanes."""
+        self._note(self.lanes.end(self.end_ns))
+
+    def series(self) -> ReportSeries:
+        """Return the numbers over time."""
+        table = np.array(self._rows, dtype=np.float64).reshape(-1, 7)
+        return ReportSeries(
+            t_s=table[:, 0],
+            slam_error_m=table[:, 1],
+            odometry_error_m=table[:, 2],
+            nis_per_dof=table[:, 3],
+            nis_dof=table[:, 4],
+            nees_per_dof=table[:, 5],
+            n_landmarks=table[:, 6],
+        )
+
+    def _note(self, changes: Iterable[LinkChange]) -> None:
+        self.changes += [(self.seconds(change.t_ns), change) for change in changes]
+
+
+_STYLE = """\
+:root { color-scheme: light; }
+body { font: 15px/1.5 system-ui, "DejaVu Sans", sans-serif; color: #20242a; background: #fff;
+       max-width: 62rem; margin: 2rem auto; padding: 0 1.2rem; }
+h1 { font-size: 1.6rem; margin: 0 0 .2rem; }
+h2 { font-size: 1.15rem; margin: 2.2rem 0 .6rem; border-bottom: 1px solid #dfe3e8; }
+p.note { color: #6a707a; margin: .3rem 0 .8rem; }
+p.origin { display: inline-block; padding: .1rem .6rem; border-radius: .6rem; margin: .3rem 0;
+           background: #fff3d6; color: #6b4b00; font-weight: 600; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+div.wide { overflow-x: auto; }
+th, td { text-align: left; padding: .25rem .9rem .25rem 0; vertical-align: top; }
+th { color: #6a707a; font-weight: 500; border-bottom: 1px solid #dfe3e8; }
+td.value { font-weight: 600; }
+div.wide td, div.wide th, td.value { white-space: nowrap; }
+img { max-width: 100%; height: auto; display: block; margin: .6rem 0; }
+pre { background: #f6f7f9; padding: .8rem; overflow-x: auto; font-size: .82rem; line-height: 1.35; }
+details { margin: .5rem 0; }
+summary { cursor: pointer; }
+"""
+
+
+@dataclass(slots=True)
+class Page:
+    """Collects the parts of a page, in order.
+
+    Parameters
+    ----------
+    title
+        Of window and page.
+    """
+
+    title: str
+    _parts: list[str] = field(default_factory=list)
+
+    def heading(self, text: str) -> None:
+        """Begin a section."""
+        self._parts.append(f"<h2>{escape(text)}</h2>")
+
+    def note(self, text: str) -> None:
+        """Add a sentence that explains."""
+        self._parts.append(f'<p class="note">{escape(text)}</p>')
+
+    def origin(self, text: str) -> None:
+        """Say where all data come from, so that nobody misses it."""
+        self._parts.append(f'<p class="origin">{escape(text)}</p>')
+
+    def picture(self, svg: str, alt: str) -> None:
+        """Add a picture, as part of the page."""
+        data = base64.b64encode(svg.encode()).decode()
+        self._parts.append(
+            f'<img alt="{escape(alt, quote=True)}" src="data:image/svg+xml;base64,{data}">'
+        )
+
+    def numbers(self, rows: Sequence[tuple[str, str, str]]) -> None:
+        """Add rows of name, value and note."""
+        lines = [
+            f'<tr><td>{escape(name)}</td><td class="value">{escape(value)}</td>'
+            f"<td>{escape(note)}</td></tr>"
+            for name, value, note in rows
+        ]
+        self._parts.append(f"<table>{''.join(lines)}</table>")
+
+    def table(self, names: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+        """Add a table with a line of column names."""
+        head = "".join(f"<th>{escape(name)}</th>" for name in names)
+        lines = [f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows]
+        self._parts.append(
+            f'<div class="wide"><table><tr>{head}</tr>{"".join(lines)}</table></div>'
+        )
+
+    def details(self, summary: str, text: str) -> None:
+        """Add text that is shown on demand."""
+        self._parts.append(
+            f"<details><summary>{escape(summary)}</summary><pre>{escape(text)}</pre></details>"
+        )
+
+    def settings(self, summary: str, values: Mapping[str, object]) -> None:
+        """Add settings, a line each, shown on demand; those inside others with a dotted name."""
+        self.details(summary, "\n".join(f"{key} = {value}" for key, value in _flat("", values)))
+
+    def text(self) -> str:
+        """Return the page."""
+        title = escape(self.title)
+        return (
+            '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+            '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+            f"<title>{title}</title>\n<style>\n{_STYLE}</style>\n</head>\n<body>\n"
+            f"<h1>{title}</h1>\n" + "\n".join(self._parts) + "\n</body>\n</html>\n"
+        )
+
+
+def _flat(prefix: str, values: Mapping[str, object]) -> list[tuple[str, object]]:
+    rows: list[tuple[str, object]] = []
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            rows += _flat(f"{prefix}{key}.", value)
+        else:
+            rows.append((f"{prefix}{key}", value))
+    return rows
+
+
+_BAND = "#dfe3e8"
+_STATE_COLOURS = {
+    LinkState.SETTING_UP: "#8a9bb8",
+    LinkState.STREAMING: "#3d9a5f",
+    LinkState.FRAMES_LOST: "#e0a030",
+    LinkState.SILENT: "#8c5a2b",
+    LinkState.FAULT: "#d03a3a",
+}
+_LANE = 0.7
+"""Height of a lane; 1 is the distance of two."""
+_TIME = "time since the first scan [s]"
+
+
+def draw_errors(figure: Figure, series: ReportSeries) -> None:
+    """Draw the position errors in mm, where the truth is known, and the number of landmarks."""
+    has_truth = bool(np.isfinite(series.slam_error_m).any())
+    panels = figure.subplots(2 if has_truth else 1, 1, sharex=True, squeeze=False).ravel()
+    if has_truth:
+        axes = panels[0]
+        axes.plot(series.t_s, 1e3 * series.odometry_error_m, color=ODOMETRY, label="wheel odometry")
+        axes.plot(series.t_s, 1e3 * series.slam_error_m, color=ESTIMATE, label="radar SLAM")
+        label(axes, "Position error, from the start pose, not aligned", "", "[mm]")
+        axes.set_ylim(bottom=0.0)
+        axes.legend(frameon=False, loc="upper left")
+    panels[-1].step(series.t_s, series.n_landmarks, color=LANDMARK, where="post")
+    label(panels[-1], "Landmarks on the map", _TIME, "")
+    panels[-1].set_ylim(bottom=0.0)
+    panels[-1].yaxis.set_major_locator(MaxNLocator(integer=True))
+
+
+def draw_consistency(figure: Figure, series: ReportSeries) -> None:
+    """Draw NIS and NEES over their degrees of freedom, with the 95 % band of each state."""
+    has_truth = bool(np.isfinite(series.nees_per_dof).any())
+    panels = figure.subplots(2 if has_truth else 1, 1, sharex=True, squeeze=False).ravel()
+    told = np.isfinite(series.nis_dof)
+    bands = np.array([band_95(int(dof)) for dof in series.nis_dof[told]]).reshape(-1, 2)
+    bands /= np.maximum(series.nis_dof[told], 1.0)[:, None]
+    _draw_band(panels[0], series.t_s[told], bands)
+    panels[0].plot(
+        series.t_s, series.nis_per_dof, linestyle="none", marker=".", markersize=2, color=ESTIMATE
+    )
+    label(panels[0], "NIS of associations inside the gate / dof, 95 % band", "", "")
+    _scale(panels[0], series.nis_per_dof)
+    if has_truth:
+        bound = np.array(band_95(POSE_DOF)) / POSE_DOF
+        _draw_band(panels[1], series.t_s, np.tile(bound, (len(series.t_s), 1)))
+        panels[1].plot(series.t_s, series.nees_per_dof, color=ESTIMATE, linewidth=1.0)
+        label(panels[1], "NEES of the pose in the start frame / 3, 95 % band", "", "")
+        _scale(panels[1], series.nees_per_dof)
+    panels[-1].set_xlabel(_TIME)
+
+
+def draw_links(
+    figure: Figure, names: Sequence[str], changes: Sequence[tuple[float, LinkChange]], end_s: float
+) -> None:
+    """Draw a lane per radar, coloured by the state of its link."""
+    axes = figure.add_subplot()
+    for row, name in enumerate(names):
+        own = [(at_s, change.state) for at_s, change in changes if change.radar == name]
+        ends = [*(at_s for at_s, _ in own[1:]), end_s]
+        for (start_s, state), stop_s in zip(own, ends, strict=True):
+            if state in _STATE_COLOURS:
+                # The shortest state, one lost frame, must stay visible.
+                width_s = max(stop_s - start_s, 0.002 * end_s)
+                place, height = [(start_s, width_s)], (row - _LANE / 2, _LANE)
+                axes.broken_barh(place, height, facecolors=_STATE_COLOURS[state])
+    axes.set_yticks(range(len(names)), names)
+    axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.set_xlim(0.0, max(end_s, 1e-3))
+    label(axes, "State of each link", _TIME, "")
+    axes.grid(visible=False)
+    shown = {change.state for _, change in changes}
+    for state, colour in _STATE_COLOURS.items():
+        if state in shown:
+            axes.plot([], [], linewidth=6, color=colour, label=str(state))
+    figure.legend(loc="outside right upper", frameon=False, handlelength=1.0)
+
+
+def _draw_band(axes: Axes, t_s: NDArray[np.float64], bounds: NDArray[np.float64]) -> None:
+    axes.fill_between(t_s, bounds[:, 0], bounds[:, 1], color=_BAND, linewidth=0.0)
+    axes.axhline(1.0, color=PALE_INK, linewidth=0.6)
+
+
+def _scale(axes: Axes, values: NDArray[np.float64]) -> None:
+    """Show what is usual; single values far above would flatten everything else."""
+    known = values[np.isfinite(values)]
+    if len(known):
+        axes.set_ylim(0.0, max(4.0, 1.2 * float(np.percentile(known, 99))))
+
+
+REPORT_NAME = "report.html"
+
+_MATCH_M = 0.15
+"""As far as a landmark may be from the truth that it is of; the metrics' own limit."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReportOptions:
+    """What the command line of `uwb-slam report` says; `out` is beside the session where None."""
+
+    session: Path
+    out: Path | None = None
+
+
+def run_report(options: ReportOptions, stop: StopFlag) -> None:
+    """Replay a session and write its report.
+
+    Raises
+    ------
+    AppError
+        The session cannot be replayed, or the page not be written.
+    StopRequestedError
+        A signal arrived; nothing was written.
+    """
+    session = open_session(session_file(options.session))
+    out = options.out or session.path.with_name(REPORT_NAME)
+    refuse_overwriting(session.path, out)
+    text = report_text(session, stop)
+    with naming(out):
+        out.write_text(text, encoding="utf-8")
+    sys.stdout.write(f"{out}\n")
+
+
+def report_text(session: RecordedSession, stop: StopFlag) -> str:
+    """Return the report of a session; the same session gives the same text.
+
+    Raises
+    ------
+    AppError
+        The session cannot be replayed, or no state was estimated in it.
+    """
+    config = settings_of(session)
+    data = ReportData(session.info)
+    losses = LostFrames(session.info.radars)
+    with ExitStack() as stack:
+        stack.callback(data.close)
+        progress = Progress(session.info, None, lambda: losses.count)
+        stack.callback(progress.close)
+        record = replay_session(session, [data, losses, progress], stop.check)
+    if not record.results:
+        raise AppError(f"{session.path}: no state was estimated, the robot did not move")
+    info = session.info
+    summary = None
+    if has_truth(record):
+        summary = summarise(
+            record,
+            scene=info.scene,
+            preset=info.preset,
+            seed=info.seed,
+            rig=session.rig,
+            true_landmarks_m=info.true_landmarks_m,
+        )
+    page = Page(f"{info.scene}, preset {info.preset}" + _seed_text(info))
+    page.origin("simulated data" if info.simulated else "measured data")
+    page.note(_what_it_is(session, data))
+    lag_states = config.window.size - 1
+    _write_numbers(page, info, record, summary, lost_frames=losses.count, lag_states=lag_states)
+    _write_figures(page, info, record, summary, data)
+    _write_landmarks(page, info, record)
+    _write_links(page, info, data)
+    _write_parameters(page, info)
+    return page.text()
+
+
+def _write_numbers(
+    page: Page,
+    info: SessionInfo,
+    record: RunRecord,
+    summary: Summary | None,
+    *,
+    lost_frames: int,
+    lag_states: int,
+) -> None:
+    page.heading("Numbers")
+    driven = run_rows(info, record, lost_frames)
+    if summary is None:
+        page.note("Nothing true is known of this drive, so no error can be told.")
+        page.numbers(driven)
+        return
+    rows = summary_rows(
+        summary, lag_states=lag_states, wall_s=record.wall_s, lost_frames=lost_frames
+    )
+    judged = [row for row in rows if row[0] != "speed"]  # the replay's, not the run's
+    times = [row for row in driven if row[0] in {"time", "driven"}]
+    nis = "-" if summary.nis_mean is None else f"{summary.nis_mean:.2f}"
+    page.numbers(
+        [*times, *judged, ("NIS, mean", nis, "of true associations over their dof; honest is 1")]
+    )
+
+
+def _write_figures(
+    page: Page, info: SessionInfo, record: RunRecord, summary: Summary | None, data: ReportData
+) -> None:
+    # Half a second of matplotlib, and only after a replay that may fail.
+    from slam.app.run.pictures import map_figure, svg_of
+
+    series = data.series()
+    page.heading("Map and trajectory")
+    page.picture(
+        svg_of(
+            lambda figure: map_figure(figure, info, record, summary, info.outlines_m),
+            width_in=9.5,
+            height_in=6.6,
+        ),
+        "map with paths and landmarks",
+    )
+    page.heading("Errors over time" if has_truth(record) else "Over time")
+    page.picture(
+        svg_of(lambda figure: draw_errors(figure, series), width_in=9.5, height_in=4.4),
+        "position errors and number of landmarks over time",
+    )
+    page.heading("Consistency")
+    page.note(
+        "How far estimates are off by their own measure. An honest filter stays inside the grey "
+        "band 95 % of the time; of one run, states are not independent."
+    )
+    page.picture(
+        svg_of(lambda figure: draw_consistency(figure, series), width_in=9.5, height_in=4.4),
+        "NIS and NEES over time with their bands",
+    )
+
+
+def _write_landmarks(page: Page, info: SessionInfo, record: RunRecord) -> None:
+    belief = record.results[-1].belief
+    page.heading("Landmarks")
+    if not belief.landmark_ids:
+        page.note("None was found.")
+        return
+    points = transform(record.world_from_map, belief.landmarks)
+    rows = []
+    for row, (number, point) in enumerate(zip(belief.landmark_ids, points, strict=True)):
+        variances = np.linalg.eigvalsh(belief.landmark_covariance(row))
+        sigma_m = math.sqrt(max(float(variances[-1]), 0.0))
+        cells = [str(number), f"{point[0]:.4f}", f"{point[1]:.4f}", f"{1e3 * sigma_m:.1f}"]
+        if len(info.true_landmarks_m):
+            off_m = float(np.linalg.norm(info.true_landmarks_m - point, axis=1).min())
+            cells.append(f"{1e3 * off_m:.1f}" if off_m <= _MATCH_M else "none within 150")
+        rows.append(cells)
+    frame = "world" if len(info.true_landmarks_m) else "map"
+    names = ["id", f"x [m, {frame}]", f"y [m, {frame}]", "largest sigma [mm]"]
+    if len(info.true_landmarks_m):
+        names.append("to nearest truth [mm]")
+    page.table(names, rows)
+
+
+def _write_links(page: Page, info: SessionInfo, data: ReportData) -> None:
+    from slam.app.run.pictures import svg_of
+
+    page.heading("Links")
+    rows = []
+    for radar in info.radars:
+        count = data.lanes.counts[radar.name]
+        share = count.lost / max(count.frames + count.lost, 1)
+        rows.append(
+            [
+                radar.name,
+                radar.serial,
+                radar.port,
+                f"{radar.rate_hz:.4f}",
+                str(count.frames),
+                f"{count.lost} ({100.0 * share:.2f} %)",
+                str(count.longest_gap),
+                str(count.faults),
+            ]
+        )
+    page.table(
+        ["radar", "serial", "port", "frames/s", "frames", "lost", "most in a row", "faults"], rows
+    )
+    names = [radar.name for radar in info.radars]
+    page.picture(
+        svg_of(
+            lambda figure: draw_links(figure, names, data.changes, data.duration_s),
+            width_in=9.5,
+            height_in=0.9 + 0.35 * len(names),
+        ),
+        "state of each link over time",
+    )
+    if data.warnings:
+        lines = [
+            f"{data.seconds(line.t_ns):10.3f} s  {line.radar:<14} {line.text}"
+            for line in data.warnings
+        ]
+        more = data.n_warnings - len(lines)
+        if more:
+            lines.append(f"... and {more} more in the session's log")
+        page.details(f"Warnings: {data.n_warnings}", "\n".join(lines))
+
+
+def _write_parameters(page: Page, info: SessionInfo) -> None:
+    page.heading("Parameters")
+    page.table(
+        ["radar", "x [m]", "y [m]", "boresight [deg]", "range offset [mm]", "from [m]", "bins"],
+        [
+            [
+                radar.name,
+                f"{radar.x_m:.4f}",
+                f"{radar.y_m:.4f}",
+                f"{math.degrees(radar.yaw_rad):.2f}",
+                f"{1e3 * radar.range_offset_m:.1f}",
+                f"{radar.range_start_m:.4f}",
+                str(radar.n_bins),
+            ]
+            for radar in info.radars
+        ],
+    )
+    page.note("Mounts in the robot's frame: x forward, y left. First bin in module metres.")
+    page.settings("SLAM", json.loads(info.config_json or "{}"))
+    page.settings("Wheels, as SLAM was told", info.wheels)
+    page.settings("Radars", {radar.name: asdict(radar) for radar in info.radars})
+    page.settings("Versions of the run", info.versions)
+
+
+def _what_it_is(session: RecordedSession, data: ReportData) -> str:
+    info = session.info
+    words = [f"{session.path.name}: {data.duration_s:.1f} s of {len(info.radars)} radars"]
+    if info.started_unix_ns is not None:
+        began = datetime.fromtimestamp(info.started_unix_ns / NS_PER_S, UTC)
+        words.append(f"begun {began:%Y-%m-%d %H:%M:%S} UTC")
+    if "xethru-hil" in info.versions:
+        words.append(f"xethru-hil {info.versions['xethru-hil']}")
+    if session.cut_at_byte is not None:
+        words.append(f"cut at byte {session.cut_at_byte}: this is what is left of it")
+    return "; ".join(words) + "."
+
+
+def _seed_text(info: SessionInfo) -> str:
+    return "" if info.seed is None else f", seed {info.seed}"

@@ -1,0 +1,299 @@
+"""`uwb-slam view`: a recorded session in Rerun, in a window, a browser, a file or a picture.
+
+Rerun calls the way to steer a viewer experimental: it is used in this file only.
+
+A session is replayed into the view, so it shows what the run itself would have shown, whatever
+version of Rerun the run had. An .rrd is opened as it is.
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+from PIL import Image
+
+from slam.app.errors import AppError, StopFlag, UsageError, naming
+from slam.app.records import SessionObserver
+from slam.app.run.output import Progress
+from slam.app.run.replay import LostFrames, replay_session, settings_of
+from slam.app.session.mcap import MAGIC
+from slam.app.session.reader import RecordedSession, open_session
+from slam.app.view import SERVE_WEB, SPAWN
+from slam.app.view.rerun_recording import DEVICE_TIME
+from slam.app.view.rerun_sdk import ViewerClient
+from slam.app.view.viewer import LiveView, ViewerKind, ViewerProcess
+
+_MAGIC = b"RRF"
+_END = b"FOOT"
+"""Ends a finished file, with four bytes behind it."""
+_OLDEST = (0, 23)
+"""Of files that later versions open."""
+
+
+def require_readable(path: Path) -> None:
+    """See that the installed Rerun opens a recording.
+
+    Raises
+    ------
+    AppError
+        It is no recording, one of a version that is too new or too old, or one that was never
+        closed; names the remedy.
+    """
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(8)
+    except OSError as error:
+        raise AppError(f"{path}: cannot be read: {error.strerror or error}") from None
+    if len(head) < 8 or not head.startswith(_MAGIC):
+        raise AppError(f"{path}: is no Rerun recording")
+    written = (head[4], head[5])
+    major, minor, *_ = version("rerun-sdk").split(".")
+    ours = (int(major), int(minor))
+    if not _OLDEST <= written <= ours:
+        kind = "newer" if written > ours else "older"
+        raise AppError(
+            f"{path}: written by Rerun {written[0]}.{written[1]}, {kind} than the {major}.{minor} "
+            "here can open; make it again from its session: "
+            f"uwb-slam view session.mcap --out {path.name}"
+        )
+    if not is_finished(path):  # the viewer refuses it in many words, and only in its window
+        raise AppError(
+            f"{path}: was never closed, its program was killed; make it again from its session: "
+            f"uwb-slam view session.mcap --out {path.name}; or: rerun rrd merge {path.name} -o NEW"
+        )
+
+
+def is_finished(path: Path) -> bool:
+    """Return whether a recording was closed; of a killed program's the last rows are missing."""
+    with path.open("rb") as stream:
+        stream.seek(max(path.stat().st_size - len(_END) - 4, 0))
+        return stream.read().startswith(_END)
+
+
+_SETTLE_LIMIT_S = 30.0
+_PERIOD_S = 0.5
+_PALETTE = 256
+_MENU_PIXELS = 36
+"""The viewer's own bar on top, which says what machine drew it."""
+
+
+def take_screenshot(rrd: Path, out: Path, *, at_s: float | None, check: Callable[[], None]) -> None:
+    """Open a recording in a viewer that draws in memory, and write what it shows as PNG.
+
+    Parameters
+    ----------
+    rrd
+        The recording, with its blueprint.
+    out
+        The picture.
+    at_s
+        Where the cursor of `device_time` stands; None for the end.
+    check
+        Called again and again; may raise to stop.
+
+    Raises
+    ------
+    AppError
+        There is no graphics driver, the recording is no view of a session, the viewer does not
+        come to rest, or the picture cannot be written.
+    """
+    with ViewerProcess(ViewerKind.HEADLESS) as process:
+        process.wait_until_ready(check)
+        try:
+            picture = _settled(process, rrd, at_s, check)
+        except (ConnectionError, RuntimeError, TimeoutError) as error:
+            said = str(error).strip() or type(error).__name__
+            raise AppError(f"{rrd}: the viewer gave no picture: {said.splitlines()[0]}") from None
+    with Image.open(io.BytesIO(picture)) as full:
+        shown = full.convert("RGB").crop((0, _MENU_PIXELS, full.width, full.height))
+        # An octree keeps colours that few points have, like landmarks; a median cut does not.
+        few = shown.quantize(_PALETTE, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    with naming(out):
+        few.save(out, format="png", optimize=True)
+
+
+def _settled(
+    process: ViewerProcess, rrd: Path, at_s: float | None, check: Callable[[], None]
+) -> bytes:
+    """Return the picture once it shows the same twice: all data are there and drawn."""
+    client = ViewerClient.connect(process.url)
+    client.open(str(rrd.resolve()))
+    give_up = time.monotonic() + _SETTLE_LIMIT_S
+    while client.get_state().loading or not client.get_state().recordings:
+        _wait(check, give_up)
+    lines = {line.name: line for line in client.get_state().recordings[0].timelines}
+    if DEVICE_TIME not in lines:
+        raise AppError(f"{rrd}: has no timeline {DEVICE_TIME}, so it is no view of a session")
+    end_s = (lines[DEVICE_TIME].end or 0) / 1e9
+    client.set_time(
+        DEVICE_TIME, duration=end_s if at_s is None else min(at_s, end_s), play_state="paused"
+    )
+    before = b""
+    while (picture := client.take_screenshot()) != before:
+        before = picture
+        _wait(check, give_up)
+    return picture
+
+
+def _wait(check: Callable[[], None], give_up: float) -> None:
+    check()
+    if time.monotonic() > give_up:
+        raise TimeoutError(f"it was still busy after {_SETTLE_LIMIT_S:g} s")
+    time.sleep(_PERIOD_S)
+
+
+SESSION_NAME, VIEW_NAME = "session.mcap", "session.rrd"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewOptions:
+    """What the command line of `uwb-slam view` says; at most one of the ways to show is given."""
+
+    session: Path
+    web: bool = False
+    out: Path | None = None
+    screenshot: Path | None = None
+    at_s: float | None = None
+
+
+def run_view(options: ViewOptions, stop: StopFlag) -> None:
+    """Show a session.
+
+    Raises
+    ------
+    AppError
+        The session cannot be read, or there is nothing to show it with; one line with the remedy.
+    StopRequestedError
+        A signal arrived; also the way to end serving a browser.
+    """
+    if options.at_s is not None and options.screenshot is None:
+        raise UsageError("--at: says when a --screenshot is taken; name its file, too")
+    path = session_file(options.session, allow_view=options.out is None)
+    for written in (options.out, options.screenshot):
+        refuse_overwriting(path, written)
+    if path.suffix == ".rrd":
+        if options.out is not None:
+            raise UsageError(f"{path}: is an .rrd already; --out makes one of a session.mcap")
+        require_readable(path)
+        _show_file(path, options, stop)
+        return
+    session = open_session(path)
+    if options.out is not None:
+        write_view(session, options.out, stop)
+        sys.stdout.write(f"{options.out}\n")
+    elif options.screenshot is not None:
+        with tempfile.TemporaryDirectory(prefix="uwb-slam-view-") as folder:
+            made = Path(folder) / VIEW_NAME
+            write_view(session, made, stop)
+            _take_picture(made, options.screenshot, options, stop)
+    else:
+        _show_replay(session, options, stop)
+
+
+def session_file(given: Path, *, allow_view: bool = False) -> Path:
+    """Return the file that a user means by a file or by the folder of a run.
+
+    `allow_view` prefers the .rrd of a folder, which needs no replay, if its run lived to close it.
+
+    Raises
+    ------
+    AppError
+        There is none.
+    """
+    if not given.is_dir():
+        if not given.exists():
+            raise AppError(f"{given}: no such file")
+        return given
+    session, view = given / SESSION_NAME, given / VIEW_NAME
+    if allow_view and view.is_file() and (is_finished(view) or not session.is_file()):
+        return view
+    if session.is_file():
+        return session
+    names = f"{VIEW_NAME} nor {SESSION_NAME}" if allow_view else SESSION_NAME
+    raise AppError(f"{given}: holds no {names}; name a session.mcap")
+
+
+def refuse_overwriting(recorded: Path, out: Path | None) -> None:
+    """See that a result does not take the place of what it is made of, or of another recording.
+
+    Raises
+    ------
+    UsageError
+        It would.
+    """
+    if out is None or not out.is_file():
+        return
+    if out.samefile(recorded):
+        raise UsageError(f"{out}: is the session itself; write to another file")
+    with out.open("rb") as stream:
+        is_recording = stream.read(len(MAGIC)) == MAGIC
+    if is_recording:
+        raise UsageError(f"{out}: is a recording, which cannot be repeated; write to another file")
+
+
+def write_view(session: RecordedSession, path: Path, stop: StopFlag) -> None:
+    """Replay a session into an .rrd file.
+
+    Raises
+    ------
+    AppError
+        It cannot be replayed, or the file not be written.
+    """
+    from slam.app.view.panels import RerunView  # half a second, only where it is needed
+
+    settings_of(session)  # before a file that is there already is given up for this one
+    with naming(path):
+        path.open("wb").close()  # Rerun's own words on this would not name the remedy
+    with ExitStack() as stack:
+        view = RerunView(path, session.info)
+        stack.callback(view.close)
+        _replay(session, view, stop, stack)
+
+
+def _show_replay(session: RecordedSession, options: ViewOptions, stop: StopFlag) -> None:
+    with LiveView(SERVE_WEB if options.web else SPAWN, stop.check, is_replay=True) as live:
+        with ExitStack() as stack:
+            view = live.observer(session.info)
+            stack.callback(view.close)
+            _replay(session, view, stop, stack)
+        live.keep_serving()
+
+
+def _replay(
+    session: RecordedSession, view: SessionObserver, stop: StopFlag, stack: ExitStack
+) -> None:
+    losses = LostFrames(session.info.radars)
+    progress = Progress(session.info, None, lambda: losses.count)
+    stack.callback(progress.close)
+    replay_session(session, [view, losses, progress], stop.check)
+    if session.cut_at_byte is not None:
+        stack.callback(_say_cut, session)
+
+
+def _say_cut(session: RecordedSession) -> None:
+    sys.stderr.write(
+        f"uwb-slam: {session.path} was cut at byte {session.cut_at_byte}; "
+        "the view shows what is left of it\n"
+    )
+
+
+def _show_file(path: Path, options: ViewOptions, stop: StopFlag) -> None:
+    if options.screenshot is not None:
+        _take_picture(path, options.screenshot, options, stop)
+        return
+    with LiveView(SERVE_WEB if options.web else SPAWN, stop.check, path) as live:
+        live.keep_serving()
+
+
+def _take_picture(rrd: Path, out: Path, options: ViewOptions, stop: StopFlag) -> None:
+
+    take_screenshot(rrd, out, at_s=options.at_s, check=stop.check)
+    sys.stdout.write(f"{out}\n")

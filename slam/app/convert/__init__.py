@@ -1,0 +1,1 @@
+"""Sessions from and to the files of others: rosbags, MATLAB files, wire captures."""

@@ -1,0 +1,402 @@
+"""Detections of the paper's authors' MATLAB files as a session, and a session's as such a file.
+
+One row per collected state:
+
+======  ===============  ========================================================================
+odom    (n, 3)           pose by the wheels: x, y [mm], heading [rad]
+obsLHS  (n, m, 2)        fixes of the two left radars: distance [mm], bearing [rad], from the body's
+obsRHS  (n, m, 2)        origin and counter-clockwise from forward; of the right ones, unwrapped to
+                         pi and more; rows of zeros are empty
+R1..R4  (n, n_bins)      raw frames of the four radars; rows of zeros are none
+======  ===============  ========================================================================
+
+Two more variables, which their programs ignore and ours write::
+
+    t       (n, 1)   session time of the state [s]
+    mounts  (4, 3)   of the radars: x, y [mm], boresight [rad], body frame
+
+Their fixes are points; SLAM here takes ranges. A fix says exactly which two ranges it is made of,
+since it is where the circles around the two radars of its side meet, so these are what a session
+gets: each once, however many fixes share it. Paired again they give the same fixes, and ghosts that
+the authors' narrower field of view left out are for the settings of SLAM to judge.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.io import loadmat, savemat
+
+from slam.app.errors import AppError, OdometryError, naming
+from slam.app.odometry.track import OdometryTrack
+from slam.app.odometry.tum import NS_PER_S, TumSample
+from slam.app.records import RadarInfo, Scan
+from slam.app.rig.sources import TRUE_PER_MODULE_METRE
+from slam.app.session.log import SessionLog
+from slam.app.session.mcap import describe_kind
+from slam.app.session.messages import SlamSettings, imported_info, imported_radar
+from slam.app.session.reader import RecordedSession
+from slam.config import SlamConfig
+from slam.frames import RadarFrame
+from slam.front_end.paper import make_detector
+from slam.geometry import Mount, RadarPair, Rig
+from slam.paper.trilateration import Trilaterator
+
+_MM = 1e-3
+_POSE_UNITS = np.array([_MM, _MM, 1.0])
+_FEWEST_FIXES = 5  # that the authors' programs have room for
+_FRAME_NAMES = ("R1", "R2", "R3", "R4")
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MatDrive:
+    """What such a file holds.
+
+    Attributes
+    ----------
+    odometry
+        Shape (n, 3): x [m], y [m], heading [rad], odometry frame.
+    left, right
+        For each state the fixes of that side, shape (k, 2): x [m], y [m], body frame.
+    frames
+        Raw frames by the number of the radar, 1 to 4, shape (n, n_bins), float32; zeros: none.
+    stamps_s
+        Shape (n,), ascending; None where the file does not tell.
+    mounts
+        Shape (4, 3): x [m], y [m], boresight [rad], body frame; None where the file does not tell.
+    """
+
+    odometry: Array
+    left: tuple[Array, ...]
+    right: tuple[Array, ...]
+    frames: dict[int, NDArray[np.float32]]
+    stamps_s: Array | None = None
+    mounts: Array | None = None
+
+
+def read_mat(path: Path) -> MatDrive:
+    """Read a file.
+
+    Raises
+    ------
+    AppError
+        No such MATLAB file, or without the variables above; one line.
+    """
+    try:
+        with path.open("rb") as stream:
+            table = loadmat(stream)  # type: ignore[arg-type]  # takes files, the stubs know names
+    except NotImplementedError:
+        raise AppError(
+            f"{path}: a MATLAB file of version 7.3; in MATLAB, save it with '-v7'"
+        ) from None
+    except OSError as error:
+        raise AppError(f"{path}: cannot read: {error.strerror or error}") from None
+    except Exception as error:  # scipy does not say what it may raise of a damaged file
+        words = " ".join(str(error).split()) or type(error).__name__
+        raise AppError(
+            f"{path}: no MATLAB file, or a damaged one{describe_kind(path)}: {words}"
+        ) from None
+    odometry = _variable(path, table, "odom", (3,))
+    n_states = len(odometry)
+    if not n_states:
+        raise AppError(f"{path}: odom is empty, there is no state")
+    left = _variable(path, table, "obsLHS", (None, 2), n_states)
+    right = _variable(path, table, "obsRHS", (None, 2), n_states)
+    frames = {
+        number: _variable(path, table, name, (None,), n_states).astype(np.float32)
+        for number, name in enumerate(_FRAME_NAMES, start=1)
+        if name in table
+    }
+    stamps_s = _variable(path, table, "t", (1,), n_states)[:, 0] if "t" in table else None
+    if stamps_s is not None and not np.all(np.diff(stamps_s) > 0):
+        raise AppError(f"{path}: t must go forward from state to state")
+    mounts = _variable(path, table, "mounts", (3,), 4) if "mounts" in table else None
+    return MatDrive(
+        stamps_s=stamps_s,
+        mounts=None if mounts is None else mounts * _POSE_UNITS,
+        odometry=odometry * _POSE_UNITS,
+        left=tuple(map(_points_of, left)),
+        right=tuple(map(_points_of, right)),
+        frames=frames,
+    )
+
+
+def write_mat(path: Path, drive: MatDrive) -> None:
+    """Write a file that `read_mat`, MATLAB and Octave read.
+
+    Raises
+    ------
+    AppError
+        It cannot be written.
+    """
+    table: dict[str, Any] = {
+        "odom": drive.odometry / _POSE_UNITS,
+        "obsLHS": _polar_of(drive.left, unwrapped=False),
+        "obsRHS": _polar_of(drive.right, unwrapped=True),
+    }
+    table |= {f"R{number}": rows for number, rows in drive.frames.items()}
+    if drive.stamps_s is not None:
+        table["t"] = drive.stamps_s[:, np.newaxis]
+    if drive.mounts is not None:
+        table["mounts"] = drive.mounts / _POSE_UNITS
+    with naming(path):
+        path.open("wb").close()  # savemat's own words would not say why it cannot be
+        savemat(path, table, appendmat=False, do_compression=True)
+
+
+def _variable(
+    path: Path,
+    table: dict[str, Any],
+    name: str,
+    ends: tuple[int | None, ...],
+    n_states: int | None = None,
+) -> Array:
+    """Return a variable of shape (n_states, *ends); None stands for any number."""
+    wanted = ", ".join("n" if size is None else str(size) for size in (n_states, *ends))
+    value = table.get(name)
+    if value is None:
+        known = ", ".join(sorted(key for key in table if not key.startswith("__"))) or "nothing"
+        raise AppError(f"{path}: holds no {name} of shape ({wanted}); it holds {known}")
+    fits = (
+        isinstance(value, np.ndarray)
+        and value.dtype.kind in "fiu"
+        and value.ndim == 1 + len(ends)
+        and all(
+            size in (None, found)
+            for size, found in zip((n_states, *ends), value.shape, strict=True)
+        )
+    )
+    if not fits:
+        found = getattr(value, "shape", type(value).__name__)
+        raise AppError(f"{path}: {name} is {found}, must be numbers of shape ({wanted})")
+    numbers = np.asarray(value, dtype=np.float64)
+    if not np.isfinite(numbers).all():
+        raise AppError(f"{path}: {name} holds NaN or infinity")
+    return numbers
+
+
+def _points_of(rows: Array) -> Array:
+    """Return the points of one state's fixes, shape (k, 2) [m], from (m, 2) [mm, rad]."""
+    distance_mm, bearing = rows[rows[:, 0] > 0].T
+    return _MM * np.column_stack([distance_mm * np.cos(bearing), distance_mm * np.sin(bearing)])
+
+
+def _polar_of(states: tuple[Array, ...], *, unwrapped: bool) -> Array:
+    most = max([_FEWEST_FIXES, *map(len, states)])
+    table = np.zeros((len(states), most, 2))
+    for row, points in zip(table, states, strict=True):
+        if len(points):
+            x, y = points.T
+            bearing = np.arctan2(y, x)
+            row[: len(points), 0] = np.hypot(x, y) / _MM
+            row[: len(points), 1] = bearing % math.tau if unwrapped else bearing
+    return table
+
+
+# The authors' later robot: 18 cm from the middle to the side, 21 cm between the radars of a side.
+MAT_RIG = Rig(
+    mounts=(
+        Mount(name="UWBradar1", x_m=0.105, y_m=-0.18, yaw_rad=-math.pi / 2),
+        Mount(name="UWBradar2", x_m=-0.105, y_m=0.18, yaw_rad=math.pi / 2),
+        Mount(name="UWBradar3", x_m=-0.105, y_m=-0.18, yaw_rad=-math.pi / 2),
+        Mount(name="UWBradar4", x_m=0.105, y_m=0.18, yaw_rad=math.pi / 2),
+    )
+)
+# As their programs label bins: from zero, 143 of them in 92 cm.
+_BIN_M = 0.92 / 143
+_SAME_RANGE_M = 1e-4
+# The authors collect a state after this much of odometry, in either.
+_STEP_M2, _STEP_RAD = 20e-6, 2e-3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatOptions:
+    """What such a file may not say: mounts, states per second, settings of SLAM.
+
+    Without ``rig`` the mounts are those in the file, or else those of the authors' robot.
+    """
+
+    rig: Rig | None = None
+    rate_hz: float = 5.0
+    settings: SlamSettings
+
+
+def convert_mat(mat: Path, out: Path, options: MatOptions, check: Callable[[], None]) -> str:
+    """Write the detections and odometry of a file as a session; return in words what was written.
+
+    Raises
+    ------
+    AppError
+        The file makes no sense, or the rig has not one pair of radars on each side.
+    """
+    drive = read_mat(mat)
+    rig = options.rig or _rig_of(drive)
+    pairs = _sides(mat, rig)
+    stamps_ns = _stamps_ns(drive, options.rate_hz)
+    radars = tuple(
+        imported_radar(
+            # whatever a module measures too long, it is in the fixes already
+            replace(mount, range_offset_m=0.0),
+            range_start_m=0.0,
+            bin_length_m=_BIN_M,
+            n_bins=drive.frames[number].shape[1] if number in drive.frames else 0,
+            rate_hz=options.rate_hz,
+        )
+        for number, mount in enumerate(rig.mounts, start=1)
+    )
+    info = imported_info(mat, radars, options.settings, time_base="states", has_detections=True)
+    poses = [
+        TumSample(t_ns=t_ns, x_m=x, y_m=y, qz=math.sin(turn / 2), qw=math.cos(turn / 2))
+        for t_ns, (x, y, turn) in zip(stamps_ns, drive.odometry.tolist(), strict=True)
+    ]
+    log = SessionLog(out, info, OdometryTrack(poses), start_ns=stamps_ns[0])
+    n_fixes = n_ranges = 0
+    try:
+        for row, t_ns in enumerate(stamps_ns):
+            check()
+            for pair, points in zip(pairs, (drive.left[row], drive.right[row]), strict=True):
+                n_fixes += len(points)
+                for radar in (pair.first, pair.second):
+                    ranges_m = _ranges(points, rig.mounts[radar])
+                    n_ranges += len(ranges_m)
+                    log.on_detections(radar, t_ns, ranges_m)
+            log.on_scan(Scan(counter=row, t_ns=t_ns, frames=_frames(drive, radars, row, t_ns)))
+    finally:
+        log.close()
+    said = f"{out}: {len(poses)} states with {n_fixes} fixes, made of {n_ranges} ranges"
+    if drive.stamps_s is None:
+        said += f"; the file has no stamps, {options.rate_hz:g} states/s are assumed"
+    return said
+
+
+def write_detections(
+    session: RecordedSession, out: Path, config: SlamConfig, check: Callable[[], None]
+) -> str:
+    """Write what the front end of ``config`` finds in a session; return in words what was written.
+
+    A state is collected as the authors do: after 4.5 mm or 2 mrad of odometry.
+
+    Raises
+    ------
+    AppError
+        The session is damaged or has no odometry, the rig has not one pair of radars on each
+        side, or the file exists.
+    """
+    if out.exists():
+        raise AppError(f"{out}: exists; choose another name")
+    rig = session.rig
+    sides = _sides(session.path, rig)
+    detector, trilaterator = make_detector(config), Trilaterator(config.trilateration, rig)
+    side_of = {
+        index: side
+        for index, pair in enumerate(trilaterator.pairs)
+        for side, wanted in enumerate(sides)
+        if (pair.first, pair.second) == (wanted.first, wanted.second)
+    }
+    track = session.odometry()
+    poses: list[Array] = []
+    stamps_s: list[float] = []
+    fixes: tuple[list[Array], list[Array]] = ([], [])
+    frames: dict[int, list[NDArray[np.float32]]] = {number: [] for number in range(1, 5)}
+    for scan, _ in session.scans():
+        check()
+        # in the order of counters, whether the state is collected or not: a front end may learn
+        offsets = [rig.mounts[frame.radar].range_offset_m for frame in scan.frames]
+        found = detector.detect_many(scan.frames, offsets)
+        try:
+            pose = track.pose_at(scan.t_ns)
+        except OdometryError:
+            continue
+        if poses and not _is_apart(poses[-1], pose):
+            continue
+        poses.append(pose)
+        stamps_s.append(scan.t_ns / NS_PER_S)
+        located = trilaterator.locate([one for row in found for one in row], scan.t_ns)
+        for side in range(2):
+            points = [(fix.x_m, fix.y_m) for fix in located if side_of.get(fix.pair) == side]
+            fixes[side].append(np.array(points).reshape(-1, 2))
+        of_radar = {frame.radar: frame.samples for frame in scan.frames}
+        for number in range(1, 5):
+            n_bins = session.info.radars[number - 1].n_bins
+            frames[number].append(of_radar.get(number - 1, np.zeros(n_bins, dtype=np.float32)))
+    if not poses:
+        raise AppError(f"{session.path}: holds no scan with odometry")
+    drive = MatDrive(
+        odometry=np.array(poses),
+        left=tuple(fixes[0]),
+        right=tuple(fixes[1]),
+        frames={number: np.array(rows) for number, rows in frames.items()},
+        stamps_s=np.array(stamps_s),
+        mounts=np.array([(mount.x_m, mount.y_m, mount.yaw_rad) for mount in rig.mounts]),
+    )
+    write_mat(out, drive)
+    n_fixes = sum(map(len, drive.left)) + sum(map(len, drive.right))
+    return f"{out}: {len(poses)} states with {n_fixes} fixes"
+
+
+def _sides(path: Path, rig: Rig) -> tuple[RadarPair, RadarPair]:
+    """Return the pair that looks to the left and the one that looks to the right."""
+    pairs = rig.pairs()
+    left = [pair for pair in pairs if pair.ahead[1] > 0]
+    right = [pair for pair in pairs if pair.ahead[1] < 0]
+    if len(rig.mounts) != 4 or len(left) != 1 or len(right) != 1:
+        raise AppError(
+            f"{path}: the authors' layout is of four radars, a pair to the left and one to the "
+            f"right; the rig has {len(rig.mounts)}, {len(left)} and {len(right)} such pairs"
+        )
+    return left[0], right[0]
+
+
+def _ranges(points: Array, mount: Mount) -> Array:
+    """Return the distances of points from a radar, each once, shape (k,), ascending [m]."""
+    ranges_m = np.sort(np.hypot(points[:, 0] - mount.x_m, points[:, 1] - mount.y_m))
+    new = np.diff(ranges_m, prepend=-math.inf) > _SAME_RANGE_M
+    return ranges_m[new]
+
+
+def _rig_of(drive: MatDrive) -> Rig:
+    if drive.mounts is None:
+        return MAT_RIG
+    return Rig(
+        mounts=tuple(
+            Mount(name=f"UWBradar{number}", x_m=x, y_m=y, yaw_rad=yaw)
+            for number, (x, y, yaw) in enumerate(drive.mounts.tolist(), start=1)
+        )
+    )
+
+
+def _stamps_ns(drive: MatDrive, rate_hz: float) -> list[int]:
+    if drive.stamps_s is None:
+        return [round(row * NS_PER_S / rate_hz) for row in range(len(drive.odometry))]
+    return [round(stamp_s * NS_PER_S) for stamp_s in drive.stamps_s.tolist()]
+
+
+def _frames(
+    drive: MatDrive, radars: tuple[RadarInfo, ...], row: int, t_ns: int
+) -> tuple[RadarFrame, ...]:
+    return tuple(
+        RadarFrame(
+            radar=number - 1,
+            t_ns=t_ns,
+            counter=row,
+            samples=rows[row],
+            range_start_m=0.0,
+            bin_length_m=radars[number - 1].bin_length_m * TRUE_PER_MODULE_METRE,
+        )
+        for number, rows in sorted(drive.frames.items())
+        if rows[row].any()
+    )
+
+
+def _is_apart(before: Array, after: Array) -> bool:
+    step = after - before
+    turn = math.remainder(float(step[2]), math.tau)
+    return bool(step[0] ** 2 + step[1] ** 2 >= _STEP_M2 or abs(turn) >= _STEP_RAD)

@@ -1,0 +1,546 @@
+"""A session as a bag of ROS 1 or ROS 2 in the layout of the paper's authors' data set.
+
+Their bags hold, per radar, `/UWBradar<k>/readings` (in earlier ones `/UWBradar<k>`) with one frame
+per message as std_msgs/Float32MultiArray, which has neither stamp nor counter; `/odom` as
+nav_msgs/Odometry; and a pose by laser as truth: Hector SLAM's `/slam_out_pose`, a
+geometry_msgs/PoseStamped. Radars 2 and 4 look to the left, 1 and 3 to the right, as their public
+launch file pairs them; each data set says so in a file of its own, so a rig file can say otherwise.
+
+What this program writes has two more kinds of topic, std_msgs/String with JSON, so that nothing is
+lost on the way back: `/UWBradar<k>/info` and `/session`.
+
+A frame's time is when it was recorded: the messages have no stamp of their own. Odometry and
+truth keep the stamps of their headers where these are of the bag's clock.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import re
+import shutil
+import sqlite3
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Writer as Rosbag1Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Rosbag2Writer
+from rosbags.typesys import Stores, get_typestore
+
+from slam.app.errors import AppError, OdometryError, StopRequestedError
+from slam.app.odometry.track import OdometryTrack
+from slam.app.odometry.tum import NS_PER_S, TumSample
+from slam.app.records import RadarInfo, Scan, SessionInfo
+from slam.app.rig.sources import TRUE_PER_MODULE_METRE
+from slam.app.session import messages as ros
+from slam.app.session.log import SessionLog
+from slam.app.session.messages import (
+    SlamSettings,
+    imported_info,
+    imported_radar,
+    radar_text,
+    read_radar_text,
+    read_session_table,
+    session_table,
+)
+from slam.app.session.reader import RecordedSession, ScanEnd
+from slam.frames import RadarFrame
+from slam.geometry import Mount, Rig
+from xethru_protocol.wire.errors import XeThruError
+from xethru_protocol.wire.x4 import frame_area
+
+ODOMETRY_TOPIC = "/odom"
+TRUTH_TOPIC = "/slam_out_pose"
+SESSION_TOPIC = "/session"
+
+_FRAMES = re.compile(r"/?(UWBradar(\d+))(/readings)?")
+_INFO = re.compile(r"/?(UWBradar(\d+))/info")
+
+AUTHORS_RIG = Rig(
+    mounts=(
+        Mount(name="UWBradar1", x_m=0.1, y_m=-0.2, yaw_rad=-math.pi / 2),
+        Mount(name="UWBradar2", x_m=-0.1, y_m=0.2, yaw_rad=math.pi / 2),
+        Mount(name="UWBradar3", x_m=-0.1, y_m=-0.2, yaw_rad=-math.pi / 2),
+        Mount(name="UWBradar4", x_m=0.1, y_m=0.2, yaw_rad=math.pi / 2),
+    )
+)
+"""The paper's mounts under the names of their topics."""
+
+
+def frames_topic(radar: int) -> str:
+    """Return the topic of the frames of a radar by its index, from 0.
+
+    >>> frames_topic(0)
+    '/UWBradar1/readings'
+    """
+    return f"/UWBradar{radar + 1}/readings"
+
+
+def info_topic(radar: int) -> str:
+    """Return the topic that says what a radar is."""
+    return f"/UWBradar{radar + 1}/info"
+
+
+def radar_of_frames(topic: str) -> str | None:
+    """Return the radar whose frames a topic holds, None for other topics.
+
+    >>> radar_of_frames("UWBradar3"), radar_of_frames("/UWBradar3/readings"), radar_of_frames("/x")
+    ('UWBradar3', 'UWBradar3', None)
+    """
+    found = _FRAMES.fullmatch(topic)
+    return found[1] if found else None
+
+
+def radar_of_info(topic: str) -> str | None:
+    """Return the radar that a topic tells of, None for other topics."""
+    found = _INFO.fullmatch(topic)
+    return found[1] if found else None
+
+
+def radar_order(name: str) -> int:
+    """Return the number in a radar's name, by which radars are ordered."""
+    return int(name.removeprefix("UWBradar"))
+
+
+# A header's stamp further from the time of recording is of another clock.
+_SAME_CLOCK_NS = NS_PER_S
+_TRUTH_TYPES = (ros.POSE, "geometry_msgs/msg/PoseWithCovarianceStamped", ros.ODOMETRY)
+_PAPER_BINS, _PAPER_AREA_M = 1431, (0.2, 9.4)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BagOptions:
+    """What a bag does not say itself.
+
+    Attributes
+    ----------
+    rig
+        Mounts under the names of the topics (UWBradar1, ...); ignored where the bag tells.
+    area_m
+        Frame area that the modules were asked for, module metres; None: the paper's.
+    truth_topic
+        Of geometry_msgs/PoseStamped or PoseWithCovarianceStamped or nav_msgs/Odometry.
+    settings
+        For bags that no session of this program became.
+    """
+
+    rig: Rig = AUTHORS_RIG
+    area_m: tuple[float, float] | None = None
+    truth_topic: str = TRUTH_TOPIC
+    settings: SlamSettings
+
+
+@dataclass(slots=True, kw_only=True)
+class _Stream:
+    """The frames of one topic, as far as one look shows."""
+
+    n_bins: int
+    stamps_ns: list[int] = field(default_factory=list)
+    info: str | None = None
+
+
+@dataclass(slots=True, kw_only=True)
+class _Contents:
+    """All of a bag but its frames."""
+
+    streams: dict[str, _Stream] = field(default_factory=dict)
+    infos: dict[str, str] = field(default_factory=dict)
+    odometry: list[TumSample] = field(default_factory=list)
+    truth: list[TumSample] = field(default_factory=list)
+    session: str | None = None
+    left_out: int = 0
+    """Poses that were not later than the one before."""
+
+
+def convert_bag(
+    bag: Path, out: Path, options: BagOptions, check: Callable[[], None]
+) -> tuple[str, list[str]]:
+    """Write a bag as a session; return what was written, in words, and what was odd about it.
+
+    Raises
+    ------
+    AppError
+        No bag, a damaged one, one without radars or odometry, or frames that do not fit the frame
+        area; one line.
+    """
+    contents = _look_through(bag, options.truth_topic, check)
+    odd = []
+    if contents.left_out:
+        odd.append(f"poses that went back in time and are left out: {contents.left_out}")
+    names = sorted(contents.streams, key=radar_order)
+    radars = tuple(_radar_info(bag, name, contents, options) for name in names)
+    try:
+        odometry = OdometryTrack(contents.odometry)
+    except OdometryError:
+        raise AppError(f"{bag}: holds no pose on {ODOMETRY_TOPIC}, nav_msgs/Odometry") from None
+    truth = OdometryTrack(contents.truth) if contents.truth else None
+    if truth is None:
+        odd.append(f"no truth on {options.truth_topic}: numbers that need it will be null")
+    period_ns = float(np.median([1e9 / radar.rate_hz for radar in radars]))
+    start_ns = min(stream.stamps_ns[0] for stream in contents.streams.values())
+    log = SessionLog(
+        out,
+        _session_info(bag, contents, radars, options),
+        odometry,
+        truth_at=None if truth is None else _poses_of(truth),
+        start_ns=min(start_ns, odometry.first_ns),
+    )
+    unused = n_scans = 0
+    try:
+        for scan in _scans(_frames(bag, names, radars, check), period_ns):
+            newest_ns = max(frame.t_ns for frame in scan.frames)
+            used = odometry.first_ns <= scan.t_ns and newest_ns <= odometry.last_ns
+            unused += not used
+            n_scans += 1
+            log.on_scan(replace(scan, used=used))
+    finally:
+        log.close()
+    if unused:
+        odd.append(f"{unused} scans lie outside the odometry and are marked as not to be used")
+    n_frames = sum(len(stream.stamps_ns) for stream in contents.streams.values())
+    return (
+        f"{out}: {n_frames} frames of {len(radars)} radars in {n_scans} scans, "
+        f"{len(odometry.samples)} poses of the wheels, {len(contents.truth)} true poses",
+        odd,
+    )
+
+
+def _look_through(bag: Path, truth_topic: str, check: Callable[[], None]) -> _Contents:
+    contents = _Contents()
+    with _open(bag) as reader:
+        for connection in reader.connections:
+            _check_type(bag, connection.topic, connection.msgtype, truth_topic)
+        for connection, t_ns, raw in reader.messages():
+            check()
+            topic = connection.topic
+            if (radar := radar_of_frames(topic)) is not None:
+                n_bins = len(reader.deserialize(raw, connection.msgtype).data)
+                stream = contents.streams.setdefault(radar, _Stream(n_bins=n_bins))
+                if n_bins != stream.n_bins:
+                    raise AppError(
+                        f"{bag}: {topic} has frames of {stream.n_bins} and of {n_bins} bins"
+                    )
+                stream.stamps_ns.append(t_ns)
+            elif (radar := radar_of_info(topic)) is not None:
+                contents.infos[radar] = reader.deserialize(raw, connection.msgtype).data
+            elif topic == SESSION_TOPIC:
+                contents.session = reader.deserialize(raw, connection.msgtype).data
+            elif topic in (ODOMETRY_TOPIC, truth_topic):
+                poses = contents.odometry if topic == ODOMETRY_TOPIC else contents.truth
+                sample = _sample(reader.deserialize(raw, connection.msgtype), t_ns)
+                if poses and sample.t_ns <= poses[-1].t_ns:
+                    contents.left_out += 1
+                else:
+                    poses.append(sample)
+    if not contents.streams:
+        raise AppError(
+            f"{bag}: holds no frames; they are looked for on {frames_topic(0)} and so on"
+        )
+    return contents
+
+
+def _check_type(bag: Path, topic: str, message_type: str, truth_topic: str) -> None:
+    if radar_of_frames(topic) is not None:
+        allowed: tuple[str, ...] = (ros.FLOAT_ARRAY,)
+    elif radar_of_info(topic) is not None or topic == SESSION_TOPIC:
+        allowed = (ros.STRING,)
+    elif topic == ODOMETRY_TOPIC:
+        allowed = (ros.ODOMETRY,)
+    elif topic == truth_topic:
+        allowed = _TRUTH_TYPES
+    else:
+        return
+    if message_type not in allowed:
+        raise AppError(f"{bag}: {topic} is {message_type}, must be {' or '.join(allowed)}")
+
+
+@contextmanager
+def _open(bag: Path) -> Iterator[Any]:
+    """Open a bag; whatever reading it raises becomes one line."""
+    folder = bag.parent if bag.suffix in (".db3", ".yaml") else bag
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    try:
+        with AnyReader([folder], default_typestore=store) as reader:
+            yield reader
+    except (AppError, StopRequestedError):
+        raise
+    except FileNotFoundError:
+        raise AppError(f"{bag}: no bag is there") from None
+    except OSError as error:
+        raise AppError(f"{bag}: cannot read: {error.strerror or error}") from None
+    except Exception as error:  # rosbags does not say what it may raise of a damaged bag
+        words = " ".join(str(error).split()) or type(error).__name__
+        raise AppError(
+            f"{bag}: no bag of ROS 1 or 2, or a damaged one: {words}; `rosbag reindex` or "
+            "`ros2 bag reindex` mend some"
+        ) from None
+
+
+def _sample(message: ros.Message, t_ns: int) -> TumSample:
+    """Read a pose, however deep the message holds it, at its stamp or else when it was recorded."""
+    pose = message.pose
+    while not hasattr(pose, "position"):
+        pose = pose.pose
+    stamp_ns = message.header.stamp.sec * NS_PER_S + message.header.stamp.nanosec
+    same = abs(stamp_ns - t_ns) < _SAME_CLOCK_NS
+    return TumSample(
+        t_ns=stamp_ns if same else t_ns,
+        x_m=pose.position.x,
+        y_m=pose.position.y,
+        qz=pose.orientation.z,
+        qw=pose.orientation.w,
+    )
+
+
+def _radar_info(bag: Path, name: str, contents: _Contents, options: BagOptions) -> RadarInfo:
+    stream = contents.streams[name]
+    if name in contents.infos:
+        return read_radar_text(bag, f"/{name}/info", contents.infos[name])
+    mount = next((mount for mount in options.rig.mounts if mount.name == name), None)
+    if mount is None:
+        known = ", ".join(mount.name for mount in options.rig.mounts)
+        raise AppError(f"{bag}: radar {name} is not in the rig ({known}); give --rig")
+    if options.area_m is None and stream.n_bins != _PAPER_BINS:
+        raise AppError(
+            f"{bag}: frames of {stream.n_bins} bins, not the paper's {_PAPER_BINS}; "
+            "say --frame-area START END, in metres, as the modules were asked for"
+        )
+    area_m = options.area_m or _PAPER_AREA_M
+    try:
+        area = frame_area(*area_m)
+    except XeThruError as error:
+        raise AppError(f"--frame-area: {error}") from None
+    if area.n_bins != stream.n_bins:
+        raise AppError(
+            f"{bag}: frames of {stream.n_bins} bins, but a frame area of {area_m[0]:g} to "
+            f"{area_m[1]:g} m has {area.n_bins}; say another --frame-area"
+        )
+    return imported_radar(
+        mount,
+        range_start_m=area.start_m,
+        bin_length_m=(area.end_m - area.start_m) / area.n_bins,
+        n_bins=area.n_bins,
+        rate_hz=_rate_hz(stream),
+    )
+
+
+def _rate_hz(stream: _Stream) -> float:
+    """Return frames per second by the median of what lies between two; 1 for a single frame."""
+    steps_ns = np.diff(stream.stamps_ns)
+    period_ns = float(np.median(steps_ns)) if len(steps_ns) else 0.0
+    return NS_PER_S / period_ns if period_ns > 0 else 1.0
+
+
+def _session_info(
+    bag: Path, contents: _Contents, radars: tuple[RadarInfo, ...], options: BagOptions
+) -> SessionInfo:
+    if contents.session is not None:
+        try:
+            table = json.loads(contents.session)
+        except ValueError as error:
+            raise AppError(f"{bag}: {SESSION_TOPIC} cannot be read: {error}") from None
+        return read_session_table(bag, table, radars)
+    return imported_info(bag, radars, options.settings, time_base="recording")
+
+
+def _poses_of(track: OdometryTrack) -> Callable[[NDArray[np.int64]], NDArray[np.float64]]:
+    """Return the true poses at times [ns]; NaN further outside the truth than it is held."""
+
+    def pose_at(t_ns: int) -> NDArray[np.float64]:
+        try:
+            return track.pose_at(t_ns)
+        except OdometryError:
+            return np.full(3, math.nan)
+
+    return lambda stamps_ns: np.array([pose_at(int(t_ns)) for t_ns in stamps_ns])
+
+
+def _frames(
+    bag: Path, names: Sequence[str], radars: Sequence[RadarInfo], check: Callable[[], None]
+) -> Iterator[RadarFrame]:
+    counters = dict.fromkeys(names, 0)
+    with _open(bag) as reader:
+        wanted = [c for c in reader.connections if radar_of_frames(c.topic) is not None]
+        for connection, t_ns, raw in reader.messages(wanted):
+            check()
+            name = radar_of_frames(connection.topic)
+            index = names.index(str(name))
+            message = reader.deserialize(raw, connection.msgtype)
+            yield RadarFrame(
+                radar=index,
+                t_ns=t_ns,
+                counter=counters[str(name)],
+                samples=np.asarray(message.data, dtype=np.float32),
+                range_start_m=radars[index].range_start_m * TRUE_PER_MODULE_METRE,
+                bin_length_m=radars[index].bin_length_m * TRUE_PER_MODULE_METRE,
+            )
+            counters[str(name)] += 1
+
+
+def _scans(frames: Iterator[RadarFrame], period_ns: float) -> Iterator[Scan]:
+    """Group frames: a scan ends before a radar's second frame, or one period after its first."""
+    held: dict[int, RadarFrame] = {}
+    number = 0
+    for frame in frames:
+        first = next(iter(held.values()), None)
+        if first is not None and (frame.radar in held or frame.t_ns - first.t_ns >= period_ns):
+            yield _scan(number, held)
+            held = {}
+            number += 1
+        held[frame.radar] = frame
+    if held:
+        yield _scan(number, held)
+
+
+def _scan(number: int, held: dict[int, RadarFrame]) -> Scan:
+    frames = tuple(held[radar] for radar in sorted(held))
+    return Scan(counter=number, t_ns=min(frame.t_ns for frame in frames), frames=frames)
+
+
+class _Bag(Protocol):
+    """What both kinds of bag take."""
+
+    def write(self, topic: str, t_ns: int, message: ros.Message) -> None:
+        """Write a message; the topic appears with its first one."""
+
+    def close(self) -> None:
+        """Write the index."""
+
+
+class _Ros1Bag:
+    def __init__(self, path: Path) -> None:
+        self._store: Any = get_typestore(Stores.ROS1_NOETIC)
+        self._writer: Any = Rosbag1Writer(path)
+        self._writer.open()
+        self._connections: dict[str, Any] = {}
+
+    def write(self, topic: str, t_ns: int, message: ros.Message) -> None:
+        name = message.__msgtype__
+        if topic not in self._connections:
+            self._connections[topic] = self._writer.add_connection(
+                topic, name, typestore=self._store, latching=1 if name == ros.STRING else None
+            )
+        data = self._store.serialize_ros1(self._as_ros1(message), name)
+        self._writer.write(self._connections[topic], t_ns, data)
+
+    def close(self) -> None:
+        self._writer.close()
+
+    def _as_ros1(self, value: object) -> object:
+        """Rebuild a message with the classes of ROS 1, whose header has a number more."""
+        if isinstance(value, list):
+            return [self._as_ros1(item) for item in value]
+        name = getattr(value, "__msgtype__", None)
+        if name is None or not dataclasses.is_dataclass(value):
+            return value
+        parts = {
+            field.name: self._as_ros1(getattr(value, field.name))
+            for field in dataclasses.fields(value)
+            if field.name != "__msgtype__"
+        }
+        if name == "std_msgs/msg/Header":
+            parts["seq"] = 0
+        return self._store.types[name](**parts)
+
+
+class _Ros2Bag:
+    def __init__(self, path: Path) -> None:
+        self._store: Any = get_typestore(Stores.ROS2_HUMBLE)
+        # 8 is the older of the two that can be written; older releases of ROS 2 read it, too
+        self._writer: Any = Rosbag2Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3)
+        self._writer.open()
+        self._connections: dict[str, Any] = {}
+
+    def write(self, topic: str, t_ns: int, message: ros.Message) -> None:
+        if topic not in self._connections:
+            self._connections[topic] = self._writer.add_connection(
+                topic, message.__msgtype__, typestore=self._store
+            )
+        self._writer.write(self._connections[topic], t_ns, ros.serialise(message))
+
+    def close(self) -> None:
+        self._writer.close()
+
+
+def write_bag(session: RecordedSession, out: Path, check: Callable[[], None]) -> str:
+    """Write frames, odometry and truth of a session; return what was written, in words.
+
+    Parameters
+    ----------
+    session
+        A recording.
+    out
+        ``*.bag`` for ROS 1, otherwise a new folder for ROS 2; bag times are session times.
+    check
+        Called for every message; may raise to stop, which leaves nothing behind.
+
+    Raises
+    ------
+    AppError
+        It exists already or cannot be written, or the session is damaged.
+    """
+    if out.exists():
+        raise AppError(f"{out}: exists; choose another name")
+    try:
+        bag: _Bag = _Ros1Bag(out) if out.suffix == ".bag" else _Ros2Bag(out)
+        try:
+            counts = _fill(bag, session, check)
+        finally:
+            bag.close()
+    except BaseException as error:
+        _remove(out)
+        if isinstance(
+            error, OSError | sqlite3.Error
+        ):  # SQLite has words of its own for a full disk
+            reason = getattr(error, "strerror", None) or error
+            raise AppError(f"{out}: cannot be written: {reason}") from None
+        raise
+    frames, poses, truths = counts
+    kind = "ROS 1" if out.suffix == ".bag" else "ROS 2"
+    return f"{out}: {kind}, {frames} frames, {poses} poses of the wheels, {truths} true poses"
+
+
+def _fill(bag: _Bag, session: RecordedSession, check: Callable[[], None]) -> tuple[int, int, int]:
+    begun = False
+    frames = poses = truths = 0
+    for record in session.records():
+        check()
+        if isinstance(record, RadarFrame | TumSample | ScanEnd) and not begun:
+            begun = True
+            _write_head(bag, session, record.t_ns)
+        if isinstance(record, RadarFrame):
+            topic = frames_topic(record.radar)
+            bag.write(topic, record.t_ns, ros.float_array(record.samples))
+            frames += 1
+        elif isinstance(record, TumSample):
+            bag.write(ODOMETRY_TOPIC, record.t_ns, ros.odometry(record))
+            poses += 1
+        elif isinstance(record, ScanEnd) and record.truth is not None:
+            message = ros.pose_stamped(record.t_ns, "world", record.truth)
+            bag.write(TRUTH_TOPIC, record.t_ns, message)
+            truths += 1
+    if not frames:
+        raise AppError(f"{session.path}: holds no frame")
+    return frames, poses, truths
+
+
+def _write_head(bag: _Bag, session: RecordedSession, t_ns: int) -> None:
+    table = json.dumps(session_table(session.info))
+    bag.write(SESSION_TOPIC, t_ns, ros.string(table))
+    for index, radar in enumerate(session.info.radars):
+        bag.write(info_topic(index), t_ns, ros.string(radar_text(radar)))
+
+
+def _remove(out: Path) -> None:
+    if out.is_dir():
+        shutil.rmtree(out, ignore_errors=True)
+    else:
+        out.unlink(missing_ok=True)

@@ -1,0 +1,413 @@
+"""What window, minimum count and search radius of the paper's outlier filter trade off.
+
+A fix is made of two ranges. It is *true* if one landmark explains both, a *ghost* if each range is
+explained, but by different landmarks, and *clutter* otherwise: noise, walls, echoes that came by
+way of walls. Explained means within ``EXPLAINED_M`` of the true distance from the radar.
+
+Light, so that ``--help`` is; the work is in ``filter_study`` and ``filter_picture``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from enum import Enum
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from emulator.scene.scene import Scene
+from emulator.scene.wheels import scene_odometry
+from slam.app.cli import seed
+from slam.app.errors import StopFlag
+from slam.app.odometry.track import OdometryTrack
+from slam.app.odometry.tum import NS_PER_S
+from slam.app.rig.emulated import (
+    FRAME_RATE_HZ,
+    RAW_CONFIG,
+    end_counter,
+    open_loopback,
+    rig_of,
+    scene_and_config,
+    true_landmarks_m,
+)
+from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label, picture
+from slam.app.run.runner import run_slam
+from slam.config import ClusteringConfig, SlamConfig, load_preset
+from slam.geometry import Rig, transform
+from slam.paper.clustering import CollectedState, filter_window
+from slam.paper.pipeline import UwbRadarSlam
+from slam.paper.trilateration import Fix
+
+Array = NDArray[np.float64]
+
+EXPLAINED_M = 0.03
+"""Four standard deviations of the paper's front end."""
+WRONG_M = 0.15
+"""An observation farther from every landmark is wrong; the metric's radius of a match."""
+
+
+class Origin(Enum):
+    """What a fix is of."""
+
+    TRUE = "true"
+    GHOST = "ghost"
+    CLUTTER = "clutter"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Setting:
+    """One setting of the filter, in the paper's terms."""
+
+    window_size: int
+    min_opc: int
+    search_rad_m: float
+
+    def __str__(self) -> str:
+        """Return the three numbers as a row of a table has them."""
+        return f"{self.window_size}, {self.min_opc}, {1e2 * self.search_rad_m:g} cm"
+
+
+TABLE_I = Setting(window_size=15, min_opc=9, search_rad_m=0.2)
+WINDOWS = (9, 12, 15, 20, 30)
+COUNTS = (3, 6, 9, 12, 15)
+RADII_M = (0.025, 0.05, 0.1, 0.2, 0.4)
+SETTINGS = tuple(
+    dict.fromkeys(
+        [
+            *(Setting(window_size=w, min_opc=9, search_rad_m=0.2) for w in WINDOWS),
+            *(Setting(window_size=15, min_opc=c, search_rad_m=0.2) for c in COUNTS),
+            *(Setting(window_size=15, min_opc=9, search_rad_m=r) for r in RADII_M),
+        ]
+    )
+)
+"""One parameter at a time around Table I."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Seen:
+    """What one lap saw.
+
+    Attributes
+    ----------
+    scene
+        Its name.
+    states
+        Every collected state, in time order.
+    truth
+        Shape (n_states, 3): the true pose of each, world frame.
+    origins
+        For each state what its fixes are of.
+    landmarks_m
+        Shape (m, 2), world frame.
+    """
+
+    scene: str
+    states: tuple[CollectedState, ...]
+    truth: Array
+    origins: tuple[tuple[Origin, ...], ...]
+    landmarks_m: Array
+
+    def count(self, origin: Origin) -> int:
+        """Return how many fixes are of this origin."""
+        return sum(each is origin for of_state in self.origins for each in of_state)
+
+    @property
+    def n_true(self) -> int:
+        """Return the number of true fixes."""
+        return self.count(Origin.TRUE)
+
+    @property
+    def n_ghosts(self) -> int:
+        """Return the number of ghosts."""
+        return self.count(Origin.GHOST)
+
+    @property
+    def n_clutter(self) -> int:
+        """Return the number of the other fixes."""
+        return self.count(Origin.CLUTTER)
+
+    def numbers(self) -> dict[str, object]:
+        """Return what goes into the JSON file."""
+        return {
+            "scene": self.scene,
+            "states": len(self.states),
+            "true_fixes": self.n_true,
+            "ghosts": self.n_ghosts,
+            "clutter": self.n_clutter,
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome:
+    """What one setting did; shares are None where there is nothing to divide by.
+
+    Attributes
+    ----------
+    true_kept, ghosts_kept, clutter_kept
+        Shares of the fixes that some cluster confirmed, of those whose window was complete.
+    n_observations, wrong_observations
+        What went to the filter, and the share farther than 15 cm from every landmark, on true
+        poses.
+    latency_s
+        Median time from a state to the newest one of its window.
+    """
+
+    setting: Setting
+    true_kept: float | None
+    ghosts_kept: float | None
+    clutter_kept: float | None
+    n_observations: int
+    wrong_observations: float | None
+    latency_s: float
+
+    def numbers(self) -> dict[str, object]:
+        """Return what goes into the JSON file."""
+        return asdict(self)
+
+
+def drive(scene: str, *, seed: int, check: Callable[[], None] = lambda: None) -> Seen:
+    """Drive the first lap of a scene and return every state with all its fixes.
+
+    Raises
+    ------
+    AppError
+        The scene cannot be used; one line.
+    """
+    loaded, config = scene_and_config(scene, "paper")
+    path = loaded.path.model_copy(update={"laps": loaded.path.laps[:1]})
+    lap = loaded.model_copy(update={"path": path})
+    trajectory = lap.trajectory()
+    odometry = OdometryTrack.from_lines(scene_odometry(lap, seed))
+    # With a window of one state each comes out as it is collected.
+    alone = config.model_copy(update={"window": config.window.model_copy(update={"size": 1})})
+    with open_loopback(lap, seed) as source:
+        source.start(RAW_CONFIG, FRAME_RATE_HZ)
+        scans = source.scans(end_counter(trajectory.duration_ns), check)
+        record = run_slam(scans, odometry, UwbRadarSlam(alone, rig_of(lap)), trajectory.poses)
+    rig = rig_of(lap)
+    return Seen(
+        scene=lap.name,
+        states=tuple(
+            CollectedState(
+                t_ns=result.t_ns,
+                odometry_pose=result.odometry_pose,
+                detections=result.detections,
+                fixes=result.fixes,
+            )
+            for result in record.results
+        ),
+        truth=record.truth,
+        origins=tuple(
+            _origins(result.fixes, pose, rig, lap)
+            for result, pose in zip(record.results, record.truth, strict=True)
+        ),
+        landmarks_m=true_landmarks_m(lap),
+    )
+
+
+def _origins(fixes: Sequence[Fix], pose: Array, rig: Rig, scene: Scene) -> tuple[Origin, ...]:
+    if not fixes or not scene.targets:
+        return (Origin.CLUTTER,) * len(fixes)
+    antennas = transform(pose, np.array([(mount.x_m, mount.y_m) for mount in rig.mounts]))
+    targets = true_landmarks_m(scene)
+    radii = np.array([target.radius_m for target in scene.targets])
+    true_m = np.linalg.norm(antennas[:, np.newaxis] - targets[np.newaxis], axis=2) - radii
+    origins = []
+    for fix in fixes:
+        first, second = (
+            np.abs(true_m[each.radar] - each.range_m) <= EXPLAINED_M for each in fix.detections
+        )
+        if (first & second).any():
+            origins.append(Origin.TRUE)
+        elif first.any() and second.any():
+            origins.append(Origin.GHOST)
+        else:
+            origins.append(Origin.CLUTTER)
+    return tuple(origins)
+
+
+def outcomes(
+    seen: Seen,
+    settings: Sequence[Setting] = SETTINGS,
+    *,
+    check: Callable[[], None] = lambda: None,
+) -> tuple[Outcome, ...]:
+    """Return what each setting of the filter makes of the same states."""
+    return tuple(_outcome(seen, setting, check) for setting in settings)
+
+
+def _outcome(seen: Seen, setting: Setting, check: Callable[[], None]) -> Outcome:
+    clustering = _with(load_preset("paper"), setting)
+    kept = dict.fromkeys(Origin, 0)
+    judged = dict.fromkeys(Origin, 0)
+    errors_m: list[float] = []
+    latencies_ns: list[int] = []
+    for first in range(len(seen.states) - setting.window_size + 1):
+        check()
+        window = seen.states[first : first + setting.window_size]
+        filtered = filter_window(window, clustering)
+        rejected = {id(fix) for fix in filtered.rejected}
+        for fix, origin in zip(window[0].fixes, seen.origins[first], strict=True):
+            judged[origin] += 1
+            kept[origin] += id(fix) not in rejected
+        if filtered.observations:
+            points = np.array([(each.x_m, each.y_m) for each in filtered.observations])
+            errors_m += _distances_m(transform(seen.truth[first], points), seen.landmarks_m)
+        latencies_ns.append(window[-1].t_ns - window[0].t_ns)
+    share = {origin: kept[origin] / judged[origin] if judged[origin] else None for origin in Origin}
+    wrong = float(np.mean(np.array(errors_m) > WRONG_M)) if errors_m else None
+    return Outcome(
+        setting=setting,
+        true_kept=share[Origin.TRUE],
+        ghosts_kept=share[Origin.GHOST],
+        clutter_kept=share[Origin.CLUTTER],
+        n_observations=len(errors_m),
+        wrong_observations=wrong,
+        latency_s=float(np.median(latencies_ns)) / NS_PER_S if latencies_ns else 0.0,
+    )
+
+
+def _with(config: SlamConfig, setting: Setting) -> ClusteringConfig:
+    return config.clustering.model_copy(
+        update={"min_observations": setting.min_opc, "search_radius_m": setting.search_rad_m}
+    )
+
+
+def _distances_m(points: Array, landmarks_m: Array) -> list[float]:
+    """Return how far each point is from the nearest landmark; infinite where there is none."""
+    gaps = np.linalg.norm(points[:, np.newaxis] - landmarks_m[np.newaxis], axis=2)
+    distances: list[float] = gaps.min(axis=1, initial=np.inf).tolist()
+    return distances
+
+
+_Value = Callable[[Setting], float]
+
+_PARAMETERS: tuple[tuple[str, str, _Value], ...] = (
+    ("window_size", "window_size [states], and its latency", lambda setting: setting.window_size),
+    ("min_opc", "min_opc [fixes]", lambda setting: setting.min_opc),
+    ("search_rad", "search_rad [cm]", lambda setting: 1e2 * setting.search_rad_m),
+)
+
+
+def draw_filter(
+    path: Path, studies: Sequence[tuple[Seen, Sequence[Outcome]]], *, seed: int
+) -> None:
+    """Draw the shares kept over each of the three parameters, a row per scene; a PNG file."""
+    with picture(path, width_in=10.4, height_in=1.3 + 3.1 * len(studies)) as figure:
+        figure.suptitle(
+            "The paper's DBSCAN filter, one parameter varied at a time; dashed: Table I "
+            f"(one lap, simulated, seed {seed})",
+            fontsize=11,
+            color=INK,
+            x=0.01,
+            ha="left",
+        )
+        panels = figure.subplots(len(studies), len(_PARAMETERS), squeeze=False, sharey=True)
+        for row, (seen, outcomes) in zip(panels, studies, strict=True):
+            for axes, (name, x_label, value) in zip(row, _PARAMETERS, strict=True):
+                _draw(axes, name, value, outcomes)
+                label(axes, f"{seen.scene}: {name}", x_label, "share [%]")
+        figure.legend(
+            *panels[0, 0].get_legend_handles_labels(),
+            loc="outside lower center",
+            ncols=4,
+            frameon=False,
+        )
+
+
+def _draw(axes: Axes, name: str, value: _Value, outcomes: Sequence[Outcome]) -> None:
+    varied = [row for row in outcomes if _differs_only_in(value, row.setting)]
+    varied.sort(key=lambda row: value(row.setting))
+    x = [value(row.setting) for row in varied]
+    for shares, colour, what in (
+        ([row.true_kept for row in varied], ESTIMATE, "true fixes kept"),
+        ([row.ghosts_kept for row in varied], ODOMETRY, "ghosts kept (ranges of two landmarks)"),
+        ([row.clutter_kept for row in varied], TRUTH, "other false fixes kept"),
+        ([row.wrong_observations for row in varied], LANDMARK, "observations > 15 cm off"),
+    ):
+        percent = [float("nan") if share is None else 1e2 * share for share in shares]
+        axes.plot(x, percent, marker="o", markersize=4, linewidth=1.4, color=colour, label=what)
+    axes.axvline(value(TABLE_I), color=PALE_INK, linewidth=0.9, linestyle="--")
+    axes.set_ylim(-4, 104)
+    if name == "window_size":
+        axes.set_xticks(x, [f"{row.setting.window_size}\n{row.latency_s:.1f} s" for row in varied])
+
+
+def _differs_only_in(value: _Value, setting: Setting) -> bool:
+    others = [other for _, _, other in _PARAMETERS if other is not value]
+    return all(other(setting) == other(TABLE_I) for other in others)
+
+
+NAME = "filter"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add seed and scenes."""
+    parser.add_argument(
+        "--seed",
+        type=seed,
+        default=0,
+        help="seed of receiver noise and odometry drift (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--scene",
+        nargs="+",
+        default=["lab"],
+        help="names or files of scenes (default: lab); in two_rooms walls make most of the fixes",
+    )
+
+
+def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
+    """Drive one lap per scene and filter what was seen with every setting."""
+    # heavy, see module text
+    from slam.app.rig.emulated import scene_and_config
+    from slam.app.run.output import print_table, share_text, write_json
+
+    for scene in arguments.scene:
+        scene_and_config(scene, "paper")  # a bad one is refused before the first is driven
+    studies = []
+    for scene in arguments.scene:
+        run_seen = drive(scene, seed=arguments.seed, check=stop.check)
+        studies.append((run_seen, outcomes(run_seen, check=stop.check)))
+    write_json(
+        arguments.out / f"{NAME}.json",
+        {
+            "simulated": True,
+            "seed": arguments.seed,
+            "scenes": [
+                seen.numbers() | {"settings": [row.numbers() for row in rows]}
+                for seen, rows in studies
+            ],
+        },
+    )
+    draw_filter(arguments.out / f"{NAME}.png", studies, seed=arguments.seed)
+    for seen, rows in studies:
+        print_table(
+            f"{seen.scene}, one lap, seed {arguments.seed}: {seen.n_true} true fixes, "
+            f"{seen.n_ghosts} ghosts, {seen.n_clutter} others: simulated numbers",
+            (
+                "window, min_opc, search_rad",
+                "true kept",
+                "ghosts kept",
+                "others kept",
+                "observations",
+                "wrong",
+                "latency",
+            ),
+            [
+                (
+                    str(row.setting),
+                    share_text(row.true_kept),
+                    share_text(row.ghosts_kept),
+                    share_text(row.clutter_kept),
+                    str(row.n_observations),
+                    share_text(row.wrong_observations),
+                    f"{row.latency_s:.1f} s",
+                )
+                for row in rows
+            ],
+        )

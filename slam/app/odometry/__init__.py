@@ -1,0 +1,1 @@
+"""Wheel odometry and trajectories as TUM text."""

@@ -1,0 +1,500 @@
+"""Where a robot's odometry comes from, as text: stdin, files, sockets, serial ports.
+
+Session time is the odometry's own clock. What the host's clock shows against it is told by when
+lines arrive, or known beforehand; then radar frames, stamped with the host's time, can be placed.
+
+`parse_source` turns what the user wrote into a `LineSource`; `read_lines` gives its lines with the
+host's time at which each one came, so that a thread can follow any of them alike.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import re
+import select
+import socket
+import stat
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.app.errors import OdometryError, UsageError
+from slam.app.odometry.arrival import ClockLine, LowerEnvelope
+from slam.app.odometry.track import OdometryTrack
+from slam.app.odometry.tum import NS_PER_S, TumError, TumSample, parse_tum_line
+from xethru_protocol.transport import SerialTransport
+from xethru_protocol.wire.errors import XeThruError
+
+MOST_GAP_NS = NS_PER_S
+"""Between two samples farther apart nobody knows how the robot moved."""
+SILENCE_S = 10.0
+"""A source without a new pose for so long is dead; that of wheels that stand still talks on."""
+MOST_SPEED_MPS = 10.0
+"""Faster robots do not carry these radars; a pose that far off was set by hand or reset."""
+AHEAD_NS = 60 * NS_PER_S
+"""A file may begin so much later than a run, and a clock be so far off."""
+MOST_STAMP_NS = (2**31 - 1_000_000) * NS_PER_S
+"""The seconds of a ROS message end at 2**31; days before, for a drive that begins there goes on."""
+MOST_M = 1e8
+"""Farther than once around the Earth, as positions on a map may be; the filter squares them."""
+_COMPLAINTS = 5
+
+
+class FixedClock:
+    """A clock known beforehand: `origin_ns` is the host's time at session time 0."""
+
+    def __init__(self, origin_ns: int) -> None:
+        self._line = ClockLine(origin_ns=origin_ns)
+
+    def session_ns(self, host_ns: int) -> int:
+        """Return the session time of a host time."""
+        return self._line.nominal_ns(host_ns)
+
+
+class LiveOdometry:
+    """Lines in, poses out; what is wrong comes out as words.
+
+    Parameters
+    ----------
+    name
+        What to call the source in messages to people.
+    clock
+        Host time of session time 0, if known; None: from when lines arrive.
+
+    Attributes
+    ----------
+    n_refused
+        Lines that were no pose, or not later than the one before.
+    ended
+        Whether no more lines will come.
+    trouble
+        Why they will not; "" where the source just ended.
+    """
+
+    def __init__(self, name: str, clock: FixedClock | None = None) -> None:
+        self._name = name
+        self._fixed = clock
+        self._envelope = LowerEnvelope()
+        self._track: OdometryTrack | None = None
+        self._heard_ns: int | None = None  # host time of the newest pose taken
+        self._trouble = ""  # why the lines since then were refused
+        self._complaints = 0
+        self.n_refused = 0
+        self.ended = False
+        self.trouble = ""
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether a pose came."""
+        return self._track is not None
+
+    @property
+    def first_ns(self) -> int:
+        """Session time of the first pose."""
+        return self._whole().first_ns
+
+    @property
+    def last_ns(self) -> int:
+        """Session time of the newest pose."""
+        return self._whole().last_ns
+
+    @property
+    def drift_ppm(self) -> float | None:
+        """How fast its clock is against the host's, in millionths; None where that is not asked."""
+        return None if self._fixed else self._envelope.line.drift_ppm
+
+    def session_ns(self, host_ns: int) -> int:
+        """Return the session time of a host time; needs a pose, unless the clock is known."""
+        if self._fixed is not None:
+            return self._fixed.session_ns(host_ns)
+        return self._envelope.line.nominal_ns(host_ns)
+
+    def take(self, line: str, arrival_ns: int) -> tuple[TumSample | None, str]:
+        """Take one line.
+
+        Parameters
+        ----------
+        line
+            TUM text; empty ones and comments are passed over.
+        arrival_ns
+            Host time when it came.
+
+        Returns
+        -------
+        The pose, None if the line gave none; and what the user should know, or "".
+        """
+        if not line.strip() or line.lstrip().startswith("#"):
+            return None, ""
+        try:
+            sample = parse_tum_line(line)
+        except TumError as error:
+            return None, self._refuse(str(error))
+        if trouble := _cannot_be(sample):
+            return None, self._refuse(trouble)
+        if self._track is not None and sample.t_ns <= self._track.last_ns:
+            back_s = (self._track.last_ns - sample.t_ns) / NS_PER_S
+            return None, self._refuse(
+                f"its stamps jumped back by {back_s:.3f} s"
+                if back_s
+                else f"stamp {sample.t_ns / NS_PER_S:.3f} s came twice"
+            )
+        words = self._accept(sample)
+        if self._fixed is None:
+            self._envelope.take(sample.t_ns, arrival_ns)
+        self._heard_ns = arrival_ns
+        return sample, words
+
+    def _accept(self, sample: TumSample) -> str:
+        if self._track is None:
+            self._track = OdometryTrack([sample])
+            return ""
+        before = self._track.last
+        self._track.append(sample)
+        words = []
+        if self._trouble:
+            words.append("its lines are sound again")
+            self._trouble, self._complaints = "", 0
+        elapsed_ns = sample.t_ns - before.t_ns
+        step_m = math.hypot(sample.x_m - before.x_m, sample.y_m - before.y_m)
+        if elapsed_ns > MOST_GAP_NS:
+            words.append(
+                f"{elapsed_ns / NS_PER_S:.1f} s of it are missing; no scan of them is used"
+            )
+        if step_m > MOST_SPEED_MPS * elapsed_ns / NS_PER_S:
+            words.append(
+                f"the pose jumped by {step_m:.2f} m in {elapsed_ns / NS_PER_S:.3f} s; "
+                "was it reset? SLAM takes it for a drive"
+            )
+        return "; ".join(words)
+
+    def _refuse(self, trouble: str) -> str:
+        self.n_refused += 1
+        is_news = not self._trouble
+        self._trouble = self._trouble or trouble
+        self._complaints += 1
+        if is_news:
+            return f"{trouble}; such lines are passed over"
+        if self._complaints == _COMPLAINTS:
+            return f"{trouble}; no more is said of such lines"
+        return ""
+
+    def end(self, trouble: str) -> None:
+        """Take note that no more lines will come."""
+        if not trouble and self._track is None:
+            trouble = f"odometry from {self._name}: ended before its first pose"
+            trouble += f": {self._trouble}" if self._trouble else ""
+        self.ended, self.trouble = True, trouble
+
+    def dead(self, now_ns: int, since_ns: int) -> str:
+        """Return why the source must be taken for dead, "" if it need not.
+
+        Parameters
+        ----------
+        now_ns
+            Host time.
+        since_ns
+            Host time from which on poses are expected.
+        """
+        heard_ns = since_ns if self._heard_ns is None else max(self._heard_ns, since_ns)
+        if self.ended or now_ns - heard_ns <= SILENCE_S * NS_PER_S:
+            return ""
+        if self._trouble:
+            return (
+                f"odometry from {self._name}: no usable line for {SILENCE_S:g} s: {self._trouble}"
+            )
+        said = "no line" if self._heard_ns is None else "no more line"
+        return f"odometry from {self._name}: {said} for {SILENCE_S:g} s; is its sender running?"
+
+    def is_elsewhere(self, now_ns: int) -> str:
+        """Return why its stamps cannot be of the clock that it was said to have, "" if they can."""
+        t_ns = self.session_ns(now_ns)
+        if self._fixed is None or self.first_ns - AHEAD_NS <= t_ns <= self.last_ns + AHEAD_NS:
+            return ""
+        return (
+            f"odometry from {self._name}: its newest pose is of {self.last_ns / NS_PER_S:.3f} s, "
+            f"and by --odometry-clock it is {t_ns / NS_PER_S:.3f} s now: its stamps are of another "
+            "clock; if you do not know which, leave the option out"
+        )
+
+    def covers(self, t_ns: int) -> bool:
+        """Return whether a pose at or after this time is known."""
+        return self._track is not None and t_ns <= self._track.last_ns
+
+    def is_known(self, t_ns: int) -> bool:
+        """Return whether the pose at this time lies between two samples close enough."""
+        return self._track is not None and self._track.gap_ns(t_ns) <= MOST_GAP_NS
+
+    def pose_at(self, t_ns: int) -> NDArray[np.float64]:
+        """Return the pose at a session time; see `OdometryTrack.pose_at`."""
+        return self._whole().pose_at(t_ns)
+
+    def _whole(self) -> OdometryTrack:
+        if self._track is None:
+            raise OdometryError(f"odometry from {self._name}: no pose came")
+        return self._track
+
+
+def _cannot_be(sample: TumSample) -> str:
+    """Return why a session cannot hold a pose, or the filter not take it; "" if both can."""
+    if not 0 <= sample.t_ns < MOST_STAMP_NS:
+        return (
+            f"stamp {sample.t_ns / NS_PER_S:.3f} s is none of 0 to {MOST_STAMP_NS // NS_PER_S} s, "
+            "which a session can hold"
+        )
+    if max(abs(sample.x_m), abs(sample.y_m)) > MOST_M:
+        return f"position ({sample.x_m:g}, {sample.y_m:g}) m is nowhere on Earth"
+    return ""
+
+
+BAUD = 115200
+_POLL_S = 0.2
+_CHUNK_BYTES = 65536
+_LONGEST_LINE = 4096
+_CONNECT_S = 5.0
+
+HELP = (
+    "-, a file or FIFO, unix:PATH, tcp://HOST:PORT, serial:PORT[@BAUD]; a path to a socket or a "
+    "serial port will do"
+)
+
+
+class SourceKind(StrEnum):
+    """What stands behind a source."""
+
+    STDIN = "stdin"
+    FILE = "file"
+    FIFO = "FIFO"
+    UNIX = "unix socket"
+    TCP = "TCP socket"
+    SERIAL = "serial port"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LineSource:
+    """A source as the user named it: a path, or host and number (a port's, or a rate in baud)."""
+
+    kind: SourceKind
+    place: str
+    number: int = 0
+
+    @property
+    def name(self) -> str:
+        """Return what to call it in messages to people."""
+        if self.kind is SourceKind.STDIN:
+            return "stdin"
+        where = f"{self.place}:{self.number}" if self.kind is SourceKind.TCP else self.place
+        return f"{self.kind} {where}"
+
+    @property
+    def is_live(self) -> bool:
+        """Whether lines come when they are new, so that their arrival tells the time."""
+        return self.kind is not SourceKind.FILE
+
+
+def parse_source(text: str) -> LineSource:
+    """Return the source that a text means.
+
+    Raises
+    ------
+    UsageError
+        It means none; one line with what is allowed.
+
+    Examples
+    --------
+    >>> parse_source("tcp://127.0.0.1:5005")
+    LineSource(kind=<SourceKind.TCP: 'TCP socket'>, place='127.0.0.1', number=5005)
+    >>> parse_source("serial:/dev/ttyUSB0@57600").name
+    'serial port /dev/ttyUSB0'
+    """
+    if text == "-":
+        return LineSource(kind=SourceKind.STDIN, place="-")
+    scheme, colon, rest = text.partition(":")
+    if colon and scheme in _SCHEMES:
+        return _SCHEMES[scheme](text, rest)
+    return _path_source(text)
+
+
+def _tcp_source(text: str, rest: str) -> LineSource:
+    host, _, port = rest.removeprefix("//").rpartition(":")
+    number = int(port) if re.fullmatch(r"[0-9]{1,5}", port) else 0
+    if not rest.startswith("//") or not host or not 0 < number < 1 << 16:
+        raise UsageError(f"odometry {text}: must be tcp://HOST:PORT")
+    return LineSource(kind=SourceKind.TCP, place=host.strip("[]"), number=number)
+
+
+def _serial_source(text: str, rest: str) -> LineSource:
+    path, at, baud = rest.partition("@")
+    if not path or (at and not re.fullmatch(r"[1-9][0-9]{0,7}", baud)):
+        raise UsageError(f"odometry {text}: must be serial:PORT or serial:PORT@BAUD")
+    return LineSource(kind=SourceKind.SERIAL, place=path, number=int(baud or BAUD))
+
+
+_SCHEMES: Mapping[str, Callable[[str, str], LineSource]] = {
+    "tcp": _tcp_source,
+    "unix": lambda _, rest: LineSource(kind=SourceKind.UNIX, place=rest),
+    "serial": _serial_source,
+}
+
+
+def _path_source(text: str) -> LineSource:
+    try:
+        mode = os.stat(text).st_mode
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UsageError(f"odometry {text}: {reason}; give one of {HELP}") from None
+    kinds = (
+        (stat.S_ISSOCK, SourceKind.UNIX),
+        (stat.S_ISFIFO, SourceKind.FIFO),
+        (stat.S_ISCHR, SourceKind.SERIAL),
+        (stat.S_ISREG, SourceKind.FILE),
+    )
+    kind = next((kind for is_one, kind in kinds if is_one(mode)), None)
+    if kind is None:
+        raise UsageError(f"odometry {text}: is no source of text; give one of {HELP}")
+    return LineSource(kind=kind, place=text, number=BAUD if kind is SourceKind.SERIAL else 0)
+
+
+class _Bytes(Protocol):
+    def read(self) -> bytes | None:
+        """Return what came, None if nothing did in a while, b"" at the end."""
+
+    def close(self) -> None:
+        """Let go of it."""
+
+
+def read_lines(source: LineSource, is_stopped: Callable[[], bool]) -> Iterator[tuple[str, int]]:
+    """Yield every line with the host's monotonic time [ns] at which its end was read.
+
+    The last line may lack its end. Bytes that are no text come as replacement characters.
+
+    Parameters
+    ----------
+    source
+        What to read.
+    is_stopped
+        Asked a few times a second; then reading ends.
+
+    Raises
+    ------
+    OdometryError
+        It cannot be opened, or breaks off; one line.
+    """
+    stream = _open(source)
+    pending = b""
+    try:
+        while not is_stopped():
+            data = stream.read()
+            if data is None:
+                continue
+            now_ns = time.monotonic_ns()
+            if not data:
+                if pending:
+                    yield pending.decode(errors="replace"), now_ns
+                return
+            *lines, pending = (pending + data).split(b"\n")
+            for line in lines:
+                yield line.decode(errors="replace"), now_ns
+            if len(pending) > _LONGEST_LINE:
+                raise OdometryError(
+                    f"odometry from {source.name}: {len(pending)} bytes without a line end; "
+                    "TUM text is expected"
+                )
+    except (OSError, XeThruError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise OdometryError(f"odometry from {source.name}: {reason}") from None
+    finally:
+        stream.close()
+
+
+class _Descriptor:
+    """Bytes of anything that has a file descriptor and poll() understands, or a regular file."""
+
+    def __init__(self, fd: int, close: Callable[[], None]) -> None:
+        self._fd, self._close = fd, close
+        self._poll = select.poll()
+        self._poll.register(fd, select.POLLIN)
+
+    def read(self) -> bytes | None:
+        if not self._poll.poll(_POLL_S * 1000):
+            return None
+        try:
+            return os.read(self._fd, _CHUNK_BYTES)
+        except (BlockingIOError, InterruptedError):
+            return None
+
+    def close(self) -> None:
+        self._close()
+
+
+class _Fifo:
+    """A FIFO: nobody writing yet is no end, the last writer gone is one."""
+
+    def __init__(self, path: str) -> None:
+        self._fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+        self._bytes = _Descriptor(self._fd, lambda: os.close(self._fd))
+        self._spoke = False
+
+    def read(self) -> bytes | None:
+        data = self._bytes.read()
+        if data == b"" and not self._spoke:
+            time.sleep(_POLL_S)  # poll() returns at once as long as no writer was there
+            return None
+        self._spoke = self._spoke or bool(data)
+        return data
+
+    def close(self) -> None:
+        self._bytes.close()
+
+
+class _Serial:
+    def __init__(self, path: str, baud: int) -> None:
+        self._port = SerialTransport(path, baud)
+
+    def read(self) -> bytes | None:
+        return self._port.read(_POLL_S) or None
+
+    def close(self) -> None:
+        self._port.close()
+
+
+def _open(source: LineSource) -> _Bytes:
+    try:
+        match source.kind:
+            case SourceKind.STDIN:
+                return _Descriptor(sys.stdin.fileno(), lambda: None)
+            case SourceKind.FILE:
+                fd = os.open(source.place, os.O_RDONLY)
+                return _Descriptor(fd, lambda: os.close(fd))
+            case SourceKind.FIFO:
+                return _Fifo(source.place)
+            case SourceKind.SERIAL:
+                return _Serial(source.place, source.number)
+            case SourceKind.UNIX:
+                line = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+                return _connected(line, lambda: line.connect(source.place))
+            case SourceKind.TCP:
+                line = socket.create_connection((source.place, source.number), _CONNECT_S)
+                return _connected(line, lambda: None)
+    except UnicodeError:  # as the codec of host names has it
+        raise OdometryError(f"odometry from {source.name}: is no name of a host") from None
+    except (OSError, XeThruError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise OdometryError(f"odometry from {source.name}: {reason}") from None
+
+
+def _connected(line: socket.socket, connect: Callable[[], None]) -> _Descriptor:
+    with contextlib.ExitStack() as unless_it_works:
+        unless_it_works.callback(line.close)
+        line.settimeout(_CONNECT_S)
+        connect()
+        line.setblocking(False)
+        unless_it_works.pop_all()
+    return _Descriptor(line.fileno(), line.close)

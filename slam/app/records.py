@@ -1,0 +1,174 @@
+"""What a run of SLAM hands to its logs, viewer and reports: one small frozen type each.
+
+Frames of reference: `world` is the scene's; `map` is the frame SLAM works in, which begins at the
+robot's first pose; `odom` is the wheel odometry's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.frames import RadarFrame
+from slam.paper.pipeline import StepResult
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RadarInfo:
+    """One radar of a run: who it is, where it is mounted, how its samples lie in range and time.
+
+    `range_start_m` and `bin_length_m` are module metres, as FRAMEAREA was read back; the same in
+    true metres are in every RadarFrame. `start_skew_ns` is the session time of counter 0.
+    `gain_db` is how much louder it hears than the mean of the rig: SLAM is given its samples less
+    that, the session holds them as they came.
+    """
+
+    name: str
+    serial: str
+    port: str
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    range_offset_m: float
+    range_start_m: float
+    bin_length_m: float
+    n_bins: int
+    rate_hz: float
+    settings: Mapping[str, object]
+    start_skew_ns: int = 0
+    phase_offset_rad: float = 0.0
+    gain_db: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SessionInfo:
+    """What a run is: enough to name it, to repeat it and to read its frames.
+
+    Attributes
+    ----------
+    scene, preset, seed
+        Its names; seed None on real modules.
+    radars
+        In the order of the rig.
+    true_landmarks_m
+        Shape (n, 2), world frame; (0, 2) where nobody knows.
+    versions
+        Of what the numbers depend on.
+    config_json
+        SLAM's settings, by `session_head.settings_text`; "" where they are not told.
+    wheels
+        Fields of `WheelNoise`: how SLAM was told the wheels err.
+    outlines_m
+        Lines of walls and boxes for pictures, shape (k, 2) each, world frame.
+    simulated
+        Whether radars and world are emulated.
+    time_base
+        What the frames' stamps come from: "counter" or "arrival".
+    has_detections
+        Whether ranges were recorded that SLAM takes instead of what it finds in frames.
+    started_unix_ns
+        Time of day at session time 0; None where it means nothing.
+    """
+
+    scene: str
+    preset: str
+    seed: int | None
+    radars: tuple[RadarInfo, ...]
+    true_landmarks_m: NDArray[np.float64]
+    versions: Mapping[str, str]
+    config_json: str = ""
+    wheels: Mapping[str, float] = field(default_factory=dict)
+    outlines_m: tuple[NDArray[np.float64], ...] = ()
+    simulated: bool = True
+    time_base: str = "counter"
+    started_unix_ns: int | None = None
+    has_detections: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scan:
+    """The frames of one tick, at most one per radar; a missing radar lost its frame.
+
+    A tick is one frame period; `counter` numbers them from session time 0, and `t_ns` is when a
+    radar without start skew samples, whether there is one or not. Every frame has its own stamp,
+    in the period that begins with `t_ns`. The counters of the frames are that of the tick, less
+    the whole periods that their radar started late (none, unless it started more than one late).
+    `host_ns` holds for each frame when it arrived, nanoseconds since 1970; () where nobody noted.
+    One that is not `used` is recorded only: SLAM was not stepped with it, as odometry was missing.
+    """
+
+    counter: int
+    t_ns: int
+    frames: tuple[RadarFrame, ...]
+    host_ns: tuple[int, ...] = ()
+    used: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Snapshot:
+    """The state of SLAM at one frame time.
+
+    Attributes
+    ----------
+    counter, t_ns
+        Frame counter and time of the state, which lags the newest frame by the paper's window.
+    truth, odometry, estimate
+        Shape (3,), [x m, y m, heading rad]; world, odom and map frame.
+    world_from_map
+        Shape (3,), the pose of the map frame in the world.
+    pose_covariance
+        Shape (3, 3), of `estimate`, map frame.
+    landmark_ids
+        Shape (m,), int64.
+    landmarks_m, landmark_covariances_m2
+        Shape (m, 2) and (m, 2, 2), map frame.
+    nis_per_dof
+        One value per observation that was associated with a landmark at this state.
+    step
+        Everything that led to the state, for views; None where it came from a file.
+    """
+
+    counter: int
+    t_ns: int
+    truth: NDArray[np.float64]
+    odometry: NDArray[np.float64]
+    estimate: NDArray[np.float64]
+    world_from_map: NDArray[np.float64]
+    pose_covariance: NDArray[np.float64]
+    landmark_ids: NDArray[np.int64]
+    landmarks_m: NDArray[np.float64]
+    landmark_covariances_m2: NDArray[np.float64]
+    nis_per_dof: tuple[float, ...]
+    step: StepResult | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogLine:
+    """One line about the link: a command, its answer, a fault. `t_ns` is session time."""
+
+    t_ns: int
+    radar: str
+    warning: bool
+    text: str
+
+
+class SessionObserver:
+    """Gets everything a run produces, in order: a log, a viewer, a progress line.
+
+    Subclasses define the methods they need.
+    """
+
+    def on_scan(self, scan: Scan) -> None:
+        """Take the frames of one counter."""
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        """Take a state of SLAM."""
+
+    def on_log(self, line: LogLine) -> None:
+        """Take a line about the link."""
+
+    def close(self) -> None:
+        """Finish; called once, also after a failure."""

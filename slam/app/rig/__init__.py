@@ -1,0 +1,1 @@
+"""The radars of a robot: rig files, modules on ports, the emulated rig."""

@@ -1,0 +1,346 @@
+"""The emulated robot as SLAM sees it: its rig, its radars on ports or in process, its truth."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import json
+import math
+import os
+import select
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from platform import python_version
+from types import TracebackType
+from typing import IO, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.chip.pace import Pace
+from emulator.device import radar_device
+from emulator.echo.echo import echo_source
+from emulator.loopback import LoopbackTransport
+from emulator.module.memory import Identity
+from emulator.scene.scene import Scene, SceneError, UnknownSceneError, load_scene
+from slam.app.errors import AppError, EmulatorError, UsageError
+from slam.app.odometry.tum import NS_PER_S
+from slam.app.rig.sources import RadarLink, RigSource
+from slam.config import ConfigError, SlamConfig, load_preset
+from slam.geometry import Mount, Rig
+from slam.robust.parameters import WheelNoise
+from xethru_protocol.driver.conversation import ProtocolRecord
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.wire.errors import XeThruError
+from xethru_protocol.wire.x4 import real_frame_rate
+
+_PR_SET_PDEATHSIG = 1
+
+
+def signal_at_parents_death(which: signal.Signals) -> Callable[[], None] | None:
+    """Return what a process calls to get a signal when its parent dies; None except on Linux.
+
+    Strictly, when the thread that started it ends. The call is a single system call, as a
+    `preexec_fn` must be.
+    """
+    if sys.platform != "linux":
+        return None
+    libc = ctypes.CDLL(None)
+    return lambda: libc.prctl(_PR_SET_PDEATHSIG, which)
+
+
+READY_LIMIT_S = 30.0
+_POLL_S = 0.2
+END_LIMIT_S = 3.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EmulatedDevice:
+    """One emulated module, as the ready line names it; `start_skew_ns` is that of its samples."""
+
+    name: str
+    path: str
+    serial: str
+    start_skew_ns: int
+
+
+class EmulatorProcess:
+    """Runs `xethru-emulator serve` in its own process group while it is entered.
+
+    The group keeps Ctrl-C for us: we stop reading first and end the emulator afterwards. It removes
+    its links when it ends; if it was killed, we remove them.
+
+    Parameters
+    ----------
+    scene
+        Name or file of the scene.
+    seed
+        Seed of noise and odometry.
+
+    """
+
+    def __init__(self, scene: str, seed: int) -> None:
+        self._scene, self._seed = scene, seed
+        self._cleanup = contextlib.ExitStack()
+        self.devices: tuple[EmulatedDevice, ...] = ()
+        self.odometry_socket = ""
+        self._control_socket = ""
+
+    def __enter__(self) -> Self:
+        """Start the process; its ports are there after `wait_until_ready`."""
+        with self._cleanup:
+            self._errors: IO[bytes] = self._cleanup.enter_context(tempfile.TemporaryFile())
+            # -P: a folder "emulator" where the user happens to stand must not come first
+            command = [sys.executable, "-P", "-m", "emulator.cli", "serve", self._scene]
+            command += ["--pace", "asap", "--seed", str(self._seed)]
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=self._errors,
+                process_group=0,
+                preexec_fn=signal_at_parents_death(signal.SIGTERM),
+            )
+            self._cleanup.callback(self._end)
+            self._cleanup = self._cleanup.pop_all()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Do what `end` does."""
+        self.end()
+
+    def end(self) -> None:
+        """End the process, by force if it does not listen, and remove its links; only once."""
+        self._cleanup.close()
+
+    def ended(self) -> str | None:
+        """Return what became of the process if it is gone, else None."""
+        try:
+            code = self._process.wait(timeout=_POLL_S)
+        except subprocess.TimeoutExpired:
+            return None
+        how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
+        return f"the emulator ended {how}{self._last_words()}"
+
+    def wait_until_ready(self, check: Callable[[], None]) -> None:
+        """Read the ready line, which names ports and odometry socket.
+
+        Parameters
+        ----------
+        check
+            Called again and again while waiting; may raise to stop.
+
+        Raises
+        ------
+        EmulatorError
+            The process ended, or said nothing in time.
+        """
+        output = self._process.stdout
+        assert output is not None
+        line = b""
+        give_up = time.monotonic() + READY_LIMIT_S
+        while not line.endswith(b"\n"):
+            check()
+            if time.monotonic() > give_up:
+                raise EmulatorError(f"the emulator was not ready after {READY_LIMIT_S:g} s")
+            if select.select([output], [], [], _POLL_S)[0]:
+                part = os.read(output.fileno(), 65536)
+                if not part:
+                    raise EmulatorError(self.ended() or "the emulator closed its output")
+                line += part
+        try:
+            ready = json.loads(line)
+            self.devices = tuple(
+                EmulatedDevice(
+                    name=row["name"],
+                    path=row["path"],
+                    serial=row["serial"],
+                    start_skew_ns=row["start_skew_ns"],
+                )
+                for row in ready["devices"]
+            )
+            self.odometry_socket = ready["odometry"]
+            self._control_socket = ready["control"]
+        except (ValueError, KeyError, TypeError):
+            raise EmulatorError(f"the emulator's ready line is unknown: {line[:200]!r}") from None
+
+    def _last_words(self) -> str:
+        self._errors.seek(0)
+        lines = self._errors.read().decode(errors="replace").split("\n")
+        said = [line.strip() for line in lines if line.strip()]
+        return f": {said[-1]}" if said else ""
+
+    def _end(self) -> None:
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+        self._process.terminate()
+        try:
+            self._process.wait(timeout=END_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._remove_links()
+
+    def _remove_links(self) -> None:
+        left = [Path(device.path) for device in self.devices]
+        left += [Path(path) for path in (self.odometry_socket, self._control_socket) if path]
+        for path in left:
+            path.unlink(missing_ok=True)
+        for folder in {path.parent for path in left}:
+            with contextlib.suppress(OSError):  # gone already, or somebody else uses it
+                folder.rmdir()
+
+
+FRAME_RATE_HZ = 5
+RAW_CONFIG = RawConfig(frame_area_m=(0.2, 9.4))
+"""The paper's set-up: 1431 range bins from 0.2 to 9.4 module metres."""
+
+_VERSIONED = ("xethru-hil", "numpy", "scipy", "scikit-learn", "mcap", "rosbags", "rerun-sdk")
+
+RecordObserver = Callable[[str, ProtocolRecord], None]
+"""Gets a radar's name and what happened on its link."""
+
+
+def scene_and_config(scene: str, preset: str) -> tuple[Scene, SlamConfig]:
+    """Load a scene and the preset with the values for its environment.
+
+    Raises
+    ------
+    UsageError
+        One of the names is not known; one line with those that are.
+    AppError
+        The scene file cannot be read or is refused; one line with file, key and remedy.
+    """
+    try:
+        loaded = load_scene(scene)
+        return loaded, load_preset(preset, loaded.environment)
+    except (UnknownSceneError, ConfigError) as error:
+        raise UsageError(str(error)) from None
+    except SceneError as error:
+        raise AppError(str(error)) from None
+
+
+def rig_of(scene: Scene) -> Rig:
+    """Return the nominal mounts of a scene's radars: what a user would write in a rig file.
+
+    The modules' own range errors stay unknown to SLAM.
+    """
+    return Rig(
+        mounts=tuple(
+            Mount(
+                name=radar.name, x_m=radar.x_m, y_m=radar.y_m, yaw_rad=math.radians(radar.yaw_deg)
+            )
+            for radar in scene.radars
+        )
+    )
+
+
+def wheels_of(scene: Scene) -> WheelNoise:
+    """Return how the robot's odometry errs, from its specification in the scene file.
+
+    Standard deviations, as a data sheet gives them; what was drawn for a run stays unknown.
+    """
+    spec = scene.odometry
+    return WheelNoise(
+        along_m_per_sqrt_m=spec.along_sigma_m_per_sqrt_m,
+        across_m_per_sqrt_m=spec.across_sigma_m_per_sqrt_m,
+        heading_rad_per_sqrt_m=spec.heading_sigma_rad_per_sqrt_m,
+        heading_rad_per_rad=spec.heading_sigma_rad_per_rad,
+        scale_sigma=spec.scale_sigma,
+        turn_scale_sigma=spec.turn_scale_sigma,
+        curvature_sigma_rad_per_m=spec.curvature_sigma_rad_per_m,
+    )
+
+
+def true_landmarks_m(scene: Scene) -> NDArray[np.float64]:
+    """Return where the targets stand, shape (n, 2), world frame."""
+    return np.array([(target.x_m, target.y_m) for target in scene.targets]).reshape(-1, 2)
+
+
+def open_ports(
+    devices: tuple[EmulatedDevice, ...], rig: Rig, observer: RecordObserver
+) -> RigSource:
+    """Open emulated modules through their serial ports, as hardware would be.
+
+    Raises
+    ------
+    AppError
+        A port is missing, in use, or what answers there is no such radar.
+    """
+    links: list[RadarLink] = []
+    by_name = {device.name: device for device in devices}
+    try:
+        for mount in rig.mounts:
+            device = by_name.get(mount.name)
+            if device is None:
+                raise AppError(f"radar {mount.name}: the emulator serves {sorted(by_name)}")
+            try:
+                driver = X4M300.open(device.path, observer=_named(observer, mount.name))
+            except XeThruError as error:
+                raise AppError(f"radar {mount.name} at {device.path}: {error}") from error
+            links.append(
+                RadarLink(
+                    mount=mount,
+                    port=device.path,
+                    serial=device.serial,
+                    driver=driver,
+                    start_skew_ns=device.start_skew_ns,
+                )
+            )
+    except BaseException:
+        for link in links:
+            link.driver.close()
+        raise
+    return RigSource(links)
+
+
+def open_loopback(scene: Scene, seed: int) -> RigSource:
+    """Open the same emulated modules in this process: same driver, no ports, no waiting."""
+    links = []
+    for index, (radar, mount) in enumerate(zip(scene.radars, rig_of(scene).mounts, strict=True)):
+        device = radar_device(
+            Identity(serial=radar.serial),
+            echo_source(scene, index, seed),
+            Pace.ASAP,
+            clock=radar.clock,
+        )
+        transport = LoopbackTransport(device, name=f"in process: {radar.name}")
+        driver = X4M300(transport, clock=transport.clock_ns)
+        links.append(
+            RadarLink(
+                mount=mount,
+                port=transport.name,
+                serial=radar.serial,
+                driver=driver,
+                start_skew_ns=radar.clock.skew_ns,
+            )
+        )
+    return RigSource(links)
+
+
+def end_counter(duration_ns: int) -> int:
+    """Return the first frame counter after the end of the scene."""
+    period_ns = NS_PER_S / real_frame_rate(FRAME_RATE_HZ)
+    return int(duration_ns / period_ns) + 1
+
+
+def versions() -> dict[str, str]:
+    """Return the versions a run depends on."""
+    return {"python": python_version()} | {name: version(name) for name in _VERSIONED}
+
+
+def _named(observer: RecordObserver, name: str) -> Callable[[ProtocolRecord], None]:
+    return lambda record: observer(name, record)

@@ -1,0 +1,270 @@
+"""Where radar frames come from: drivers on ports or in process, grouped into scans.
+
+Here, and nowhere else, module metres become true metres: the module computes with light at
+3.0e8 m/s, echoes travel at 299 792 458 m/s.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from types import TracebackType
+from typing import Literal, Self, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.app.errors import AppError, RadarSilentError
+from slam.app.odometry.tum import NS_PER_S
+from slam.app.records import RadarInfo, Scan
+from slam.frames import RadarFrame
+from slam.geometry import Mount
+from xethru_protocol.driver.frames import Frame
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.wire.errors import Disconnected, ResponseTimeout, XeThruError
+from xethru_protocol.wire.x4 import MODULE_SPEED_MPS, Normalisation, frame_time_ns
+
+LIGHT_MPS = 299_792_458.0
+TRUE_PER_MODULE_METRE = LIGHT_MPS / MODULE_SPEED_MPS
+
+SILENCE_S = 5.0
+_POLL_S = 0.25
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RadarLink:
+    """An open driver and what it is called: its mount on the robot, its port, its serial number.
+
+    `start_skew_ns` is the session time of its counter 0, 0 or later; `gain_db` as in `RadarInfo`.
+    """
+
+    mount: Mount
+    port: str
+    serial: str
+    driver: X4M300
+    start_skew_ns: int = 0
+    gain_db: float = 0.0
+
+
+def sampler_limits(config: RawConfig) -> tuple[float, float]:
+    """Return the smallest and the largest value of a raw RF sample, normalised units.
+
+    What the counter's ends are as float32 on the wire, so that samples can be compared with them
+    exactly. Protocol reference 9.7.
+
+    >>> sampler_limits(RawConfig(dac_min=949, dac_max=1100))
+    (-0.07421875, 0.07421875)
+    """
+    scale = Normalisation.of(
+        iterations=config.iterations,
+        pulses_per_step=config.pulses_per_step,
+        dac_min=config.dac_min,
+        dac_max=config.dac_max,
+        dac_step=config.dac_step,
+    )
+    largest = np.float32(scale.max_counter) * np.float32(scale.quantum)
+    return -scale.dac_offset, float(largest - np.float32(scale.dac_offset))
+
+
+def radar_frame(
+    radar: int,
+    frame: Frame,
+    rate_hz: float,
+    *,
+    start_skew_ns: int = 0,
+    limits: tuple[float, float] | None = None,
+) -> RadarFrame:
+    """Turn a driver's frame into one for SLAM: true metres, time by the counter.
+
+    The counter is the only clock here: what the module's own clock is off by (tens of ppm, tens
+    of milliseconds after a quarter of an hour) does not show in it.
+
+    Parameters
+    ----------
+    radar
+        Index of the radar in the rig.
+    frame
+        What the driver read; its geometry is in module metres.
+    rate_hz
+        The chip's real frame rate, as read back.
+    start_skew_ns
+        Session time of its counter 0.
+    limits
+        Of the sampler, see `RadarFrame`.
+    """
+    return RadarFrame(
+        radar=radar,
+        t_ns=start_skew_ns + frame_time_ns(frame.counter, rate_hz),
+        counter=frame.counter,
+        # raw RF was configured, so they are real; RadarFrame refuses anything else
+        samples=cast(NDArray[np.float32], frame.samples),
+        range_start_m=frame.geometry.range_start_m * TRUE_PER_MODULE_METRE,
+        bin_length_m=frame.geometry.bin_length_m * TRUE_PER_MODULE_METRE,
+        limits=limits,
+    )
+
+
+def whole_periods(start_skew_ns: int, rate_hz: float) -> int:
+    """Return how many whole frame periods a radar started late, its counter behind the ticks.
+
+    >>> whole_periods(190_000_000, 5.0), whole_periods(200_000_000, 5.0)
+    (0, 1)
+    """
+    nearly = int(start_skew_ns * rate_hz / NS_PER_S)  # rounded, so it may be one off
+    fitting = (n for n in (nearly + 1, nearly) if frame_time_ns(n, rate_hz) <= start_skew_ns)
+    return next(fitting, nearly - 1)
+
+
+class RigSource:
+    """All radars of a robot as one stream of scans, in the order of time.
+
+    Attributes
+    ----------
+    radars
+        What the modules answered, after `start`.
+    lost_frames
+        Frames missing between the counters that arrived, over all radars.
+    """
+
+    def __init__(self, links: Sequence[RadarLink]) -> None:
+        self._links = self._open_links = tuple(links)
+        self.radars: tuple[RadarInfo, ...] = ()
+        self._limits: tuple[float, float] | None = None
+        self.lost_frames = 0
+
+    def __enter__(self) -> Self:
+        """Return the source; its links are open already."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close; see there."""
+        self.close()
+
+    def close(self) -> None:
+        """Stop the radars and close every driver; doing so again does nothing."""
+        open_links, self._open_links = self._open_links, ()
+        for link in open_links:
+            link.driver.close()
+
+    def listen(self, listener: Callable[[str, Literal["rx", "tx"], bytes, int], None]) -> None:
+        """Hand on the bytes of every port: radar, way, bytes, time of the driver's clock [ns]."""
+        for link in self._links:
+            link.driver.raw_listener = partial(listener, link.mount.name)
+
+    def start(self, config: RawConfig, fps: int) -> None:
+        """Configure raw RF on every radar and start all streams.
+
+        Raises
+        ------
+        AppError
+            A module does not answer or refuses a setting; names the radar.
+        """
+        infos = []
+        for link in self._links:
+            try:
+                geometry = link.driver.configure_raw(config)
+            except XeThruError as error:
+                raise AppError(f"radar {link.mount.name} at {link.port}: {error}") from error
+            infos.append((link, geometry))
+        radars = []
+        for link, geometry in infos:
+            try:
+                rate_hz = link.driver.start(fps)
+            except XeThruError as error:
+                raise AppError(f"radar {link.mount.name} at {link.port}: {error}") from error
+            radars.append(
+                RadarInfo(
+                    name=link.mount.name,
+                    serial=link.serial,
+                    port=link.port,
+                    x_m=link.mount.x_m,
+                    y_m=link.mount.y_m,
+                    yaw_rad=link.mount.yaw_rad,
+                    range_offset_m=link.mount.range_offset_m,
+                    range_start_m=geometry.range_start_m,
+                    bin_length_m=geometry.bin_length_m,
+                    n_bins=geometry.n_bins,
+                    rate_hz=rate_hz,
+                    settings=asdict(config),
+                    start_skew_ns=link.start_skew_ns,
+                    phase_offset_rad=link.mount.phase_offset_rad,
+                    gain_db=link.gain_db,
+                )
+            )
+        self.radars = tuple(radars)
+        self._limits = sampler_limits(config)
+
+    def scans(self, end_counter: int, check: Callable[[], None]) -> Iterator[Scan]:
+        """Yield the frames of ticks below `end_counter`, one scan per tick; see `Scan`.
+
+        Parameters
+        ----------
+        end_counter
+            First tick that is not wanted any more.
+        check
+            Called once per scan and while waiting; may raise to stop.
+
+        Raises
+        ------
+        RadarSilentError
+            A radar sent no frame for 5 s, or its port is gone.
+        """
+        # By tick, from here on: a radar's counter and the periods that it started late.
+        late = [whole_periods(info.start_skew_ns, info.rate_hz) for info in self.radars]
+        expected = list(late)
+        heads: list[Frame | None] = [None] * len(self._links)
+        while True:
+            check()
+            for radar, head in enumerate(heads):
+                if head is None:
+                    frame = self._next_frame(radar, expected[radar] - late[radar], check)
+                    tick = frame.counter + late[radar]
+                    self.lost_frames += max(min(tick, end_counter) - expected[radar], 0)
+                    expected[radar] = tick + 1
+                    heads[radar] = frame
+            tick = min(expected) - 1
+            if tick >= end_counter:
+                return
+            frames = []
+            for radar, head in enumerate(heads):
+                if head is not None and expected[radar] - 1 == tick:
+                    frames.append(self._radar_frame(radar, head))
+                    heads[radar] = None
+            t_ns = frame_time_ns(tick, self.radars[frames[0].radar].rate_hz)
+            yield Scan(counter=tick, t_ns=t_ns, frames=tuple(frames))
+
+    def _radar_frame(self, radar: int, frame: Frame) -> RadarFrame:
+        info = self.radars[radar]
+        return radar_frame(
+            radar,
+            frame,
+            info.rate_hz,
+            start_skew_ns=info.start_skew_ns,
+            limits=self._limits,
+        )
+
+    def _next_frame(self, radar: int, expected: int, check: Callable[[], None]) -> Frame:
+        link = self._links[radar]
+        give_up = time.monotonic() + SILENCE_S
+        while True:
+            try:
+                return link.driver.read_frame(timeout_s=_POLL_S)
+            except ResponseTimeout:
+                check()
+                if time.monotonic() > give_up:
+                    raise RadarSilentError(
+                        f"radar {link.mount.name} at {link.port}: no frame for {SILENCE_S:g} s "
+                        f"after frame {expected - 1}"
+                    ) from None
+            except Disconnected as error:
+                raise RadarSilentError(
+                    f"radar {link.mount.name} at {link.port}: {error} after frame {expected - 1}"
+                ) from None

@@ -1,0 +1,1 @@
+"""Runs of SLAM: demo, real modules, replay."""

@@ -1,0 +1,262 @@
+"""The numbers of one run, from its record and what is known about the world."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from slam.app.odometry.tum import NS_PER_S
+from slam.app.records import Snapshot
+from slam.app.run.runner import RunRecord
+from slam.evaluation import (
+    TrueAssociationNis,
+    align_se2,
+    ate_rmse_m,
+    icp_ate_rmse_m,
+    landmark_metrics,
+    nees_pose,
+    observable_landmarks,
+    true_range_nis,
+)
+from slam.geometry import Rig, between, compose, transform
+
+
+def ratio(error_m: float, odometry_error_m: float) -> float:
+    """Return an error in units of odometry's; infinite where odometry is perfect.
+
+    >>> ratio(0.5, 2.0), ratio(0.5, 0.0)
+    (0.25, inf)
+    """
+    return error_m / odometry_error_m if odometry_error_m else math.inf
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LandmarkSummary:
+    """Landmarks against the truth, matched within 0.15 m after the trajectory's alignment."""
+
+    true: int | None
+    """None where nobody knows what stands there; so are precision, recall and rmse_m then."""
+    estimated: int
+    precision: float | None
+    recall: float | None
+    duplicates: int
+    rmse_m: float | None
+    """These three are None where there is nothing to divide by."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Summary:
+    """The numbers of one run; field names are those of summary.json and a stable contract.
+
+    `ate_rmse_m` is time-associated and SE(2)-aligned, of the filtered path; `ate_icp_rmse_m` is the
+    paper's number, without time, and flatters; `final_error_m` is that of the last state, not
+    aligned; `nees_pose` holds (time of the state [s], NEES) pairs of the unaligned pose in the
+    start frame, of the last state at or before each of ten times; `nis_mean` is divided by its
+    degrees of freedom.
+    """
+
+    scene: str
+    preset: str
+    seed: int | None
+    """None on real modules."""
+    frames: int
+    duration_s: float
+    realtime_factor: float
+    ate_rmse_m: float
+    ate_icp_rmse_m: float
+    odometry_ate_rmse_m: float
+    final_error_m: float
+    landmarks: LandmarkSummary
+    nees_pose: tuple[tuple[float, float], ...]
+    nis_mean: float | None
+    """None where nothing was associated."""
+    nis_times: tuple[tuple[float, float, int], ...] = ()
+    """(time of the state [s], summed NIS, degrees of freedom) of the last state at or before each
+    of the ten times that has a true association; for groups of runs, not part of summary.json."""
+
+    @property
+    def ate_ratio(self) -> float:
+        """SLAM's ATE in units of odometry's; below 1 is better than driving blind."""
+        return ratio(self.ate_rmse_m, self.odometry_ate_rmse_m)
+
+    def to_json(self) -> str:
+        """Return the text of summary.json: exactly these fields, no NaN."""
+        fields = asdict(self)
+        del fields["nis_times"]
+        return json.dumps(fields, indent=2, allow_nan=False)
+
+
+POSE_DOF = 3
+_FIX_DOF = 2
+_ONE_STEP = 0.1
+"""Metres and radians that odometry and estimate may differ by at the first state, if they began
+together; a step is shorter than that."""
+_TAIL = 0.025
+"""On either side of a 95 % band."""
+
+
+@lru_cache(maxsize=512)
+def band_95(dof: int) -> tuple[float, float]:
+    """Return the bounds between which 95 % of a chi-square of so many degrees of freedom lie.
+
+    >>> [round(bound, 2) for bound in band_95(3)]
+    [0.22, 9.35]
+    """
+    return float(chdtri(dof, 1.0 - _TAIL)), float(chdtri(dof, _TAIL))
+
+
+def nis_dof(snapshot: Snapshot) -> int | None:
+    """Return over how many degrees of freedom the state's NIS is spread; None if nobody told."""
+    if not snapshot.nis_per_dof or snapshot.step is None:
+        return None
+    report = snapshot.step.report
+    return _FIX_DOF * len(snapshot.nis_per_dof) if report is None else report.dof
+
+
+def world_from_odom(first: Snapshot) -> NDArray[np.float64]:
+    """Return where the odometry's frame lies in the world, shape (3,), from the first state.
+
+    That of a demo begins with the map frame. A robot's begins anywhere, as it runs before we
+    listen: it is placed so that both paths begin at one pose.
+    """
+    apart = between(first.estimate, first.odometry)
+    if np.all(np.abs(apart) < _ONE_STEP):
+        return first.world_from_map
+    start = compose(first.world_from_map, first.estimate)
+    return compose(start, between(first.odometry, np.zeros(3)))
+
+
+def position_errors_m(snapshot: Snapshot, odom: NDArray[np.float64]) -> tuple[float, float]:
+    """Return how far estimate and odometry are from the truth, not aligned; NaN without truth.
+
+    ``odom`` is what `world_from_odom` said of the first state.
+    """
+    place, truth = snapshot.world_from_map, snapshot.truth[:2]
+    return (
+        float(np.linalg.norm(transform(place, snapshot.estimate[:2]) - truth)),
+        float(np.linalg.norm(transform(odom, snapshot.odometry[:2]) - truth)),
+    )
+
+
+def pose_nees(snapshot: Snapshot) -> float:
+    """Return the NEES of the pose in the start frame, 3 dof; NaN without truth or certainty."""
+    if not np.isfinite(snapshot.truth).all():
+        return math.nan
+    truth: NDArray[np.float64] = between(snapshot.world_from_map, snapshot.truth)
+    try:
+        return nees_pose(snapshot.estimate, snapshot.pose_covariance, truth)
+    except (ValueError, np.linalg.LinAlgError):  # singular at the very start: no statement
+        return math.nan
+
+
+NEES_AT = (0.1, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.9, 1.0)
+"""Parts of the run at which consistency is judged; the quarters are the ends of four laps."""
+
+
+Nis = tuple[float, int]
+"""Summed NIS of one state's true associations, and its degrees of freedom."""
+
+
+def summarise(
+    record: RunRecord,
+    *,
+    scene: str,
+    preset: str,
+    seed: int | None,
+    rig: Rig,
+    true_landmarks_m: NDArray[np.float64],
+) -> Summary | None:
+    """Compute summary.json's numbers; None where the run was too short for any state.
+
+    Parameters
+    ----------
+    record
+        The run.
+    scene, preset, seed
+        Its names.
+    rig
+        What SLAM was told of the mounts; decides which true landmarks count.
+    true_landmarks_m
+        Shape (n, 2), world frame.
+    """
+    if not record.results:
+        return None
+    truth_xy = record.truth[:, :2]
+    truth_in_map = np.array([between(record.world_from_map, pose) for pose in record.truth])
+    estimate = np.array([result.belief.pose for result in record.results])
+    odometry = np.array([result.odometry_pose for result in record.results])
+    last = record.results[-1]
+    alignment = align_se2(estimate[:, :2], truth_xy)
+    counting = observable_landmarks(rig, record.truth, true_landmarks_m)
+    score = landmark_metrics(last.belief.landmarks, true_landmarks_m[counting], alignment)
+    nis = _true_nis(record, true_landmarks_m)
+    return Summary(
+        scene=scene,
+        preset=preset,
+        seed=seed,
+        frames=record.n_frames,
+        duration_s=record.duration_ns / NS_PER_S,
+        realtime_factor=record.duration_ns / NS_PER_S / record.wall_s,
+        ate_rmse_m=ate_rmse_m(estimate[:, :2], truth_xy),
+        ate_icp_rmse_m=icp_ate_rmse_m(estimate[:, :2], truth_in_map[:, :2]),
+        odometry_ate_rmse_m=ate_rmse_m(odometry[:, :2], truth_xy),
+        final_error_m=float(np.linalg.norm(estimate[-1, :2] - truth_in_map[-1, :2])),
+        landmarks=LandmarkSummary(
+            true=score.true,
+            estimated=score.estimated,
+            precision=score.precision,
+            recall=score.recall,
+            duplicates=score.duplicates,
+            rmse_m=score.rmse_m,
+        ),
+        nees_pose=_nees(record, truth_in_map),
+        nis_mean=sum(value for value, _ in nis) / dof if (dof := sum(n for _, n in nis)) else None,
+        nis_times=_nis_times(record, nis),
+    )
+
+
+def _nees(record: RunRecord, truth_in_map: NDArray[np.float64]) -> tuple[tuple[float, float], ...]:
+    """Return (its time [s], its NEES) of the last state at or before each of the ten times."""
+    stamps_ns = np.array([result.t_ns for result in record.results])
+    values = []
+    for part in NEES_AT:
+        t_ns = record.start_ns + round(part * record.duration_ns)
+        row = max(int(np.searchsorted(stamps_ns, t_ns, side="right")) - 1, 0)
+        belief = record.results[row].belief
+        nees = nees_pose(belief.pose, belief.pose_covariance, truth_in_map[row])
+        values.append((int(stamps_ns[row]) / NS_PER_S, nees))
+    return tuple(values)
+
+
+def _true_nis(record: RunRecord, true_landmarks_m: NDArray[np.float64]) -> list[Nis]:
+    """Return the NIS of each state's measurements of what they are truly of, before gates."""
+    collector = TrueAssociationNis(true_landmarks_m)
+    nis = []
+    for result, truth in zip(record.results, record.truth, strict=True):
+        if result.report is None:
+            fixes = [value for value in collector.add(result, truth) if math.isfinite(value)]
+            nis.append((sum(fixes), _FIX_DOF * len(fixes)))
+        else:
+            ranges = true_range_nis(result, truth, true_landmarks_m)
+            nis.append((sum(ranges), len(ranges)))
+    return nis
+
+
+def _nis_times(record: RunRecord, nis: list[Nis]) -> tuple[tuple[float, float, int], ...]:
+    """Return (time [s], NIS, dof) of the last state at or before each time that has any."""
+    judged = [row for row, (_, dof) in enumerate(nis) if dof]
+    if not judged:
+        return ()
+    stamps_ns = np.array([record.results[row].t_ns for row in judged])
+    values = []
+    for part in NEES_AT:
+        t_ns = record.start_ns + round(part * record.duration_ns)
+        place = max(int(np.searchsorted(stamps_ns, t_ns, side="right")) - 1, 0)
+        values.append((int(stamps_ns[place]) / NS_PER_S, *nis[judged[place]]))
+    return tuple(values)

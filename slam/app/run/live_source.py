@@ -1,0 +1,718 @@
+"""Scans of radars on real ports, as they come: arrivals to stamps, silence to words.
+
+Each thread owns what it reads from and tells the main loop through one queue. A radar that falls
+silent or vanishes is looked for until it is back or the run ends.
+
+Ticks are frame periods of session time. A tick is complete when every radar that is alive has
+sent a frame of it or a later one, and odometry has come past it; or when waiting longer would
+help nobody. No clock is read here: time is an argument, so all of it runs in virtual time, too.
+
+Time base `arrival`: every radar's counter is regressed on the host's clock, the odometry's stamps
+likewise, so a frame's session time is what the odometry's clock showed when it was taken. The
+main loop reads its inbox only; ports are read by the threads of `run_readers`.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from queue import Empty, SimpleQueue
+from types import TracebackType
+from typing import Literal, Protocol, Self, TypeAlias
+
+from slam.app.errors import AppError, OdometryError, StopRequestedError
+from slam.app.odometry.arrival import ArrivalClock
+from slam.app.odometry.live import LineSource, LiveOdometry, read_lines
+from slam.app.odometry.tum import NS_PER_S, TumSample
+from slam.app.records import RadarInfo, Scan
+from slam.app.rig.sources import RadarLink, radar_frame
+from slam.frames import RadarFrame
+from xethru_protocol.driver.conversation import ProtocolRecord
+from xethru_protocol.driver.frames import Frame
+from xethru_protocol.wire.errors import ResponseTimeout, XeThruError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameCame:
+    """A frame of a radar of the rig; it knows when it arrived."""
+
+    radar: int
+    frame: Frame
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RadarLost:
+    """A radar sends no more; `text` says why. It is looked for."""
+
+    radar: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RadarBack:
+    """A radar that was lost sends again, from a port."""
+
+    radar: int
+    port: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkSaid:
+    """A line of the protocol log of a radar."""
+
+    radar: str
+    record: ProtocolRecord
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WireCame:
+    """Bytes as they went over a radar's port."""
+
+    radar: str
+    way: Literal["rx", "tx"]
+    data: bytes
+    host_ns: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OdometryLine:
+    """A line of the odometry's source, and the host's time when it came."""
+
+    text: str
+    arrival_ns: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OdometryEnded:
+    """No more lines will come; `trouble` says why, "" where the source just ended."""
+
+    trouble: str
+
+
+Event: TypeAlias = (
+    FrameCame | RadarLost | RadarBack | LinkSaid | WireCame | OdometryLine | OdometryEnded
+)
+
+
+SILENCE_S = 3.0
+"""Many frame periods; a module that is silent for so long has stopped streaming."""
+_POLL_S = 0.2
+_LOOK_S = 2.0
+_LOOK_AGAIN_S = 1.0
+_JOIN_S = 10.0
+"""More than a look for a module takes; whoever still reads then hangs in the system."""
+
+Inbox = SimpleQueue[Event]
+
+
+class Readers:
+    """Reads all radars and the odometry while it is entered.
+
+    Parameters
+    ----------
+    links
+        Radars that stream, in the order of the rig; their drivers are the threads' own meanwhile.
+    source
+        Where odometry comes from.
+    inbox
+        Gets everything.
+    """
+
+    def __init__(self, links: Sequence[RadarLink], source: LineSource, inbox: Inbox) -> None:
+        self._stopped = threading.Event()
+        self._inbox = inbox
+        self._threads = [
+            threading.Thread(
+                target=_read_radar,
+                args=(index, link, inbox, self._stopped),
+                name=f"radar {link.mount.name}",
+                daemon=True,
+            )
+            for index, link in enumerate(links)
+        ]
+        self._threads.append(
+            threading.Thread(
+                target=_read_odometry,
+                args=(source, inbox, self._stopped),
+                name="odometry",
+                daemon=True,
+            )
+        )
+
+    def __enter__(self) -> Self:
+        """Start the threads."""
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """End the threads; afterwards the drivers may be used again."""
+        self._stopped.set()
+        give_up = time.monotonic() + _JOIN_S
+        for thread in self._threads:
+            thread.join(max(give_up - time.monotonic(), 0.0))
+
+
+def tap_wire(link: RadarLink, inbox: Inbox) -> None:
+    """Let every byte of a radar's port pass the inbox."""
+
+    def tell(way: Literal["rx", "tx"], data: bytes, host_ns: int) -> None:
+        inbox.put(WireCame(radar=link.mount.name, way=way, data=data, host_ns=host_ns))
+
+    link.driver.raw_listener = tell
+
+
+def _read_radar(radar: int, link: RadarLink, inbox: Inbox, stopped: threading.Event) -> None:
+    try:
+        _follow_radar(radar, link, inbox, stopped)
+    except Exception as error:  # a bug; the run must hear of it, not lose a radar without a word
+        inbox.put(RadarLost(radar=radar, text=f"its reader failed: {error!r}"))
+        raise
+
+
+def _follow_radar(radar: int, link: RadarLink, inbox: Inbox, stopped: threading.Event) -> None:
+    heard = time.monotonic()
+    while not stopped.is_set():
+        trouble = ""
+        try:
+            inbox.put(FrameCame(radar=radar, frame=link.driver.read_frame(_POLL_S)))
+            heard = time.monotonic()
+        except ResponseTimeout:
+            if time.monotonic() - heard > SILENCE_S:
+                trouble = f"no frame for {SILENCE_S:g} s"
+        except XeThruError as error:
+            trouble = str(error)
+        if trouble:
+            inbox.put(RadarLost(radar=radar, text=trouble))
+            if _found_again(link, stopped.is_set, stopped.wait):
+                inbox.put(RadarBack(radar=radar, port=link.driver.port))
+            heard = time.monotonic()
+
+
+def _found_again(
+    link: RadarLink, is_stopped: Callable[[], bool], wait: Callable[[float], bool]
+) -> bool:
+    while not is_stopped():
+        try:
+            link.driver.reconnect(_LOOK_S)
+        except XeThruError:
+            wait(_LOOK_AGAIN_S)
+        else:
+            return True
+    return False
+
+
+def _read_odometry(source: LineSource, inbox: Inbox, stopped: threading.Event) -> None:
+    trouble = ""
+    try:
+        for text, arrival_ns in read_lines(source, stopped.is_set):
+            inbox.put(OdometryLine(text=text, arrival_ns=arrival_ns))
+    except OdometryError as error:
+        trouble = str(error)
+    except Exception as error:  # a bug, as above
+        inbox.put(OdometryEnded(trouble=f"its reader failed: {error!r}"))
+        raise
+    inbox.put(OdometryEnded(trouble=trouble))
+
+
+GRACE_NS = NS_PER_S // 2
+"""How long a tick waits for a radar that has not sent its frame yet."""
+ODOMETRY_PATIENCE_NS = NS_PER_S
+"""How long a tick waits for odometry; then its frames are recorded and not used."""
+MOST_LAG_NS = 10 * NS_PER_S
+"""When SLAM is later than that, scans are recorded and not used until it has caught up."""
+CAUGHT_UP_NS = NS_PER_S
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReceivedFrame:
+    """A frame with session time, and when it arrived, nanoseconds since 1970."""
+
+    frame: RadarFrame
+    host_ns: int
+
+
+class TickAssembler:
+    """Gives out scans in the order of time.
+
+    Parameters
+    ----------
+    n_radars
+        Radars of the rig.
+    period_ns
+        Of their frames.
+    odometry
+        Asked how far it has come.
+
+    Attributes
+    ----------
+    start_ns
+        Session time of tick 0; None before `begin`.
+    lag_ns
+        How long ago the newest tick given out was over.
+    n_unused, n_late
+        Scans given out that SLAM must not use; those among them for which it was too late.
+    n_left_out
+        Frames that came too late for SLAM, given out in scans that it must not use.
+    ended
+        Whether odometry ended, and the ticks have come there.
+    """
+
+    def __init__(self, n_radars: int, period_ns: int, odometry: LiveOdometry) -> None:
+        self._odometry = odometry
+        self._period_ns = period_ns
+        self._waiting: list[deque[ReceivedFrame]] = [deque() for _ in range(n_radars)]
+        self._alive = set(range(n_radars))
+        self._tick = 0
+        self._is_late = False
+        self.start_ns: int | None = None
+        self.lag_ns = 0
+        self.n_unused = self.n_late = self.n_left_out = 0
+        self.ended = False
+
+    @property
+    def alive(self) -> frozenset[int]:
+        """Radars that are not lost."""
+        return frozenset(self._alive)
+
+    def begin(self, start_ns: int) -> None:
+        """Let tick 0 begin at a session time; frames before it are forgotten."""
+        self.start_ns = start_ns
+        for queue in self._waiting:
+            while queue and queue[0].frame.t_ns < start_ns:
+                queue.popleft()
+
+    def take(self, received: ReceivedFrame) -> None:
+        """Take a frame; those of one radar come in the order of time."""
+        self._waiting[received.frame.radar].append(received)
+
+    def lost(self, radar: int) -> None:
+        """Wait for this radar no more."""
+        self._alive.discard(radar)
+
+    def back(self, radar: int) -> None:
+        """Wait for it again."""
+        self._alive.add(radar)
+
+    def next_scan(self, now_ns: int) -> Scan | None:
+        """Return the next scan that is complete at a session time, None if none is yet."""
+        if self.start_ns is None:
+            return None
+        while True:
+            begin_ns = self.start_ns + self._tick * self._period_ns
+            end_ns = begin_ns + self._period_ns
+            late = self._late(begin_ns, end_ns)
+            if late:
+                self.n_left_out += len(late)
+                return self._scan(late, begin_ns, used=False)
+            self.ended = self._odometry.ended and not self._odometry.covers(begin_ns)
+            received = self._of_tick(end_ns)
+            stamps_ns = [begin_ns, *(row.frame.t_ns for row in received)]
+            if self.ended or self._may_get_more(received, max(stamps_ns), end_ns, now_ns):
+                return None
+            if received:
+                break
+            self._tick = max(self._tick + 1, self._next_with_something(now_ns))
+        for row in received:
+            self._waiting[row.frame.radar].popleft()
+        self._note_lag(now_ns - end_ns)
+        used = not self._is_late and all(map(self._odometry.is_known, stamps_ns))
+        self.n_late += self._is_late
+        scan = self._scan(received, begin_ns, used=used)
+        self._tick += 1
+        return scan
+
+    def _next_with_something(self, now_ns: int) -> int:
+        """Return the tick of the oldest frame, or the first one that may still get some.
+
+        Those before it are empty; there are billions where odometry's clock was set from 1970.
+        """
+        assert self.start_ns is not None
+        heads_ns = [queue[0].frame.t_ns for queue in self._waiting if queue]
+        return (min([now_ns - GRACE_NS, *heads_ns]) - self.start_ns) // self._period_ns
+
+    def _may_get_more(
+        self, received: Sequence[ReceivedFrame], needed_ns: int, end_ns: int, now_ns: int
+    ) -> bool:
+        """Return whether waiting makes a tick more complete: by a radar, or by odometry."""
+        missing = not self._alive or any(not self._waiting[radar] for radar in self._alive)
+        if missing and now_ns < end_ns + GRACE_NS:
+            return True
+        if not received:
+            return now_ns < end_ns
+        if self._odometry.covers(needed_ns) or self._odometry.ended:
+            return False
+        return now_ns < needed_ns + ODOMETRY_PATIENCE_NS
+
+    def _scan(self, received: Sequence[ReceivedFrame], t_ns: int, *, used: bool) -> Scan:
+        self.n_unused += not used
+        return Scan(
+            counter=self._tick,
+            t_ns=t_ns,
+            frames=tuple(row.frame for row in received),
+            host_ns=tuple(row.host_ns for row in received),
+            used=used,
+        )
+
+    def _late(self, begin_ns: int, end_ns: int) -> Sequence[ReceivedFrame]:
+        """Take the oldest frame of every radar that is too old for a tick.
+
+        It is, if it is older than a whole period, or than a quarter of one where a newer one of
+        the tick is there: after a stall of a line, or once in hours where a module's clock is
+        fast. By less, jitter about a tick's bounds makes frames old; they count.
+        """
+        late = []
+        for queue in self._waiting:
+            age_ns = begin_ns - queue[0].frame.t_ns if queue else 0
+            has_newer = len(queue) > 1 and queue[1].frame.t_ns < end_ns
+            if age_ns > (self._period_ns // 4 if has_newer else self._period_ns):
+                late.append(queue.popleft())
+        return late
+
+    def _of_tick(self, end_ns: int) -> Sequence[ReceivedFrame]:
+        """Return the oldest frame of every radar, if it was taken before the tick's end."""
+        return [q[0] for q in self._waiting if q and q[0].frame.t_ns < end_ns]
+
+    def _note_lag(self, lag_ns: int) -> None:
+        self.lag_ns = lag_ns
+        if self._is_late:
+            self._is_late = lag_ns > CAUGHT_UP_NS
+        else:
+            self._is_late = lag_ns > MOST_LAG_NS
+
+
+SETTLE_S = 2.0
+"""For so long frames and odometry are listened to before the first scan: clocks are known then."""
+START_LIMIT_S = 15.0
+SILENT_RIG_S = 10.0
+WARN_LAG_S = 2.0
+UNUSED_S = 5.0
+_SOURCE_POLL_S = 0.05
+_DRIFT_EVERY_S = 60.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ended:
+    """Why a run came to its end; `failed` where it should have gone on."""
+
+    text: str
+    failed: bool = False
+    stopped: StopRequestedError | None = None
+
+
+class EventQueue(Protocol):
+    """Where events wait; a `queue.SimpleQueue` is one."""
+
+    def get(self, *, timeout: float) -> Event:
+        """Return the next event; raise `queue.Empty` if none comes in time."""
+        ...
+
+    def get_nowait(self) -> Event:
+        """Return the next event; raise `queue.Empty` if none waits."""
+        ...
+
+
+class RunListener(Protocol):
+    """Gets what a run learns beside scans."""
+
+    def on_odometry(self, sample: TumSample) -> None:
+        """Take a pose of the wheels."""
+
+    def on_wire(self, event: WireCame) -> None:
+        """Take raw bytes of a port."""
+
+    def on_link(self, event: LinkSaid) -> None:
+        """Take a line of a radar's protocol log."""
+
+    def say(self, who: str, text: str, *, warning: bool) -> None:
+        """Take what the user should know; `who` is a radar, the odometry or the run."""
+
+
+class LiveSource:
+    """The rig as a stream of scans in real time.
+
+    Parameters
+    ----------
+    radars
+        What the modules answered, in the order of the rig.
+    limits
+        Of the sampler, see `RadarFrame`.
+    odometry
+        Takes the lines.
+    inbox
+        Where the threads' events are.
+    listener
+        Gets everything beside the scans, in this thread.
+    check
+        Called often; may raise StopRequestedError to stop.
+    duration_s
+        When to end; None: never.
+    clock_ns
+        The host's monotonic time, that of the drivers' arrivals.
+
+    Attributes
+    ----------
+    clocks
+        Of every radar, in the order of the rig.
+    ended
+        Why `scans` came to its end.
+    worst_lag_s
+        How long ago a tick was over when SLAM got it, at worst.
+    busy_s
+        Time spent by whoever took the scans.
+    lost_frames
+        Frames missing between the counters that arrived, over all radars.
+    """
+
+    def __init__(  # noqa: PLR0917 - everything a run consists of
+        self,
+        radars: tuple[RadarInfo, ...],
+        limits: tuple[float, float] | None,
+        odometry: LiveOdometry,
+        inbox: EventQueue,
+        listener: RunListener,
+        check: Callable[[], None],
+        *,
+        duration_s: float | None = None,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self._radars, self._limits = radars, limits
+        self._odometry, self._inbox, self._listener = odometry, inbox, listener
+        self._check, self._duration_s, self._clock_ns = check, duration_s, clock_ns
+        self._unix_ns = time.time_ns() - time.monotonic_ns()
+        self._assembler = TickAssembler(len(radars), round(NS_PER_S / radars[0].rate_hz), odometry)
+        self._began_ns = clock_ns()
+        self._all_lost_ns: int | None = None
+        self._last_counters: list[int | None] = [None] * len(radars)
+        self._drift_told_ns = self._began_ns
+        self._lag_told_s = WARN_LAG_S
+        self._unused_since_ns: int | None = None
+        self._unused_told = False
+        self.clocks = tuple(ArrivalClock(radar.rate_hz) for radar in radars)
+        self.ended: Ended | None = None
+        self.worst_lag_s = self.busy_s = 0.0
+        self.lost_frames = 0
+
+    @property
+    def lag_s(self) -> float:
+        """How long ago the newest tick given out was over."""
+        return self._assembler.lag_ns / NS_PER_S
+
+    @property
+    def n_unused(self) -> int:
+        """Scans recorded that SLAM did not use."""
+        return self._assembler.n_unused
+
+    @property
+    def n_left_out(self) -> int:
+        """Frames that came too late for SLAM and are only recorded."""
+        return self._assembler.n_left_out
+
+    @property
+    def odometry_drift_ppm(self) -> float | None:
+        """How fast the odometry's clock is against the host's; None where it is told otherwise."""
+        return self._odometry.drift_ppm
+
+    def settle(self) -> int:
+        """Listen until every clock is known a little; return the session time of the first scan.
+
+        Raises
+        ------
+        AppError
+            A radar or the odometry says nothing.
+        StopRequestedError
+            As `check` raises it.
+        """
+        ready_ns: int | None = None
+        while True:
+            self._check()
+            self._drain(_SOURCE_POLL_S)
+            now_ns = self._clock_ns()
+            waited_s = (now_ns - self._began_ns) / NS_PER_S
+            silent = [
+                radar.name
+                for radar, last in zip(self._radars, self._last_counters, strict=True)
+                if last is None
+            ]
+            if silent and waited_s > START_LIMIT_S:
+                raise AppError(f"radar {', '.join(silent)}: no frame in {START_LIMIT_S:g} s")
+            if self._odometry.ended and not self._odometry.has_pose:
+                raise AppError(self._odometry.trouble)
+            if text := self._odometry.dead(now_ns, self._began_ns):
+                raise AppError(text)
+            if silent or not self._odometry.has_pose:
+                continue
+            ready_ns = now_ns if ready_ns is None else ready_ns
+            if now_ns - ready_ns < SETTLE_S * NS_PER_S:
+                continue
+            start_ns = max(self._odometry.session_ns(now_ns), self._odometry.first_ns)
+            if self._odometry.ended and not self._odometry.covers(start_ns):
+                raise AppError(
+                    f"odometry: its last pose is of {self._odometry.last_ns / NS_PER_S:.3f} s, and "
+                    f"by its clock it is {start_ns / NS_PER_S:.3f} s: it ended before the run "
+                    "could begin, or --odometry-clock is another"
+                )
+            if text := self._odometry.is_elsewhere(now_ns):
+                raise AppError(text)
+            if self._odometry.session_ns(now_ns) < NS_PER_S:
+                continue  # no session holds what was before 0
+            self._assembler.begin(start_ns)
+            return start_ns
+
+    def scans(self) -> Iterator[Scan]:
+        """Yield scans until the run ends; `ended` says why it did."""
+        while self.ended is None:
+            try:
+                self._check()
+            except StopRequestedError as stopped:
+                self.ended = Ended(text=str(stopped), stopped=stopped)
+                break
+            self._drain(_SOURCE_POLL_S)
+            while (scan := self._next_scan()) is not None:
+                started_ns = self._clock_ns()
+                yield scan
+                self.busy_s += (self._clock_ns() - started_ns) / NS_PER_S
+                self._drain(0.0)
+            self._judge()
+        self._tell_drifts()
+
+    def _next_scan(self) -> Scan | None:
+        if self.ended is not None:
+            return None
+        scan = self._assembler.next_scan(self._odometry.session_ns(self._clock_ns()))
+        if scan is None:
+            return None
+        assert self._assembler.start_ns is not None
+        elapsed_s = (scan.t_ns - self._assembler.start_ns) / NS_PER_S
+        if self._duration_s is not None and elapsed_s >= self._duration_s:
+            self.ended = Ended(text=f"the {self._duration_s:g} s asked for are over")
+            return None
+        self._note_lag()
+        self._note_unused(scan)
+        return scan
+
+    def _drain(self, wait_s: float) -> None:
+        """Take all events there are; wait for the first one if there is none."""
+        try:
+            self._take(self._inbox.get(timeout=wait_s) if wait_s else self._inbox.get_nowait())
+            while True:
+                self._take(self._inbox.get_nowait())
+        except Empty:
+            return
+
+    def _take(self, event: Event) -> None:
+        match event:
+            case FrameCame():
+                self._take_frame(event.radar, event.frame)
+            case OdometryLine():
+                sample, words = self._odometry.take(event.text, event.arrival_ns)
+                if words:
+                    self._listener.say("odometry", words, warning=True)
+                if sample is not None:
+                    self._listener.on_odometry(sample)
+            case OdometryEnded():
+                self._odometry.end(event.trouble)
+                self._listener.say(
+                    "odometry", event.trouble or "ended", warning=bool(event.trouble)
+                )
+            case RadarLost():
+                self._assembler.lost(event.radar)
+                left = len(self._assembler.alive)
+                self._listener.say(
+                    self._radars[event.radar].name,
+                    f"{event.text}; the run goes on with {left} of {len(self._radars)} radars",
+                    warning=True,
+                )
+            case RadarBack():
+                self._assembler.back(event.radar)
+                text = f"is back, at {event.port}"
+                self._listener.say(self._radars[event.radar].name, text, warning=True)
+            case LinkSaid():
+                self._listener.on_link(event)
+            case WireCame():
+                self._listener.on_wire(event)
+
+    def _take_frame(self, radar: int, frame: Frame) -> None:
+        info = self._radars[radar]
+        last = self._last_counters[radar]
+        if last is not None and frame.counter > last:
+            self.lost_frames += frame.counter - last - 1
+        self._last_counters[radar] = frame.counter
+        taken_ns = self.clocks[radar].stamp_ns(frame.counter, frame.arrival_ns)
+        if not self._odometry.has_pose:
+            return  # nobody knows session time yet
+        made = radar_frame(radar, frame, info.rate_hz, limits=self._limits)
+        self._assembler.take(
+            ReceivedFrame(
+                frame=replace(made, t_ns=self._odometry.session_ns(taken_ns)),
+                host_ns=frame.arrival_ns + self._unix_ns,
+            )
+        )
+
+    def _note_lag(self) -> None:
+        lag_s = self.lag_s
+        self.worst_lag_s = max(self.worst_lag_s, lag_s)
+        if lag_s > self._lag_told_s:
+            self._lag_told_s = 2.0 * lag_s
+            self._listener.say(
+                "run",
+                f"SLAM is {lag_s:.1f} s behind the radars: this machine is too slow, or busy with "
+                "something else; all frames are recorded",
+                warning=True,
+            )
+
+    def _note_unused(self, scan: Scan) -> None:
+        """Say it where SLAM has stood still for long: its clock may be another one by now."""
+        if scan.used:
+            self._unused_since_ns = None
+        elif self._unused_since_ns is None:
+            self._unused_since_ns, self._unused_told = scan.t_ns, False
+        elif scan.t_ns - self._unused_since_ns > UNUSED_S * NS_PER_S and not self._unused_told:
+            self._unused_told = True
+            self._listener.say(
+                "run",
+                f"SLAM got no scan for {UNUSED_S:g} s, as odometry does not cover their time or "
+                "they came too late; they are recorded. Was a clock set?",
+                warning=True,
+            )
+
+    def _judge(self) -> None:
+        """Say how clocks drift, and end a run that cannot go on."""
+        now_ns = self._clock_ns()
+        if now_ns - self._drift_told_ns > _DRIFT_EVERY_S * NS_PER_S:
+            self._drift_told_ns = now_ns
+            self._tell_drifts()
+        if self.ended is not None:
+            return
+        if self._assembler.ended:
+            self.ended = Ended(text=self._odometry.trouble or "odometry ended")
+            if self._odometry.trouble:
+                self.ended = replace(self.ended, failed=True)
+        elif text := self._odometry.dead(now_ns, self._began_ns):
+            self.ended = Ended(text=text, failed=True)
+        elif self._assembler.alive:
+            self._all_lost_ns = None
+        elif self._all_lost_ns is None:
+            self._all_lost_ns = now_ns
+        elif now_ns - self._all_lost_ns > SILENT_RIG_S * NS_PER_S:
+            self.ended = Ended(text=f"no radar for {SILENT_RIG_S:g} s", failed=True)
+
+    def _tell_drifts(self) -> None:
+        for info, clock in zip(self._radars, self.clocks, strict=True):
+            self._listener.say(info.name, drift_text(clock), warning=False)
+
+
+def drift_text(clock: ArrivalClock) -> str:
+    """Return a clock's drift against the host's, for people."""
+    return (
+        f"clock {clock.drift_ppm:+.2f} ppm against this machine's, "
+        f"+-{clock.drift_sigma_ppm:.2f} over {clock.baseline_s:.0f} s"
+    )

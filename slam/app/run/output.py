@@ -1,0 +1,275 @@
+"""What a person reads during and after a run: progress and tables."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+
+from slam.app.errors import naming
+from slam.app.odometry.tum import NS_PER_S
+from slam.app.records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
+from slam.app.run.evaluation import LandmarkSummary, Summary, ratio
+from slam.app.run.runner import RunRecord
+from slam.geometry import transform
+
+_LIVE_PERIOD_S = 0.2
+_PLAIN_PERIOD_S = 10.0
+_NO_RADARS = frozenset({"odometry", "run"})
+"""Who else log lines are about."""
+
+
+class Progress(SessionObserver):
+    """Shows scene time, frames per second and radar, pose error, landmarks and lost frames.
+
+    The pose error compares with the truth, which SLAM itself never sees.
+
+    Parameters
+    ----------
+    info
+        The run; its radars are counted.
+    duration_ns
+        Session time the run will cover; None where nobody knows.
+    lost_frames
+        Asked when a line is shown.
+    also
+        Asked for more words when a line is shown.
+    stream
+        Where lines go; a terminal gets one line that is rewritten.
+    """
+
+    def __init__(
+        self,
+        info: SessionInfo,
+        duration_ns: int | None,
+        lost_frames: Callable[[], int],
+        *,
+        also: Callable[[], str] = str,
+        stream: TextIO | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._stream = sys.stderr if stream is None else stream
+        self._n_radars, self._duration_ns = max(len(info.radars), 1), duration_ns
+        self._lost_frames, self._also, self._clock = lost_frames, also, clock
+        self._is_terminal = self._stream.isatty()
+        self._period_s = _LIVE_PERIOD_S if self._is_terminal else _PLAIN_PERIOD_S
+        self._started = self._shown = clock()
+        self._n_frames = self._t_ns = 0
+        self._start_ns: int | None = None
+        self._snapshot: Snapshot | None = None
+
+    def on_scan(self, scan: Scan) -> None:
+        """Count frames; show a line when it is time."""
+        self._n_frames += len(scan.frames)
+        if self._start_ns is None:  # in the real world session time begins anywhere
+            self._start_ns = 0 if self._duration_ns is not None else scan.t_ns
+        self._t_ns = scan.t_ns - self._start_ns
+        if self._clock() - self._shown >= self._period_s:
+            self._show()
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        """Remember the newest state."""
+        self._snapshot = snapshot
+
+    def on_log(self, line: LogLine) -> None:
+        """Show warnings about the link at once."""
+        if line.warning:
+            who = line.radar if line.radar in _NO_RADARS else f"radar {line.radar}"
+            self._write(f"warning: {who}: {line.text}\n")
+
+    def close(self) -> None:
+        """Show the last line and leave it standing."""
+        self._show()
+        if self._is_terminal:
+            self._stream.write("\n")
+            self._stream.flush()
+
+    def line(self) -> str:
+        """Return the line as it would be shown now."""
+        wall_s = max(self._clock() - self._started, 1e-9)
+        rate = self._n_frames / self._n_radars / wall_s
+        text = f"scene time {self._t_ns / NS_PER_S:6.1f} "
+        text += "s" if self._duration_ns is None else f"of {self._duration_ns / NS_PER_S:.1f} s"
+        text += f"  {rate:5.0f} frames/s per radar"
+        if self._snapshot is not None:
+            state = self._snapshot
+            estimate = transform(state.world_from_map, state.estimate[:2])
+            error_m = float(np.linalg.norm(estimate - state.truth[:2]))
+            if not np.isnan(error_m):
+                text += f"  pose error {1e3 * error_m:6.1f} mm"
+            text += f"  {len(state.landmark_ids)} landmarks"
+        return f"{text}  {self._lost_frames()} frames lost{self._also()}"
+
+    def _show(self) -> None:
+        self._shown = self._clock()
+        if self._is_terminal:  # erasing reaches one row only, so the line must not wrap
+            self._write(self.line()[: shutil.get_terminal_size().columns - 1])
+        else:
+            self._write(f"{self.line()}\n")
+
+    def _write(self, text: str) -> None:
+        # Carriage return and erase: the live line stays one line.
+        self._stream.write(f"\r\x1b[K{text}" if self._is_terminal else text)
+        self._stream.flush()
+
+
+def write_json(path: Path, numbers: Mapping[str, object]) -> None:
+    """Write the numbers; NaN is refused, None stands for what there is not.
+
+    Raises
+    ------
+    AppError
+        The file cannot be written.
+    """
+    text = json.dumps(numbers, indent=2, allow_nan=False)
+    with naming(path):
+        path.write_text(text + "\n", encoding="ascii")
+
+
+def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Write a table to stdout: names to the left, everything else to the right."""
+    table = [header, *rows]
+    widths = [max(len(row[column]) for row in table) for column in range(len(header))]
+    rule = "-" * max(len(title), sum(widths) + 2 * (len(widths) - 1))
+    lines = [
+        "  ".join(
+            cell.ljust(width) if column == 0 else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in table
+    ]
+    sys.stdout.write("\n".join([title, rule, lines[0], rule, *lines[1:], rule]) + "\n")
+
+
+def print_summary(
+    summary: Summary, *, lag_states: int, wall_s: float, lost_frames: int, stream: TextIO
+) -> None:
+    """Write the table of one simulated run."""
+    text = table_text(summary, lag_states=lag_states, wall_s=wall_s, lost_frames=lost_frames)
+    stream.write(text)
+    stream.flush()
+
+
+def table_text(summary: Summary, *, lag_states: int, wall_s: float, lost_frames: int) -> str:
+    """Return the table of `summary_rows` under its title."""
+    rows = summary_rows(summary, lag_states=lag_states, wall_s=wall_s, lost_frames=lost_frames)
+    title = f"{summary.scene}, preset {summary.preset}"
+    title += ": a drive" if summary.seed is None else f", seed {summary.seed}: simulated numbers"
+    widths = [max(len(row[column]) for row in rows) for column in (0, 1)]
+    rule = "-" * max(len(title), *(sum(widths) + 4 + len(row[2]) for row in rows))
+    lines = [f"{name:<{widths[0]}}  {value:>{widths[1]}}  {note}" for name, value, note in rows]
+    return "\n".join([title, rule, *lines, rule]) + "\n"
+
+
+def summary_rows(
+    summary: Summary, *, lag_states: int, wall_s: float, lost_frames: int
+) -> list[tuple[str, str, str]]:
+    """Return name, value and note: errors in mm with their ratio to odometry's, landmarks, speed.
+
+    `lag_states` is how many newer states had been seen when a state was estimated.
+    """
+    lag = f"filtered, {lag_states} states late" if lag_states else "causal"
+    icp_ratio = ratio(summary.ate_icp_rmse_m, summary.odometry_ate_rmse_m)
+    return [
+        ("odometry ATE", mm_text(summary.odometry_ate_rmse_m), "wheels alone, SE(2)-aligned"),
+        (
+            "SLAM ATE",
+            mm_text(summary.ate_rmse_m),
+            f"{summary.ate_ratio:.2f} of odometry's, SE(2)-aligned, {lag}",
+        ),
+        (
+            "SLAM ATE, ICP",
+            mm_text(summary.ate_icp_rmse_m),
+            f"{icp_ratio:.2f} of odometry's ATE; paper's metric: nearest point, no time",
+        ),
+        ("final error", mm_text(summary.final_error_m), "at the last state, not aligned"),
+        _landmark_row(summary.landmarks),
+        (
+            "speed",
+            f"{summary.realtime_factor:.0f} x real time",
+            f"{summary.frames} frames in {wall_s:.1f} s, {lost_frames} lost",
+        ),
+    ]
+
+
+def _landmark_row(landmarks: LandmarkSummary) -> tuple[str, str, str]:
+    if landmarks.true is None:
+        return ("landmarks", str(landmarks.estimated), "nobody told what really stands there")
+    return (
+        "landmarks",
+        f"{landmarks.estimated} for {landmarks.true} true",
+        f"precision {share_text(landmarks.precision)}, recall {share_text(landmarks.recall)}, "
+        f"{landmarks.duplicates} duplicates, rmse {mm_text(landmarks.rmse_m)}",
+    )
+
+
+def mm_text(length_m: float | None) -> str:
+    """Return a length in millimetres, a dash where there is none."""
+    return "-" if length_m is None else f"{1e3 * length_m:.1f} mm"
+
+
+def share_text(value: float | None) -> str:
+    """Return a share of one, a dash where there is none."""
+    return "-" if value is None else f"{value:.2f}"
+
+
+Row = tuple[str, str, str]
+
+
+def print_run_table(
+    info: SessionInfo,
+    record: RunRecord,
+    *,
+    lost_frames: int,
+    stream: TextIO,
+    also: Sequence[Row] = (),
+) -> None:
+    """Write what was driven, mapped and lost; `also` are more rows of name, value, note."""
+    rows = [*run_rows(info, record, lost_frames), *also]
+    what = "emulated radars" if info.simulated else "a real drive"
+    title = f"{info.scene}, preset {info.preset}: {what}, with no truth to compare with"
+    widths = [max(len(row[column]) for row in rows) for column in (0, 1)]
+    rule = "-" * max(len(title), *(sum(widths) + 4 + len(row[2]) for row in rows))
+    lines = [f"{name:<{widths[0]}}  {value:>{widths[1]}}  {note}" for name, value, note in rows]
+    stream.write("\n".join([title, rule, *(line.rstrip() for line in lines), rule]) + "\n")
+    stream.flush()
+
+
+def run_rows(info: SessionInfo, record: RunRecord, lost_frames: int) -> list[Row]:
+    """Return the rows of a run: name, value, note."""
+    duration_s = record.duration_ns / NS_PER_S
+    speed = f"{record.n_frames} frames used, {lost_frames} lost between counters"
+    rows = [("time", f"{duration_s:.1f} s", f"{speed}, {len(info.radars)} radars")]
+    if not record.results:
+        return [*rows, ("states", "0", "the robot did not move, or no scan could be used")]
+    estimate = np.array([result.belief.pose[:2] for result in record.results])
+    odometry = np.array([result.odometry_pose[:2] for result in record.results])
+    lengths_m = [
+        float(np.linalg.norm(np.diff(p, axis=0), axis=1).sum()) for p in (estimate, odometry)
+    ]
+    belief = record.results[-1].belief
+    sigma_m = float(np.sqrt(np.trace(belief.pose_covariance[:2, :2])))
+    ids = belief.landmark_ids
+    spread = [float(np.sqrt(np.trace(belief.landmark_covariance(row)))) for row in range(len(ids))]
+    rows += [
+        ("driven", f"{lengths_m[0]:.2f} m", f"{lengths_m[1]:.2f} m by the wheels alone"),
+        (
+            "last pose",
+            f"+-{1e3 * sigma_m:.1f} mm",
+            "standard deviation that SLAM believes, map frame",
+        ),
+        (
+            "landmarks",
+            f"{len(ids)}",
+            f"standard deviation {1e3 * min(spread):.1f} .. {1e3 * max(spread):.1f} mm"
+            if spread
+            else "none was seen often enough",
+        ),
+    ]
+    return rows

@@ -1,0 +1,321 @@
+"""Pictures of a run: style, ellipses, the map."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import matplotlib.colors
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from PIL import Image
+
+from emulator.scene.scene import Scene
+from slam.app.errors import naming
+from slam.app.records import SessionInfo
+from slam.app.run.evaluation import Summary
+from slam.app.run.runner import RunRecord
+from slam.geometry import between, compose, transform
+from slam.paper.ekf import Belief
+
+TRUTH, ODOMETRY, ESTIMATE, LANDMARK = "#8a8f98", "#e08a2c", "#1f6fd0", "#c2255c"
+INK, PALE_INK, GRID = "#20242a", "#6a707a", "#eceef1"
+_PALETTE = 256
+
+# The same picture on every machine: no user style, no font that may be missing.
+STYLE: dict[Any, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 10.0,
+    "axes.edgecolor": "#c8ccd2",
+    "axes.labelcolor": "#40444c",
+    "xtick.color": "#40444c",
+    "ytick.color": "#40444c",
+}
+
+
+@contextmanager
+def picture(path: Path, *, width_in: float, height_in: float, dpi: int = 100) -> Iterator[Figure]:
+    """Give a figure to draw in, and write it as a PNG file at the end.
+
+    Its colours are cut to a palette of 256, which makes the file a third of the size. No software
+    version or date goes into it: the same figure gives the same bytes.
+
+    Raises
+    ------
+    AppError
+        The file cannot be written.
+    """
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(
+            figsize=(width_in, height_in), dpi=dpi, layout="constrained", facecolor="white"
+        )
+        FigureCanvasAgg(figure)
+        yield figure
+        drawn = io.BytesIO()
+        figure.savefig(drawn, format="png")
+        with Image.open(drawn) as colours:
+            few = colours.convert("RGB").quantize(_PALETTE, dither=Image.Dither.NONE)
+        with naming(path):
+            few.save(path, format="png", optimize=True)
+
+
+def svg_of(draw: Callable[[Figure], None], *, width_in: float, height_in: float) -> str:
+    """Return what `draw` puts on a figure as the text of an SVG, the same for the same figure."""
+    with matplotlib.rc_context(STYLE | {"svg.hashsalt": "xethru-hil"}):
+        figure = Figure(figsize=(width_in, height_in), layout="constrained", facecolor="white")
+        FigureCanvasSVG(figure)
+        draw(figure)
+        drawn = io.StringIO()
+        figure.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
+    return drawn.getvalue()
+
+
+def label(axes: Axes, title: str, x_label: str, y_label: str) -> None:
+    """Give a panel its title, its axes' names with units, and a quiet grid."""
+    axes.set_title(title, loc="left", fontsize=10, color=INK)
+    axes.set_xlabel(x_label)
+    axes.set_ylabel(y_label)
+    axes.grid(color=GRID, linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.tick_params(length=0)
+
+
+# Chi-square quantile for two degrees of freedom, in closed form.
+CHI2_95_TWO_DOF = -2.0 * math.log(1.0 - 0.95)
+
+
+def ellipse_95(
+    center_m: NDArray[np.float64], covariance_m2: NDArray[np.float64], n_points: int = 33
+) -> NDArray[np.float64]:
+    """Return the closed 95 % contour of a planar Gaussian.
+
+    Parameters
+    ----------
+    center_m
+        Shape (2,).
+    covariance_m2
+        Shape (2, 2). Its root comes from the eigenvectors, so a singular one gives a line.
+    n_points
+        Number of points, the first repeated at the end.
+
+    Returns
+    -------
+    Shape (n_points, 2), same frame as the arguments.
+
+    Examples
+    --------
+    >>> outline = ellipse_95(np.zeros(2), np.diag([4.0, 1.0]), n_points=5)
+    >>> np.abs(outline).max(axis=0).round(3)
+    array([4.895, 2.448])
+    """
+    variances, axes = np.linalg.eigh(covariance_m2)
+    angle_rad = np.linspace(0.0, 2.0 * np.pi, n_points)
+    circle = np.stack([np.cos(angle_rad), np.sin(angle_rad)], axis=-1)
+    half_axes_m = np.sqrt(CHI2_95_TWO_DOF * np.maximum(variances, 0.0))
+    return np.asarray(center_m + (circle * half_axes_m) @ axes.T)
+
+
+def rotate_covariances(
+    heading_rad: float, covariances_m2: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Turn covariances, shape (n, 2, 2), by a heading, as when changing the frame they are in."""
+    cosine, sine = math.cos(heading_rad), math.sin(heading_rad)
+    rotation = np.array([[cosine, -sine], [sine, cosine]])
+    return np.asarray(rotation @ covariances_m2 @ rotation.T)
+
+
+Array = NDArray[np.float64]
+
+
+def outlines_m(scene: Scene) -> tuple[Array, ...]:
+    """Return a line for each wall and a closed one for each box, shape (k, 2) [m], world frame."""
+    walls = [np.array([wall.from_m, wall.to_m]) for wall in scene.walls]
+    boxes = []
+    for box in scene.objects:
+        half = np.array([box.width_m, box.depth_m]) / 2
+        corners = half * np.array([(1, 1), (-1, 1), (-1, -1), (1, -1), (1, 1)])
+        boxes.append(transform(np.array([box.x_m, box.y_m, math.radians(box.yaw_deg)]), corners))
+    return (*walls, *boxes)
+
+
+def draw_map(
+    path: Path,
+    info: SessionInfo,
+    record: RunRecord,
+    summary: Summary | None,
+    outlines_m: Sequence[NDArray[np.float64]] = (),
+) -> None:
+    """Draw the map of a run into a PNG file; see `map_figure`."""
+    with picture(path, width_in=9.0, height_in=6.6, dpi=150) as figure:
+        map_figure(figure, info, record, summary, outlines_m)
+
+
+def map_figure(
+    figure: Figure,
+    info: SessionInfo,
+    record: RunRecord,
+    summary: Summary | None,
+    outlines_m: Sequence[NDArray[np.float64]] = (),
+) -> None:
+    """Draw the map of a run.
+
+    Without `summary` nothing true is known, and nothing true is drawn: a drive in the real world.
+    `outlines_m` are lines of shape (k, 2), world frame: walls and boxes, where there are any.
+    Estimate and odometry are drawn where they began, at the robot's first pose, without the
+    alignment that the ATE uses: drift is seen as it is.
+    """
+    place = record.world_from_map
+    truth = record.truth
+    estimate = transform(place, _xy_m([row.belief.pose for row in record.results]))
+    odom_place = place if summary is not None else _world_from_odom(record)
+    odometry = transform(odom_place, _xy_m([row.odometry_pose for row in record.results]))
+    axes = figure.add_subplot()
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(color=GRID, linewidth=0.8)
+    axes.set_axisbelow(True)
+    for number, line in enumerate(outlines_m):
+        name = "wall or box" if number == 0 else None
+        axes.plot(*line.T, color=INK, linewidth=1.6, alpha=0.45, label=name)
+    axes.plot(*odometry.T, color=ODOMETRY, linewidth=0.9, alpha=0.9, label="wheel odometry")
+    if summary is not None:
+        axes.plot(*truth[:, :2].T, color=TRUTH, linewidth=3.2, alpha=0.55, label="true path")
+    axes.plot(*estimate.T, color=ESTIMATE, linewidth=1.0, label="radar SLAM")
+    _draw_start(axes, truth[0] if summary is not None else _first_pose(record))
+    if len(info.true_landmarks_m):
+        axes.plot(
+            *info.true_landmarks_m.T,
+            linestyle="none",
+            marker="+",
+            markersize=11,
+            markeredgewidth=1.4,
+            color="#30343b",
+            label="true landmark",
+            zorder=4,
+        )
+    for number, ends_m in enumerate(record.wall_spans_m):
+        name = "estimated wall" if number == 0 else None
+        axes.plot(*transform(place, ends_m).T, color=LANDMARK, linewidth=2.0, label=name)
+    _draw_landmarks(axes, record.results[-1].belief, place)
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
+    axes.margins(0.06)
+    axes.tick_params(length=0)
+    if summary is None:
+        _write_plain_title(axes, info, estimate)
+    else:
+        _write_title(axes, summary)
+    # beside the axes, below a title that may be longer than they are wide
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, handlelength=1.6)
+
+
+def _draw_start(axes: Axes, pose: NDArray[np.float64]) -> None:
+    axes.plot(
+        *pose[:2],
+        linestyle="none",
+        marker=(3, 0, np.degrees(pose[2]) - 90.0),
+        markersize=11,
+        color="#30343b",
+        label="start",
+        zorder=5,
+    )
+
+
+def _draw_landmarks(axes: Axes, belief: Belief, place: NDArray[np.float64]) -> None:
+    if not belief.landmark_ids:
+        return
+    points = transform(place, belief.landmarks)
+    covariances = rotate_covariances(
+        place[2],
+        np.array([belief.landmark_covariance(row) for row in range(len(points))]),
+    )
+    outlines = [ellipse_95(*pair) for pair in zip(points, covariances, strict=True)]
+    axes.add_collection(
+        PolyCollection(
+            outlines,
+            facecolors=(*matplotlib.colors.to_rgb(LANDMARK), 0.14),
+            edgecolors=LANDMARK,
+            linewidths=1.0,
+            label="95 % ellipse",
+            zorder=3,
+        )
+    )
+    axes.plot(
+        *points.T,
+        linestyle="none",
+        marker="o",
+        markersize=3.6,
+        color=LANDMARK,
+        label="estimated landmark",
+        zorder=6,
+    )
+
+
+def _xy_m(poses: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    return np.array([pose[:2] for pose in poses])
+
+
+def _world_from_odom(record: RunRecord) -> NDArray[np.float64]:
+    """Return the place of odometry's frame such that it begins where SLAM does, shape (3,).
+
+    A robot's odometry begins anywhere, as it runs before we listen; that of a demo at its start.
+    """
+    odom_from_body = record.results[0].odometry_pose
+    return compose(_first_pose(record), between(odom_from_body, np.zeros(3)))
+
+
+def _first_pose(record: RunRecord) -> NDArray[np.float64]:
+    pose: NDArray[np.float64] = record.results[0].belief.pose
+    return compose(record.world_from_map, pose)
+
+
+def _write_plain_title(axes: Axes, info: SessionInfo, estimate: NDArray[np.float64]) -> None:
+    length_m = float(np.linalg.norm(np.diff(estimate, axis=0), axis=1).sum())
+    axes.set_title(
+        f"{info.scene}, preset {info.preset}{' (simulated)' if info.simulated else ''}: "
+        f"{length_m:.1f} m driven, no truth to compare with",
+        loc="left",
+        fontsize=11,
+        color=INK,
+        pad=24,
+    )
+    axes.annotate(
+        "map frame: the origin is the robot's first pose",
+        xy=(0.0, 1.0),
+        xytext=(0.0, 8.0),
+        xycoords="axes fraction",
+        textcoords="offset points",
+        fontsize=8.5,
+        color=PALE_INK,
+    )
+
+
+def _write_title(axes: Axes, summary: Summary) -> None:
+    axes.set_title(
+        f"{summary.scene}, preset {summary.preset}, seed {summary.seed} (simulated): "
+        f"ATE {1e3 * summary.ate_rmse_m:.1f} mm, "
+        f"{summary.ate_ratio:.2f} of odometry's {1e3 * summary.odometry_ate_rmse_m:.1f} mm",
+        loc="left",
+        fontsize=11,
+        color=INK,
+        pad=24,
+    )
+    axes.annotate(
+        "drawn from the start pose, while the ATE is after SE(2) alignment; "
+        f"last state {1e3 * summary.final_error_m:.0f} mm off",
+        xy=(0.0, 1.0),
+        xytext=(0.0, 8.0),
+        xycoords="axes fraction",
+        textcoords="offset points",
+        fontsize=8.5,
+        color=PALE_INK,
+    )

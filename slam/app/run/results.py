@@ -1,0 +1,192 @@
+"""`uwb-slam evaluate`: the error of one trajectory file against another."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.app.errors import AppError, StopRequestedError, naming
+from slam.app.odometry.tum import NS_PER_S, Trajectory, read_tum, write_tum
+from slam.app.records import SessionInfo
+from slam.app.run.evaluation import Summary, summarise
+from slam.app.run.runner import RunRecord
+from slam.evaluation import associate_times, ate_rmse_m
+from slam.geometry import Rig
+from xethru_protocol.system import PathInUseError, locked
+
+RESULTS = ("map.png", "summary.json", "estimate.tum", "truth.tum", "odometry.tum")
+
+
+def has_truth(record: RunRecord) -> bool:
+    """Return whether the true pose is known at every state, and there is a state."""
+    return len(record.truth) > 0 and bool(np.isfinite(record.truth).all())
+
+
+def write_results(out: Path, info: SessionInfo, record: RunRecord, rig: Rig) -> Summary | None:
+    """Write trajectories, summary.json and map.png; return the numbers where truth is known.
+
+    Parameters
+    ----------
+    out
+        An existing folder.
+    info, record, rig
+        The run.
+    """
+    summary = None
+    if has_truth(record):
+        summary = summarise(
+            record,
+            scene=info.scene,
+            preset=info.preset,
+            seed=info.seed,
+            rig=rig,
+            true_landmarks_m=info.true_landmarks_m,
+        )
+        if summary is not None and not info.simulated and not len(info.true_landmarks_m):
+            unknown = replace(summary.landmarks, true=None, precision=None, recall=None)
+            summary = replace(summary, landmarks=unknown)
+    text = summary.to_json() if summary else _summary_without_truth(info, record)
+    with naming(path := out / "summary.json"):
+        path.write_text(text + "\n", encoding="ascii")
+    write_trajectories(out, record)
+    if record.results:
+        from slam.app.run.pictures import draw_map  # half a second; nobody waits for it before
+
+        with naming(path := out / "map.png"):
+            draw_map(path, info, record, summary, info.outlines_m)
+    return summary
+
+
+def write_trajectories(out: Path, record: RunRecord) -> None:
+    """Write estimate, odometry and, where it is known, truth at the stamps of SLAM's states."""
+    stamps_ns = np.array([result.t_ns for result in record.results], dtype=np.int64)
+    paths = {
+        "estimate": np.array([result.belief.pose for result in record.results]),
+        "odometry": np.array([result.odometry_pose for result in record.results]),
+    }
+    if has_truth(record):
+        paths["truth"] = record.truth
+    for name, poses in paths.items():
+        with naming(path := out / f"{name}.tum"):
+            write_tum(path, Trajectory(stamps_ns=stamps_ns, poses=poses.reshape(-1, 3)))
+
+
+def _summary_without_truth(info: SessionInfo, record: RunRecord) -> str:
+    """Return the text of summary.json with null for everything that needs the truth."""
+    duration_s = record.duration_ns / NS_PER_S
+    n_landmarks = len(record.results[-1].belief.landmark_ids) if record.results else 0
+    fields = {
+        "scene": info.scene,
+        "preset": info.preset,
+        "seed": info.seed,
+        "frames": record.n_frames,
+        "duration_s": duration_s,
+        "realtime_factor": duration_s / record.wall_s,
+        "ate_rmse_m": None,
+        "ate_icp_rmse_m": None,
+        "odometry_ate_rmse_m": None,
+        "final_error_m": None,
+        "landmarks": {
+            "true": None,
+            "estimated": n_landmarks,
+            "precision": None,
+            "recall": None,
+            "duplicates": None,
+            "rmse_m": None,
+        },
+        "nees_pose": None,
+        "nis_mean": None,
+    }
+    return json.dumps(fields, indent=2, allow_nan=False)
+
+
+def prepare_folder(out: Path, names: tuple[str, ...], held: ExitStack) -> None:
+    """Make the folder, hold it, and remove an earlier run's files so that no two runs mix.
+
+    Raises
+    ------
+    AppError
+        It cannot be made, or another run writes there.
+    """
+    with naming(out):
+        out.mkdir(parents=True, exist_ok=True)
+        try:
+            held.enter_context(locked(out))
+        except PathInUseError:
+            raise AppError(
+                f"{out}: another run is writing there; wait for its end or choose another --out"
+            ) from None
+        for name in names:
+            (out / name).unlink(missing_ok=True)
+
+
+@contextmanager
+def saying_what_is_left(kept: str) -> Iterator[None]:
+    """Let a stop by a signal say what was recorded until then."""
+    try:
+        yield
+    except StopRequestedError as stopped:
+        raise StopRequestedError(stopped.received, kept) from None
+
+
+Array = NDArray[np.float64]
+
+_TOLERANCE_NS = NS_PER_S // 100
+"""Stamps further apart than 10 ms do not belong together, as in evo."""
+
+
+def evaluate(estimate: Path, reference: Path) -> dict[str, float | int | str | None]:
+    """Return the ATE of one TUM file against another, with what it rests on.
+
+    The ATE is None where positions are so large that it overflows.
+
+    Raises
+    ------
+    AppError
+        A file cannot be read, or the two have fewer than two stamps in common.
+    """
+    est, ref = read_tum(estimate), read_tum(reference)
+    est_rows, ref_rows = associate_times(est.stamps_ns, ref.stamps_ns, _TOLERANCE_NS)
+    if len(est_rows) < 2:
+        raise AppError(
+            f"{estimate} and {reference} share {len(est_rows)} stamps within 10 ms; "
+            "both must be in the same time base"
+        )
+    return {
+        "ate_rmse_m": _finite_ate_m(est.poses[est_rows, :2], ref.poses[ref_rows, :2]),
+        "pairs": len(est_rows),
+        "estimate_poses": len(est.stamps_ns),
+        "reference_poses": len(ref.stamps_ns),
+        "alignment": "SE(2), no scale",
+    }
+
+
+def _finite_ate_m(estimate_xy: Array, reference_xy: Array) -> float | None:
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            ate_m = ate_rmse_m(estimate_xy, reference_xy)
+    except np.linalg.LinAlgError:  # the alignment met what had overflowed
+        return None
+    return ate_m if math.isfinite(ate_m) else None
+
+
+def run_evaluate(estimate: Path, reference: Path, *, as_json: bool) -> None:
+    """Print the ATE as a line, or as one JSON object."""
+    result = evaluate(estimate, reference)
+    if as_json:
+        sys.stdout.write(json.dumps(result, allow_nan=False) + "\n")
+        return
+    ate_m = result["ate_rmse_m"]
+    size = "beyond floating point" if ate_m is None else f"{1e3 * float(ate_m):.1f} mm"
+    sys.stdout.write(
+        f"ATE {size} (RMS, {result['alignment']}, "
+        f"{result['pairs']} of {result['estimate_poses']} poses)\n"
+    )

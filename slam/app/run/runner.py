@@ -1,0 +1,313 @@
+"""What happens on the radars' links, as lines of a session."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from slam.app.records import LogLine, RadarInfo, Scan, SessionObserver, Snapshot
+from slam.frames import RadarFrame
+from slam.paper.pipeline import Slam, StepResult
+from xethru_protocol.driver.conversation import ProtocolRecord
+
+TruthAt = Callable[[NDArray[np.int64]], NDArray[np.float64]]
+"""True poses, shape (n, 3), world frame, at n session times [ns]; NaN where nobody knows."""
+
+
+def nobody_knows(stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the truth of a run in the real world: NaN, shape (n, 3)."""
+    return np.full((len(stamps_ns), 3), np.nan)
+
+
+class Odometry(Protocol):
+    """What tells the wheels' pose."""
+
+    def pose_at(self, t_ns: int) -> NDArray[np.float64]:
+        """Return the pose at a session time, shape (3,), odometry frame."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RunRecord:
+    """What a run leaves behind for its reports.
+
+    Attributes
+    ----------
+    results, truth
+        States of SLAM in time order, and the true pose at each, shape (n_states, 3), world frame;
+        NaN where nobody knows.
+    world_from_map
+        Shape (3,): where the map frame lies in the world; zeros where nobody knows.
+    n_frames
+        Radar frames used, over all radars.
+    start_ns
+        Session time of the first scan.
+    duration_ns, wall_s
+        Session time covered and the time it took.
+    wall_spans_m
+        Ends of the stretches of wall that answered, shape (k, 2, 2), map frame.
+    """
+
+    results: tuple[StepResult, ...]
+    truth: NDArray[np.float64]
+    world_from_map: NDArray[np.float64]
+    n_frames: int
+    duration_ns: int
+    wall_s: float
+    start_ns: int = 0
+    wall_spans_m: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 2, 2)))
+
+
+def run_slam(
+    scans: Iterable[Scan],
+    odometry: Odometry,
+    slam: Slam,
+    truth_at: TruthAt,
+    observers: Sequence[SessionObserver] = (),
+    *,
+    gains_db: Sequence[float] = (),
+) -> RunRecord:
+    """Feed scans to SLAM as they come and tell the observers about scans and states.
+
+    A scan that is not `used` is told, and not stepped. BLAS runs on one thread, here as in every
+    other path, so that results are the same bits. Truth goes to the observers only; they see
+    frames as they came, SLAM sees them less each radar's gain, where `gains_db` tells any.
+
+    Raises
+    ------
+    OdometryError
+        Odometry does not cover the time of a scan.
+    """
+    results: list[StepResult] = []
+    truths: list[NDArray[np.float64]] = []
+    counter_at: dict[int, int] = {}
+    world_from_map: NDArray[np.float64] | None = None
+    start_ns: int | None = None
+    n_frames = duration_ns = 0
+    started = time.monotonic()
+
+    def take(new: Iterable[StepResult]) -> None:
+        for result in new:
+            truth = truth_at(np.array([result.t_ns]))[0]
+            results.append(result)
+            truths.append(truth)
+            assert world_from_map is not None
+            snapshot = make_snapshot(result, counter_at.pop(result.t_ns), truth, world_from_map)
+            for observer in observers:
+                observer.on_snapshot(snapshot)
+
+    with threadpool_limits(limits=1):
+        for scan in scans:
+            for observer in observers:
+                observer.on_scan(scan)
+            start_ns = scan.t_ns if start_ns is None else start_ns
+            duration_ns = scan.t_ns - start_ns
+            if not scan.used:
+                continue
+            if world_from_map is None:
+                world_from_map = np.nan_to_num(truth_at(np.array([scan.t_ns]))[0])
+            counter_at[scan.t_ns] = scan.counter
+            n_frames += len(scan.frames)
+            frames = [less_gain(f, gains_db[f.radar]) if gains_db else f for f in scan.frames]
+            take(slam.step(frames, odometry.pose_at, scan.t_ns))
+        take(slam.flush())
+    return RunRecord(
+        results=tuple(results),
+        truth=np.array(truths).reshape(-1, 3),
+        world_from_map=np.zeros(3) if world_from_map is None else world_from_map,
+        n_frames=n_frames,
+        duration_ns=duration_ns,
+        start_ns=start_ns or 0,
+        wall_spans_m=slam.wall_spans_m(),
+        wall_s=time.monotonic() - started,
+    )
+
+
+def less_gain(frame: RadarFrame, gain_db: float) -> RadarFrame:
+    """Return a frame as a radar of no gain would have heard it, cut off where it was cut off."""
+    if gain_db == 0.0:
+        return frame
+    scale = np.float32(10.0 ** (-gain_db / 20.0))
+    limits = frame.limits
+    if limits is not None:  # as float32, for samples at a limit are compared with it exactly
+        low, high = (float(np.float32(limit) * scale) for limit in limits)
+        limits = (low, high)
+    return replace(frame, samples=frame.samples * scale, limits=limits)
+
+
+def make_snapshot(
+    result: StepResult,
+    counter: int,
+    truth: NDArray[np.float64],
+    world_from_map: NDArray[np.float64],
+) -> Snapshot:
+    """Reduce a result of the pipeline to what logs and viewers show."""
+    belief = result.belief
+    rows = range(len(belief.landmark_ids))
+    return Snapshot(
+        counter=counter,
+        t_ns=result.t_ns,
+        truth=truth,
+        odometry=result.odometry_pose,
+        estimate=belief.pose,
+        world_from_map=world_from_map,
+        pose_covariance=belief.pose_covariance,
+        landmark_ids=np.array(belief.landmark_ids, dtype=np.int64),
+        landmarks_m=belief.landmarks,
+        landmark_covariances_m2=np.array([belief.landmark_covariance(row) for row in rows]).reshape(
+            -1, 2, 2
+        ),
+        nis_per_dof=result.nis_per_dof,
+        step=result,
+    )
+
+
+class LinkState(StrEnum):
+    """One of the states a lane shows."""
+
+    SETTING_UP = "setting up"
+    STREAMING = "streaming"
+    FRAMES_LOST = "frames lost"
+    SILENT = "silent"
+    FAULT = "fault"
+    ENDED = "ended"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkChange:
+    """From `t_ns` of session time on, a radar's link is in this state."""
+
+    t_ns: int
+    radar: str
+    state: LinkState
+
+
+@dataclass(slots=True, kw_only=True)
+class LinkCount:
+    """What came and what did not, of one radar.
+
+    Attributes
+    ----------
+    frames, lost, faults
+        Frames that came; counters missing between them; warnings in the log of its link.
+    last_counter, last_t_ns
+        Of its newest frame; None before the first.
+    longest_gap
+        Most frames lost in a row.
+    state
+        What its lane shows now; None before anything was heard.
+    """
+
+    frames: int = 0
+    lost: int = 0
+    faults: int = 0
+    last_counter: int | None = None
+    last_t_ns: int | None = None
+    longest_gap: int = 0
+    state: LinkState | None = None
+
+
+@dataclass(slots=True)
+class LinkLanes:
+    """Follows the links of all radars.
+
+    Parameters
+    ----------
+    radars
+        In the order of the frames' radar index.
+    """
+
+    radars: tuple[RadarInfo, ...]
+    counts: dict[str, LinkCount] = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Start with nothing heard."""
+        self.counts = {radar.name: LinkCount() for radar in self.radars}
+
+    def on_scan(self, scan: Scan) -> Iterator[LinkChange]:
+        """Yield the changes that one tick brings; a radar without a frame in it is silent.
+
+        What SLAM did not use holds late frames, too, and tells nothing of the radars not in it.
+        """
+        frames = {frame.radar: frame for frame in scan.frames}
+        for index, radar in enumerate(self.radars):
+            count = self.counts[radar.name]
+            frame = frames.get(index)
+            if frame is None:
+                if scan.used:
+                    yield from self._change(radar.name, scan.t_ns, LinkState.SILENT)
+                continue
+            before = count.last_counter
+            gap = 0 if before is None else max(frame.counter - before - 1, 0)
+            count.frames += 1
+            count.lost += gap
+            count.longest_gap = max(count.longest_gap, gap)
+            count.last_counter, count.last_t_ns = frame.counter, frame.t_ns
+            state = LinkState.FRAMES_LOST if gap else LinkState.STREAMING
+            yield from self._change(radar.name, frame.t_ns, state)
+
+    def on_log(self, line: LogLine) -> Iterator[LinkChange]:
+        """Yield the change that a line of the log brings, if any."""
+        count = self.counts.get(line.radar)
+        if count is None:
+            return  # a line about something else than a radar
+        if line.warning:
+            count.faults += 1
+            yield from self._change(line.radar, line.t_ns, LinkState.FAULT)
+        elif count.state is None:
+            yield from self._change(line.radar, line.t_ns, LinkState.SETTING_UP)
+
+    def end(self, t_ns: int) -> Iterator[LinkChange]:
+        """Yield the end of every lane."""
+        for radar in self.radars:
+            yield from self._change(radar.name, t_ns, LinkState.ENDED)
+
+    def _change(self, radar: str, t_ns: int, state: LinkState) -> Iterator[LinkChange]:
+        count = self.counts[radar]
+        if count.state is not state:
+            count.state = state
+            yield LinkChange(t_ns=t_ns, radar=radar, state=state)
+
+
+class LinkLog(SessionObserver):
+    """Stamps what the drivers report with session time and passes it on, once someone listens."""
+
+    def __init__(self) -> None:
+        self._t_ns = 0
+        self._waiting: list[LogLine] = []
+        self._listeners: tuple[SessionObserver, ...] = ()
+
+    def attach(self, *listeners: SessionObserver) -> None:
+        """Pass on what was said so far, and everything from now on."""
+        self._listeners = listeners
+        waiting, self._waiting = self._waiting, []
+        for line in waiting:
+            self._tell(line)
+
+    def on_record(self, radar: str, record: ProtocolRecord) -> None:
+        """Take one command, answer, SYSTEM message or fault of a radar's link."""
+        text = f"{record.direction} {record.summary}"
+        self.say(radar, text, warning=record.direction == "fault")
+
+    def say(self, who: str, text: str, *, warning: bool) -> None:
+        """Pass on a line about a radar, the odometry or the run itself."""
+        line = LogLine(t_ns=self._t_ns, radar=who, warning=warning, text=text)
+        if self._listeners:
+            self._tell(line)
+        else:
+            self._waiting.append(line)
+
+    def on_scan(self, scan: Scan) -> None:
+        """Keep session time."""
+        self._t_ns = scan.t_ns
+
+    def _tell(self, line: LogLine) -> None:
+        for listener in self._listeners:
+            listener.on_log(line)

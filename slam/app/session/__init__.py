@@ -1,0 +1,1 @@
+"""Sessions: one MCAP file per run, written, read, repaired."""

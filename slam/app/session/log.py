@@ -1,0 +1,187 @@
+"""The durable record of a run: one MCAP file that ROS 2, Foxglove, PlotJuggler and Rerun open.
+
+Times in the file are session time. The order of the file is the order in which the run learned of
+things: what stands before a scan's mark was known when SLAM took that scan.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.app.odometry.track import OdometryTrack
+from slam.app.odometry.tum import TumSample
+from slam.app.records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
+from slam.app.session import messages as ros
+from slam.app.session.mcap import SessionFile
+from slam.app.session.messages import METADATA_NAME, radar_text, session_table, state_row
+from slam.geometry import between, compose
+
+_ORIGIN = np.zeros(3)
+
+TruthAt = Callable[[NDArray[np.int64]], NDArray[np.float64]]
+"""True poses, shape (n, 3), world frame, at n session times [ns]."""
+
+
+class SessionLog(SessionObserver):
+    """Writes a session as it happens.
+
+    Topics: `/radar/<name>/frame` with the frame counter in the record's sequence number and a
+    latched `/radar/<name>/info` (JSON); `/scan` after the frames of each scan, with their counters
+    and the true pose where it is known, or `/scan_unused`; `/odom`, `/truth`, `/estimate`,
+    `/landmarks`, `/tf`, `/tf_static`, `/log`; `/slam/state`, the same states to the last bit
+    (`session_states`); where there are such, raw bytes in `/radar/<name>/rx` and `tx`, and ranges
+    that another program found in `/radar/<name>/detections`. A metadata record names scene, preset,
+    seed, settings, versions.
+
+    Parameters
+    ----------
+    path
+        The file; replaced if it exists.
+    info
+        What the run is.
+    odometry
+        The whole track where it is known before the run; None where `on_odometry` brings it.
+    truth_at
+        The robot's true pose; None where nobody knows.
+    start_ns
+        Session time [ns] at which the file begins.
+    clock_ns
+        Monotonic time [ns]; ends chunks.
+
+    Raises
+    ------
+    CannotWriteError
+        Here and in every other method: the disk takes no more.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        info: SessionInfo,
+        odometry: OdometryTrack | None = None,
+        *,
+        truth_at: TruthAt | None = None,
+        start_ns: int = 0,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self._file = SessionFile(path, start_ns=start_ns, clock_ns=clock_ns)
+        self._samples: Iterator[TumSample] = iter(odometry.samples if odometry else ())
+        self._odometry_ns = -1  # of the newest sample written
+        self._truth_at = truth_at
+        self._t_ns = start_ns
+        self._rare: dict[str, int] = {}
+        self._names = [radar.name for radar in info.radars]
+        self._frame_channels: list[int] = []
+        self._file.add_metadata(METADATA_NAME, session_table(info))
+        for radar in info.radars:
+            self._frame_channels.append(
+                self._file.channel(f"/radar/{radar.name}/frame", ros.FLOAT_ARRAY)
+            )
+            channel = self._file.channel(f"/radar/{radar.name}/info", ros.STRING, latched=True)
+            self._file.write(channel, start_ns, ros.string(radar_text(radar)))
+        self._scans = self._file.channel("/scan", ros.DOUBLE_ARRAY)
+        self._unused_scans = self._file.channel("/scan_unused", ros.DOUBLE_ARRAY)
+        self._states = self._file.channel("/slam/state", ros.DOUBLE_ARRAY)
+        self._odometry = self._file.channel("/odom", ros.ODOMETRY)
+        self._truth = self._file.channel("/truth", ros.POSE)
+        self._estimate = self._file.channel("/estimate", ros.POSE)
+        self._landmarks = self._file.channel("/landmarks", ros.POINT_CLOUD)
+        self._transforms = self._file.channel("/tf", ros.TRANSFORMS)
+        self._static_transforms = self._file.channel("/tf_static", ros.TRANSFORMS, latched=True)
+        self._log = self._file.channel("/log", ros.LOG)
+        # The topic is latched with depth 1, so each message holds all that is static so far.
+        self._placements = {
+            ("base_link", f"radar_{radar.name}"): np.array([radar.x_m, radar.y_m, radar.yaw_rad])
+            for radar in info.radars
+        }
+        self._file.write(
+            self._static_transforms, start_ns, ros.transforms(start_ns, self._placements)
+        )
+        self._file.cut_chunk()
+
+    def on_scan(self, scan: Scan) -> None:
+        """Write the frames of one tick, and the odometry that their poses come from."""
+        self._t_ns = scan.t_ns
+        needed_ns = max([scan.t_ns, *(frame.t_ns for frame in scan.frames)])
+        while self._odometry_ns < needed_ns and (sample := next(self._samples, None)) is not None:
+            self.on_odometry(sample)
+        arrivals = scan.host_ns or (None,) * len(scan.frames)
+        for frame, host_ns in zip(scan.frames, arrivals, strict=True):
+            self._file.write(
+                self._frame_channels[frame.radar],
+                frame.t_ns,
+                ros.float_array(frame.samples),
+                sequence=frame.counter,
+                publish_ns=host_ns,
+            )
+        truth = np.zeros(0) if self._truth_at is None else self._truth_at(np.array([scan.t_ns]))[0]
+        known = truth if np.all(np.isfinite(truth)) else np.zeros(0)
+        # which frames they are, so that a reader of a damaged file knows what is missing
+        members = [number for frame in scan.frames for number in (frame.radar, frame.counter)]
+        row = np.array([len(scan.frames), *members, *known], dtype=np.float64)
+        mark = ros.double_array("n_frames_radars_counters_truth", row)
+        topic = self._scans if scan.used else self._unused_scans
+        self._file.write(topic, scan.t_ns, mark, sequence=scan.counter)
+
+    def on_detections(self, radar: int, t_ns: int, ranges_m: NDArray[np.float64]) -> None:
+        """Write ranges of the scan that comes next, shape (n,) [m], of a radar by its index."""
+        channel = self._lazily(radar, "detections", ros.DOUBLE_ARRAY)
+        self._file.write(channel, t_ns, ros.double_array("range_m", ranges_m))
+
+    def on_odometry(self, sample: TumSample) -> None:
+        """Write a pose of the wheels as it comes."""
+        self._file.write(self._odometry, sample.t_ns, ros.odometry(sample))
+        self._odometry_ns = sample.t_ns
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        """Write a state of SLAM with its landmarks and transforms."""
+        t_ns = snapshot.t_ns
+        if ("world", "map") not in self._placements:
+            self._placements["world", "map"] = snapshot.world_from_map
+            static = ros.transforms(t_ns, self._placements)
+            self._file.write(self._static_transforms, t_ns, static)
+        if np.all(np.isfinite(snapshot.truth)):
+            self._file.write(self._truth, t_ns, ros.pose_stamped(t_ns, "world", snapshot.truth))
+        self._file.write(self._estimate, t_ns, ros.pose_stamped(t_ns, "map", snapshot.estimate))
+        self._file.write(self._landmarks, t_ns, ros.landmark_cloud(snapshot))
+        links = {
+            ("map", "odom"): compose(snapshot.estimate, between(snapshot.odometry, _ORIGIN)),
+            ("odom", "base_link"): snapshot.odometry,
+        }
+        self._file.write(self._transforms, t_ns, ros.transforms(t_ns, links))
+        row = ros.double_array("state", state_row(snapshot))
+        self._file.write(self._states, t_ns, row, sequence=snapshot.counter)
+
+    def on_log(self, line: LogLine) -> None:
+        """Write a line about the link."""
+        message = ros.log_line(line.t_ns, line.radar, line.text, warning=line.warning)
+        self._file.write(self._log, line.t_ns, message)
+
+    def on_wire(self, radar: str, way: Literal["rx", "tx"], data: bytes, host_ns: int) -> None:
+        """Write bytes as a radar's port gave (rx) or took (tx) them, at a host time [ns].
+
+        In the file they lie at the time of the newest scan, and keep ``host_ns`` beside it.
+        """
+        if not data:
+            return
+        channel = self._lazily(radar, way, ros.BYTE_ARRAY)
+        message = ros.byte_array("byte", data)
+        self._file.write(channel, self._t_ns, message, publish_ns=host_ns)
+
+    def _lazily(self, radar: int | str, part: str, message_type: str) -> int:
+        """Return the channel of a part that few sessions have, made when it is first needed."""
+        name = self._names[radar] if isinstance(radar, int) else radar
+        topic = f"/radar/{name}/{part}"
+        if topic not in self._rare:
+            self._rare[topic] = self._file.channel(topic, message_type)
+        return self._rare[topic]
+
+    def close(self) -> None:
+        """Write index and footer, and close the file; doing so again does nothing."""
+        self._file.close()

@@ -1,0 +1,488 @@
+"""What a session of somebody else's recording says about itself.
+
+The row::
+
+    n_landmarks, n_nis,
+    truth (3), odometry (3), estimate (3), world_from_map (3),
+    pose_covariance (9, row by row),
+    n_landmarks times: id, x, y, cov_xx, cov_xy, cov_yx, cov_yy,
+    n_nis times: NIS per degree of freedom
+
+in the units and frames of `Snapshot`; an unknown truth is NaN.
+
+Types and serialisation are those of the rosbags library; the arrays of a frame are copied once,
+into the serialised bytes.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import MISSING, asdict, dataclass, field, fields
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.typesys import Stores, get_typestore
+
+from slam.app.errors import AppError
+from slam.app.odometry.tum import NS_PER_S, TumSample
+from slam.app.records import RadarInfo, SessionInfo, Snapshot
+from slam.config import SlamConfig
+from slam.geometry import Mount
+
+_COUNTS = 2
+_PER_LANDMARK = 7
+
+
+def state_row(snapshot: Snapshot) -> NDArray[np.float64]:
+    """Return the row of a state, shape (23 + 7 n_landmarks + n_nis,), float64."""
+    n_landmarks, n_nis = len(snapshot.landmark_ids), len(snapshot.nis_per_dof)
+    landmarks = np.column_stack(
+        [
+            snapshot.landmark_ids,
+            snapshot.landmarks_m.reshape(-1, 2),
+            snapshot.landmark_covariances_m2.reshape(-1, 4),
+        ]
+    )
+    parts = (
+        [n_landmarks, n_nis],
+        snapshot.truth,
+        snapshot.odometry,
+        snapshot.estimate,
+        snapshot.world_from_map,
+        snapshot.pose_covariance.ravel(),
+        landmarks.ravel(),
+        snapshot.nis_per_dof,
+    )
+    return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
+
+
+def snapshot_of(counter: int, t_ns: int, row: NDArray[np.float64]) -> Snapshot:
+    """Return the state that a row holds.
+
+    Raises
+    ------
+    ValueError
+        The row's length is not what its first two numbers say.
+    """
+    n_landmarks, n_nis = (int(value) for value in row[:_COUNTS])
+    ends = np.cumsum([_COUNTS, 3, 3, 3, 3, 9, _PER_LANDMARK * n_landmarks, n_nis])
+    if min(n_landmarks, n_nis) < 0 or ends[-1] != len(row):
+        raise ValueError(f"a state of {len(row)} numbers says it has {ends[-1]}")
+    _, truth, odometry, estimate, world_from_map, covariance, landmarks, nis, _ = np.split(
+        row, ends
+    )
+    table = landmarks.reshape(-1, _PER_LANDMARK)
+    return Snapshot(
+        counter=counter,
+        t_ns=t_ns,
+        truth=truth,
+        odometry=odometry,
+        estimate=estimate,
+        world_from_map=world_from_map,
+        pose_covariance=covariance.reshape(3, 3),
+        landmark_ids=table[:, 0].astype(np.int64),
+        landmarks_m=table[:, 1:3],
+        landmark_covariances_m2=table[:, 3:].reshape(-1, 2, 2),
+        nis_per_dof=tuple(nis.tolist()),
+    )
+
+
+FLOAT_ARRAY = "std_msgs/msg/Float32MultiArray"
+DOUBLE_ARRAY = "std_msgs/msg/Float64MultiArray"
+BYTE_ARRAY = "std_msgs/msg/UInt8MultiArray"
+STRING = "std_msgs/msg/String"
+ODOMETRY = "nav_msgs/msg/Odometry"
+POSE = "geometry_msgs/msg/PoseStamped"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+LOG = "rcl_interfaces/msg/Log"
+
+_LOG_INFO, _LOG_WARN = 20, 30
+_POINT_FIELD_FLOAT32, _POINT_FIELD_UINT32 = 7, 6
+
+# PointCloud2 is the one standard message that carries named fields per point, so the covariance
+# travels with its landmark and every viewer still draws the points. RViz wants float32 x, y, z.
+LANDMARK_DTYPE = np.dtype(
+    [
+        ("x", "<f4"),
+        ("y", "<f4"),
+        ("z", "<f4"),
+        ("id", "<u4"),
+        ("cov_xx", "<f4"),
+        ("cov_xy", "<f4"),
+        ("cov_yy", "<f4"),
+    ]
+)
+
+Message: TypeAlias = Any  # rosbags makes its message classes at run time
+
+
+@cache
+def _typestore() -> Any:  # noqa: ANN401 - rosbags' Typestore; its messages are untyped anyway
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+@cache
+def _type(name: str) -> Any:  # noqa: ANN401 - a message class made at run time
+    return _typestore().types[name]
+
+
+def schema_text(message_type: str) -> bytes:
+    """Return the ros2msg schema of a type with everything it refers to."""
+    text, _digest = _typestore().generate_msgdef(message_type, ros_version=2)
+    return bytes(text, "utf-8")
+
+
+def serialise(message: Message) -> memoryview:
+    """Serialise any of the messages of this module to CDR."""
+    data: memoryview = _typestore().serialize_cdr(message, message.__msgtype__)
+    return data
+
+
+def deserialise(data: bytes, message_type: str) -> Message:
+    """Read CDR bytes back; arrays come as numpy arrays."""
+    return _typestore().deserialize_cdr(data, message_type)
+
+
+def float_array(samples: NDArray[np.float32]) -> Message:
+    """Wrap one frame, shape (n_bins,), as an array with the dimension `range_bin`."""
+    return _array(FLOAT_ARRAY, "range_bin", samples)
+
+
+def double_array(label: str, values: NDArray[np.float64]) -> Message:
+    """Wrap numbers, shape (n,), as an array with one labelled dimension."""
+    return _array(DOUBLE_ARRAY, label, values)
+
+
+def byte_array(label: str, data: bytes) -> Message:
+    """Wrap bytes as an array with one labelled dimension."""
+    return _array(BYTE_ARRAY, label, np.frombuffer(data, dtype=np.uint8))
+
+
+def string(text: str) -> Message:
+    """Wrap text."""
+    return _type(STRING)(data=text)
+
+
+def odometry(sample: TumSample) -> Message:
+    """Wrap an odometry sample; the quaternion is kept as it came, so replay sees the same floats.
+
+    Covariances are zero, which means unknown in ROS.
+    """
+    pose = _pose(sample.x_m, sample.y_m, sample.qz, sample.qw)
+    with_covariance = _type("geometry_msgs/msg/PoseWithCovariance")(
+        pose=pose, covariance=np.zeros(36)
+    )
+    zero = _type("geometry_msgs/msg/Vector3")(x=0.0, y=0.0, z=0.0)
+    twist = _type("geometry_msgs/msg/TwistWithCovariance")(
+        twist=_type("geometry_msgs/msg/Twist")(linear=zero, angular=zero), covariance=np.zeros(36)
+    )
+    return _type(ODOMETRY)(
+        header=_header(sample.t_ns, "odom"),
+        child_frame_id="base_link",
+        pose=with_covariance,
+        twist=twist,
+    )
+
+
+def odometry_sample(message: Message) -> TumSample:
+    """Read an odometry message back."""
+    pose = message.pose.pose
+    stamp = message.header.stamp
+    return TumSample(
+        t_ns=stamp.sec * NS_PER_S + stamp.nanosec,
+        x_m=pose.position.x,
+        y_m=pose.position.y,
+        qz=pose.orientation.z,
+        qw=pose.orientation.w,
+    )
+
+
+def pose_stamped(t_ns: int, frame: str, pose: NDArray[np.float64]) -> Message:
+    """Wrap a planar pose, shape (3,), of the robot in a frame."""
+    return _type(POSE)(header=_header(t_ns, frame), pose=_pose_of(pose))
+
+
+def transforms(t_ns: int, links: Mapping[tuple[str, str], NDArray[np.float64]]) -> Message:
+    """Wrap planar transforms: (parent, child) -> pose of the child in the parent, shape (3,)."""
+    rows = []
+    for (parent, child), pose in links.items():
+        x, y, heading = (float(value) for value in pose)
+        transform = _type("geometry_msgs/msg/Transform")(
+            translation=_type("geometry_msgs/msg/Vector3")(x=x, y=y, z=0.0),
+            rotation=_quaternion(math.sin(heading / 2), math.cos(heading / 2)),
+        )
+        rows.append(
+            _type("geometry_msgs/msg/TransformStamped")(
+                header=_header(t_ns, parent), child_frame_id=child, transform=transform
+            )
+        )
+    return _type(TRANSFORMS)(transforms=rows)
+
+
+def landmark_cloud(snapshot: Snapshot) -> Message:
+    """Wrap the landmarks of a state, with id and covariance, in the map frame."""
+    points = np.zeros(len(snapshot.landmark_ids), dtype=LANDMARK_DTYPE)
+    points["x"] = snapshot.landmarks_m[:, 0]
+    points["y"] = snapshot.landmarks_m[:, 1]
+    points["id"] = snapshot.landmark_ids
+    points["cov_xx"] = snapshot.landmark_covariances_m2[:, 0, 0]
+    points["cov_xy"] = snapshot.landmark_covariances_m2[:, 0, 1]
+    points["cov_yy"] = snapshot.landmark_covariances_m2[:, 1, 1]
+    return _type(POINT_CLOUD)(
+        header=_header(snapshot.t_ns, "map"),
+        height=1,
+        width=len(points),
+        fields=_landmark_fields(),
+        is_bigendian=False,
+        point_step=LANDMARK_DTYPE.itemsize,
+        row_step=LANDMARK_DTYPE.itemsize * len(points),
+        data=points.view(np.uint8),
+        is_dense=True,
+    )
+
+
+def log_line(t_ns: int, radar: str, text: str, *, warning: bool) -> Message:
+    """Wrap one line of the protocol log; the radar is the logger's name."""
+    return _type(LOG)(
+        stamp=_time(t_ns),
+        level=_LOG_WARN if warning else _LOG_INFO,
+        name=radar,
+        msg=text,
+        file="",
+        function="",
+        line=0,
+    )
+
+
+@cache
+def _landmark_fields() -> list[Message]:
+    fields = LANDMARK_DTYPE.fields
+    assert fields is not None
+    return [
+        _type("sensor_msgs/msg/PointField")(
+            name=name,
+            offset=fields[name][1],
+            datatype=_POINT_FIELD_UINT32 if name == "id" else _POINT_FIELD_FLOAT32,
+            count=1,
+        )
+        for name in LANDMARK_DTYPE.names or ()
+    ]
+
+
+def _array(message_type: str, label: str, values: NDArray[Any]) -> Message:
+    size = len(values)
+    dimension = _type("std_msgs/msg/MultiArrayDimension")(label=label, size=size, stride=size)
+    layout = _type("std_msgs/msg/MultiArrayLayout")(dim=[dimension], data_offset=0)
+    # a row of an array in Fortran order is none that can be written as it lies
+    return _type(message_type)(layout=layout, data=np.ascontiguousarray(values))
+
+
+def _time(t_ns: int) -> Message:
+    seconds, rest = divmod(int(t_ns), NS_PER_S)
+    return _type("builtin_interfaces/msg/Time")(sec=seconds, nanosec=rest)
+
+
+def _header(t_ns: int, frame: str) -> Message:
+    return _type("std_msgs/msg/Header")(stamp=_time(t_ns), frame_id=frame)
+
+
+def _quaternion(qz: float, qw: float) -> Message:
+    return _type("geometry_msgs/msg/Quaternion")(x=0.0, y=0.0, z=qz, w=qw)
+
+
+def _pose(x_m: float, y_m: float, qz: float, qw: float) -> Message:
+    return _type("geometry_msgs/msg/Pose")(
+        position=_type("geometry_msgs/msg/Point")(x=x_m, y=y_m, z=0.0),
+        orientation=_quaternion(qz, qw),
+    )
+
+
+def _pose_of(pose: NDArray[np.float64]) -> Message:
+    x, y, heading = (float(value) for value in pose)
+    return _pose(x, y, math.sin(heading / 2), math.cos(heading / 2))
+
+
+METADATA_NAME = "xethru-hil session"
+"""Of the table in the file."""
+
+LENGTH_UNIT = "module metres, c = 3.0e8 m/s"
+"""Of a radar's range_start_m and bin_length_m in its text; its mount is in true metres."""
+
+FORMAT = 2
+"""Of the file; format 1 was never released."""
+
+
+def session_table(info: SessionInfo) -> dict[str, str]:
+    """Return the table of a run; floats in it are those of the run to the last bit."""
+    return {
+        "format": str(FORMAT),
+        "scene": info.scene,
+        "preset": info.preset,
+        "seed": "" if info.seed is None else str(info.seed),
+        "simulated": json.dumps(info.simulated),
+        "time_base": info.time_base,
+        "has_detections": json.dumps(info.has_detections),
+        "started_unix_ns": "" if info.started_unix_ns is None else str(info.started_unix_ns),
+        "true_landmarks_m": json.dumps(info.true_landmarks_m.tolist()),
+        "outlines_m": json.dumps([line.tolist() for line in info.outlines_m]),
+        "config": info.config_json,
+        "wheels": json.dumps(dict(info.wheels)),
+        "versions": json.dumps(dict(info.versions)),
+    }
+
+
+def settings_text(config: SlamConfig) -> str:
+    """Return SLAM's settings for `SessionInfo.config_json`.
+
+    `SlamConfig.model_validate_json` reads them back the same; pydantic's own text has null for
+    infinity, which is not.
+    """
+    return json.dumps(config.model_dump(mode="json"))
+
+
+def radar_text(radar: RadarInfo) -> str:
+    """Return what a session says of a radar."""
+    return json.dumps(asdict(radar) | {"length_unit": LENGTH_UNIT})
+
+
+def check_format(path: Path, table: Mapping[str, str]) -> None:
+    """Check that this version reads the file's format.
+
+    Raises
+    ------
+    AppError
+        The file is of another format; one line.
+    """
+    number = table.get("format", "1")
+    if number == str(FORMAT):
+        return
+    remedy = "record the session again" if number == "1" else "a newer xethru-hil wrote it"
+    raise AppError(
+        f"{path}: a session of format {number}; this version reads format {FORMAT}; {remedy}"
+    )
+
+
+def read_session_table(
+    path: Path, table: Mapping[str, str], radars: tuple[RadarInfo, ...]
+) -> SessionInfo:
+    """Read the table of a run back; what older files did not say has its default.
+
+    Raises
+    ------
+    AppError
+        The table makes no sense; one line with the file.
+    """
+    try:
+        seed, started = table["seed"], table.get("started_unix_ns", "")
+        return SessionInfo(
+            scene=table["scene"],
+            preset=table["preset"],
+            seed=int(seed) if seed else None,
+            radars=radars,
+            true_landmarks_m=np.array(
+                json.loads(table["true_landmarks_m"]), dtype=np.float64
+            ).reshape(-1, 2),
+            versions=json.loads(table["versions"]),
+            config_json=table.get("config", ""),
+            wheels=json.loads(table.get("wheels", "{}")),
+            outlines_m=tuple(
+                np.array(line, dtype=np.float64).reshape(-1, 2)
+                for line in json.loads(table.get("outlines_m", "[]"))
+            ),
+            simulated=bool(json.loads(table.get("simulated", "true"))),
+            time_base=table.get("time_base", "counter"),
+            has_detections=bool(json.loads(table.get("has_detections", "false"))),
+            started_unix_ns=int(started) if started else None,
+        )
+    except (KeyError, ValueError, TypeError) as error:
+        raise AppError(f"{path}: metadata {METADATA_NAME!r} cannot be read: {error!r}") from None
+
+
+def read_radar_text(path: Path, topic: str, text: str) -> RadarInfo:
+    """Read what a session says of a radar.
+
+    Raises
+    ------
+    AppError
+        The text makes no sense, or its lengths are in another unit; one line with file and topic.
+    """
+    try:
+        facts = json.loads(text)
+        unit = facts["length_unit"]
+        known = {
+            field.name: facts[field.name] for field in fields(RadarInfo) if field.name in facts
+        }
+    except (ValueError, TypeError, KeyError) as error:
+        raise AppError(f"{path}: {topic} cannot be read: {error!r}") from None
+    missing = [
+        field.name
+        for field in fields(RadarInfo)
+        if known.get(field.name) is None
+        and field.default is MISSING
+        and field.default_factory is MISSING
+    ]
+    if missing:
+        raise AppError(f"{path}: {topic} does not tell {', '.join(missing)}")
+    if unit != LENGTH_UNIT:
+        raise AppError(f"{path}: {topic}: lengths in {unit!r}, expected {LENGTH_UNIT!r}")
+    return RadarInfo(**known)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SlamSettings:
+    """How SLAM is to be set; see the fields of `SessionInfo` of these names."""
+
+    preset: str = "robust"
+    config_json: str = ""
+    wheels: Mapping[str, float] = field(default_factory=dict)
+
+
+def imported_info(
+    source: Path,
+    radars: tuple[RadarInfo, ...],
+    settings: SlamSettings,
+    *,
+    time_base: str,
+    has_detections: bool = False,
+) -> SessionInfo:
+    """Return the head of a session made of a file; it is named after the file."""
+    return SessionInfo(
+        scene=source.resolve().stem,
+        preset=settings.preset,
+        seed=None,
+        radars=radars,
+        true_landmarks_m=np.zeros((0, 2)),
+        versions={},
+        config_json=settings.config_json,
+        wheels=settings.wheels,
+        simulated=False,
+        time_base=time_base,
+        has_detections=has_detections,
+    )
+
+
+def imported_radar(
+    mount: Mount, *, range_start_m: float, bin_length_m: float, n_bins: int, rate_hz: float
+) -> RadarInfo:
+    """Return a radar of whose serial number, port and settings nobody told; module metres."""
+    return RadarInfo(
+        name=mount.name,
+        serial="",
+        port="",
+        x_m=mount.x_m,
+        y_m=mount.y_m,
+        yaw_rad=mount.yaw_rad,
+        range_offset_m=mount.range_offset_m,
+        range_start_m=range_start_m,
+        bin_length_m=bin_length_m,
+        n_bins=n_bins,
+        rate_hz=rate_hz,
+        settings={},
+        phase_offset_rad=mount.phase_offset_rad,
+    )

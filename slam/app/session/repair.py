@@ -1,0 +1,291 @@
+"""`uwb-slam repair`: a recording that was cut or damaged becomes one that opens everywhere again.
+
+Everything that is whole is written anew, with an index, into a file beside it, which is read back
+before it takes the place of the old one. The old one is kept under another name.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+from slam.app.errors import AppError
+from slam.app.session import mcap
+from slam.app.session.mcap import open_mcap
+from xethru_protocol.system import PathInUseError, locked
+
+KEPT_SUFFIX = ".unrepaired"
+"""Of the name under which the file is kept as it was."""
+
+_CHUNK_BYTES = 256 * 1024
+_MESSAGE = struct.Struct("<HIQQ")
+_ATTACHMENT = struct.Struct("<QQ")
+_FOOTER = struct.Struct("<QQI")
+_FOOTER_HEAD_BYTES = 9  # code and length
+_CHECKED_FOOTER_BYTES = 16  # of its body, that its checksum covers
+
+
+@dataclass(slots=True, kw_only=True)
+class _Survey:
+    """What one look at the whole file finds."""
+
+    cut_at: int | None = None
+    damages: list[mcap.Damage] = field(default_factory=list)
+    has_index: bool = False
+    profile: str = ""
+    library: str = ""
+    schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
+    channels: dict[int, tuple[int, str, str, dict[str, str]]] = field(default_factory=dict)
+
+    def lose(self, record: mcap.Record, error: Exception) -> None:
+        """Note that a record is left out, once for all that begin in the same place."""
+        if not self.damages or self.damages[-1].at != record.at:
+            self.damages.append(mcap.Damage(record.at, record.at, f"records there: {error!r}"))
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether there is nothing to do."""
+        return self.cut_at is None and not self.damages and self.has_index
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Repair:
+    """What was done.
+
+    Attributes
+    ----------
+    path
+        The file that opens everywhere now.
+    was_whole
+        There was nothing to do.
+    n_messages, first_ns, last_ns
+        Messages in it, and the session time they span [ns].
+    cut_at
+        Byte at which the old file ended too early; None if it did not.
+    damages
+        Places of the old file that were left out.
+    kept
+        Where the old file is now; None where it was not moved.
+    """
+
+    path: Path
+    was_whole: bool
+    n_messages: int
+    first_ns: int
+    last_ns: int
+    cut_at: int | None
+    damages: tuple[mcap.Damage, ...]
+    kept: Path | None
+
+    def __str__(self) -> str:
+        """Say so to a person."""
+        span = f"{self.n_messages} messages, {(self.last_ns - self.first_ns) / 1e9:.1f} s"
+        if self.was_whole:
+            return f"{self.path}: whole, nothing to repair: {span}"
+        lines = [f"{self.path}: {span}"]
+        if self.cut_at is not None:
+            lines.append(f"  it ended too early, at byte {self.cut_at} or behind it")
+        lines += [
+            f"  bytes {row.at} to {row.until} are left out: {row.reason}" for row in self.damages
+        ]
+        if self.cut_at is None and not self.damages:
+            lines.append("  its index was missing or wrong")
+        if self.kept is not None:
+            lines.append(f"  as it was: {self.kept}")
+        return "\n".join(lines)
+
+
+def repair(path: Path, out: Path | None, check: Callable[[], None]) -> Repair:
+    """Make a recording whole.
+
+    Parameters
+    ----------
+    path
+        An MCAP file, of this program or another.
+    out
+        Where to write; None: in its place, and the old one stays as ``path`` + `KEPT_SUFFIX`. A
+        file that is whole is left alone then.
+    check
+        Called now and then; may raise to stop, which leaves everything as it was.
+
+    Raises
+    ------
+    AppError
+        Not an MCAP file, nothing left of it, still being written, or no place to write.
+    """
+    with _held(path):
+        survey = _survey(path, check)
+        kept = path.with_name(path.name + KEPT_SUFFIX)
+        if survey.is_whole and out is None:
+            return _result(path, path, survey, None)
+        if not survey.channels:
+            raise AppError(f"{path}: nothing in it can be kept, no channel is named before its end")
+        if out is None and kept.exists():
+            raise AppError(f"{kept}: exists, from an earlier repair; move or remove it first")
+        if out is not None and out.exists():
+            raise AppError(f"{out}: exists; choose another --out")
+        target = path if out is None else out
+        fresh = target.with_name(f".{target.name}.repairing")
+        try:
+            _write(path, fresh, survey, check)
+            result = _result(fresh, target, survey, kept if out is None else None)
+            if out is None:
+                _swap(fresh, path, kept)
+            else:
+                fresh.replace(out)
+        except OSError as error:
+            raise AppError(
+                f"{error.filename or fresh}: cannot be written: {error.strerror or error}; "
+                f"{path} is as it was; make room or give --out on another disk"
+            ) from None
+        finally:
+            fresh.unlink(missing_ok=True)
+    return result
+
+
+def _swap(fresh: Path, path: Path, kept: Path) -> None:
+    """Put a file in another's place, which goes on under its second name; all of it or nothing."""
+    try:
+        kept.hardlink_to(path)  # whatever ends us before the next line, the session has its name
+    except OSError:  # FAT and some network shares have no second names
+        path.rename(kept)
+    try:
+        fresh.replace(path)
+    except OSError:
+        kept.replace(path)
+        kept.unlink(missing_ok=True)  # two names of one file: replacing did nothing
+        raise
+
+
+@contextmanager
+def _held(path: Path) -> Iterator[None]:
+    """Refuse a file that a run is still writing: it holds its folder."""
+    try:
+        with locked(Path(os.path.realpath(path)).parent):
+            yield
+    except PathInUseError:
+        raise AppError(f"{path}: a run is still writing it; wait for its end") from None
+
+
+def _survey(path: Path, check: Callable[[], None]) -> _Survey:
+    survey = _Survey()
+    with open_mcap(path) as reader:
+        for found in reader.read():
+            if isinstance(found, mcap.Cut):
+                survey.cut_at = found.at
+            elif isinstance(found, mcap.Damage):
+                survey.damages.append(found)
+            else:
+                check()
+                try:
+                    _note(survey, path, found)
+                except mcap.DAMAGES as error:
+                    survey.lose(found, error)
+    return survey
+
+
+def _note(survey: _Survey, path: Path, record: mcap.Record) -> None:
+    body = record.body
+    if record.code == mcap.HEADER:
+        survey.profile, at = mcap.text_at(body, 0)
+        survey.library, _ = mcap.text_at(body, at)
+    elif record.code == mcap.SCHEMA:
+        (number,) = struct.unpack_from("<H", body)
+        name, at = mcap.text_at(body, 2)
+        encoding, at = mcap.text_at(body, at)
+        survey.schemas[number] = (name, encoding, mcap.bytes_at(body, at)[0])
+    elif record.code == mcap.CHANNEL:
+        number, schema = struct.unpack_from("<HH", body)
+        topic, at = mcap.text_at(body, 4)
+        encoding, at = mcap.text_at(body, at)
+        survey.channels[number] = (schema, topic, encoding, mcap.table_at(body, at)[0])
+    elif record.code == mcap.FOOTER:
+        survey.has_index = _is_index_right(path, record)
+
+
+def _is_index_right(path: Path, footer: mcap.Record) -> bool:
+    """Whether the index before the footer is there and what its checksum says."""
+    start, _, checksum = _FOOTER.unpack(footer.body)
+    with path.open("rb") as stream:
+        stream.seek(start)
+        checked = footer.at + _FOOTER_HEAD_BYTES + _CHECKED_FOOTER_BYTES - start
+        index = stream.read(max(checked, 0))
+        stream.seek(footer.at + _FOOTER_HEAD_BYTES + _FOOTER.size)
+        ends_well = stream.read() == mcap.MAGIC
+    return ends_well and start != 0 and checksum in (0, zlib.crc32(index))
+
+
+def _write(path: Path, fresh: Path, survey: _Survey, check: Callable[[], None]) -> None:
+    with fresh.open("wb") as stream, open_mcap(path) as reader:
+        writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
+        writer.start(profile=survey.profile, library=survey.library)
+        schemas = {0: 0} | {
+            number: writer.register_schema(*row) for number, row in survey.schemas.items()
+        }
+        channels = {
+            number: writer.register_channel(topic, encoding, schemas.get(schema, 0), table)
+            for number, (schema, topic, encoding, table) in survey.channels.items()
+        }
+        for found in reader.read():
+            check()
+            if not isinstance(found, mcap.Record):
+                continue
+            try:
+                _copy(writer, channels, found)
+            except mcap.DAMAGES as error:
+                survey.lose(found, error)
+        writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+def _copy(writer: Writer, channels: dict[int, int], record: mcap.Record) -> None:
+    body = record.body
+    if record.code == mcap.MESSAGE:
+        channel, sequence, t_ns, publish_ns = _MESSAGE.unpack_from(body)
+        writer.add_message(
+            channel_id=channels[channel],
+            log_time=t_ns,
+            publish_time=publish_ns,
+            sequence=sequence,
+            data=body[_MESSAGE.size :],
+        )
+    elif record.code == mcap.METADATA:
+        name, at = mcap.text_at(body, 0)
+        writer.add_metadata(name, mcap.table_at(body, at)[0])
+    elif record.code == mcap.ATTACHMENT:
+        log_ns, created_ns = _ATTACHMENT.unpack_from(body)
+        name, at = mcap.text_at(body, _ATTACHMENT.size)
+        media_type, at = mcap.text_at(body, at)
+        (size,) = struct.unpack_from("<Q", body, at)
+        writer.add_attachment(created_ns, log_ns, name, media_type, body[at + 8 : at + 8 + size])
+
+
+def _result(readable: Path, target: Path, survey: _Survey, kept: Path | None) -> Repair:
+    """Read the finished file's own index, as every other program will."""
+    try:
+        with readable.open("rb") as stream:
+            summary = make_reader(stream, validate_crcs=True).get_summary()
+    except McapError as error:
+        raise AppError(f"{target}: cannot be made whole: {error}") from None
+    if summary is None or summary.statistics is None:
+        raise AppError(f"{target}: cannot be made whole: it has no index")
+    return Repair(
+        path=target,
+        was_whole=survey.is_whole,
+        n_messages=summary.statistics.message_count,
+        first_ns=summary.statistics.message_start_time,
+        last_ns=summary.statistics.message_end_time,
+        cut_at=survey.cut_at,
+        damages=tuple(survey.damages),
+        kept=kept,
+    )

@@ -1,0 +1,1 @@
+"""The same run over scenes, presets, settings, stresses and seeds."""

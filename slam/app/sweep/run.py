@@ -1,0 +1,493 @@
+"""One run of a sweep: the demo's job without ports and processes, and its numbers.
+
+Random choices are words of Philox keyed by the run's seed, so a row changes neither the noise of
+receivers nor that of the wheels: runs of one seed, clean and stressed, differ by the stress alone.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.scene.philox import counter_normals
+from emulator.scene.scene import CarriedSpec, Scene
+from emulator.scene.wheels import scene_odometry
+from slam.app.errors import AppError, UsageError
+from slam.app.odometry.track import OdometryTrack
+from slam.app.odometry.tum import NS_PER_S
+from slam.app.records import Scan
+from slam.app.rig.emulated import (
+    FRAME_RATE_HZ,
+    RAW_CONFIG,
+    end_counter,
+    open_loopback,
+    rig_of,
+    scene_and_config,
+    true_landmarks_m,
+    versions,
+    wheels_of,
+)
+from slam.app.run.evaluation import Summary, summarise
+from slam.app.run.pictures import outlines_m
+from slam.app.run.runner import RunRecord, run_slam
+from slam.app.sweep.bound import BoundSummary, bound_of
+from slam.app.sweep.stress import CLEAN, STRESSES, Stress
+from slam.config import ConfigError, SlamConfig, override
+from slam.evaluation import LANDMARK_MATCH_M
+from slam.frames import Detection, Detector, RadarFrame
+from slam.front_end.paper import make_detector
+from slam.geometry import transform
+from slam.paper.pipeline import Slam
+from slam.robust.pipeline import make_slam
+
+# Streams of their own beside the radars' (serial numbers and purposes, below 2**51) and the
+# odometry's, 2**63.
+_STREAM = 1 << 62
+_OFFSETS, _SILENCE, _DROPPED, _OUTLIERS = (_STREAM + (part << 32) for part in range(4))
+
+# When a silence may begin, in parts of the run.
+_SILENCE_FROM, _SILENCE_TO = 0.15, 0.75
+_BLOCKS_PER_FRAME = 256
+"""Of four words each: three words for each of at most 341 echoes of a frame."""
+
+
+def stressed_scene(scene: Scene, stress: Stress, seed: int) -> Scene:
+    """Return the scene with what a row plants in it: skews, range offsets, wheels, a lift.
+
+    A radar beyond those that have a skew in the row takes them from the first again.
+    """
+    radars = scene.radars
+    if stress.start_skews_ms:
+        skews_ms = stress.start_skews_ms
+        radars = tuple(
+            radar.model_copy(update={"start_skew_ms": skews_ms[index % len(skews_ms)]})
+            for index, radar in enumerate(radars)
+        )
+    if stress.offset_sigma_m:
+        normals = counter_normals(np.arange(len(radars)), seed=seed, stream=_OFFSETS)
+        radars = tuple(
+            radar.model_copy(
+                update={"range_offset_m": radar.range_offset_m + stress.offset_sigma_m * normal}
+            )
+            for radar, normal in zip(radars, normals.tolist(), strict=True)
+        )
+    duration_s = scene.trajectory().duration_ns / NS_PER_S
+    odometry = scene.odometry
+    if stress.walk_sigmas:
+        rate = stress.walk_sigmas / math.sqrt(duration_s)
+        odometry = odometry.model_copy(update={"walk_per_sqrt_s": rate})
+    path = scene.path
+    if stress.carried_skips:
+        lift = CarriedSpec(
+            at_s=stress.carried_at * duration_s, skips_s=stress.carried_skips * duration_s
+        )
+        path = path.model_copy(update={"carried": lift})
+    return scene.model_copy(update={"radars": radars, "odometry": odometry, "path": path})
+
+
+def stressed_scans(
+    scans: Iterable[Scan], stress: Stress, seed: int, duration_ns: int
+) -> Iterator[Scan]:
+    """Yield the scans without the frames that a row loses; a scan that lost all stays, empty.
+
+    Parameters
+    ----------
+    scans
+        Of a whole run, nothing lost.
+    stress
+        Silence, losses and dead radars count.
+    seed
+        Of the run.
+    duration_ns
+        Of the run: silence is a part of it.
+    """
+    begin = _SILENCE_FROM + (_SILENCE_TO - _SILENCE_FROM) * float(
+        _uniforms(seed, _SILENCE, 0, 1)[0]
+    )
+    silent_ns = (begin * duration_ns, (begin + stress.silent_share) * duration_ns)
+    for scan in scans:
+        silent = silent_ns[0] <= scan.t_ns < silent_ns[1]
+        frames = tuple(
+            frame
+            for frame in scan.frames
+            if not silent
+            and frame.radar not in stress.dead_radars
+            and not _is_dropped(frame, stress.dropped_share, seed)
+        )
+        yield scan if len(frames) == len(scan.frames) else replace(scan, frames=frames)
+
+
+def _is_dropped(frame: RadarFrame, share: float, seed: int) -> bool:
+    if not share:
+        return False
+    return float(_uniforms(seed, _DROPPED + frame.radar, frame.counter, 1)[0]) < share
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutlierDetector:
+    """A front end that gives random ranges now and then, with the looks of the true detection.
+
+    Attributes
+    ----------
+    detector
+        The true front end.
+    share
+        Of the detections, replaced by ranges uniform between ``min_range_m`` and ``max_range_m``
+        with a uniform carrier phase, if they have one; amplitude and predictions stay.
+    seed
+        Of the run.
+    """
+
+    detector: Detector
+    share: float
+    min_range_m: float
+    max_range_m: float
+    seed: int
+
+    def detect(self, frame: RadarFrame, range_offset_m: float = 0.0) -> tuple[Detection, ...]:
+        """Return the echoes of one frame, some replaced, nearest first."""
+        return self.detect_many([frame], [range_offset_m])[0]
+
+    def detect_many(
+        self, frames: Sequence[RadarFrame], offsets_m: Sequence[float]
+    ) -> list[tuple[Detection, ...]]:
+        """Return what ``detect`` returns, for each frame with its range offset."""
+        found = self.detector.detect_many(frames, offsets_m)
+        return [self._mixed(*pair) for pair in zip(frames, found, strict=True)]
+
+    def _mixed(self, frame: RadarFrame, detections: Sequence[Detection]) -> tuple[Detection, ...]:
+        block = frame.counter * _BLOCKS_PER_FRAME
+        words = _uniforms(self.seed, _OUTLIERS + frame.radar, block, 3 * len(detections))
+        span_m = self.max_range_m - self.min_range_m
+        mixed = [
+            replace(
+                detection,
+                range_m=self.min_range_m + span_m * where,
+                phase_rad=_phase_like(detection, phase),
+            )
+            if chance < self.share
+            else detection
+            for detection, (chance, where, phase) in zip(
+                detections, words.reshape(-1, 3).tolist(), strict=True
+            )
+        ]
+        return tuple(sorted(mixed, key=lambda detection: detection.range_m))
+
+
+def _phase_like(detection: Detection, turns: float) -> float:
+    known = not math.isnan(detection.phase_rad)
+    return math.pi * (2 * turns - 1) if known else math.nan
+
+
+def _uniforms(seed: int, stream: int, block: int, count: int) -> NDArray[np.float64]:
+    """Return numbers in [0, 1), selected by stream and block alone; shape (count,)."""
+    philox = np.random.Philox(key=np.array([seed, stream], dtype=np.uint64), counter=block)
+    words: NDArray[np.uint64] = philox.random_raw(count)
+    return (words >> np.uint64(11)).astype(np.float64) * 2.0**-53
+
+
+CONFIDENT_M = 0.05
+"""Largest standard deviation, in any direction, of a landmark that claims to be known."""
+
+
+def false_landmarks(record: RunRecord, scene: Scene) -> tuple[int, int]:
+    """Count the landmarks of the last map that have nothing within 15 cm; in all, and confident.
+
+    Judged in the start frame and not aligned, since that is the frame of the claim: a map turned
+    by an error of heading that it does not know of is false, too. Something is a target's surface,
+    a wall, or the side of a box. None are false where there is no state.
+    """
+    if not record.results:
+        return 0, 0
+    belief = record.results[-1].belief
+    false = confident = 0
+    for row, place in enumerate(belief.landmarks):
+        if distance_m(scene, transform(record.world_from_map, place)) > LANDMARK_MATCH_M:
+            false += 1
+            variance = float(np.linalg.eigvalsh(belief.landmark_covariance(row))[-1])
+            confident += variance < CONFIDENT_M**2
+    return false, confident
+
+
+def distance_m(scene: Scene, point: NDArray[np.float64]) -> float:
+    """Return the distance from a point, shape (2,) [m], world frame, to what reflects."""
+    x, y = float(point[0]), float(point[1])
+    distances = [
+        abs(math.hypot(target.x_m - x, target.y_m - y) - target.radius_m)
+        for target in scene.targets
+    ]
+    for line in outlines_m(scene):
+        starts, ways = line[:-1], np.diff(line, axis=0)
+        shares = ((point - starts) * ways).sum(axis=1) / (ways**2).sum(axis=1)
+        feet = starts + np.clip(shares, 0.0, 1.0)[:, np.newaxis] * ways
+        distances.append(float(np.linalg.norm(feet - point, axis=1).min()))
+    return min(distances, default=math.inf)
+
+
+LARGEST = 1e12
+"""What stands for an infinite NEES or NIS."""
+
+Key = tuple[str, str, tuple[tuple[str, str], ...], str, int | None]
+"""Scene, preset, settings, stress, seed."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Case:
+    """One run to do, complete: a worker on another machine needs no file of ours.
+
+    Attributes
+    ----------
+    scene, config
+        Loaded; `config` has the settings in it.
+    preset, settings, stress, seed
+        What the run is called by.
+    bound
+        Whether to compute the known-association bound on the same data.
+    """
+
+    scene: Scene
+    config: SlamConfig
+    preset: str
+    settings: tuple[tuple[str, str], ...] = ()
+    stress: str = CLEAN
+    seed: int = 0
+    bound: bool = False
+
+    @property
+    def key(self) -> Key:
+        """Return what tells the run from all others of its sweep."""
+        return (self.scene.name, self.preset, self.settings, self.stress, self.seed)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SweepRun(Summary):
+    """The numbers of one run of a sweep: those of summary.json, and how it differs from others.
+
+    Attributes
+    ----------
+    settings
+        Settings of the preset that were replaced, dotted keys.
+    stress
+        Row of the stress table.
+    false, confident_false
+        Landmarks of the map where nothing stands, and those of them that claim to be known to
+        5 cm.
+    bound
+        The known-association bound on the same data, where it was asked for.
+    """
+
+    settings: dict[str, str] = field(default_factory=dict)
+    stress: str = CLEAN
+    false: int = 0
+    confident_false: int = 0
+    bound: BoundSummary | None = None
+
+    @property
+    def key(self) -> Key:
+        """Return what tells the run from all others of its sweep."""
+        return (self.scene, self.preset, tuple(self.settings.items()), self.stress, self.seed)
+
+
+def never() -> None:
+    """Do not stop."""
+
+
+def make_case(
+    scene: str,
+    preset: str,
+    seed: int,
+    *,
+    settings: Mapping[str, str] | None = None,
+    stress: str = CLEAN,
+    bound: bool = False,
+) -> Case:
+    """Load what a run needs by its names.
+
+    Raises
+    ------
+    AppError
+        A name or a setting is not known, or a file cannot be used; one line.
+    """
+    loaded, config = scene_and_config(scene, preset)
+    if stress not in STRESSES:
+        raise UsageError(f"unknown stress {stress!r}; known: {', '.join(STRESSES)}")
+    named = tuple((settings or {}).items())
+    try:
+        config = override(config, dict(named))
+    except ConfigError as error:
+        raise UsageError(f"--set: {error}") from None
+    return Case(
+        scene=loaded,
+        config=config,
+        preset=preset,
+        settings=named,
+        stress=stress,
+        seed=seed,
+        bound=bound,
+    )
+
+
+def run_in_process(
+    scene: str,
+    preset: str,
+    seed: int,
+    *,
+    stress: str = CLEAN,
+    settings: Mapping[str, str] | None = None,
+    check: Callable[[], None] = never,
+) -> RunRecord:
+    """Do what the demo does without ports and processes: same driver, device, odometry text."""
+    return record_of(make_case(scene, preset, seed, settings=settings, stress=stress), check=check)
+
+
+def run_one(scene: str, preset: str, seed: int, *, check: Callable[[], None] = never) -> Summary:
+    """Run a scene with a preset and return its numbers.
+
+    Raises
+    ------
+    AppError
+        The scene is too short for a single state.
+    """
+    case = make_case(scene, preset, seed)
+    return _summary(case, record_of(case, check=check))
+
+
+def record_of(case: Case, *, check: Callable[[], None] = never) -> RunRecord:
+    """Drive the robot through a case; SLAM is told the scene's own rig and wheels, no stress."""
+    stress = STRESSES[case.stress]
+    scene = stressed_scene(case.scene, stress, case.seed)
+    trajectory = scene.trajectory()
+    duration_ns = trajectory.duration_ns
+    odometry = OdometryTrack.from_lines(scene_odometry(scene, case.seed))
+    with open_loopback(scene, case.seed) as source:
+        source.start(RAW_CONFIG, FRAME_RATE_HZ)
+        scans = source.scans(end_counter(duration_ns), check)
+        return run_slam(
+            stressed_scans(scans, stress, case.seed, duration_ns),
+            odometry,
+            _slam(case, stress),
+            trajectory.poses,
+        )
+
+
+def run_case(
+    case: Case, program: str | None = None, *, check: Callable[[], None] = never
+) -> SweepRun:
+    """Run one case and return its numbers.
+
+    Parameters
+    ----------
+    case
+        What to run.
+    program
+        `program_version` of whoever asks, if that may be another machine.
+    check
+        Called once per scan; may raise to stop.
+
+    Raises
+    ------
+    AppError
+        The scene is too short for a single state, or the program here is another version.
+    """
+    if program not in (None, program_version()):
+        raise AppError(
+            "a worker has another version of xethru-hil or its libraries than this machine; "
+            "install the same on both"
+        )
+    record = record_of(case, check=check)
+    summary = _summary(case, record)
+    false, confident = false_landmarks(record, case.scene)
+    run = SweepRun(
+        **{row.name: getattr(summary, row.name) for row in fields(summary)},
+        settings=dict(case.settings),
+        stress=case.stress,
+        false=false,
+        confident_false=confident,
+        bound=bound_of(record, case.scene, case.config) if case.bound else None,
+    )
+    return finite(run)
+
+
+def finite(run: SweepRun) -> SweepRun:
+    """Return the run with NEES and NIS of a state that is certain and wrong, infinite, at 1e12.
+
+    JSON has no infinity, and one such run must neither end a sweep nor go unseen in its means.
+
+    Raises
+    ------
+    AppError
+        Another number is not finite: SLAM has diverged.
+    """
+    nis_mean = None if run.nis_mean is None else min(run.nis_mean, LARGEST)
+    capped = replace(
+        run,
+        nees_pose=tuple((t_s, min(nees, LARGEST)) for t_s, nees in run.nees_pose),
+        nis_mean=nis_mean,
+        nis_times=tuple((t_s, min(nis, LARGEST), dof) for t_s, nis, dof in run.nis_times),
+    )
+    try:
+        json.dumps(asdict(capped), allow_nan=False)
+    except ValueError:
+        wrong = [
+            row.name for row in fields(capped) if "nan" in repr(getattr(capped, row.name)).lower()
+        ]
+        raise AppError(
+            f"{run.scene}, {run.preset}, stress {run.stress}, seed {run.seed}: SLAM diverged, "
+            f"not finite: {', '.join(wrong) or 'an error'}; leave this preset or stress out"
+        ) from None
+    return capped
+
+
+@cache
+def program_version() -> str:
+    """Return a digest of our own sources and of the versions of what they build on."""
+    digest = hashlib.sha256(repr(sorted(versions().items())).encode())
+    for package in ("xethru_protocol", "emulator", "slam"):
+        found = find_spec(package)
+        assert found is not None
+        assert found.origin is not None
+        folder = Path(found.origin).parent
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(str(path.relative_to(folder)).encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+def _slam(case: Case, stress: Stress) -> Slam:
+    rig, wheels = rig_of(case.scene), wheels_of(case.scene)
+    return make_slam(case.config, rig, wheels, _front_end(case, stress))
+
+
+def _front_end(case: Case, stress: Stress) -> OutlierDetector | None:
+    if not stress.outlier_share:
+        return None
+    limits = case.config.detection
+    return OutlierDetector(
+        detector=make_detector(case.config),
+        share=stress.outlier_share,
+        min_range_m=limits.min_range_m,
+        max_range_m=limits.max_range_m,
+        seed=case.seed,
+    )
+
+
+def _summary(case: Case, record: RunRecord) -> Summary:
+    summary = summarise(
+        record,
+        scene=case.scene.name,
+        preset=case.preset,
+        seed=case.seed,
+        rig=rig_of(case.scene),
+        true_landmarks_m=true_landmarks_m(case.scene),
+    )
+    if summary is None:
+        raise AppError(f"{case.scene.name}: too short for SLAM, no state was estimated")
+    return summary

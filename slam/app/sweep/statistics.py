@@ -1,0 +1,224 @@
+"""Statistics of a sweep, and its tables."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy.special import gammaincinv
+
+from slam.app.run.evaluation import ratio
+from slam.app.run.output import mm_text, print_table, share_text
+from slam.app.sweep.run import SweepRun
+from slam.app.sweep.stress import CLEAN
+
+_POSE_DOF = 3
+
+
+def summarise_groups(runs: Sequence[SweepRun]) -> list[dict[str, Any]]:
+    """Return the statistics of each cell but its seeds, in the order they first appear.
+
+    A cell is scene, preset, settings and stress. Every group has its number of runs, how many beat
+    odometry, `median` and `p90` of the errors, medians of the landmarks' scores, the share of runs
+    without a duplicate, false landmarks (per run, and how many were claimed to be known), the mean
+    NEES over runs (ANEES) and the mean NIS per degree of freedom at each of the ten times with
+    their 95 % bands, and the same errors of the known-association bound where it was computed.
+    """
+    keys = list(dict.fromkeys(run.key[:-1] for run in runs))
+    return [_group([run for run in runs if run.key[:-1] == key]) for key in keys]
+
+
+def group_name(group: dict[str, Any]) -> str:
+    """Return what a group is called: scene, preset, settings and stress if there are any."""
+    settings = "".join(f", {key}={value}" for key, value in group["settings"].items())
+    stress = f", stress {group['stress']}" if group["stress"] != CLEAN else ""
+    return f"{group['scene']}, preset {group['preset']}{settings}{stress}"
+
+
+def group_line(group: dict[str, Any]) -> str:
+    """Return what a person wants to know of a group, in a line."""
+    estimate, wheels, found = (
+        group[key] for key in ("ate_rmse_m", "odometry_ate_rmse_m", "landmark_medians")
+    )
+    low, high = group["anees_band_95"]
+    inside = sum(low <= value <= high for _, value in group["anees_pose"])
+    beside = ""
+    if group["bound"] is not None:
+        medians = [
+            mm_text(group["bound"][f"{path}_ate_rmse_m"]["median"])
+            for path in ("filtered", "smoothed")
+        ]
+        beside = f"; known association: filtered median {medians[0]}, smoothed {medians[1]}"
+    return (
+        f"{group_name(group)}, {group['runs']} seeds (simulated): "
+        f"SLAM ATE median {mm_text(estimate['median'])} "
+        f"({ratio(estimate['median'], wheels['median']):.2f} of odometry's), "
+        f"p90 {mm_text(estimate['p90'])}; odometry median {mm_text(wheels['median'])}{beside}; "
+        f"landmark medians: precision {share_text(found['precision'])}, "
+        f"recall {share_text(found['recall'])}, rmse {mm_text(found['rmse_m'])}; "
+        f"no duplicate in {group['without_duplicates']:.0%}, "
+        f"{group['confident_false']} confident false landmarks; "
+        f"ANEES in band at {inside} of {len(group['anees_pose'])} times"
+    )
+
+
+def _group(runs: Sequence[SweepRun]) -> dict[str, Any]:
+    first = runs[0]
+    nis = [run.nis_mean for run in runs if run.nis_mean is not None]
+    return {
+        "scene": first.scene,
+        "preset": first.preset,
+        "settings": first.settings,
+        "stress": first.stress,
+        "runs": len(runs),
+        "runs_below_odometry": sum(run.ate_ratio < 1.0 for run in runs),
+        **{
+            name: spread([getattr(run, name) for run in runs])
+            for name in ("ate_rmse_m", "ate_icp_rmse_m", "odometry_ate_rmse_m", "final_error_m")
+        },
+        "landmark_medians": {
+            name: _median_of_known([getattr(run.landmarks, name) for run in runs])
+            for name in ("precision", "recall", "rmse_m")
+        },
+        "without_duplicates": statistics.fmean(run.landmarks.duplicates == 0 for run in runs),
+        "false_per_run": statistics.fmean(run.false for run in runs),
+        "confident_false": sum(run.confident_false for run in runs),
+        "realtime_factor": spread([run.realtime_factor for run in runs]),
+        **_anees([run.nees_pose for run in runs]),
+        "nis_mean": statistics.fmean(nis) if nis else None,
+        "nis_times": _nis_times(runs),
+        "bound": _bound(runs),
+    }
+
+
+def _anees(values: Sequence[tuple[tuple[float, float], ...]]) -> dict[str, Any]:
+    """Return [time, mean over runs] at each of the ten times, and where 95 % of them belong."""
+    anees = [
+        [statistics.fmean(pair[0] for pair in pairs), statistics.fmean(pair[1] for pair in pairs)]
+        for pairs in zip(*values, strict=True)
+    ]
+    return {"anees_pose": anees, "anees_band_95": _band(_POSE_DOF * len(values), len(values))}
+
+
+def _nis_times(runs: Sequence[SweepRun]) -> list[list[float | None]]:
+    """Return [time, NIS per degree of freedom over runs, its band] at each of the ten times.
+
+    None where no run associated anything truly until then.
+    """
+    rows: list[list[float | None]] = []
+    judged = [run.nis_times for run in runs if run.nis_times]
+    for cells in zip(*judged, strict=True):
+        time_s = statistics.fmean(cell[0] for cell in cells)
+        dof = sum(cell[2] for cell in cells)
+        if dof:
+            total = sum(cell[1] for cell in cells)
+            rows.append([time_s, total / dof, *_band(dof, dof)])
+        else:
+            rows.append([time_s, None, None, None])
+    return rows
+
+
+def _bound(runs: Sequence[SweepRun]) -> dict[str, Any] | None:
+    bounds = [run.bound for run in runs if run.bound is not None]
+    if not bounds:
+        return None
+    return {
+        "filtered_ate_rmse_m": spread([bound.filtered_ate_rmse_m for bound in bounds]),
+        "smoothed_ate_rmse_m": spread([bound.smoothed_ate_rmse_m for bound in bounds]),
+        **_anees([bound.nees_pose for bound in bounds]),
+    }
+
+
+def spread(values: Sequence[float]) -> dict[str, float]:
+    """Return median and 90th percentile."""
+    return {"median": float(np.median(values)), "p90": float(np.quantile(values, 0.9))}
+
+
+def _band(dof: int, parts: int) -> list[float]:
+    """Return where 95 % of the means over ``parts`` of a chi-square of ``dof`` in all lie.
+
+    The quantile is that of a gamma distribution; scipy.stats would take a second to import.
+    """
+    return [2.0 * float(gammaincinv(dof / 2, tail)) / parts for tail in (0.025, 0.975)]
+
+
+def _median_of_known(values: Sequence[float | None]) -> float | None:
+    """Return the median of the runs that have the number; None where no run has it."""
+    known = [value for value in values if value is not None]
+    return statistics.median(known) if known else None
+
+
+_HEADER = (
+    "stress",
+    "ATE median",
+    "p90",
+    "x clean",
+    "p90 x clean",
+    "of odometry",
+    "ANEES in band",
+    "no duplicate",
+    "recall",
+    "false per run",
+    "confident",
+)
+
+
+def stress_tables(groups: Sequence[dict[str, Any]]) -> list[tuple[dict[str, Any], list[Any]]]:
+    """Return each clean group and all groups that differ from it by stress alone, itself first."""
+    tables = []
+    for clean in groups:
+        if clean["stress"] == CLEAN:
+            alike = [
+                group
+                for group in groups
+                if all(group[key] == clean[key] for key in ("scene", "preset", "settings"))
+            ]
+            if len(alike) > 1:
+                tables.append((clean, alike))
+    return tables
+
+
+def times_clean(group: dict[str, Any], clean: dict[str, Any], statistic: str) -> float:
+    """Return a statistic of the ATE, "median" or "p90", in units of the clean group's."""
+    return ratio(group["ate_rmse_m"][statistic], clean["ate_rmse_m"][statistic])
+
+
+def in_band(group: dict[str, Any]) -> int:
+    """Return at how many of the ten times the mean NEES lies in its 95 % band."""
+    low, high = group["anees_band_95"]
+    return sum(low <= value <= high for _, value in group["anees_pose"])
+
+
+def nis_in_band(group: dict[str, Any]) -> int:
+    """Return at how many of the ten times the mean NIS lies in its 95 % band."""
+    known = [row for row in group["nis_times"] if row[1] is not None]
+    return sum(low <= mean <= high for _, mean, low, high in known)
+
+
+def print_stress_tables(groups: Sequence[dict[str, Any]]) -> None:
+    """Write a table for each scene and preset that has stressed runs; to stdout."""
+    for clean, rows in stress_tables(groups):
+        print_table(
+            f"{group_name(clean)}, {clean['runs']} seeds, the same in every row: simulated",
+            _HEADER,
+            [_row(group, clean) for group in rows],
+        )
+
+
+def _row(group: dict[str, Any], clean: dict[str, Any]) -> tuple[str, ...]:
+    ate, wheels = group["ate_rmse_m"], group["odometry_ate_rmse_m"]
+    return (
+        group["stress"],
+        mm_text(ate["median"]),
+        mm_text(ate["p90"]),
+        f"{times_clean(group, clean, 'median'):.2f}",
+        f"{times_clean(group, clean, 'p90'):.2f}",
+        f"{ratio(ate['median'], wheels['median']):.3f}",
+        f"{in_band(group)} of {len(group['anees_pose'])}",
+        f"{group['without_duplicates']:.0%}",
+        share_text(group["landmark_medians"]["recall"]),
+        f"{group['false_per_run']:.2f}",
+        str(group["confident_false"]),
+    )

@@ -1,0 +1,102 @@
+"""The stress table: named hardships that a run goes through, from its echoes on.
+
+Light, so that ``--help`` is; `slam.app.sweep.run` does what a row says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+CLEAN = "clean"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stress:
+    """One row: what it is called, what it says in a line, and how hard each hardship is.
+
+    What is random about it depends on the run's seed alone. SLAM is told nothing of it, but that
+    frames carry the time they were really taken at, as they always do.
+
+    Attributes
+    ----------
+    outlier_share
+        Of the detections, replaced by ranges that are uniform between the front end's limits. The
+        one hardship that enters behind the front end: no reflector gives such echoes.
+    dropped_share
+        Of the frames, each lost by itself.
+    start_skews_ms
+        How late each radar samples.
+    walk_sigmas
+        By how many of their own standard deviations the wheels' scale, turn scale and curvature
+        walk at random over the run.
+    silent_share
+        Of the run, during which no radar sends anything, in one piece; it begins between 15 and
+        75 % of the run.
+    dead_radars
+        Indices of radars that never send a frame.
+    offset_sigma_m
+        Standard deviation of every radar's own constant range error.
+    carried_at, carried_skips
+        Parts of the drive: where the robot is picked up, and how much of its course it misses.
+    """
+
+    name: str
+    help: str
+    outlier_share: float = 0.0
+    dropped_share: float = 0.0
+    start_skews_ms: tuple[float, ...] = ()
+    walk_sigmas: float = 0.0
+    silent_share: float = 0.0
+    dead_radars: frozenset[int] = frozenset()
+    offset_sigma_m: float = 0.0
+    carried_at: float = 0.0
+    carried_skips: float = 0.0
+
+
+_SKEWS_MS = (0.0, 190.0, 100.0, 150.0)
+
+_ROWS: tuple[Stress, ...] = (
+    Stress(name=CLEAN, help="nothing is wrong"),
+    Stress(
+        name="outliers",
+        help="a fifth of the detections replaced by random ranges",
+        outlier_share=0.2,
+    ),
+    Stress(name="dropped", help="a tenth of the frames lost", dropped_share=0.1),
+    Stress(
+        name="skew",
+        help="radars sample up to 190 ms apart, stamped so",
+        start_skews_ms=_SKEWS_MS,
+    ),
+    Stress(
+        name="walk",
+        help="scale, turn scale and curvature of the wheels walk by one sigma over the run",
+        walk_sigmas=1.0,
+    ),
+    Stress(name="silent", help="no radar for a tenth of the run", silent_share=0.1),
+    Stress(
+        name="all",
+        help="outliers, dropped, skew, walk and silent together",
+        outlier_share=0.2,
+        dropped_share=0.1,
+        start_skews_ms=_SKEWS_MS,
+        walk_sigmas=1.0,
+        silent_share=0.1,
+    ),
+    Stress(name="dead", help="the first radar never sends a frame", dead_radars=frozenset({0})),
+    Stress(
+        name="offsets",
+        help="each radar's ranges off by a constant, 20 mm standard deviation, uncalibrated",
+        offset_sigma_m=0.02,
+    ),
+    Stress(
+        name="carried",
+        help="picked up and set down elsewhere on the course; the wheels do not see it",
+        carried_at=0.4,
+        carried_skips=0.15,
+    ),
+)
+
+STRESSES: Mapping[str, Stress] = MappingProxyType({row.name: row for row in _ROWS})

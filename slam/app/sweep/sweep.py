@@ -1,0 +1,313 @@
+"""`uwb-slam sweep`: the same run over scenes, presets, settings, stresses and seeds.
+
+The file is a JSON object, ``{"command": {...}, "runs": [...]}``, whole after every run: each is
+appended over the closing brackets by one write.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from pathlib import Path
+
+from pydantic import TypeAdapter, ValidationError
+
+from slam.app.errors import AppError, StopFlag, StopRequestedError, UsageError, naming
+from slam.app.sweep.bound import require_gtsam
+from slam.app.sweep.run import (
+    Case,
+    SweepRun,
+    make_case,
+    program_version,
+    run_case,
+)
+from slam.app.sweep.statistics import group_line, print_stress_tables, summarise_groups
+from slam.app.sweep.stress import CLEAN
+from slam.app.sweep.workers import ClusterLostError, dask_results, worker_results
+from xethru_protocol.system import PathInUseError, locked
+
+_TAIL = b"\n]}\n"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Contents:
+    command: dict[str, str]
+    runs: list[SweepRun]
+
+
+_READER: TypeAdapter[_Contents] = TypeAdapter(_Contents)
+
+
+class PartFile:
+    """The file OUT.part: made new, or read and continued.
+
+    Parameters
+    ----------
+    path
+        An existing file; empty if there is nothing to go on with.
+    command
+        What the runs depend on, in words by name; must be what the file says.
+
+    Attributes
+    ----------
+    runs
+        Done so far, in the order in which they were.
+
+    Raises
+    ------
+    AppError
+        It holds the runs of another command, or no such thing; nothing is changed then.
+    """
+
+    def __init__(self, path: Path, command: Mapping[str, str]) -> None:
+        self.path = path
+        self.runs: list[SweepRun] = []
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            raise AppError(f"{path}: cannot be read: {error.strerror or error}") from None
+        if content:
+            self.runs = _runs_of(path, content, command)
+            self._end = content.rindex(_TAIL)
+            return
+        head = f'{{"command": {json.dumps(dict(command), indent=1)},\n"runs": ['.encode()
+        with naming(path):
+            path.write_bytes(head + _TAIL)
+        self._end = len(head)
+
+    def add(self, run: SweepRun) -> None:
+        """Append a run.
+
+        Raises
+        ------
+        AppError
+            The file cannot be written.
+        """
+        text = json.dumps(asdict(run), allow_nan=False).encode()
+        separator = b",\n" if self.runs else b"\n"
+        with naming(self.path), self.path.open("r+b", buffering=0) as file:
+            file.seek(self._end)
+            file.write(separator + text + _TAIL)
+            os.fsync(file.fileno())
+        self._end += len(separator) + len(text)
+        self.runs.append(run)
+
+
+def _runs_of(path: Path, content: bytes, command: Mapping[str, str]) -> list[SweepRun]:
+    remedy = "choose another --json, or move this file away"
+    try:
+        known = _READER.validate_json(content)
+    except ValidationError:
+        raise AppError(
+            f"{path}: damaged, or not what a sweep left unfinished; {remedy} to begin anew"
+        ) from None
+    if not content.endswith(_TAIL):
+        raise AppError(f"{path}: somebody else wrote behind the runs of a sweep; {remedy}")
+    differing = [name for name in command if known.command.get(name) != command[name]]
+    if differing or set(known.command) != set(command):
+        names = ", ".join(differing or sorted(set(known.command) ^ set(command)))
+        raise AppError(
+            f"{path}: holds {len(known.runs)} runs of another sweep (other: {names}); "
+            f"give that one's command to go on with it, {remedy}"
+        )
+    return known.runs
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SweepOptions:
+    """What the command line of `uwb-slam sweep` says.
+
+    `settings` maps dotted keys of a preset to the values to try, `stresses` are rows beside the
+    clean runs, and `dask` is the address of a scheduler that takes the place of `jobs` processes.
+    """
+
+    scenes: tuple[str, ...]
+    presets: tuple[str, ...]
+    n_seeds: int
+    jobs: int
+    out: Path
+    settings: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    stresses: tuple[str, ...] = ()
+    bound: bool = False
+    dask: str | None = None
+
+
+def run_sweep(options: SweepOptions, stop: StopFlag) -> None:
+    """Run all cells, write `{"runs": [...], "groups": [...]}`, print one line per group.
+
+    OUT.part holds the runs done so far, and the same command goes on with it.
+
+    Raises
+    ------
+    AppError
+        A wrong name, a file that cannot be written or is not this sweep's, before the first run; a
+        scene too short; a worker process or a cluster that died.
+    StopRequestedError
+        A signal arrived; OUT.part stays if it holds a run.
+    """
+    cases = _cases(options)  # a wrong name ends the command before any run
+    if options.bound:
+        require_gtsam()
+    if options.out.is_dir():
+        raise AppError(f"{options.out}: is a folder, must be a file")
+    if options.out.exists() and not options.out.is_file():
+        # it would be replaced: as root, even a device for everybody
+        raise AppError(f"{options.out}: is no regular file, must be one")
+    path = options.out.with_name(f"{options.out.name}.part")
+    with ExitStack() as held:
+        with naming(path):  # what cannot be written ends the command before any run, too
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+            try:
+                held.enter_context(locked(path))
+            except PathInUseError:
+                raise AppError(
+                    f"{path}: another sweep is writing there; choose another --json"
+                ) from None
+        part = PartFile(path, _command(options, cases))
+        _run(options, cases, part, stop)
+
+
+def _cases(options: SweepOptions) -> list[Case]:
+    """Return the runs in their order: seeds innermost, so that groups are done one by one."""
+    values = [[(key, value) for value in of_key] for key, of_key in options.settings]
+    stresses = dict.fromkeys((CLEAN, *options.stresses))
+    cells = [
+        make_case(scene, preset, 0, settings=dict(settings), stress=stress, bound=options.bound)
+        for scene, preset, settings, stress in product(
+            options.scenes, options.presets, product(*values), stresses
+        )
+    ]
+    if len({cell.key for cell in cells}) < len(cells):
+        names = len({cell.scene.name for cell in cells}) < len(options.scenes)
+        raise UsageError(
+            "--scene: two of the scenes have the same name; give each its own"
+            if names
+            else "--preset, --set: one of them is given twice; give each once"
+        )
+    return [replace(cell, seed=seed) for cell in cells for seed in range(options.n_seeds)]
+
+
+def _command(options: SweepOptions, cases: Sequence[Case]) -> dict[str, str]:
+    """Return what the results depend on, by the name that an error message gives it."""
+    command = {
+        "scenes": " ".join(dict.fromkeys(case.scene.name for case in cases)),
+        "presets": " ".join(options.presets),
+        "seeds": str(options.n_seeds),
+        "settings": " ".join(f"{key}={','.join(values)}" for key, values in options.settings),
+        "stresses": " ".join(dict.fromkeys(case.stress for case in cases)),
+        "bound": str(options.bound),
+    }
+    for case in cases[:: options.n_seeds]:
+        command[f"scene file {case.scene.name}"] = _digest(case.scene.model_dump_json())
+        command[f"preset file {case.preset}"] = ""
+    for preset in options.presets:
+        configs = [case.config.model_dump_json() for case in cases if case.preset == preset]
+        command[f"preset file {preset}"] = _digest(*dict.fromkeys(configs))
+    return command | {"version of the program": program_version()}
+
+
+def _digest(*texts: str) -> str:
+    return hashlib.sha256("\n".join(texts).encode()).hexdigest()
+
+
+def _run(options: SweepOptions, cases: Sequence[Case], part: PartFile, stop: StopFlag) -> None:
+    done = {run.key for run in part.runs}
+    missing = [case for case in cases if case.key not in done]
+    if done:
+        sys.stderr.write(f"{part.path}: {len(done)} of {len(cases)} runs are done, going on\n")
+
+    def left() -> str:
+        return f"; {len(part.runs)} of {len(cases)} runs are in {part.path}" if part.runs else ""
+
+    started = time.monotonic()
+    try:
+        for run in _results(missing, options, stop):
+            part.add(run)
+            elapsed_s = time.monotonic() - started
+            to_do = len(cases) - len(part.runs)
+            remaining_s = elapsed_s / (len(missing) - to_do) * to_do
+            sys.stderr.write(
+                f"{len(part.runs)} of {len(cases)}: {_run_line(run)}; {_clock(elapsed_s)} "
+                f"elapsed, {_clock(remaining_s)} remaining\n"
+            )
+            stop.check()
+    except StopRequestedError as stopped:
+        raise StopRequestedError(stopped.received, left()) from None
+    except BrokenExecutor:
+        raise AppError(f"a worker process died; did memory run out?{left()}") from None
+    except ClusterLostError as lost:
+        raise AppError(f"{lost}{left()}") from None
+    finally:
+        if not part.runs:
+            part.path.unlink()
+    _finish(options, cases, part)
+
+
+def _finish(options: SweepOptions, cases: Sequence[Case], part: PartFile) -> None:
+    by_key = {run.key: run for run in part.runs}
+    runs = [by_key[case.key] for case in cases]
+    groups = summarise_groups(runs)
+    result = {"runs": [asdict(run) for run in runs], "groups": groups}
+    with naming(part.path):
+        text = json.dumps(result, indent=2, allow_nan=False) + "\n"
+        part.path.write_text(text, encoding="ascii")
+        part.path.replace(options.out)
+    for group in groups:
+        sys.stdout.write(f"{group_line(group)}\n")
+    print_stress_tables(groups)
+
+
+def _run_line(run: SweepRun) -> str:
+    settings = "".join(f", {key}={value}" for key, value in run.settings.items())
+    stress = f", stress {run.stress}" if run.stress != CLEAN else ""
+    return (
+        f"{run.scene}, {run.preset}{settings}{stress}, seed {run.seed}: "
+        f"ATE {1e3 * run.ate_rmse_m:.1f} mm "
+        f"({run.ate_ratio:.2f} of odometry's {1e3 * run.odometry_ate_rmse_m:.1f} mm)"
+    )
+
+
+def _clock(seconds: float) -> str:
+    """Return a duration as hours, minutes and seconds.
+
+    >>> _clock(3723.4)
+    '1:02:03'
+    """
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
+
+
+def _results(cases: Sequence[Case], options: SweepOptions, stop: StopFlag) -> Iterator[SweepRun]:
+    """Run cases here, on worker processes or on a cluster; results in the order of the cases."""
+    if not cases:
+        return
+    if options.dask is None and options.jobs == 1:
+        for case in cases:
+            yield run_case(case, check=stop.check)
+        return
+    with _workers(cases, options) as results:
+        while True:
+            # Nothing is half-written while we wait, so a signal may end the waiting at once.
+            with stop.at_once():
+                run = next(results, None)
+            if run is None:
+                return
+            yield run
+
+
+def _workers(
+    cases: Sequence[Case], options: SweepOptions
+) -> AbstractContextManager[Iterator[SweepRun]]:
+    if options.dask is None:
+        return worker_results(run_case, [(case,) for case in cases], options.jobs)
+    tasks = [(case, program_version()) for case in cases]
+    return dask_results(run_case, tasks, options.dask)

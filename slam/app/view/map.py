@@ -1,0 +1,341 @@
+"""The map in Rerun: truth, odometry, estimate, landmarks, and what the robot sees right now."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import defaultdict, deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.app.odometry.tum import NS_PER_S
+from slam.app.records import RadarInfo, SessionInfo, Snapshot
+from slam.app.run.evaluation import world_from_odom
+from slam.app.run.pictures import ellipse_95, rotate_covariances
+from slam.app.view.rerun_recording import (
+    ARROW_M,
+    ESTIMATE_RGB,
+    FIX_RGB,
+    KEPT_RGB,
+    LANDMARK_RGB,
+    ODOMETRY_RGB,
+    REJECTED_RGB,
+    TRUTH_RGB,
+    UNUSED_RGB,
+    USED_RGB,
+    WALL_RGB,
+    WEDGE_RGB,
+    Recording,
+    Rgb,
+    Stamps,
+    lengths,
+    part,
+    screen,
+    strips_column,
+)
+from slam.app.view.rerun_sdk import rr
+from slam.geometry import compose, transform
+from slam.paper.clustering import Observation
+from slam.paper.pipeline import StepResult
+from slam.paper.trilateration import Fix
+
+_PAPERS_FIELD_OF_VIEW_DEG = 65.0
+_PAPERS_REACH_M = 1.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Beams:
+    """How wide and how far radars look.
+
+    Attributes
+    ----------
+    field_of_view_rad
+        Opening angle.
+    reach_m
+        Longest range that the front end looks at.
+    n_points
+        Points of an arc.
+    """
+
+    field_of_view_rad: float
+    reach_m: float
+    n_points: int = 17
+
+    def arcs(self, radar: RadarInfo, ranges_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where echoes of these ranges (n,) may come from: (n, n_points, 2), body frame."""
+        half = self.field_of_view_rad / 2
+        angles_rad = radar.yaw_rad + np.linspace(-half, half, self.n_points)
+        ray = np.stack([np.cos(angles_rad), np.sin(angles_rad)], axis=-1)
+        antenna = np.array([radar.x_m, radar.y_m])
+        arcs: NDArray[np.float64] = antenna + ranges_m[:, None, None] * ray
+        return arcs
+
+    def wedge(self, radar: RadarInfo) -> NDArray[np.float64]:
+        """Return the closed outline of the beam, shape (n_points + 2, 2), body frame."""
+        antenna = np.array([[radar.x_m, radar.y_m]])
+        (rim,) = self.arcs(radar, np.array([self.reach_m]))
+        return np.concatenate([antenna, rim, antenna])
+
+
+def beams_of(config_json: str) -> Beams:
+    """Return how SLAM was told the radars look; as in the paper where it is not recorded."""
+    settings = json.loads(config_json) if config_json else {}
+    table = settings.get("robust" if settings.get("back_end") == "robust" else "trilateration", {})
+    opening_deg = float(table.get("field_of_view_deg", _PAPERS_FIELD_OF_VIEW_DEG))
+    reach_m = float(settings.get("detection", {}).get("max_range_m", _PAPERS_REACH_M))
+    return Beams(field_of_view_rad=math.radians(opening_deg), reach_m=reach_m)
+
+
+def used_detections(step: StepResult) -> tuple[bool, ...]:
+    """Return for each detection of a state whether it moved the estimate.
+
+    Under the robust back end: it continued the track of a landmark. Under the paper's: it is part
+    of a fix of an observation that the outlier filter let through.
+    """
+    if step.report is None:
+        inside = {
+            id(detection)
+            for observation in step.observations
+            for fix in observation.fixes
+            for detection in fix.detections
+        }
+        return tuple(id(detection) in inside for detection in step.detections)
+    continued = {(radar, index) for radar, index, _ in step.report.continued}
+    given = dict.fromkeys((detection.radar for detection in step.detections), 0)
+    flags = []
+    for detection, sigma_m in zip(step.detections, step.range_sigmas_m, strict=True):
+        if not math.isfinite(sigma_m):  # the back end was not given this one, so does not count it
+            flags.append(False)
+            continue
+        flags.append((detection.radar, given[detection.radar]) in continued)
+        given[detection.radar] += 1
+    return tuple(flags)
+
+
+Array = NDArray[np.float64]
+
+_MAP_PERIOD_NS = NS_PER_S
+_PATH_PERIOD_NS = 2 * NS_PER_S
+_PATH_STEP = 5
+"""One point per five states is 5 cm of path: no corner is lost."""
+
+TRAIL_STATES = 40
+"""Of so many states trilaterated points stay on the map: the clouds that clusters are made of."""
+
+# Name, colour, half line width, draw order: the truth lies below, wide enough to be seen.
+_PATHS: tuple[tuple[str, Rgb, float, float], ...] = (
+    ("truth", TRUTH_RGB, 0.02, 10.0),
+    ("odometry", ODOMETRY_RGB, 0.006, 20.0),
+    ("estimate", ESTIMATE_RGB, 0.006, 30.0),
+)
+
+# Name, colour, radius [m], draw order.
+_POINTS: tuple[tuple[str, Rgb, float, float], ...] = (
+    ("clusters/kept", KEPT_RGB, 0.022, 41.0),
+    ("fixes/found", FIX_RGB, 0.012, 42.0),
+    ("fixes/rejected", REJECTED_RGB, 0.015, 43.0),
+)
+
+
+class MapLayer:
+    """Collects states, and sends poses and echoes in blocks, the map once per second."""
+
+    def __init__(self, recording: Recording, info: SessionInfo, beams: Beams) -> None:
+        self._recording = recording
+        self._radars = info.radars
+        self._beams = beams
+        self._rows: list[Snapshot] = []
+        self._stamps = Stamps.none()
+        self._paths: dict[str, list[Array]] = defaultdict(list)
+        self._trails: dict[str, deque[Array]] = {
+            name: deque(maxlen=TRAIL_STATES) for name, *_ in _POINTS
+        }
+        self._odom: Array | None = None
+        self._first_ns = self._next_map_ns = self._next_path_ns = 0
+        self._last: tuple[Snapshot, int | None] | None = None
+        self._send_statics(info)
+
+    def on_snapshot(self, snapshot: Snapshot, host_ns: int | None) -> None:
+        """Take a state of SLAM."""
+        if self._odom is None:
+            self._first_ns, self._odom = snapshot.t_ns, world_from_odom(snapshot)
+        self._rows.append(snapshot)
+        self._stamps.add(snapshot.t_ns, snapshot.counter, host_ns)
+        self._last = snapshot, host_ns
+        place = snapshot.world_from_map
+        self._paths["odometry"].append(transform(self._odom, snapshot.odometry[:2]))
+        self._paths["estimate"].append(transform(place, snapshot.estimate[:2]))
+        if np.isfinite(snapshot.truth).all():
+            if not self._paths["truth"]:  # nobody shall see a robot where none was
+                self._recording.static("map/truth/robot", _arrow(TRUTH_RGB, 45.0))
+            self._paths["truth"].append(snapshot.truth[:2])
+        if snapshot.t_ns >= self._next_map_ns:
+            self._next_map_ns = snapshot.t_ns + _MAP_PERIOD_NS
+            self._send_landmarks(snapshot, host_ns)
+        if snapshot.t_ns >= self._next_path_ns:
+            # Sent whole, as a view shows the newest row only; ever rarer, so the sum stays small.
+            lasted_ns = snapshot.t_ns - self._first_ns
+            self._next_path_ns = snapshot.t_ns + max(_PATH_PERIOD_NS, lasted_ns // 100)
+            self._send_paths(snapshot, host_ns)
+
+    def send(self) -> None:
+        """Send the states that wait."""
+        rows, self._rows = self._rows, []
+        stamps, self._stamps = self._stamps, Stamps.none()
+        if not rows:
+            return
+        world = np.array([compose(row.world_from_map, row.estimate) for row in rows])
+        self._send_poses("map/robot", stamps, world)
+        known = [k for k, row in enumerate(rows) if np.isfinite(row.truth).all()]
+        truth = np.array([rows[k].truth for k in known]).reshape(-1, 3)
+        self._send_poses("map/truth/robot", stamps.at(known), truth)
+        spread = [
+            ellipse_95(pose[:2], rotated)
+            for row, pose in zip(rows, world, strict=True)
+            for rotated in rotate_covariances(
+                row.world_from_map[2], row.pose_covariance[None, :2, :2]
+            )
+        ]
+        ellipses = strips_column(screen(np.array(spread)))
+        one_each = np.ones(len(rows), dtype=np.int64)
+        self._recording.rows("map/estimate/ellipse", stamps, [ellipses.partition(one_each)])
+        told = [k for k, row in enumerate(rows) if row.step is not None]
+        if told:
+            self._send_echoes([rows[k] for k in told], stamps.at(told), world[told])
+
+    def finish(self) -> None:
+        """Send what waits, and the last map."""
+        self.send()
+        if self._last is not None:
+            self._send_landmarks(*self._last)
+            self._send_paths(*self._last)
+
+    def _send_statics(self, info: SessionInfo) -> None:
+        static = self._recording.static
+        if info.outlines_m:
+            walls = [screen(line) for line in info.outlines_m]
+            static("map/walls", rr.LineStrips2D(walls, colors=WALL_RGB, radii=0.015))
+        if len(info.true_landmarks_m):
+            static("map/landmarks/true", _crosses(info.true_landmarks_m))
+        static("map/robot", _arrow(ESTIMATE_RGB, 50.0))
+        style = rr.LineStrips2D.from_fields(colors=ESTIMATE_RGB, radii=0.004, draw_order=50.0)
+        static("map/estimate/ellipse", style)
+        for index, radar in enumerate(info.radars):
+            wedge = [screen(self._beams.wedge(radar))]
+            static(
+                f"map/robot/{part(radar.name)}/wedge",
+                rr.LineStrips2D(wedge, colors=WEDGE_RGB, radii=0.003, draw_order=5.0),
+            )
+            for name, colour, radius_m in (
+                ("arcs_used", USED_RGB, 0.007),
+                ("arcs_unused", UNUSED_RGB, 0.004),
+            ):
+                arcs = rr.LineStrips2D.from_fields(
+                    colors=colour, radii=radius_m, draw_order=6.0 + index
+                )
+                static(f"map/robot/{part(radar.name)}/{name}", arcs)
+        for name, colour, radius_m, order in _POINTS:
+            points = rr.Points2D.from_fields(colors=colour, radii=radius_m, draw_order=order)
+            static(f"map/{name}", points)
+
+    def _send_poses(self, entity: str, stamps: Stamps, poses: Array) -> None:
+        """Send poses (n, 3) of the world as the transform of an entity drawn in the body frame."""
+        turned = -0.5 * poses[:, 2]  # a turn to the left is one to the right on the screen
+        quaternions = np.zeros((len(poses), 4))
+        quaternions[:, 2], quaternions[:, 3] = np.sin(turned), np.cos(turned)
+        places = np.zeros((len(poses), 3))
+        places[:, :2] = screen(poses[:, :2])
+        if len(poses):
+            columns = rr.Transform3D.columns(translation=places, quaternion=quaternions)
+            self._recording.rows(entity, stamps, columns)
+
+    def _send_echoes(self, rows: Sequence[Snapshot], stamps: Stamps, world: Array) -> None:
+        steps = [row.step for row in rows if row.step is not None]
+        used = [used_detections(step) for step in steps]
+        for index, radar in enumerate(self._radars):
+            for name, wanted in (("arcs_used", True), ("arcs_unused", False)):
+                ranges_m = [
+                    [
+                        detection.range_m
+                        for detection, is_used in zip(step.detections, flags, strict=True)
+                        if detection.radar == index and is_used is wanted
+                    ]
+                    for step, flags in zip(steps, used, strict=True)
+                ]
+                self._send_arcs(f"map/robot/{part(radar.name)}/{name}", stamps, radar, ranges_m)
+        if not any(step.fixes or step.observations for step in steps):
+            return
+        found: dict[str, list[Sequence[Fix | Observation]]] = {
+            "fixes/found": [step.fixes for step in steps],
+            "fixes/rejected": [step.rejected for step in steps],
+            "clusters/kept": [step.observations for step in steps],
+        }
+        for name, points in found.items():
+            shown = []
+            for pose, row in zip(world, points, strict=True):
+                own = np.array([(point.x_m, point.y_m) for point in row]).reshape(-1, 2)
+                self._trails[name].append(transform(pose, own))
+                shown.append(np.concatenate(self._trails[name]))
+            columns = rr.Points2D.columns(positions=screen(np.concatenate(shown)))
+            self._recording.rows(f"map/{name}", stamps, columns.partition(lengths(shown)))
+
+    def _send_arcs(
+        self, entity: str, stamps: Stamps, radar: RadarInfo, ranges_m: Sequence[Sequence[float]]
+    ) -> None:
+        every_m = np.array([range_m for row in ranges_m for range_m in row], dtype=np.float64)
+        arcs = strips_column(screen(self._beams.arcs(radar, every_m)))
+        self._recording.rows(entity, stamps, [arcs.partition(lengths(ranges_m))])
+
+    def _send_landmarks(self, snapshot: Snapshot, host_ns: int | None) -> None:
+        stamps = Stamps.none()
+        stamps.add(snapshot.t_ns, snapshot.counter, host_ns)
+        points = transform(snapshot.world_from_map, snapshot.landmarks_m)
+        covariances = rotate_covariances(
+            snapshot.world_from_map[2], snapshot.landmark_covariances_m2
+        )
+        outlines = [screen(ellipse_95(*pair)) for pair in zip(points, covariances, strict=True)]
+        dots = rr.Points2D(
+            screen(points),
+            colors=LANDMARK_RGB,
+            radii=0.025,
+            labels=[str(number) for number in snapshot.landmark_ids],
+            show_labels=False,
+        )
+        ellipses = rr.LineStrips2D(outlines, colors=LANDMARK_RGB)
+        self._recording.row("map/landmarks/estimated", stamps, dots)
+        self._recording.row("map/landmarks/ellipses", stamps, ellipses)
+
+    def _send_paths(self, snapshot: Snapshot, host_ns: int | None) -> None:
+        stamps = Stamps.none()
+        stamps.add(snapshot.t_ns, snapshot.counter, host_ns)
+        for name, colour, radius_m, order in _PATHS:
+            points = self._paths[name]
+            if not points:
+                continue
+            path = screen(np.array([*points[::_PATH_STEP], points[-1]]))
+            line = rr.LineStrips2D([path], colors=colour, radii=radius_m, draw_order=order)
+            self._recording.row(f"map/{name}/path", stamps, line)
+
+
+def _arrow(colour: Rgb, order: float) -> rr.Arrows2D:
+    """Draw the robot in its own frame: from its base footprint forwards."""
+    return rr.Arrows2D(
+        origins=[[0.0, 0.0]],
+        vectors=[[ARROW_M, 0.0]],
+        colors=colour,
+        radii=0.02,
+        draw_order=order,
+    )
+
+
+def _crosses(points: Array, arm_m: float = 0.04) -> rr.LineStrips2D:
+    """Draw a cross at each point, shape (n, 2)."""
+    strips = [
+        screen(np.array([point - arm, point + arm]))
+        for point in points
+        for arm in (np.array([arm_m, arm_m]), np.array([arm_m, -arm_m]))
+    ]
+    return rr.LineStrips2D(strips, colors=TRUTH_RGB, radii=0.008)

@@ -1,0 +1,517 @@
+"""A session in Rerun: what observers hear, drawn on a map, as echoes, numbers and links.
+
+The recording is re-creatable from the session log and never the only copy: Rerun reads files of
+adjacent versions only.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.app.odometry.tum import NS_PER_S
+from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, SessionObserver, Snapshot
+from slam.app.run.evaluation import (
+    POSE_DOF,
+    band_95,
+    nis_dof,
+    pose_nees,
+    position_errors_m,
+    world_from_odom,
+)
+from slam.app.run.runner import LinkChange, LinkLanes, LinkState
+from slam.app.view.frames import BLOCK_FRAMES, FrameLayer
+from slam.app.view.map import TRAIL_STATES, MapLayer, beams_of
+from slam.app.view.rerun_recording import (
+    BAND_RGB,
+    DEVICE_TIME,
+    ESTIMATE_RGB,
+    FAULT_RGB,
+    LANDMARK_RGB,
+    ODOMETRY_RGB,
+    RADAR_RGB,
+    FileTarget,
+    Recording,
+    Rgb,
+    Stamps,
+    ViewerTarget,
+    part,
+    screen,
+)
+from slam.app.view.rerun_sdk import rr, rrb
+
+_ABOUT = """\
+# What you see
+
+A robot drives through a room and maps it with {n_radars} short-range radars, which tell distances
+only. {data}
+
+* **Map** (left, metres, y up). {truth}Orange: where its *wheels* alone say it went. Blue: where
+  *radar SLAM* says, with the robot as an arrow. Red dots: *landmarks* it found, each with the
+  ellipse that should hold the truth in 95 % of cases.
+* **Around the robot**: a grey wedge is what one radar can see. An echo has a distance but no
+  direction, so it is an arc: **green** if it moved the estimate, **dim** if not. {points}
+* **B-scan** (middle, a tab per radar): echoes of up to {block} frames, time downwards, range to
+  the right, constant part removed. A landmark that the robot passes is a curved line.
+* **Frame**: the newest raw frame, amplitude over range in metres; red bars are detections.
+* **Position error** (below the map): distance to the truth, which SLAM never sees. **NIS**,
+  **NEES**: how surprised the filter is by echoes, and how wrong by its own measure; an honest
+  filter stays inside the grey 95 % band most of the time. Below it is too modest, above too sure.
+* **Links** (right, below): the state of each serial link; losses and faults in the next tab,
+  every command and answer under *Log*.
+
+Move the cursor of the time line below. `device_time` is the radars' own time, `frame` their
+frame counter, `host_time`, if there, when frames arrived.
+"""
+
+_TRUTH = "Grey: the *true* path, and crosses where the landmarks truly are. "
+_POINTS = (
+    "Yellow points are where two arcs cross (trilateration), of the last {states} states; red "
+    "those that no cluster confirmed, large green ones what the clusters pass on."
+)
+
+
+def is_world_known(info: SessionInfo) -> bool:
+    """Return whether a view may expect a true path: that of a scene, not of a robot's drive."""
+    return len(info.true_landmarks_m) > 0 or len(info.outlines_m) > 0
+
+
+def about(info: SessionInfo, *, block: int, states: int) -> str:
+    """Return the guide for a run: frames in a B-scan, states whose points are on the map."""
+    settings = json.loads(info.config_json or "{}")
+    return _ABOUT.format(
+        n_radars=len(info.radars),
+        block=block,
+        data="**All data here are simulated.**" if info.simulated else "All data are measured.",
+        truth=_TRUTH if is_world_known(info) else "",
+        points="" if settings.get("back_end") == "robust" else _POINTS.format(states=states),
+    )
+
+
+_MAP_MARGIN_M = 0.6
+
+
+def blueprint(info: SessionInfo) -> rrb.Blueprint:
+    """Return the layout; the cursor keeps to the newest data: a file opens with its whole map."""
+    names = [radar.name for radar in info.radars]
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(_map_view(info), _numbers(info), row_shares=[5, 2]),
+            _echoes(names),
+            rrb.Vertical(_texts(), _links(), row_shares=[5, 2]),
+            column_shares=[4, 3, 3],
+        ),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline=DEVICE_TIME, play_state="following"),
+        auto_views=False,
+    )
+
+
+def _map_view(info: SessionInfo) -> rrb.Spatial2DView:
+    known = [line for line in (info.true_landmarks_m, *info.outlines_m) if len(line)]
+    bounds = None
+    if known:
+        corners = screen(np.concatenate(known))
+        low, high = corners.min(axis=0) - _MAP_MARGIN_M, corners.max(axis=0) + _MAP_MARGIN_M
+        bounds = rrb.VisualBounds2D(
+            x_range=[float(low[0]), float(high[0])], y_range=[float(low[1]), float(high[1])]
+        )
+    return rrb.Spatial2DView(name="Map", origin="/map", visual_bounds=bounds)
+
+
+def _echoes(names: Sequence[str]) -> rrb.Tabs:
+    mapping = rrb.TensorScalarMapping(colormap="viridis")
+    bscans = [
+        rrb.TensorView(
+            name=f"B-scan {name}",
+            origin=f"/radar/{part(name)}/bscan",
+            view_fit="fill",
+            scalar_mapping=mapping,
+        )
+        for name in names
+    ]
+    frames = [
+        rrb.BarChartView(
+            name=f"Frame {name}",
+            origin=f"/radar/{part(name)}",
+            contents=["$origin/frame", "$origin/detections"],
+        )
+        for name in names
+    ]
+    both = [
+        rrb.Vertical(bscan, frame, name=name)
+        for name, bscan, frame in zip(names, bscans, frames, strict=True)
+    ]
+    return rrb.Tabs(*both)
+
+
+def _numbers(info: SessionInfo) -> rrb.Tabs:
+    """Lay out the curves; in the world without known truth the first two stay empty."""
+    origins = {
+        "Position error": "/error",
+        "NEES": "/consistency/nees",
+        "NIS": "/consistency/nis",
+        "Landmarks": "/landmarks",
+    }
+    views = [
+        rrb.TimeSeriesView(name=name, origin=origin, axis_x=_whole_run())
+        for name, origin in origins.items()
+    ]
+    return rrb.Tabs(*views, active_tab=0 if is_world_known(info) else len(views) - 1)
+
+
+def _whole_run() -> rrb.TimeAxis:
+    """Return an axis from the first to the newest moment; Rerun's own shows one minute."""
+    everything = rrb.TimeRange(
+        start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite()
+    )
+    return rrb.TimeAxis(view_range=everything)
+
+
+def _texts() -> rrb.Tabs:
+    return rrb.Tabs(
+        rrb.TextDocumentView(name="What you see", origin="/about"),
+        rrb.TextLogView(name="Log", origin="/link/log"),
+        rrb.TextDocumentView(name="Radars", origin="/radars"),
+    )
+
+
+def _links() -> rrb.Tabs:
+    return rrb.Tabs(
+        rrb.StateTimelineView(name="Links", origin="/link/state", time_view=_whole_run()),
+        rrb.TimeSeriesView(
+            name="Lost frames, faults",
+            origin="/link",
+            contents=["$origin/lost/**", "$origin/faults/**"],
+            axis_x=_whole_run(),
+        ),
+    )
+
+
+_STATE_COLOURS = {
+    LinkState.SETTING_UP: 0x5B6B8CFF,
+    LinkState.STREAMING: 0x2E8B57FF,
+    LinkState.FRAMES_LOST: 0xE0A030FF,
+    LinkState.SILENT: 0x8C5A2BFF,
+    LinkState.FAULT: 0xD03A3AFF,
+    LinkState.ENDED: 0x444A52FF,
+}
+
+
+class LinkLayer:
+    """Collects lines and changes of state, and sends them in blocks.
+
+    Lines come at any time, also from the threads that read the ports; all else is of one thread.
+    """
+
+    def __init__(self, recording: Recording, radars: Sequence[RadarInfo]) -> None:
+        self._recording = recording
+        self._lanes = LinkLanes(tuple(radars))
+        self._heard: deque[LogLine] = deque()
+        self._changes: list[tuple[LinkChange, int, int | None]] = []
+        self._losses: dict[str, tuple[Stamps, list[int]]] = {
+            radar.name: (Stamps.none(), []) for radar in radars
+        }
+        self._counter = self._t_ns = 0
+        self._host_ns: int | None = None
+        for index, radar in enumerate(radars):
+            states = rr.StateConfiguration(
+                values=[str(state) for state in _STATE_COLOURS],
+                colors=list(_STATE_COLOURS.values()),
+            )
+            recording.static(f"link/state/{part(radar.name)}", states)
+            line = rr.SeriesLines(
+                colors=RADAR_RGB[index % len(RADAR_RGB)],
+                names=f"{radar.name}: lost",
+                widths=1.5,
+                interpolation_mode=rr.components.InterpolationMode.StepAfter,
+            )
+            recording.static(f"link/lost/{part(radar.name)}", line)
+            marker = rr.SeriesPoints(
+                colors=FAULT_RGB, markers="cross", names=f"{radar.name}: fault", marker_sizes=5.0
+            )
+            recording.static(f"link/faults/{part(radar.name)}", marker)
+
+    def on_scan(self, scan: Scan, host_ns: int | None) -> None:
+        """Take the frames of one tick: who sent, who lost."""
+        self._follow_log()
+        self._counter, self._t_ns, self._host_ns = scan.counter, scan.t_ns, host_ns
+        before = {name: count.lost for name, count in self._lanes.counts.items()}
+        self._note(self._lanes.on_scan(scan))
+        for name, count in self._lanes.counts.items():
+            stamps, values = self._losses[name]
+            # A step, so also where it starts; a line that never moves needs its ends only.
+            if count.lost != before[name] or count.frames == 1:
+                stamps.add(scan.t_ns, scan.counter, host_ns)
+                values.append(count.lost)
+
+    def on_log(self, line: LogLine) -> None:
+        """Take a line about the link."""
+        self._heard.append(line)
+
+    def send(self) -> None:
+        """Send what waits."""
+        self._follow_log()
+        changes, self._changes = self._changes, []
+        for radar in self._lanes.radars:
+            stamps = Stamps.none()
+            states = []
+            for change, counter, host_ns in changes:
+                if change.radar == radar.name:
+                    stamps.add(change.t_ns, counter, host_ns)
+                    states.append(str(change.state))
+            if states:
+                columns = rr.StateChange.columns(state=states)
+                self._recording.rows(f"link/state/{part(radar.name)}", stamps, columns)
+            losses, values = self._losses[radar.name]
+            self._losses[radar.name] = Stamps.none(), []
+            if values:
+                scalars = rr.Scalars.columns(scalars=np.array(values, dtype=np.float64))
+                self._recording.rows(f"link/lost/{part(radar.name)}", losses, scalars)
+
+    def finish(self) -> None:
+        """Send what waits, and end every lane."""
+        self._follow_log()
+        self._note(self._lanes.end(self._t_ns))
+        for name, count in self._lanes.counts.items():
+            stamps, values = self._losses[name]
+            stamps.add(self._t_ns, self._counter, self._host_ns)
+            values.append(count.lost)
+        self.send()
+
+    def _note(self, changes: Iterable[LinkChange]) -> None:
+        self._changes += [(change, self._counter, self._host_ns) for change in changes]
+
+    def _follow_log(self) -> None:
+        """Send the lines that came meanwhile, and let the lanes follow them."""
+        lines = []
+        while self._heard:  # not a swap: another thread may add while this runs
+            lines.append(self._heard.popleft())
+        for line in lines:
+            self._note(self._lanes.on_log(line))
+        for name in dict.fromkeys(line.radar for line in lines):
+            self._send_lines(name, [line for line in lines if line.radar == name])
+
+    def _send_lines(self, name: str, lines: Sequence[LogLine]) -> None:
+        stamps = self._stamps_of(lines)
+        columns = rr.TextLog.columns(
+            text=[line.text for line in lines],
+            level=["WARN" if line.warning else "INFO" for line in lines],
+        )
+        self._recording.rows(f"link/log/{part(name)}", stamps, columns)
+        faults = [line for line in lines if line.warning]
+        if faults and name in self._lanes.counts:
+            # The number of the fault, so that a burst of them is a steep stair.
+            last = self._lanes.counts[name].faults
+            numbers = np.arange(last - len(faults) + 1, last + 1, dtype=np.float64)
+            scalars = rr.Scalars.columns(scalars=numbers)
+            self._recording.rows(f"link/faults/{part(name)}", self._stamps_of(faults), scalars)
+
+    def _stamps_of(self, lines: Sequence[LogLine]) -> Stamps:
+        stamps = Stamps.none()
+        for line in lines:
+            stamps.add(line.t_ns, self._counter, self._host_ns)
+        return stamps
+
+
+# Entity, name in the legend, colour, line width in points.
+_SERIES: tuple[tuple[str, str, Rgb, float], ...] = (
+    ("error/slam", "SLAM [m]", ESTIMATE_RGB, 2.0),
+    ("error/odometry", "wheels [m]", ODOMETRY_RGB, 1.5),
+    ("consistency/nis/value", "NIS / dof", ESTIMATE_RGB, 1.5),
+    ("consistency/nis/low", "95 % band", BAND_RGB, 1.0),
+    ("consistency/nis/high", "95 % band", BAND_RGB, 1.0),
+    ("consistency/nees/value", "NEES / 3", ESTIMATE_RGB, 1.5),
+    ("consistency/nees/low", "95 % band", BAND_RGB, 1.0),
+    ("consistency/nees/high", "95 % band", BAND_RGB, 1.0),
+    ("landmarks/count", "landmarks", LANDMARK_RGB, 2.0),
+)
+
+
+class NumberLayer:
+    """Collects states, and sends what they amount to in blocks."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._rows: list[Snapshot] = []
+        self._odom: NDArray[np.float64] | None = None
+        self._stamps = Stamps.none()
+        for entity, name, colour, width in _SERIES:
+            line = rr.SeriesLines(
+                colors=colour,
+                names=name,
+                widths=width,
+                interpolation_mode=rr.components.InterpolationMode.StepAfter
+                if entity == "landmarks/count"
+                else None,
+            )
+            recording.static(entity, line)
+
+    def on_snapshot(self, snapshot: Snapshot, host_ns: int | None) -> None:
+        """Take a state of SLAM."""
+        if self._odom is None:
+            self._odom = world_from_odom(snapshot)
+        self._rows.append(snapshot)
+        self._stamps.add(snapshot.t_ns, snapshot.counter, host_ns)
+
+    def send(self) -> None:
+        """Send the states that wait."""
+        rows, self._rows = self._rows, []
+        stamps, self._stamps = self._stamps, Stamps.none()
+        if not rows or self._odom is None:
+            return
+        errors_m = [position_errors_m(row, self._odom) for row in rows]
+        self._send("error/slam", stamps, [slam_m for slam_m, _ in errors_m])
+        self._send("error/odometry", stamps, [wheels_m for _, wheels_m in errors_m])
+        self._send("landmarks/count", stamps, [float(len(row.landmark_ids)) for row in rows])
+        means = [np.mean(row.nis_per_dof) if row.nis_per_dof else math.nan for row in rows]
+        self._send("consistency/nis/value", stamps, [float(mean) for mean in means])
+        nis_bands = [_band(nis_dof(row)) for row in rows]
+        self._send("consistency/nis/low", stamps, [low for low, _ in nis_bands])
+        self._send("consistency/nis/high", stamps, [high for _, high in nis_bands])
+        nees = [pose_nees(row) / POSE_DOF for row in rows]
+        self._send("consistency/nees/value", stamps, nees)
+        low, high = _band(POSE_DOF)
+        known = [math.isfinite(value) for value in nees]
+        for name, bound in (("low", low), ("high", high)):
+            self._send(
+                f"consistency/nees/{name}", stamps, [bound if told else math.nan for told in known]
+            )
+
+    def _send(self, entity: str, stamps: Stamps, values: Sequence[float]) -> None:
+        """Send a series; a value that is no number is left out."""
+        told = [row for row, value in enumerate(values) if math.isfinite(value)]
+        if told:
+            scalars = np.array([values[row] for row in told])
+            columns = rr.Scalars.columns(scalars=scalars)
+            self._recording.rows(entity, stamps.at(told), columns)
+
+
+def _band(dof: int | None) -> tuple[float, float]:
+    """Return the 95 % band of a chi-square divided by its degrees of freedom."""
+    if not dof:
+        return math.nan, math.nan
+    low, high = band_95(dof)
+    return low / dof, high / dof
+
+
+_BLOCK_STATES = 128
+
+
+class RerunView(SessionObserver):
+    """Draws a session, into a file in large blocks, or live as it happens.
+
+    Parameters
+    ----------
+    target
+        A path for an .rrd file, or where a viewer listens.
+    info
+        What the run is.
+    flush_s
+        Live: longest time that a row waits before it is sent; None for full blocks only.
+    clock_s
+        Monotonic, for `flush_s`.
+    time_of_day_ns
+        Live: tells when a scan arrived that does not say so itself; None leaves it unknown.
+
+    Raises
+    ------
+    AppError
+        From `close`, when the finished file does not hold every row that was sent.
+    """
+
+    def __init__(
+        self,
+        target: Path | ViewerTarget,
+        info: SessionInfo,
+        *,
+        flush_s: float | None = None,
+        clock_s: Callable[[], float] = time.monotonic,
+        time_of_day_ns: Callable[[], int] | None = None,
+    ) -> None:
+        self._clock_s, self._flush_s = clock_s, flush_s
+        self._time_of_day_ns = time_of_day_ns
+        self._flushed_s = clock_s()
+        self._n_waiting = 0
+        self._host_ns: int | None = None
+        self._began = False
+        seed = "" if info.seed is None else f"-{info.seed}"
+        self._recording = Recording(
+            FileTarget(path=target) if isinstance(target, Path) else target,
+            blueprint(info),
+            recording_id=f"{info.scene}-{info.preset}{seed}",
+        )
+        of_seed = "" if info.seed is None else f", seed {info.seed}"
+        name = f"{info.scene}, preset {info.preset}{of_seed}"
+        self._recording.name(name, info.started_unix_ns or 0)
+        guide = rr.TextDocument(
+            about(info, block=BLOCK_FRAMES, states=TRAIL_STATES), media_type=rr.MediaType.MARKDOWN
+        )
+        self._recording.static("about", guide)
+        settings = json.dumps([asdict(radar) for radar in info.radars], indent=1)
+        self._recording.static("radars", rr.TextDocument(settings))
+        self._frames = FrameLayer(self._recording, info.radars)
+        self._map = MapLayer(self._recording, info, beams_of(info.config_json))
+        self._numbers = NumberLayer(self._recording)
+        self._link = LinkLayer(self._recording, info.radars)
+
+    def on_scan(self, scan: Scan) -> None:
+        """Take the frames of one counter; a block of them goes out at once."""
+        if not self._began:
+            # Session time is the odometry's: that of a robot's drive begins anywhere.
+            self._began, self._recording.epoch_ns = True, scan.t_ns
+        if not scan.host_ns and self._time_of_day_ns is not None:
+            scan = replace(scan, host_ns=(self._time_of_day_ns(),) * len(scan.frames))
+        self._host_ns = scan.host_ns[-1] if scan.host_ns else None
+        self._frames.on_scan(scan)
+        self._link.on_scan(scan, self._host_ns)
+        if self._flush_s is not None and self._clock_s() - self._flushed_s >= self._flush_s:
+            self._send(scan.t_ns - round(self._flush_s * NS_PER_S))
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        """Take a state of SLAM: poses and scalars in blocks, the map once per second."""
+        self._map.on_snapshot(snapshot, self._host_ns)
+        self._numbers.on_snapshot(snapshot, self._host_ns)
+        self._frames.on_snapshot(snapshot, self._host_ns)
+        self._n_waiting += 1
+        if self._n_waiting == _BLOCK_STATES:
+            self._send_states()
+
+    def on_log(self, line: LogLine) -> None:
+        """Take a line about the link."""
+        if self._recording.is_finished:
+            raise ValueError("the view is closed already")
+        self._link.on_log(line)
+
+    def close(self) -> None:
+        """Send what is left, finish, and count the rows of a file."""
+        if self._recording.is_finished:
+            return
+        self._frames.send()
+        self._map.finish()
+        self._numbers.send()
+        self._link.finish()
+        self._recording.finish()
+
+    def _send(self, older_than_ns: int) -> None:
+        self._flushed_s = self._clock_s()
+        # Of fast radars the next full block is never far; parts of blocks would cost twice.
+        self._frames.send_older(older_than_ns)
+        self._link.send()
+        self._send_states()
+
+    def _send_states(self) -> None:
+        self._n_waiting = 0
+        self._map.send()
+        self._numbers.send()
+        self._frames.send_detections()
+        self._link.send()

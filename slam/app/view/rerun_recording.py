@@ -1,0 +1,306 @@
+"""One Rerun recording being written to a file or a viewer: rows counted, never waited for long.
+
+Rerun's 2D views have y downwards and ours upwards: `screen` is the one place that negates it.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections import defaultdict
+from collections.abc import Iterable, Sequence, Sized
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Thread
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from slam.app.errors import AppError
+from slam.app.view.rerun_sdk import RerunWarning, RrdReader, rr, rrb
+
+Rgb = tuple[int, int, int]
+
+TRUTH_RGB: Rgb = (150, 150, 150)
+ODOMETRY_RGB: Rgb = (230, 130, 30)
+ESTIMATE_RGB: Rgb = (60, 140, 240)
+LANDMARK_RGB: Rgb = (230, 60, 110)
+WALL_RGB: Rgb = (95, 95, 95)
+WEDGE_RGB: Rgb = (70, 80, 95)
+USED_RGB: Rgb = (90, 220, 130)
+UNUSED_RGB: Rgb = (120, 110, 70)
+FIX_RGB: Rgb = (240, 220, 70)
+KEPT_RGB: Rgb = (90, 220, 130)
+REJECTED_RGB: Rgb = (240, 80, 60)
+BAND_RGB: Rgb = (130, 130, 130)
+FAULT_RGB: Rgb = (240, 60, 60)
+
+RADAR_RGB: tuple[Rgb, ...] = ((76, 175, 200), (240, 170, 60), (150, 120, 230), (120, 200, 100))
+"""One per radar, in the order of the rig; used again from the first beyond the fourth."""
+
+ARROW_M = 0.25
+"""Length of the arrow that stands for the robot."""
+
+
+DEVICE_TIME, HOST_TIME, FRAME = "device_time", "host_time", "frame"
+"""The timelines: session time of the radars, time of day of arrival, frame counter."""
+
+_STATIC = " (static)"
+
+_FILE_CLOSE_LIMIT_S = 20.0
+"""Longest wait for Rerun to finish the file."""
+_VIEWER_CLOSE_LIMIT_S = 5.0
+"""Longest wait for a viewer to take the last rows; one that hangs takes none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FileTarget:
+    """The recording becomes an .rrd file."""
+
+    path: Path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewerTarget:
+    """The recording goes to a viewer or server that listens at a `rerun+http://` address."""
+
+    url: str
+
+
+@dataclass(slots=True, kw_only=True)
+class Stamps:
+    """When rows happened, on every timeline.
+
+    Attributes
+    ----------
+    t_ns, counters, host_ns
+        Session times, frame counters, and nanoseconds since 1970, equally long. `host_ns` is left
+        out of the recording as soon as one of its rows has none.
+    """
+
+    t_ns: list[int]
+    counters: list[int]
+    host_ns: list[int | None]
+
+    @classmethod
+    def none(cls) -> Stamps:
+        """Return no rows."""
+        return cls(t_ns=[], counters=[], host_ns=[])
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.t_ns)
+
+    def add(self, t_ns: int, counter: int, host_ns: int | None) -> None:
+        """Add a row."""
+        self.t_ns.append(t_ns)
+        self.counters.append(counter)
+        self.host_ns.append(host_ns)
+
+    def at(self, rows: Iterable[int]) -> Stamps:
+        """Return some of the rows."""
+        picked = Stamps.none()
+        for row in rows:
+            picked.add(self.t_ns[row], self.counters[row], self.host_ns[row])
+        return picked
+
+    def columns(self, epoch_ns: int) -> list[rr.TimeColumn]:
+        """Return the rows as Rerun's time columns, device time counted from an epoch."""
+        since_ns = np.maximum(np.array(self.t_ns, dtype=np.int64) - epoch_ns, 0)
+        columns = [
+            rr.TimeColumn(DEVICE_TIME, duration=since_ns.astype("timedelta64[ns]")),
+            rr.TimeColumn(FRAME, sequence=np.array(self.counters, dtype=np.int64)),
+        ]
+        if None not in self.host_ns:
+            stamps = np.array(self.host_ns, dtype="datetime64[ns]")
+            columns.append(rr.TimeColumn(HOST_TIME, timestamp=stamps))
+        return columns
+
+
+class Recording:
+    """Sends rows to one target and knows how many.
+
+    Parameters
+    ----------
+    target
+        Where to.
+    blueprint
+        How a viewer lays it out, unless its user chose otherwise.
+    recording_id
+        The same for the same run: a file written twice is the same.
+
+    Attributes
+    ----------
+    epoch_ns
+        Session time that `device_time` is counted from: the first scan's. What was before it is
+        shown at it.
+    sent
+        Rows sent, of every entity.
+
+    Raises
+    ------
+    AppError
+        The file cannot be begun; from `finish`: it does not hold every row that was sent.
+    """
+
+    def __init__(
+        self, target: FileTarget | ViewerTarget, blueprint: rrb.Blueprint, *, recording_id: str
+    ) -> None:
+        rr.set_strict_mode(True)
+        self._target = target
+        self.epoch_ns = 0
+        self.sent: dict[str, int] = defaultdict(int)
+        # Never `with` this stream: leaving the block closes the file and drops what follows.
+        self._stream: rr.RecordingStream | None = rr.RecordingStream(
+            "xethru-hil", recording_id=recording_id
+        )
+        self._stream.set_log_time_enabled(False)
+        self._stream.set_log_tick_enabled(False)
+        if isinstance(target, FileTarget):
+            try:
+                self._stream.save(target.path, default_blueprint=blueprint)
+            except RuntimeError as error:  # Rerun's own, with the system's words at its end
+                reason = str(error).rpartition(": ")[2]
+                raise AppError(f"{target.path}: cannot be written: {reason}") from None
+        else:
+            self._stream.connect_grpc(target.url, default_blueprint=blueprint)
+
+    @property
+    def is_finished(self) -> bool:
+        """Return whether nothing more can be sent."""
+        return self._stream is None
+
+    def name(self, name: str, start_ns: int = 0) -> None:
+        """Tell the recording's name and when it began."""
+        self._open().send_recording_name(name)
+        self._open().send_recording_start_time_nanos(start_ns)
+
+    def static(
+        self, entity: str, what: rr.AsComponents | Sequence[rr.DescribedComponentBatch]
+    ) -> None:
+        """Send what holds at all times."""
+        self._open().log(entity, what, static=True)
+        self.sent[f"/{entity}{_STATIC}"] += 1
+
+    def rows(
+        self, entity: str, stamps: Stamps, columns: Iterable[rr.ComponentColumn] | None
+    ) -> None:
+        """Send a row for each stamp, all at once."""
+        if columns is not None and len(stamps):
+            self._open().send_columns(entity, stamps.columns(self.epoch_ns), columns)
+            self.sent[f"/{entity}"] += len(stamps)
+
+    def row(self, entity: str, stamps: Stamps, what: rr.AsComponents) -> None:
+        """Send one row, of something that Rerun cannot batch."""
+        stream = self._open()
+        since_ns = max(stamps.t_ns[0] - self.epoch_ns, 0)
+        stream.set_time(DEVICE_TIME, duration=np.timedelta64(since_ns, "ns"))
+        stream.set_time(FRAME, sequence=stamps.counters[0])
+        if stamps.host_ns[0] is not None:
+            stream.set_time(HOST_TIME, timestamp=np.datetime64(stamps.host_ns[0], "ns"))
+        stream.log(entity, what)
+        stream.reset_time()
+        self.sent[f"/{entity}"] += 1
+
+    def finish(self) -> None:
+        """Send what is left; count the rows of a file."""
+        if self._stream is None:
+            return
+        stream, self._stream = self._stream, None
+        # On a full disk Rerun's writer is gone and disconnect may wait for it without end.
+        closing = Thread(target=stream.disconnect, daemon=True)
+        closing.start()
+        is_file = isinstance(self._target, FileTarget)
+        closing.join(_FILE_CLOSE_LIMIT_S if is_file else _VIEWER_CLOSE_LIMIT_S)
+        if closing.is_alive():
+            rr.unregister_shutdown()  # or it waits once more when the interpreter ends
+            if isinstance(self._target, FileTarget):
+                raise AppError(f"{self._target.path}: cannot be finished; is the disk full?")
+            return  # whoever closed the viewer knows
+        if isinstance(self._target, FileTarget):
+            check_rows(self._target.path, self.sent)
+
+    def _open(self) -> rr.RecordingStream:
+        if self._stream is None:
+            raise ValueError("the view is closed already")
+        return self._stream
+
+
+def check_rows(path: Path, sent: dict[str, int]) -> None:
+    """Compare the rows of a finished file with what was sent.
+
+    Raises
+    ------
+    AppError
+        Rows are missing; names the file and the first entity.
+    """
+    try:
+        found = count_rows(path)
+    except RuntimeError:  # Rerun's own errors about a damaged file
+        raise AppError(f"{path}: is incomplete; is the disk full?") from None
+    for entity, count in sent.items():
+        if found.get(entity, 0) != count:
+            raise AppError(
+                f"{path}: holds {found.get(entity, 0)} of {count} rows of {entity}; "
+                "the view is incomplete, the session log is not affected"
+            )
+
+
+def count_rows(path: Path) -> dict[str, int]:
+    """Count the rows of every entity of an .rrd file, static ones under a name of their own."""
+    rows: dict[str, int] = defaultdict(int)
+    with warnings.catch_warnings():
+        # of a file without its footer; what is missing then is found by counting
+        warnings.simplefilter("ignore", RerunWarning)
+        for chunk in RrdReader(path).stream():
+            kind = _STATIC if chunk.is_static else ""
+            rows[f"{chunk.entity_path}{kind}"] += chunk.num_rows
+    return dict(rows)
+
+
+def screen(points: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Turn points or vectors, shape (..., 2), y up, into Rerun's 2D views, y down."""
+    flipped: NDArray[np.float32] = (points * np.array([1.0, -1.0])).astype(np.float32)
+    return flipped
+
+
+class _ArrowBatch:
+    """A ready arrow array in the shape that rr.ComponentColumn takes."""
+
+    def __init__(self, descriptor: rr.ComponentDescriptor, array: pa.Array) -> None:
+        self._descriptor, self._array = descriptor, array
+
+    def component_descriptor(self) -> rr.ComponentDescriptor:
+        return self._descriptor
+
+    def as_arrow_array(self) -> pa.Array:
+        return self._array
+
+
+def arrow_column(descriptor: rr.ComponentDescriptor, array: pa.Array) -> rr.ComponentColumn:
+    """Return a column of a ready arrow array, one element per row."""
+    return rr.ComponentColumn(descriptor, _ArrowBatch(descriptor, array))
+
+
+def strips_column(strips: NDArray[np.float32]) -> rr.ComponentColumn:
+    """Return lines of equally many points, shape (n, n_points, 2), as a column of one line a row.
+
+    Rerun's own conversion looks at every point in Python, which would be most of a view's cost.
+    """
+    (template,) = rr.LineStrips2D(np.zeros((1, 2, 2), dtype=np.float32)).as_component_batches()
+    kind = template.as_arrow_array().type
+    n_points = strips.shape[1]
+    ends = np.arange(0, (len(strips) + 1) * n_points, n_points, dtype=np.int32)
+    points = pa.FixedSizeListArray.from_arrays(pa.array(strips.ravel()), type=kind.value_type)
+    lines = pa.ListArray.from_arrays(pa.array(ends), points, type=kind)
+    return arrow_column(template.component_descriptor(), lines)
+
+
+def part(name: str) -> str:
+    """Return a user's name as one part of an entity's path, whatever characters are in it."""
+    return rr.escape_entity_path_part(name)
+
+
+def lengths(rows: Sequence[Sized]) -> NDArray[np.int64]:
+    """Return how many instances each row has, for `partition`."""
+    return np.array([len(row) for row in rows], dtype=np.int64)

@@ -1,0 +1,1 @@
+"""Range offsets, mounts and gains of a rig from one drive past reflectors."""

@@ -1,0 +1,439 @@
+"""What the numbers mean: trajectory, landmark and consistency metrics.
+
+Every trajectory error states its alignment. ``ate_rmse_m`` is the one to quote; the ICP numbers
+of the paper are computed beside it because they answer a different, kinder question.
+
+The rule is part of the metric, not of the design under test, so its numbers are constants here:
+designs are compared on equal seeds only, and against the same landmarks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import KDTree
+
+from slam.geometry import Mount, Rig, compose, transform, wrap_angle, wrap_angles
+from slam.paper.association import Association
+from slam.paper.pipeline import StepResult
+
+Array = NDArray[np.float64]
+
+LANDMARK_MATCH_M = 0.15
+_ICP_GATE_M = 0.5
+_ICP_ITERATIONS = 100
+# A share of a variance (of a unit one) that is rounding, and an error [m, rad] that is.
+_ROUNDING_VARIANCE = 1e-12
+_ROUNDING_ERROR = 1e-9
+
+
+def associate_times(
+    estimate_ns: NDArray[np.int64], reference_ns: NDArray[np.int64], tolerance_ns: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return index pairs of stamps that belong together, each stamp used at most once.
+
+    Parameters
+    ----------
+    estimate_ns, reference_ns
+        shapes (n,) and (m,), strictly increasing [ns].
+    tolerance_ns
+        Largest difference of a pair.
+
+    Returns
+    -------
+    estimate_rows, reference_rows
+        Equal lengths, increasing. Empty where nothing is close enough.
+    """
+    if len(estimate_ns) == 0 or len(reference_ns) == 0:
+        return np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp)
+    after = np.searchsorted(reference_ns, estimate_ns)
+    left, right = np.maximum(after - 1, 0), np.minimum(after, len(reference_ns) - 1)
+    to_left = np.abs(estimate_ns - reference_ns[left])
+    to_right = np.abs(estimate_ns - reference_ns[right])
+    nearest = np.where(to_left <= to_right, left, right)
+    difference = np.minimum(to_left, to_right)
+    # The closest estimate keeps a reference that two of them claim.
+    order = np.lexsort((difference, nearest))
+    rows = order[difference[order] <= tolerance_ns]
+    _, firsts = np.unique(nearest[rows], return_index=True)
+    estimate_rows = np.sort(rows[firsts])
+    return estimate_rows, nearest[estimate_rows]
+
+
+def align_se2(estimate_xy: Array, reference_xy: Array) -> Array:
+    """Return the rigid motion that brings an estimate closest to a reference, point by point.
+
+    Least squares over rotation and translation, no scale (Umeyama 1991 in the plane).
+
+    Parameters
+    ----------
+    estimate_xy, reference_xy
+        shape (n, 2) each [m], n >= 1; row i of one belongs to row i of the other.
+
+    Returns
+    -------
+    pose
+        shape (3,): ``transform(pose, estimate_xy)`` is the aligned estimate.
+    """
+    _check_rows(estimate_xy, reference_xy)
+    centre_e, centre_r = estimate_xy.mean(axis=0), reference_xy.mean(axis=0)
+    e, r = estimate_xy - centre_e, reference_xy - centre_r
+    cross = float(np.sum(e[:, 0] * r[:, 1] - e[:, 1] * r[:, 0]))
+    heading = math.atan2(cross, float(np.sum(e * r)))
+    rotation_only = np.array([0.0, 0.0, heading])
+    return np.append(centre_r - transform(rotation_only, centre_e), heading)
+
+
+def rmse_m(estimate_xy: Array, reference_xy: Array) -> float:
+    """Return the root mean square distance of rows that belong together, not aligned."""
+    _check_rows(estimate_xy, reference_xy)
+    return math.sqrt(float(np.mean(np.sum((estimate_xy - reference_xy) ** 2, axis=1))))
+
+
+def ate_rmse_m(estimate_xy: Array, reference_xy: Array) -> float:
+    """Return the absolute trajectory error: RMS distance after SE(2) alignment without scale.
+
+    Both have shape (n, 2) [m]; rows belong together by time.
+    """
+    return rmse_m(transform(align_se2(estimate_xy, reference_xy), estimate_xy), reference_xy)
+
+
+def icp_ate_rmse_m(estimate_xy: Array, reference_xy: Array) -> float:
+    """Return the RMS distance of the ICP-aligned points to the nearest reference points [m].
+
+    This is what ICP minimises, and one reading of the paper's "RMS ATE after ICP". Time plays no
+    part, so drift along the path costs nothing. Both have shape (n, 2) [m], rows together by time,
+    *both in their start frames*: ICP begins with the two start poses on each other, as two SLAM
+    systems started together are.
+    """
+    _check_rows(estimate_xy, reference_xy)
+    aligned = transform(icp_align_se2(estimate_xy, reference_xy), estimate_xy)
+    distances, _ = _nearest(KDTree(reference_xy), aligned)
+    return math.sqrt(float(np.mean(distances**2)))
+
+
+def icp_align_se2(estimate_xy: Array, reference_xy: Array) -> Array:
+    """Return the rigid motion, shape (3,), found by point-to-point ICP from the identity.
+
+    Points farther than 0.5 m from any reference point do not pull. Shapes (n, 2) and (m, 2) [m].
+    """
+    tree = KDTree(reference_xy)
+    pose, previous = np.zeros(3), math.inf
+    for _ in range(_ICP_ITERATIONS):
+        moved = transform(pose, estimate_xy)
+        distances, neighbours = _nearest(tree, moved)
+        close = distances <= _ICP_GATE_M
+        if not close.any():
+            break
+        residual = float(np.mean(distances[close] ** 2))
+        if previous - residual <= 1e-9 * residual:
+            break
+        previous = residual
+        pose = compose(align_se2(moved[close], reference_xy[neighbours[close]]), pose)
+    return pose
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LandmarkScore:
+    """How a map compares with the landmarks that were there to be found.
+
+    Attributes
+    ----------
+    true, estimated, matched
+        Numbers of true landmarks, of estimates, and of one-to-one matches within 0.15 m.
+    precision, recall
+        matched / estimated and matched / true; None where the denominator is 0.
+    duplicates
+        Further estimates within 0.15 m of a matched true landmark.
+    rmse_m
+        RMS distance of the matches; None without any.
+    """
+
+    true: int
+    estimated: int
+    matched: int
+    precision: float | None
+    recall: float | None
+    duplicates: int
+    rmse_m: float | None
+
+
+def landmark_metrics(estimated_xy: Array, true_xy: Array, alignment: Array) -> LandmarkScore:
+    """Return how well estimated landmarks match the true ones.
+
+    Parameters
+    ----------
+    estimated_xy
+        shape (n, 2) [m], map frame.
+    true_xy
+        shape (m, 2) [m], world frame: the landmarks that count (``observable_landmarks``).
+    alignment
+        shape (3,), the *trajectory's* alignment (``align_se2`` of its positions). The map is not
+        fitted to the landmarks it is judged by.
+    """
+    n, m = len(estimated_xy), len(true_xy)
+    if n and m:
+        placed = transform(alignment, estimated_xy)
+        distances = np.linalg.norm(placed[:, None, :] - true_xy[None, :, :], axis=2)
+    else:
+        distances = np.empty((n, m))
+    close = distances <= LANDMARK_MATCH_M
+    # First as many matches as possible, then the least total distance.
+    rows, columns = linear_sum_assignment(np.where(close, distances, 1e6))
+    kept = close[rows, columns]
+    rows, columns = rows[kept], columns[kept]
+    others = np.setdiff1d(np.arange(n), rows)
+    matched = len(rows)
+    squared = distances[rows, columns] ** 2
+    return LandmarkScore(
+        true=m,
+        estimated=n,
+        matched=matched,
+        precision=matched / n if n else None,
+        recall=matched / m if m else None,
+        duplicates=int(close[others][:, columns].any(axis=1).sum()),
+        rmse_m=math.sqrt(float(np.mean(squared))) if matched else None,
+    )
+
+
+def nees_pose(estimate: Array, covariance: Array, truth: Array) -> float:
+    """Return the normalised estimation error squared of a pose (3 dof), not aligned.
+
+    ``e^T P^-1 e`` with the pseudo-inverse where P is singular, as it is after a turn on the spot
+    from a perfect start under proportional noise: a direction without variance adds nothing if
+    the error in it is rounding, and makes the result inf if not, the limit of a vanishing
+    variance. Then fewer than 3 degrees of freedom take part.
+
+    Parameters
+    ----------
+    estimate, truth
+        shape (3,) each, both in the start frame; the heading difference is wrapped.
+    covariance
+        shape (3, 3), symmetric, positive semidefinite.
+    """
+    error = np.array(
+        [estimate[0] - truth[0], estimate[1] - truth[1], wrap_angle(estimate[2] - truth[2])]
+    )
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    varies = sigma > 0.0
+    if np.any(np.abs(error[~varies]) > _ROUNDING_ERROR):
+        return math.inf
+    # In units of sigma, so that metres and radians do not decide what is small.
+    sigma = sigma[varies]
+    correlation = covariance[varies][:, varies] / np.outer(sigma, sigma)
+    variances, axes = np.linalg.eigh(correlation)
+    squared = (axes.T @ (error[varies] / sigma)) ** 2
+    certain = variances <= _ROUNDING_VARIANCE
+    if np.any(squared[certain] > _ROUNDING_VARIANCE):
+        return math.inf
+    return float(np.sum(squared[~certain] / variances[~certain]))
+
+
+def _nearest(tree: KDTree, points: Array) -> tuple[Array, NDArray[np.intp]]:
+    """Return distance to and row of the nearest tree point, shape (n,) each."""
+    distances, rows = tree.query(points)
+    return np.asarray(distances, dtype=np.float64), np.asarray(rows, dtype=np.intp)
+
+
+def _check_rows(estimate_xy: Array, reference_xy: Array) -> None:
+    if estimate_xy.shape != reference_xy.shape or estimate_xy.shape[1:] != (2,):
+        raise ValueError(
+            f"trajectories must both have shape (n, 2), got {estimate_xy.shape} and "
+            f"{reference_xy.shape}; associate them by time first"
+        )
+    if len(estimate_xy) == 0:
+        raise ValueError("trajectories have no common stamps")
+
+
+ECHO_LENGTH_M = 0.06
+"""Half of a pulse's width at half height: what lies farther from a target is no echo of it."""
+
+
+def true_range_nis(result: StepResult, true_pose: Array, true_xy: Array) -> tuple[float, ...]:
+    """Return the NIS (1 dof) of every range of the robust pipeline that is truly of a landmark.
+
+    The back end tells which ranges it expected, before it looked at any. Ground truth tells the
+    rest: a landmark of the map belongs to the true one nearest to it as seen from the robot,
+    within 0.15 m; of the detections the one nearest to that target's true range is of it, if no
+    farther than half a pulse, and if no other expected target is nearer to it. Gates play no part.
+    Ranges that the front end itself called unfit for the back end are not judged.
+
+    Parameters
+    ----------
+    result
+        With a report.
+    true_pose
+        shape (3,), world frame, at ``result.t_ns``.
+    true_xy
+        shape (m, 2) [m], all true landmarks, world frame.
+    """
+    if result.report is None or not result.report.expected or not len(true_xy):
+        return ()
+    expected = result.report.expected
+    points = transform(true_pose, np.array([each.point_m for each in expected]))
+    antennas = transform(true_pose, np.array([each.antenna_m for each in expected]))
+    gaps = np.linalg.norm(points[:, None] - true_xy[None], axis=2)
+    origins = np.argmin(gaps, axis=1)
+    known = gaps[np.arange(len(expected)), origins] <= LANDMARK_MATCH_M
+    true_ranges = np.linalg.norm(true_xy[origins] - antennas, axis=1)
+    # By radar and detection: how far it is from the nearest target, and that target's row.
+    owners: dict[int, tuple[float, int]] = {}
+    detections = result.detections
+    for row in np.flatnonzero(known).tolist():
+        radar, range_m = expected[row].radar, float(true_ranges[row])
+        found = min(
+            (
+                (abs(detection.range_m - range_m), index)
+                for index, detection in enumerate(detections)
+                if detection.radar == radar
+            ),
+            default=None,
+        )
+        if found is not None and found[0] <= ECHO_LENGTH_M:
+            owners[found[1]] = min(owners.get(found[1], (np.inf, -1)), (found[0], row))
+    values = []
+    for index, (_, row) in owners.items():
+        sigma_m = result.range_sigmas_m[index]
+        if np.isfinite(sigma_m):
+            innovation = detections[index].range_m - expected[row].range_m
+            values.append(innovation**2 / (expected[row].variance + sigma_m**2))
+    return tuple(values)
+
+
+class TrueAssociationNis:
+    """Collects the NIS of every observation against the landmark it is truly of, before gating.
+
+    Ground truth decides what an observation is of, its *origin*: the true landmark nearest to
+    where the true pose puts it, within 0.15 m, or clutter. A landmark of the map belongs to the
+    origin that more than half of its observations so far, its birth included, came from; so one
+    that wrong associations dragged from one true landmark to another changes its owner, and in
+    between has none. Of several that belong to one true landmark, the one with most observations
+    of it counts.
+
+    The observation itself is judged before it is counted and whatever the filter made of it, so a
+    tight gate cannot make the numbers look good. An observation of clutter, or of a true landmark
+    that no landmark of the map belongs to at that moment, is not counted: there is nothing it
+    could be compared with.
+
+    Parameters
+    ----------
+    true_xy
+        shape (m, 2) [m], all true landmarks, world frame.
+    """
+
+    def __init__(self, true_xy: Array) -> None:
+        self._true_xy = true_xy
+        # By landmark id: how many of its observations came from each origin, None for clutter.
+        self._origins: dict[int, Counter[int | None]] = {}
+
+    def add(self, result: StepResult, true_pose: Array) -> tuple[float, ...]:
+        """Return the NIS (2 dof) of this state's observations of landmarks already in the map.
+
+        ``true_pose`` has shape (3,), world frame, at ``result.t_ns``. Call it for every result, in
+        order: who belongs to whom is learned on the way.
+        """
+        values = []
+        for observation, association in zip(result.observations, result.associations, strict=True):
+            origin = self._origin(true_pose, np.array([observation.x_m, observation.y_m]))
+            if origin is not None:
+                row = self._row_of(origin, association)
+                if row is not None:
+                    values.append(float(association.mahalanobis_sq[row]))
+            self._origins.setdefault(association.landmark_id, Counter())[origin] += 1
+        return tuple(values)
+
+    def _origin(self, true_pose: Array, body_xy: Array) -> int | None:
+        if len(self._true_xy) == 0:
+            return None
+        distances = np.linalg.norm(self._true_xy - transform(true_pose, body_xy), axis=1)
+        nearest = int(np.argmin(distances))
+        return nearest if distances[nearest] <= LANDMARK_MATCH_M else None
+
+    def _row_of(self, origin: int, association: Association) -> int | None:
+        """Return the candidate that is the true landmark's own, the older one of two equals."""
+        best, most = None, 0
+        for row, landmark_id in enumerate(association.candidate_ids):
+            origins = self._origins.get(landmark_id)
+            if origins is None:
+                continue
+            own = origins[origin]
+            if own > most and 2 * own > origins.total():
+                best, most = row, own
+        return best
+
+
+# Joint field of view and range limits of one radar: theta and L of the paper, and the start of
+# the module's detection zone.
+VIEW_DEG = 65.0
+MIN_RANGE_M = 0.2
+MAX_RANGE_M = 1.5
+# As many poses as the paper wants observations of a landmark (min_opc) ...
+MIN_POSES = 9
+# ... and two poses are distinct if the paper would collect both (min_disp).
+DISTINCT_M = 5e-3
+DISTINCT_RAD = 0.1
+
+
+def observable_landmarks(rig: Rig, poses: Array, landmarks_xy: Array) -> NDArray[np.bool_]:
+    """Tell which landmarks lay in the joint view of one radar pair at nine or more poses.
+
+    Joint view means within the 65 degree field of view and between 0.2 and 1.5 m of both radars
+    of one pair. Poses less than 5 mm and 0.1 rad from the last distinct one count with it, so
+    standing still adds nothing.
+
+    Parameters
+    ----------
+    rig
+        The mounts.
+    poses
+        shape (n, 3), true poses in time order, frame of the landmarks.
+    landmarks_xy
+        shape (m, 2) [m].
+
+    Returns
+    -------
+    observable
+        shape (m,).
+    """
+    observable = np.zeros(len(landmarks_xy), dtype=bool)
+    distinct = _distinct(poses)
+    for pair in rig.pairs():
+        seen = _in_view(rig.mounts[pair.first], distinct, landmarks_xy) & _in_view(
+            rig.mounts[pair.second], distinct, landmarks_xy
+        )
+        observable |= seen.sum(axis=0) >= MIN_POSES
+    return observable
+
+
+def _distinct(poses: Array) -> Array:
+    """Return the poses that differ from the one kept before them."""
+    kept: list[Array] = []
+    for pose in poses:
+        if (
+            not kept
+            or math.dist(kept[-1][:2], pose[:2]) >= DISTINCT_M
+            or abs(wrap_angle(pose[2] - kept[-1][2])) >= DISTINCT_RAD
+        ):
+            kept.append(pose)
+    return np.array(kept).reshape(-1, 3)
+
+
+def _in_view(mount: Mount, poses: Array, landmarks_xy: Array) -> NDArray[np.bool_]:
+    """Return whether one radar has each landmark in view from each pose, shape (n, m)."""
+    antenna = np.array([mount.x_m, mount.y_m])
+    antennas = np.array([transform(pose, antenna) for pose in poses]).reshape(-1, 2)
+    offsets = landmarks_xy[None, :, :] - antennas[:, None, :]
+    ranges_m = np.hypot(offsets[..., 0], offsets[..., 1])
+    directions = np.arctan2(offsets[..., 1], offsets[..., 0])
+    off_boresight = wrap_angles(directions - poses[:, 2, None] - mount.yaw_rad)
+    in_view: NDArray[np.bool_] = (
+        (ranges_m >= MIN_RANGE_M)
+        & (ranges_m <= MAX_RANGE_M)
+        & (np.abs(off_boresight) <= math.radians(VIEW_DEG) / 2)
+    )
+    return in_view

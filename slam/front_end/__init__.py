@@ -1,0 +1,1 @@
+"""Front ends: raw radar frames in, ranges of echoes out."""

@@ -1,0 +1,898 @@
+"""Echoes that overlap, told apart by joint maximum likelihood.
+
+The model and its literature are in `slam.front_end.overlapping`, which decides how many pulses
+there are. Everything is batched: a row is one window with one start.
+
+A window of a raw frame is modelled as K pulses of known shape and white noise,
+
+    x[n] = sum_k g(n - u_k) (b_k cos(w n) + d_k sin(w n)) + sigma w[n],
+
+g the Gaussian envelope, w the carrier. Whatever the reflection and the carrier do to the phase is
+in the linear b and d, so the carrier's 20 mm ambiguity never enters: only the envelope is asked
+where an echo lies. For given positions b and d are a linear least-squares solution; the positions
+are found by Levenberg-Marquardt on what is left, the Jacobian projected off the linear part
+(variable projection; Golub and Pereyra 1973, in Kaufman's form). Two echoes start at
+the best pair of a grid over the whole window, so no first guess can lock the search; each further
+echo starts where it explains most of what the others leave, and as a half of each of them.
+
+How many echoes: one more is believed if it raises twice the log-likelihood by more than
+
+    (sqrt(h) + model_error sqrt(E) / sigma)**2,    E = energy of the echoes so far.
+
+h is exceeded by noise alone, anywhere in the window, with probability ``false_split`` (upcrossings
+of a chi-square process with 2 degrees of freedom; Davies 1987). The other term keeps a pulse that
+is not quite ours one echo, however strong: what the pulse model leaves of it grows with the signal,
+and the noise adds to its root. Its price: of two echoes in phase, closer than the bandwidth can be
+trusted to tell from one wide pulse, or one far weaker than the other, only one is reported.
+
+All arithmetic is batched over windows of one length.
+
+The same maximum likelihood as in :mod:`slam.front_end.overlapping`, in closed form. Behind the
+filter (:mod:`slam.front_end.matched_filter`), with the carrier turned back, K pulses are
+
+    z(n) = y(n) exp(-j kappa n) = sum_k a_k rho(n - u_k) + noise,   rho(d) = exp(-d**2 / (4 s**2))
+
+and the noise is correlated by rho too, so that all a window of samples tells about the positions u
+lies in the K values z(u_k). With R_kl = rho(u_k - u_l), what the echoes explain at their best is
+
+    G(u) = z^H R^-1 z,   a = R^-1 z,   twice the log-likelihood = G / sigma_y**2
+
+and with D_kl = d rho(u_k - u_l) / d u_k and H_kl = d2 rho(u_k - u_l) / (d u_k d u_l), variable
+projection (Golub and Pereyra 1973, in Kaufman's form) gives
+
+    1/2 dG/du_k = Re conj(a_k) (z'(u_k) - sum_l D_kl a_l)
+    Fisher information of u = Re(conj(a_k) a_l) (H - D R^-1 D^T)_kl / sigma_y**2
+
+The matrices have at most `SplitTest.max_echoes` rows: plain Python is several times faster on them
+than arrays are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from operator import mul
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from slam.front_end.pulse import ComplexArray
+
+Array = NDArray[np.float64]
+
+_MAX_STEPS = 30
+_LARGEST_STEP = 0.5
+"""Of the envelope's sigma."""
+_HOPELESS = 1e3
+"""Damping at which the search ends: it presses against a limit."""
+TINY = 1e-200
+"""Added to what may be zero where no sample is usable."""
+
+
+class Windows(NamedTuple):
+    """Rows to be fitted, zero where a sample is not usable.
+
+    Attributes
+    ----------
+    samples
+        Shape (r, n).
+    cosine, sine
+        Shape (r, n), or (1, n) for all: the carrier.
+    weight
+        Shape (r, n), or (1, n) for all: 1 where a sample is usable.
+    noise_sigma
+        Shape (r,): standard deviation of a sample's noise.
+    """
+
+    samples: Array
+    cosine: Array
+    sine: Array
+    weight: Array
+    noise_sigma: Array
+
+    @staticmethod
+    def of(
+        samples: Array,
+        usable: NDArray[np.bool_] | None,
+        noise_sigma: Array,
+        carrier_rad_per_bin: float,
+    ) -> Windows:
+        """Return windows of raw samples; ``usable`` has their shape, all of them if None."""
+        angle = carrier_rad_per_bin * np.arange(samples.shape[1])
+        cosine, sine = np.cos(angle)[np.newaxis], np.sin(angle)[np.newaxis]
+        if usable is None:
+            return Windows(samples, cosine, sine, np.ones_like(cosine), noise_sigma)
+        weight = usable.astype(np.float64)
+        return Windows(
+            np.where(usable, samples, 0.0), cosine * weight, sine * weight, weight, noise_sigma
+        )
+
+    def rows(self, chosen: NDArray[np.intp]) -> Windows:
+        """Return some of the rows."""
+
+        def pick(table: Array) -> Array:
+            return table if len(table) == 1 else table[chosen]
+
+        return Windows(
+            self.samples[chosen],
+            pick(self.cosine),
+            pick(self.sine),
+            pick(self.weight),
+            self.noise_sigma[chosen],
+        )
+
+
+class State(NamedTuple):
+    """Everything known at given positions, K per row."""
+
+    positions: Array  # (r, K)
+    linear: Array  # (r, 2 K): b of every echo, then d
+    sse: Array  # (r,)
+    gradient: Array  # (r, K): of half the SSE, downhill
+    information: Array  # (r, K, K): sigma**2 times the Fisher matrix of the positions
+
+    def rows(self, chosen: NDArray[np.intp]) -> State:
+        """Return some of the rows, copied."""
+        return State(*(table[chosen] for table in self))
+
+
+class Solver:
+    """Positions of K echoes by Levenberg-Marquardt, kept in the window and apart.
+
+    Parameters
+    ----------
+    sigma
+        Standard deviation of the envelope, in bins.
+    first, last
+        Least and largest position, in bins.
+    separation
+        Least distance of two positions, in bins.
+    """
+
+    def __init__(self, sigma: float, first: float, last: float, separation: float) -> None:
+        self.sigma = sigma
+        self.separation = separation
+        self._first = first
+        self._last = last
+
+    def fit(self, data: Windows, starts: Array, tolerance: float) -> State:
+        """Return the best fit of each window over its starts.
+
+        A row whose positions are never apart enough has an infinite ``sse``.
+
+        Parameters
+        ----------
+        data
+            r windows.
+        starts
+            Shape (r, n_starts, K): ascending positions.
+        tolerance
+            A gain of twice the log-likelihood too small to go on.
+        """
+        n_rows, n_starts, n_echoes = starts.shape
+        data = data.rows(np.repeat(np.arange(n_rows), n_starts))
+        fitted = evaluate(data, starts.reshape(-1, n_echoes), self.sigma)
+        fitted.sse[~self._apart(fitted.positions)] = math.inf
+        fitted = self.polish(data, fitted, tolerance)
+        best = fitted.sse.reshape(n_rows, n_starts).argmin(axis=1)
+        return fitted.rows(best + n_starts * np.arange(n_rows))
+
+    def polish(self, data: Windows, begun: State, tolerance: float) -> State:
+        """Return the fit a search that began earlier ends at; parameters as in `fit`."""
+        state = begun.rows(np.arange(len(begun.sse)))
+        damping = np.full(len(state.sse), 1e-3)
+        going = np.arange(len(state.sse))
+        diagonal = np.arange(state.positions.shape[1])
+        largest = _LARGEST_STEP * self.sigma
+        for _ in range(_MAX_STEPS):
+            at, data_at = state.rows(going), data.rows(going)
+            damped = at.information
+            scale = damped[:, diagonal, diagonal]
+            floor = 1e-12 * scale.max(axis=1, keepdims=True) + TINY
+            damped[:, diagonal, diagonal] += damping[going, np.newaxis] * scale + floor
+            step = np.linalg.solve(damped, at.gradient[..., np.newaxis])[..., 0]
+            wanted = at.positions + np.clip(step, -largest, largest)
+            wanted = np.sort(np.clip(wanted, self._first, self._last), axis=1)
+            tried = evaluate(data_at, wanted, self.sigma)
+            better = (tried.sse < at.sse) & self._apart(wanted)
+            for table, values in zip(state, tried, strict=True):
+                table[going[better]] = values[better]
+            damping[going] *= np.where(better, 0.1, 10.0)
+            # the model's own forecast of the gain, for a step that was not taken
+            promised = np.einsum("rk,rk->r", step, at.gradient)
+            gained = np.where(better, at.sse - tried.sse, promised)
+            open_ends = (gained > tolerance * data_at.noise_sigma**2) & (damping[going] < _HOPELESS)
+            going = going[open_ends]
+            if not going.size:
+                break
+        return state
+
+    def _apart(self, positions: Array) -> NDArray[np.bool_]:
+        gaps = positions[:, 1:] - positions[:, :-1]
+        apart: NDArray[np.bool_] = np.all(gaps >= self.separation, axis=1)
+        return apart
+
+
+def evaluate(data: Windows, positions: Array, sigma: float) -> State:
+    """Solve for the linear part and project the Jacobian of the positions off it."""
+    n_echoes = positions.shape[1]
+    offsets = np.arange(data.samples.shape[1]) - positions[..., np.newaxis]
+    envelopes = np.exp(offsets * offsets * (-0.5 / sigma**2))
+    cosine, sine = data.cosine[:, np.newaxis], data.sine[:, np.newaxis]
+    columns = np.concatenate([envelopes * cosine, envelopes * sine], axis=1)
+    samples = data.samples[..., np.newaxis]
+
+    matched = (columns @ samples)[..., 0]
+    gram = columns @ columns.swapaxes(1, 2)
+    diagonal = np.arange(2 * n_echoes)
+    gram[:, diagonal, diagonal] *= 1 + 1e-13
+    gram[:, diagonal, diagonal] += TINY
+    linear = np.linalg.solve(gram, matched[..., np.newaxis])[..., 0]
+    residual = data.samples - (linear[:, np.newaxis] @ columns)[:, 0]
+
+    slope = offsets * (1 / sigma**2)
+    pulses = linear[..., np.newaxis] * columns
+    tangents = (pulses[:, :n_echoes] + pulses[:, n_echoes:]) * slope
+    mixed = tangents @ columns.swapaxes(1, 2)
+    explained: Array = mixed @ np.linalg.solve(gram, mixed.swapaxes(1, 2))
+    return State(
+        positions=positions,
+        linear=linear,
+        sse=np.einsum("rn,rn->r", residual, residual),
+        gradient=(tangents @ residual[..., np.newaxis])[..., 0],
+        information=tangents @ tangents.swapaxes(1, 2) - explained,
+    )
+
+
+def _on_grid(data: Windows, samples: Array, envelopes: Array) -> tuple[Array, Array]:
+    """Return what the starts need of pulses on a grid, edges and gaps of the window included.
+
+    Cosine and sine columns are taken as orthogonal, which they are but for cut pulses.
+
+    Returns
+    -------
+    Shape (r, n_grid), complex128: correlation of the samples with a pulse; and shape
+    (r or 1, n_grid): its squared norm.
+    """
+    matched = (samples * data.cosine) @ envelopes.T + 1j * ((samples * data.sine) @ envelopes.T)
+    norm = 0.5 * data.weight @ (envelopes**2).T
+    return matched, norm + TINY
+
+
+def _envelopes(positions: Array, n_bins: int, sigma: float) -> Array:
+    """Return envelopes centred at positions, shape (..., n_bins)."""
+    envelopes: Array = np.exp(
+        -0.5 * ((np.arange(n_bins) - positions[..., np.newaxis]) / sigma) ** 2
+    )
+    return envelopes
+
+
+def best_single(data: Windows, grid: Array, sigma: float) -> Array:
+    """Return the place of the grid where one echo explains most; shape (r, 1, 1)."""
+    matched, norm = _on_grid(data, data.samples, _envelopes(grid, data.samples.shape[1], sigma))
+    best: Array = grid[np.argmax(np.abs(matched) ** 2 / norm, axis=1)]
+    return best[:, np.newaxis, np.newaxis]
+
+
+def best_pair(data: Windows, grid: Array, sigma: float, separation: float) -> Array:
+    """Return the pair of the grid that explains most; shape (r, 1, 2)."""
+    one, other = np.triu_indices(len(grid), k=math.ceil(separation / (grid[1] - grid[0])))
+    if not one.size:  # a search interval shorter than two echoes' distance
+        return np.broadcast_to(grid[[0, -1]], (len(data.samples), 1, 2))
+    envelopes = _envelopes(grid, data.samples.shape[1], sigma)
+    matched, norm = _on_grid(data, data.samples, envelopes)
+    overlaps = 0.5 * (data.weight[:, np.newaxis] * envelopes) @ envelopes.T
+    overlap = overlaps[:, one, other]
+    energy = np.abs(matched) ** 2
+    joint = energy[:, one] * norm[:, other] + energy[:, other] * norm[:, one]
+    joint -= 2 * overlap * (matched[:, one] * matched[:, other].conj()).real
+    joint /= norm[:, one] * norm[:, other] - overlap**2 + TINY
+    best = joint.argmax(axis=1)
+    return np.stack([grid[one[best]], grid[other[best]]], axis=1)[:, np.newaxis]
+
+
+def one_more(data: Windows, state: State, grid: Array, sigma: float, separation: float) -> Array:
+    """Return starts with one more echo: where it explains most, or as a split of one; (r, s, K)."""
+    n_bins = data.samples.shape[1]
+    weight = data.weight
+    mine, theirs = _envelopes(state.positions, n_bins, sigma), _envelopes(grid, n_bins, sigma)
+    fitted = state.linear.reshape(len(state.linear), 2, -1) @ mine
+    residual = data.samples - fitted[:, 0] * data.cosine - fitted[:, 1] * data.sine
+    matched, norm = _on_grid(data, residual, theirs)
+    weighted = 0.5 * mine * weight[:, np.newaxis]
+    mixed = weighted @ theirs.T
+    known = np.linalg.solve(weighted @ mine.swapaxes(1, 2) + TINY * np.eye(mine.shape[1]), mixed)
+    left = norm - (mixed * known).sum(axis=1)
+    far = np.abs(grid - state.positions[..., np.newaxis]).min(axis=1) >= separation
+    explained = np.where(far, np.abs(matched) ** 2 / np.maximum(left, 1e-3 * norm), -1.0)
+    added = grid[explained.argmax(axis=1)][:, np.newaxis]
+    starts = [np.concatenate([state.positions, added], axis=1)]
+    for k in range(state.positions.shape[1]):
+        split = np.insert(state.positions, k, state.positions[:, k] - 0.5 * sigma, axis=1)
+        split[:, k + 1] += 0.5 * sigma
+        starts.append(split)
+    together: Array = np.sort(np.stack(starts, axis=1), axis=2)
+    return together.clip(grid[0], grid[-1])
+
+
+_GRID_STEP = 0.2
+"""Of the envelope's sigma: spacing of the start grid. The likelihood is smooth on that scale."""
+_COARSE = 1.0
+"""Of twice the log-likelihood: what does not decide between one echo more or less."""
+_FINE = 1e-4
+"""Likewise: a hundredth of a standard deviation of a position."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EchoFit:
+    """One echo of a window.
+
+    Attributes
+    ----------
+    position_bins
+        Centre of the pulse, in bins from the window's first sample.
+    amplitude
+        Peak of the envelope, in the unit of the samples.
+    phase_rad
+        Phase of the carrier at the pulse's centre, in (-pi, pi].
+    sigma_bins
+        Standard deviation of the position: the Cramer-Rao bound at this fit, the amplitudes and
+        phases of all echoes and the other positions unknown.
+    misfit
+        Of the whole window: root of the residual's energy above noise over the echoes' energy.
+    """
+
+    position_bins: float
+    amplitude: float
+    phase_rad: float
+    sigma_bins: float
+    misfit: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KnownPulse:
+    """What the fit knows of the pulse.
+
+    Attributes
+    ----------
+    envelope_sigma_bins
+        Standard deviation of the Gaussian envelope, in bins.
+    carrier_rad_per_bin
+        Advance of the carrier's phase per bin.
+    """
+
+    envelope_sigma_bins: float
+    carrier_rad_per_bin: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SplitTest:
+    """When one more echo is believed.
+
+    Attributes
+    ----------
+    max_echoes
+        No window gets more.
+    false_split
+        Probability that noise alone makes one more echo in a window.
+    model_error
+        Amplitude error of the pulse model, relative. 0.08 covers a bandwidth wrong by 10 %.
+    min_separation
+        Closest echoes told apart, in standard deviations of the envelope.
+    """
+
+    max_echoes: int = 4
+    false_split: float = 1e-3
+    model_error: float = 0.08
+    min_separation: float = 0.5
+
+
+def fit_echoes(
+    samples: Array,
+    *,
+    pulse: KnownPulse,
+    noise_sigma: float,
+    usable: NDArray[np.bool_] | None = None,
+    search_bins: tuple[float, float] | None = None,
+    split: SplitTest | None = None,
+) -> tuple[EchoFit, ...]:
+    """Return the echoes of one window, nearest first; see `fit_many`."""
+    return fit_many(
+        samples[np.newaxis],
+        pulse=pulse,
+        noise_sigma=np.array([noise_sigma]),
+        usable=None if usable is None else usable[np.newaxis],
+        search_bins=search_bins,
+        split=split,
+    )[0]
+
+
+def fit_many(
+    windows: Array,
+    *,
+    pulse: KnownPulse,
+    noise_sigma: Array,
+    usable: NDArray[np.bool_] | None = None,
+    search_bins: tuple[float, float] | None = None,
+    split: SplitTest | None = None,
+) -> tuple[tuple[EchoFit, ...], ...]:
+    """Return the echoes of windows, at least one and at most ``split.max_echoes`` each.
+
+    Parameters
+    ----------
+    windows
+        Shape (b, n), float64: raw samples. About 3.5 envelope sigmas either side of the cluster.
+    pulse
+        The pulse.
+    noise_sigma
+        Shape (b,): standard deviation of a sample's noise, > 0.
+    usable
+        Shape (b, n): false where a sample says nothing (clipped, outside the frame). All, if None.
+    search_bins
+        Least and largest position of an echo, in bins; 1.5 envelope sigmas off the ends, if None.
+    split
+        When one more echo is believed; `SplitTest()`, if None.
+
+    Returns
+    -------
+    One tuple per window, nearest echo first.
+    """
+    split = split or SplitTest()
+    n_bins = windows.shape[1]
+    sigma = pulse.envelope_sigma_bins
+    first, last = search_bins or (1.5 * sigma, n_bins - 1 - 1.5 * sigma)
+    if not 0 <= first <= last <= n_bins - 1:
+        raise ValueError(f"echoes cannot be searched in bins {first} ... {last} of {n_bins}")
+    if not (noise_sigma > 0).all():
+        raise ValueError("the noise of a window must be more than 0")
+    data = Windows.of(windows, usable, noise_sigma, pulse.carrier_rad_per_bin)
+    grid = np.linspace(first, last, max(2, math.ceil((last - first) / (_GRID_STEP * sigma)) + 1))
+    solver = Solver(sigma, first, last, split.min_separation * sigma)
+    threshold = split_threshold(split.false_split, (last - first) / sigma)
+    energy = np.einsum("rn,rn->r", data.samples, data.samples)
+
+    found: list[tuple[EchoFit, ...]] = [()] * len(windows)
+    active = np.arange(len(windows))
+    state = solver.fit(data, best_single(data, grid, sigma), _COARSE)
+    while active.size:
+        more, believed = _try_one_more(
+            data.rows(active),
+            state,
+            grid=grid,
+            solver=solver,
+            split=split,
+            threshold=threshold,
+            energy=energy[active],
+        )
+        settled = ~believed
+        final = solver.polish(
+            data.rows(active[settled]), state.rows(np.flatnonzero(settled)), _FINE
+        )
+        for place, row in enumerate(active[settled]):
+            found[row] = _echoes(
+                data,
+                final,
+                place=place,
+                row=row,
+                energy=energy[row],
+                carrier_rad_per_bin=pulse.carrier_rad_per_bin,
+            )
+        active, state = active[believed], more
+    return tuple(found)
+
+
+def _try_one_more(
+    data: Windows,
+    state: State,
+    *,
+    grid: Array,
+    solver: Solver,
+    split: SplitTest,
+    threshold: float,
+    energy: Array,
+) -> tuple[State, NDArray[np.bool_]]:
+    """Return the fits with one more echo that are believed, and of which rows, shape (r,)."""
+    n_echoes = state.positions.shape[1] + 1
+    signal = np.sqrt(np.maximum(energy - state.sse, 0.0))
+    needed = (math.sqrt(threshold) * data.noise_sigma + split.model_error * signal) ** 2
+    # no echo can explain more than all that is left
+    believed = (state.sse > needed) & (n_echoes <= split.max_echoes)
+    hopeful = np.flatnonzero(believed)
+    if not hopeful.size:
+        return state.rows(hopeful), believed
+    rows, fewer = data.rows(hopeful), state.rows(hopeful)
+    if n_echoes == 2:
+        starts = best_pair(rows, grid, solver.sigma, solver.separation)
+    else:
+        starts = one_more(rows, fewer, grid, solver.sigma, solver.separation)
+    more = solver.fit(rows, starts, _COARSE)
+    enough = fewer.sse - more.sse > needed[hopeful]
+    believed[hopeful] = enough
+    return more.rows(np.flatnonzero(enough)), believed
+
+
+@lru_cache
+def split_threshold(false_split: float, search_sigmas: float) -> float:
+    """Return the rise of twice the log-likelihood that noise exceeds with a given probability.
+
+    Along the position, what one more echo explains is a chi-square process of 2 degrees, whose
+    correlation is that of the pulse; the probability that it exceeds h anywhere is at most that
+    of its first point plus its upcrossings, ``exp(-h/2) (1 + L sqrt(h / (4 pi)))``.
+
+    Parameters
+    ----------
+    false_split
+        The probability, 0 ... 1.
+    search_sigmas
+        Length L of the interval searched, in standard deviations of the envelope.
+    """
+
+    def excess(h: float) -> float:
+        return math.log1p(search_sigmas * math.sqrt(h / (4 * math.pi))) - h / 2
+
+    return float(brentq(lambda h: excess(h) - math.log(false_split), 0.0, 200.0))
+
+
+def _echoes(
+    data: Windows,
+    fit: State,
+    *,
+    place: int,
+    row: int,
+    energy: float,
+    carrier_rad_per_bin: float,
+) -> tuple[EchoFit, ...]:
+    """Return the echoes of window ``row``, whose fit is row ``place`` of ``fit``."""
+    positions = fit.positions[place]
+    n_echoes = len(positions)
+    noise_sigma = data.noise_sigma[row]
+    information = fit.information[place]
+    if np.linalg.eigvalsh(information)[0] > TINY:
+        sigma_bins = noise_sigma * np.sqrt(np.diag(np.linalg.inv(information)))
+    else:
+        sigma_bins = np.full(n_echoes, math.inf)
+
+    weight = data.weight[min(row, len(data.weight) - 1)]
+    freedom = max(0.0, weight.sum() - 3 * n_echoes)
+    above_noise = max(0.0, fit.sse[place] - freedom * noise_sigma**2)
+    misfit = math.sqrt(above_noise / max(energy - fit.sse[place], TINY))
+
+    b, d = fit.linear[place, :n_echoes], fit.linear[place, n_echoes:]
+    # A cos(w (n - u) + phase) = b cos(w n) + d sin(w n)
+    phases = np.angle((b - 1j * d) * np.exp(1j * carrier_rad_per_bin * positions))
+    return tuple(
+        EchoFit(
+            position_bins=position,
+            amplitude=amplitude,
+            phase_rad=phase,
+            sigma_bins=spread,
+            misfit=misfit,
+        )
+        for position, amplitude, phase, spread in zip(
+            positions.tolist(),
+            np.hypot(b, d).tolist(),
+            phases.tolist(),
+            sigma_bins.tolist(),
+            strict=True,
+        )
+    )
+
+
+Matrix = list[list[float]]
+T = TypeVar("T")
+
+"""Of s."""
+"""Damping at which the search ends: it presses against a limit."""
+_OPTIMISM = 10.0
+"""How many times what it forecasts a search may gain, at most."""
+_COARSE_BINS, _FINE_BINS = 1.0, 1e-4
+"""Gains of twice the log-likelihood too small to go on: while echoes are counted, and at last."""
+REACH_STEPS = 4
+"""On either side of a step, how many it takes to interpolate there."""
+_WINDOW = np.arange(2 * REACH_STEPS + 1)
+_TAYLOR = np.linalg.inv(np.vander(_WINDOW - REACH_STEPS, increasing=True)).T + 0j
+"""From nine values of z to the polynomial through them; z is smooth over ten steps."""
+
+
+class Correlation:
+    """z of a stretch of one frame, a polynomial around each of its steps.
+
+    Parameters
+    ----------
+    z
+        Shape (n,), complex: the filter's output with the carrier turned back.
+    step_bins
+        Bins from one value to the next.
+    sigma_bins
+        s, of the envelope.
+    sigma_y
+        Standard deviation of the noise of z, per quadrature.
+    """
+
+    def __init__(
+        self, z: ComplexArray, *, step_bins: float, sigma_bins: float, sigma_y: float
+    ) -> None:
+        self.sigma_bins = sigma_bins
+        self.sigma_y = sigma_y
+        self.step_bins = step_bins
+        self.curvature = 0.5 / sigma_bins**2
+        """Of rho at its top [1/bin**2]."""
+        self._around = z[np.arange(z.size - 2 * REACH_STEPS)[:, np.newaxis] + _WINDOW] @ _TAYLOR
+        self._polynomials: list[list[complex]] = self._around.tolist()
+
+    def on_steps(self, first: float, last: float) -> tuple[Array, ComplexArray]:
+        """Return the positions of the steps within two positions, and z there."""
+        begin = max(0, math.ceil(first / self.step_bins) - REACH_STEPS)
+        end = max(begin + 1, math.floor(last / self.step_bins) + 1 - REACH_STEPS)
+        values = self._around[begin:end, 0]
+        return (np.arange(begin, begin + values.size) + REACH_STEPS) * self.step_bins, values
+
+    def at(self, position: float) -> tuple[complex, complex]:
+        """Return z and its derivative by the position [1/bin]; positions count from ``z[0]``."""
+        steps = position / self.step_bins
+        nearest = min(max(round(steps), REACH_STEPS), len(self._polynomials) - 1 + REACH_STEPS)
+        offset = steps - nearest
+        value = slope = 0j
+        for coefficient in reversed(self._polynomials[nearest - REACH_STEPS]):
+            slope = slope * offset + value
+            value = value * offset + coefficient
+        return value, slope / self.step_bins
+
+
+class _Search(NamedTuple):
+    """Where echoes are looked for: limits of their positions, least distance, steps, z there."""
+
+    first: float
+    last: float
+    separation: float
+    grid: Array
+    z: ComplexArray
+
+
+class _Fit:
+    """Everything known at given positions.
+
+    Attributes
+    ----------
+    positions, amplitudes
+        u and a, one each per echo.
+    inverse
+        R^-1.
+    explained
+        G.
+    gradient, information
+        Half of dG/du, and the Fisher matrix times sigma_y**2.
+    """
+
+    __slots__ = ("amplitudes", "explained", "gradient", "information", "inverse", "positions")
+
+    def __init__(self, data: Correlation, positions: list[float]) -> None:
+        self.positions = positions
+        overlap, slope, bend = _tables(positions, data.curvature)
+        seen, climb = zip(*map(data.at, positions), strict=True)
+        self.inverse = inverse = _inverse(overlap)
+        self.amplitudes = a = [_dot(row, seen) for row in inverse]
+        self.explained = _dot(a, map(complex.conjugate, seen)).real
+        turned = [each.conjugate() for each in a]
+        self.gradient = [
+            (each * (here - _dot(row, a))).real
+            for each, here, row in zip(turned, climb, slope, strict=True)
+        ]
+        # D^T = -D
+        known = [[_dot(row, column) for column in inverse] for row in slope]
+        columns = list(zip(*slope, strict=True))
+        self.information = [
+            [
+                (each * other).real * (straight + _dot(row, column))
+                for other, straight, column in zip(a, bends, columns, strict=True)
+            ]
+            for each, bends, row in zip(turned, bend, known, strict=True)
+        ]
+
+
+def fit_whole_echoes(
+    data: Correlation, first: float, last: float, split: SplitTest
+) -> tuple[EchoFit, ...]:
+    """Return the echoes between two positions, at least one and at most ``split.max_echoes``.
+
+    Parameters
+    ----------
+    data
+        z around them, all other echoes of the frame taken away.
+    first, last
+        Least and largest position [bins].
+    split
+        When one more echo is believed.
+
+    Returns
+    -------
+    Nearest first, positions counted in bins from ``z[0]``, phases at the positions with the carrier
+    turned back; ``misfit`` is not known here (NaN).
+    """
+    s = data.sigma_bins
+    grid, z = data.on_steps(first, last)
+    search = _Search(first, last, split.min_separation * s, grid, z)
+    threshold = split_threshold(split.false_split, math.ceil((last - first) / s))
+    fit = _polished(data, _Fit(data, [float(grid[np.argmax(np.abs(z))])]), search, _COARSE_BINS)
+    while len(fit.positions) < split.max_echoes:
+        signal = math.sqrt(max(fit.explained, 0.0))
+        needed = (math.sqrt(threshold) * data.sigma_y + split.model_error * signal) ** 2
+        if len(fit.positions) == 1:
+            starts = [_best_pair(search, s)]
+        else:
+            starts = _one_more(fit, search, s, needed)
+        tried = [
+            _polished(data, _Fit(data, start), search, _COARSE_BINS, fit.explained + needed)
+            for start in starts
+            if _apart(start, search.separation)
+        ]
+        more = max(tried, key=lambda each: each.explained, default=fit)
+        if more.explained - fit.explained <= needed:
+            break
+        fit = more
+    return _fitted_echoes(_polished(data, fit, search, _FINE_BINS), data.sigma_y)
+
+
+def _polished(
+    data: Correlation,
+    fit: _Fit,
+    search: _Search,
+    tolerance: float,
+    at_least: float = -math.inf,
+) -> _Fit:
+    """Return the best fit by Levenberg-Marquardt, kept between limits and apart.
+
+    A search is given up when its own forecast, however often missed, stays short of what G is
+    wanted to be.
+    """
+    first, last, separation = search[:3]
+    largest = _LARGEST_STEP * data.sigma_bins
+    damping = 1e-3
+    for _ in range(_MAX_STEPS):
+        damped = [row.copy() for row in fit.information]
+        floor = 1e-12 * max(row[k] for k, row in enumerate(damped))
+        if floor <= 0.0:  # nothing is there
+            break
+        for k, row in enumerate(damped):
+            row[k] += damping * row[k] + floor
+        step = [_dot(row, fit.gradient) for row in _inverse(damped)]
+        # the model's own forecast of the gain
+        promised = _dot(step, fit.gradient)
+        if fit.explained + _OPTIMISM * promised < at_least:
+            break
+        wanted = sorted(
+            min(max(u + min(max(du, -largest), largest), first), last)
+            for u, du in zip(fit.positions, step, strict=True)
+        )
+        tried = _Fit(data, wanted) if _apart(wanted, separation) else fit
+        gained = tried.explained - fit.explained
+        if gained > 0.0:
+            fit = tried
+            damping *= 0.1
+        else:
+            gained = promised
+            damping *= 10.0
+        if gained <= tolerance * data.sigma_y**2 or damping >= _HOPELESS:
+            break
+    return fit
+
+
+def _tables(positions: list[float], curvature: float) -> tuple[Matrix, Matrix, Matrix]:
+    """Return R, D and H of pulses at positions."""
+    size = len(positions)
+    overlap, slope, bend = ([[0.0] * size for _ in positions] for _ in range(3))
+    for k, here in enumerate(positions):
+        overlap[k][k], bend[k][k] = 1.0, curvature
+        for m, there in enumerate(positions[:k]):
+            scaled = curvature * (here - there)
+            left = scaled * (here - there)
+            rho = math.exp(-0.5 * left)
+            overlap[k][m] = overlap[m][k] = rho
+            slope[m][k] = scaled * rho
+            slope[k][m] = -slope[m][k]
+            bend[k][m] = bend[m][k] = (1 - left) * curvature * rho
+    return overlap, slope, bend
+
+
+def _dot(one: Iterable[T], other: Iterable[T]) -> T:
+    total: T = sum(map(mul, one, other))
+    return total
+
+
+def _apart(positions: list[float], separation: float) -> bool:
+    return all(b - a >= separation for a, b in pairwise(positions))
+
+
+def _best_pair(search: _Search, s: float) -> list[float]:
+    """Return the two steps of the grid that explain most, far enough apart; or its two ends."""
+    grid, z = search.grid, search.z
+    step_bins = float(grid[1] - grid[0]) if grid.size > 1 else 0.0
+    overlap, gain = _pairs(grid.size, step_bins, s, search.separation)
+    energy = z.real**2 + z.imag**2
+    crossed = np.multiply.outer(z.real, z.real) + np.multiply.outer(z.imag, z.imag)
+    explained = np.add.outer(energy, energy)
+    explained -= 2 * overlap * crossed
+    explained *= gain
+    one, other = divmod(int(np.argmax(explained)), grid.size)
+    if not gain[one, other]:
+        return [float(grid[0]), float(grid[-1])]
+    return sorted((float(grid[one]), float(grid[other])))
+
+
+@lru_cache
+def _pairs(size: int, step_bins: float, s: float, separation: float) -> tuple[Array, Array]:
+    """Return rho of each pair of steps, and 1 / (1 - rho**2), 0 where they are too close."""
+    steps = np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
+    apart = step_bins * steps
+    overlap = np.exp(-0.25 * (apart / s) ** 2)
+    far = apart >= separation
+    return overlap, np.where(far, 1 / np.where(far, 1 - overlap**2, 1.0), 0.0)
+
+
+def _one_more(fit: _Fit, search: _Search, s: float, needed: float) -> list[list[float]]:
+    """Return starts with one more echo: where it explains most, or as a split of one.
+
+    None, where what is left is far from explaining what is needed.
+    """
+    first, last, separation, grid, z = search
+    positions = np.array(fit.positions)
+    apart = grid - positions[:, np.newaxis]
+    overlap = np.exp(-0.25 * (apart / s) ** 2)
+    residual = z - np.array(fit.amplitudes) @ overlap
+    norm = 1 - np.einsum("kn,kn->n", overlap, np.array(fit.inverse) @ overlap)
+    explained = (residual.real**2 + residual.imag**2) / np.maximum(norm, 1e-3)
+    if _OPTIMISM * explained.max() < needed:
+        return []
+    explained[np.abs(apart).min(axis=0) < separation] = -1.0
+    starts = [sorted([*fit.positions, float(grid[np.argmax(explained)])])]
+    for k, position in enumerate(fit.positions):
+        others = fit.positions[:k] + fit.positions[k + 1 :]
+        halves = (max(position - 0.5 * s, first), min(position + 0.5 * s, last))
+        starts.append(sorted([*others, *halves]))
+    return starts
+
+
+def _inverse(matrix: Matrix) -> Matrix:
+    """Return the inverse of a small symmetric positive definite matrix, by bordering."""
+    if len(matrix) == 1:
+        return [[1 / matrix[0][0]]]
+    (first, cross, *_), (_, second, *_) = matrix[:2]
+    scale = 1 / (first * second - cross * cross)
+    inverse = [[scale * second, -scale * cross], [-scale * cross, scale * first]]
+    for row in matrix[2:]:
+        size = len(inverse)
+        border = [_dot(known, row[:size]) for known in inverse]
+        scale = 1 / (row[size] - _dot(border, row))
+        scaled = [scale * value for value in border]
+        for known, factor in zip(inverse, border, strict=True):
+            known[:] = [
+                *(x + factor * y for x, y in zip(known, scaled, strict=True)),
+                -scale * factor,
+            ]
+        inverse.append([*(-value for value in scaled), scale])
+    return inverse
+
+
+def _fitted_echoes(fit: _Fit, sigma_y: float) -> tuple[EchoFit, ...]:
+    information = fit.information
+    told = [row[k] for k, row in enumerate(information)]
+    blind = min(told) <= 1e-12 * max(told)
+    variances = [math.inf] * len(information)
+    if not blind:
+        variances = [row[k] for k, row in enumerate(_inverse(information))]
+    spread = [sigma_y * math.sqrt(v) if v > 0.0 else math.inf for v in variances]
+    return tuple(
+        EchoFit(
+            position_bins=position,
+            amplitude=abs(a),
+            phase_rad=math.atan2(a.imag, a.real),
+            sigma_bins=sigma,
+            misfit=math.nan,
+        )
+        for position, a, sigma in zip(fit.positions, fit.amplitudes, spread, strict=True)
+    )

@@ -1,0 +1,725 @@
+"""New landmarks: ranges of the last frames that one point at rest explains.
+
+A range is evidence once. What continues a track never comes here, and what a tracklet takes is
+gone for every later one.
+
+A point b with noise n and known dependence D_b on the radars' range offsets measures
+
+    y = b - R^T (l - p),   H = [e_p: -R^T, e_l: R^T, e_b: -D_b],   S = H P H^T + C_b,
+
+and a new landmark is l = p + R b with e_l = e_p + R D_b e_b + R n: correlated with all that the
+pose is correlated with. (In right-invariant errors the heading enters neither.)
+
+A point is guessed from ranges of now and followed back through the frames in odometry by a small
+Kalman filter on its position in the body frame of now; each frame gives the unused range nearest
+to the prediction, if it is near enough. The guess is believed if enough frames hold it and its
+residuals are as small as those of a point at rest: clutter has no past, and a ghost, the fix of
+two ranges of different targets, does not stay at rest while the robot moves.
+
+With b = R^T (l - p) in the body frame, z = (|b|, atan2(b_y, b_x)) and G = dz / db::
+
+    H = [e_p: -G R^T, e_l: G R^T]
+
+A point is matched to the landmark of least Mahalanobis distance, all points of one time together
+and no landmark twice, or named by whoever knows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from slam.geometry import compose, wrap_angle
+from slam.robust.parameters import MapRule, RangeNoise, TrackletRule
+from slam.robust.ranges import LONGEST_M, Antennas, RangeScan, fix_of_pair
+from slam.robust.state import POSITION, Array, Indices, Motion, State, rotation
+
+
+@dataclass(frozen=True, slots=True)
+class Leftover:
+    """One unused range: as measured, its target's label where known, its standard deviation.
+
+    ``alone`` tells whether no other echo overlaps its own.
+    """
+
+    range_m: float
+    label: int | None
+    sigma_m: float
+    alone: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SeenFrame:
+    """One frame: where the antennas were in the odometry frame, and the ranges still unused.
+
+    Attributes
+    ----------
+    pose_index
+        Which pose of the run it belongs to.
+    pose
+        shape (3,), odometry frame.
+    path_m, turned_rad
+        Way and turn so far, always growing.
+    antennas
+        In the odometry frame.
+    unused
+        One list per radar; what is taken is removed.
+    """
+
+    pose_index: int
+    pose: Array
+    path_m: float
+    turned_rad: float
+    antennas: Antennas
+    unused: tuple[list[Leftover], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Slot:
+    """One radar's share of one earlier frame, in the body frame of now.
+
+    ``x_m, y_m, yaw_rad`` is the antenna then, ``drift`` the variance [m^2] that the way back
+    adds to a range, ``back`` how many frames ago, ``radar`` the radar's index.
+    """
+
+    back: int
+    radar: int
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    drift: float
+    unused: list[Leftover]
+    antenna_then: tuple[float, float]
+
+
+class Leftovers:
+    """The unused ranges of the last frames, and the way the robot went between them.
+
+    Parameters
+    ----------
+    capacity
+        Number of frames kept.
+    sigma_m
+        Standard deviation of a range whose scan tells none.
+    drift_per_m, drift_per_rad_m
+        Standard deviation a range gains per metre of way back, and per radian of turn.
+    """
+
+    def __init__(
+        self, capacity: int, sigma_m: float, drift_per_m: float, drift_per_rad_m: float
+    ) -> None:
+        self._sigma_m = sigma_m
+        self._frames: deque[SeenFrame] = deque(maxlen=capacity)
+        self._bodies: deque[Antennas] = deque(maxlen=capacity)
+        self._drift_per_m = drift_per_m
+        self._drift_per_rad_m = drift_per_rad_m
+        self._pose = np.zeros(3)
+        self._path_m = 0.0
+        self._turned_rad = 0.0
+
+    def move(self, motion: Motion) -> None:
+        """Go on by one step of odometry."""
+        step = np.array([motion.step_m[0], motion.step_m[1], motion.turn_rad])
+        self._pose = compose(self._pose, step)
+        self._path_m += motion.distance_m
+        self._turned_rad += abs(motion.turn_rad)
+
+    def clear(self) -> None:
+        """Forget all frames: what they held was seen from another place."""
+        self._frames.clear()
+        self._bodies.clear()
+
+    def keep(
+        self,
+        pose_index: int,
+        antennas: Antennas,
+        scans: Sequence[RangeScan],
+        used: set[tuple[int, int]],
+    ) -> None:
+        """Store a frame without the ranges used, given as (radar, index)."""
+        unused: tuple[list[Leftover], ...] = tuple([] for _ in antennas.yaw_rad)
+        for scan in scans:
+            unused[scan.radar].extend(
+                Leftover(
+                    range_m,
+                    scan.label(index),
+                    scan.sigma(index, self._sigma_m),
+                    scan.is_alone(index),
+                )
+                for index, range_m in enumerate(scan.ranges_m)
+                if (scan.radar, index) not in used and 0.0 < range_m < LONGEST_M
+            )
+        turn = rotation(self._pose[2])
+        self._bodies.append(antennas)
+        self._frames.append(
+            SeenFrame(
+                pose_index=pose_index,
+                pose=self._pose,
+                path_m=self._path_m,
+                turned_rad=self._turned_rad,
+                antennas=Antennas(
+                    position_m=antennas.position_m @ turn.T + self._pose[:2],
+                    yaw_rad=antennas.yaw_rad + self._pose[2],
+                    heard=antennas.heard,
+                ),
+                unused=unused,
+            )
+        )
+
+    def newest(self) -> SeenFrame:
+        """Return the last frame stored."""
+        return self._frames[-1]
+
+    def pose_index(self, back: int) -> int:
+        """Return the pose that the frame ``back`` frames ago belongs to."""
+        return self._frames[-1 - back].pose_index
+
+    def slots(self, radars: Sequence[int], window: int) -> list[list[Slot]]:
+        """Return the last frames, newest first, as some radars saw them."""
+        now = self._frames[-1]
+        R = rotation(now.pose[2])
+        frames: list[list[Slot]] = []
+        for back in range(min(window, len(self._frames))):
+            frame, body = self._frames[-1 - back], self._bodies[-1 - back]
+            way, turn = now.path_m - frame.path_m, now.turned_rad - frame.turned_rad
+            drift = (self._drift_per_m * way) ** 2 + (self._drift_per_rad_m * turn) ** 2
+            places = ((frame.antennas.position_m - now.pose[:2]) @ R).tolist()
+            yaws = (frame.antennas.yaw_rad - now.pose[2]).tolist()
+            then = body.position_m.tolist()
+            frames.append(
+                [
+                    Slot(
+                        back,
+                        radar,
+                        places[radar][0],
+                        places[radar][1],
+                        math.remainder(yaws[radar], math.tau),
+                        drift,
+                        frame.unused[radar],
+                        (then[radar][0], then[radar][1]),
+                    )
+                    for radar in radars
+                    if frame.antennas.heard[radar]
+                ]
+            )
+        return frames
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BodyPoint:
+    """A point in the body frame of now.
+
+    ``point_m`` (2,), ``covariance`` (2, 2), ``by_offsets`` (2, r): d(point) / d(range offsets);
+    ``outward`` (2,): away from where it was seen from, where the axis of a round target lies.
+    """
+
+    point_m: Array
+    covariance: Array
+    by_offsets: Array
+    outward: Array | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FeatureRows:
+    """What is seen against one of the map: residual (2,), H (2, c) on columns ``at``, S (2, 2)."""
+
+    residual: Array
+    at: Indices
+    H: Array
+    S: Array
+
+    @property
+    def mahalanobis_sq(self) -> float:
+        """Return the squared Mahalanobis distance (2 dof)."""
+        return float(self.residual @ np.linalg.solve(self.S, self.residual))
+
+    @property
+    def log_det(self) -> float:
+        """Return ln det S."""
+        return math.log(float(np.linalg.det(self.S)))
+
+
+def point_rows(state: State, row: int, point: BodyPoint) -> FeatureRows:
+    """Return residual, H and S of a point that would be the landmark in ``row``."""
+    R = rotation(state.heading_rad)
+    offsets = np.arange(state.offsets.start, state.offsets.stop)
+    at = np.concatenate([np.array([1, 2]), offsets, state.landmark_columns(np.array([row]))])
+    H = np.hstack([-R.T, -point.by_offsets, R.T])
+    S = H @ state.P.block(at) @ H.T + point.covariance
+    seen_m = point.point_m
+    if point.outward is not None and (radius_m := state.radii_m.get(state.landmark_ids[row], 0.0)):
+        seen_m = seen_m + radius_m * point.outward
+    return FeatureRows(
+        residual=seen_m - R.T @ (state.landmarks_m[row] - state.position_m),
+        at=at,
+        H=H,
+        S=(S + S.T) / 2,
+    )
+
+
+def near_rows(state: State, point: BodyPoint, reach_m: float) -> NDArray[np.intp]:
+    """Return the rows of landmarks within reach of a point; O(n)."""
+    place = state.position_m + rotation(state.heading_rad) @ point.point_m
+    away = state.landmarks_m - place
+    return np.flatnonzero(np.hypot(away[:, 0], away[:, 1]) <= reach_m)
+
+
+def match(
+    state: State, point: BodyPoint, rule: MapRule, elsewhere: Collection[int] = ()
+) -> int | None:
+    """Return the row of the landmark that a point is, or None where none stands out.
+
+    A match must pass the gate, be likelier than a landmark not yet in the map,
+    ``N(residual; 0, S) > beta``, and beat the next best in ``d^2 + ln det S``. Landmarks whose ids
+    are ``elsewhere`` are out of reach.
+    """
+    scored = []
+    for row in near_rows(state, point, rule.merge_reach_m):
+        if state.landmark_ids[row] in elsewhere:
+            continue
+        rows = point_rows(state, int(row), point)
+        scored.append((rows.mahalanobis_sq + rows.log_det, rows.mahalanobis_sq, int(row)))
+    if not scored:
+        return None
+    scored.sort()
+    score, distance, best = scored[0]
+    if distance > rule.match_gate:
+        return None
+    if -0.5 * score - math.log(math.tau) <= math.log(rule.unmapped_per_m2):
+        return None
+    if len(scored) > 1 and scored[1][0] - score < rule.match_lead:
+        return None
+    return best
+
+
+def update_with_point(state: State, row: int, point: BodyPoint) -> float:
+    """Correct the state with a point that is the landmark in ``row``; return the NIS (2 dof)."""
+    rows = point_rows(state, row, point)
+    nis, _ = state.update(rows.at, rows.H, rows.residual, point.covariance)
+    return nis
+
+
+def give_birth(state: State, point: BodyPoint) -> int:
+    """Append a point to the map; return the new landmark's id."""
+    R = rotation(state.heading_rad)
+    at = np.arange(state.offsets.stop)
+    columns = state.P.columns(at)
+    G = np.zeros((2, len(at)))
+    G[:, POSITION] = np.eye(2)
+    G[:, state.offsets] = R @ point.by_offsets
+    cross = columns @ G.T
+    corner = G @ cross[at] + R @ point.covariance @ R.T
+    return state.augment(state.position_m + R @ point.point_m, cross, (corner + corner.T) / 2)
+
+
+_SEED_MARGIN_RAD = 0.05
+_MEMBER_MARGIN_RAD = 0.1
+_SINGLE_BEARINGS_RAD = (0.0, -0.25, 0.25, -0.5, 0.5)
+_SINGLE_SPREAD_RAD = 0.2
+_SINGLE_RANGE_SIGMA_M = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """One range of a tracklet, and where its slot is."""
+
+    slot: Slot
+    leftover: Leftover
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Guess:
+    """Where a point may be, in the body frame of now: mean (2,) and covariance (2, 2)."""
+
+    point_m: Array
+    covariance: Array
+    label: int | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Tracklet:
+    """A point at rest, and the ranges that say so.
+
+    Attributes
+    ----------
+    point_m, covariance
+        In the body frame of now, shapes (2,) and (2, 2), for the range offsets given.
+    by_offsets
+        shape (2, r), d(point) / d(offsets).
+    members
+        Newest first.
+    chi_square, dof
+        Of the residuals.
+    share
+        Part of the frames with the point in view that hold a member.
+    """
+
+    point_m: Array
+    covariance: Array
+    by_offsets: Array
+    members: tuple[Member, ...]
+    chi_square: float
+    dof: int
+    share: float
+    label: int | None
+
+    def body_point(self) -> BodyPoint:
+        """Return it as a point seen from the body of now."""
+        antennas = [(member.slot.x_m, member.slot.y_m) for member in self.members]
+        away = self.point_m - np.mean(antennas, axis=0)
+        return BodyPoint(
+            point_m=self.point_m,
+            covariance=self.covariance,
+            by_offsets=self.by_offsets,
+            outward=away / max(math.hypot(away[0], away[1]), 1e-6),
+        )
+
+    @property
+    def score(self) -> float:
+        """Return 4 dof - chi-square, by which tracklets compete for ranges."""
+        return 4.0 * self.dof - self.chi_square
+
+
+def guesses_of(
+    newest: Sequence[Slot], radars: Sequence[int], noise: RangeNoise, rule: TrackletRule
+) -> list[Guess]:
+    """Return the guesses of what radars of one side saw in the newest frame."""
+    return single_guesses(newest) if len(radars) == 1 else pair_guesses(newest, noise, rule)
+
+
+def pair_guesses(newest: Sequence[Slot], noise: RangeNoise, rule: TrackletRule) -> list[Guess]:
+    """Return the fixes of all pairs of unused ranges of now inside both fields of view."""
+    guesses = []
+    for place, first in enumerate(newest):
+        for second in newest[place + 1 :]:
+            ahead = np.array([math.cos(first.yaw_rad), math.sin(first.yaw_rad)])
+            here, there = np.array([first.x_m, first.y_m]), np.array([second.x_m, second.y_m])
+            for a in first.unused:
+                for b in second.unused:
+                    if a.label != b.label:
+                        continue
+                    point = fix_of_pair(here, there, a.range_m, b.range_m, ahead)
+                    if point is None or not (
+                        _in_view(point, first, noise) and _in_view(point, second, noise)
+                    ):
+                        continue
+                    spread = rule.prior_sigma_m**2 * np.eye(2)
+                    guesses.append(Guess(point_m=point, covariance=spread, label=a.label))
+    return guesses
+
+
+def single_guesses(newest: Sequence[Slot]) -> list[Guess]:
+    """Return, for each unused range of a radar alone, points on its arc."""
+    guesses = []
+    for slot in newest:
+        for leftover in slot.unused:
+            for off in _SINGLE_BEARINGS_RAD:
+                u = np.array([math.cos(slot.yaw_rad + off), math.sin(slot.yaw_rad + off)])
+                across = (_SINGLE_SPREAD_RAD * leftover.range_m) ** 2
+                along = _SINGLE_RANGE_SIGMA_M**2
+                guesses.append(
+                    Guess(
+                        point_m=np.array([slot.x_m, slot.y_m]) + leftover.range_m * u,
+                        covariance=across * np.eye(2) + (along - across) * np.outer(u, u),
+                        label=leftover.label,
+                    )
+                )
+    return guesses
+
+
+def _in_view(point: Array, slot: Slot, noise: RangeNoise) -> bool:
+    dx, dy = float(point[0]) - slot.x_m, float(point[1]) - slot.y_m
+    off = math.remainder(math.atan2(dy, dx) - slot.yaw_rad, math.tau)
+    return abs(off) <= noise.field_of_view_rad / 2 + _SEED_MARGIN_RAD
+
+
+class Tracker:
+    """Follows guesses back in time.
+
+    Parameters
+    ----------
+    noise, rule
+        Of the radars, and of what is believed.
+    offsets_m, offset_covariance
+        What the state knows of the radars' range offsets, shapes (r,) and (r, r).
+    """
+
+    def __init__(
+        self, noise: RangeNoise, rule: TrackletRule, offsets_m: Array, offset_covariance: Array
+    ) -> None:
+        self._noise, self._rule = noise, rule
+        self._offsets: list[float] = offsets_m.tolist()
+        self._offset_covariance = offset_covariance
+        self._doubt: list[float] = offset_covariance.diagonal().tolist()
+        self._offsets_known = max(self._doubt, default=0.0) <= (0.1 * noise.sigma_m) ** 2
+
+    def follow(self, guess: Guess, frames: Sequence[Sequence[Slot]]) -> Tracklet:
+        """Return what the last frames hold of a guess; twice, from the result of the first."""
+        first = self._walk(guess, frames)
+        again = Guess(point_m=first.point_m, covariance=guess.covariance, label=guess.label)
+        second = self._walk(again, frames)
+        return second if self._offsets_known else self._with_free_offsets(second)
+
+    def _walk(self, guess: Guess, frames: Sequence[Sequence[Slot]]) -> Tracklet:
+        """Filter the position backwards; plain floats, the loop is short and runs often."""
+        x, y = float(guess.point_m[0]), float(guess.point_m[1])
+        cxx, cxy, cyy = (float(guess.covariance[i]) for i in ((0, 0), (0, 1), (1, 1)))
+        noise, rule = self._noise, self._rule
+        half_view = noise.field_of_view_rad / 2
+        gate_sq = rule.gate_sigmas**2
+        n_radars = len(self._offsets)
+        dx_do, dy_do = [0.0] * n_radars, [0.0] * n_radars
+        members: list[Member] = []
+        chi_square = 0.0
+        in_view, hit = 0, 0
+        for slots in frames:
+            sees = hits = False
+            for slot in slots:
+                dx, dy = x - slot.x_m, y - slot.y_m
+                distance = math.sqrt(dx * dx + dy * dy)
+                off = abs(math.remainder(math.atan2(dy, dx) - slot.yaw_rad, math.tau))
+                if off <= half_view and noise.min_range_m <= distance <= noise.max_range_m:
+                    sees = True
+                if off > half_view + _MEMBER_MARGIN_RAD or not slot.unused or distance == 0.0:
+                    continue
+                radar = slot.radar
+                expected = distance + self._offsets[radar]
+                nearest, nu = None, math.inf
+                for leftover in slot.unused:
+                    miss = leftover.range_m - expected
+                    if abs(miss) < abs(nu) and leftover.label == guess.label:
+                        nearest, nu = leftover, miss
+                if nearest is None:
+                    continue
+                ux, uy = dx / distance, dy / distance
+                px, py = cxx * ux + cxy * uy, cxy * ux + cyy * uy
+                variance = nearest.sigma_m**2 + slot.drift
+                s = ux * px + uy * py + variance + self._doubt[radar]
+                if nu * nu > gate_sq * s:
+                    continue
+                kx, ky = px / s, py / s
+                x, y = x + kx * nu, y + ky * nu
+                cxx, cxy, cyy = cxx - kx * px, cxy - kx * py, cyy - ky * py
+                for other in range(n_radars):
+                    change = ux * dx_do[other] + uy * dy_do[other] + (other == radar)
+                    dx_do[other] -= kx * change
+                    dy_do[other] -= ky * change
+                chi_square += nu * nu / s
+                members.append(Member(slot, nearest))
+                hits = True
+            in_view += sees or hits
+            hit += hits
+        return Tracklet(
+            point_m=np.array([x, y]),
+            covariance=np.array([[cxx, cxy], [cxy, cyy]]),
+            by_offsets=np.array([dx_do, dy_do]),
+            members=tuple(members),
+            chi_square=chi_square,
+            dof=len(members) - 2,
+            share=hit / max(in_view, 1),
+            label=guess.label,
+        )
+
+    def _with_free_offsets(self, walked: Tracklet) -> Tracklet:
+        """Judge the members by a point *and* the radars' common offsets, which are uncertain.
+
+        Least squares over point and offset errors o ~ N(0, offset covariance). The point is
+        returned for the offsets the state has, moved along d(point) / d(offsets) from where the
+        residuals are least: there the linearisation is right.
+        """
+        if walked.dof < 1:
+            return walked
+        radars = sorted({member.slot.radar for member in walked.members})
+        place = np.array([radars.index(member.slot.radar) for member in walked.members])
+        antennas = np.array([[m.slot.x_m, m.slot.y_m] for m in walked.members])
+        z = np.array([m.leftover.range_m - self._offsets[m.slot.radar] for m in walked.members])
+        variance = np.array([m.leftover.sigma_m**2 + m.slot.drift for m in walked.members])
+        offset_part = np.zeros((len(z), len(radars)))
+        offset_part[np.arange(len(z)), place] = 1.0
+        prior = self._offset_covariance[np.ix_(radars, radars)]
+        prior = np.asarray(np.linalg.inv(prior + 1e-12 * np.eye(len(radars))))
+        point, offsets = walked.point_m.copy(), np.zeros(len(radars))
+        for _ in range(4):
+            away = point - antennas
+            distance = np.hypot(away[:, 0], away[:, 1])
+            u = away / distance[:, None]
+            residual = z - distance - offset_part @ offsets
+            J = np.hstack([u, offset_part])
+            information = (J.T / variance) @ J
+            information[2:, 2:] += prior
+            gradient = (J.T / variance) @ residual
+            gradient[2:] -= prior @ offsets
+            change = np.linalg.solve(information + 1e-9 * np.eye(len(information)), gradient)
+            point, offsets = point + change[:2], offsets + change[2:]
+        covariance = np.linalg.inv((u.T / variance) @ u + np.eye(2) / self._rule.prior_sigma_m**2)
+        by_offsets = np.zeros((2, len(self._offsets)))
+        by_offsets[:, radars] = -covariance @ (u.T / variance) @ offset_part
+        return Tracklet(
+            point_m=point - by_offsets[:, radars] @ offsets,
+            covariance=covariance,
+            by_offsets=by_offsets,
+            members=walked.members,
+            chi_square=float(residual @ (residual / variance) + offsets @ prior @ offsets),
+            dof=walked.dof,
+            share=walked.share,
+            label=walked.label,
+        )
+
+
+def is_believable(tracklet: Tracklet, n_radars: int, rule: TrackletRule) -> bool:
+    """Tell whether a tracklet is evidence of a point at rest; ``n_radars`` is 1 or 2."""
+    frames = {member.slot.back for member in tracklet.members}
+    alone = n_radars == 1
+    if len(frames) < (rule.single_min_frames if alone else rule.min_frames):
+        return False
+    hits: dict[int, int] = {}
+    for member in tracklet.members:
+        hits[member.slot.radar] = hits.get(member.slot.radar, 0) + 1
+    if len(hits) < n_radars or min(hits.values()) < rule.min_hits_per_radar:
+        return False
+    if tracklet.share < rule.min_share:
+        return False
+    if alone:
+        spread = float(np.linalg.eigvalsh(tracklet.covariance)[-1])
+        if spread > rule.single_max_sigma_m**2:
+            return False
+    limit = tracklet.dof + rule.excess_sigmas * math.sqrt(2.0 * max(tracklet.dof, 0))
+    return tracklet.chi_square <= limit
+
+
+def take(members: Iterable[Member]) -> None:
+    """Remove the ranges of a tracklet from what is unused."""
+    for member in members:
+        member.slot.unused.remove(member.leftover)
+
+
+def find_tracklets(
+    tracker: Tracker,
+    guesses: Sequence[Guess],
+    frames: Sequence[Sequence[Slot]],
+    n_radars: int,
+    rule: TrackletRule,
+    *,
+    is_point: Callable[[Tracklet], bool] | None = None,
+) -> list[Tracklet]:
+    """Return the believable tracklets, best first; their ranges are taken out of the frames.
+
+    ``is_point`` may have doubts about a tracklet that is of a point at rest in all else.
+    """
+    available: dict[int, int] = {}
+    for slots in frames:
+        for slot in slots:
+            available[slot.radar] = available.get(slot.radar, 0) + bool(slot.unused)
+    if len(available) < n_radars or min(available.values()) < rule.min_hits_per_radar:
+        return []
+    found: list[Tracklet] = []
+    waiting = list(guesses)
+    while waiting:
+        followed = [(tracker.follow(guess, frames), guess) for guess in waiting]
+        believed = [pair for pair in followed if is_believable(pair[0], n_radars, rule)]
+        if is_point is not None:
+            believed = [pair for pair in believed if pair[0].label is not None or is_point(pair[0])]
+        if not believed:
+            break
+        best, chosen = max(believed, key=lambda pair: pair[0].score)
+        take(best.members)
+        found.append(best)
+        # What is left may have lost its ranges: follow it again.
+        waiting = [guess for _, guess in believed if guess is not chosen]
+    return found
+
+
+_FORBIDDEN = 1e9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RangeBearing:
+    """One point seen: range [m] and bearing [rad] in the body frame, covariance (2, 2).
+
+    ``label`` names the target where that is known.
+    """
+
+    range_m: float
+    bearing_rad: float
+    covariance: Array
+    label: int | None = None
+
+    @property
+    def values(self) -> Array:
+        """Return [range m, bearing rad], shape (2,)."""
+        return np.array([self.range_m, self.bearing_rad])
+
+    def body_point(self, n_radars: int) -> BodyPoint:
+        """Return the point in the body frame, its covariance to first order."""
+        c, s = math.cos(self.bearing_rad), math.sin(self.bearing_rad)
+        G = np.array([[c, -self.range_m * s], [s, self.range_m * c]])
+        return BodyPoint(
+            point_m=self.range_m * np.array([c, s]),
+            covariance=G @ self.covariance @ G.T,
+            by_offsets=np.zeros((2, n_radars)),
+        )
+
+
+def range_bearing_rows(state: State, row: int, seen: RangeBearing) -> FeatureRows:
+    """Return residual, H and S of a point that would be the landmark in ``row``."""
+    R = rotation(state.heading_rad)
+    b = R.T @ (state.landmarks_m[row] - state.position_m)
+    q = float(b @ b)
+    r = math.sqrt(q)
+    G = np.array([[b[0] / r, b[1] / r], [-b[1] / q, b[0] / q]]) @ R.T
+    at = np.concatenate([np.array([1, 2]), state.landmark_columns(np.array([row]))])
+    H = np.hstack([-G, G])
+    S = H @ state.P.block(at) @ H.T + seen.covariance
+    residual = seen.values - np.array([r, math.atan2(b[1], b[0])])
+    residual[1] = wrap_angle(float(residual[1]))
+    return FeatureRows(residual=residual, at=at, H=H, S=(S + S.T) / 2)
+
+
+def named_rows(
+    state: State, points: Sequence[RangeBearing], landmark_of_label: Mapping[int, int]
+) -> list[int | None] | None:
+    """Return the rows that labels name, -1 for new ones; None if not every point has a label."""
+    labels = [point.label for point in points if point.label is not None]
+    if len(labels) < len(points):
+        return None
+    known = {id_: row for row, id_ in enumerate(state.landmark_ids)}
+    return [known.get(landmark_of_label.get(label, -1), -1) for label in labels]
+
+
+def assign(
+    state: State, points: Sequence[RangeBearing], gate: float, new_gate: float, reach_m: float
+) -> list[int | None]:
+    """Return for each point the row of its landmark, -1 for a new one, None where in doubt.
+
+    A point farther than ``new_gate`` (squared Mahalanobis distance) from every landmark is new;
+    one that is nearer but not assigned is in doubt.
+    """
+    if not points:
+        return []
+    n = len(state.landmark_ids)
+    cost = np.full((len(points), n + len(points)), _FORBIDDEN)
+    nearest = np.full(len(points), math.inf)
+    R = rotation(state.heading_rad)
+    for i, point in enumerate(points):
+        cost[i, n + i] = gate
+        place = state.position_m + R @ point.body_point(0).point_m
+        away = state.landmarks_m - place
+        for row in np.flatnonzero(np.hypot(away[:, 0], away[:, 1]) <= reach_m):
+            distance = range_bearing_rows(state, int(row), point).mahalanobis_sq
+            nearest[i] = min(nearest[i], distance)
+            if distance < gate:
+                cost[i, row] = distance
+    rows: list[int | None] = []
+    columns = linear_sum_assignment(cost)[1].tolist()
+    for column, distance in zip(columns, nearest.tolist(), strict=True):
+        if column < n:
+            rows.append(column)
+        else:
+            rows.append(-1 if distance > new_gate else None)
+    return rows

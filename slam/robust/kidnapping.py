@@ -1,0 +1,516 @@
+"""Whether the robot is where the map has it, and what to do when it was carried away.
+
+Each landmark that a radar should see is a trial. Where the pose is right, a range lies near its
+prediction with the detection probability; where it is not, by chance only: with n ranges over a
+span L, with 1 - exp(-n w / L) for a gate of width w. The log likelihood ratios are summed from each
+of several moments at which the robot may have been carried, and the largest sum counts (a
+cumulative sum test, Page, Biometrika 41, 1954, with few moments). Landmarks mapped after that
+moment were put where the robot thought it was: they are no witnesses. One landmark that was taken
+away is no proof about the robot: what each may say is bounded, so that several must be missing.
+
+Where it was set down, a new *island* begins: the error of the pose is zero by definition, what is
+seen becomes landmarks of the island, and those of the old map stay in the state, elsewhere. All
+errors keep their correlations, the wheels' calibration and the range offsets are shared.
+
+An island and the old map are joined by a motion T that lays landmarks of one on those of the
+other. Two pairs of landmarks with equal distances give a T, all pairs that then lie together test
+it. Its evidence is the likelihood of their residuals r with T integrated out, uniform over the
+map's surroundings of area A and all headings (S covariance of r, N derivative of r by T)::
+
+    ln p = -(r^T S^-1 r + ln det(2 pi S) + ln det(N^T S^-1 N / 2 pi)) / 2 - ln(2 pi A)
+
+against ln beta for each landmark that would be new, and against every other T. Islands are joined
+when one T stands out. In right-invariant errors, T = Exp(e_T) T^ adds the same e_T to pose and
+island: exact however little is known of T, so that the join is a merge (module ``merging``).
+
+When the evidence has grown until the robot must be elsewhere (module ``surprise``), what was
+measured since it was carried, perhaps of other landmarks than it was taken for, is forgotten. An
+island begins, and ends when its landmarks are found on the map (module ``relocation``).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtri
+
+from slam.geometry import between, compose, transform
+from slam.robust.map import Existence, apply_merge, find_merge
+from slam.robust.matching import SureLandmarks
+from slam.robust.parameters import BackEndParameters, MapRule, RelocationRule, SurpriseRule
+from slam.robust.ranges import RangeScan, View
+from slam.robust.run_log import RunLog
+from slam.robust.smoother import relinearise
+from slam.robust.state import (
+    HEADING,
+    Array,
+    Indices,
+    State,
+    SymmetricMatrix,
+    quarter_turn,
+    rotation,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """What a landmark says, in nats: positive if the robot is not where the map has it."""
+
+    landmark_id: int
+    evidence: float
+
+
+def trials(
+    near: SureLandmarks,
+    seen: View,
+    scans: Sequence[RangeScan],
+    state: State,
+    parameters: BackEndParameters,
+) -> list[Trial]:
+    """Return one trial for each range that should be among those of some scans.
+
+    Parameters
+    ----------
+    near, seen
+        Landmarks that may be in view, all landmarks in view.
+    scans
+        Of the radars of one side.
+    state
+        Tells the ids of all rows, and which are points.
+    parameters
+        Noise of a range, detection probability; what counts.
+    """
+    noise, rule = parameters.ranges, parameters.surprise
+    rows, ids, n_points = near.rows, state.landmark_ids, len(state.landmark_ids)
+    inside = seen.inside(noise, -rule.view_inset_rad, -rule.view_inset_m)
+    variances = near.prior.diagonal()
+    counts = inside[rows.radars, rows.landmarks] & (variances <= rule.most_sigma_m**2)
+    counts &= rows.landmarks < n_points  # a wall may end before it comes into view
+    by_radar = {scan.radar: scan for scan in scans}
+    detection = min(noise.detection_probability, 1.0 - 1e-3)
+    span_m = noise.max_range_m - noise.min_range_m
+    found = []
+    for k in np.flatnonzero(counts).tolist():
+        scan = by_radar[int(rows.radars[k])]
+        if scan.may_hide(float(rows.predicted_m[k])):
+            continue
+        sigmas = np.array([scan.sigma(i, noise.sigma_m) for i in range(len(scan.ranges_m))])
+        gates_m = rule.gate_sigmas * np.sqrt(float(variances[k]) + sigmas**2)
+        chance = 1.0 - math.exp(-2.0 * float(gates_m.sum()) / span_m)
+        chance = min(max(chance, rule.least_chance), detection)
+        if np.any(np.abs(np.array(scan.ranges_m) - rows.predicted_m[k]) <= gates_m):
+            evidence = math.log(chance / detection)
+        else:
+            evidence = math.log((1.0 - chance) / (1.0 - detection))
+        found.append(Trial(ids[int(rows.landmarks[k])], evidence))
+    return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Hypothesis:
+    """The robot was carried away before a pose: who knew its place before, and what they say."""
+
+    first_pose: int
+    witnesses: frozenset[int]
+    votes: dict[int, float]
+
+    def score(self) -> float:
+        return sum(self.votes.values())
+
+    def score_without_one(self) -> float:
+        """Return the score without the landmark that says most against the pose."""
+        return self.score() - max(self.votes.values(), default=0.0)
+
+
+class Surprise:
+    """The running evidence that the robot is not where the map has it.
+
+    Parameters
+    ----------
+    rule
+        Bounds.
+    """
+
+    def __init__(self, rule: SurpriseRule) -> None:
+        self._rule = rule
+        self._hypotheses: deque[_Hypothesis] = deque(maxlen=rule.hypotheses)
+
+    @property
+    def score(self) -> float:
+        """Return the evidence in nats of the best hypothesis, zero or more."""
+        return max((one.score() for one in self._hypotheses), default=0.0)
+
+    @property
+    def first_pose(self) -> int:
+        """Return the first pose after the robot was carried, by the best hypothesis."""
+        return max(self._hypotheses, key=_Hypothesis.score).first_pose
+
+    @property
+    def witnesses(self) -> frozenset[int]:
+        """Return the landmarks that were known before that."""
+        return max(self._hypotheses, key=_Hypothesis.score).witnesses
+
+    @property
+    def is_suspicious(self) -> bool:
+        """Tell whether more than one landmark speaks against the pose.
+
+        One alone may hide behind a box or be of another shape than a point: were that enough, it
+        could neither be deleted nor solved for again, and would speak on.
+        """
+        scores = (one.score_without_one() for one in self._hypotheses)
+        return max(scores, default=0.0) > self._rule.suspicious
+
+    @property
+    def is_carried(self) -> bool:
+        """Tell whether the robot must be elsewhere."""
+        return self.score > self._rule.carried
+
+    def look(self, frame: Sequence[Trial], pose: int, ids: Iterable[int]) -> None:
+        """Take in the trials of one frame, given its pose and the landmarks known before."""
+        last = self._hypotheses[-1].first_pose if self._hypotheses else -math.inf
+        if frame and pose - last >= self._rule.every:
+            self._hypotheses.append(_Hypothesis(pose, frozenset(ids), {}))
+        rule = self._rule
+        for one in self._hypotheses:
+            for trial in frame:
+                if trial.landmark_id in one.witnesses:
+                    vote = one.votes.get(trial.landmark_id, 0.0) + trial.evidence
+                    vote = min(max(vote, -rule.most_for), rule.most_against)
+                    one.votes[trial.landmark_id] = vote
+
+    def reset(self) -> None:
+        """Begin anew, without suspicion."""
+        self._hypotheses.clear()
+
+
+# Far more than what is left to know of T once it is found; sets nothing.
+_FREE_RAD, _FREE_M = 1.0, 1.0
+_SURROUNDINGS_M = 1.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Join:
+    """A motion that lays an island on the map.
+
+    ``motion`` (3,) is applied from the left to all of the island; ``pairs`` are rows (landmark
+    elsewhere, landmark of the island); ``evidence`` is in nats over that all of them are new.
+    """
+
+    motion: Array
+    pairs: tuple[tuple[int, int], ...]
+    evidence: float
+
+
+def set_down(state: State, pose: Array) -> None:
+    """Begin an island: the pose becomes one without doubt, in place; nothing else is forgotten."""
+    T = state.additive_transform()
+    P = T @ state.P.full() @ T.T
+    P[:3, :] = 0.0
+    P[:, :3] = 0.0
+    state.position_m = np.array(pose[:2])
+    state.heading_rad = float(pose[2])
+    # With no doubt about the heading, invariant errors are additive ones.
+    state.P = SymmetricMatrix(P)
+
+
+def find_join(
+    state: State,
+    island: Sequence[int],
+    elsewhere: Sequence[int],
+    map_rule: MapRule,
+    rule: RelocationRule,
+) -> Join | None:
+    """Return the join that stands out, or None.
+
+    Parameters
+    ----------
+    state
+        With an island.
+    island, elsewhere
+        Rows of landmarks believed in.
+    map_rule, rule
+        Density of unmapped landmarks; when a join stands out.
+    """
+    if len(island) < rule.least_landmarks or len(elsewhere) < rule.least_landmarks:
+        return None
+    joins: dict[tuple[tuple[int, int], ...], Join] = {}
+    tried: set[tuple[tuple[int, int], ...]] = set()
+    for pairs in _constellations(state, island, elsewhere, rule):
+        if pairs in tried:
+            continue
+        tried.add(pairs)
+        join = _judged(state, pairs, elsewhere, map_rule)
+        if join is not None and len(join.pairs) >= rule.least_landmarks:
+            joins[join.pairs] = join
+    ranked = sorted(joins.values(), key=lambda join: -join.evidence)
+    if not ranked or ranked[0].evidence < rule.evidence:
+        return None
+    best = ranked[0]
+    rivals = [join for join in ranked[1:] if _differ(state, join, best, rule)]
+    if rivals and best.evidence - rivals[0].evidence < rule.lead:
+        return None
+    return best
+
+
+def _differ(state: State, one: Join, other: Join, rule: RelocationRule) -> bool:
+    """Tell whether two joins put the robot in different places."""
+    away = between(compose(one.motion, state.pose), compose(other.motion, state.pose))
+    return math.hypot(away[0], away[1]) > rule.reach_m or abs(float(away[2])) > rule.turn_rad
+
+
+def _constellations(
+    state: State, island: Sequence[int], elsewhere: Sequence[int], rule: RelocationRule
+) -> list[tuple[tuple[int, int], ...]]:
+    """Return the pairings that two landmarks of the island with two elsewhere lead to."""
+    here, there = np.array(island), np.array(elsewhere)
+    points, targets = state.landmarks_m[here], state.landmarks_m[there]
+    gaps = targets[None, :] - targets[:, None]
+    lengths = np.hypot(gaps[..., 0], gaps[..., 1])
+    angles = np.arctan2(gaps[..., 1], gaps[..., 0])
+    found = []
+    for a in range(len(here)):
+        for b in range(a + 1, len(here)):
+            gap = points[b] - points[a]
+            length = float(np.hypot(*gap))
+            if length < rule.least_base_m:
+                continue
+            alike = np.abs(lengths - length) <= rule.reach_m
+            for i, j in np.argwhere(alike & (lengths >= rule.least_base_m)).tolist():
+                turn = float(angles[i, j]) - math.atan2(gap[1], gap[0])
+                R = rotation(turn)
+                middle = (targets[i] + targets[j]) / 2 - R @ (points[a] + points[b]) / 2
+                moved = points @ R.T + middle
+                away = np.hypot(*np.moveaxis(moved[:, None] - targets[None, :], -1, 0))
+                pairs = _nearest(away, rule.reach_m)
+                if len(pairs) >= rule.least_landmarks:
+                    found.append(tuple((int(there[t]), int(here[p])) for p, t in pairs))
+    found.sort(key=lambda pairs: -len(pairs))
+    return found[: rule.most_tried]
+
+
+def _nearest(away: Array, reach_m: float) -> list[tuple[int, int]]:
+    """Return mutual nearest neighbours (row, column) within reach."""
+    best_column, best_row = away.argmin(axis=1), away.argmin(axis=0)
+    return [
+        (row, int(column))
+        for row, column in enumerate(best_column)
+        if best_row[column] == row and away[row, column] <= reach_m
+    ]
+
+
+def _judged(
+    state: State, pairs: tuple[tuple[int, int], ...], elsewhere: Sequence[int], rule: MapRule
+) -> Join | None:
+    """Return the best join of some pairs, the worst left out until all fit; None below two."""
+    while len(pairs) >= 2:
+        motion, residual, S, N = _aligned(state, pairs)
+        S_inverse = np.linalg.inv(S)
+        distance = float(residual @ S_inverse @ residual)
+        if distance <= chdtri(max(2 * len(pairs) - 3, 1), 0.001):
+            information = N.T @ S_inverse @ N
+            log_det = float(np.linalg.slogdet(math.tau * S)[1])
+            log_det += float(np.linalg.slogdet(information / math.tau)[1])
+            targets = state.landmarks_m[np.array(elsewhere)]
+            area = float(np.prod(np.ptp(targets, axis=0) + 2 * _SURROUNDINGS_M))
+            evidence = -0.5 * (distance + log_det) - math.log(math.tau * area)
+            evidence -= len(pairs) * math.log(rule.unmapped_per_m2)
+            return Join(motion=motion, pairs=pairs, evidence=evidence)
+        apart = residual.reshape(-1, 2)
+        blocks = [S[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(len(pairs))]
+        misfits = [float(r @ np.linalg.solve(B, r)) for r, B in zip(apart, blocks, strict=True)]
+        worst = int(np.argmax(misfits))
+        pairs = pairs[:worst] + pairs[worst + 1 :]
+    return None
+
+
+def _aligned(state: State, pairs: tuple[tuple[int, int], ...]) -> tuple[Array, Array, Array, Array]:
+    """Return the motion of least squares, residual (2 k,), its covariance and derivative (2 k, 3).
+
+    residual = T l_island - l_elsewhere. While there is an island, errors of landmarks are added to
+    T (module docstring), so their additive errors are what counts.
+    """
+    there = np.array([pair[0] for pair in pairs])
+    here = np.array([pair[1] for pair in pairs])
+    points, targets = state.landmarks_m[here], state.landmarks_m[there]
+    P = _additive_block(state, np.concatenate([here, there]))
+    k = 2 * len(pairs)
+    motion = _first_alignment(points, targets)
+    for _ in range(5):
+        turned = np.kron(np.eye(len(pairs)), rotation(float(motion[2])))
+        H = np.hstack([turned, -np.eye(k)])
+        S = H @ P @ H.T
+        S = (S + S.T) / 2 + 1e-10 * np.eye(k)
+        moved = transform(motion, points)
+        residual = (moved - targets).ravel()
+        N = np.zeros((k, 3))
+        N[0::2, 0] = N[1::2, 1] = 1.0
+        N[:, 2] = quarter_turn(moved).ravel()
+        weighted = np.linalg.solve(S, N)
+        change = -np.linalg.solve(N.T @ weighted, weighted.T @ residual)
+        motion = compose(np.array([change[0], change[1], change[2]]), motion)
+        if float(np.abs(change).max()) < 1e-9:
+            break
+    residual = (transform(motion, points) - targets).ravel()
+    return motion, residual, S, N
+
+
+def _additive_block(state: State, rows: Indices) -> Array:
+    """Return the covariance of additive errors of landmarks, shape (2 k, 2 k)."""
+    at = np.concatenate([[HEADING], state.landmark_columns(rows)])
+    P = state.P.block(at)
+    T = np.hstack([quarter_turn(state.landmarks_m[rows]).reshape(-1, 1), np.eye(2 * len(rows))])
+    return np.asarray(T @ P @ T.T)
+
+
+def _first_alignment(points: Array, targets: Array) -> Array:
+    """Return the motion of unweighted least squares (Umeyama without scale), shape (3,)."""
+    p, t = points - points.mean(axis=0), targets - targets.mean(axis=0)
+    turn = math.atan2(float(np.sum(p[:, 0] * t[:, 1] - p[:, 1] * t[:, 0])), float(np.sum(p * t)))
+    shift = targets.mean(axis=0) - rotation(turn) @ points.mean(axis=0)
+    return np.array([shift[0], shift[1], turn])
+
+
+def apply_join(state: State, join: Join, island: Collection[int], sigma_m: float) -> None:
+    """Lay the island, rows of its landmarks given, on the map, and merge the pairs."""
+    motion = join.motion
+    R, rows = rotation(float(motion[2])), np.array(sorted(island), dtype=np.intp)
+    blocks = [np.array([1, 2]), *state.landmark_columns(rows).reshape(-1, 2)]
+    # Old landmarks do not turn with the island: their invariant errors follow the heading's alone.
+    A = np.eye(state.P.size)
+    for block in blocks:
+        A[np.ix_(block, block)] = R
+        A[block, HEADING] = -quarter_turn(motion[:2])
+    N = np.zeros((state.P.size, 3))
+    N[HEADING, 0] = 1.0
+    first = state.offsets.stop
+    N[first:, 0] = -state.turned_features().ravel()
+    for block in blocks:
+        N[block, 0] = 0.0
+        N[block, 1:] = np.eye(2)
+    free = np.diag([_FREE_RAD**2, _FREE_M**2, _FREE_M**2])
+    P = A @ state.P.full() @ A.T + N @ free @ N.T
+    pose = compose(motion, state.pose)
+    state.position_m, state.heading_rad = pose[:2].copy(), float(pose[2])
+    state.landmarks_m = state.landmarks_m.copy()
+    state.landmarks_m[rows] = transform(motion, state.landmarks_m[rows])
+    state.P = SymmetricMatrix((P + P.T) / 2)
+    apply_merge(state, join.pairs, sigma_m)
+
+
+class Whereabouts:
+    """Keeps watch over the pose.
+
+    Parameters
+    ----------
+    parameters
+        Noise and rules.
+    """
+
+    def __init__(self, parameters: BackEndParameters) -> None:
+        self.parameters = parameters
+        self._surprise = Surprise(parameters.surprise)
+        self._first_pose = 0
+        self._is_lost = False
+        self.elsewhere: frozenset[int] = frozenset()
+
+    @property
+    def is_lost(self) -> bool:
+        """Tell whether the place of the robot on the map is unknown.
+
+        It stays so where nothing of the map is left: then there is no way back.
+        """
+        return self._is_lost
+
+    @property
+    def is_suspicious(self) -> bool:
+        """Tell whether something speaks against the pose."""
+        return self._surprise.is_suspicious
+
+    @property
+    def is_carried(self) -> bool:
+        """Tell whether the robot must be elsewhere."""
+        return self._surprise.is_carried
+
+    @property
+    def lost_covariance(self) -> Array:
+        """Return the covariance of a pose of which nothing is known, shape (3, 3)."""
+        sigma_m = self.parameters.relocation.lost_position_m
+        return np.diag([sigma_m**2, sigma_m**2, math.pi**2 / 3.0])
+
+    def seen_from_here(self, seen: View, state: State) -> View:
+        """Return a view without what is elsewhere."""
+        ids = enumerate(state.feature_ids)
+        return seen.without([row for row, id_ in ids if id_ in self.elsewhere])
+
+    def look(self, trials: Sequence[Trial], state: State, log: RunLog) -> None:
+        """Judge one frame; to be called before anything is learned from it."""
+        self._surprise.look(trials, log.n_poses - 1, state.feature_ids)
+
+    def set_down(self, state: State, existence: Existence, log: RunLog) -> None:
+        """Begin an island at the present pose, and forget what was measured since it was wrong.
+
+        What came into the map since is taken out again; the rest is solved for without the ranges
+        since then. Where there is an island already it is given up: what is left is the old map.
+        """
+        first = self._surprise.first_pose
+        log.forget_from(first)
+        known = self.elsewhere if self._is_lost else self._surprise.witnesses
+        for id_ in state.feature_ids:
+            if id_ not in known:
+                forget(id_, state, existence, log)
+        pose = state.pose
+        if not self.is_lost:
+            relinearise(log, state, self.parameters)
+        set_down(state, pose)
+        log.carried(pose)
+        self.elsewhere = frozenset(state.feature_ids)
+        self._is_lost = True
+        self._first_pose = log.n_poses - 1
+        self._surprise.reset()
+
+    def find(self, state: State, existence: Existence, log: RunLog) -> tuple[tuple[int, int], ...]:
+        """Join the island with the map if it is certain how; return (kept, gone) ids."""
+        rules = self.parameters
+        rows = [r for r, id_ in enumerate(state.landmark_ids) if existence.is_reported(id_)]
+        island = [r for r in rows if state.landmark_ids[r] not in self.elsewhere]
+        old = [r for r in rows if state.landmark_ids[r] in self.elsewhere]
+        join = find_join(state, island, old, rules.map, rules.relocation)
+        if join is None:
+            return ()
+        ids = [(state.landmark_ids[kept], state.landmark_ids[gone]) for kept, gone in join.pairs]
+        whole = [r for r, id_ in enumerate(state.landmark_ids) if id_ not in self.elsewhere]
+        apply_join(state, join, whole, rules.map.merge_sigma_m)
+        log.lay(self._first_pose, join.motion)
+        for kept, gone in ids:
+            existence.merge(kept, gone)
+            log.rename(gone, kept)
+        self.elsewhere = frozenset()
+        self._is_lost = False
+        self._surprise.reset()
+        return tuple(ids)
+
+
+def forget(id_: int, state: State, existence: Existence, log: RunLog) -> None:
+    """Take a landmark or a wall out of the belief and all that was measured of it."""
+    state.remove(state.feature_ids.index(id_))
+    existence.forget(id_)
+    log.drop(id_)
+
+
+def merge_landmarks(
+    state: State, existence: Existence, log: RunLog, rule: MapRule, elsewhere: frozenset[int]
+) -> tuple[tuple[int, int], ...]:
+    """Make the merge that is certain enough now, if any; return (kept, gone) ids."""
+    merge = find_merge(state, existence, rule, elsewhere)
+    if merge is None:
+        return ()
+    ids = tuple((state.landmark_ids[kept], state.landmark_ids[gone]) for kept, gone in merge.pairs)
+    apply_merge(state, merge.pairs, rule.merge_sigma_m)
+    for kept, gone in ids:
+        existence.merge(kept, gone)
+        log.rename(gone, kept)
+    return ids

@@ -1,0 +1,654 @@
+"""The map kept tidy: existence, merging, points and walls and round targets told apart.
+
+The statement ``l_i - l_j = 0`` is a measurement of the whole state, H = [e_li: I, e_lj: -I]:
+merging after a loop bends the trajectory back, and everything that is correlated with it. It is
+made late, when one merge, or two disjoint ones together, stand out from all competitors.
+
+The specular echo of a wall comes from wherever the wall is nearest, so its range is *linear* in
+the antenna's position a; a point's is a hyperbola::
+
+    point at b:     r = |b - a|
+    wall (phi, d):  r = d - n . a,   n = [cos phi, sin phi]
+
+A corner of two walls sends the pulse back to where it came from by way of both, and the length of
+that way is twice the distance to the apex: a corner is a point, for ranges. Both laws have two
+unknowns, so the difference of their chi-squares is twice the logarithm of the likelihood ratio
+(and that of their BIC). Over a short displacement, or at a great distance, it is near zero, and
+nothing is decided. Source of the laws: Leonard and Durrant-Whyte, "Directed Sonar Sensing for
+Mobile Robot Navigation", 1992, chapter 2.
+
+Its range is r = |c - a| - R, with c its axis and R its radius: a law between a point's (R = 0) and
+a wall's. Over a few frames no radius is seen, and the point that fits lies on the surface; the
+farther the robot drives, the more ranges miss it. So points whose ranges tell a radius get one.
+
+The ranges of the last frames are laid along odometry alone, for poses that the ranges have
+corrected already have given way to the wrong law. Odometry errs so that it looks like a radius:
+a scale error s stretches the way, x^2 / 2 r, by as much as R = 2 s r does, and a curvature kappa
+bends it by kappa x^2 / 2. Both are unknowns of the fit, with the radars' offsets and the wheels'
+white noise, each with what is known of it before. Turns are left out: there wheels err most.
+
+That makes a radius likely. It is believed if a solution over all poses is likelier with it. It is
+no unknown of the state: what is not known of it counts as noise of the landmark's ranges.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence, Set
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from slam.geometry import between, transform
+from slam.robust.parameters import BackEndParameters, MapRule, RoundnessRule, WheelNoise
+from slam.robust.run_log import LoggedSightings, RunLog
+from slam.robust.smoother import give_radius
+from slam.robust.state import Array, Indices, State, quarter_turn
+
+
+@dataclass(slots=True)
+class _Record:
+    score: float = 0.0
+    hits: int = 0
+
+
+class Existence:
+    """Scores of all landmarks by id, and which pairs were seen whole in common frames.
+
+    Parameters
+    ----------
+    rule
+        Steps and limits.
+    """
+
+    def __init__(self, rule: MapRule) -> None:
+        self._rule = rule
+        self._records: dict[int, _Record] = {}
+        self._together: dict[tuple[int, int], int] = {}
+
+    def hit(self, landmark_id: int, frames: int = 1) -> None:
+        """Count frames that hit a landmark; a new id begins here."""
+        record = self._records.setdefault(landmark_id, _Record())
+        record.score = min(record.score + frames * self._rule.hit, self._rule.most)
+        record.hits += frames
+
+    def miss(self, landmark_id: int) -> None:
+        """Count a frame that should have hit a landmark and did not."""
+        self._records[landmark_id].score -= self._rule.miss
+
+    def lost(self) -> list[int]:
+        """Return the ids of landmarks that are believed in no longer."""
+        return [id_ for id_, record in self._records.items() if record.score < self._rule.least]
+
+    def hits(self, landmark_id: int) -> int:
+        """Return the number of frames that hit a landmark."""
+        return self._records[landmark_id].hits
+
+    def is_reported(self, landmark_id: int) -> bool:
+        """Tell whether a landmark was hit often enough to be shown."""
+        return self._records[landmark_id].hits >= self._rule.report_hits
+
+    def forget(self, landmark_id: int) -> None:
+        """Drop all that is known of a landmark."""
+        self._records.pop(landmark_id, None)
+        for pair in [pair for pair in self._together if landmark_id in pair]:
+            del self._together[pair]
+
+    def seen_whole(self, landmark_ids: Iterable[int]) -> None:
+        """Count a frame in which each of these was seen by both radars of a pair."""
+        ids = sorted(landmark_ids)
+        for place, first in enumerate(ids):
+            for second in ids[place + 1 :]:
+                key = (first, second)
+                self._together[key] = self._together.get(key, 0) + 1
+
+    def are_apart(self, first: int, second: int) -> bool:
+        """Tell whether two landmarks were seen whole together, and so are two.
+
+        Only whole sightings count: of two copies of one target, each can be given one of its two
+        ranges, and they would veto their own merge.
+        """
+        key = (min(first, second), max(first, second))
+        return self._together.get(key, 0) >= self._rule.apart_frames
+
+    def merge(self, kept: int, gone: int) -> None:
+        """Let one landmark take over what is known of another."""
+        into, other = self._records[kept], self._records[gone]
+        into.score = min(max(into.score, 0.0) + max(other.score, 0.0), self._rule.most)
+        into.hits += other.hits
+        for (first, second), count in list(self._together.items()):
+            if gone in (first, second):
+                third = second if first == gone else first
+                if third != kept:
+                    key = (min(kept, third), max(kept, third))
+                    self._together[key] = self._together.get(key, 0) + count
+        self.forget(gone)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Merge:
+    """Landmarks by row, the older first, and how likely the statement is.
+
+    ``log_likelihood`` is ln N(l_i - l_j; 0, S), that of several merges their joint one.
+    """
+
+    pairs: tuple[tuple[int, int], ...]
+    mahalanobis_sq: float
+    log_likelihood: float
+
+
+def merge_rows(
+    state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float
+) -> tuple[Indices, Array, Array, Array]:
+    """Return columns, H (2 k, 4 k), residual (2 k,) and R (2 k, 2 k) of k merges of rows."""
+    at = state.landmark_columns(np.array(pairs, dtype=np.intp).ravel())
+    H = np.asarray(
+        np.kron(np.eye(len(pairs)), np.hstack([np.eye(2), -np.eye(2)])), dtype=np.float64
+    )
+    apart = [state.landmarks_m[i] - state.landmarks_m[j] for i, j in pairs]
+    return at, H, -np.concatenate(apart), sigma_m**2 * np.eye(2 * len(pairs))
+
+
+def judge(state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float) -> Merge:
+    """Return the likelihood of a merge, or of several together."""
+    at, H, residual, R = merge_rows(state, pairs, sigma_m)
+    S = H @ state.P.block(at) @ H.T + R
+    distance = float(residual @ np.linalg.solve(S, residual))
+    log_det = float(np.linalg.slogdet(S)[1])
+    k = len(residual)
+    return Merge(
+        pairs=pairs,
+        mahalanobis_sq=distance,
+        log_likelihood=-0.5 * (distance + log_det + k * math.log(math.tau)),
+    )
+
+
+def apply_merge(state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float) -> None:
+    """State that pairs of landmarks are one, and marginalise the second of each.
+
+    The covariance changes in Joseph's form: the statement is nearly free of noise.
+    """
+    at, H, residual, R = merge_rows(state, pairs, sigma_m)
+    PHt = state.P.columns(at) @ H.T
+    S = H @ PHt[at] + R
+    S = (S + S.T) / 2
+    K = np.asarray(np.linalg.solve(S, PHt.T).T, dtype=np.float64)
+    state.P.subtract_gains(K, PHt, S)
+    state.correct(K @ residual)
+    ids = state.landmark_ids
+    for kept, gone in pairs:
+        if ids[gone] in state.radii_m:
+            state.radii_m.setdefault(ids[kept], state.radii_m[ids[gone]])
+            state.range_doubts_m.setdefault(ids[kept], state.range_doubts_m.get(ids[gone], 0.0))
+    for row in sorted((second for _, second in pairs), reverse=True):
+        state.remove(row)
+
+
+def find_merge(
+    state: State, existence: Existence, rule: MapRule, elsewhere: Set[int] = frozenset()
+) -> Merge | None:
+    """Return the merge to be made now, one or two disjoint ones, or None.
+
+    A landmark whose id is ``elsewhere`` is merged with none.
+    """
+    candidates = _candidates(state, existence, rule, elsewhere)
+    floor = math.log(rule.unmapped_per_m2)
+    fair = [merge for merge in candidates if merge.log_likelihood > floor]
+    best: Merge | None = None
+    for merge in fair:
+        rivals = [
+            other.log_likelihood
+            for other in candidates
+            if other is not merge and _share_landmark(other, merge)
+        ]
+        stands_out = merge.log_likelihood - max(rivals, default=-math.inf) > rule.merge_lead
+        if stands_out and (best is None or merge.log_likelihood > best.log_likelihood):
+            best = merge
+    if best is not None:
+        return best
+    return _joint_merge(state, fair, 2.0 * floor, rule)
+
+
+def _candidates(
+    state: State, existence: Existence, rule: MapRule, elsewhere: Set[int]
+) -> list[Merge]:
+    """Return all merges of two landmarks within reach that pass the gate.
+
+    Only pairs that are near touch the covariance, all of them at once.
+    """
+    if len(state.landmark_ids) < 2:
+        return []
+    near = cKDTree(state.landmarks_m).query_pairs(rule.merge_reach_m, output_type="ndarray")
+    near = near[np.lexsort((near[:, 1], near[:, 0]))].astype(np.intp)
+    distances = _distances_sq(state, near, rule.merge_sigma_m)
+    # The last word is the judge's: here, rounding must not leave out what it would accept.
+    found = []
+    for first, second in near[distances <= (1.0 + 1e-6) * rule.merge_gate].tolist():
+        ids = state.landmark_ids[first], state.landmark_ids[second]
+        if existence.are_apart(*ids) or not elsewhere.isdisjoint(ids):
+            continue
+        merge = judge(state, ((first, second),), rule.merge_sigma_m)
+        if merge.mahalanobis_sq <= rule.merge_gate:
+            found.append(merge)
+    return found
+
+
+def _distances_sq(state: State, pairs: Indices, sigma_m: float) -> Array:
+    """Return d^2 of the statement that pairs of rows, shape (k, 2), are one landmark each."""
+    start = state.landmark_columns(np.zeros(1, dtype=np.intp))[0]
+    i, j = start + 2 * pairs[:, 0], start + 2 * pairs[:, 1]
+
+    def spread(a: int, b: int) -> Array:
+        entries = state.P.entries
+        own = entries(i + a, i + b) + entries(j + a, j + b)
+        return np.asarray(own - entries(i + a, j + b) - entries(j + a, i + b))
+
+    xx, yy, xy = spread(0, 0) + sigma_m**2, spread(1, 1) + sigma_m**2, spread(0, 1)
+    apart = state.landmarks_m[pairs[:, 0]] - state.landmarks_m[pairs[:, 1]]
+    x, y = apart[:, 0], apart[:, 1]
+    # Where rounding has left no spread at all, nothing is ruled out here.
+    determinant = np.maximum(xx * yy - xy**2, 0.0)
+    numerator = yy * x**2 - 2.0 * xy * x * y + xx * y**2
+    spread_out = determinant > 1e-12 * xx * yy
+    return np.where(spread_out, numerator / np.where(spread_out, determinant, 1.0), 0.0)
+
+
+def _joint_merge(state: State, fair: list[Merge], floor: float, rule: MapRule) -> Merge | None:
+    """Return two disjoint merges that together beat every other two that contradict them."""
+    joint = []
+    for place, one in enumerate(fair):
+        for other in fair[place + 1 :]:
+            if _share_landmark(one, other):
+                continue
+            both = judge(state, one.pairs + other.pairs, rule.merge_sigma_m)
+            if both.mahalanobis_sq <= rule.merge_gate_joint and both.log_likelihood > floor:
+                joint.append(both)
+    joint.sort(key=lambda merge: -merge.log_likelihood)
+    if not joint:
+        return None
+    best = joint[0]
+    for rival in joint[1:]:
+        contradicts = any(
+            mine != theirs and set(mine) & set(theirs)
+            for mine in best.pairs
+            for theirs in rival.pairs
+        )
+        if contradicts and best.log_likelihood - rival.log_likelihood <= rule.merge_lead:
+            return None
+    return best
+
+
+def _share_landmark(one: Merge, other: Merge) -> bool:
+    mine = {row for pair in one.pairs for row in pair}
+    return any(row in mine for pair in other.pairs for row in pair)
+
+
+_STEPS = 8
+_DAMPING = 1e-6
+
+
+class Law(Enum):
+    """What ranges over displacement say of a reflector."""
+
+    POINT = "point"
+    WALL = "wall"
+    UNDECIDED = "undecided"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sightings:
+    """Ranges of one reflector from several places.
+
+    Attributes
+    ----------
+    antennas_m
+        shape (k, 2), in one frame.
+    ranges_m, variances
+        shape (k,): measured, without the offsets known, and their variances [m^2].
+    radars
+        shape (k,): index into the offsets.
+    offset_covariance
+        shape (r, r), of what is not known of the radars' offsets; None where they are known.
+    """
+
+    antennas_m: Array
+    ranges_m: Array
+    variances: Array
+    radars: Array
+    offset_covariance: Array | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Fit:
+    """A law at its best.
+
+    Attributes
+    ----------
+    unknown
+        shape (2,): the law's own two.
+    offsets_m, radars
+        shape (q,): what the offsets of these radars are off by.
+    chi_square
+        Of the residuals and of the offsets.
+    by_law, extra
+        d(range) / d(unknown), shape (k, 2), and d(range) / d(offset), shape (k, q).
+    """
+
+    unknown: Array
+    offsets_m: Array
+    radars: tuple[int, ...]
+    chi_square: float
+    by_law: Array
+    extra: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """Chi-squares of the two laws, each at its best."""
+
+    point: float
+    wall: float
+
+    def law(self, lead: float) -> Law:
+        """Return the law whose chi-square is less by ``lead``, if one is."""
+        if self.wall - self.point >= lead:
+            return Law.POINT
+        return Law.WALL if self.point - self.wall >= lead else Law.UNDECIDED
+
+
+def compare(sightings: Sightings, toward_rad: float) -> Verdict:
+    """Fit both laws to the same ranges.
+
+    Parameters
+    ----------
+    sightings
+        What was measured.
+    toward_rad
+        Roughly the direction of the reflector, in the frame of the antennas.
+    """
+    middle = sightings.antennas_m.mean(axis=0)
+    range_m = float(sightings.ranges_m.mean())
+    n = np.array([math.cos(toward_rad), math.sin(toward_rad)])
+    point = _least(sightings, np.array([*(middle + range_m * n)]), _point_law)
+    wall = _least(sightings, np.array([toward_rad, range_m + float(n @ middle)]), _wall_law)
+    return Verdict(point=point.chi_square, wall=wall.chi_square)
+
+
+def fit_wall(sightings: Sightings, start: Array) -> Fit:
+    """Return the wall (phi, d) of least chi-square near a start."""
+    return _least(sightings, start, _wall_law)
+
+
+def _point_law(unknown: Array, antennas: Array) -> tuple[Array, Array]:
+    away = unknown - antennas
+    distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-6)
+    return distance, away / distance[:, None]
+
+
+def _wall_law(unknown: Array, antennas: Array) -> tuple[Array, Array]:
+    c, s = math.cos(float(unknown[0])), math.sin(float(unknown[0]))
+    by_angle = s * antennas[:, 0] - c * antennas[:, 1]
+    distance = float(unknown[1]) - c * antennas[:, 0] - s * antennas[:, 1]
+    return distance, np.column_stack([by_angle, np.ones(len(antennas))])
+
+
+def _least(
+    sightings: Sightings, start: Array, predict: Callable[[Array, Array], tuple[Array, Array]]
+) -> Fit:
+    """Return a law at its least chi-square: Gauss-Newton, steps halved until it falls."""
+    extra, prior, radars = _offset_part(sightings)
+    unknown, offsets = start, np.zeros(extra.shape[1])
+
+    def chi_square(unknown: Array, offsets: Array) -> float:
+        residual = sightings.ranges_m - predict(unknown, sightings.antennas_m)[0] - extra @ offsets
+        return float(residual @ (residual / sightings.variances) + offsets @ prior @ offsets)
+
+    best = chi_square(unknown, offsets)
+    for _ in range(_STEPS):
+        distance, J = predict(unknown, sightings.antennas_m)
+        residual = sightings.ranges_m - distance - extra @ offsets
+        J = np.hstack([J, extra])
+        weighted = J.T / sightings.variances
+        information, gradient = weighted @ J, weighted @ residual
+        information[2:, 2:] += prior
+        gradient[2:] -= prior @ offsets
+        information += _DAMPING * np.diag(information.diagonal() + 1.0)
+        change = np.linalg.solve(information, gradient)
+        share = 1.0
+        while share > 1e-3:
+            moved = unknown + share * change[:2], offsets + share * change[2:]
+            value = chi_square(*moved)
+            if value <= best:
+                break
+            share *= 0.5
+        else:
+            break
+        decrease, best = best - value, value
+        unknown, offsets = moved
+        if decrease < 1e-4:
+            break
+    return Fit(
+        unknown=unknown,
+        offsets_m=offsets,
+        radars=radars,
+        chi_square=best,
+        by_law=predict(unknown, sightings.antennas_m)[1],
+        extra=extra,
+    )
+
+
+def _offset_part(sightings: Sightings) -> tuple[Array, Array, tuple[int, ...]]:
+    """Return d(range) / d(offset), (k, q), the offsets' information, (q, q), and whose, (q,)."""
+    k = len(sightings.ranges_m)
+    if sightings.offset_covariance is None:
+        return np.zeros((k, 0)), np.zeros((0, 0)), ()
+    used: Sequence[int] = np.unique(sightings.radars).tolist()
+    part = (sightings.radars[:, None] == np.array(used)[None, :]).astype(np.float64)
+    covariance = sightings.offset_covariance[np.ix_(used, used)] + 1e-12 * np.eye(len(used))
+    return part, np.asarray(np.linalg.inv(covariance)), tuple(used)
+
+
+# A radius off by e misses ranges up to 30 degrees from the middle one by e (1 - cos 30 deg), all
+# alike: to the hundred of one passage that is as noise ten times as large.
+_DOUBT_PER_SIGMA = 1.3
+_RADIUS_STEPS = 6
+_KNOTS = 8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Arc:
+    """Ranges of one target along one piece of way, in the odometry frame of its first pose.
+
+    Attributes
+    ----------
+    antennas_m, ranges_m, variances
+        shapes (k, 2), (k,), (k,); ranges without the offsets known.
+    nuisance
+        shape (k, 2, q): d(antenna) / d(scale, curvature, offsets, wheel noise in steps).
+    by_offset
+        shape (k, q): d(range) / d(the same), of the offsets alone.
+    prior
+        shape (q, q): information about all q.
+    start_m
+        shape (2,): where the landmark is believed to be.
+    """
+
+    antennas_m: Array
+    ranges_m: Array
+    variances: Array
+    nuisance: Array
+    by_offset: Array
+    prior: Array
+    start_m: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Radius:
+    """A radius [m] and its standard deviation; chi-square and its degrees of freedom."""
+
+    radius_m: float
+    sigma_m: float
+    chi_square: float
+    dof: int
+
+
+def arc_of(
+    log: RunLog, state: State, landmark_id: int, wheels: WheelNoise, rule: RoundnessRule
+) -> Arc | None:
+    """Return what the last frames say of a landmark; None where that is too little."""
+    seen = log.sightings(landmark_id, rule.window, state.calibration, rule.most_turn_rad)
+    k = len(seen.ranges_m)
+    if k < rule.min_ranges:
+        return None
+    length_m = float(np.ptp(seen.way_m))
+    if length_m < rule.min_way_m:
+        return None
+    place = state.landmarks_m[state.landmark_ids.index(landmark_id)]
+    step_m = length_m / _KNOTS
+    moved = _moved_by_steps(seen, step_m)
+    since = seen.way_m - seen.way_m.min()
+    ahead = np.column_stack([np.cos(seen.headings_rad), np.sin(seen.headings_rad)])
+    by_scale, by_curvature = since[:, None] * ahead, step_m * moved[:, :, :_KNOTS].sum(axis=2)
+    n_offsets = len(state.offsets_m)
+    nuisance = np.concatenate(
+        [by_scale[..., None], by_curvature[..., None], np.zeros((k, 2, n_offsets)), moved], axis=2
+    )
+    by_offset = np.zeros((k, nuisance.shape[2]))
+    by_offset[np.arange(k), 2 + seen.radars] = 1.0
+    at = np.array([3, 5, *range(state.offsets.start, state.offsets.stop)])
+    prior = np.zeros((nuisance.shape[2], nuisance.shape[2]))
+    known = 2 + n_offsets
+    prior[:known, :known] = np.linalg.inv(state.P.block(at) + 1e-12 * np.eye(known))
+    white = np.square(
+        [wheels.heading_rad_per_sqrt_m, wheels.along_m_per_sqrt_m, wheels.across_m_per_sqrt_m]
+    )
+    per_step = np.repeat(white * step_m + 1e-12, _KNOTS)
+    prior[known:, known:] = np.diag(1.0 / per_step)
+    return Arc(
+        antennas_m=seen.antennas_m,
+        ranges_m=seen.ranges_m - state.offsets_m[seen.radars],
+        variances=np.square(seen.sigmas_m),
+        nuisance=nuisance,
+        by_offset=by_offset,
+        prior=prior,
+        start_m=transform(seen.newest, transform(between(state.pose, np.zeros(3)), place)),
+    )
+
+
+def _moved_by_steps(seen: LoggedSightings, step_m: float) -> Array:
+    """Return how errors of the wheels along the way move the antennas, shape (k, 2, 3 _KNOTS).
+
+    The way is cut into steps; a turn, then a shift ahead, then one to the left may happen amid each
+    of them, and move what comes after.
+    """
+    order = np.argsort(seen.way_m, kind="stable")
+    knots_m = seen.way_m[order[0]] + step_m * (np.arange(_KNOTS) + 0.5)
+    way_m = seen.way_m[order]
+    places = np.column_stack([np.interp(knots_m, way_m, seen.places_m[order, i]) for i in (0, 1)])
+    headings = np.interp(knots_m, way_m, seen.headings_rad[order])
+    ahead = np.column_stack([np.cos(headings), np.sin(headings)])
+    after = (seen.way_m[:, None] > knots_m)[..., None]
+    turned = quarter_turn(seen.antennas_m[:, None] - places) * after
+    shifted = [np.where(after, way, 0.0) for way in (ahead, quarter_turn(ahead))]
+    return np.concatenate([each.transpose(0, 2, 1) for each in (turned, *shifted)], axis=2)
+
+
+def radius_of(arc: Arc) -> Radius | None:
+    """Return the radius that ranges tell; None where the fit fails."""
+    unknown = np.concatenate([arc.start_m, np.zeros(1 + len(arc.prior))])
+    for _ in range(_RADIUS_STEPS):
+        q = unknown[3:]
+        away = unknown[:2] - arc.antennas_m - arc.nuisance @ q
+        distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-6)
+        u = away / distance[:, None]
+        residual = arc.ranges_m - (distance - unknown[2] + arc.by_offset @ q)
+        moved = arc.by_offset - np.einsum("ki,kiq->kq", u, arc.nuisance)
+        J = np.hstack([u, -np.ones((len(u), 1)), moved])
+        information = (J.T / arc.variances) @ J
+        information[3:, 3:] += arc.prior
+        gradient = (J.T / arc.variances) @ residual
+        gradient[3:] -= arc.prior @ q
+        try:
+            covariance = np.linalg.inv(information)
+        except np.linalg.LinAlgError:
+            return None
+        unknown = unknown + covariance @ gradient
+    if not np.isfinite(unknown).all() or covariance[2, 2] <= 0.0:
+        return None
+    q = unknown[3:]
+    return Radius(
+        radius_m=float(unknown[2]),
+        sigma_m=math.sqrt(float(covariance[2, 2])),
+        chi_square=float(residual @ (residual / arc.variances) + q @ arc.prior @ q),
+        dof=len(residual) - 3,
+    )
+
+
+class Roundness:
+    """Gives landmarks their radii.
+
+    Parameters
+    ----------
+    rule
+        When a radius is believed.
+    """
+
+    def __init__(self, rule: RoundnessRule) -> None:
+        self._rule = rule
+        self._hits: dict[int, int] = {}
+        self._sigmas_m: dict[int, float] = {}
+
+    def give(
+        self,
+        state: State,
+        log: RunLog,
+        parameters: BackEndParameters,
+        hits: Callable[[int], int],
+    ) -> bool:
+        """Give landmarks the radii that are evident; tell whether all poses were solved for.
+
+        Parameters
+        ----------
+        state, log, parameters
+            The belief, what was measured, and its noise.
+        hits
+            Returns the frames that hit a landmark so far.
+        """
+        solved = False
+        rule = self._rule
+        for row, id_ in enumerate(state.landmark_ids):
+            count = hits(id_)
+            if count - self._hits.get(id_, 0) < rule.every or log.is_condensed(id_):
+                continue
+            self._hits[id_] = count
+            arc = arc_of(log, state, id_, parameters.wheels, rule)
+            radius = None if arc is None else radius_of(arc)
+            if radius is None or not self._is_news(id_, radius):
+                continue
+            self._sigmas_m[id_] = radius.sigma_m
+            told_m = radius.radius_m if self._is_likely(radius) else 0.0
+            known_m = state.radii_m.get(id_, 0.0)
+            if told_m == known_m:
+                continue
+            # Being round takes evidence; of two radii the likelier one is right.
+            lead = 0.0 if known_m else rule.lead
+            if give_radius(log, state, parameters, (row, told_m), lead):
+                solved = True
+                state.range_doubts_m[id_] = _DOUBT_PER_SIGMA * radius.sigma_m if told_m else 0.0
+        return solved
+
+    def _is_news(self, id_: int, radius: Radius) -> bool:
+        """Tell whether a radius is worth a look at all that was measured."""
+        limit = radius.dof + self._rule.excess_sigmas * math.sqrt(2.0 * max(radius.dof, 0))
+        before_m = self._sigmas_m.get(id_)
+        if radius.chi_square > limit:
+            return False
+        if before_m is None:
+            return self._is_likely(radius)
+        return radius.sigma_m < self._rule.sharper * before_m
+
+    def _is_likely(self, radius: Radius) -> bool:
+        least_m = self._rule.sigmas * radius.sigma_m
+        return least_m < radius.radius_m < self._rule.largest_m

@@ -1,0 +1,248 @@
+"""The pipeline around the robust back end: radar frames and odometry in, pose and map out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.config import BackEnd, SlamConfig
+from slam.frames import Detection, Detector, RadarFrame
+from slam.front_end.paper import make_detector
+from slam.geometry import Rig, between
+from slam.paper.clustering import has_moved
+from slam.paper.ekf import Belief
+from slam.paper.pipeline import PoseAt, Slam, StepResult, UwbRadarSlam
+from slam.robust.back_end import RobustBackEnd
+from slam.robust.parameters import BackEndParameters, RangeNoise, WheelNoise
+from slam.robust.ranges import RangeScan
+from slam.robust.state import quarter_turn
+
+Array = NDArray[np.float64]
+
+
+def make_slam(
+    config: SlamConfig, rig: Rig, wheels: WheelNoise, detector: Detector | None = None
+) -> Slam:
+    """Return the pipeline that a configuration names.
+
+    Parameters
+    ----------
+    config
+        ``back_end`` decides.
+    rig
+        Where the radars sit.
+    wheels
+        How the robot's odometry errs, as its specification says; preset ``paper`` has numbers of
+        its own.
+    detector
+        The front end, if not the one that the configuration names.
+    """
+    if config.back_end is BackEnd.ROBUST:
+        return RobustSlam(config, rig, wheels, detector)
+    return UwbRadarSlam(config, rig, detector)
+
+
+class RobustSlam:
+    """Ranges of all radars, each at its own time, into the robust back end; nothing is delayed.
+
+    The map frame is the body frame at the first odometry pose. The belief's errors are additive,
+    as everywhere outside ``slam.robust``; it holds the landmarks that are believed in, and their
+    ids stay.
+
+    Parameters
+    ----------
+    config
+        Front end, window, and the table ``robust``.
+    rig
+        Where the radars sit.
+    wheels
+        How odometry errs.
+    detector
+        The front end, if not the one that the configuration names.
+    """
+
+    def __init__(
+        self, config: SlamConfig, rig: Rig, wheels: WheelNoise, detector: Detector | None = None
+    ) -> None:
+        self.config = config
+        self.rig = rig
+        self.back_end = RobustBackEnd(rig, back_end_parameters(config, wheels))
+        self._detector = detector or make_detector(config)
+        self._pose: Array | None = None  # odometry at the last state
+
+    def step(
+        self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
+    ) -> tuple[StepResult, ...]:
+        """Take in what sensors say around one time; return the state if the robot has moved.
+
+        Parameters
+        ----------
+        frames
+            At most one frame per radar, each with the time it was taken at; a radar whose frame
+            was lost is simply absent, and none at all leaves odometry alone.
+        pose_at
+            Odometry, asked for the pose at ``t_ns`` and at the time of every frame.
+        t_ns
+            Session time of the state.
+        """
+        stamps_ns = {frame.radar: frame.t_ns for frame in frames}
+        return self._take(lambda: self._detect(frames), stamps_ns, pose_at, t_ns)
+
+    def step_detections(
+        self, detections: Sequence[Detection], pose_at: PoseAt, t_ns: int
+    ) -> tuple[StepResult, ...]:
+        """Do what ``step`` does, from ranges that some other front end found.
+
+        Every radar counts as heard; one without a detection looked at ``t_ns`` and saw nothing.
+        """
+        stamps_ns = dict.fromkeys(range(len(self.rig.mounts)), t_ns)
+        stamps_ns |= {detection.radar: detection.t_ns for detection in detections}
+        return self._take(lambda: tuple(detections), stamps_ns, pose_at, t_ns)
+
+    def flush(self) -> tuple[StepResult, ...]:
+        """Return the states not yet returned: none, for nothing is delayed."""
+        return ()
+
+    def wall_spans_m(self) -> Array:
+        """Return the ends of the stretches of wall that answered, shape (k, 2, 2) [m], map frame.
+
+        Of walls hit often enough to be reported.
+        """
+        walls = self.back_end.walls()
+        return np.concatenate([np.empty((0, 2, 2)), *(wall.spans_m for wall in walls)])
+
+    def _take(
+        self,
+        detect: Callable[[], tuple[Detection, ...]],
+        stamps_ns: dict[int, int],
+        pose_at: PoseAt,
+        t_ns: int,
+    ) -> tuple[StepResult, ...]:
+        pose = np.array(pose_at(t_ns), dtype=np.float64)
+        if self._pose is None:
+            self._pose = pose
+            return ()
+        # What is seen again from one place is no new evidence: clutter and aspect stay the same.
+        if not has_moved(self._pose, pose, self.config.window):
+            return ()
+        detections = detect()
+        sigmas_m = tuple(self._sigma_m(detection) for detection in detections)
+        moved = {
+            radar: None if stamp_ns == t_ns else between(pose, pose_at(stamp_ns))
+            for radar, stamp_ns in stamps_ns.items()
+        }
+        back_end = self.back_end
+        back_end.predict(between(self._pose, pose))
+        report = back_end.update(self._scans(detections, sigmas_m, moved))
+        self._pose = pose
+        return (
+            StepResult(
+                t_ns=t_ns,
+                odometry_pose=pose,
+                belief=belief_of(back_end, is_lost=report.lost),
+                detections=detections,
+                report=report,
+                range_sigmas_m=sigmas_m,
+            ),
+        )
+
+    def _sigma_m(self, detection: Detection) -> float:
+        """Return the standard deviation of a range; infinite for one to be left out.
+
+        A front end that predicts nothing is taken to be as good as ``range_sigma_m``.
+        """
+        told = self.config.robust
+        if math.isnan(detection.sigma_m):
+            return told.range_sigma_m
+        if detection.misfit > told.max_misfit or detection.sigma_m > told.max_predicted_sigma_m:
+            return math.inf
+        variance = told.predicted_share
+        if not math.isnan(detection.misfit):
+            variance += told.misfit_share * detection.misfit**2
+        return math.hypot(told.range_floor_m, math.sqrt(variance) * detection.sigma_m)
+
+    def _scans(
+        self,
+        detections: Sequence[Detection],
+        sigmas_m: Sequence[float],
+        moved: Mapping[int, Array | None],
+    ) -> list[RangeScan]:
+        """Return the scan of every radar heard, the ranges that are unfit as blurred.
+
+        ``moved`` tells how the robot moved from the state to each radar's own sample.
+        """
+        fit: dict[int, list[tuple[float, float]]] = {radar: [] for radar in moved}
+        blurred: dict[int, list[float]] = {radar: [] for radar in moved}
+        for detection, sigma_m in zip(detections, sigmas_m, strict=True):
+            if sigma_m < math.inf:
+                fit[detection.radar].append((detection.range_m, sigma_m))
+            else:
+                blurred[detection.radar].append(detection.range_m)
+        return [
+            RangeScan(
+                radar=radar,
+                ranges_m=tuple(range_m for range_m, _ in fit[radar]),
+                sigmas_m=tuple(sigma_m for _, sigma_m in fit[radar]),
+                moved=None if motion is None else (motion[0], motion[1], motion[2]),
+                blurred_m=tuple(blurred[radar]),
+            )
+            for radar, motion in moved.items()
+        ]
+
+    def _detect(self, frames: Sequence[RadarFrame]) -> tuple[Detection, ...]:
+        offsets_m = [self.rig.mounts[frame.radar].range_offset_m for frame in frames]
+        found = self._detector.detect_many(frames, offsets_m)
+        return tuple(detection for of_frame in found for detection in of_frame)
+
+
+def back_end_parameters(config: SlamConfig, wheels: WheelNoise) -> BackEndParameters:
+    """Return what the back end is told, from the configuration and the robot's specification."""
+    told, limits = config.robust, config.detection
+    reach_m = limits.max_range_m - limits.min_range_m
+    return BackEndParameters(
+        wheels=replace(wheels, walk_per_sqrt_m=told.wheel_walk_per_sqrt_m),
+        ranges=RangeNoise(
+            sigma_m=told.range_sigma_m,
+            doubt_m=told.association_doubt_m,
+            huber_sigmas=told.huber_sigmas,
+            offset_sigma_m=told.offset_sigma_m,
+            detection_probability=told.detection_probability,
+            clutter_per_m=told.false_ranges_per_frame / reach_m,
+            field_of_view_rad=told.field_of_view_rad,
+            min_range_m=limits.min_range_m,
+            max_range_m=limits.max_range_m,
+        ),
+    )
+
+
+def belief_of(back_end: RobustBackEnd, *, is_lost: bool = False) -> Belief:
+    """Return pose and reported landmarks with additive errors, as a belief of its own.
+
+    While the robot is lost the map is as it was, and the pose on it is unknown.
+
+    With e_add = e + t e_th, t = J x for every point x (``State.additive_transform``), the
+    covariance is P + t p_th^T + p_th t^T + P_thth t t^T: O(m^2), not a product of matrices.
+    """
+    state = back_end.state
+    rows = np.array(back_end.reported_rows(), dtype=np.intp)
+    at = np.concatenate([np.array([1, 2, 0]), state.landmark_columns(rows)])
+    P = state.P.block(at)
+    landmarks = state.landmarks_m[rows]
+    turned = np.concatenate(
+        [quarter_turn(state.position_m), [0.0], quarter_turn(landmarks).ravel()]
+    )
+    along = np.outer(turned, P[2] + 0.5 * P[2, 2] * turned)
+    covariance = P + (along + along.T)
+    if is_lost:
+        covariance[:3], covariance[:, :3] = 0.0, 0.0
+        covariance[:3, :3] = back_end.pose_covariance
+    return Belief(
+        mean=np.concatenate([state.pose, landmarks.ravel()]),
+        covariance=covariance,
+        landmark_ids=tuple(state.landmark_ids[row] for row in rows),
+        next_id=state.next_id,
+    )

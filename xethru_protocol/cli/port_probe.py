@@ -1,0 +1,480 @@
+"""What `doctor` finds out about one port, each fact when it is first asked for.
+
+Two programs that read one port each get a part of the bytes, and the mere opening of a port
+flushes what waits in it: so this is asked first.
+
+The order in which the checks ask matters: a port that another program has open is never opened.
+"""
+
+import getpass
+import grp
+import os
+import re
+import shlex
+import stat
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from functools import cached_property
+from pathlib import Path
+from typing import Generic, TypeVar
+
+from xethru_protocol.driver.link import ModuleInfo
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.transport import SerialTransport, Transport
+from xethru_protocol.wire.codes import X4Setting
+from xethru_protocol.wire.connection import Connection, Role
+from xethru_protocol.wire.errors import DeviceError, Disconnected, PortUnavailable, XeThruError
+from xethru_protocol.wire.framing import NEED_DATA, FramingFault
+from xethru_protocol.wire.messages import (
+    BootloaderGetDeviceInfo,
+    Command,
+    GetProfileId,
+    Message,
+    Ping,
+    Pong,
+    Response,
+    X4DriverGet,
+)
+
+PatientT = TypeVar("PatientT")
+
+
+class Level(Enum):
+    """How bad a finding is."""
+
+    OK = "ok"
+    NOTE = "note"  # as it should be for some users, not for others
+    FAULT = "fault"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Check(Generic[PatientT]):
+    """A row of a table.
+
+    Attributes
+    ----------
+    name
+        What is all right if nothing is found.
+    looks_at
+        Where the evidence comes from.
+    find
+        Returns what is wrong, None if nothing is.
+    remedy
+        What to do about it; ``{...}`` may name any attribute of the patient, which is quoted as
+        a shell needs it.
+    level
+        NOTE for what is a fault only to some users.
+    ends
+        Whether this finding ends the examination: it leaves nothing that later rows could look
+        at, or they would disturb another program.
+    """
+
+    name: str
+    looks_at: str
+    find: Callable[[PatientT], str | None]
+    remedy: str
+    level: Level = Level.FAULT
+    ends: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """What a check came to; ``found`` and ``remedy`` are empty if all is well."""
+
+    check: str
+    looks_at: str
+    level: Level
+    found: str = ""
+    remedy: str = ""
+
+
+def examine(patient: PatientT, checks: Sequence[Check[PatientT]]) -> Iterator[Finding]:
+    """Carry out checks in order, until one ends the examination."""
+    for check in checks:
+        try:
+            found = check.find(patient)
+        except (XeThruError, OSError) as error:  # a module that answered, a port that was there
+            yield Finding(
+                check=check.name,
+                looks_at=check.looks_at,
+                level=Level.FAULT,
+                found=f"this could not be found out: {getattr(error, 'strerror', None) or error}",
+                remedy="try again; if this stays, take the module's power away for some seconds",
+            )
+            return
+        if found is None:
+            yield Finding(check=check.name, looks_at=check.looks_at, level=Level.OK)
+            continue
+        yield Finding(
+            check=check.name,
+            looks_at=check.looks_at,
+            level=check.level,
+            found=found,
+            remedy=check.remedy.format_map(_Attributes(patient)),
+        )
+        if check.ends:
+            return
+
+
+class _Attributes(dict[str, object]):
+    """The attributes of an object, quoted for a shell; each is asked for only when named."""
+
+    def __init__(self, named: object) -> None:
+        super().__init__()
+        self._named = named
+
+    def __missing__(self, name: str) -> object:
+        value = getattr(self._named, name)
+        if isinstance(value, tuple):
+            return shlex.join(map(str, value))
+        return shlex.quote(value) if isinstance(value, str) else value
+
+
+_LONGEST_NAME = 60
+_FIRST_PTS_MAJOR, _LAST_PTS_MAJOR = 136, 143
+_MINORS_PER_PTS_MAJOR = 256
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PortUser:
+    """A program that has a port open."""
+
+    pid: int
+    name: str
+
+    def __str__(self) -> str:
+        """Name and process id, for messages."""
+        return f"{self.name!r} (pid {self.pid})"
+
+
+def port_users(path: str) -> tuple[PortUser, ...]:
+    """Programs that have a port open, as far as this user may know; by process id.
+
+    Whoever serves the port of a pseudo-terminal is none of them. Other users' programs are
+    seen by root only.
+    """
+    try:
+        device = os.stat(path)
+    except OSError:
+        return ()
+    if not stat.S_ISCHR(device.st_mode):
+        return ()
+    return tuple(
+        PortUser(pid=pid, name=_name(pid))
+        for pid in _process_ids()
+        if _has_open(pid, device) and not _serves(pid, device)
+    )
+
+
+def _process_ids() -> list[int]:
+    try:
+        return sorted(int(name) for name in os.listdir("/proc") if name.isdecimal())
+    except OSError:  # no /proc on this system
+        return []
+
+
+def _has_open(pid: int, device: os.stat_result) -> bool:
+    for descriptor, target in _descriptors(pid):
+        if not target.startswith("/dev/"):
+            continue
+        try:
+            opened = os.stat(descriptor)
+        except OSError:  # closed meanwhile
+            continue
+        if opened.st_rdev == device.st_rdev and (
+            # the same number is another terminal in another container
+            _pts_index(device) is None or opened.st_dev == device.st_dev
+        ):
+            return True
+    return False
+
+
+def _serves(pid: int, device: os.stat_result) -> bool:
+    """Whether a process has the other end of a pseudo-terminal."""
+    index = _pts_index(device)
+    if index is None:
+        return False
+    for descriptor, target in _descriptors(pid):
+        if target.endswith("ptmx"):
+            facts = _read(descriptor.replace("/fd/", "/fdinfo/"))
+            if f"tty-index:\t{index}" in facts.splitlines():
+                return True
+    return False
+
+
+def _pts_index(device: os.stat_result) -> int | None:
+    major = os.major(device.st_rdev)
+    if not _FIRST_PTS_MAJOR <= major <= _LAST_PTS_MAJOR:
+        return None
+    return (major - _FIRST_PTS_MAJOR) * _MINORS_PER_PTS_MAJOR + os.minor(device.st_rdev)
+
+
+def _descriptors(pid: int) -> Iterator[tuple[str, str]]:
+    """Path below /proc of each open descriptor, and what it is."""
+    try:
+        names = os.listdir(f"/proc/{pid}/fd")
+    except OSError:  # another user's, or gone
+        return
+    for name in names:
+        path = f"/proc/{pid}/fd/{name}"
+        try:
+            yield path, os.readlink(path)
+        except OSError:
+            continue
+
+
+def _name(pid: int) -> str:
+    """Command line of a process, without the interpreter and its folders."""
+    words = [word for word in _read(f"/proc/{pid}/cmdline").split("\0") if word]
+    if not words:
+        return _read(f"/proc/{pid}/comm").strip() or "unknown"
+    if len(words) > 1 and Path(words[0]).name.startswith("python"):
+        del words[: 2 if words[1] == "-m" and len(words) > 2 else 1]
+    words[0] = Path(words[0]).name
+    text = " ".join(words)
+    return text if len(text) <= _LONGEST_NAME else text[: _LONGEST_NAME - 3] + "..."
+
+
+def _read(path: str) -> str:
+    try:
+        return Path(path).read_text(errors="replace")
+    except OSError:
+        return ""
+
+
+USUAL_BAUDRATE = 115200
+# Protocol reference 10, the likeliest first
+_OTHER_BAUDRATES = (
+    *(921600, 460800, 230400, 1000000, 2000000, 3000000, 4000000),
+    *(500000, 576000, 38400, 19200, 9600),
+)
+_PATIENCE_S = 1.0
+_GLANCE_S = 0.25  # enough for the 18 bytes of PING and PONG at 9600 baud
+_WITHOUT_RATE = ("/dev/pts/", "/dev/ttyACM")  # pseudo-terminals, and USB of class CDC ACM
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contact:
+    """What came back over an opened port.
+
+    Attributes
+    ----------
+    pong
+        Answer to PING; None: there was none.
+    baudrate
+        Rate at which that came, or the usual one.
+    talks
+        Whether other messages came.
+    damaged
+        Whether bytes came that are no packets.
+    bootloader
+        Whether a bootloader answered.
+    gone
+        Whether the port went away meanwhile.
+    """
+
+    pong: int | None = None
+    baudrate: int = USUAL_BAUDRATE
+    talks: bool = False
+    damaged: bool = False
+    bootloader: bool = False
+    gone: bool = False
+
+
+class Patient:
+    """One port under examination."""
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        self.refusal: str | None = None
+        self._transport: Transport | None = None
+
+    def close(self) -> None:
+        """Release the port, if it was opened."""
+        if self._transport is not None:
+            self._transport.close()
+
+    # --- without opening it ---------------------------------------------------------------------
+
+    @property
+    def target(self) -> str:
+        """The device behind a link, or the path itself."""
+        return os.path.realpath(self.path)
+
+    @property
+    def is_stale_link(self) -> bool:
+        """Whether the path is a link to something that is gone."""
+        return os.path.islink(self.path) and not os.path.exists(self.path)
+
+    @property
+    def exists(self) -> bool:
+        """Whether there is anything of that name."""
+        return os.path.exists(self.path)
+
+    @property
+    def is_serial_port(self) -> bool:
+        """Whether it is a device, and, where the system tells (Linux), one of a serial driver."""
+        status = os.stat(self.path)
+        if not stat.S_ISCHR(status.st_mode):
+            return False
+        drivers = _serial_drivers()
+        return not drivers or any(
+            os.major(status.st_rdev) == major and os.minor(status.st_rdev) in minors
+            for major, minors in drivers
+        )
+
+    @property
+    def may_be_opened(self) -> bool:
+        """Whether this user may read and write it."""
+        return os.access(self.path, os.R_OK | os.W_OK)
+
+    @property
+    def group(self) -> str:
+        """Group the device belongs to."""
+        number = os.stat(self.path).st_gid
+        try:
+            return grp.getgrgid(number).gr_name
+        except KeyError:
+            return str(number)
+
+    @property
+    def group_may_open(self) -> bool:
+        """Whether joining the group would help."""
+        return os.stat(self.path).st_mode & 0o060 == 0o060
+
+    @property
+    def user(self) -> str:
+        """Who examines."""
+        try:
+            return getpass.getuser()
+        except (KeyError, OSError):
+            return str(os.getuid())
+
+    @cached_property
+    def users(self) -> tuple[PortUser, ...]:
+        """Programs that have the port open."""
+        return port_users(self.path)
+
+    # --- having opened it -----------------------------------------------------------------------
+
+    @cached_property
+    def opens(self) -> bool:
+        """Open the port; if that fails, `refusal` says why."""
+        try:
+            self._transport = SerialTransport(self.path)
+        except PortUnavailable as error:
+            self.refusal = str(error)
+            return False
+        return True
+
+    @cached_property
+    def contact(self) -> Contact:
+        """Ask for a sign of life, at other rates too, and whether it is the bootloader."""
+        first = self._ask(Ping(), _PATIENCE_S)
+        if first.pong is not None or first.gone:
+            return first
+        if self._ask(BootloaderGetDeviceInfo(), _GLANCE_S).talks and not first.talks:
+            return Contact(bootloader=True)
+        if not ignores_baudrate(self.target):
+            for baudrate in _OTHER_BAUDRATES:
+                if self._reopen(baudrate):
+                    contact = self._ask(Ping(), _GLANCE_S, baudrate)
+                    if contact.pong is not None:
+                        return contact
+            self._reopen(USUAL_BAUDRATE)
+        return first
+
+    @cached_property
+    def module(self) -> X4M300:
+        """The driver of a module that answers."""
+        assert self._transport is not None, "the checks open the port first"
+        return X4M300(self._transport)
+
+    @cached_property
+    def info(self) -> ModuleInfo:
+        """What the module tells about itself."""
+        return self.module.info()
+
+    @property
+    def is_bare_xep(self) -> bool:
+        """Whether the firmware has no profile layer."""
+        return self.info.order_code is None
+
+    @property
+    def version(self) -> tuple[int, ...] | None:
+        """Firmware version; None if it is no three numbers."""
+        found = re.match(r"(\d+)\.(\d+)\.(\d+)", self.info.version or "")
+        return None if found is None else tuple(map(int, found.groups()))
+
+    @cached_property
+    def profile_id(self) -> int | None:
+        """Loaded profile, 0 for none; None where the module does not say."""
+        try:
+            values = self.module.request(GetProfileId()).values
+        except DeviceError:
+            return None
+        return values[0] if values else None
+
+    @cached_property
+    def tx_power(self) -> int | None:
+        """Transmitter power, 0 for off; None where the module does not say."""
+        try:
+            values = self.module.request(X4DriverGet(setting=X4Setting.TXPOWER)).values
+        except DeviceError:
+            return None
+        return int(values[0]) if values else None
+
+    # --- inside ---------------------------------------------------------------------------------
+
+    def _reopen(self, baudrate: int) -> bool:
+        """Open the port at another rate; False where the adapter does not know that."""
+        assert self._transport is not None
+        self._transport.close()
+        try:
+            self._transport = SerialTransport(self.path, baudrate=baudrate)
+        except PortUnavailable:
+            return False
+        return True
+
+    def _ask(
+        self, command: Command[Response], timeout_s: float, baudrate: int = USUAL_BAUDRATE
+    ) -> Contact:
+        """Send a command; return what came until its answer, or until the time was over."""
+        assert self._transport is not None
+        connection = Connection(Role.HOST)
+        talks = damaged = False
+        try:
+            self._transport.write(connection.send(command))
+            deadline_s = time.monotonic() + timeout_s
+            while (left_s := deadline_s - time.monotonic()) > 0:
+                connection.receive_data(self._transport.read(left_s))
+                while (event := connection.next_event()) is not NEED_DATA:
+                    if isinstance(event, Pong):
+                        return Contact(pong=event.value, baudrate=baudrate)
+                    damaged |= isinstance(event, FramingFault)
+                    talks |= isinstance(event, Message)
+        except Disconnected:
+            return Contact(gone=True)
+        return Contact(talks=talks, damaged=damaged)
+
+
+def ignores_baudrate(target: str) -> bool:
+    """Whether a device talks alike at every rate."""
+    return target.startswith(_WITHOUT_RATE)
+
+
+def _serial_drivers() -> list[tuple[int, range]]:
+    """Major and minor numbers of serial ports and pseudo-terminals; empty where unknown."""
+    try:
+        lines = Path("/proc/tty/drivers").read_text().splitlines()
+    except OSError:
+        return []
+    found = []
+    for line in lines:
+        words = line.split()  # driver, path, major, minors, kind
+        if len(words) >= 5 and words[4].partition(":")[0] in ("serial", "pty"):
+            first, _, last = words[3].partition("-")
+            found.append((int(words[2]), range(int(first), int(last or first) + 1)))
+    return found

@@ -1,0 +1,287 @@
+"""``xethru decode``, ``dump`` and ``convert``."""
+
+import json
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import nullcontext
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from xethru_protocol.cli.output import (
+    Progress,
+    bytes_text,
+    counted,
+    one_line,
+    print_json,
+    print_line,
+    profile_name,
+    warn,
+    warn_of,
+)
+from xethru_protocol.cli.record import is_part_of, set_aside
+from xethru_protocol.recordings import (
+    RecordingError,
+    RecordingFault,
+    RecordingSummary,
+    describe_recording,
+    read_recording,
+    recording_facts,
+)
+from xethru_protocol.recordings import convert as convert_recording
+from xethru_protocol.recordings.wire_capture import MAGIC as WIRE_CAPTURE
+from xethru_protocol.wire.codec import decode_command, decode_response, describe, encode
+from xethru_protocol.wire.codes import PongCode
+from xethru_protocol.wire.errors import LocalProtocolError, XeThruError
+from xethru_protocol.wire.fields import hex_bytes
+from xethru_protocol.wire.framing import (
+    Direction,
+    Framing,
+    FramingFault,
+    LinkStatistics,
+    Packet,
+    PacketReader,
+)
+from xethru_protocol.wire.messages import Ack, Message, Pong, Response, UnknownMessage
+from xethru_protocol.wire.table import ROWS
+
+_CHUNK_BYTES = 65536
+
+
+class DecodeError(XeThruError):
+    """The input cannot be read as what it was said to be."""
+
+
+def decode(file: str | None, *, is_hex: bool, sender: str, with_statistics: bool = False) -> int:
+    """Print one JSON object per packet and per fault; totals at the end, on stderr, if wanted."""
+    name = file or "standard input"
+    statistics = LinkStatistics()
+    if file is None and sys.stdin is None:
+        raise DecodeError("standard input is closed; there is nothing to decode")
+    try:
+        with Path(file).open("rb") if file else nullcontext(sys.stdin.buffer) as source:
+            if is_hex:
+                for number, line in enumerate(source, start=1):
+                    _print_all(iter((_from_hex(line, name, number),)), sender, statistics)
+            else:
+                _print_all(_chunks(source, name), sender, statistics)
+    except BrokenPipeError:  # of stdout
+        raise
+    except OSError as error:
+        raise DecodeError(f"{name} cannot be read: {error.strerror}") from None
+    finally:
+        if with_statistics:
+            warn(json.dumps(statistics.summary()))
+    return 0
+
+
+def found_in(
+    chunks: Iterable[bytes], sender: str, statistics: LinkStatistics
+) -> Iterator[Packet | FramingFault]:
+    """Packets and faults of a stream that comes in chunks, each as soon as it can be told."""
+    direction = Direction.FROM_HOST if sender == "host" else Direction.FROM_MODULE
+    reader = PacketReader(direction, statistics)
+    for chunk in chunks:
+        reader.receive_data(chunk)
+        while isinstance(found := reader.next_packet(), Packet | FramingFault):
+            yield found
+    reader.end_data()
+    while isinstance(found := reader.next_packet(), Packet | FramingFault):
+        yield found
+
+
+def message_of(packet: Packet, sender: str) -> Message:
+    """Message of a packet from ``sender``: "host", "module", or "auto" to judge by structure.
+
+    Of two readings the one that explains every byte wins. PING and PONG look alike: a value
+    that modules answer with is a PONG. An ACK is its code alone: with more behind it the code
+    is APPCOMMAND's, also if its content is not known.
+    """
+    payload = packet.payload
+    if sender == "host":
+        return decode_command(payload)
+    response = decode_response(payload)
+    if sender == "module" or packet.framing is Framing.NO_ESCAPE:
+        return response
+    command = decode_command(payload)
+    if isinstance(response, Ack) and len(payload) == 1:
+        return response
+    if not _explains(command, payload):
+        return command if isinstance(response, UnknownMessage | Ack) else response
+    if isinstance(response, Pong):
+        return response if response.value in set(PongCode) else command
+    return response if _explains(response, payload) else command
+
+
+def _explains(message: Message, payload: bytes) -> bool:
+    try:
+        return not isinstance(message, UnknownMessage) and encode(message, bulk=False) == payload
+    except LocalProtocolError:
+        return False
+
+
+def _print_all(chunks: Iterable[bytes], sender: str, statistics: LinkStatistics) -> None:
+    for found in found_in(chunks, sender, statistics):
+        if isinstance(found, FramingFault):
+            print_json({"fault": found.kind.value, "offset": found.offset})
+            continue
+        message = message_of(found, sender)
+        statistics.unknown += isinstance(message, UnknownMessage)
+        name, shown = describe(message)
+        print_json(
+            {
+                "framing": found.framing.value,
+                "payload_hex": hex_bytes(found.payload),
+                "message": name,
+                "fields": shown,
+            }
+        )
+
+
+def _chunks(source: BinaryIO, name: str) -> Iterator[bytes]:
+    read = getattr(source, "read1", source.read)  # read1 returns what there is, not a full chunk
+    chunk = read(_CHUNK_BYTES)
+    if chunk.startswith(WIRE_CAPTURE):
+        raise DecodeError(f"{name} is a wire capture and no bare bytes; use xethru dump")
+    while chunk:
+        yield chunk
+        chunk = read(_CHUNK_BYTES)
+
+
+def _from_hex(line: bytes, name: str, number: int) -> bytes:
+    try:
+        return bytes.fromhex(line.decode("ascii"))
+    except ValueError:
+        text = line.strip()[:40].decode("ascii", "replace")
+        raise DecodeError(
+            f"{name} line {number} is not hexadecimal bytes: {text!r}; write them like 7D 10 6D 7E"
+        ) from None
+
+
+_FEW = 3  # elements of an array that are shown
+_LONGEST_TEXT = 60
+
+
+def dump(file: str, *, with_samples: bool, as_json: bool, radar: str | None) -> int:
+    """Print every message of a recording; 1 if a part could not be read."""
+    faults: list[RecordingFault] = []
+    if as_json:
+        for message, t_ns in read_recording(file, faults.append, radar=radar):
+            print_json(_as_json(message, t_ns))
+    else:
+        summary = describe_recording(file, radar=radar)
+        for line in _head(summary):
+            print_line(line)
+        for message, t_ns in read_recording(file, faults.append, radar=radar):
+            time = _since(t_ns, summary.start_ns)
+            print_line(f"{time}  {message_line(message, with_samples=with_samples)}")
+    warn_of("dump", faults)
+    return 1 if faults else 0
+
+
+def message_line(message: Response, *, with_samples: bool) -> str:
+    """One line about a message: its name and fields, long ones cut unless asked for.
+
+    >>> from xethru_protocol.wire.messages import DataFloat
+    >>> import numpy as np
+    >>> message = DataFloat(info=7, values=np.arange(5, dtype=np.float32) / 3)
+    >>> message_line(message, with_samples=False)
+    'DATA FLOAT content_id=0 info=7 length=5 data=[0, 0.333333, 0.666667, ... 5 in all]'
+    """
+    name, shown = describe(message)
+    parts = (f"{key}={_text(value, with_samples)}" for key, value in shown.items())
+    return " ".join([name, *parts])
+
+
+def _as_json(message: Response, t_ns: int | None) -> dict[str, Any]:
+    bulk = not isinstance(message, UnknownMessage) and ROWS[type(message)].bulk
+    name, shown = describe(message)
+    return {
+        "framing": (Framing.NO_ESCAPE if bulk else Framing.NORMAL).value,
+        "payload_hex": hex_bytes(encode(message, bulk=bulk)),
+        "message": name,
+        "fields": shown,
+        "t_ns": t_ns,
+    }
+
+
+def _head(summary: RecordingSummary) -> Iterator[str]:
+    total = sum(summary.messages.values())
+    yield (
+        f"{one_line(str(summary.path))}: {summary.format} recording, {counted(total, 'message')}, "
+        f"{bytes_text(summary.size_bytes)}"
+    )
+    for name, count in sorted(summary.messages.items()):
+        yield f"  {count} {name}"
+    if summary.start_ns is not None and summary.duration_ns is not None:
+        start = datetime.fromtimestamp(summary.start_ns // 10**9, UTC)
+        ms = summary.start_ns % 10**9 // 10**6
+        yield f"  from {start:%Y-%m-%d %H:%M:%S}.{ms:03d} UTC, {summary.duration_ns * 1e-9:.3f} s"
+    else:
+        yield "  times are not known"
+    if summary.session_id:
+        yield f"  session {one_line(summary.session_id)}"
+    if summary.profile_id:
+        yield f"  profile {profile_name(summary.profile_id)}"
+    if summary.parameter_file is not None:
+        yield f"  parameter file {one_line(summary.parameter_file)}"
+    yield ""
+
+
+def _since(t_ns: int | None, start_ns: int | None) -> str:
+    if t_ns is None or start_ns is None:
+        return f"{'-':>12}"
+    return f"{(t_ns - start_ns) * 1e-9:12.6f}"
+
+
+def _text(value: Any, whole: bool) -> str:  # noqa: ANN401 - any JSON value
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list):
+        shown = [_text(item, whole) for item in (value if whole else value[:_FEW])]
+        if len(shown) < len(value):
+            shown.append(f"... {len(value)} in all")
+        return f"[{', '.join(shown)}]"
+    if isinstance(value, dict):
+        return " ".join(f"{key}={_text(item, whole)}" for key, item in value.items())
+    text = one_line(str(value))
+    return text if whole or len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]}..."
+
+
+def convert(source: str, target: str, *, replace: bool, as_json: bool, radar: str | None) -> int:
+    """Write ``source`` again as ``target``; 1 if a part of it could not be read."""
+    recording_facts(source)  # raises before anything is removed
+    path = Path(target)
+    if is_part_of(Path(source), path):
+        raise RecordingError(f"{source} cannot be converted into itself")
+    progress = Progress("xethru convert")
+    newest = 0
+
+    def show(messages: int) -> None:
+        nonlocal newest
+        newest = messages
+        progress.show(lambda: f"{newest} messages")
+
+    with set_aside(path, replace=replace):
+        try:
+            done = convert_recording(source, target, show, radar=radar)
+        finally:
+            progress.finish(lambda: f"{newest} messages")
+    if as_json:
+        print_json(
+            {
+                "target": target,
+                "messages": done.messages,
+                "skipped": done.skipped,
+                "faults": [
+                    {"file": fault.file, "offset": fault.offset, "reason": fault.reason}
+                    for fault in done.faults
+                ],
+            }
+        )
+    else:
+        print_line(f"{one_line(target)}: {counted(done.messages, 'message')}")
+    for name, number in sorted(done.skipped.items()):
+        warn(f"xethru convert: {number} {name} left out: the format has no place for them")
+    warn_of("convert", done.faults)
+    return 1 if done.faults else 0

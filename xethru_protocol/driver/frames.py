@@ -1,0 +1,410 @@
+"""Frames of one stream in order of arrival: fitted to the geometry, losses counted, bounded.
+
+A radar frame carries float32 values, but the chip counts in integers and the firmware multiplies
+each count by one quantum. So only few of all float32 values can be true, and a damaged sample is
+nearly always none of them (Protocol reference 9.7). That holds for radar frames as the chip's
+driver sends them; what a profile filters before it sends it (BASEBAND_IQ of a real recording) is
+on no lattice.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from numpy.typing import NDArray
+
+from xethru_protocol.wire.errors import LocalProtocolError
+from xethru_protocol.wire.framing import LinkStatistics
+from xethru_protocol.wire.messages import BasebandIq, DataFloat
+from xethru_protocol.wire.x4 import Normalisation
+
+# Sum of the absolute filter taps of the first I set, by TXCENTERFREQUENCY.
+_TAP_SUMS: Final = {3: 306, 4: 316}
+
+# Two float32 roundings lie between a counter and its sample: together less than 2 counts.
+_NEIGHBOURS: Final = (-2.0, -1.0, -0.5, 0.5, 1.0, 2.0)
+
+Float32s = NDArray[np.float32]
+Float64s = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lattice:
+    """The float32 values that counters of one setting become, by the firmware's arithmetic.
+
+    RF: ``counter * quantum - dac_offset`` for the counters 0 ... ``max_counter``. Baseband:
+    ``counter * quantum / tap_sum`` for sums of counters weighted by taps of total 0, so from
+    ``-max_counter`` to ``max_counter``; Q is sent with the opposite sign, which is the same set.
+    Every step rounds to float32; a compiler may have fused RF's product and difference, so the
+    value rounded once is accepted, too.
+
+    ``lowest`` and ``highest`` are the ends of the range.
+    """
+
+    quantum: np.float32
+    dac_offset: np.float32
+    tap_sum: np.float32
+    min_counter: int
+    max_counter: int
+    lowest: float
+    highest: float
+
+    @classmethod
+    def of(
+        cls,
+        *,
+        iterations: int,
+        pulses_per_step: int,
+        dac_min: int,
+        dac_max: int,
+        dac_step: int,
+        downconversion: bool,
+        tx_center_frequency: int,
+    ) -> "Lattice":
+        """Lattice of a radar with these settings.
+
+        Raises
+        ------
+        LocalProtocolError
+            If the settings count nothing, or no filter is known for the centre frequency.
+
+        >>> lattice = Lattice.of(
+        ...     iterations=16, pulses_per_step=300, dac_min=949, dac_max=1100, dac_step=0,
+        ...     downconversion=False, tx_center_frequency=3)
+        >>> lattice.off_lattice(np.array([-0.07421875, 0.0, 0.0742, 0.1], np.float32))
+        2
+        """
+        if min(iterations, pulses_per_step, dac_max - dac_min + 1) < 1:
+            raise LocalProtocolError("a chip with these settings counts nothing")
+        if downconversion and tx_center_frequency not in _TAP_SUMS:
+            raise LocalProtocolError(
+                f"no filter is known for centre frequency {tx_center_frequency}"
+            )
+        unit = Normalisation.of(
+            iterations=iterations,
+            pulses_per_step=pulses_per_step,
+            dac_min=dac_min,
+            dac_max=dac_max,
+            dac_step=dac_step,
+        )
+        tap_sum = _TAP_SUMS[tx_center_frequency] if downconversion else 1
+        # all positive taps see the most and all negative ones nothing, or the reverse
+        largest = unit.max_counter * tap_sum // 2 if downconversion else unit.max_counter
+        smallest = -largest if downconversion else 0
+        offset = 0.0 if downconversion else unit.dac_offset
+        ends = _values(
+            np.array([smallest, largest], np.float32),
+            np.float32(unit.quantum),
+            np.float32(offset),
+            np.float32(tap_sum),
+        )
+        return cls(
+            quantum=np.float32(unit.quantum),
+            dac_offset=np.float32(offset),
+            tap_sum=np.float32(tap_sum),
+            min_counter=smallest,
+            max_counter=largest,
+            lowest=float(ends[0]),
+            highest=float(ends[1]),
+        )
+
+    def off_lattice(self, samples: Float32s) -> int:
+        """Count the samples that no chip counter can give; NaN and infinities are such.
+
+        Parameters
+        ----------
+        samples
+            Values as sent, shape (n,), float32.
+        """
+        # Nearly every frame is whole: one rounding to the lattice and back proves it. Bytes take
+        # a fourth of array_equal's time; a -0.0, which they tell from 0.0, is judged below.
+        if samples.size == 0 or (
+            np.minimum.reduce(samples) >= self.lowest
+            and np.maximum.reduce(samples) <= self.highest
+            and self._rounded(samples).tobytes() == samples.tobytes()
+        ):
+            return 0
+        with np.errstate(invalid="ignore"):  # comparing with a signalling NaN
+            in_range = samples[(samples >= self.lowest) & (samples <= self.highest)]
+        doubtful = in_range[self._rounded(in_range) != in_range]
+        bad = samples.size - in_range.size + doubtful.size - self._count_neighbours(doubtful)
+        return int(bad)
+
+    def nearest(self, samples: Float32s) -> Float32s:
+        """Return what the chip would give for samples: of the nearest counter it can hold.
+
+        Parameters
+        ----------
+        samples
+            Finite values, shape (n,), float32.
+        """
+        counters = np.rint((samples + self.dac_offset) * (self.tap_sum / self.quantum))
+        counters = np.clip(counters, self.min_counter, self.max_counter).astype(np.float32)
+        return _values(counters, self.quantum, self.dac_offset, self.tap_sum)
+
+    def _rounded(self, samples: Float32s) -> Float32s:
+        """Round each sample to the value of the nearest counter, found in float32."""
+        scale = self.tap_sum / self.quantum
+        counters = samples + self.dac_offset
+        counters *= scale
+        np.rint(counters, out=counters)
+        return _values(counters, self.quantum, self.dac_offset, self.tap_sum)
+
+    def _count_neighbours(self, samples: Float32s) -> int:
+        """Count samples that a counter near the most likely one gives, or the fused arithmetic."""
+        scale = float(self.tap_sum) / float(self.quantum)
+        middle: Float64s = np.rint((samples.astype(np.float64) + float(self.dac_offset)) * scale)
+        # Beyond 2**24 the firmware's float32 skips counters.
+        spacing = np.maximum(np.spacing(np.abs(middle).astype(np.float32)), np.float32(1.0))
+        found = np.zeros(samples.shape, np.bool_)
+        for steps in (0.0, *_NEIGHBOURS):
+            exact = np.rint(middle + steps * spacing)
+            valid = (exact >= self.min_counter) & (exact <= self.max_counter)
+            counters = exact.astype(np.float32)
+            separate = _values(counters, self.quantum, self.dac_offset, self.tap_sum)
+            found |= valid & (separate == samples)
+            if self.tap_sum == 1.0:
+                fused = counters.astype(np.float64) * float(self.quantum) - float(self.dac_offset)
+                found |= valid & (fused.astype(np.float32) == samples)
+        return int(np.count_nonzero(found))
+
+
+def _values(
+    counters: Float32s, quantum: np.float32, dac_offset: np.float32, tap_sum: np.float32
+) -> Float32s:
+    """Compute the samples of counters; each operation rounds to float32, as in the firmware."""
+    values = counters * quantum
+    if tap_sum != 1.0:
+        values /= tap_sum
+    else:
+        values -= dac_offset
+    return values
+
+
+Samples = npt.NDArray[np.float32] | npt.NDArray[np.complex64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameGeometry:
+    """Where the bins of a frame lie, in module metres, from the module's own answers.
+
+    Bin k lies at ``range_start_m + k * bin_length_m``, in RF and in baseband.
+    """
+
+    range_start_m: float
+    bin_length_m: float
+    n_bins: int
+    downconversion: bool
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of one radar frame on the wire. Protocol reference 1.3, 6.1.
+
+        >>> FrameGeometry(
+        ...     range_start_m=0.2, bin_length_m=0.0064, n_bins=1431, downconversion=False
+        ... ).frame_bytes
+        5747
+        """
+        return 9 + 14 + 4 * self.n_bins * (2 if self.downconversion else 1)
+
+    @classmethod
+    def from_read_back(
+        cls, *, area_m: tuple[float, float], n_bins: int, downconversion: bool
+    ) -> "FrameGeometry":
+        """Geometry from the answers to GET FRAMEAREA and GET FRAMEBINCOUNT.
+
+        The area ends at the last bin in baseband, one bin behind it in RF (Protocol reference
+        9.4).
+
+        >>> geometry = FrameGeometry.from_read_back(
+        ...     area_m=(0.19929012656211853, 9.400678634643555), n_bins=1431, downconversion=False)
+        >>> round(geometry.bin_length_m, 8)
+        0.00643004
+        """
+        start, end = area_m
+        steps = n_bins - 1 if downconversion else n_bins
+        return cls(
+            range_start_m=start,
+            bin_length_m=(end - start) / steps if steps > 0 else 0.0,
+            n_bins=n_bins,
+            downconversion=downconversion,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Frame:
+    """One sweep of the radar.
+
+    ``samples``, shape (geometry.n_bins,): float32 RF amplitudes (read-only, the only copy of
+    the received bytes) or complex64 baseband. ``arrival_ns`` is the driver's clock when the
+    frame's last byte was read; the frame itself carries only ``counter``.
+    """
+
+    counter: int
+    samples: Samples
+    geometry: FrameGeometry
+    arrival_ns: int
+
+
+def rf_or_baseband(message: DataFloat, geometry: FrameGeometry) -> Samples | None:
+    """Return the samples of a radar frame, or None if the message is none of this geometry.
+
+    Radar frames have content id 0 (Protocol reference 6.1).
+    """
+    if message.content_id != 0:
+        return None
+    values = message.values
+    n = geometry.n_bins
+    if not geometry.downconversion:
+        return values if values.size == n else None
+    return _complex(values[:n], values[n:]) if values.size == 2 * n else None
+
+
+def baseband(message: BasebandIq) -> Samples:
+    """Return the samples of a profile's baseband message, shape (num_bins,), complex64."""
+    return _complex(message.i, message.q)
+
+
+def _complex(i: npt.NDArray[np.float32], q: npt.NDArray[np.float32]) -> npt.NDArray[np.complex64]:
+    iq = np.empty(i.size, np.complex64)
+    iq.real = i
+    iq.imag = q
+    return iq
+
+
+DEFAULT_FRAMES = 1024  # a minute at 17 frames/s; 6 MB of RF frames
+_COUNTER_WRAP = 1 << 32
+
+
+class FrameQueue:
+    """Frames that came and were not taken yet.
+
+    A full queue drops its oldest frame for every new one.
+
+    Parameters
+    ----------
+    limit
+        How many frames may wait, at least 1.
+    statistics
+        Where lost frames and damaged samples are counted.
+    warn
+        Told once per burst of drops: from a first one until the queue was empty again.
+
+    Attributes
+    ----------
+    geometry
+        Where the bins of radar frames lie; None: not known yet, radar frames are discarded.
+    lattice
+        Which samples radar frames can have; None: not known, nothing is checked.
+    dropped
+        Frames that came, but left a full queue unread.
+    discarded
+        Data messages that are no frame of this geometry.
+    last_counter
+        Counter of the newest frame of this stream; None before the first.
+    """
+
+    def __init__(self, limit: int, statistics: LinkStatistics, warn: Callable[[str], None]) -> None:
+        if limit < 1:
+            raise LocalProtocolError(f"a frame queue needs room for a frame, not for {limit}")
+        self.geometry: FrameGeometry | None = None
+        self.lattice: Lattice | None = None
+        self.dropped = 0
+        self.discarded = 0
+        self.last_counter: int | None = None
+        self._limit = limit
+        self._statistics = statistics
+        self._warn = warn
+        self._frames: deque[Frame] = deque()
+        self._in_burst = False
+        self._gap = (0, 0)  # the last one: counter before it, frames missing in it
+        self._baseband_geometry: FrameGeometry | None = None
+
+    def __len__(self) -> int:
+        """Count the frames that wait."""
+        return len(self._frames)
+
+    def pop(self) -> Frame:
+        """Take the oldest frame."""
+        frame = self._frames.popleft()
+        if not self._frames:
+            self._in_burst = False
+        return frame
+
+    def new_stream(self) -> None:
+        """Forget the frames that wait and their counters: what comes now follows on nothing."""
+        self._frames.clear()
+        self._in_burst = False
+        self.break_off()
+
+    def break_off(self) -> None:
+        """Keep the frames that wait, but what comes now does not follow on them."""
+        self.last_counter = None
+        self._gap = (0, 0)
+
+    def take(self, message: DataFloat | BasebandIq, arrival_ns: int) -> None:
+        """Queue a message's frame, or count the message as discarded."""
+        if isinstance(message, BasebandIq):
+            self._take_baseband(message, arrival_ns)
+        else:
+            self._take_radar_frame(message, arrival_ns)
+
+    def _take_radar_frame(self, message: DataFloat, arrival_ns: int) -> None:
+        geometry = self.geometry
+        samples = None if geometry is None else rf_or_baseband(message, geometry)
+        if geometry is None or samples is None:
+            self.discarded += 1
+            return
+        if self.lattice is not None:
+            self._statistics.off_lattice_samples += self.lattice.off_lattice(message.values)
+        self._queue(message.info, samples, geometry, arrival_ns)
+
+    def _take_baseband(self, message: BasebandIq, arrival_ns: int) -> None:
+        geometry = FrameGeometry(
+            range_start_m=message.range_offset_m,
+            bin_length_m=message.bin_length_m,
+            n_bins=message.num_bins,
+            downconversion=True,
+        )
+        if geometry != self._baseband_geometry:
+            self._baseband_geometry = geometry
+        self._queue(message.counter, baseband(message), self._baseband_geometry, arrival_ns)
+
+    def _queue(
+        self, counter: int, samples: Samples, geometry: FrameGeometry, arrival_ns: int
+    ) -> None:
+        if self.last_counter is not None:
+            self._count_missing(self.last_counter, counter)
+        self.last_counter = counter
+        if len(self._frames) >= self._limit:
+            self._drop_oldest()
+        self._frames.append(
+            Frame(counter=counter, samples=samples, geometry=geometry, arrival_ns=arrival_ns)
+        )
+
+    def _count_missing(self, last: int, counter: int) -> None:
+        missing = (counter - last - 1) % _COUNTER_WRAP
+        if missing < _COUNTER_WRAP // 2:
+            self._statistics.frames_lost += missing
+            self._gap = (last, missing)
+            return
+        # It went back: the chip was restarted, or the last counter was damaged. Then this one
+        # lies in the gap which that one seemed to make, and one of those before it did come.
+        before, gap = self._gap
+        inside = (counter - before - 1) % _COUNTER_WRAP
+        if 1 <= inside <= gap:
+            self._statistics.frames_lost += inside - 1 - gap
+        self._gap = (0, 0)
+
+    def _drop_oldest(self) -> None:
+        self._frames.popleft()
+        self.dropped += 1
+        if not self._in_burst:
+            self._in_burst = True
+            self._warn(
+                f"{self._limit} frames wait unread, so the oldest are dropped; "
+                "read them faster or make the queue longer"
+            )

@@ -1,0 +1,363 @@
+"""Every kind of recording: which kind a path is, its messages, its summary, conversion.
+
+What is lost, and nothing else: vendor directories cut times to 1 ms, know none before the first
+message's, give a message without a time that of the one before, and have no place for answers,
+system messages and the like; text files of theirs lose the payload bits of a NaN. Only wire
+captures hold what the host sent and how messages lay in packets. Messages are written as the
+message table encodes them: with a trailer or NUL that was left out, without what lies behind the
+last field.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from xethru_protocol.recordings import npz, wire_capture
+from xethru_protocol.recordings.npz import npz_facts, read_npz
+from xethru_protocol.recordings.records import (
+    FaultHandler,
+    RadarFacts,
+    RecordingError,
+    RecordingFacts,
+    RecordingFault,
+    Timed,
+    unreadable,
+)
+from xethru_protocol.recordings.vendor.layouts import PARAMETER_FILE_NAME
+from xethru_protocol.recordings.vendor.reader import is_vendor_file, read_vendor, vendor_facts
+from xethru_protocol.recordings.vendor.writer import RecordingWriter
+from xethru_protocol.recordings.wire_capture import read_wire, wire_facts
+from xethru_protocol.wire.connection import Connection, Role
+from xethru_protocol.wire.table import ROWS, Response, UnknownMessage
+
+RecordingFormat = Literal["vendor", "wire", "mcap", "npz"]
+
+
+def message_name(message: Response) -> str:
+    """Name of a message as in dumps, for example ``"DATA FLOAT"``."""
+    return "UNKNOWN" if isinstance(message, UnknownMessage) else ROWS[type(message)].name
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordingSummary:
+    """What a recording holds.
+
+    Attributes
+    ----------
+    path, format
+        Where, and ``"vendor"``, ``"wire"``, ``"mcap"`` or ``"npz"``.
+    start_ns, duration_ns
+        Time of the first message [ns since 1970] and from there to the last; None without times.
+    messages
+        How many of each kind, by name.
+    size_bytes
+        Of all its files.
+    parameter_file
+        Name of the stored parameter file; None if there is none.
+    faults
+        What could not be read.
+    """
+
+    path: Path
+    format: RecordingFormat
+    start_ns: int | None
+    duration_ns: int | None
+    messages: dict[str, int]
+    size_bytes: int
+    session_id: str
+    profile_id: int | None
+    parameter_file: str | None
+    faults: tuple[RecordingFault, ...]
+
+
+_MAGICS: dict[bytes, RecordingFormat] = {
+    wire_capture.MAGIC: "wire",
+    b"\x89MCAP0\r\n": "mcap",
+    b"PK\x03\x04": "npz",
+}
+
+
+def recording_format(path: Path | str) -> RecordingFormat:
+    """Return the format of a recording, told by what it begins with.
+
+    Raises
+    ------
+    RecordingError
+        If there is nothing, or nothing that this can read.
+    """
+    path = Path(path)
+    try:
+        if not path.exists():
+            raise RecordingError(f"there is no recording {path}")
+        if path.is_dir() or is_vendor_file(path):
+            return "vendor"
+        if not path.is_file():  # a pipe would be waited for
+            raise RecordingError(f"{path} is no file; a recording is read from files only")
+        with path.open("rb") as stream:
+            start = stream.read(8)
+    except OSError as error:
+        raise unreadable(path, error) from None
+    for magic, found in _MAGICS.items():
+        if start.startswith(magic):
+            return found
+    raise RecordingError(
+        f"{path} is no recording this can read: a directory or data file of ModuleConnector,"
+        " a wire capture (.xtwire), MCAP or .npz"
+    )
+
+
+def read_recording(
+    path: Path | str, on_fault: FaultHandler | None = None, *, radar: str | None = None
+) -> Iterator[Timed]:
+    """Messages of a recording with their times, whatever its format.
+
+    Parameters
+    ----------
+    path
+        A directory of ModuleConnector, its meta file or one data file in it; a wire capture
+        (`WireCapture`), an MCAP file or a numpy archive that `convert` wrote.
+    on_fault
+        Called with what could not be read; the rest is read all the same. None: what costs
+        messages raises, what costs only times passes.
+    radar
+        Which radar's, by its name in `recording_radars`; needed where there are several.
+
+    Yields
+    ------
+    The message, and its time [ns since 1970]; None where the recording has none. In vendor
+    directories the resolution is 1 ms.
+
+    Raises
+    ------
+    RecordingError
+        If there is nothing to read, or messages are lost and ``on_fault`` is None.
+    """
+    path = Path(path)
+    found = recording_format(path)
+    if radar is not None and found != "mcap":
+        raise RecordingError(f"{path} is of one radar and names none; leave the name out")
+    match found:
+        case "wire":
+            yield from read_wire(path, on_fault)
+        case "npz":
+            yield from read_npz(path)
+        case "mcap":
+            from xethru_protocol.recordings.mcap import read_mcap
+
+            yield from read_mcap(path, on_fault, radar)
+        case "vendor":
+            yield from read_vendor(path, on_fault)
+
+
+def recording_radars(path: Path | str) -> tuple[RadarFacts, ...]:
+    """Return the radars of a recording; only a session (MCAP) has several, and names them.
+
+    Raises
+    ------
+    RecordingError
+        If there is nothing that this can read.
+    """
+    path = Path(path)
+    if recording_format(path) != "mcap":
+        return (RadarFacts(),)
+    from xethru_protocol.recordings.mcap import mcap_radars
+
+    return mcap_radars(path)
+
+
+def recording_facts(path: Path | str) -> RecordingFacts:
+    """Return what a recording says about itself; RecordingError if it cannot be read."""
+    path = Path(path)
+    match recording_format(path):
+        case "wire":
+            return wire_facts(path)
+        case "npz":
+            return npz_facts(path)
+        case "mcap":
+            from xethru_protocol.recordings.mcap import mcap_facts
+
+            return mcap_facts(path)
+        case "vendor":
+            return vendor_facts(path)
+
+
+def describe_recording(path: Path | str, *, radar: str | None = None) -> RecordingSummary:
+    """Read a whole recording and say what it holds; RecordingError if it holds nothing.
+
+    Of a session of several radars, only the named one, as in `read_recording`.
+    """
+    path = Path(path)
+    faults: list[RecordingFault] = []
+    counts: Counter[str] = Counter()
+    first_ns = last_ns = None
+    for message, t_ns in read_recording(path, faults.append, radar=radar):
+        counts[message_name(message)] += 1
+        if t_ns is not None:
+            first_ns = t_ns if first_ns is None else min(first_ns, t_ns)
+            last_ns = t_ns if last_ns is None else max(last_ns, t_ns)
+    facts = recording_facts(path)
+    return RecordingSummary(
+        path=path,
+        format=recording_format(path),
+        start_ns=first_ns,
+        duration_ns=None if first_ns is None or last_ns is None else last_ns - first_ns,
+        messages=dict(counts),
+        size_bytes=_size(path),
+        session_id=facts.session_id,
+        profile_id=facts.profile_id,
+        parameter_file=None if facts.parameter_file is None else PARAMETER_FILE_NAME,
+        faults=tuple(faults),
+    )
+
+
+def _size(path: Path) -> int:
+    try:
+        if path.is_file() and not is_vendor_file(path):
+            return path.stat().st_size
+        directory = path if path.is_dir() else path.parent
+        return sum(file.stat().st_size for file in directory.rglob("xethru_*") if file.is_file())
+    except OSError as error:
+        raise unreadable(path, error) from None
+
+
+_PROGRESS_EVERY = 1000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Conversion:
+    """What a conversion did.
+
+    Attributes
+    ----------
+    messages
+        How many messages were written.
+    skipped
+        By name, how many the target's format has no place for.
+    faults
+        What could not be read from the source.
+    """
+
+    messages: int
+    skipped: dict[str, int]
+    faults: tuple[RecordingFault, ...]
+
+
+def convert(
+    source: Path | str,
+    target: Path | str,
+    on_progress: Callable[[int], None] | None = None,
+    *,
+    radar: str | None = None,
+) -> Conversion:
+    """Write a recording again in the format that the target's suffix names.
+
+    Parameters
+    ----------
+    source
+        Any recording that `read_recording` takes.
+    target
+        A new file ``*.mcap``, ``*.npz`` or ``*.xtwire``; a name without suffix is a new
+        directory of ModuleConnector.
+    on_progress
+        Called with the number of messages so far, every thousand and at the end.
+    radar
+        Which radar of a session of several, as in `read_recording`.
+
+    Raises
+    ------
+    RecordingError
+        If the source cannot be read, the target exists or cannot be written, or its suffix
+        names no format.
+    """
+    source, target = Path(source), Path(target)
+    write = _writer(target)
+    faults: list[RecordingFault] = []
+    facts = recording_facts(source)
+    counted = _Counted(read_recording(source, faults.append, radar=radar), on_progress)
+    skipped = write(target, iter(counted), facts)
+    if on_progress is not None:
+        on_progress(counted.messages)
+    return Conversion(
+        messages=counted.messages - sum(skipped.values()),
+        skipped=dict(skipped),
+        faults=tuple(faults),
+    )
+
+
+@dataclass(slots=True)
+class _Counted:
+    """Counts the messages that pass."""
+
+    source: Iterator[Timed]
+    on_progress: Callable[[int], None] | None
+    messages: int = 0
+
+    def __iter__(self) -> Iterator[Timed]:
+        for timed in self.source:
+            yield timed
+            self.messages += 1
+            if self.on_progress is not None and self.messages % _PROGRESS_EVERY == 0:
+                self.on_progress(self.messages)
+
+
+_Writer = Callable[[Path, Iterator[Timed], RecordingFacts], Counter[str]]
+
+
+def _writer(target: Path) -> _Writer:
+    if target.is_dir() or not target.suffix:
+        return _to_vendor
+    writers: dict[str, _Writer] = {
+        ".mcap": _to_mcap,
+        npz.SUFFIX: _to_npz,
+        wire_capture.SUFFIX: _to_wire,
+    }
+    writer = writers.get(target.suffix)
+    if writer is None:
+        known = ", ".join(writers)
+        raise RecordingError(
+            f"{target}: no format has the suffix {target.suffix}; known are {known},"
+            " and none for a directory of ModuleConnector"
+        )
+    if target.exists():
+        raise RecordingError(f"{target} exists already")
+    return writer
+
+
+def _to_vendor(target: Path, messages: Iterator[Timed], facts: RecordingFacts) -> Counter[str]:
+    skipped: Counter[str] = Counter()
+    last_ns = 0
+    with RecordingWriter(
+        target,
+        session_id=facts.session_id,
+        profile_id=facts.profile_id,
+        parameter_file=facts.parameter_file,
+        user_header=facts.user_header,
+    ) as writer:
+        for message, t_ns in messages:
+            last_ns = last_ns if t_ns is None else t_ns
+            if not writer.write(message, last_ns):
+                skipped[message_name(message)] += 1
+        writer.close(stopped_ns=facts.stopped_ns, closed_ns=facts.closed_ns)
+    return skipped
+
+
+def _to_npz(target: Path, messages: Iterator[Timed], facts: RecordingFacts) -> Counter[str]:
+    npz.write_npz(target, messages, facts)
+    return Counter()
+
+
+def _to_mcap(target: Path, messages: Iterator[Timed], facts: RecordingFacts) -> Counter[str]:
+    from xethru_protocol.recordings.mcap import write_mcap
+
+    write_mcap(target, messages, facts)
+    return Counter()
+
+
+def _to_wire(target: Path, messages: Iterator[Timed], facts: RecordingFacts) -> Counter[str]:
+    module = Connection(Role.MODULE)
+    with wire_capture.WireCapture(target, {"facts": facts.as_json()}) as capture:
+        for message, t_ns in messages:
+            capture.write("rx", module.send(message), t_ns)
+    return Counter()

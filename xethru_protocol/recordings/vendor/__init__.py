@@ -1,0 +1,1 @@
+"""Recording directories of the vendor's ModuleConnector."""

@@ -1,0 +1,1 @@
+"""The wire of an X4M300 without I/O: messages, codec, framing, X4 arithmetic."""

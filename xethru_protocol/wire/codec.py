@@ -1,0 +1,150 @@
+"""Payload bytes to messages and back, driven by the message table.
+
+Decoding never raises on wire input: what no row describes, and what is shorter than its row,
+becomes an `UnknownMessage`. Bytes behind the last field are ignored, as the firmware ignores
+them (Protocol reference 3).
+"""
+
+import struct
+from typing import Any, TypeVar, cast
+
+import numpy as np
+
+from xethru_protocol.wire.codes import ElementType, ResponseCode
+from xethru_protocol.wire.errors import LocalProtocolError
+from xethru_protocol.wire.fields import FLOAT32, hex_bytes
+from xethru_protocol.wire.messages import DataFloat  # importing messages enters all rows
+from xethru_protocol.wire.table import (
+    COMMANDS,
+    RESPONSES,
+    ROWS,
+    Command,
+    Message,
+    Response,
+    Row,
+    UnknownMessage,
+)
+
+BuiltT = TypeVar("BuiltT", bound=Message)
+
+
+def encode(message: Message, *, bulk: bool | None = None) -> bytes:
+    """Payload of ``message``.
+
+    Parameters
+    ----------
+    message
+        Any message of the table, or an `UnknownMessage`, which is sent as it is.
+    bulk
+        True if the packet will travel in NoEscape framing, where an empty element list still
+        has its count; None: as a real module sends this message.
+
+    Raises
+    ------
+    LocalProtocolError
+        If a field does not fit its place on the wire.
+
+    >>> from xethru_protocol.wire.messages import Ping
+    >>> encode(Ping()).hex(" ")
+    '01 ae ea aa ee'
+    """
+    if isinstance(message, UnknownMessage):
+        return message.payload
+    row = ROWS[type(message)]
+    framed_in_bulk = row.bulk if bulk is None else bulk
+    fields = _fields(message, row)
+    parts = [row.prefix]
+    for name, kind in row.kinds:
+        try:
+            parts.append(kind.pack(fields.get(name), fields, framed_in_bulk))
+        except (struct.error, ValueError, TypeError, OverflowError) as error:
+            what = f"{name}={fields[name]!r}" if name in fields else name
+            raise LocalProtocolError(f"{row.name} cannot carry {what}: {error}") from None
+    return b"".join(parts)
+
+
+def decode_command(payload: bytes) -> Command[Response]:
+    """Message of a host-to-module payload.
+
+    >>> decode_command(bytes.fromhex("50 10 10 00 00 00 00 00 A0 41"))
+    X4DriverSet(setting=<X4Setting.FPS: 16>, value_width=None, value=20.0)
+    """
+    cls = COMMANDS.find(payload)
+    return _unknown(payload) if cls is None else cast(Command[Response], _build(cls, payload))
+
+
+def decode_response(payload: bytes) -> Response:
+    """Message of a module-to-host payload.
+
+    >>> decode_response(bytes.fromhex("20 01 00 00 00"))
+    Error(code=1)
+    """
+    cls = RESPONSES.find(payload)
+    return _unknown(payload) if cls is None else cast(Response, _build(cls, payload))
+
+
+_FRAME_HEADER = struct.Struct("<III")  # content id, info, count: from payload byte 2
+_FRAME_CODES = bytes((ResponseCode.XTS_SPR_DATA, ElementType.XTS_SPRD_FLOAT))
+_new_frame = object.__new__
+# A frozen dataclass pays an object.__setattr__ per field; the slots' own setters do not.
+_set_content_id = vars(DataFloat)["content_id"].__set__
+_set_info = vars(DataFloat)["info"].__set__
+_set_values = vars(DataFloat)["values"].__set__
+_array = np.frombuffer
+
+
+def decode_response_at(buffer: bytes, start: int, end: int) -> Response:
+    """Message of the payload ``buffer[start:end]``, copying a frame's samples once.
+
+    The way of every radar frame; same result as ``decode_response(buffer[start:end])``.
+    """
+    if buffer[start : start + 2] == _FRAME_CODES and end - start > 14:
+        content_id, info, count = _FRAME_HEADER.unpack_from(buffer, start + 2)
+        first = start + 14
+        if first + 4 * count == end:
+            frame = _new_frame(DataFloat)
+            _set_content_id(frame, content_id)
+            _set_info(frame, info)
+            _set_values(frame, _array(buffer[first:end], FLOAT32))
+            return frame
+    return decode_response(buffer[start:end])
+
+
+def describe(message: Message) -> tuple[str, dict[str, Any]]:
+    """Name and JSON-able fields of a message, named as in the golden vectors.
+
+    >>> describe(decode_response(bytes.fromhex("01 EA AE EE AA")))
+    ('PONG', {'value': '0xAAEEAEEA'})
+    """
+    if isinstance(message, UnknownMessage):
+        return "UNKNOWN", {"code": message.code, "payload": hex_bytes(message.payload)}
+    row = ROWS[type(message)]
+    fields = _fields(message, row)
+    shown: dict[str, Any] = {}
+    for name, kind in row.kinds:
+        shown |= kind.show(name, fields.get(name), fields)
+    for name, derive in row.derived.items():
+        shown[name] = derive(message)
+    return row.name, shown
+
+
+def _build(cls: type[BuiltT], payload: bytes) -> BuiltT | UnknownMessage:
+    row = ROWS[cls]
+    position = len(row.prefix)
+    fields: dict[str, Any] = {}
+    try:
+        for name, kind in row.kinds:
+            fields[name], position = kind.unpack(payload, position, fields)
+    except (struct.error, ValueError, KeyError):
+        return _unknown(payload)
+    for name in row.wire_only:
+        del fields[name]
+    return cls(**fields)
+
+
+def _fields(message: Message, row: Row) -> dict[str, Any]:
+    return {name: getattr(message, name) for name in row.fields}
+
+
+def _unknown(payload: bytes) -> UnknownMessage:
+    return UnknownMessage(code=payload[0] if payload else -1, payload=payload)

@@ -1,0 +1,488 @@
+"""Kinds of wire fields: what ``Annotated[type, KIND]`` in a message may say.
+
+A kind knows how one field is packed, unpacked and shown. The codec walks a message's fields in
+order; the layouts themselves stand in the rows. All numbers are little-endian, unpadded
+(Protocol reference, head). Lists with a count of their own stand in ``wire_lists``. A kind raises
+``struct.error`` or ``ValueError`` when the bytes do not fit; the codec turns that into
+`UnknownMessage`.
+
+A `Count` lies on the wire only: a row declares it as ``ClassVar``, so that a message has the
+list and not, beside it, a number that could contradict it. Kinds in general: ``wire``.
+"""
+
+import struct
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+# ruff: noqa: ANN401 - a kind handles whatever type its field has
+
+
+FLOAT32 = np.dtype("<f4")
+# A message's fields by name; while unpacking, those before this one.
+Fields = Mapping[str, Any]
+
+
+class Kind(Protocol):
+    """One way to put a field on the wire."""
+
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
+        """Bytes of ``value``; ``bulk`` says that the packet travels in NoEscape framing."""
+
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
+        """Value at ``start`` and the offset behind it."""
+
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
+        """JSON-able entries of a dump."""
+
+
+def _plain(value: Any) -> Any:
+    return value
+
+
+def hexadecimal(value: int) -> str:
+    """Show an id as eight hexadecimal digits."""
+    return f"0x{value:08X}"
+
+
+def short_hexadecimal(value: int) -> str:
+    """Show an id without leading zeros."""
+    return f"0x{value:X}"
+
+
+def hex_bytes(value: bytes) -> str:
+    """Show bytes as spaced upper-case hexadecimal."""
+    return value.hex(" ").upper()
+
+
+@dataclass(frozen=True, slots=True)
+class Number:
+    """One scalar: a ``struct`` code, and how a dump shows it."""
+
+    code: str
+    label: str = ""
+    shown: Callable[[Any], Any] = _plain
+    order: str = "<"
+
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
+        """Pack the scalar."""
+        return struct.pack(self.order + self.code, value)
+
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
+        """Unpack the scalar."""
+        (value,) = struct.unpack_from(self.order + self.code, data, start)
+        return value, start + struct.calcsize(self.order + self.code)
+
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
+        """Show it under its label, as the golden vectors name it."""
+        return {self.label or name: self.shown(value)}
+
+
+U8 = Number("B")
+U32 = Number("I")
+F32 = Number("f")
+ID32 = Number("I", shown=hexadecimal)
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """A u32 that must be a member of ``enum``; shown by its name."""
+
+    enum: type[IntEnum]
+    label: str
+
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
+        """Pack the number behind the member; ``ValueError`` if it is none."""
+        return struct.pack("<I", self.enum(value))
+
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
+        """Unpack the member; ``ValueError`` if the number is none."""
+        (value,) = struct.unpack_from("<I", data, start)
+        return self.enum(value), start + 4
+
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
+        """Show the member's name."""
+        return {self.label: self.enum(value).name}
+
+
+@dataclass(frozen=True, slots=True)
+class Spelling:
+    """A code that belongs to the prefix and has several values for one and the same message.
+
+    Must be a row's first field: the row is entered once per value. The value ``usual`` is not
+    shown.
+    """
+
+    codes: tuple[int, ...]
+    usual: int | None = None
+
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
+        """Pack the code; ``ValueError`` if it is not one of this message's."""
+        if value not in self.codes:
+            raise ValueError("this code is another message's")
+        return bytes((value,))
+
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
+        """Unpack the code."""
+        return data[start], start + 1
+
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
+        """Show which code was used, unless it is the usual one."""
+        return {} if value == self.usual else {name: short_hexadecimal(value)}
+
+
+@dataclass(frozen=True, slots=True)
+class OptionalByte:
+    """A trailing u8 that may be absent (None)."""
+
+    wanted: Callable[[Fields], bool] = lambda fields: True
+    required: bool = False
+    shown_if_absent: bool = False
+
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
+        """Pack the byte, or nothing; ``ValueError`` if this message needs one."""
+        if value is None and self.required and self.wanted(fields):
+            raise ValueError("the address is missing")
+        return b"" if value is None else bytes((value,))
+
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
+        """Unpack the byte where this message has one."""
+        if not self.wanted(fields):
+            return None, start
+        if start < len(data):
+            return data[start], start + 1
+        if self.required:
+            raise ValueError("the address is missing")
+        return None, start
+
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
+        """Show the byte; an absent one only where the vectors list it as null."""
+        return {} if value is None and not self.shown_if_absent else {name: value}
+
+
+@dataclass(frozen=True, slots=True)
+class ByDiscriminator:
+    """A value whose struct layout depends on an earlier field.
+
+    ``layouts[id]`` is ``(codes, names)``: one scalar, or a tuple of several. ``short`` lists
+    ids whose single value may also travel in one byte; which form was used is kept in the
+    field ``width_field`` (None: the normal form), so that a decoded message encodes to the
+    bytes it came from.
+    """
+
+    field: str
+    layouts: Mapping[int, tuple[str, tuple[str, ...]]]
+    short: frozenset[int] = frozenset()
+    width_field: str = ""
+
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
+        """Pack in the layout of the discriminator."""
+        key = fields[self.field]
+        if key not in self.layouts:
+            raise ValueError("this setting cannot be set")
+        codes, names = self.layouts[key]
+        if key in self.short and fields[self.width_field] == 1:
+            codes = "B"
+        return struct.pack("<" + codes, *(value if len(names) > 1 else (value,)))
+
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
+        """Unpack in the layout of the discriminator."""
+        key = fields[self.field]
+        codes, names = self.layouts[key]
+        if key in self.short and fields[self.width_field] == 1:
+            codes = "B"
+        values = struct.unpack_from("<" + codes, data, start)
+        return (values if len(names) > 1 else values[0]), start + struct.calcsize("<" + codes)
+
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
+        """Show each scalar under its own name."""
+        names = self.layouts[fields[self.field]][1]
+        return dict(zip(names, value if len(names) > 1 else (value,), strict=True))
+
+
+@dataclass(frozen=True, slots=True)
+class ShortForm:
+    """Pseudo field, no bytes: 1 if the value that follows travels in one byte, else None."""
+
+    field: str
+    short: frozenset[int]
+
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
+        """Nothing."""
+        if value not in (None, 1):
+            raise ValueError("a value is one byte wide or as the firmware parses it (None)")
+        return b""
+
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
+        """Tell the form by the bytes that are left."""
+        return (1 if fields[self.field] in self.short and len(data) - start == 1 else None), start
+
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
+        """Nothing: the value itself is shown."""
+        return {}
+
+
+@dataclass(frozen=True, slots=True)
+class Elements:
+    """Element list of REPLY and DATA: ``[u32 count] elements [trailer]``.
+
+    The count is absent when it is 0, except in NoEscape framing. REPLYs other than INT end with
+    a trailer byte; it is optional on receipt (Protocol reference 5.2, 6).
+    """
+
+    code: str  # struct code of one element; "a" float32 array, "s" text, "c" raw bytes
+    size: int
+    label: str
+    trailer: int | None = None
+    count_label: str = ""  # the name under which a dump shows the count
+    trailer_shown: bool = False
+
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
+        """Pack count, elements and trailer."""
+        body = self._bytes(value)
+        count = b"" if not body and not bulk else struct.pack("<I", len(body) // self.size)
+        return count + body + (b"" if self.trailer is None else bytes((self.trailer,)))
+
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
+        """Unpack the elements; a missing count or trailer is accepted."""
+        rest = len(data) - start
+        if rest <= (0 if self.trailer is None else 1):
+            return self._value(b""), len(data)
+        (count,) = struct.unpack_from("<I", data, start)
+        begin = start + 4
+        end = begin + count * self.size
+        if end > len(data):
+            raise ValueError(f"{count} elements announced, fewer present")
+        return self._value(data[begin:end]), end
+
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
+        """Show count, elements and trailer as the golden vectors do."""
+        shown: dict[str, Any] = {}
+        if self.count_label:
+            shown[self.count_label] = len(self._bytes(value)) // self.size
+        if isinstance(value, bytes):
+            shown[self.label] = list(value) if self.trailer_shown else hex_bytes(value)
+        elif isinstance(value, str):
+            shown[self.label] = value
+        elif isinstance(value, np.ndarray):
+            shown[self.label] = value.tolist()
+        else:
+            shown[self.label] = [item.item() if hasattr(item, "item") else item for item in value]
+        if self.trailer_shown:
+            shown["trailer"] = self.trailer
+        return shown
+
+    def _bytes(self, value: Any) -> bytes:
+        if self.code == "a":
+            return np.ascontiguousarray(value, dtype=FLOAT32).tobytes()
+        if self.code == "s":
+            return str(value).encode("latin-1")
+        if self.code == "c":
+            return bytes(value)
+        return struct.pack(f"<{len(value)}{self.code}", *value)
+
+    def _value(self, body: bytes) -> Any:
+        if self.code == "a":
+            return np.frombuffer(body, dtype=FLOAT32)
+        if self.code == "s":
+            return body.decode("latin-1")  # every byte is a character: no wire text can fail
+        if self.code == "c":
+            return body
+        return struct.unpack(f"<{len(body) // self.size}{self.code}", body)
+
+
+@dataclass(frozen=True, slots=True)
+class Bins:
+    """A float32 array with one value per bin; the bin count is the field ``count_field``."""
+
+    count_field: str
+    label: str = ""
+
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
+        """Pack the array."""
+        array: npt.NDArray[np.float32] = np.ascontiguousarray(value, dtype=FLOAT32)
+        if array.shape != (fields[self.count_field],):
+            raise ValueError(f"{array.shape} values for {fields[self.count_field]} bins")
+        return array.tobytes()
+
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
+        """Unpack the array, as a view on its own copy of the bytes."""
+        end = start + 4 * fields[self.count_field]
+        if end > len(data):
+            raise ValueError("fewer bins than announced")
+        return np.frombuffer(data[start:end], dtype=FLOAT32), end
+
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
+        """Show the values."""
+        return {self.label or name: value.tolist()}
+
+
+@dataclass(frozen=True, slots=True)
+class RestBytes:
+    """All bytes that are left."""
+
+    shown: Callable[[bytes], Any] = hex_bytes
+    label: str = ""
+
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
+        """Pack the bytes."""
+        return bytes(value)
+
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
+        """Take everything."""
+        return data[start:], len(data)
+
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
+        """Show the bytes."""
+        return {self.label or name: self.shown(value)}
+
+
+# ruff: noqa: ANN401 - a kind handles whatever type its field has
+
+
+def text_bytes(value: str | bytes) -> bytes:
+    """Bytes of a text as it travels: one per character, and a terminating NUL."""
+    return (value if isinstance(value, bytes) else value.encode("latin-1")) + b"\x00"
+
+
+def text_size(value: str | bytes) -> int:
+    """Bytes that a text takes, its NUL included."""
+    return len(text_bytes(value))
+
+
+@dataclass(frozen=True, slots=True)
+class Count:
+    """A u32 that counts the entries of the lists ``of``, which are equally long.
+
+    ``per`` entries count as one; ``label`` is its name in a dump, none if it is not shown.
+    """
+
+    of: tuple[str, ...]
+    label: str = ""
+    per: int = 1
+    size: Callable[[Any], int] = len
+
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
+        """Pack the count; ``ValueError`` if the lists differ in length."""
+        return struct.pack("<I", self._count(fields))
+
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
+        """Unpack the count."""
+        (count,) = struct.unpack_from("<I", data, start)
+        return count, start + 4
+
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
+        """Show the count, where the vectors do."""
+        return {self.label: self._count(fields)} if self.label else {}
+
+    def _count(self, fields: Fields) -> int:
+        entries, *others = (self.size(fields[name]) for name in self.of)
+        if any(other != entries for other in others) or entries % self.per:
+            raise ValueError(f"{' and '.join(self.of)} must have one length, of whole entries")
+        return entries // self.per
+
+
+@dataclass(frozen=True, slots=True)
+class Floats:
+    """``per`` float32 values for each entry that the field ``count`` announces."""
+
+    count: str
+    label: str = ""
+    per: int = 1
+    empty_shown: bool = False
+
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
+        """Pack the values."""
+        return struct.pack(f"<{len(value)}f", *value)
+
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
+        """Unpack the values; ``struct.error`` if there are fewer than announced."""
+        size = fields[self.count] * self.per
+        return struct.unpack_from(f"<{size}f", data, start), start + 4 * size
+
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
+        """Show the values; an empty list is not shown."""
+        return {self.label or name: list(value)} if value or self.empty_shown else {}
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """As many bytes as the field ``count`` announces."""
+
+    count: str
+    label: str = ""
+    shown: Callable[[bytes], Any] = hex_bytes
+
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
+        """Pack the bytes; ``ValueError`` if the message itself counts them otherwise."""
+        if fields.get(self.count, len(value)) != len(value):
+            raise ValueError(f"{len(value)} bytes, but {self.count} is {fields[self.count]}")
+        return bytes(value)
+
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
+        """Unpack the bytes; ``ValueError`` if there are fewer than announced."""
+        end = start + fields[self.count]
+        if end > len(data):
+            raise ValueError("fewer bytes than announced")
+        return data[start:end], end
+
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
+        """Show the bytes."""
+        return {self.label or name: self.shown(value)}
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """A NUL-terminated text, one byte per character; the field ``count`` includes the NUL.
+
+    The NUL is no part of the value; a text that comes without one is accepted.
+    """
+
+    count: str
+    label: str = ""
+
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
+        """Pack the text and its NUL."""
+        return text_bytes(value)
+
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
+        """Unpack the text; ``ValueError`` if it is shorter than announced."""
+        end = start + fields[self.count]
+        if end > len(data):
+            raise ValueError("a shorter text than announced")
+        return data[start:end].removesuffix(b"\x00").decode("latin-1"), end
+
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
+        """Show the text."""
+        text = value.decode("latin-1") if isinstance(value, bytes) else value
+        return {self.label or name: text}
+
+
+@dataclass(frozen=True, slots=True)
+class TypedElements:
+    """An element list whose type an earlier field tells."""
+
+    field: str
+    types: Mapping[int, Elements]
+
+    def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
+        """Pack as that type's list; ``ValueError`` if there is no such type."""
+        return self._elements(fields).pack(value, fields, bulk)
+
+    def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
+        """Unpack that type's list."""
+        return self._elements(fields).unpack(data, start, fields)
+
+    def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
+        """Show that type's list."""
+        return self._elements(fields).show(name, value, fields)
+
+    def _elements(self, fields: Fields) -> Elements:
+        elements = self.types.get(fields[self.field])
+        if elements is None:
+            raise ValueError("there is no such element type")
+        return elements

@@ -1,0 +1,741 @@
+"""Packets in their two framings, and the receiver that finds them in any bytes.
+
+A NoEscape packet has no checksum, so a receiver that believes a damaged length field loses all
+that follows. The judgement needs the length and at most the first 14 payload bytes, and is the
+same for every receiver, so that it depends on nothing but the bytes (Protocol reference 1.3, 1.4).
+
+Normal framing escapes 7D, 7E, 7F and ends with an XOR checksum; NoEscape framing announces a
+length and has neither (Protocol reference 1.1, 1.3).
+
+All positions are offsets in the stream; a buffer is given with the offset ``base`` of its first
+byte. No byte is searched twice by one finder, however the bytes arrive.
+
+What it guarantees, for any bytes in any chunks:
+
+- The packets and faults depend on the bytes only, not on how they were cut into chunks.
+- It never raises, and once it asks for data it holds less than one packet (65 544 bytes) that
+  is not judged, in whatever chunks these came.
+- Starts are tried in the order of their position and the first that holds wins. So an intact
+  packet is found unless an earlier start makes a valid packet out of its bytes: a Normal packet
+  whose checksum happens to fit (1 in 256 for random bytes; always when the end of an intact
+  packet became 7F, since the two checksums cancel) or a NoEscape header that happens to be
+  consistent. Junk without a start cannot hide anything; a stray 7D delays what follows until
+  it is refuted, by the next unescaped 7D or 7E or at the longest possible packet.
+- Every byte is searched and parsed a bounded number of times, also in input made to hurt.
+- `LinkStatistics` counts every byte: in a packet, junk, or not judged yet.
+
+The last point rests on one fact. Let a Normal packet started at s be parsed up to its
+terminator t. A 7D between the two was not a terminator, so it was escaped, so the parse is in
+the same state behind it as a parse started *at* it. Therefore all starts between s and t share
+the terminator t, and their contents are suffixes of the first's: one scan serves them all.
+"""
+
+import re
+import struct
+from bisect import bisect_right
+from collections import Counter, deque
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Final
+
+import numpy as np
+
+from xethru_protocol.wire.codes import AppDataId, CommandCode, ElementType, ResponseCode
+from xethru_protocol.wire.errors import LocalProtocolError
+
+HEAD_BYTES = 14  # payload bytes needed to judge
+MAX_LENGTH = 65535
+_VENDOR_LIMIT = 7995  # what the module's own parser can receive
+_COUNT = struct.Struct("<I")
+
+
+class Direction(Enum):
+    """Which way bytes travel; what a payload may be depends on it."""
+
+    FROM_HOST = "from host"
+    FROM_MODULE = "from module"
+
+
+_KNOWN = {
+    Direction.FROM_HOST: frozenset(int(code) for code in CommandCode),
+    Direction.FROM_MODULE: frozenset(int(code) for code in ResponseCode),
+}
+
+_ELEMENT_BYTES: dict[int, int] = {
+    ElementType.XTS_SPRD_BYTE: 1,
+    ElementType.XTS_SPRD_INT: 4,
+    ElementType.XTS_SPRD_FLOAT: 4,
+    ElementType.XTS_SPRD_STRING: 1,
+    ElementType.XTS_SPRD_USER: 1,
+}
+# Messages that end with their elements: bytes per element, by type.
+_LISTS: dict[int, dict[int, int]] = {
+    ResponseCode.XTS_SPR_DATA: _ELEMENT_BYTES,
+    ResponseCode.XTS_SPR_HIL: _ELEMENT_BYTES | {ElementType.XTS_SPRD_NONE: 1},
+}
+# APPDATA with bulk content: (header bytes, offset of the bin count if within the head, bytes
+# per bin). Pulse-Doppler and noise maps count their bins behind the head.
+_APPDATA: dict[int, tuple[int, int | None, int]] = {
+    AppDataId.XTS_ID_BASEBAND_IQ: (29, 9, 8),
+    AppDataId.XTS_ID_BASEBAND_AMPLITUDE_PHASE: (29, 9, 8),
+    AppDataId.XTS_ID_PULSEDOPPLER_FLOAT: (49, None, 4),
+    AppDataId.XTS_ID_PULSEDOPPLER_BYTE: (57, None, 1),
+    AppDataId.XTS_ID_NOISEMAP_FLOAT: (49, None, 4),
+    AppDataId.XTS_ID_NOISEMAP_BYTE: (57, None, 1),
+}
+
+
+def plausible(  # noqa: PLR0911 - one return per kind of message
+    length: int, head: bytes, direction: Direction
+) -> bool:
+    """Whether a NoEscape packet may announce ``length`` payload bytes starting with ``head``.
+
+    Parameters
+    ----------
+    length
+        The header's length field.
+    head
+        The payload's first ``min(length, HEAD_BYTES)`` bytes.
+    direction
+        Who sent it.
+
+    >>> head = bytes.fromhex("A0 12 00 00 00 00 2A 00 00 00 01 00 00 00")
+    >>> plausible(18, head, Direction.FROM_MODULE), plausible(19, head, Direction.FROM_MODULE)
+    (True, False)
+    """
+    if not 1 <= length <= MAX_LENGTH or head[0] not in _KNOWN[direction]:
+        return False
+    if length < HEAD_BYTES:
+        return True
+    code = head[0]
+    from_module = direction is Direction.FROM_MODULE
+    if code in _LISTS and from_module:
+        size = _LISTS[code].get(head[1])
+        return size is not None and HEAD_BYTES + _count(head, 10) * size == length
+    if code == ResponseCode.XTS_SPR_REPLY and from_module:
+        size = _ELEMENT_BYTES.get(head[1])
+        trailers = (0,) if head[1] == ElementType.XTS_SPRD_INT else (0, 1)  # may be left out
+        return size is not None and length - HEAD_BYTES - _count(head, 10) * size in trailers
+    if code == ResponseCode.XTS_SPR_APPDATA and from_module:
+        layout = _APPDATA.get(_count(head, 1))
+        if layout is None:
+            return length <= _VENDOR_LIMIT
+        header, count_at, size = layout
+        if count_at is None:
+            return length >= header and (length - header) % size == 0
+        return header + _count(head, count_at) * size == length
+    # The rest is a few bytes long and never sent this way by a real module or host.
+    return length <= (HEAD_BYTES if from_module else _VENDOR_LIMIT)
+
+
+def _count(head: bytes, offset: int) -> int:
+    (count,) = _COUNT.unpack_from(head, offset)
+    return int(count)
+
+
+START: Final = 0x7D
+END: Final = 0x7E
+ESCAPE: Final = 0x7F
+NO_ESCAPE_START: Final = b"\x7c\x7c\x7c\x7c"
+NO_ESCAPE_HEADER_BYTES: Final = 9
+MAX_NORMAL_BYTES: Final = 7999  # payload and checksum, unescaped: the vendor's parser buffer
+
+
+class Framing(Enum):
+    """How a packet is delimited."""
+
+    NORMAL = "normal"
+    NO_ESCAPE = "noescape"
+
+
+class NeedData(Enum):
+    """Type of `NEED_DATA`."""
+
+    NEED_DATA = "need data"
+
+
+NEED_DATA: Final = NeedData.NEED_DATA  # nothing to report until more bytes are received
+
+
+class FaultKind(Enum):
+    """What was wrong with bytes that belong to no packet."""
+
+    GARBAGE = "bytes between packets"
+    CHECKSUM = "wrong checksum"
+    TRUNCATED = "packet cut short by a new start"
+    EMPTY = "packet without payload"
+    OVERSIZE = "packet longer than any receiver accepts"
+    HEADER = "implausible NoEscape header"
+    INCOMPLETE = "packet cut off by the end of the data"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FramingFault:
+    """Damage on the line; ``offset`` counts bytes from the start of the stream.
+
+    One fault is reported per damaged place: what a rescan rejects inside bytes that were
+    already reported is not reported again.
+    """
+
+    kind: FaultKind
+    offset: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Packet:
+    """A received packet: its payload, unescaped and without checksum."""
+
+    framing: Framing
+    payload: bytes
+    offset: int
+
+
+def encode_normal(payload: bytes) -> bytes:
+    """Frame a payload with escapes and checksum.
+
+    >>> encode_normal(bytes.fromhex("24 02 7D")).hex(" ")
+    '7d 24 02 7f 7d 26 7e'
+
+    Raises
+    ------
+    LocalProtocolError
+        If the payload is empty or too long for any receiver.
+    """
+    if not 1 <= len(payload) < MAX_NORMAL_BYTES:
+        raise LocalProtocolError(
+            f"a Normal packet carries 1 to {MAX_NORMAL_BYTES - 1} bytes, not {len(payload)}"
+        )
+    body = payload + bytes((START ^ xor(payload),))
+    escaped = body.replace(b"\x7f", b"\x7f\x7f")  # first: the others bring new 7F
+    escaped = escaped.replace(b"\x7d", b"\x7f\x7d").replace(b"\x7e", b"\x7f\x7e")
+    return b"\x7d" + escaped + b"\x7e"
+
+
+def encode_no_escape(payload: bytes) -> bytes:
+    r"""Frame a payload behind its length.
+
+    >>> encode_no_escape(b"\x01\x02\x03").hex(" ")
+    '7c 7c 7c 7c 03 00 00 00 00 01 02 03'
+
+    Raises
+    ------
+    LocalProtocolError
+        If the payload is empty or longer than receivers believe.
+    """
+    if not 1 <= len(payload) <= MAX_LENGTH:
+        raise LocalProtocolError(
+            f"a NoEscape packet carries 1 to {MAX_LENGTH} bytes, not {len(payload)}"
+        )
+    return NO_ESCAPE_START + len(payload).to_bytes(4, "little") + b"\0" + payload
+
+
+def unescape(body: bytes) -> bytes:
+    r"""Drop the escape bytes of a Normal packet's inside; what follows each is literal.
+
+    >>> unescape(b"\x10\x7f\x7e\x7f\x7f\x04")
+    b'\x10~\x7f\x04'
+    """
+    if ESCAPE not in body:
+        return body
+    parts = body.split(b"\x7f")
+    if b"" not in parts:
+        return b"".join(parts)
+    # Each part stands behind a 7F; an empty one means that the next stands behind two.
+    rest = iter(parts[1:])
+    literal = [part or b"\x7f" + next(rest, b"") for part in rest]
+    return parts[0] + b"".join(literal)
+
+
+def xor(data: bytes) -> int:
+    r"""XOR of all bytes; the checksum of a packet also counts its start byte.
+
+    >>> xor(b"\x01\x02\x04")
+    7
+    """
+    if len(data) < 64:
+        folded = 0
+        for byte in data:
+            folded ^= byte
+        return folded
+    words = len(data) >> 3
+    folded = int(np.bitwise_xor.reduce(np.frombuffer(data, np.uint64, words)))
+    folded ^= int.from_bytes(data[words << 3 :], "little")
+    folded ^= folded >> 32
+    folded ^= folded >> 16
+    return (folded ^ folded >> 8) & 0xFF
+
+
+@dataclass(slots=True, kw_only=True)
+class LinkStatistics:
+    """Totals since the link was opened; each part of the receiver counts what it alone can see.
+
+    The receiver: ``bytes`` received, ``packets`` found, ``junk_bytes`` that belong to no packet,
+    ``resyncs`` (starts that were rejected and scanned on behind) and ``faults`` by kind, one per
+    damaged place. So ``bytes`` = bytes of packets + ``junk_bytes`` + bytes not judged yet.
+    The connection: ``unknown`` packets, intact but described by no row of the message table.
+    The frame queue: ``frames_lost`` by gaps of the frame counter, and ``off_lattice_samples``,
+    which no chip counter can give, so that they were damaged although nothing else showed it
+    (NoEscape packets carry no checksum).
+
+    >>> statistics = LinkStatistics(bytes=8, junk_bytes=8, resyncs=1)
+    >>> statistics.faults[FaultKind.CHECKSUM] += 1
+    >>> statistics.checksum_failures, statistics.summary()["faults"]
+    (1, {'wrong checksum': 1})
+    """
+
+    bytes: int = 0
+    packets: int = 0
+    junk_bytes: int = 0
+    resyncs: int = 0
+    unknown: int = 0
+    frames_lost: int = 0
+    off_lattice_samples: int = 0
+    faults: Counter[FaultKind] = field(default_factory=Counter)
+
+    @property
+    def checksum_failures(self) -> int:
+        """Damaged places that were a Normal packet with a wrong checksum."""
+        return self.faults[FaultKind.CHECKSUM]
+
+    @property
+    def clean(self) -> bool:
+        """Whether nothing was wrong so far."""
+        return not (
+            self.faults
+            or self.junk_bytes
+            or self.resyncs
+            or self.unknown
+            or self.frames_lost
+            or self.off_lattice_samples
+        )
+
+    def summary(self) -> dict[str, int | dict[str, int]]:
+        """JSON-able totals; faults by the text of their kind."""
+        return {
+            "bytes": self.bytes,
+            "packets": self.packets,
+            "junk_bytes": self.junk_bytes,
+            "resyncs": self.resyncs,
+            "checksum_failures": self.checksum_failures,
+            "unknown": self.unknown,
+            "frames_lost": self.frames_lost,
+            "off_lattice_samples": self.off_lattice_samples,
+            "faults": {kind.value: count for kind, count in self.faults.items() if count},
+        }
+
+
+NEVER: Final = 1 << 62  # a stream offset that is not reached
+
+_NEAR: Final = 256  # in which most packets end: looked at before more is marked
+_WORTH_MARKING: Final = 2048  # fewer bytes are searched faster by a regular expression
+_WINDOW: Final = 65536  # most bytes marked at once
+# Greedy, but never tried again: what is in front of an unescaped 7D or 7E, or of a last 7F.
+_CONTENT = re.compile(rb"[^\x7d-\x7f]*(?:\x7f.[^\x7d-\x7f]*)*", re.DOTALL)
+
+
+class PatternFinder:
+    """Where a byte pattern comes next."""
+
+    __slots__ = ("_found", "_pattern", "_searched")
+
+    def __init__(self, pattern: bytes) -> None:
+        self._pattern = pattern
+        self._found = -1
+        self._searched = 0
+
+    def next(self, buffer: bytes, base: int, here: int, stop: int = NEVER) -> int:
+        """Find the first pattern at or after ``here``; NEVER if there is none before ``stop``.
+
+        No pattern may lie across ``stop``.
+        """
+        if here <= self._found:
+            return self._found if self._found < stop else NEVER
+        begin = max(here, self._searched)
+        if begin >= stop:
+            return NEVER
+        limit = base + len(buffer)
+        at = buffer.find(self._pattern, begin - base, min(stop, limit) - base)
+        if at >= 0:
+            self._found = self._searched = base + at
+            return self._found
+        self._searched = stop if stop < limit else max(begin, limit - len(self._pattern) + 1)
+        return NEVER
+
+
+class TerminatorFinder:
+    """Where the next 7D or 7E stands that is not escaped: it ends a Normal packet, well or badly.
+
+    Escaped is a byte behind an odd number of 7F in a row. A start is no 7F, so that run lies
+    behind the start whatever start is asked for: which bytes are terminators depends on none,
+    and those of a whole window can be marked at once.
+
+    ``searched`` is the offset up to which the bytes are known; the byte there is not escaped.
+    """
+
+    __slots__ = ("_found", "_next", "_window", "searched")
+
+    def __init__(self) -> None:
+        self._found: list[int] = []  # ascending
+        self._next = 0  # index in it of the first behind the last start
+        self._window = _Window(b"", 0, 0)  # where they were found, unless there is only one
+        self.searched = 0
+
+    def after(self, buffer: bytes, base: int, start: int, reach: int) -> int:
+        """Find the first terminator behind the packet start at ``start``.
+
+        -1 if it is not in the buffer, or farther than ``reach`` bytes behind the start.
+        """
+        while True:
+            self._next = bisect_right(self._found, start, self._next)
+            if self._next < len(self._found):
+                return self._found[self._next]
+            at = max(start + 1, self.searched) - base
+            left = len(buffer) - at
+            if left <= 0 or base + at > start + reach:
+                return -1
+            stop = at + (left if left < _WORTH_MARKING else _NEAR)
+            content = _CONTENT.match(buffer, at, stop)
+            at = content.end() if content else at  # it always matches
+            self.searched = base + at
+            if at < stop and buffer[at] != ESCAPE:
+                self._found, self._next = [base + at], 0
+                self.searched += 1
+            elif stop == len(buffer):
+                return -1
+            else:
+                self._window = window = _Window(buffer, base, at)
+                self._found, self._next, self.searched = window.found, 0, window.end
+
+    def content(self, buffer: bytes, base: int, start: int) -> bytes:
+        """Unescape what lies between ``start`` and the terminator just found behind it."""
+        if self._next and self._found[self._next - 1] == start:
+            return self._window.content(self._next)
+        return unescape(buffer[start + 1 - base : self._found[self._next] - base])
+
+
+class _Window:
+    """Bytes whose terminators were marked together; the first of them is not escaped.
+
+    ``found`` are the offsets of the terminators, ``end`` is that of the first byte behind the
+    window that is not escaped by it.
+    """
+
+    __slots__ = ("_bounds", "_bytes", "_drop", "_places", "_unescaped", "end", "found")
+
+    def __init__(self, buffer: bytes, base: int, begin: int) -> None:
+        piece = buffer[begin : begin + _WINDOW]  # a copy: the buffer may be large, and done with
+        size = len(piece)
+        self._bytes = np.frombuffer(piece, np.uint8)
+        special = np.flatnonzero(self._bytes - np.uint8(START) < 3)  # 7D to 7F; less wraps around
+        is_escape = self._bytes[special] == ESCAPE
+        # A special byte is free if an even number of 7F stands right before it.
+        order = np.arange(special.size)
+        behind_escape = np.zeros(special.size, np.bool_)
+        behind_escape[1:] = is_escape[:-1] & (special[1:] - special[:-1] == 1)
+        free = (order - np.maximum.accumulate(np.where(behind_escape, 0, order))) & 1 == 0
+        self._places = special[free & ~is_escape]  # of the terminators
+        self._drop = special[free & is_escape]  # bytes that escape the next
+        self._unescaped = b""  # the window without those, made when the first packet asks
+        self._bounds: list[int] = []  # where the terminators lie in that
+        self.found: list[int] = (self._places + (base + begin)).tolist()
+        splits = self._drop.size and self._drop[-1] == size - 1
+        self.end = base + begin + size - (1 if splits else 0)
+
+    def content(self, index: int) -> bytes:
+        """Unescape what lies between the terminator before the ``index``-th and that one."""
+        if not self._unescaped:
+            keep = np.ones(self._bytes.size, np.bool_)
+            keep[self._drop] = False
+            self._unescaped = self._bytes[keep].tobytes()
+            self._bounds = (self._places - np.searchsorted(self._drop, self._places)).tolist()
+        return self._unescaped[self._bounds[index - 1] + 1 : self._bounds[index]]
+
+
+Span = tuple[Framing, bytes, int, int, int]
+"""Framing, buffer, payload start and end in it, offset of the packet in the stream."""
+
+MAX_NORMAL_WIRE_BYTES: Final = 2 * MAX_NORMAL_BYTES + 2  # all escaped, with start and end
+
+_JOIN_BYTES = 4096  # of the next chunk, to a Normal packet whose end is not known
+_LENGTH = struct.Struct("<I")
+# Magic and length, then code, type and element count of a DATA FLOAT.
+_FRAME_HEADER = struct.Struct("<4sIxBB8xI")
+_ESCAPED = re.compile(rb"\x7f(.)", re.DOTALL)
+_RUN_OF_7C = re.compile(rb"\x7c{9,}")
+
+
+class PacketReader:
+    """Finds packets in received bytes: ``receive_data``, then ``next_packet`` until NEED_DATA.
+
+    Parameters
+    ----------
+    direction
+        Who sends the bytes: it tells which NoEscape headers can be true.
+    statistics
+        Where to count; None: in new ones.
+
+    >>> reader = PacketReader()
+    >>> reader.receive_data(bytes.fromhex("7D 10 6D 7E"))
+    >>> reader.next_packet().payload.hex(), reader.next_packet()
+    ('10', <NeedData.NEED_DATA: 'need data'>)
+    """
+
+    def __init__(
+        self,
+        direction: Direction = Direction.FROM_MODULE,
+        statistics: LinkStatistics | None = None,
+    ) -> None:
+        self._direction = direction
+        self.statistics = LinkStatistics() if statistics is None else statistics
+        self._buffer = b""  # what is being parsed, from _pos on; never changed in place
+        self._pos = 0
+        self._base = 0  # stream offset of _buffer[0]; all other positions are stream offsets
+        self._queue: deque[bytes] = deque()  # received and not in the buffer yet
+        self._taken = 0  # bytes of the queue's first chunk that were moved to the buffer
+        self._queued = 0
+        self._missing = 1  # bytes without which parsing cannot go on; 0: it can
+        self._wanted = 1  # bytes worth joining to the buffer at once
+        self._ended = False
+        self._damage_end = -1  # end of the bytes a fault was reported for; -1: none since a packet
+        self._starts = PatternFinder(b"\x7d")
+        self._bulk_starts = PatternFinder(NO_ESCAPE_START)
+        self._terminators = TerminatorFinder()
+        self._judged = -1  # the last terminator for which a Normal start was judged
+        self._good_starts: frozenset[int] | None = None  # that share it and have a fitting checksum
+
+    def receive_data(self, data: bytes) -> None:
+        """Take bytes as they come from the port, in chunks of any size.
+
+        A ``bytes`` object is kept as it is, without a copy.
+        """
+        if data:
+            self._queue.append(bytes(data))
+            self._queued += len(data)
+            self.statistics.bytes += len(data)
+
+    def end_data(self) -> None:
+        """Tell that no more bytes will come: what is incomplete now will be a fault."""
+        self._ended = True
+
+    @property
+    def buffered(self) -> int:
+        """Bytes received that are not yet part of a reported packet or fault."""
+        return len(self._buffer) - self._pos + self._queued
+
+    def next_packet(self) -> Packet | FramingFault | NeedData:
+        """Next packet or fault, or NEED_DATA."""
+        span = self.next_span()
+        if isinstance(span, tuple):
+            framing, buffer, start, end, offset = span
+            return Packet(framing=framing, payload=buffer[start:end], offset=offset)
+        return span
+
+    def next_span(self) -> Span | FramingFault | NeedData:
+        """Like ``next_packet``, but tells where the payload lies instead of copying it."""
+        while True:
+            if self._missing and not self._refill():  # parsing would tell nothing new
+                if not self._ended or not self.buffered:
+                    return NEED_DATA
+                fault = self._reject_last_start()
+                if fault is not None:
+                    return fault
+            buffer, pos = self._buffer, self._pos
+            if len(buffer) - pos >= 23:
+                # The way of nearly every byte: a consistent DATA FLOAT. It accepts nothing that
+                # _no_escape() would not.
+                magic, length, code, kind, count = _FRAME_HEADER.unpack_from(buffer, pos)
+                end = pos + 9 + length
+                if (
+                    magic == NO_ESCAPE_START
+                    and length == 14 + 4 * count
+                    and code == 0xA0
+                    and kind == 0x12
+                    and length <= MAX_LENGTH
+                ):
+                    if end > len(buffer):
+                        self._need(end - len(buffer))
+                        continue
+                    self._pos = end
+                    self._damage_end = -1
+                    self.statistics.packets += 1
+                    return Framing.NO_ESCAPE, buffer, pos + 9, end, self._base + pos
+            found = self._parse()
+            if found is not NEED_DATA:
+                return found
+
+    def _reject_last_start(self) -> FramingFault | None:
+        """Give up a packet whose end will not come, with all that came of it."""
+        if self._queued:
+            self._need(self._queued)
+            self._refill()
+        self._missing = 0
+        limit = self._base + len(self._buffer)
+        return self._reject(FaultKind.INCOMPLETE, self._base + self._pos, limit)
+
+    def _parse(self) -> Span | FramingFault | NeedData:
+        """Next packet or fault in the buffer; NEED_DATA if ``_missing`` more bytes are needed."""
+        while True:
+            here = self._base + self._pos
+            limit = self._base + len(self._buffer)
+            if self._buffer.startswith(b"\x7d", self._pos):  # nothing to search for
+                start, bulk = here, NEVER
+            else:
+                start = self._starts.next(self._buffer, self._base, here)
+                bulk = self._bulk_starts.next(self._buffer, self._base, here, start)
+            first = min(start, bulk)
+            junk_end = first if first < NEVER else limit - self._trailing_7c()
+            if junk_end > here:
+                self._skip_to(junk_end)
+                clean = self._damage_end < 0
+                self._damage_end = max(self._damage_end, junk_end)
+                if clean:
+                    return self._fault(FaultKind.GARBAGE, here)
+            if first == NEVER:
+                return self._need(1, HEAD_BYTES)
+            found = self._normal(first) if first == start else self._no_escape(first)
+            if found is not None:
+                return found
+
+    def _trailing_7c(self) -> int:
+        """7Cs at the end of a buffer without a start, which may become one (at most 3)."""
+        tail = self._buffer[max(self._pos, len(self._buffer) - 3) :]
+        return len(tail) - len(tail.rstrip(b"\x7c"))
+
+    def _reject(self, kind: FaultKind, first: int, covered_end: int) -> FramingFault | None:
+        """Give up a start and go on behind it; a fault unless these bytes had theirs."""
+        self._skip_to(first + 1)
+        self.statistics.resyncs += 1
+        reported = first < self._damage_end
+        self._damage_end = max(self._damage_end, covered_end)
+        return None if reported else self._fault(kind, first)
+
+    def _fault(self, kind: FaultKind, offset: int) -> FramingFault:
+        self.statistics.faults[kind] += 1
+        return FramingFault(kind=kind, offset=offset)
+
+    def _skip_to(self, offset: int) -> None:
+        """Go on at ``offset``; the bytes before it belong to no packet."""
+        self.statistics.junk_bytes += offset - self._base - self._pos
+        self._pos = offset - self._base
+
+    def _no_escape(self, first: int) -> Span | FramingFault | NeedData | None:
+        """Judge the NoEscape packet at ``first``; None if it was rejected without a report."""
+        at = first - self._base
+        have = len(self._buffer) - at
+        if have < NO_ESCAPE_HEADER_BYTES:
+            return self._need(NO_ESCAPE_HEADER_BYTES - have)
+        (length,) = _LENGTH.unpack_from(self._buffer, at + 4)
+        begin = at + NO_ESCAPE_HEADER_BYTES
+        if 1 <= length <= MAX_LENGTH:
+            head = min(length, HEAD_BYTES)
+            if have < NO_ESCAPE_HEADER_BYTES + head:
+                return self._need(NO_ESCAPE_HEADER_BYTES + head - have)
+            if plausible(length, self._buffer[begin : begin + head], self._direction):
+                if have < NO_ESCAPE_HEADER_BYTES + length:
+                    return self._need(NO_ESCAPE_HEADER_BYTES + length - have)
+                self._pos = begin + length
+                self._damage_end = -1
+                self.statistics.packets += 1
+                return Framing.NO_ESCAPE, self._buffer, begin, begin + length, first
+        fault = self._reject(FaultKind.HEADER, first, first + len(NO_ESCAPE_START))
+        run = _RUN_OF_7C.match(self._buffer, at)
+        if run:  # a start whose length would be 7C7C7C7C: all but the last 7 of the run
+            last_rejected = self._base + run.end() - 8
+            self._skip_to(last_rejected + 1)
+            self.statistics.resyncs += last_rejected - first
+            self._damage_end = max(self._damage_end, last_rejected + len(NO_ESCAPE_START))
+        return fault
+
+    def _normal(  # noqa: PLR0911 - one return per row of the state table
+        self, first: int
+    ) -> Span | FramingFault | NeedData | None:
+        """Judge the Normal packet at ``first``; None if it was rejected without a report."""
+        end = self._terminators.after(self._buffer, self._base, first, MAX_NORMAL_WIRE_BYTES)
+        if (end if end >= 0 else self._terminators.searched) - first > MAX_NORMAL_WIRE_BYTES:
+            return self._reject(FaultKind.OVERSIZE, first, first + MAX_NORMAL_WIRE_BYTES)
+        if end < 0:
+            return self._need(1, max(len(self._buffer) - self._pos, _JOIN_BYTES))
+        at, stop = first - self._base, end - self._base
+        if self._buffer[stop] == START:
+            if end == first + 1:  # doubled start: nothing is lost
+                self._skip_to(end)
+                return None
+            return self._reject(FaultKind.TRUNCATED, first, end)
+        if end != self._judged:
+            self._judged, self._good_starts = end, None
+            content = self._terminators.content(self._buffer, self._base, first)
+            good = xor(content) == START
+        else:
+            if self._good_starts is None:
+                self._good_starts = _good_starts(self._buffer[at:stop], first)
+            good = first in self._good_starts
+            content = unescape(self._buffer[at + 1 : stop]) if good else b""
+        if good and len(content) > MAX_NORMAL_BYTES:
+            return self._reject(FaultKind.OVERSIZE, first, first + MAX_NORMAL_WIRE_BYTES)
+        if good and len(content) > 1:
+            self._pos = stop + 1
+            self._damage_end = -1
+            self.statistics.packets += 1
+            return Framing.NORMAL, content, 0, len(content) - 1, first
+        kind = FaultKind.EMPTY if good or not content else FaultKind.CHECKSUM
+        return self._reject(kind, first, end + 1)
+
+    def _need(self, missing: int, wanted: int = 0) -> NeedData:
+        self._missing = missing
+        self._wanted = max(missing, wanted)
+        return NEED_DATA
+
+    def _refill(self) -> bool:
+        """Make the buffer longer by what was asked for; False if that has not arrived.
+
+        Only a packet that straddles two chunks is joined; the rest of the second chunk is
+        parsed where it is.
+        """
+        if self._queued < self._missing:
+            return False
+        self._missing = 0
+        self._base += self._pos
+        rest = len(self._buffer) - self._pos
+        if rest <= self._taken:  # all of it was copied from the chunk that goes on: parse it there
+            self._buffer = self._queue.popleft()
+            self._queued -= len(self._buffer) - self._taken
+            self._pos, self._taken = self._taken - rest, 0
+            self._base -= self._pos
+            return True
+        parts = [memoryview(self._buffer)[self._pos :]]
+        wanted = min(self._wanted, self._queued)
+        self._queued -= wanted
+        while wanted:
+            part = memoryview(self._queue[0])[self._taken : self._taken + wanted]
+            parts.append(part)
+            wanted -= len(part)
+            self._taken += len(part)
+            if self._taken == len(self._queue[0]):
+                self._queue.popleft()
+                self._taken = 0
+        self._buffer = b"".join(parts)
+        self._pos = 0
+        return True
+
+
+def _good_starts(packet: bytes, offset: int) -> frozenset[int]:
+    """Find the starts in a refuted Normal packet, itself included, whose checksum fits.
+
+    ``packet`` lies at ``offset`` in the stream, without its terminator. One pass from the back
+    over its escaped bytes, since the content behind each is a suffix of the whole.
+    """
+    good = []
+    checksum, count, end = 0, 0, len(packet)
+    for escaped in reversed(list(_ESCAPED.finditer(packet, 1))):
+        tail = packet[escaped.end() : end]
+        checksum ^= xor(tail)
+        count += len(tail)
+        end = escaped.start()
+        if packet[end + 1] == START and checksum == START and count > 1:
+            good.append(offset + end + 1)
+        checksum ^= packet[end + 1]
+        count += 1
+    tail = packet[1:end]
+    if checksum ^ xor(tail) == START and count + len(tail) > 1:
+        good.append(offset)
+    return frozenset(good)

@@ -1,0 +1,164 @@
+"""The message table: what a row is, and the decorators that enter one.
+
+A row is a frozen dataclass under a decorator that names the bytes its payload begins with;
+``Annotated`` fields say how they lie on the wire. Encoder, decoder, CLI dump and test strategy
+follow from the row. A field under ``ClassVar`` lies on the wire only: a count that follows from
+the lists it counts. A command's row names its reply by its base, ``Command[Reply]``; that is what
+`X4M300.request` returns. The rows stand in the modules ``responses*`` and ``commands*``.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import UnionType
+from typing import Any, ClassVar, Generic, TypeVar, get_args, get_origin, get_type_hints
+
+from xethru_protocol.wire import fields
+from xethru_protocol.wire.codes import ErrorSpace
+
+
+class Message:
+    """Anything the wire can carry, in either direction."""
+
+    __slots__ = ()
+
+
+class Response(Message):
+    """A message from the module."""
+
+    __slots__ = ()
+
+
+ReplyT = TypeVar("ReplyT", bound=Response, covariant=True)
+
+
+class Command(Message, Generic[ReplyT]):
+    """A message to the module, with the type of the answer that means success."""
+
+    __slots__ = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UnknownMessage(Command[Response], Response):
+    """A payload that no row describes, or that is shorter than its row.
+
+    ``code`` is its first byte (-1 if there is none), ``payload`` all of it.
+    """
+
+    code: int
+    payload: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """What a decorator recorded about one message type."""
+
+    name: str
+    prefix: bytes
+    kinds: tuple[tuple[str, fields.Kind], ...]  # in the order of the wire
+    fields: tuple[str, ...]  # those of them that are fields of the message
+    wire_only: frozenset[str]  # the others
+    bulk: bool  # a real module sends it in NoEscape framing
+    replies: tuple[type[Response], ...]
+    content_id: Callable[[Any], int] | None  # content id the reply must carry
+    errors: ErrorSpace  # what the codes of an ERROR to this command mean
+    derived: Mapping[str, Callable[[Any], Any]]  # dump entries computed from the message
+
+
+class Prefixes:
+    """Which message type a payload is of, told by the bytes it begins with."""
+
+    def __init__(self) -> None:
+        self.types: dict[bytes, type[Message]] = {}
+        self._lengths: dict[int, tuple[int, ...]] = {}  # by first byte, the longest first
+
+    def enter(self, prefix: bytes, cls: type[Message]) -> None:
+        """Add a message type; ``ValueError`` if the prefix is another's."""
+        if prefix in self.types:
+            raise ValueError(f"{prefix.hex(' ')} is {self.types[prefix].__name__} already")
+        self.types[prefix] = cls
+        lengths = {len(prefix), *self._lengths.get(prefix[0], ())}
+        self._lengths[prefix[0]] = tuple(sorted(lengths, reverse=True))
+
+    def find(self, payload: bytes) -> type[Message] | None:
+        """Type with the longest fitting prefix; None if there is none."""
+        for length in self._lengths.get(payload[0], ()) if payload else ():
+            cls = self.types.get(payload[:length])
+            if cls is not None:
+                return cls
+        return None
+
+
+ROWS: dict[type[Message], Row] = {}
+COMMANDS = Prefixes()
+RESPONSES = Prefixes()
+MessageT = TypeVar("MessageT", bound=Message)
+
+
+def command(
+    *prefix: int,
+    name: str,
+    reply_content_id: Callable[[Any], int] | None = None,
+    errors: ErrorSpace = ErrorSpace.PROTOCOL,
+    derived: Mapping[str, Callable[[Any], Any]] | None = None,
+) -> Callable[[type[MessageT]], type[MessageT]]:
+    """Enter a command into the table; ``prefix`` is the payload's first byte or bytes."""
+
+    def enter(cls: type[MessageT]) -> type[MessageT]:
+        (answer,) = get_args(cls.__orig_bases__[0])  # type: ignore[attr-defined] # set for every generic base
+        replies = get_args(answer) if isinstance(answer, UnionType) else (answer,)
+        row = _row(cls, bytes(prefix), name, derived, replies, reply_content_id, errors)
+        return _enter(COMMANDS, cls, row)
+
+    return enter
+
+
+def response(
+    *prefix: int,
+    name: str,
+    bulk: bool = False,
+    derived: Mapping[str, Callable[[Any], Any]] | None = None,
+) -> Callable[[type[MessageT]], type[MessageT]]:
+    """Enter a response into the table; ``bulk`` ones travel in NoEscape framing (1.3)."""
+
+    def enter(cls: type[MessageT]) -> type[MessageT]:
+        return _enter(RESPONSES, cls, _row(cls, bytes(prefix), name, derived, bulk=bulk))
+
+    return enter
+
+
+def id32(number: int) -> tuple[int, ...]:
+    """Prefix bytes of a 32-bit id."""
+    return tuple(number.to_bytes(4, "little"))
+
+
+def _row(  # noqa: PLR0917 - the two decorators above are its only callers
+    cls: type[Message],
+    prefix: bytes,
+    name: str,
+    derived: Mapping[str, Callable[[Any], Any]] | None,
+    replies: tuple[type[Response], ...] = (),
+    content_id: Callable[[Any], int] | None = None,
+    errors: ErrorSpace = ErrorSpace.PROTOCOL,
+    bulk: bool = False,
+) -> Row:
+    hints = get_type_hints(cls, include_extras=True)
+    wire_only = frozenset(field for field, hint in hints.items() if get_origin(hint) is ClassVar)
+    kinds = tuple(
+        (field, get_args(get_args(hint)[0] if field in wire_only else hint)[1])
+        for field, hint in hints.items()
+    )
+    fields = tuple(field for field in hints if field not in wire_only)
+    return Row(
+        name, prefix, kinds, fields, wire_only, bulk, replies, content_id, errors, derived or {}
+    )
+
+
+def _enter(prefixes: Prefixes, cls: type[MessageT], row: Row) -> type[MessageT]:
+    first = row.kinds[0][1] if row.kinds else None
+    codes = (
+        [bytes((code,)) for code in first.codes] if isinstance(first, fields.Spelling) else [b""]
+    )
+    for code in codes:
+        prefixes.enter(row.prefix + code, cls)
+    ROWS[cls] = row
+    return cls

@@ -1,0 +1,242 @@
+"""X4 arithmetic: frame area, frame rate, normalisation. Pure functions.
+
+Source: Protocol reference 9. All ranges are *module metres*: the firmware computes with a
+propagation speed of exactly 3.0e8 m/s. Converting to true metres is the application's business.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from xethru_protocol.wire.errors import LocalProtocolError
+
+MODULE_SPEED_MPS = 3.0e8  # what the firmware uses for light
+SAMPLING_RATE_HZ = 23.328e9
+RF_BIN_M = 1.5e8 / SAMPLING_RATE_HZ
+BASEBAND_DECIMATION = 8
+BASEBAND_BIN_M = BASEBAND_DECIMATION * 1.5e8 / SAMPLING_RATE_HZ
+COARSE_STEP_M = 96 * 1.5e8 / SAMPLING_RATE_HZ  # one step of the receive delay
+FRAME_SAMPLES = 1536  # RF samples the chip captures per frame
+BASEBAND_DISCARDED_LINES = 4  # filter fill at the start of a downconverted frame
+COMMON_PLL_HZ = 243e6
+DEFAULT_PRF_DIV = 16
+DEFAULT_OFFSET_M = 0.18  # frame area offset the firmware sets for the X4M300 board
+CARRIER_HZ = {3: 7.290e9, 4: 8.748e9}  # by TXCENTERFREQUENCY
+FULL_AREA_M = (0.0, 9.8765432)  # requested area after INIT
+
+_MAX_LENGTH_M = (float(np.float32(9.8765432)), float(np.float32(9.6707819)))
+_SNAP = 1e-4  # of a bin: how close a request must be to a bin to be taken as that bin
+
+# What the chip's timer really does when asked for 1 ... 34 frames per second, measured.
+_REAL_RATES_HZ = (
+    *(1.004108, 2.008015, 3.012023, 4.015228, 5.018533, 6.024046, 7.027351),
+    *(8.027246, 9.030652, 10.032053, 11.035258, 12.040869, 13.041668, 14.044873),
+    *(15.055598, 16.041667, 17.049379, 18.061303, 19.055188, 20.044080, 21.052587),
+    *(22.070515, 23.085254, 24.081739, 25.042607, 26.083338, 27.067616, 28.050517),
+    *(29.107494, 30.066123, 31.090047, 32.083339, 33.033175, 34.040967),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameArea:
+    """A frame area as the module quantises it. Protocol reference 9.4.
+
+    ``start_m`` and ``end_m`` are what GET FRAMEAREA answers (float32 values). In RF the end is
+    the range of the bin *after* the last one; in baseband it is the range of the last bin.
+    ``base_m`` is the range of the first sample of the captured frame and ``first_index`` the
+    bin's index in that capture (baseband: without the discarded lines). ``requested_*`` is what
+    the chip remembers as requested: float32, shortened if it was longer than a frame.
+    """
+
+    start_m: float
+    end_m: float
+    n_bins: int
+    bin_length_m: float
+    base_m: float
+    first_index: int
+    rx_wait: int
+    requested_start_m: float
+    requested_end_m: float
+    offset_m: float
+    downconversion: bool
+
+
+def frame_area(
+    start_m: float,
+    end_m: float,
+    offset_m: float = DEFAULT_OFFSET_M,
+    downconversion: bool = False,
+    tx_wait: int = 1,
+) -> FrameArea:
+    """Quantise a requested frame area exactly as the firmware does.
+
+    Parameters
+    ----------
+    start_m, end_m
+        Requested area [m], rounded to float32 like on the wire.
+    offset_m
+        FRAMEAREAOFFSET [m], rounded to float32.
+    downconversion
+        False: RF bins of 6.43 mm; True: baseband bins of 51.4 mm.
+    tx_wait
+        The chip's transmit delay in coarse steps.
+
+    Raises
+    ------
+    LocalProtocolError
+        If the start lies behind the end (the module answers ERROR 17).
+
+    Notes
+    -----
+    Protocol reference 9.4, steps 1-10.
+
+    >>> frame_area(0.2, 9.4).n_bins, frame_area(0.2, 9.4, downconversion=True).n_bins
+    (1431, 181)
+    """
+    start, end, offset = _f32(start_m), _f32(end_m), _f32(offset_m)
+    if not (math.isfinite(start) and math.isfinite(end) and math.isfinite(offset)):
+        raise LocalProtocolError("a frame area must have finite limits; give metres")
+    if start > end:
+        raise LocalProtocolError(
+            f"frame area {start_m} ... {end_m} m starts behind its end; swap the limits"
+        )
+    longest = _MAX_LENGTH_M[downconversion]
+    if end - start > longest:
+        end = _f32(start + longest)
+
+    discarded, decimation, bin_m = 0, 1, RF_BIN_M
+    if downconversion:
+        discarded, decimation = BASEBAND_DISCARDED_LINES, BASEBAND_DECIMATION
+        bin_m = BASEBAND_BIN_M
+    lines = FRAME_SAMPLES // decimation
+    delay_steps = max(math.floor((start - offset) / COARSE_STEP_M), -1)
+    base = delay_steps * COARSE_STEP_M + offset
+    first_m = max(start, base)
+    last_m = max(min(end, bin_m * (lines - discarded - 1) + base), first_m)
+    first = _snap_down((first_m - base) / bin_m)
+    last = _snap_up((last_m - base) / bin_m)
+    return FrameArea(
+        start_m=_f32(first * bin_m + base),
+        end_m=_f32(last * bin_m + base),
+        n_bins=last - first + (1 if downconversion else 0),
+        bin_length_m=bin_m,
+        base_m=base,
+        first_index=first,
+        rx_wait=(tx_wait + delay_steps) % 256,
+        requested_start_m=start,
+        requested_end_m=end,
+        offset_m=offset,
+        downconversion=downconversion,
+    )
+
+
+def real_frame_rate(requested_hz: float) -> float:
+    """Frame rate [Hz] the chip's timer runs at when asked for ``requested_hz``.
+
+    The same for a request and for its read-back, so that a host finds from GET FPS the identical
+    number the module computes with. Not positive: the request itself, which stops the chip.
+    Protocol reference 9.6.
+
+    >>> round(real_frame_rate(17.9), 6), real_frame_rate(200.5), real_frame_rate(0.0)
+    (17.049379, 200.0, 0.0)
+    """
+    requested = _f32(requested_hz)
+    if not requested > 0:
+        return requested
+    whole = max(int(min(requested, 65535.0)), 1)  # the firmware keeps 16 bits of the integer part
+    return _f32(_REAL_RATES_HZ[whole - 1]) if whole <= len(_REAL_RATES_HZ) else float(whole)
+
+
+def frame_rate_read_back(requested_hz: float) -> float:
+    """Answer to GET FPS [Hz], a float32 value, when ``requested_hz`` was set.
+
+    It is the real rate below 35, else the request with its fraction, which the timer does not
+    have. Protocol reference 9.6.
+
+    >>> round(frame_rate_read_back(17.9), 6), frame_rate_read_back(200.5)
+    (17.049379, 200.5)
+    """
+    requested = _f32(requested_hz)
+    return real_frame_rate(requested) if requested < len(_REAL_RATES_HZ) + 1 else requested
+
+
+def frame_time_ns(counter: int, rate_hz: float) -> int:
+    """Time of frame ``counter`` after frame 0 at a constant rate: the nearest ns, exactly.
+
+    >>> frame_time_ns(5, 2.0)
+    2500000000
+    """
+    frames, seconds = rate_hz.as_integer_ratio()
+    whole, rest = divmod(counter * 1_000_000_000 * seconds, frames)
+    return whole + (2 * rest + whole % 2 > frames)
+
+
+def fps_max(
+    *,
+    iterations: int,
+    pulses_per_step: int,
+    dac_min: int,
+    dac_max: int,
+    dac_step: int = 0,
+    prf_div: int = DEFAULT_PRF_DIV,
+    duty: float = 0.95,
+) -> float:
+    """Highest frame rate [Hz] the chip can sweep at. Protocol reference 9.6.
+
+    ``dac_step`` is the setting 0 ... 3 (steps of 1, 2, 4, 8); ``duty`` is the share of time
+    spent sweeping, at most 0.95 as the vendor recommends.
+
+    >>> round(fps_max(iterations=16, pulses_per_step=300, dac_min=949, dac_max=1100), 1)
+    19.8
+    """
+    steps = (dac_max - dac_min + 1) / 2**dac_step
+    sweep = iterations * pulses_per_step * steps
+    if sweep <= 0:
+        raise LocalProtocolError(
+            "no frame rate without a sweep: iterations, pulses per step and "
+            "dac_max - dac_min must be positive"
+        )
+    return float(duty * COMMON_PLL_HZ / prf_div / sweep)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Normalisation:
+    """How chip counters become the float32 values on the wire. Protocol reference 9.7.
+
+    An RF sample is ``counter * quantum - dac_offset`` in float32 arithmetic.
+    """
+
+    quantum: float
+    dac_offset: float
+    max_counter: int
+
+    @classmethod
+    def of(
+        cls, *, iterations: int, pulses_per_step: int, dac_min: int, dac_max: int, dac_step: int = 0
+    ) -> "Normalisation":
+        """Normalisation for the given settings; ``quantum`` and ``dac_offset`` are float32 values.
+
+        >>> Normalisation.of(iterations=16, pulses_per_step=300, dac_min=949, dac_max=1100)
+        Normalisation(quantum=2.0345052575976297e-07, dac_offset=0.07421875, max_counter=729600)
+        """
+        levels = dac_max - dac_min + 1
+        pulses = np.float32(iterations * pulses_per_step)
+        quantum = np.float32(2**dac_step) / pulses / np.float32(1024)
+        return cls(
+            quantum=float(quantum),
+            dac_offset=float(np.float32(levels) / np.float32(2048)),
+            max_counter=iterations * pulses_per_step * levels // 2**dac_step,
+        )
+
+
+def _f32(value: float) -> float:
+    return float(np.float32(value))
+
+
+def _snap_down(x: float) -> int:
+    return math.ceil(x) if abs(x - math.ceil(x)) < _SNAP else math.floor(x)
+
+
+def _snap_up(x: float) -> int:
+    return math.floor(x) if abs(x - math.floor(x)) < _SNAP else math.ceil(x)
