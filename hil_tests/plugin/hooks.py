@@ -62,7 +62,7 @@ class Summary:
             if one["identity"] or one["name"] not in self._said:
                 silent = "did not answer" if found["reason"] is None else "not asked"
                 who = one["identity"] or silent
-                self._said[one["name"]] = f"{who}; {radar['reached']}"
+                self._said[one["name"]] = f"{who}; {one['reached']}"
         if found["reason"] is not None:
             self._reasons[found["reason"]] += 1
         self._tests.append({"test": report.nodeid, "outcome": outcome, **found})
