@@ -13,7 +13,6 @@ from emulator.modes import state_diagram
 from emulator.options import DeviceOptions
 from emulator.pace import Pace
 from emulator.permissions import permission_table
-from hil_tests.patience import seconds
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource
 from xethru_protocol import messages as m
 from xethru_protocol.codes import X4Setting
@@ -100,11 +99,7 @@ def test_the_permissions_are_those_of_the_reference(name: str) -> None:
 @pytest.mark.parametrize("module", ["emulator.modes", "emulator.permissions"])
 def test_the_tables_can_be_printed(module: str) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", module],
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=seconds(30),
+        [sys.executable, "-m", module], capture_output=True, text=True, check=True
     )
     printed = {"emulator.modes": state_diagram, "emulator.permissions": permission_table}
     assert done.stdout == printed[module]() + "\n"
