@@ -76,7 +76,6 @@ class FaultBench:
             self.truth = TruthLog(stream.write)
 
     def wrap(self, device: InnerDevice, name: str) -> FaultyDevice:
-        """Return a device with the faults of the plan."""
         faulty = wrap(device, name, self._plan, self.truth, zero_ns=self._zero_ns)
         self.devices[name] = faulty
         return faulty

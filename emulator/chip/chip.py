@@ -306,7 +306,6 @@ def _ignored(settings: ChipSettings, byte: int) -> ChipSettings:
 
     Assumed: the reference says what they hold, not what writing them does to the frames.
     """
-    del byte
     return settings
 
 
@@ -464,7 +463,6 @@ class Chip:
 
     @property
     def running(self) -> bool:
-        """Whether the chip's timer makes frames."""
         return self.powered and self.settings.fps > 0
 
     def set(self, setting: X4Setting, value: X4Value) -> None:
@@ -513,7 +511,6 @@ class Chip:
         return ChipFrame(counter=counter & 0xFFFFFFFF, values=block.values[index])
 
     def _frames_from(self, counter: int) -> int:
-        """Return how many frames the block that begins with a counter shall have."""
         if self._block_phase is None:
             return self._block_frames
         return min(self._block_frames, 1 + (self._block_phase - counter) % self._largest_block)
@@ -604,7 +601,6 @@ def _normalisation(settings: ChipSettings) -> x4.Normalisation:
 def _rf_values(
     raw: NDArray[np.int64], settings: ChipSettings, area: x4.FrameArea
 ) -> NDArray[np.float32]:
-    del area  # RF bins need no line signs
     normalisation = _normalisation(settings)
     quantum, middle = np.float32(normalisation.quantum), np.float32(normalisation.dac_offset)
     return raw.astype(np.float32) * quantum - middle

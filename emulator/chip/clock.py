@@ -113,7 +113,6 @@ class ModuleClock:
         return times
 
     def scene_time_ns(self, nominal_ns: int) -> int:
-        """Return the true time of one frame: `scene_times_ns` of a single number."""
         return nominal_ns - round(nominal_ns * self._lead) + self.skew_ns
 
     def nominal_ns(self, scene_time_ns: int) -> int:

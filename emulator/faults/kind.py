@@ -127,12 +127,10 @@ def normal_payload(packet: bytes) -> bytes | None:
 
 
 def response_bytes(message: Response) -> bytes:
-    """Return a message as a module sends it."""
     return Connection(Role.MODULE).send(message)
 
 
 def command_bytes(command: Command[Response]) -> bytes:
-    """Return a command as a host sends it."""
     return Connection(Role.HOST).send(command)
 
 
@@ -140,17 +138,11 @@ class InnerDevice(Protocol):
     """A module as its port sees it: see `emulator.device.Device`."""
 
     @property
-    def wants_data(self) -> bool:
-        """Whether more bytes should be read from the host now."""
-        ...
+    def wants_data(self) -> bool: ...
 
-    def receive_data(self, data: bytes, now_ns: int) -> None:
-        """Take bytes from the host."""
-        ...
+    def receive_data(self, data: bytes, now_ns: int) -> None: ...
 
-    def advance(self, now_ns: int) -> None:
-        """Let time pass."""
-        ...
+    def advance(self, now_ns: int) -> None: ...
 
     def next_packet(self, now_ns: int) -> bytes | None:
         """Return the next packet to send now."""
@@ -160,13 +152,9 @@ class InnerDevice(Protocol):
         """Return when time alone changes something."""
         ...
 
-    def port_opened(self, now_ns: int) -> None:
-        """Learn that a host opened the port."""
-        ...
+    def port_opened(self, now_ns: int) -> None: ...
 
-    def port_closed(self, now_ns: int) -> None:
-        """Learn that the last host closed the port."""
-        ...
+    def port_closed(self, now_ns: int) -> None: ...
 
 
 @runtime_checkable

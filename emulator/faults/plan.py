@@ -102,7 +102,6 @@ def described(kind: Kind) -> dict[str, Any]:
 
 
 def example(kind: Kind) -> str:
-    """Return a scenario with one fault of a kind, as TOML."""
     parameters = kind.parameters().model_dump(exclude_none=True)
     lines = ["[[fault]]", f'kind = "{kind.name}"', "at_s = 2.0"]
     if parameters:
@@ -159,7 +158,6 @@ class TruthLog:
         self.counts: Counter[str] = Counter()
 
     def note(self, injected: Injected) -> None:
-        """Add a record."""
         self.records.append(injected)
         self.counts[injected.kind] += 1
         if self._write is not None:
@@ -243,11 +241,9 @@ class FaultSpec(_Table):
 
     @property
     def row(self) -> Kind:
-        """The row of the catalogue."""
         return KINDS[self.kind]
 
     def kind_parameters(self) -> Parameters:
-        """Return the parameters of the kind, with its defaults."""
         return self.row.parameters.model_validate(self.parameters)
 
 
@@ -301,7 +297,6 @@ def parse_plan(text: str, source: str = "scenario") -> FaultPlan:
 
 
 def plan_names() -> tuple[str, ...]:
-    """Return the names of the scenarios that ship with the package, sorted."""
     return tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))
 
 

@@ -148,7 +148,6 @@ class ModeMachine:
 
     @property
     def mode(self) -> SensorMode:
-        """Current mode, as GETMODE answers it."""
         return _MODES[self.state]
 
     def power_up(self, into: State | None) -> None:
@@ -363,7 +362,6 @@ GROUPS: dict[type[m.Message], Group] = {
 
 
 def group_of(command: m.Message) -> Group:
-    """Return the group of a command."""
     if isinstance(command, m.OutputSetControl | m.DebugOutputSetControl):
         return _group_of_output(command)
     return GROUPS.get(type(command), Group.BASIC)

@@ -134,7 +134,6 @@ class Control:
         }
 
     def _fault_add(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
-        del now_ns
         spec = parse_fault(asked.get("fault"))
         chosen = [
             device for device in self._named(asked) if not spec.radar or device.name in spec.radar
@@ -144,11 +143,9 @@ class Control:
         return {"ids": {device.name: device.add(spec) for device in chosen}}
 
     def _fault_list(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
-        del now_ns
         return {"faults": {device.name: _faults(device) for device in self._named(asked)}}
 
     def _fault_clear(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
-        del now_ns
         number = asked.get("id")
         if number is not None and (not isinstance(number, int) or isinstance(number, bool)):
             raise _RefusedError("id: must be the number that `fault add` gave")
@@ -309,12 +306,10 @@ class ControlSocket(Service):
             raise LinkError(f"{path}: cannot offer the control socket: {reason}") from error
 
     def register(self, selector: selectors.BaseSelector) -> None:
-        """Register with the loop."""
         self._selector = selector
         selector.register(self._listener, selectors.EVENT_READ, self._accept)
 
     def close(self) -> None:
-        """Close everything and remove the socket; the loop may be gone."""
         self._selector = None
         for client in list(self._clients):
             self._drop(client)
@@ -323,7 +318,6 @@ class ControlSocket(Service):
         self._listener.close()
 
     def _accept(self, events: int, now_ns: int) -> None:
-        del events, now_ns
         try:
             connection, _ = self._listener.accept()
         except OSError:

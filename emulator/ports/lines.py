@@ -48,9 +48,7 @@ class Line(Protocol):
         """Return what has reached the host's side and was not returned before."""
         ...
 
-    def from_host(self, data: bytes, now_ns: int) -> None:
-        """Take bytes of the host."""
-        ...
+    def from_host(self, data: bytes, now_ns: int) -> None: ...
 
     def to_module(self, now_ns: int) -> bytes:
         """Return what has reached the module and was not returned before."""
@@ -64,9 +62,7 @@ class Line(Protocol):
         """Return when more reaches the module; None if nothing is under way."""
         ...
 
-    def clear(self) -> None:
-        """Lose all that is under way: the line is cut."""
-        ...
+    def clear(self) -> None: ...
 
 
 class Flight:
@@ -77,12 +73,10 @@ class Flight:
         self._size = 0
 
     def put(self, due_ns: int, piece: bytes) -> None:
-        """Send a piece off."""
         self._pieces.append((due_ns, piece))
         self._size += len(piece)
 
     def take(self, now_ns: int) -> bytes:
-        """Return all that has arrived."""
         arrived = []
         while self._pieces and self._pieces[0][0] <= now_ns:
             arrived.append(self._pieces.popleft()[1])
@@ -91,7 +85,6 @@ class Flight:
         return data
 
     def take_one(self, now_ns: int) -> bytes:
-        """Return the first piece if it has arrived."""
         if not self._pieces or self._pieces[0][0] > now_ns:
             return b""
         _, piece = self._pieces.popleft()
@@ -99,11 +92,9 @@ class Flight:
         return piece
 
     def next_ns(self) -> int | None:
-        """Return when the next piece arrives; None if none is under way."""
         return self._pieces[0][0] if self._pieces else None
 
     def clear(self) -> None:
-        """Lose everything."""
         self._pieces.clear()
         self._size = 0
 
@@ -113,7 +104,6 @@ class Flight:
         return not self._pieces
 
     def __len__(self) -> int:
-        """Return the number of bytes under way."""
         return self._size
 
 
@@ -138,7 +128,6 @@ class UsbLine:
 
     @property
     def takes_packet(self) -> bool:
-        """Whether not too much is under way."""
         return len(self._to_host) < MOST_UNDER_WAY
 
     @property
@@ -148,35 +137,27 @@ class UsbLine:
 
     @property
     def takes_bytes(self) -> bool:
-        """Whether not too much is under way."""
         return len(self._to_module) < MOST_UNDER_WAY
 
     def from_module(self, packet: bytes, now_ns: int) -> None:
-        """Take a packet of the module."""
         self._send_off(self._to_host, packet, now_ns)
 
     def to_host(self, now_ns: int) -> bytes:
-        """Return what has arrived, one transfer at most at a time."""
         return self._to_host.take_one(now_ns)
 
     def from_host(self, data: bytes, now_ns: int) -> None:
-        """Take bytes of the host."""
         self._send_off(self._to_module, data, now_ns)
 
     def to_module(self, now_ns: int) -> bytes:
-        """Return what has arrived, one transfer at most at a time."""
         return self._to_module.take_one(now_ns)
 
     def to_host_ns(self) -> int | None:
-        """Return when the next transfer arrives."""
         return self._to_host.next_ns()
 
     def to_module_ns(self) -> int | None:
-        """Return when the next transfer arrives."""
         return self._to_module.next_ns()
 
     def clear(self) -> None:
-        """Lose all that is under way."""
         self._to_host.clear()
         self._to_module.clear()
 
@@ -227,16 +208,13 @@ class UartLine:
 
     @property
     def takes_bytes(self) -> bool:
-        """Whether the host may write on."""
         return len(self._to_module) < UART_MOST_UNDER_WAY
 
     def from_module(self, packet: bytes, now_ns: int) -> None:
-        """Take a packet of the module."""
         sent, read = self._module_baud(), self._baud_of_host()
         _send(self._to_host, packet, now_ns, sent, read)
 
     def to_host(self, now_ns: int) -> bytes:
-        """Return what has arrived."""
         return self._to_host.take(now_ns)
 
     def from_host(self, data: bytes, now_ns: int) -> None:
@@ -246,15 +224,12 @@ class UartLine:
         self._host_done_ns = _send(self._to_module, data, begin_ns, sent, read)
 
     def to_module(self, now_ns: int) -> bytes:
-        """Return what has arrived."""
         return self._to_module.take(now_ns)
 
     def to_host_ns(self) -> int | None:
-        """Return when the next piece arrives."""
         return self._to_host.next_ns()
 
     def to_module_ns(self) -> int | None:
-        """Return when the next piece arrives."""
         return self._to_module.next_ns()
 
     def flush_output(self) -> None:
@@ -263,7 +238,6 @@ class UartLine:
         self._host_done_ns = 0
 
     def clear(self) -> None:
-        """Lose all that is under way."""
         self._to_host.clear()
         self.flush_output()
 

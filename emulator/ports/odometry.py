@@ -83,20 +83,16 @@ class OdometryFeed(Service):
             raise LinkError(f"{path}: cannot offer the odometry socket: {reason}") from error
 
     def register(self, selector: selectors.BaseSelector) -> None:
-        """Register with the loop."""
         self._selector = selector
         self._listen()
 
     def advance(self, now_ns: int) -> None:
-        """Send what fell due."""
         if self._accept_again_ns is not None and now_ns >= self._accept_again_ns:
             self._listen()
         for client in list(self._clients):
             self._serve(client, now_ns)
 
     def wake_ns(self, now_ns: int) -> int | None:
-        """Return when the next line falls due for a client that waits for it."""
-        del now_ns
         wakes = [
             self._due_ns[client.next_line]
             for client in self._clients
@@ -107,7 +103,6 @@ class OdometryFeed(Service):
         return min(wakes, default=None)
 
     def close(self) -> None:
-        """Close everything and remove the socket if it is still ours; the loop may be gone."""
         self._selector = None
         for client in list(self._clients):
             self._drop(client)
@@ -122,7 +117,6 @@ class OdometryFeed(Service):
             self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
 
     def _accept(self, events: int, now_ns: int) -> None:
-        del events
         try:
             connection, _ = self._listener.accept()
         except OSError as error:

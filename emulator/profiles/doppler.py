@@ -112,11 +112,9 @@ class ProfileSweep:
 
     @property
     def n_bins(self) -> int:
-        """Bins per frame."""
         return len(self.range_m)
 
     def scene_time_ns(self, counter: int) -> int:
-        """Return the scene time of a frame, ns."""
         return self._chip.timeline.scene_time_ns(counter)
 
     def first_counter_from(self, scene_time_ns: int) -> int:
@@ -165,17 +163,14 @@ class Matrix:
 
     @property
     def rate_hz(self) -> float:
-        """Rate of the pulses."""
         return FRAME_RATE_HZ / self.decimation
 
     @property
     def step_hz(self) -> float:
-        """Step from one frequency to the next."""
         return self.rate_hz / self.pulses
 
     @property
     def start_hz(self) -> float:
-        """Lowest frequency."""
         return -(self.pulses // 2) * self.step_hz
 
     @property
@@ -204,14 +199,12 @@ class SlowTime:
         self.clear()
 
     def clear(self) -> None:
-        """Forget all frames."""
         self._pulses: deque[NDArray[np.complex128]] = deque(maxlen=self._matrix.pulses)
         self._sum: NDArray[np.complex128] | None = None
         self._summed = 0
 
     @property
     def full(self) -> bool:
-        """Whether as many frames have come as the matrix needs."""
         return len(self._pulses) == self._matrix.pulses
 
     def add(self, iq: NDArray[np.complex128]) -> None:
@@ -281,7 +274,6 @@ class NoiseMap:
 
     @property
     def complete(self) -> bool:
-        """Whether it may be used."""
         return self._learned >= CREATION_TICKS
 
     def learn(self, power: Powers) -> None:
@@ -300,7 +292,6 @@ class NoiseMap:
             mean[quiet] += ADAPTATION * (newest[quiet] - mean[quiet])
 
     def copy(self) -> NoiseMap:
-        """Return a map that changes independently."""
         return NoiseMap({instance: power.copy() for instance, power in self.power.items()})
 
 
@@ -357,7 +348,6 @@ class StoredMap:
         return cls(zone_m=(start_m, end_m), tx_center_frequency=band, noise_map=NoiseMap(power))
 
     def fits(self, zone_m: tuple[float, float], tx_center_frequency: int, n_bins: int) -> bool:
-        """Whether it was made in this zone and band."""
         bins = {len(power) for power in self.noise_map.power.values()}
         same_zone = np.allclose(self.zone_m, zone_m, atol=1e-5)
         return same_zone and self.tx_center_frequency == tx_center_frequency and bins == {n_bins}

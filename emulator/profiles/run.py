@@ -140,7 +140,6 @@ def presence_single(counter: int, presence: Presence, sensitivity: int) -> m.Pre
 
 
 def moving_list(counter: int, presence: Presence) -> m.PresenceMovingList:
-    """Return movement by range, and the distances of all detections."""
     nothing = (0.0,) * len(presence.detections)
     return m.PresenceMovingList(
         counter=counter & 0xFFFFFFFF,
@@ -227,14 +226,10 @@ class OutputSettings(Protocol):
     """What of the profile's settings a run obeys while it runs."""
 
     @property
-    def outputs(self) -> Mapping[int, int]:
-        """Control bits by message id; what is off is absent or 0."""
-        ...
+    def outputs(self) -> Mapping[int, int]: ...
 
     @property
-    def sensitivity(self) -> int:
-        """0...9."""
-        ...
+    def sensitivity(self) -> int: ...
 
 
 class ProfileRun:
@@ -282,24 +277,20 @@ class ProfileRun:
 
     @property
     def silent(self) -> bool:
-        """Whether no output is on."""
         return self._next_index() is None and not self._ready
 
     def next_due_ns(self) -> int | None:
-        """Return when the next message is due; None when no output is on."""
         if self._ready:
             return self._due_ns(self._taken - 1)
         index = self._next_index()
         return None if index is None else self._due_ns(index)
 
     def take(self) -> Response:
-        """Return the next message; there must be one."""
         while not self._ready:
             self._frame()
         return self._ready.popleft()
 
     def skip_before(self, time_ns: int) -> int:
-        """Give up every message due before a time; return how many."""
         skipped = 0
         while (due_ns := self.next_due_ns()) is not None and due_ns < time_ns:
             skipped += self._jump(time_ns)
@@ -341,7 +332,6 @@ class ProfileRun:
         return [matrix for matrix in MATRICES if wanted[matrix.instance]]
 
     def _frame(self) -> None:
-        """Take one frame, and make ready its messages."""
         index = self._taken
         counter = self._first_counter + index
         iq = self.sweep.frame(counter)
@@ -422,28 +412,18 @@ class ProfileHost(Protocol):
     """What of a module its profile looks at."""
 
     @property
-    def modes(self) -> ModeMachine:
-        """The mode, and which profile is loaded."""
-        ...
+    def modes(self) -> ModeMachine: ...
 
     @property
-    def profile(self) -> ProfileSettings:
-        """The settings of that profile."""
-        ...
+    def profile(self) -> ProfileSettings: ...
 
     @property
-    def options(self) -> DeviceOptions:
-        """How open questions are answered."""
-        ...
+    def options(self) -> DeviceOptions: ...
 
     @property
-    def files(self) -> FileSystem:
-        """Where noise maps are kept over restarts."""
-        ...
+    def files(self) -> FileSystem: ...
 
-    def save(self) -> None:
-        """Keep what the flash holds."""
-        ...
+    def save(self) -> None: ...
 
 
 class ProfileStream(MessageStream):
@@ -493,12 +473,10 @@ class ProfileStream(MessageStream):
         return None if self._paused else self._run
 
     def next_due_ns(self) -> int | None:
-        """Return when the next message is due; None while no profile runs, or says anything."""
         run = self.running
         return None if run is None else run.next_due_ns()
 
     def take(self) -> Response:
-        """Return the next message; there must be one."""
         run = self.running
         assert run is not None
         message = run.take()
@@ -523,7 +501,6 @@ class ProfileStream(MessageStream):
             self._paused = True
         else:
             self._run = None
-        del command  # the mode says all
 
     def restarted(self, ready_ns: int) -> None:
         """Begin anew at a time, if the module is in RUN then."""

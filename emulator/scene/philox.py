@@ -180,7 +180,6 @@ class Dice:
         return (int(self._bits.random_raw()) >> 11) * 2.0**-53
 
     def chance(self, probability: float) -> bool:
-        """Return True with a probability."""
         return self.uniform() < probability
 
     def normal(self) -> float:
@@ -193,5 +192,4 @@ class Dice:
         return self._walked
 
     def data(self, count: int) -> bytes:
-        """Return random bytes."""
         return bytes(self.below(256) for _ in range(count))

@@ -84,7 +84,6 @@ class RadarSpec(Table):
 
     @property
     def clock(self) -> ModuleClock:
-        """Return the clock that this module's skew and error make."""
         return ModuleClock(skew_ns=round(self.start_skew_ms * 1e6), ppm=self.clock_ppm)
 
 
@@ -398,7 +397,6 @@ def empty_room(count: int = 1) -> Scene:
 
 
 def scene_names() -> tuple[str, ...]:
-    """Return the names of the scenes that ship with the package, sorted."""
     return tuple(sorted(path.stem for path in _SHIPPED_SCENES.glob("*.toml")))
 
 

@@ -24,7 +24,6 @@ class _At(Parameters):
     ] = None
 
     def place(self, data: bytes, dice: Dice) -> int:
-        """Return an index into the data, which is not empty."""
         return dice.below(len(data)) if self.at is None else min(self.at, len(data) - 1)
 
 
@@ -60,19 +59,16 @@ class _Baud(Parameters):
 
 
 def _drop(data: bytes, wanted: _Several, dice: Dice, context: Context) -> Sequence[Piece]:
-    del context
     at = wanted.place(data, dice)
     return [Piece(data[:at] + data[at + wanted.bytes :])]
 
 
 def _duplicate(data: bytes, wanted: _Several, dice: Dice, context: Context) -> Sequence[Piece]:
-    del context
     end = wanted.place(data, dice) + 1
     return [Piece(data[:end] + data[max(end - wanted.bytes, 0) : end] + data[end:])]
 
 
 def _flip(data: bytes, wanted: _Flip, dice: Dice, context: Context) -> Sequence[Piece]:
-    del context
     flipped = bytearray(data)
     first = 0 if wanted.at is None else wanted.place(data, dice)
     room = 8 * (1 if wanted.at is not None and wanted.bits <= 8 else len(data) - first)
@@ -85,19 +81,16 @@ def _flip(data: bytes, wanted: _Flip, dice: Dice, context: Context) -> Sequence[
 
 
 def _insert(data: bytes, wanted: _Several, dice: Dice, context: Context) -> Sequence[Piece]:
-    del context
     at = wanted.place(data, dice)
     return [Piece(data[:at] + dice.data(wanted.bytes) + data[at:])]
 
 
 def _noise_between(data: bytes, wanted: _Several, dice: Dice, context: Context) -> Sequence[Piece]:
-    del context
     noise = bytes(_CALM[dice.below(len(_CALM))] for _ in range(wanted.bytes))
     return [Piece(noise + data)]
 
 
 def _burst(data: bytes, wanted: _Burst, dice: Dice, context: Context) -> Sequence[Piece] | None:
-    del context
     bad = False
     damaged = bytearray(data)
     for index in range(len(damaged)):
@@ -110,7 +103,6 @@ def _burst(data: bytes, wanted: _Burst, dice: Dice, context: Context) -> Sequenc
 def _escape_lost(
     data: bytes, wanted: Parameters, dice: Dice, context: Context
 ) -> Sequence[Piece] | None:
-    del wanted, context
     if data[:1] != bytes((START,)):
         return None
     places, index = [], 1
@@ -128,7 +120,6 @@ def _escape_lost(
 def _flow_control(
     data: bytes, wanted: Parameters, dice: Dice, context: Context
 ) -> Sequence[Piece] | None:
-    del wanted, dice, context
     left = data.translate(None, _FLOW_CONTROL)
     return None if left == data else [Piece(left)]
 
@@ -136,18 +127,15 @@ def _flow_control(
 def _seven_bits(
     data: bytes, wanted: Parameters, dice: Dice, context: Context
 ) -> Sequence[Piece] | None:
-    del wanted, dice, context
     left = bytes(byte & 0x7F for byte in data)
     return None if left == data else [Piece(left)]
 
 
 def _split(data: bytes, wanted: _Split, dice: Dice, context: Context) -> Sequence[Piece]:
-    del dice, context
     return _cut(data, wanted.bytes, wanted.gap_us)
 
 
 def _one_byte(data: bytes, wanted: _Gap, dice: Dice, context: Context) -> Sequence[Piece]:
-    del dice, context
     return _cut(data, 1, wanted.gap_us)
 
 
@@ -159,7 +147,6 @@ def _cut(data: bytes, size: int, gap_us: float) -> Sequence[Piece]:
 
 
 def _wrong_baud(data: bytes, wanted: _Baud, dice: Dice, context: Context) -> Sequence[Piece] | None:
-    del dice, context
     if wanted.sent == wanted.heard:
         return None
     return [Piece(what_is_heard(data, wanted.sent, wanted.heard))]

@@ -57,12 +57,10 @@ class _Step(Parameters):
 
 
 def _no_reply(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Sequence[Piece]:
-    del packet, wanted, dice, context
     return []
 
 
 def _slow_reply(packet: bytes, wanted: _Slow, dice: Dice, context: Context) -> Sequence[Piece]:
-    del context
     factor = 1.0
     if wanted.tail == "uniform":
         factor = 2 * dice.uniform()
@@ -72,24 +70,20 @@ def _slow_reply(packet: bytes, wanted: _Slow, dice: Dice, context: Context) -> S
 
 
 def _duplicate(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Sequence[Piece]:
-    del wanted, dice, context
     return [Piece(packet), Piece(packet)]
 
 
 def _stale_ack(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Sequence[Piece]:
-    del wanted, dice, context
     return [Piece(response_bytes(Ack())), Piece(packet)]
 
 
 def _late(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Sequence[Piece]:
-    del wanted, dice, context
     return [Piece(packet, behind=1)]
 
 
 def _wrong_reply(
     packet: bytes, wanted: Parameters, dice: Dice, context: Context
 ) -> Sequence[Piece] | None:
-    del wanted, dice, context
     payload = normal_payload(packet)
     if payload is None or len(payload) < 6 or payload[0] != ResponseCode.XTS_SPR_REPLY:
         return None
@@ -98,21 +92,18 @@ def _wrong_reply(
 
 
 def _system(packet: bytes, wanted: _SystemCode, dice: Dice, context: Context) -> Sequence[Piece]:
-    del dice, context
     return [Piece(response_bytes(System(code=wanted.code)) + packet)]
 
 
 def _not_ready(
     packet: bytes, wanted: Parameters, dice: Dice, context: Context
 ) -> Sequence[Piece] | None:
-    del packet, wanted, dice
     if not isinstance(context.command, Ping):
         return None
     return [Piece(response_bytes(Pong(value=PongCode.XTS_SPRP_NOTREADY)))]
 
 
 def _nack(packet: bytes, wanted: _Code, dice: Dice, context: Context) -> Handling | None:
-    del packet, dice
     if isinstance(context.command, Ping):
         return None  # PING has no errors
     return Handling(to_host=(Piece(response_bytes(Error(code=wanted.code))),))
@@ -121,14 +112,12 @@ def _nack(packet: bytes, wanted: _Code, dice: Dice, context: Context) -> Handlin
 def _ack_then_ignore(
     packet: bytes, wanted: Parameters, dice: Dice, context: Context
 ) -> Handling | None:
-    del packet, wanted, dice
     if not isinstance(context.command, X4DriverSet):
         return None
     return Handling(to_host=(Piece(response_bytes(Ack())),))
 
 
 def _ack_quantised(packet: bytes, wanted: _Step, dice: Dice, context: Context) -> Handling | None:
-    del dice
     command = context.command
     if not isinstance(command, X4DriverSet):
         return None
@@ -149,7 +138,6 @@ def _cut(value: float, step: float) -> float:
 
 
 def _command_lost(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Handling:
-    del packet, wanted, dice, context
     return Handling()
 
 
@@ -157,7 +145,6 @@ def _command_damaged(
     packet: bytes, wanted: Parameters, dice: Dice, context: Context
 ) -> Handling | None:
     """Replace the checksum: the module then says nothing, like the firmware."""
-    del wanted, context
     if packet[-3] == ESCAPE:
         return None
     right = packet[-2]

@@ -72,22 +72,18 @@ class _Drift(Parameters):
 
 
 def _unplug(wanted: _Away, dice: Dice) -> Sequence[Action]:
-    del dice
     return [Unplug(round(wanted.away_s * _NS_PER_S))]
 
 
 def _mid_frame(wanted: _MidFrame, dice: Dice) -> Sequence[Action]:
-    del dice
     return [Unplug(round(wanted.away_s * _NS_PER_S), part_of_frame=wanted.part)]
 
 
 def _watchdog(wanted: Parameters, dice: Dice) -> Sequence[Action]:
-    del wanted, dice
     return [Restart()]
 
 
 def _brown_out(wanted: _Loop, dice: Dice) -> Sequence[Action]:
-    del dice
     period_ns = round(wanted.period_s * _NS_PER_S)
     return [
         Restart(delay_ns=index * period_ns, reason="brown-out") for index in range(wanted.restarts)
@@ -95,19 +91,16 @@ def _brown_out(wanted: _Loop, dice: Dice) -> Sequence[Action]:
 
 
 def _mode_lost(wanted: Parameters, dice: Dice) -> Sequence[Action]:
-    del wanted, dice
     return [SayToModule(SetMode(mode=SensorMode.XTID_SM_STOP))]
 
 
 def _stream_stopped(wanted: Parameters, dice: Dice) -> Sequence[Action]:
-    del wanted, dice
     return [SayToModule(X4DriverSet(setting=X4Setting.FPS, value=0.0))]
 
 
 def _safe_mode(
     packet: bytes, wanted: Parameters, dice: Dice, context: Context
 ) -> Sequence[Piece] | None:
-    del packet, wanted, dice
     if not isinstance(context.command, Ping):
         return None
     return [Piece(response_bytes(Pong(value=PongCode.XTS_SPRP_SAFEMODE)))]
@@ -116,7 +109,6 @@ def _safe_mode(
 def _wrong_profile(
     packet: bytes, wanted: _Profile, dice: Dice, context: Context
 ) -> Sequence[Piece] | None:
-    del packet, dice
     if not isinstance(context.command, GetProfileId):
         return None
     return [Piece(response_bytes(ReplyInt(values=(wanted.profile,))))]
@@ -133,21 +125,18 @@ def _says(item: InfoItem, text: str, context: Context) -> Sequence[Piece] | None
 def _wrong_version(
     packet: bytes, wanted: _Version, dice: Dice, context: Context
 ) -> Sequence[Piece] | None:
-    del packet, dice
     return _says(InfoItem.XTID_SSIC_VERSION, wanted.version, context)
 
 
 def _duplicate_serial(
     packet: bytes, wanted: _Serial, dice: Dice, context: Context
 ) -> Sequence[Piece] | None:
-    del packet, dice
     return _says(InfoItem.XTID_SSIC_SERIALNUMBER, wanted.serial, context)
 
 
 def _offset_drift(
     packet: bytes, wanted: _Drift, dice: Dice, context: Context
 ) -> Sequence[Piece] | None:
-    del dice
     parts = frame_parts(packet)
     if parts is None or parts.samples.size == 0:
         return None
@@ -301,30 +290,25 @@ class _Silence(Parameters):
 
 
 def _offset(packet: bytes, wanted: _Offset, dice: Dice, context: Context) -> Sequence[Piece]:
-    del dice, context
     return [Piece(packet, delay_ns=round(wanted.offset_ms * _NS_PER_MS))]
 
 
 def _drift(packet: bytes, wanted: _Ppm, dice: Dice, context: Context) -> Sequence[Piece]:
-    del dice
     delay_ns = round((context.now_ns - context.since_ns) * wanted.ppm * 1e-6)
     return [Piece(packet, delay_ns=delay_ns)]
 
 
 def _jitter(packet: bytes, wanted: _Walk, dice: Dice, context: Context) -> Sequence[Piece]:
-    del context
     # reflected at 0: nothing can be early
     return [Piece(packet, delay_ns=round(abs(dice.walk(wanted.sigma_us)) * _NS_PER_US))]
 
 
 def _latency(packet: bytes, wanted: _Poll, dice: Dice, context: Context) -> Sequence[Piece]:
-    del dice
     period_ns = round(wanted.period_ms * _NS_PER_MS)
     return [Piece(packet, delay_ns=(context.since_ns - context.now_ns) % period_ns)]
 
 
 def _silent(packet: bytes, wanted: _Silence, dice: Dice, context: Context) -> Sequence[Piece]:
-    del dice
     end_ns = context.since_ns + round(wanted.seconds * _NS_PER_S)
     return [] if not wanted.seconds or context.now_ns < end_ns else [Piece(packet)]
 

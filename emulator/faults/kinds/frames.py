@@ -47,7 +47,6 @@ class _Cut(Parameters):
 
 
 def _whole_normal(packet: bytes) -> bytes | None:
-    """Return the payload of an intact Normal packet."""
     payload = normal_payload(packet)
     return payload if payload and encode_normal(payload) == packet else None
 
@@ -55,7 +54,6 @@ def _whole_normal(packet: bytes) -> bytes | None:
 def _bad_checksum(
     packet: bytes, wanted: Parameters, dice: Dice, context: Context
 ) -> Sequence[Piece] | None:
-    del wanted, context
     payload = _whole_normal(packet)
     if payload is None:
         return None
@@ -72,7 +70,6 @@ def _cut_normal(
     def effect(
         packet: bytes, wanted: Parameters, dice: Dice, context: Context
     ) -> Sequence[Piece] | None:
-        del wanted, dice, context
         return None if _whole_normal(packet) is None else [Piece(change(packet))]
 
     return effect
@@ -82,14 +79,12 @@ def _before(
     stray: bytes,
 ) -> Callable[[bytes, Parameters, Dice, Context], Sequence[Piece]]:
     def effect(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Sequence[Piece]:
-        del wanted, dice, context
         return [Piece(stray + packet)]
 
     return effect
 
 
 def _truncated(packet: bytes, wanted: _Cut, dice: Dice, context: Context) -> Sequence[Piece] | None:
-    del dice, context
     return None if wanted.keep >= len(packet) else [Piece(packet[: wanted.keep])]
 
 
@@ -97,7 +92,6 @@ def _cancelling_flips(
     packet: bytes, wanted: Parameters, dice: Dice, context: Context
 ) -> Sequence[Piece] | None:
     """Flip one bit in two bytes of the content, so that the XOR of all stays the same."""
-    del wanted, context
     payload = _whole_normal(packet)
     first = 10  # behind content id and info of a REPLY, so that the answer still fits the question
     if payload is None or len(payload) < first + 6:
@@ -116,7 +110,6 @@ def _checksum_needs_escape() -> bytes:
 
 
 def _unescaped_end(packet: bytes) -> bytes:
-    """Put an unescaped end behind the first payload byte."""
     return packet[:2] + bytes((END,)) + packet[2:]
 
 
@@ -322,7 +315,6 @@ def _another_value(samples: NDArray[np.float32], context: Context) -> NDArray[np
 
 
 def _wrong_bins(packet: bytes, wanted: _Bins, dice: Dice, context: Context) -> list[Piece] | None:
-    del dice, context
     parts = frame_parts(packet)
     if parts is None or wanted.more == 0 or parts.samples.size + wanted.more < 1:
         return None
@@ -336,7 +328,6 @@ def _wrong_bins(packet: bytes, wanted: _Bins, dice: Dice, context: Context) -> l
 def _wrong_length(
     packet: bytes, wanted: _Length, dice: Dice, context: Context
 ) -> list[Piece] | None:
-    del dice, context
     if not packet.startswith(NO_ESCAPE_START) or wanted.more == 0:
         return None
     length = len(packet) - NO_ESCAPE_HEADER_BYTES + wanted.more
@@ -348,7 +339,6 @@ def _wrong_length(
 def _inside_frame(
     packet: bytes, wanted: Parameters, dice: Dice, context: Context
 ) -> list[Piece] | None:
-    del wanted, dice
     if context.packet_class is not PacketClass.FRAME:
         return None
     middle = len(packet) // 2
@@ -358,7 +348,6 @@ def _inside_frame(
 def _normal_framed(
     packet: bytes, wanted: Parameters, dice: Dice, context: Context
 ) -> list[Piece] | None:
-    del wanted, dice, context
     payload = packet[NO_ESCAPE_HEADER_BYTES:]
     if not packet.startswith(NO_ESCAPE_START) or not 0 < len(payload) < MAX_NORMAL_BYTES:
         return None

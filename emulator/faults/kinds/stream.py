@@ -64,12 +64,9 @@ class _Amplitude(Parameters):
 def _renumbered(
     number: Callable[[int, int, Context], int],
 ) -> Callable[[bytes, _Frames, Dice, Context], Sequence[Piece] | None]:
-    """Return an effect that replaces the frame counter."""
-
     def effect(
         packet: bytes, wanted: _Frames, dice: Dice, context: Context
     ) -> Sequence[Piece] | None:
-        del dice
         parts = frame_parts(packet)
         if parts is None:
             return None
@@ -84,28 +81,23 @@ def _since_first(counter: int, context: Context) -> int:
 
 
 def _duplicate(packet: bytes, wanted: _Copies, dice: Dice, context: Context) -> Sequence[Piece]:
-    del dice, context
     return [Piece(packet)] * (1 + wanted.copies)
 
 
 def _missing(packet: bytes, wanted: _Frames, dice: Dice, context: Context) -> Sequence[Piece]:
-    del dice
     return [] if context.packets_since < wanted.frames else [Piece(packet)]
 
 
 def _reorder(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Sequence[Piece]:
-    del wanted, dice, context
     return [Piece(packet, behind=1)]
 
 
 def _slower(packet: bytes, wanted: _Slower, dice: Dice, context: Context) -> Sequence[Piece]:
-    del dice
     delay_ns = round((context.now_ns - context.since_ns) * wanted.percent / 100)
     return [Piece(packet, delay_ns=delay_ns)]
 
 
 def _stall(packet: bytes, wanted: _Seconds, dice: Dice, context: Context) -> Sequence[Piece]:
-    del dice
     end_ns = context.since_ns + round(wanted.seconds * _NS_PER_S)
     return [Piece(packet, delay_ns=max(end_ns - context.now_ns, 0))]
 
@@ -113,7 +105,6 @@ def _stall(packet: bytes, wanted: _Seconds, dice: Dice, context: Context) -> Seq
 def _saturated(
     packet: bytes, wanted: _Level, dice: Dice, context: Context
 ) -> Sequence[Piece] | None:
-    del dice
     parts = frame_parts(packet)
     if parts is None or context.lattice is None or parts.samples.size == 0:
         return None
@@ -125,7 +116,6 @@ def _saturated(
 def _dead_bins(
     packet: bytes, wanted: _DeadBins, dice: Dice, context: Context
 ) -> Sequence[Piece] | None:
-    del dice, context
     parts = frame_parts(packet)
     if parts is None or wanted.first >= parts.samples.size:
         return None
@@ -138,7 +128,6 @@ def _dead_bins(
 def _dc_step(
     packet: bytes, wanted: _Amplitude, dice: Dice, context: Context
 ) -> Sequence[Piece] | None:
-    del dice
     parts = frame_parts(packet)
     if parts is None or context.lattice is None:
         return None
@@ -149,7 +138,6 @@ def _dc_step(
 def _stale(
     packet: bytes, wanted: Parameters, dice: Dice, context: Context
 ) -> Sequence[Piece] | None:
-    del wanted, dice
     parts = frame_parts(packet)
     before = None if context.previous_frame is None else frame_parts(context.previous_frame)
     if parts is None or before is None or before.samples.size != parts.samples.size:
@@ -319,7 +307,6 @@ class _Fading(Parameters):
 
 
 def _clutter(n: int, wanted: _Clutter, dice: Dice) -> NDArray[np.float64]:
-    del dice
     bins = np.arange(n) - wanted.bin
     envelope = np.exp(-0.5 * (bins / wanted.bins) ** 2)
     wave: NDArray[np.float64] = (
@@ -354,7 +341,6 @@ def _added(
 
 
 def _fading(packet: bytes, wanted: _Fading, dice: Dice, context: Context) -> Sequence[Piece] | None:
-    del dice
     parts = frame_parts(packet)
     if parts is None or context.lattice is None:
         return None
