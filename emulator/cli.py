@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from xethru_protocol.system import Stop, stop_signals
 
 if TYPE_CHECKING:
@@ -116,7 +116,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _list(arguments: argparse.Namespace) -> int:
-    from emulator.faults.plan import KINDS, described
+    from emulator.faults.kinds import KINDS
+    from emulator.faults.plan import described
 
     kinds = list(KINDS.values())
     if arguments.kind is not None:

@@ -14,9 +14,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from emulator.chip.chip import Chip, EchoSource
-from emulator.chip.clock import ModuleClock
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
+from emulator.chip.chip import Chip, EchoSource, ModuleClock
 from emulator.module.commands import answer
 from emulator.module.memory import Identity, Memory
 from emulator.module.modes import State

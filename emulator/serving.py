@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.device import Device, radar_device
 from emulator.echo.echo import echo_source
 from emulator.faults.faulty_device import FaultyDevice, wrap

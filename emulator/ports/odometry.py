@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.ports.pty import LinkError
 from emulator.ports.server import Service
 

@@ -39,9 +39,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.chip.chip import EchoSource, Refusal
-from emulator.chip.clock import ModuleClock
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
+from emulator.chip.chip import EchoSource, ModuleClock, Refusal
 from emulator.module.memory import FileSystem
 from emulator.module.modes import ModeMachine
 from emulator.module.outbox import MessageStream

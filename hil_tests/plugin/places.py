@@ -309,7 +309,7 @@ class MemoryPlace(Place):
 
     def begin_test(self) -> None:
         """Make a fresh module: what a test leaves behind is gone."""
-        from emulator.chip.pace import Pace
+        from emulator.chip import Pace
         from emulator.device import radar_device
         from emulator.echo.echo import echo_source
         from emulator.module.memory import Identity

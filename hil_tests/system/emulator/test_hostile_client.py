@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from hil_tests.bench.hostile_client import MOST_OBJECTS_GROWN, run
 from hil_tests.device.serving import Served, emulator
 from hil_tests.patience import seconds

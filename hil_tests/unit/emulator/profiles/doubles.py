@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, cast
 
-from emulator.chip.clock import ModuleClock
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
+from emulator.chip.chip import ModuleClock
 from emulator.echo.echo import SceneEcho
 from emulator.module.memory import FileSystem
 from emulator.module.modes import ModeMachine
