@@ -18,7 +18,7 @@ from emulator.chip import Pace
 from emulator.chip.chip import Chip, EchoSource, ModuleClock
 from emulator.module.commands import answer
 from emulator.module.memory import Identity, Memory
-from emulator.module.modes import State
+from emulator.module.modes import STREAMING, State
 from emulator.module.module import Module
 from emulator.module.outbox import (
     FirmwareOutbox,
@@ -30,7 +30,7 @@ from emulator.module.outbox import (
 from emulator.module.settings import DeviceOptions
 from emulator.profiles.run import ProfileStream
 from xethru_protocol.wire.codec import encode
-from xethru_protocol.wire.codes import SensorMode, SystemCode
+from xethru_protocol.wire.codes import SystemCode
 from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.framing import NeedData
 from xethru_protocol.wire.messages import (
@@ -85,7 +85,7 @@ class ChipStream(MessageStream):
     def streaming(self) -> bool:
         """Whether frames go to the host. Protocol reference 8.3 and 8.4."""
         module = self._module
-        return module.modes.mode is SensorMode.XTID_SM_MANUAL and module.chip.running
+        return module.state in STREAMING and module.chip.running
 
     def next_due_ns(self) -> int | None:
         """Return when the next frame is due; 0, long past, under `Pace.ASAP`."""

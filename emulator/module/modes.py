@@ -112,6 +112,10 @@ _MODES: dict[State, SensorMode] = {
 }
 
 
+STREAMING = frozenset(s for s, mode in _MODES.items() if mode is SensorMode.XTID_SM_MANUAL)
+"""States in which radar frames go to the host."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Start:
     """What a module remembers of its modes over a reset.

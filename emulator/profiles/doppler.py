@@ -81,8 +81,8 @@ class ProfileSweep:
         Shape (n_bins,), float64: range of each bin [module metres].
     in_zone
         Shape (n_bins,), bool: the bins inside the zone.
-    carrier_hz
-        Centre frequency of the band.
+    timeline
+        Scene times of the counters.
     """
 
     def __init__(
@@ -107,6 +107,7 @@ class ProfileSweep:
         self.in_zone: NDArray[np.bool_] = (self.range_m > start_m - tolerance_m) & (
             self.range_m < end_m + tolerance_m
         )
+        self.timeline = self._chip.timeline
         self.tx_center_frequency = tx_center_frequency
         self.carrier_hz = x4.CARRIER_HZ[tx_center_frequency]
 
@@ -114,19 +115,15 @@ class ProfileSweep:
     def n_bins(self) -> int:
         return len(self.range_m)
 
-    def scene_time_ns(self, counter: int) -> int:
-        return self._chip.timeline.scene_time_ns(counter)
-
     def first_counter_from(self, scene_time_ns: int) -> int:
         """Return the first counter that does not lie before a scene time."""
-        timeline = self._chip.timeline
-        timeline.next_counter = 0
-        timeline.skip_before(scene_time_ns)
-        return timeline.next_counter
+        self.timeline.next_counter = 0
+        self.timeline.skip_before(scene_time_ns)
+        return self.timeline.next_counter
 
     def frame(self, counter: int) -> NDArray[np.complex128]:
         """Return I + jQ of one frame, shape (n_bins,); float32 values, exactly."""
-        self._chip.timeline.next_counter = counter
+        self.timeline.next_counter = counter
         values = self._chip.next_frame().values.astype(np.float64)
         iq: NDArray[np.complex128] = values[: self.n_bins] + 1j * values[self.n_bins :]
         return iq

@@ -33,18 +33,16 @@ from __future__ import annotations
 
 import contextlib
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from typing import Protocol
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emulator.chip import Pace
 from emulator.chip.chip import EchoSource, ModuleClock, Refusal
-from emulator.module.memory import FileSystem
-from emulator.module.modes import ModeMachine
+from emulator.module.module import NOISE_MAPS, Module
 from emulator.module.outbox import MessageStream
-from emulator.module.settings import DeviceOptions, ProfileSettings
+from emulator.module.settings import ProfileSettings
 from emulator.profiles.doppler import (
     FRAME_RATE_HZ,
     FRAMES_PER_TICK,
@@ -63,7 +61,6 @@ from emulator.profiles.presence import Presence, PresenceProcessing, threshold_d
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import (
-    FileType,
     MatrixControl,
     NoiseMapControl,
     OutputFeature,
@@ -221,16 +218,6 @@ _NOISE_MAPS = (OutputFeature.NOISEMAP_FLOAT, OutputFeature.NOISEMAP_BYTE)
 _CYCLE = SLOW.frames
 
 
-class OutputSettings(Protocol):
-    """What of the profile's settings a run obeys while it runs."""
-
-    @property
-    def outputs(self) -> Mapping[int, int]: ...
-
-    @property
-    def sensitivity(self) -> int: ...
-
-
 class ProfileRun:
     """A profile from RUN to STOP, or from one pause to the next.
 
@@ -256,7 +243,7 @@ class ProfileRun:
         self,
         sweep: ProfileSweep,
         processing: PresenceProcessing,
-        settings: Callable[[], OutputSettings],
+        settings: Callable[[], ProfileSettings],
         *,
         first_counter: int,
         zero_ns: int,
@@ -305,7 +292,7 @@ class ProfileRun:
             self._ready.clear()
 
     def _due_ns(self, index: int) -> int:
-        nominal_ns = self.sweep.scene_time_ns(self._first_counter + index)
+        nominal_ns = self.sweep.timeline.scene_time_ns(self._first_counter + index)
         return self._zero_ns + self._clock.scene_time_ns(nominal_ns)
 
     def _on(self, feature: int) -> int:
@@ -404,27 +391,6 @@ def _next_multiple(taken: int, period: int) -> int:
     return taken + (-(taken + 1)) % period
 
 
-_FILES = ((int(FileType.NOISEMAP_SLOW), 0), (int(FileType.NOISEMAP_FAST), 0))
-
-
-class ProfileHost(Protocol):
-    """What of a module its profile looks at."""
-
-    @property
-    def modes(self) -> ModeMachine: ...
-
-    @property
-    def profile(self) -> ProfileSettings: ...
-
-    @property
-    def options(self) -> DeviceOptions: ...
-
-    @property
-    def files(self) -> FileSystem: ...
-
-    def save(self) -> None: ...
-
-
 class ProfileStream(MessageStream):
     """Messages of a module in RUN.
 
@@ -446,7 +412,7 @@ class ProfileStream(MessageStream):
 
     def __init__(
         self,
-        module: ProfileHost,
+        module: Module,
         source: EchoSource,
         *,
         pace: Pace,
@@ -563,7 +529,7 @@ class ProfileStream(MessageStream):
 
     def _stored_map(self, sweep: ProfileSweep) -> StoredMap | None:
         """Return the map in the module's files, if there is one of this zone and band."""
-        slow, fast = (self._module.files.get(key) or b"" for key in _FILES)
+        slow, fast = (self._module.files.get(key) or b"" for key in NOISE_MAPS)
         stored = StoredMap.of_files((slow, fast))
         zone_m = self._module.profile.zone_m
         if stored is None or not stored.fits(zone_m, sweep.tx_center_frequency, sweep.n_bins):
@@ -582,7 +548,7 @@ class ProfileStream(MessageStream):
         self._creating = False
         if wanted:
             with contextlib.suppress(Refusal):  # no room: the next start creates one again
-                for key, data in zip(_FILES, current.files(), strict=True):
+                for key, data in zip(NOISE_MAPS, current.files(), strict=True):
                     self._module.files.replace(key, data)
             self._module.save()
 
