@@ -74,7 +74,7 @@ class Control:
         try:
             asked = json.loads(line)
         except (ValueError, RecursionError):
-            raise _RefusedError("a line must be one JSON object") from None
+            asked = None
         if not isinstance(asked, dict):
             raise _RefusedError("a line must be one JSON object")
         for key in asked:
@@ -83,7 +83,7 @@ class Control:
         verb = VERBS.get(str(asked.get("verb")))
         if verb is None:
             raise _RefusedError(f"verb: must be one of {', '.join(VERBS)}")
-        return verb(self, asked, now_ns)
+        return verb(self, asked, now_ns) or {}
 
     def _named(self, asked: Mapping[str, Any]) -> list[FaultyDevice]:
         name = asked.get("radar")
@@ -151,53 +151,45 @@ class Control:
             raise _RefusedError(f"id: no armed fault has number {number}")
         return {"cleared": cleared}
 
-    def _unplug(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+    def _unplug(self, asked: Mapping[str, Any], now_ns: int) -> None:
         seconds = None if asked.get("seconds") is None else _number(asked, "seconds", _LONGEST_S)
         for device in self._named(asked):
             device.unplug(now_ns, None if seconds is None else round(seconds * NS_PER_S))
-        return {}
 
-    def _plug(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+    def _plug(self, asked: Mapping[str, Any], now_ns: int) -> None:
         for device in self._named(asked):
             device.plug(now_ns)
-        return {}
 
-    def _reset(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+    def _reset(self, asked: Mapping[str, Any], now_ns: int) -> None:
         for device in self._named(asked):
             device.restart(now_ns)
-        return {}
 
-    def _pause(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+    def _pause(self, asked: Mapping[str, Any], now_ns: int) -> None:
         for player in self._played(asked):
             player.pause(now_ns)
-        return {}
 
-    def _resume(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+    def _resume(self, asked: Mapping[str, Any], now_ns: int) -> None:
         for player in self._played(asked):
             player.resume(now_ns)
-        return {}
 
-    def _rate(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+    def _rate(self, asked: Mapping[str, Any], now_ns: int) -> None:
         rate = _number(asked, "value", 1e9)
         for player in self._played(asked):
             player.set_rate(rate, now_ns)
-        return {}
 
-    def _seek(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+    def _seek(self, asked: Mapping[str, Any], now_ns: int) -> None:
         position_ns = round(_number(asked, "seconds", _LONGEST_S) * NS_PER_S)
         for player in self._played(asked):
             player.seek(position_ns, now_ns)
-        return {}
 
-    def _loop(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+    def _loop(self, asked: Mapping[str, Any], now_ns: int) -> None:
         value = asked.get("value")
         if not isinstance(value, bool):
             raise _RefusedError("value: must be true or false")
         for player in self._played(asked):
             player.set_loop(value, now_ns)
-        return {}
 
-    def _filter(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+    def _filter(self, asked: Mapping[str, Any], now_ns: int) -> None:
         names = asked.get("kinds")
         if names is not None and not (
             isinstance(names, list) and all(isinstance(name, str) for name in names)
@@ -206,10 +198,9 @@ class Control:
         chosen = None if names is None else kinds(names)
         for player in self._played(asked):
             player.set_filter(chosen, now_ns)
-        return {}
 
 
-VERBS: dict[str, Callable[[Control, Mapping[str, Any], int], dict[str, Any]]] = {
+VERBS: dict[str, Callable[[Control, Mapping[str, Any], int], dict[str, Any] | None]] = {
     "state": Control._state,
     "fault add": Control._fault_add,
     "fault list": Control._fault_list,
@@ -224,7 +215,6 @@ VERBS: dict[str, Callable[[Control, Mapping[str, Any], int], dict[str, Any]]] = 
     "loop": Control._loop,
     "filter": Control._filter,
 }
-"""What each verb does."""
 
 
 def _faults(device: FaultyDevice) -> list[dict[str, Any]]:
