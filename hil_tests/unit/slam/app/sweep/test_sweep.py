@@ -1,6 +1,7 @@
 """Sweeps that would mix up runs are refused before the first, and stopped ones go on."""
 
 import json
+import math
 import os
 import signal
 from collections.abc import Callable
@@ -16,8 +17,8 @@ from hil_tests.unit.slam.app.sweep_runs import run_of
 from slam.app.cli import main
 from slam.app.errors import AppError, StopFlag, StopRequestedError, UsageError
 from slam.app.sweep import sweep
-from slam.app.sweep.run import Case, Key, SweepRun
-from slam.app.sweep.sweep import SweepOptions, run_sweep
+from slam.app.sweep.run import Case, Key, SweepRun, finite, make_case
+from slam.app.sweep.sweep import PartFile, SweepOptions, run_sweep
 
 
 def test_two_scenes_of_one_name_are_refused(tmp_path: Path) -> None:
@@ -189,3 +190,92 @@ def test_what_the_parser_refuses_is_2(wrong: str, capsys: pytest.CaptureFixture[
         main(["sweep", "--json", "o", *wrong.split()])
     assert caught.value.code == 2
     assert "Traceback" not in capsys.readouterr().err
+
+
+COMMAND = {"seeds": "3", "scene file lab": "12ab"}
+
+
+def runs() -> list[SweepRun]:
+    return [run_of(make_case("lab", "paper", seed, stress="skew")) for seed in range(3)]
+
+
+def part_with(path: Path, count: int) -> PartFile:
+    path.touch()
+    part = PartFile(path, COMMAND)
+    for run in runs()[:count]:
+        part.add(run)
+    return part
+
+
+def test_the_file_is_whole_after_every_run_and_reads_back_the_same(tmp_path: Path) -> None:
+    path = tmp_path / "o.part"
+    path.touch()
+    part = PartFile(path, COMMAND)
+    assert json.loads(path.read_text()) == {"command": COMMAND, "runs": []}
+    for count, run in enumerate(runs(), start=1):
+        part.add(run)
+        assert len(json.loads(path.read_text())["runs"]) == count
+        assert PartFile(path, COMMAND).runs == part.runs == runs()[:count]
+
+
+def test_a_file_goes_on_where_it_ended(tmp_path: Path) -> None:
+    part_with(at_once := tmp_path / "at_once", 3)
+    part_with(in_two := tmp_path / "in_two", 1)
+    again = PartFile(in_two, COMMAND)
+    for run in runs()[1:]:
+        again.add(run)
+    assert in_two.read_bytes() == at_once.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        (COMMAND | {"seeds": "4"}, "holds 2 runs of another sweep (other: seeds)"),
+        (COMMAND | {"scene file lab": "34cd"}, "other: scene file lab"),
+        (COMMAND | {"preset file paper": "1"}, "other: preset file paper"),
+        ({"seeds": "3"}, "other: scene file lab"),
+    ],
+)
+def test_another_command_is_told_what_differs_and_nothing_is_lost(
+    command: dict[str, str], said: str, tmp_path: Path
+) -> None:
+    part_with(path := tmp_path / "o.part", 2)
+    before = path.read_bytes()
+    with pytest.raises(AppError) as caught:
+        PartFile(path, command)
+    assert said in str(caught.value)
+    assert "choose another --json" in str(caught.value)
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda whole: whole[:-40],
+        lambda whole: b"\0" * len(whole),
+        lambda whole: whole + b"x",
+        lambda whole: whole + b" ",
+        lambda whole: whole.replace(b'"ate_rmse_m"', b'"ate"'),
+        lambda whole: b"[]",
+        lambda whole: b"\xff\xfe",
+    ],
+)
+def test_a_damaged_file_is_one_line_and_stays_as_it_is(
+    damage: Callable[[bytes], bytes], tmp_path: Path
+) -> None:
+    part_with(path := tmp_path / "o.part", 2)
+    path.write_bytes(damage(path.read_bytes()))
+    before = path.read_bytes()
+    with pytest.raises(AppError, match="move this file away") as caught:
+        PartFile(path, COMMAND)
+    assert "\n" not in str(caught.value)
+    assert path.read_bytes() == before
+
+
+def test_an_infinite_nees_is_kept_as_a_huge_one_and_a_diverged_run_is_named() -> None:
+    run = runs()[1]
+    certain_and_wrong = replace(run, nees_pose=((1.0, math.inf), (2.0, 3.0)))
+    assert finite(certain_and_wrong).nees_pose == ((1.0, 1e12), (2.0, 3.0))
+    assert finite(run) == run
+    with pytest.raises(AppError, match=r"lab, paper, stress skew, seed 1: .* finite: ate_rmse_m"):
+        finite(replace(run, ate_rmse_m=math.nan))

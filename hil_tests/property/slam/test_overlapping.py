@@ -1,4 +1,4 @@
-"""Laws of the joint fit of close echoes; signals and bounds come from closed forms of our own."""
+"""Laws of the joint fit of close echoes, by windows and by whole frames."""
 
 import math
 
@@ -8,14 +8,19 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from slam.front_end.matched_filter import BINS_PER_STEP, PulseFilter
 from slam.front_end.overlapping import (
+    Correlation,
     EchoFit,
     KnownPulse,
     SplitTest,
+    _Fit,
     fit_echoes,
     fit_many,
+    fit_whole_echoes,
     split_threshold,
 )
+from slam.front_end.pulse import PulseModel
 
 Array = NDArray[np.float64]
 
@@ -294,3 +299,125 @@ def test_what_cannot_be_searched_is_refused(wrong: dict[str, float], message: st
     arguments = {"pulse": PULSE, "noise_sigma": 1.0, **wrong}
     with pytest.raises(ValueError, match=message):
         fit_echoes(np.zeros(N_BINS), **arguments)  # type: ignore[arg-type]
+
+
+MODEL = PulseModel()
+MODEL_SIGMA = MODEL.sigma_bins(BIN_M)
+MODEL_CARRIER = MODEL.carrier_rad(BIN_M)
+N_WHOLE = 240
+FIRST, LAST = 90.0, 150.0
+FILTER = PulseFilter(MODEL, N_WHOLE, BIN_M, false_alarms=0.1, noise_is_told=True)
+MARGIN = round(1.5 * MODEL_SIGMA)
+
+
+@st.composite
+def whole_clusters(draw: st.DrawFn) -> tuple[Array, Array, Array]:
+    """Draw one to four echoes at least 1.3 envelope sigmas apart: positions, amplitudes, phases."""
+    n = draw(st.integers(1, 4))
+    gaps = draw(st.lists(st.floats(1.3, 2.0), min_size=n, max_size=n))
+    positions = 92.0 + MODEL_SIGMA * np.cumsum([0.0, *gaps[1:]]) + draw(st.floats(0, 3))
+    amplitudes = draw(st.lists(st.floats(0.5, 2.0), min_size=n, max_size=n))
+    phases = draw(st.lists(st.floats(-math.pi, math.pi), min_size=n, max_size=n))
+    return positions, np.array(amplitudes), np.array(phases)
+
+
+def whole_signal(positions: Array, amplitudes: Array, phases: Array) -> Array:
+    x = np.arange(N_WHOLE) - positions[:, np.newaxis]
+    pulses = np.exp(-0.5 * (x / MODEL_SIGMA) ** 2) * np.cos(
+        MODEL_CARRIER * x + phases[:, np.newaxis]
+    )
+    total: Array = amplitudes @ pulses
+    return total
+
+
+def correlation(samples: Array, noise_sigma: float) -> Correlation:
+    n = BINS_PER_STEP * np.arange(N_WHOLE // BINS_PER_STEP)
+    return Correlation(
+        FILTER.apply(samples) * np.exp(-1j * MODEL_CARRIER * n),
+        step_bins=BINS_PER_STEP,
+        sigma_bins=MODEL_SIGMA,
+        sigma_y=FILTER.noise_gain * noise_sigma,
+    )
+
+
+def phase(fit: EchoFit) -> float:
+    return fit.phase_rad + MODEL_CARRIER * fit.position_bins
+
+
+@settings(max_examples=30)
+@given(whole_clusters())
+def test_whole_echoes_without_noise_are_recovered(cluster: tuple[Array, Array, Array]) -> None:
+    fits = fit_whole_echoes(
+        correlation(whole_signal(*cluster), 1e-3), FIRST, LAST, SplitTest(model_error=0.0)
+    )
+    positions, amplitudes, phases = cluster
+    assert len(fits) == len(positions)
+    for fit, position in zip(fits, positions, strict=True):
+        # far less than the noise that the fit was told of, 1e-3, would move them
+        assert abs(fit.position_bins - position) < 0.1 * fit.sigma_bins
+    assert [fit.amplitude for fit in fits] == pytest.approx(amplitudes, rel=2e-4)
+    turns = [
+        math.remainder(phase(fit) - told, math.tau) for fit, told in zip(fits, phases, strict=True)
+    ]
+    assert np.abs(turns).max() < 2e-3
+
+
+@settings(max_examples=40)
+@given(whole_clusters(), st.floats(1e-3, 0.1), st.integers(0, 2**32 - 1))
+def test_the_closed_form_finds_what_the_samples_tell(
+    cluster: tuple[Array, Array, Array], sigma: float, seed: int
+) -> None:
+    samples = whole_signal(*cluster) + sigma * np.random.default_rng(seed).standard_normal(N_WHOLE)
+    known = fit_echoes(
+        samples,
+        pulse=KnownPulse(envelope_sigma_bins=MODEL_SIGMA, carrier_rad_per_bin=MODEL_CARRIER),
+        noise_sigma=sigma,
+        search_bins=(FIRST, LAST),
+    )
+    fits = fit_whole_echoes(correlation(samples, sigma), FIRST, LAST, SplitTest())
+    assert len(fits) == len(known)
+    for one, other in zip(fits, known, strict=True):
+        assert abs(one.position_bins - other.position_bins) < 0.3 * other.sigma_bins
+        assert one.sigma_bins == pytest.approx(other.sigma_bins, rel=0.1)
+        assert one.amplitude == pytest.approx(other.amplitude, rel=0.1)
+
+
+@settings(max_examples=30)
+@given(whole_clusters(), st.floats(-3, 3))
+def test_gradient_and_information_are_derivatives_of_what_is_explained(
+    cluster: tuple[Array, Array, Array], off: float
+) -> None:
+    data = correlation(whole_signal(*cluster), 1e-3)
+    positions = (cluster[0] + off * np.arange(1, len(cluster[0]) + 1) / 4).tolist()
+    fit = _Fit(data, positions)
+    for k in range(len(positions)):
+        shifted = [
+            [*positions[:k], positions[k] + step, *positions[k + 1 :]] for step in (-1e-4, 1e-4)
+        ]
+        below, above = (_Fit(data, each).explained for each in shifted)
+        slope = (above - below) / 4e-4
+        assert fit.gradient[k] == pytest.approx(slope, abs=1e-3 * fit.explained / MODEL_SIGMA)
+    np.testing.assert_allclose(fit.information, np.transpose(fit.information), rtol=1e-9)
+    # at the truth nothing is left, so the Gauss-Newton matrix is minus half the Hessian
+    true = cluster[0].tolist()
+    at_truth = _Fit(data, true)
+    for k in range(len(true)):
+        climb = [
+            _Fit(data, [*true[:k], true[k] + step, *true[k + 1 :]]).gradient[k]
+            for step in (-1e-2, 1e-2)
+        ]
+        bend = (climb[0] - climb[1]) / 2e-2
+        assert at_truth.information[k][k] == pytest.approx(bend, rel=2e-2)
+
+
+def test_interval_too_short_for_two_gives_one() -> None:
+    samples = whole_signal(np.array([118.0, 124.0]), np.array([1.0, 1.0]), np.array([0.0, 2.0]))
+    fits = fit_whole_echoes(correlation(samples, 1e-3), 120.0, 122.0, SplitTest())
+    assert len(fits) == 1
+    assert 120.0 <= fits[0].position_bins <= 122.0
+
+
+def test_nothing_gives_one_echo_of_nothing() -> None:
+    (fit,) = fit_whole_echoes(correlation(np.zeros(N_WHOLE), 1e-3), FIRST, LAST, SplitTest())
+    assert fit.amplitude == 0.0
+    assert math.isinf(fit.sigma_bins)
