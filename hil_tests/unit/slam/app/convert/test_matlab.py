@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.io import loadmat, savemat
 
-from hil_tests.unit.slam.app.sessions import feed, scan, session_info
+from hil_tests.unit.slam.app.sessions import scan, session_info
 from slam.app.cli import main
 from slam.app.convert.matlab import MAT_RIG, MatDrive, read_mat, write_mat
 from slam.app.errors import AppError
@@ -109,7 +109,8 @@ def test_it_is_replayed(
     assert "Traceback" not in capsys.readouterr().err
 
 
-LEFT = st.tuples(st.floats(-0.1, 0.1), st.floats(0.5, 1.5))
+# Both antennas of the pair, 10.5 cm ahead and behind, see these within 32.5 degrees.
+LEFT = st.tuples(st.floats(-0.1, 0.1), st.floats(0.51, 1.5))
 
 
 @settings(max_examples=60, deadline=None)
@@ -200,60 +201,11 @@ def test_a_session_as_such_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[
         assert drive.frames[2][row].tolist() == scan(counter, 4).frames[1].samples.tolist()
 
 
-def test_settings_that_this_version_does_not_know_are_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    info = replace(four_radars(), config_json='{"unheard_of": 1}', versions={"xethru-hil": "9.9"})
-    session = tmp_path / "s.mcap"
-    track = OdometryTrack.from_lines([format_tum_line(scan(0).t_ns, np.zeros(3))])
-    log = SessionLog(session, info, track)
-    log.on_scan(scan(0, 4))
-    log.close()
-    code, said, err = run(capsys, session, tmp_path / "a.mat")
-    assert (code, said) == (1, "")
-    assert err.startswith(f"uwb-slam: {session}: its setting ")
-    assert err.endswith("it was recorded with xethru-hil 9.9\n")
-    assert err.count("\n") == 1
-
-
-def test_a_session_is_not_made_of_a_session(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    session = tmp_path / "s.mcap"
-    SessionLog(session, session_info()).close()
-    code, said, err = run(capsys, session, tmp_path / "a.mcap")
-    assert (code, said) == (2, "")
-    assert err.startswith(f"uwb-slam: {session}: is a session already; name an OUT that ends in")
-    assert not (tmp_path / "a.mcap").exists()
-
-
 def test_a_file_that_cannot_be_written_says_why(tmp_path: Path) -> None:
     savemat(tmp_path / "a.mat", authors_table())
     drive = read_mat(tmp_path / "a.mat")
     with pytest.raises(AppError, match="cannot be written: No such file or directory"):
         write_mat(tmp_path / "no folder" / "b.mat", drive)
-
-
-def test_two_radars_are_no_such_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    log = SessionLog(tmp_path / "s.mcap", session_info())
-    feed(log, 2)
-    log.close()
-    code, _, err = run(capsys, tmp_path / "s.mcap", tmp_path / "a.mat", "--preset", "paper")
-    assert code == 1
-    assert "four radars, a pair to the left and one to the right; the rig has 2" in err
-
-
-def test_a_session_with_settings_of_another_version_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    info = replace(four_radars(), config_json='{"of_tomorrow": 1}', wheels={"scale_sigma": 0.1})
-    log = SessionLog(tmp_path / "s.mcap", info)
-    log.on_scan(scan(0, 4))
-    log.close()
-    code, _, err = run(capsys, tmp_path / "s.mcap", tmp_path / "a.mat")
-    assert code == 1
-    (line,) = err.splitlines()
-    assert "its setting of_tomorrow is not one of this version" in line
 
 
 @pytest.mark.parametrize(
@@ -304,27 +256,6 @@ def problem(capsys: pytest.CaptureFixture[str], path: Path) -> str:
     assert str(path) in err
     assert not out.exists()
     return err
-
-
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        ({"odom": None}, "holds no odom of shape (n, 3); it holds R1, R2"),
-        ({"odom": np.zeros((N_STATES, 2))}, "odom is (6, 2), must be numbers of shape (n, 3)"),
-        ({"odom": np.zeros((0, 3))}, "odom is empty"),
-        ({"obsLHS": np.zeros((5, 5, 2))}, "obsLHS is (5, 5, 2), must be numbers of shape (6, n, 2"),
-        ({"obsRHS": np.full((N_STATES, 5, 2), np.nan)}, "obsRHS holds NaN or infinity"),
-        ({"R2": np.zeros((N_STATES, 5, 2))}, "R2 is (6, 5, 2), must be numbers of shape (6, n)"),
-        ({"t": np.zeros((N_STATES, 1))}, "t must go forward"),
-        ({"odom": "text"}, "odom is (1,), must be numbers"),
-    ],
-)
-def test_what_does_not_fit_is_named(
-    change: dict[str, Any], expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    table = {key: value for key, value in (authors_table() | change).items() if value is not None}
-    savemat(tmp_path / "x.mat", table)
-    assert expected in problem(capsys, tmp_path / "x.mat")
 
 
 def test_what_is_no_such_file_is_named(

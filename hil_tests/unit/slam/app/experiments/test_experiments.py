@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 
 from emulator.scene.scene import Scene, load_scene
 from hil_tests.paths import FIXTURES, REPOSITORY
-from hil_tests.unit.slam.app.sessions import session_info
 from hil_tests.unit.slam.app.sweep_runs import run_of
 from slam.app.cli import main
-from slam.app.experiments import EXPERIMENTS
 from slam.app.experiments.figure7 import measure_steps, range_errors
 from slam.app.experiments.filter import Origin, Seen, Setting, drive, outcomes
 from slam.app.experiments.recording import (
@@ -29,10 +27,7 @@ from slam.app.experiments.recording import (
 )
 from slam.app.experiments.smoke import in_smoke, light_attenuation_db, smoke_attenuation_db
 from slam.app.experiments.step_cost import StepCost, mapped_state, slope_of, stepper
-from slam.app.odometry.track import OdometryTrack
-from slam.app.odometry.tum import TumSample
 from slam.app.run.pictures import picture
-from slam.app.session.log import SessionLog
 from slam.app.sweep.run import SweepRun, make_case
 from slam.app.sweep.statistics import summarise_groups
 from slam.geometry import paper_rig, transform
@@ -129,49 +124,11 @@ def test_a_filter_that_asks_for_more_keeps_less(seen: Seen) -> None:
     assert lax.n_observations >= table_i.n_observations > strict.n_observations
 
 
-def test_an_unknown_experiment_is_wrong_usage_and_lists_the_known(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    with pytest.raises(SystemExit) as end:
-        main(["experiment", "figure8"])
-    assert end.value.code == 2
-    error = capsys.readouterr().err
-    assert all(name in error for name in EXPERIMENTS)
-    assert "Traceback" not in error
-
-
-@pytest.mark.parametrize("name", [name for name in EXPERIMENTS if name != "recording"])
-def test_a_folder_that_cannot_be_written_is_one_line_before_anything_is_measured(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = tmp_path / "file"
-    file.write_text("not a folder")
-    assert main(["experiment", name, "--out", str(file)]) == 1
-    captured = capsys.readouterr()
-    assert captured.err.startswith(f"uwb-slam: {file}: ")
-    assert captured.err.count("\n") == 1
-    assert captured.out == ""
-
-
 def test_a_picture_is_the_same_file_each_time(tmp_path: Path) -> None:
     for name in ("one.png", "two.png"):
         with picture(tmp_path / name, width_in=2, height_in=2) as figure:
             figure.subplots().plot([0, 1, 2], [1, 0, 1], color="#1f6fd0")
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
-
-
-def test_a_scene_that_is_not_there_is_told_before_the_first_is_driven(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def never(*_: object, **__: object) -> Seen:
-        raise AssertionError("driven")
-
-    monkeypatch.setattr("slam.app.experiments.filter.drive", never)
-    command = ["experiment", "filter", "--out", str(tmp_path), "--scene", "lab", "nowhere"]
-    assert main(command) == 2
-    error = capsys.readouterr().err
-    assert "nowhere: no such scene" in error
-    assert error.count("\n") == 1
 
 
 def test_a_step_predicts_and_learns_from_a_landmark_on_each_side() -> None:
@@ -231,14 +188,6 @@ def test_the_experiment_tells_measured_from_quoted(
     assert "slowest step" in capsys.readouterr().out
 
 
-def test_a_map_of_one_landmark_is_refused_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code = main(["experiment", "step-cost", "--out", str(tmp_path), "--landmarks", "1"])
-    assert code == 2
-    assert "--landmarks 1" in capsys.readouterr().err
-
-
 SIGMA = 3e-5
 SEEDS = range(6)
 
@@ -262,20 +211,6 @@ def white() -> SlowTime:
     iq = SIGMA * (rng.normal(size=(4000, 40)) + 1j * rng.normal(size=(4000, 40)))
     iq[:, 4] += 0.02
     return frames_of(iq)
-
-
-def test_of_a_session_of_several_radars_one_is_chosen(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The remedy that is offered works: what is missing then are frames."""
-    session = tmp_path / "session.mcap"
-    start = TumSample(t_ns=0, x_m=0.0, y_m=0.0, qz=0.0, qw=1.0)
-    SessionLog(session, session_info(), OdometryTrack([start])).close()
-    command = ["experiment", "recording", "--out", str(tmp_path), "--recording", str(session)]
-    assert main(command) == 1
-    assert "choose one: --radar NAME" in capsys.readouterr().err
-    assert main([*command, "--radar", "radar0"]) == 1
-    assert "0 baseband frames" in capsys.readouterr().err
 
 
 def test_white_noise_is_its_own_floor_and_all_new_with_every_frame(white: SlowTime) -> None:
@@ -369,19 +304,6 @@ def test_the_experiment_leaves_picture_numbers_and_table(
     assert "ten farthest bins" in capsys.readouterr().out
 
 
-def test_a_missing_recording_is_one_clear_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    missing = tmp_path / "nowhere"
-    code = main(
-        ["experiment", "recording", "--recording", str(missing), "--out", str(tmp_path / "out")]
-    )
-    said = capsys.readouterr().err.strip()
-    assert code == 1
-    assert str(missing) in said
-    assert "\n" not in said
-
-
 TIMES_S = tuple(float(second) for second in range(1, 11))
 
 
@@ -472,34 +394,6 @@ def test_scenes_has_a_row_per_clean_group(
     ]
     assert (tmp_path / "out" / "scenes.png").read_bytes().startswith(b"\x89PNG")
     assert "0.250" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        (None, "cannot be read"),
-        ("{", "is not a result"),
-        ("[]", "is not a result"),
-        ('{"runs": [], "groups": []}', "is not a result"),
-        ('{"groups": [{"scene": "lab"}]}', "is not a result"),
-    ],
-)
-@pytest.mark.parametrize("name", ["consistency", "stress", "scenes"])
-def test_what_no_sweep_wrote_is_1_and_one_line(
-    name: str,
-    content: str | None,
-    said: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    path = tmp_path / "o.json"
-    if content is not None:
-        path.write_text(content)
-    assert main(["experiment", name, "--sweep", str(path), "--out", str(tmp_path / "out")]) == 1
-    text = capsys.readouterr()
-    assert str(path) in text.err
-    assert said in text.err
-    assert (text.out, text.err.count("\n")) == ("", 1)
 
 
 @pytest.mark.parametrize("name", ["consistency", "stress", "scenes"])

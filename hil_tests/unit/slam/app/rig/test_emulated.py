@@ -9,7 +9,7 @@ import pytest
 
 from hil_tests.patience import wait_until
 from hil_tests.system.short_scene import write_short_scene
-from hil_tests.unit.slam.app.sessions import feed, session_info
+from hil_tests.unit.slam.app.sessions import session_info
 from slam.app.cli import main
 from slam.app.commands.demo import WireTap
 from slam.app.errors import EmulatorError
@@ -142,29 +142,3 @@ def test_the_bytes_of_every_port_hold_its_frames(
         # the host spoke first: what was said before the log began is there, too
         assert ways[0] == "tx"
         assert read_note(out)["radar"] == radar.name
-
-
-def problem(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    assert main(["convert", *map(str, arguments)]) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    return line
-
-
-def test_what_is_not_there_is_named(
-    recorded: tuple[Path, list[Scan]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path, _ = recorded
-    out = tmp_path / "x.xtwire"
-    assert "several radars (front_left, rear_left, front_right, rear_right); choose one" in problem(
-        capsys, path, out
-    )
-    assert "holds no radar 'left'; it holds front_left" in problem(
-        capsys, path, out, "--radar", "left"
-    )
-    bare = tmp_path / "bare.mcap"
-    log = SessionLog(bare, session_info())
-    feed(log, 2)
-    log.close()
-    said = problem(capsys, bare, out, "--radar", "radar0")
-    assert "holds no raw bytes; record with --wire" in said
-    assert not out.exists()

@@ -284,19 +284,6 @@ def test_an_error_beyond_all_floats_is_null(
     assert capsys.readouterr().out.startswith("ATE beyond floating point (RMS, ")
 
 
-def test_wrong_files_are_one_line_and_exit_1(
-    files: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["evaluate", str(tmp_path / "none.tum"), str(files[1])]) == 1
-    assert "none.tum: cannot read: No such file" in capsys.readouterr().err
-    late = tmp_path / "late.tum"
-    write_tum(late, Trajectory(stamps_ns=STAMPS + 10**15, poses=square_path()))
-    assert main(["evaluate", str(late), str(files[1])]) == 1
-    said = capsys.readouterr().err
-    assert "share 0 stamps" in said
-    assert said.count("\n") == 1
-
-
 SUMMARY = Summary(
     scene="lab",
     preset="paper",

@@ -19,8 +19,6 @@ from slam.app.odometry.tum import TumSample, format_tum_line
 from slam.app.records import LogLine, Scan, Snapshot
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import (
-    METADATA_NAME,
-    session_table,
     settings_text,
     snapshot_of,
     state_row,
@@ -231,34 +229,6 @@ def test_wire_bytes_come_back_with_both_clocks(tmp_path: Path) -> None:
         "/radar/radar1/tx": "std_msgs/msg/UInt8MultiArray",
         "/radar/radar1/rx": "std_msgs/msg/UInt8MultiArray",
     }
-
-
-@pytest.mark.parametrize(
-    ("number", "remedy"),
-    [
-        ("3", "a newer xethru-hil wrote it"),
-        ("two", "a newer xethru-hil wrote it"),
-        ("1", "record the session again"),
-        (None, "record the session again"),
-    ],
-)
-def test_a_session_of_another_format_is_refused_in_one_line(
-    tmp_path: Path, number: str | None, remedy: str
-) -> None:
-    table = session_table(session_info())
-    del table["format"]
-    if number is not None:
-        table["format"] = number
-    path = tmp_path / "s.mcap"
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        writer.add_metadata(METADATA_NAME, table)
-        writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
-    with pytest.raises(AppError) as caught:
-        open_session(path)
-    line = f"{path}: a session of format {number or 1}; this version reads format 2; {remedy}"
-    assert str(caught.value) == line
 
 
 @pytest.mark.parametrize("preset", ["paper", "robust"])

@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import signal
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor
@@ -14,25 +13,10 @@ import pytest
 
 from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.sweep_runs import run_of
-from slam.app.cli import main
-from slam.app.errors import AppError, StopFlag, StopRequestedError, UsageError
+from slam.app.errors import AppError, StopFlag, StopRequestedError
 from slam.app.sweep import sweep
 from slam.app.sweep.run import Case, Key, SweepRun, finite, make_case
 from slam.app.sweep.sweep import PartFile, SweepOptions, run_sweep
-
-
-def test_two_scenes_of_one_name_are_refused(tmp_path: Path) -> None:
-    scene = write_short_scene(tmp_path)
-    options = SweepOptions(
-        scenes=(str(scene), str(scene)),
-        presets=("paper",),
-        n_seeds=1,
-        jobs=1,
-        out=tmp_path / "out.json",
-    )
-    with StopFlag() as stop, pytest.raises(UsageError, match="same name"):
-        run_sweep(options, stop)
-    assert not (tmp_path / "out.json").exists()
 
 
 def test_a_worker_that_dies_is_one_line_and_leaves_nothing(
@@ -48,16 +32,6 @@ def test_a_worker_that_dies_is_one_line_and_leaves_nothing(
     with StopFlag() as stop, pytest.raises(AppError, match=r"^a worker process died; did memory"):
         run_sweep(options, stop)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_what_is_no_regular_file_is_never_replaced(tmp_path: Path) -> None:
-    pipe = tmp_path / "pipe"
-    os.mkfifo(pipe)
-    options = SweepOptions(scenes=("lab",), presets=("paper",), n_seeds=1, jobs=1, out=pipe)
-    with StopFlag() as stop, pytest.raises(AppError, match="no regular file"):
-        run_sweep(options, stop)
-    assert pipe.is_fifo()
-    assert list(tmp_path.iterdir()) == [pipe]
 
 
 def test_the_folder_of_the_results_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -161,35 +135,6 @@ def test_another_version_of_a_scene_file_does_not_go_on(
         scene.write_text(scene.read_text().replace("0.05", "0.06"))
         with pytest.raises(AppError, match="other: scene file short"):
             run_sweep(options, stop)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        ("--set association.gte=1", "unknown key association.gte; allowed: gate_rule"),
-        ("--set association.gate=1,x", "association.gate"),
-        ("--set gate=1", "write it as part.key"),
-        ("--set association.gate=1,1", "given twice"),
-        ("--preset paper paper", "given twice"),
-    ],
-)
-def test_a_wrong_setting_is_2_and_one_line_before_any_run(
-    arguments: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    command = ["sweep", "--json", str(tmp_path / "o"), *arguments.split()]
-    assert main(command) == 2
-    text = capsys.readouterr()
-    assert said in text.err
-    assert (text.out, text.err.count("\n")) == ("", 1)
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("wrong", ["--set gate", "--stress mud", "--jobs 2 --dask tcp://x:1"])
-def test_what_the_parser_refuses_is_2(wrong: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(["sweep", "--json", "o", *wrong.split()])
-    assert caught.value.code == 2
-    assert "Traceback" not in capsys.readouterr().err
 
 
 COMMAND = {"seeds": "3", "scene file lab": "12ab"}
