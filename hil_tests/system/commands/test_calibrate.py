@@ -1,7 +1,5 @@
 """`uwb-slam calibrate` on what `uwb-slam demo` records: planted offsets come back."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -269,18 +269,6 @@ def kill_viewer() -> None:
     os.waitid(os.P_PID, viewer, os.WEXITED | os.WNOWAIT)
 
 
-def test_what_is_left_of_a_cut_session_is_shown(
-    viewed: Viewed, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    whole = viewed.session.read_bytes()
-    (cut := tmp_path / "cut.mcap").write_bytes(whole[: len(whole) // 2])
-    assert main(["view", str(cut), "--out", str(tmp_path / "v.rrd")]) == 0
-    assert f"{cut} was cut at byte" in capsys.readouterr().err
-    rows, all_rows = count_rows(tmp_path / "v.rrd"), count_rows(viewed.rrd)
-    share = rows["/radar/front_left/frame"] / all_rows["/radar/front_left/frame"]
-    assert 0.3 < share < 0.6
-
-
 def test_of_a_killed_run_the_session_is_shown_not_its_unfinished_view(
     viewed: Viewed, tmp_path: Path
 ) -> None:

@@ -1,7 +1,5 @@
 """Bags as the paper's authors recorded them, made by nothing but the rosbags library."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

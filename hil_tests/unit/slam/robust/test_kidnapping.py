@@ -1,7 +1,5 @@
 """A robot that is carried away: noticed by what is missing, found again by what is there."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

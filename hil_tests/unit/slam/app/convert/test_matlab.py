@@ -1,7 +1,5 @@
 """MATLAB files of detections: the authors' layout as we generate it, there and back."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

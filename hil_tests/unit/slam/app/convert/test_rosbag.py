@@ -1,7 +1,5 @@
 """Bags of ROS 1 and ROS 2: sessions there and back, and the authors' layout as we generate it."""
 
-from __future__ import annotations
-
 import math
 import signal
 import sqlite3

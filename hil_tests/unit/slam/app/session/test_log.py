@@ -256,17 +256,6 @@ def test_a_file_that_was_never_finished_lacks_its_last_chunk_only(tmp_path: Path
     assert N_SCANS - 25 <= len(counters) < N_SCANS
 
 
-@pytest.mark.parametrize("part", [0.1, 0.5, 0.99])
-def test_a_file_cut_anywhere_is_readable_up_to_the_cut(
-    tmp_path: Path, finished: Path, part: float
-) -> None:
-    cut = tmp_path / "cut.mcap"
-    cut.write_bytes(finished.read_bytes()[: int(part * finished.stat().st_size)])
-    counters = surviving_counters(cut, "/radar/radar1/frame")
-    assert counters == list(range(len(counters)))
-    assert len(counters) >= part * N_SCANS - 30
-
-
 def test_closing_twice_is_harmless(tmp_path: Path) -> None:
     log = SessionLog(tmp_path / "s.mcap", session_info(), odometry())
     log.close()

@@ -1,7 +1,5 @@
 """A recorded session comes back as it was; damaged and foreign files are one line."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -235,24 +233,6 @@ def test_wire_bytes_come_back_with_both_clocks(tmp_path: Path) -> None:
 def test_settings_of_every_preset_come_back_the_same(preset: str) -> None:
     config = load_preset(preset, "lab")
     assert SlamConfig.model_validate_json(settings_text(config)) == config
-
-
-@pytest.mark.parametrize("share", [0.3, 0.5, 0.77, 0.9])
-def test_a_cut_file_is_read_to_its_last_message(
-    session_file: Path, tmp_path: Path, share: float
-) -> None:
-    content = session_file.read_bytes()
-    path = tmp_path / "cut.mcap"
-    path.write_bytes(content[: round(share * len(content))])
-    session = open_session(path)
-    frames = [r for r in session.records() if isinstance(r, RadarFrame)]
-    assert session.cut_at_byte is not None
-    sent = [frame for k in range(N_SCANS) for frame in scan(k).frames]
-    # whole frames only, in order, none skipped; frames hardly compress, so as many as fit
-    assert [f.samples.tobytes() for f in frames] == [f.samples.tobytes() for f in sent][
-        : len(frames)
-    ]
-    assert len(frames) >= share * len(sent) - 26  # a block of zstd holds 128 KiB, 23 frames
 
 
 def test_a_whole_file_is_not_called_cut(session_file: Path) -> None:

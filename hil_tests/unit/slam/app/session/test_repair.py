@@ -1,7 +1,5 @@
 """What `uwb-slam repair` says and refuses; what it keeps is tested in property/."""
 
-from __future__ import annotations
-
 import errno
 import signal
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The known-association bound: against truth, against our own smoother, and what it is told."""
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Sequence
