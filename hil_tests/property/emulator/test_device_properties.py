@@ -1,7 +1,5 @@
 """Whatever a host sends, the module never raises, never blocks, and never grows."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

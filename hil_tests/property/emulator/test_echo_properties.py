@@ -1,7 +1,5 @@
 """Laws of the echo in any scene: shifts, blocks, linearity, radar order, independence."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """What holds for every fault: no plan changes nothing, one seed gives the same bytes."""
 
-from __future__ import annotations
-
 from typing import Any, cast
 
 import numpy as np

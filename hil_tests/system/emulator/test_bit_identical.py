@@ -1,7 +1,5 @@
 """Through pseudo-terminals and in process: the same frames, bit for bit."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """A small ``python -m hil_tests.bench.hostile_client``, and the same at real ports."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import select

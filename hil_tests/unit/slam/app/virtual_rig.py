@@ -3,8 +3,6 @@
 What the threads of a run would put into its inbox, each event at its own virtual time.
 """
 
-from __future__ import annotations
-
 import heapq
 import math
 from collections.abc import Callable, Iterator
