@@ -1,9 +1,12 @@
 """Serial transport on pseudo-terminals."""
 
+import fcntl
 import math
 import os
 import pty
 import resource
+import struct
+import termios
 import threading
 import time
 import tty
@@ -13,6 +16,7 @@ from pathlib import Path
 import pytest
 import serial
 
+from hil_tests.patience import wait_until
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.transport import SerialTransport
 from xethru_protocol.wire.errors import Disconnected, LocalProtocolError, PortUnavailable
@@ -111,7 +115,13 @@ def test_frame_is_read_in_few_pieces_never_byte_by_byte(line: Line) -> None:
     port = SerialTransport(line.path)
     os.write(line.master, bytes(5747))  # a radar frame; one read of a tty gives at most 4095
     sizes: list[int] = []
+
+    def is_full() -> bool:  # the kernel moves bytes on at no certain time
+        n_waiting = struct.unpack("i", fcntl.ioctl(port.fileno(), termios.FIONREAD, bytes(4)))[0]
+        return bool(n_waiting >= min(4095, 5747 - sum(sizes)))
+
     while sum(sizes) < 5747:
+        wait_until(is_full)
         sizes.append(len(port.read(1.0)))
     assert len(sizes) == 2
     port.close()

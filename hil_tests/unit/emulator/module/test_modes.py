@@ -97,7 +97,7 @@ def test_the_permissions_are_those_of_the_reference(name: str) -> None:
 
 def test_the_tables_can_be_printed() -> None:
     command = [sys.executable, "-m", "emulator.module.modes"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=30)
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout == state_diagram() + "\n\n" + permission_table() + "\n"
 
 

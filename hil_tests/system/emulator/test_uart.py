@@ -34,7 +34,6 @@ def test_the_speed_must_fit_and_can_be_changed(served: Served) -> None:
         radar.start(17.0)
         counters = [frame.counter for frame in radar.frames(8)]
         assert counters == list(range(counters[0], counters[0] + 8)), "716 bins fit"
-        radar.reset(
-            wait=True, timeout_s=seconds(15)
-        )  # back at 115200, from where the driver takes it again
+        # back at 115200, from where the driver takes it again
+        radar.reset(wait=True, timeout_s=seconds(15))
         assert radar.ping() is PongCode.XTS_SPRP_READY

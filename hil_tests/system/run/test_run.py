@@ -92,7 +92,6 @@ def test_a_run_from_stdin_ends_when_it_is_told_to_and_replays_to_the_last_bit(
             capture_output=True,
             text=True,
             check=False,
-            timeout=seconds(60),
         )
         wheels.terminate()
     assert process.returncode == 0, process.stderr

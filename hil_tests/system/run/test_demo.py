@@ -14,7 +14,6 @@ from PIL import Image
 from rerun.chunk import RrdReader
 from rosbags.highlevel import AnyReader
 
-from hil_tests.patience import seconds
 from hil_tests.system.short_scene import write_short_scene
 from slam.app.odometry.tum import read_tum
 from slam.app.records import Scan
@@ -50,9 +49,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     out = folder / "out"
     command = [sys.executable, "-m", "slam.app.cli", "demo", "--scene", str(scene)]
     command += ["--seed", str(SEED), "--out", str(out)]
-    process = subprocess.run(
-        command, capture_output=True, text=True, check=False, timeout=seconds(60)
-    )
+    process = subprocess.run(command, capture_output=True, text=True, check=False)
     assert process.returncode == 0, process.stderr
     return Finished(scene=scene, out=out, process=process)
 

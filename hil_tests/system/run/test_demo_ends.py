@@ -121,7 +121,6 @@ def test_a_file_that_may_not_grow_is_one_line(tmp_path: Path) -> None:
         capture_output=True,
         text=True,
         check=False,
-        timeout=seconds(60),
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
     )
     assert (run.returncode, run.stdout) == (1, "")

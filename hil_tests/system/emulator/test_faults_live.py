@@ -9,7 +9,6 @@ from pathlib import Path
 
 from hil_tests.device.serving import emulator, open_radar
 from hil_tests.paths import FIXTURES
-from hil_tests.patience import seconds
 from xethru_protocol.driver.link import RawConfig
 
 CTL = (sys.executable, "-m", "emulator.cli", "ctl")
@@ -20,7 +19,6 @@ def ctl(*words: str) -> subprocess.CompletedProcess[str]:
         [*CTL, *words],
         capture_output=True,
         text=True,
-        timeout=seconds(20),
         check=False,
     )
 
@@ -66,7 +64,6 @@ def test_a_wrong_scenario_is_one_line(tmp_path: Path) -> None:
         [sys.executable, "-m", "emulator.cli", "serve", "--bare", "--faults", str(scenario)],
         capture_output=True,
         text=True,
-        timeout=seconds(20),
         check=False,
     )
     assert result.returncode == 1
@@ -79,7 +76,6 @@ def test_the_list_of_faults_is_json() -> None:
         [sys.executable, "-m", "emulator.cli", "faults", "--json"],
         capture_output=True,
         text=True,
-        timeout=seconds(20),
         check=True,
     )
     listed = json.loads(result.stdout)

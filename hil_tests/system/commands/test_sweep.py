@@ -26,7 +26,7 @@ def sweep(tmp_path: Path, jobs: int) -> dict[str, Any]:
     command = [sys.executable, "-m", "slam.app.cli", "sweep", "--scene", str(scene)]
     command += ["--preset", "paper"]
     command += ["--seeds", "3", "--jobs", str(jobs), "--json", str(out)]
-    run = subprocess.run(command, capture_output=True, text=True, check=True, timeout=seconds(100))
+    run = subprocess.run(command, capture_output=True, text=True, check=True)
     assert run.stdout.startswith("short, preset paper, 3 seeds (simulated): SLAM ATE median")
     result: dict[str, Any] = json.loads(out.read_text())
     return result
@@ -92,11 +92,7 @@ def test_ctrl_c_while_workers_start(tmp_path: Path) -> None:
         "raise SystemExit(main(['sweep', '--jobs', '2', '--json', out]))\n"
     )
     process = subprocess.run(
-        [sys.executable, str(script)],
-        capture_output=True,
-        text=True,
-        process_group=0,
-        timeout=seconds(60),
+        [sys.executable, str(script)], capture_output=True, text=True, process_group=0
     )
     assert (process.returncode, process.stdout) == (130, "")
     assert process.stderr == "uwb-slam: stopped by SIGINT\n"
