@@ -373,7 +373,7 @@ def _parser() -> argparse.ArgumentParser:
         parser_of_row.add_argument(
             "--out", type=folder, default=Path("out/experiments"), help="folder for the results"
         )
-        for flag, keywords in row.options.items():
+        for flag, keywords in row.options:
             parser_of_row.add_argument(flag, **keywords)
         parser_of_row.set_defaults(command=run_experiment)
     return parser

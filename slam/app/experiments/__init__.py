@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
@@ -21,6 +21,8 @@ from slam.app.errors import StopFlag, naming
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+Option = tuple[str, Mapping[str, Any]]
+"""A flag, and the keywords of ``add_argument`` for it."""
 Table = tuple[str, Sequence[str], Sequence[Sequence[str]]]
 """Title, header and rows."""
 
@@ -48,12 +50,12 @@ class Result:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Experiment:
-    """One row; ``options`` are flags and their keywords for ``add_argument``."""
+    """One row: what the experiment is called, what it shows in a line, where it lives."""
 
     name: str
     help: str
     module: str
-    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    options: Sequence[Option]
 
 
 def run_experiment(arguments: argparse.Namespace, stop: StopFlag) -> None:
@@ -81,14 +83,17 @@ def run_experiment(arguments: argparse.Namespace, stop: StopFlag) -> None:
         print_table(*table)
 
 
-def _seed_of(what: str) -> dict[str, Mapping[str, Any]]:
-    text = f"seed of {what} (default: %(default)s)"
-    return {"--seed": {"type": seed, "default": 0, "help": text}}
+def _option(flag: str, **keywords: Any) -> Option:  # noqa: ANN401 - argparse's
+    return flag, keywords
 
 
-def _sweep_of(made_by: str, default: str) -> dict[str, Mapping[str, Any]]:
+def _seed_of(what: str) -> Option:
+    return _option("--seed", type=seed, default=0, help=f"seed of {what} (default: %(default)s)")
+
+
+def _sweep_of(made_by: str, default: str) -> Option:
     text = f"result of {made_by} (default: %(default)s)"
-    return {"--sweep": {"type": Path, "default": Path(default), "metavar": "JSON", "help": text}}
+    return _option("--sweep", type=Path, default=Path(default), metavar="JSON", help=text)
 
 
 _ROWS: tuple[Experiment, ...] = (
@@ -96,120 +101,123 @@ _ROWS: tuple[Experiment, ...] = (
         name="figure7",
         help="one frame from raw to peaks, and a target that moves away in 1 cm steps",
         module="slam.app.experiments.figure7",
-        options=_seed_of("the receiver noise")
-        | {
-            "--frames": {
-                "type": count,
-                "default": 20,
-                "help": "frames taken at each position of the target (default: %(default)s)",
-            }
-        },
+        options=(
+            _seed_of("the receiver noise"),
+            _option(
+                "--frames",
+                type=count,
+                default=20,
+                help="frames taken at each position of the target (default: %(default)s)",
+            ),
+        ),
     ),
     Experiment(
         name="smoke",
         help="observations in smoke and in clear air, raw and filtered",
         module="slam.app.experiments.smoke",
-        options=_seed_of("receiver noise and odometry drift"),
+        options=(_seed_of("receiver noise and odometry drift"),),
     ),
     Experiment(
         name="filter",
         help="what window, minimum count and search radius of the outlier filter trade off",
         module="slam.app.experiments.filter",
-        options=_seed_of("receiver noise and odometry drift")
-        | {
-            "--scene": {
-                "nargs": "+",
-                "default": ["lab"],
-                "help": "names or files of scenes (default: lab); in two_rooms walls make most of "
+        options=(
+            _seed_of("receiver noise and odometry drift"),
+            _option(
+                "--scene",
+                nargs="+",
+                default=["lab"],
+                help="names or files of scenes (default: lab); in two_rooms walls make most of "
                 "the fixes",
-            }
-        },
+            ),
+        ),
     ),
     Experiment(
         name="limits",
         help="range error, detection and resolution of the front ends beside their bounds",
         module="slam.app.experiments.limits",
-        options=_seed_of("places, phases and noise")
-        | {
-            "--trials": {
-                "type": count,
-                "default": 2000,
-                "help": "frames per cell (default: %(default)s)",
-            }
-        },
+        options=(
+            _seed_of("places, phases and noise"),
+            _option(
+                "--trials", type=count, default=2000, help="frames per cell (default: %(default)s)"
+            ),
+        ),
     ),
     Experiment(
         name="recording",
         help="a real recording of a standing module beside emulated frames",
         module="slam.app.experiments.recording",
-        options={
-            "--recording": {
-                "type": Path,
-                "required": True,
-                "metavar": "DIR",
-                "help": "recording of a standing module's baseband frames, in any format "
+        options=(
+            _option(
+                "--recording",
+                type=Path,
+                required=True,
+                metavar="DIR",
+                help="recording of a standing module's baseband frames, in any format "
                 "`xethru dump` reads",
-            },
-            "--radar": {"metavar": "NAME", "help": "which radar of a recording of several"},
-        }
-        | _seed_of("the run drawn in full")
-        | {
-            "--runs": {
-                "type": count,
-                "default": 20,
-                "help": "emulated runs, with seeds from there on (default: %(default)s)",
-            }
-        },
+            ),
+            _option("--radar", metavar="NAME", help="which radar of a recording of several"),
+            _seed_of("the run drawn in full"),
+            _option(
+                "--runs",
+                type=count,
+                default=20,
+                help="emulated runs, with seeds from there on (default: %(default)s)",
+            ),
+        ),
     ),
     Experiment(
         name="step-cost",
         help="what a step of the robust filter costs against the size of the map",
         module="slam.app.experiments.step_cost",
-        options={
-            "--landmarks": {
-                "nargs": "+",
-                "type": count,
-                "default": [10, 20, 50, 100, 200, 500, 1000, 2000],
-                "metavar": "N",
-                "help": "sizes of the map (default: 10 20 50 100 200 500 1000 2000)",
-            },
-            "--repetitions": {
-                "type": count,
-                "default": 7,
-                "metavar": "N",
-                "help": "how often every step is timed; the least counts (default: %(default)s)",
-            },
-        },
+        options=(
+            _option(
+                "--landmarks",
+                nargs="+",
+                type=count,
+                default=[10, 20, 50, 100, 200, 500, 1000, 2000],
+                metavar="N",
+                help="sizes of the map (default: 10 20 50 100 200 500 1000 2000)",
+            ),
+            _option(
+                "--repetitions",
+                type=count,
+                default=7,
+                metavar="N",
+                help="how often every step is timed; the least counts (default: %(default)s)",
+            ),
+        ),
     ),
     Experiment(
         name="consistency",
         help="mean NEES and NIS of a sweep at ten times, against their bands",
         module="slam.app.experiments.consistency",
-        options=_sweep_of("`uwb-slam sweep`, like `make sweep`", "out/sweep.json"),
+        options=(_sweep_of("`uwb-slam sweep`, like `make sweep`", "out/sweep.json"),),
     ),
     Experiment(
         name="stress",
         help="what each hardship of a sweep costs, in units of its clean runs",
         module="slam.app.experiments.stress",
-        options=_sweep_of("`uwb-slam sweep --stress ...`", "out/stress.json"),
+        options=(_sweep_of("`uwb-slam sweep --stress ...`", "out/stress.json"),),
     ),
     Experiment(
         name="scenes",
         help="what one preset does in each scene of a sweep",
         module="slam.app.experiments.scenes",
-        options=_sweep_of("`uwb-slam sweep --scene ...`", "out/scenes.json"),
+        options=(_sweep_of("`uwb-slam sweep --scene ...`", "out/scenes.json"),),
     ),
     Experiment(
         name="victoria-park",
         help="the robust back end on real data, a car among trees, against GTSAM's batch solution",
         module="slam.app.experiments.victoria_park",
-        options={
-            "--steps": {
-                "type": count,
-                "default": None,
-                "help": "take the first steps of the drive only (default: all 6968)",
-            }
-        },
+        options=(
+            _option(
+                "--steps",
+                type=count,
+                default=None,
+                help="take the first steps of the drive only (default: all 6968)",
+            ),
+        ),
     ),
 )
 
