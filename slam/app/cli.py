@@ -14,7 +14,7 @@ from pathlib import Path
 
 from slam.app.commands.options import add_rerun, count, folder, seconds, seed
 from slam.app.errors import EXIT_FAILED, AppError, StopFlag, StopRequestedError
-from slam.app.experiments import EXPERIMENTS, run_experiment
+from slam.app.experiments import add_experiments
 from slam.app.sweep.stress import STRESSES
 from xethru_protocol.system import drop_what_cannot_be_said, open_closed_streams
 
@@ -367,15 +367,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Runs one experiment on emulated radars; writes NAME.png and NAME.json. All "
         "numbers are simulated.",
     )
-    names = experiment.add_subparsers(required=True, metavar="NAME", dest="name")
-    for row in EXPERIMENTS.values():
-        parser_of_row = names.add_parser(row.name, help=row.help, description=row.help)
-        parser_of_row.add_argument(
-            "--out", type=folder, default=Path("out/experiments"), help="folder for the results"
-        )
-        for flag, keywords in row.options:
-            parser_of_row.add_argument(flag, **keywords)
-        parser_of_row.set_defaults(command=run_experiment)
+    add_experiments(experiment)
     return parser
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from slam.app.commands.options import count, seed
+from slam.app.commands.options import count, folder, seed
 from slam.app.errors import StopFlag, naming
 
 if TYPE_CHECKING:
@@ -56,6 +56,19 @@ class Experiment:
     help: str
     module: str
     options: Sequence[Option]
+
+
+def add_experiments(experiment: argparse.ArgumentParser) -> None:
+    """Add a command for each experiment."""
+    names = experiment.add_subparsers(required=True, metavar="NAME", dest="name")
+    for row in EXPERIMENTS.values():
+        parser = names.add_parser(row.name, help=row.help, description=row.help)
+        parser.add_argument(
+            "--out", type=folder, default=Path("out/experiments"), help="folder for the results"
+        )
+        for flag, keywords in row.options:
+            parser.add_argument(flag, **keywords)
+        parser.set_defaults(command=run_experiment)
 
 
 def run_experiment(arguments: argparse.Namespace, stop: StopFlag) -> None:
