@@ -228,10 +228,7 @@ def test_the_second_signal_insists() -> None:
 
 
 class Screen(io.StringIO):
-    """A terminal."""
-
     def isatty(self) -> bool:
-        """Be one."""
         return True
 
 
