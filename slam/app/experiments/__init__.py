@@ -20,7 +20,7 @@ from importlib import import_module
 from types import MappingProxyType
 from typing import Protocol, cast
 
-from slam.app.errors import StopFlag
+from xethru_protocol.system import StopFlag
 
 
 class ExperimentModule(Protocol):

@@ -12,9 +12,9 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
-from slam.app.errors import StopFlag
 from slam.app.experiments.stress import add_sweep_argument, read_groups
 from slam.app.run.pictures import ESTIMATE, GRID, INK, LANDMARK, ODOMETRY, TRUTH, label, picture
+from xethru_protocol.system import StopFlag
 
 _COLOURS = (ESTIMATE, ODOMETRY, LANDMARK, "#2b8a3e", "#7048b8")
 

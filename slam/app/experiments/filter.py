@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from emulator.scene.scene import Scene
 from emulator.scene.wheels import scene_odometry
 from slam.app.commands.options import seed
-from slam.app.errors import StopFlag
 from slam.app.odometry.track import OdometryTrack
 from slam.app.odometry.tum import NS_PER_S
 from slam.app.rig.emulated import (
@@ -41,6 +40,7 @@ from slam.geometry import Rig, transform
 from slam.paper.clustering import CollectedState, filter_window
 from slam.paper.pipeline import UwbRadarSlam
 from slam.paper.trilateration import Fix
+from xethru_protocol.system import StopFlag
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,6 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from slam.app.commands.options import count, seed
-from slam.app.errors import StopFlag
 from slam.app.experiments.limit_cells import (
     BIN_LENGTH_M,
     FRONT_ENDS,
@@ -33,6 +32,7 @@ from slam.app.experiments.limit_cells import (
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label, picture
 from slam.config import MatchedFilterConfig
 from slam.front_end.matched_filter import threshold_sigmas
+from xethru_protocol.system import StopFlag
 
 METHODS = (*FRONT_ENDS, "lasso", "omp", "clean")
 _LOOKS: Mapping[str, dict[str, Any]] = {

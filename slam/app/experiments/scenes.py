@@ -13,7 +13,6 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullLocator
 
-from slam.app.errors import StopFlag
 from slam.app.experiments.stress import (
     add_sweep_argument,
     draw_consistency,
@@ -22,6 +21,7 @@ from slam.app.experiments.stress import (
 )
 from slam.app.run.pictures import ESTIMATE, GRID, INK, LANDMARK, ODOMETRY, label, picture
 from slam.app.sweep.statistics import group_name
+from xethru_protocol.system import StopFlag
 
 
 def draw_scenes(path: Path, groups: Sequence[dict[str, Any]]) -> None:

@@ -29,7 +29,6 @@ from numpy.typing import NDArray
 from emulator.scene.scene import Scene
 from emulator.scene.wheels import scene_odometry
 from slam.app.commands.options import seed
-from slam.app.errors import StopFlag
 from slam.app.odometry.track import OdometryTrack
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
@@ -48,6 +47,7 @@ from slam.geometry import transform
 from slam.paper.clustering import Observation
 from slam.paper.pipeline import StepResult, UwbRadarSlam
 from slam.paper.trilateration import Fix
+from xethru_protocol.system import StopFlag
 
 Array = NDArray[np.float64]
 

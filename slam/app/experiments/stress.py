@@ -15,10 +15,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
-from slam.app.errors import AppError, StopFlag
+from slam.app.errors import AppError
 from slam.app.run.pictures import ESTIMATE, GRID, INK, LANDMARK, PALE_INK, label, picture
 from slam.app.sweep.statistics import group_name, times_clean
-from xethru_protocol.system import read_bounded
+from xethru_protocol.system import StopFlag, read_bounded
 
 _MOST_BYTES = 1 << 28
 _NEEDED = {"scene", "preset", "settings", "stress", "ate_rmse_m", "anees_pose", "nis_times"}

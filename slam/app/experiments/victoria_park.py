@@ -29,7 +29,7 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from slam.app.commands.options import count
-from slam.app.errors import AppError, StopFlag
+from slam.app.errors import AppError
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, TRUTH, label, picture
 from slam.app.sweep.bound import load_gtsam
 from slam.evaluation import ate_rmse_m
@@ -38,6 +38,7 @@ from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import RangeBearing
 from slam.robust.parameters import BackEndParameters, RelinearisationRule, WheelNoise
 from slam.robust.state import CALIBRATION
+from xethru_protocol.system import StopFlag
 
 Array = NDArray[np.float64]
 

@@ -3,7 +3,6 @@
 import io
 import json
 import resource
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -14,7 +13,7 @@ import pytest
 from hil_tests.unit.xethru_protocol.pty_module import PtyModule
 from hil_tests.unit.xethru_protocol.scripted import frame
 from hil_tests.unit.xethru_protocol.sick_module import Said, SickModule, silent
-from xethru_protocol.cli import main, record
+from xethru_protocol.cli import main
 from xethru_protocol.cli.output import Progress
 from xethru_protocol.cli.record import Recorder
 from xethru_protocol.recordings import describe_recording, read_note, read_recording
@@ -248,24 +247,6 @@ def test_wrong_usage(arguments: list[str], capsys: Capture) -> None:
         main(["record", "--port", "p", *arguments])
     assert caught.value.code == 2
     assert "usage: xethru record" in capsys.readouterr().err
-
-
-def test_the_second_signal_insists() -> None:
-    noted: list[int] = []
-
-    def twice() -> None:
-        with record._noted(noted):
-            signal.raise_signal(signal.SIGINT)
-            assert noted == [signal.SIGINT]
-            signal.raise_signal(signal.SIGINT)
-
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            twice()
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 # --- progress -------------------------------------------------------------------------------------

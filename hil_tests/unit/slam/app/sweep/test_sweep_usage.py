@@ -14,10 +14,11 @@ import pytest
 from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.sweep_runs import run_of
 from slam.app.cli import main
-from slam.app.errors import AppError, StopFlag, StopRequestedError, UsageError
+from slam.app.errors import AppError, UsageError
 from slam.app.sweep import sweep
 from slam.app.sweep.run import Case, Key, SweepRun
 from slam.app.sweep.sweep import SweepOptions, run_sweep
+from xethru_protocol.system import StopFlag, StopRequestedError
 
 
 def test_two_scenes_of_one_name_are_refused(tmp_path: Path) -> None:
