@@ -15,7 +15,7 @@ from emulator.chip.chip import CaptureSettings
 from emulator.echo.echo import SceneEcho, echo_source
 from emulator.echo.pulse import sum_of_pulses
 from emulator.scene.scene import ClutterSpec, LeakageSpec, Scene, load_scene
-from hil_tests.captures import PAPER
+from hil_tests.unit.emulator.rooms import PAPER
 
 CAPTURE = replace(PAPER, n_samples=400)
 LAB = load_scene("lab")

@@ -13,38 +13,6 @@ from slam.app.cli import main
 from slam.app.session.log import SessionLog
 from xethru_protocol.system import locked
 
-HEAVY = {
-    "numpy",
-    "scipy",
-    "sklearn",
-    "rerun",
-    "matplotlib",
-    "pydantic",
-    "mcap",
-    "rosbags",
-    "joblib",
-    "rich",
-    "serial",
-    "emulator",
-}
-
-
-@pytest.mark.parametrize(
-    "arguments", [["--help"], ["demo", "--help"], ["evaluate", "--help"], ["sweep", "--help"]]
-)
-def test_help_loads_nothing_heavy(arguments: list[str]) -> None:
-    script = (
-        "import sys\n"
-        "from slam.app.cli import main\n"
-        f"try: main({arguments!r})\n"
-        "except SystemExit as end: assert end.code == 0\n"
-        "print('LOADED', *{name.partition('.')[0] for name in sys.modules})\n"
-    )
-    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert "usage: uwb-slam" in run.stdout
-    loaded = set(run.stdout.partition("LOADED")[2].split())
-    assert loaded & HEAVY == set()
-
 
 @pytest.mark.parametrize(
     "arguments",

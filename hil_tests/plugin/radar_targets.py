@@ -1,4 +1,4 @@
-"""Where radars are: each place opens lines to one radar and says what can be done there."""
+"""Radar targets: each opens lines to one radar under test and lists what that radar can do."""
 
 from __future__ import annotations
 
@@ -10,118 +10,20 @@ import select
 import socket
 import time
 from abc import ABC, abstractmethod
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING
 
 from hil_tests.device.serving import Served, emulator
 from hil_tests.paths import FIXTURES
 from hil_tests.plugin.specs import Kind, RadarSpec
+from hil_tests.plugin.wire_tap import WireTap
 from xethru_protocol.driver.radar import X4M300, known_ports
 from xethru_protocol.transport import SerialTransport, Transport, find_ports
-from xethru_protocol.wire.errors import Disconnected, PortUnavailable
+from xethru_protocol.wire.errors import Disconnected, PortUnavailable, XeThruError
 
 if TYPE_CHECKING:
     from emulator.scene.scene import Scene
-
-MOST_BYTES = 32 << 20  # of one test, some five minutes of frames; then the oldest go
-
-Way = Literal["rx", "tx"]
-
-
-@dataclass(frozen=True, slots=True)
-class WireBytes:
-    """Bytes that passed together.
-
-    Attributes
-    ----------
-    way
-        ``rx``: from the module; ``tx``: from the host.
-    data
-        As they passed: packets may begin and end anywhere.
-    t_ns
-        The driver's clock, ns; of a module in this process, virtual.
-    """
-
-    way: Way
-    data: bytes
-    t_ns: int
-
-
-class WireTap:
-    """What passed over the lines to one radar, oldest first.
-
-    Attributes
-    ----------
-    clock_ns
-        The driver's clock.
-    started_unix_ns, started_ns
-        Wall clock and driver's clock at one moment, so that a reader can date what passed.
-    forgotten_bytes
-        Bytes that were dropped from the beginning.
-    """
-
-    def __init__(self, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        self.clock_ns = clock_ns
-        self.started_unix_ns = time.time_ns()
-        self.started_ns = clock_ns()
-        self.forgotten_bytes = 0
-        self._kept: deque[WireBytes] = deque()
-        self._bytes = 0
-
-    @property
-    def passed(self) -> tuple[WireBytes, ...]:
-        """What is kept."""
-        return tuple(self._kept)
-
-    def note(self, way: Way, data: bytes) -> None:
-        """Keep what passed."""
-        self._kept.append(WireBytes(way, data, self.clock_ns()))
-        self._bytes += len(data)
-        while self._bytes > MOST_BYTES:
-            size = len(self._kept.popleft().data)
-            self._bytes -= size
-            self.forgotten_bytes += size
-
-    def around(self, transport: Transport) -> TappedTransport:
-        """Return a line that passes everything on and notes it."""
-        return TappedTransport(transport, self)
-
-
-class TappedTransport:
-    """A line with a tap; what else it can do, the line itself does."""
-
-    def __init__(self, line: Transport, tap: WireTap) -> None:
-        self._line = line
-        self._tap = tap
-
-    @property
-    def name(self) -> str:
-        """Name of the line."""
-        return self._line.name
-
-    def read(self, timeout_s: float) -> bytes:
-        """See `Transport.read`."""
-        data = self._line.read(timeout_s)
-        if data:
-            self._tap.note("rx", data)
-        return data
-
-    def write(self, data: bytes) -> None:
-        """See `Transport.write`."""
-        self._tap.note("tx", bytes(data))
-        self._line.write(data)
-
-    def close(self) -> None:
-        """See `Transport.close`."""
-        self._line.close()
-
-    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - capacity and baud rate, where a line has them
-        """Return what the line itself has."""
-        return getattr(self._line, name)
-
 
 _CONNECT_S = 5.0
 _WRITE_S = 5.0
@@ -129,25 +31,14 @@ _CHUNK_BYTES = 65536
 
 
 class TcpTransport:
-    """An `xethru_protocol.transport.Transport` over a TCP connection.
-
-    Parameters
-    ----------
-    address
-        ``host:port`` or ``tcp://host:port``.
-
-    Raises
-    ------
-    PortUnavailable
-        If nobody listens there.
-    """
+    """A `Transport` to ``host:port`` or ``tcp://host:port``; may raise `PortUnavailable`."""
 
     def __init__(self, address: str) -> None:
         self.name = address if address.startswith("tcp://") else f"tcp://{address}"
         host, _, port = self.name.removeprefix("tcp://").rpartition(":")
         try:
             self._socket = socket.create_connection((host.strip("[]"), int(port)), _CONNECT_S)
-        except (OSError, UnicodeError) as error:  # the latter of what is no name of a host
+        except (OSError, UnicodeError) as error:  # UnicodeError: not a host name
             reason = getattr(error, "strerror", None) or error
             raise PortUnavailable(
                 f"{self.name} cannot be reached: {reason}; does the adapter, or "
@@ -157,7 +48,6 @@ class TcpTransport:
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def read(self, timeout_s: float) -> bytes:
-        """Return what has arrived, waiting up to ``timeout_s`` [s]; b"" if nothing."""
         try:
             ready, _, _ = select.select([self._socket], [], [], max(timeout_s, 0.0))
             if not ready:
@@ -170,7 +60,6 @@ class TcpTransport:
         return data
 
     def write(self, data: bytes) -> None:
-        """Send all of ``data``."""
         rest = memoryview(data)
         deadline_s = time.monotonic() + _WRITE_S
         while rest:
@@ -187,7 +76,6 @@ class TcpTransport:
                 raise Disconnected(self._lost()) from error
 
     def close(self) -> None:
-        """Hang up; calling it again does nothing."""
         self._socket.close()
 
     def _lost(self) -> str:
@@ -205,7 +93,7 @@ CAPABILITIES: Mapping[str, str] = {
     "uart": "USB, TCP and pseudo-terminals have no baud rate",
     "virtual_time": "waiting must cost nothing",
 }
-"""What a test may require of a radar, and why one may lack it; others come with ``?has=``."""
+"""What a test may require of a radar, and why one may lack it; ``?has=`` adds others."""
 
 _CONTROL_S = 5.0
 _BAUD = 115200
@@ -213,23 +101,14 @@ _UART_BYTES_PER_S = _BAUD / 10
 _EMPTY_ROOM_RADARS = 4
 
 
-class PlaceError(Exception):
-    """A radar that cannot be had; the message is one line with the remedy."""
+class TargetError(Exception):
+    """A radar that is not available; the message is one line with the remedy."""
 
 
-class Place(ABC):
-    """One radar under test.
+class RadarTarget(ABC):
+    """How one radar under test is reached, and its capabilities.
 
-    Attributes
-    ----------
-    spec
-        What the user asked for.
-    capabilities
-        What can be done there.
-    description
-        How it is reached, for reports.
-    bytes_per_s
-        What its line carries at most; infinite but on a UART.
+    ``bytes_per_s`` is the capacity of the line: infinite but on a UART.
     """
 
     def __init__(self, spec: RadarSpec, capabilities: frozenset[str], description: str) -> None:
@@ -242,12 +121,12 @@ class Place(ABC):
 
     @property
     def virtual(self) -> bool:
-        """Whether time passes only while somebody waits for the module."""
+        """Whether time passes only while a driver waits for the module."""
         return "virtual_time" in self.capabilities
 
     @property
     def lock_target(self) -> str | None:
-        """Name of what must be locked against other sessions; None: nobody else can have it."""
+        """Name to lock against other sessions; None: no other process can reach the radar."""
         return None
 
     @property
@@ -255,11 +134,11 @@ class Place(ABC):
         """The scene file of an emulated radar; None without one."""
         return None
 
-    def explore(self) -> None:  # noqa: B027 - most places know it without asking
-        """Find out what can be done there; called once, when no other session can have it."""
+    def explore(self) -> None:  # noqa: B027 - most targets know it without asking
+        """Complete the capabilities; called once, after locking."""
 
-    def begin_test(self) -> None:  # noqa: B027 - most places have nothing to do
-        """Do what must be done before each test."""
+    def begin_test(self) -> None:  # noqa: B027 - an optional hook
+        """Prepare the radar; called before each test."""
 
     @abstractmethod
     def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
@@ -270,7 +149,7 @@ class Place(ABC):
         return ()
 
     def driver(self, line: Transport, tap: WireTap, *, reconnect_s: float = 0.0) -> X4M300:
-        """Return a driver on an open line, in the clock of the place; new lines are tapped."""
+        """Return a driver on an open line, with the target's clock; new lines are tapped."""
         return X4M300(
             line,
             clock=self.clock_ns,
@@ -281,14 +160,14 @@ class Place(ABC):
         )
 
     def unplug(self, seconds: float) -> None:
-        """Take the port away and bring it back after ``seconds``; the module starts anew."""
-        raise PlaceError(f"{self.spec.name} cannot be unplugged by a program")
+        """Take the port away and bring it back after ``seconds``; the module restarts."""
+        raise TargetError(f"{self.spec.name} cannot be unplugged by a program")
 
-    def close(self) -> None:  # noqa: B027 - most places hold nothing
-        """Release what the place holds."""
+    def close(self) -> None:  # noqa: B027 - an optional hook
+        """Release processes and ports."""
 
 
-class MemoryPlace(Place):
+class InProcessTarget(RadarTarget):
     """A module in this process, in virtual time; a fresh one for every test."""
 
     def __init__(self, spec: RadarSpec) -> None:
@@ -304,11 +183,10 @@ class MemoryPlace(Place):
 
     @property
     def scene_text(self) -> str | None:
-        """The scene as a file says it."""
         return _scene_text(self.spec)
 
     def begin_test(self) -> None:
-        """Make a fresh module: what a test leaves behind is gone."""
+        """Make a new module, so that no test sees what an earlier one left."""
         from emulator.chip.pace import Pace
         from emulator.device import radar_device
         from emulator.echo.echo import echo_source
@@ -328,21 +206,18 @@ class MemoryPlace(Place):
         self.sleep = self._line.sleep
 
     def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
-        """See `Place.open_line`."""
         from hil_tests.faulty import PATH
 
         return self._line.open(path or PATH, baudrate)
 
     def candidates(self) -> Sequence[str]:
-        """See `Place.candidates`."""
         return self._line.ports()
 
     def unplug(self, seconds: float) -> None:
-        """See `Place.unplug`."""
         self._line.device.unplug(self._line.clock_ns(), round(seconds * 1e9))
 
 
-class ProcessPlace(Place):
+class ProcessTarget(RadarTarget):
     """A module of an emulator that runs in a process of its own, or a recording played there."""
 
     def __init__(self, spec: RadarSpec) -> None:
@@ -365,35 +240,31 @@ class ProcessPlace(Place):
             self._served: Served = self._cleanup.enter_context(emulator(*arguments))
             self._index = _index_of(spec, self._served.names)
         except AssertionError as error:
-            raise PlaceError(f"--radar {spec.text}: the emulator did not start: {error}") from None
-        except PlaceError:
+            raise TargetError(f"--radar {spec.text}: the emulator did not start: {error}") from None
+        except TargetError:
             self._cleanup.close()
             raise
 
     @property
     def scene_text(self) -> str | None:
-        """The scene as a file says it."""
         return None if self.spec.kind is Kind.REPLAY else _scene_text(self.spec)
 
     def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
-        """See `Place.open_line`."""
         if self.spec.line == "tcp":
             return TcpTransport(f"127.0.0.1:{self._served.tcp_ports[self._index]}")
         return SerialTransport(path or self._served.paths[self._index], baudrate)
 
     def unplug(self, seconds: float) -> None:
-        """See `Place.unplug`."""
         assert self._served.control is not None
         name = self._served.names[self._index]
         _ask(self._served.control, {"verb": "unplug", "radar": name, "seconds": seconds})
 
     def close(self) -> None:
-        """End the emulator."""
         self._served.end()
         self._cleanup.close()
 
 
-class PortPlace(Place):
+class PortTarget(RadarTarget):
     """A module at a port of this machine, named or found by its serial number."""
 
     def __init__(self, spec: RadarSpec) -> None:
@@ -405,11 +276,10 @@ class PortPlace(Place):
 
     @property
     def lock_target(self) -> str | None:
-        """The port."""
         return os.path.realpath(self._path)
 
     def explore(self) -> None:
-        """Ask the port whether it is a UART."""
+        """Find out whether the port is a UART."""
         line = SerialTransport(self._path)
         self.bytes_per_s = _UART_BYTES_PER_S if self.spec.line == "uart" else line.bytes_per_s
         line.close()
@@ -417,15 +287,13 @@ class PortPlace(Place):
             self.capabilities |= {"uart"}
 
     def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
-        """See `Place.open_line`."""
         return SerialTransport(path or self._path, baudrate)
 
     def candidates(self) -> Sequence[str]:
-        """See `Place.candidates`."""
         return known_ports()
 
 
-class TcpPlace(Place):
+class TcpTarget(RadarTarget):
     """A module behind a TCP port, perhaps of another machine."""
 
     def __init__(self, spec: RadarSpec) -> None:
@@ -435,38 +303,36 @@ class TcpPlace(Place):
 
     @property
     def lock_target(self) -> str | None:
-        """The address."""
         return self.spec.target
 
     def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
-        """See `Place.open_line`."""
         del path, baudrate
         return TcpTransport(self.spec.target)
 
 
-def place_of(spec: RadarSpec) -> Place:
-    """Return the place that a spec names.
+def target_of(spec: RadarSpec) -> RadarTarget:
+    """Return the target that a spec names.
 
     Raises
     ------
-    PlaceError, PortUnavailable
-        If there is no radar to be had; one line with the remedy.
+    TargetError, PortUnavailable
+        If there is no such radar; one line with the remedy.
     """
     match spec.kind:
         case Kind.EMULATED if spec.line == "memory":
-            return MemoryPlace(spec)
+            return InProcessTarget(spec)
         case Kind.EMULATED | Kind.REPLAY:
-            return ProcessPlace(spec)
+            return ProcessTarget(spec)
         case Kind.TCP:
-            return TcpPlace(spec)
+            return TcpTarget(spec)
         case _:
-            return PortPlace(spec)
+            return PortTarget(spec)
 
 
 def ports_that_answer() -> tuple[tuple[str, str], ...]:
     """Return path and serial number of every port where a module answers.
 
-    A port that some program has open is left alone: opening it would take bytes from that program.
+    A port that another program has open is skipped: opening it would take bytes from that program.
     """
     from xethru_protocol.cli.port_probe import port_users
 
@@ -484,18 +350,16 @@ def ports_that_answer() -> tuple[tuple[str, str], ...]:
 def _port_of(serial: str) -> str:
     for port in find_ports():
         if port.kind == "emulated" and port.serial == serial:
-            return port.path  # its emulator says so: nobody needs to be asked
+            return port.path  # its emulator publishes the number
     found = ports_that_answer()
     for path, number in found:
         if number == serial:
             return path
     there = ", ".join(f"{number} at {path}" for path, number in found) or "none"
-    raise PlaceError(f"no module with serial number {serial} answers; those that do: {there}")
+    raise TargetError(f"no module with serial number {serial} answers; those that do: {there}")
 
 
 def _serial_number(radar: X4M300) -> str | None:
-    from xethru_protocol.wire.errors import XeThruError
-
     try:
         radar.ping(0.5)
         return radar.info().serial_number
@@ -508,7 +372,7 @@ def _index_of(spec: RadarSpec, names: Sequence[str]) -> int:
     if wanted is None:
         return 0
     if wanted not in names:
-        raise PlaceError(
+        raise TargetError(
             f"--radar {spec.text}: no radar is called {wanted!r}; there are {', '.join(names)}"
         )
     return names.index(wanted)
@@ -525,7 +389,7 @@ def _scene(spec: RadarSpec) -> Scene:
     try:
         return load_scene(spec.target) if spec.target else empty_room(_EMPTY_ROOM_RADARS)
     except SceneError as error:
-        raise PlaceError(f"--radar {spec.text}: {error}") from None
+        raise TargetError(f"--radar {spec.text}: {error}") from None
 
 
 def _serve_arguments(spec: RadarSpec) -> list[str]:
@@ -544,7 +408,7 @@ def _scene_text(spec: RadarSpec) -> str | None:
 
 
 def _ask(control: str, request: Mapping[str, object]) -> None:
-    """Ask a running emulator for something; `PlaceError` if it refuses."""
+    """Send a request to a running emulator; `TargetError` if it refuses."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
         connection.settimeout(_CONTROL_S)
         connection.connect(control)
@@ -552,4 +416,4 @@ def _ask(control: str, request: Mapping[str, object]) -> None:
         with connection.makefile() as answers:
             answer = json.loads(answers.readline())
     if not answer["ok"]:
-        raise PlaceError(str(answer["error"]))
+        raise TargetError(str(answer["error"]))
