@@ -17,8 +17,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+<<<<<<< HEAD
 from emulator.chip.pace import Pace
 from xethru_protocol.system import StopFlag
+=======
+from emulator.chip import Pace
+from xethru_protocol.system import Stop, stop_signals
+>>>>>>> 5fc74c2e7bafec597fe47f8268cbe50b11348506
 
 if TYPE_CHECKING:
     from emulator.faults.kind import Kind
@@ -53,7 +58,6 @@ Prints the answer as one JSON line. Exit 1 when the emulator refuses. For exampl
 
 
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the sub-commands to a parser."""
     faults = commands.add_parser(
         "faults",
         help="list the kinds of faults",
@@ -78,7 +82,6 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def add_proxy(
     commands: argparse._SubParsersAction[argparse.ArgumentParser],
 ) -> argparse.ArgumentParser:
-    """Add the sub-command ``proxy``, and return its parser."""
     proxy = commands.add_parser(
         "proxy", help="put faults on the line of a real module", description=_PROXY_HELP
     )
@@ -102,7 +105,6 @@ def add_proxy(
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run one of them; return the exit code."""
     try:
         return _list(arguments) if arguments.command == "faults" else _control(arguments)
     except KeyboardInterrupt:
@@ -119,7 +121,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _list(arguments: argparse.Namespace) -> int:
-    from emulator.faults.plan import KINDS, described
+    from emulator.faults.kinds import KINDS
+    from emulator.faults.plan import described
 
     kinds = list(KINDS.values())
     if arguments.kind is not None:
@@ -349,8 +352,12 @@ who opens a port, a host's first command counts as opening it.)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
+<<<<<<< HEAD
     """Run the command line; return its exit code."""
     with StopFlag("same") as stop:  # the imports take most of a second: a signal may come in them
+=======
+    with stop_signals() as stop:  # the imports take most of a second: a signal may come in them
+>>>>>>> 5fc74c2e7bafec597fe47f8268cbe50b11348506
         arguments = _parse(argv)
         if arguments.command not in COMMANDS:
             return _run(arguments, stop)

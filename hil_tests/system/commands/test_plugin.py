@@ -1,7 +1,5 @@
 """The plugin as a user runs it: pytest in an empty folder, radars of another process."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -6,8 +6,8 @@ import re
 
 import pytest
 
-from emulator.chip.clock import ModuleClock
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
+from emulator.chip.chip import ModuleClock
 from emulator.device import BootTiming, radar_device
 from emulator.module.memory import Identity
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource, ramp_device

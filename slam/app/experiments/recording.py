@@ -35,11 +35,11 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from scipy.signal import welch
 
+from emulator.chip import Pace
 from emulator.chip.downconversion import CHANNELS, LEAD_SAMPLES, TAP_COUNT
-from emulator.chip.pace import Pace
 from emulator.device import radar_device
 from emulator.echo.echo import SPEED_OF_LIGHT_MPS, echo_source
-from emulator.echo.pulse import CARRIER_CYCLES_PER_SAMPLE, SIGMA_S
+from emulator.echo.reflections import CARRIER_CYCLES_PER_SAMPLE, SIGMA_S
 from emulator.loopback import LoopbackTransport
 from emulator.module.memory import Identity
 from emulator.scene.scene import ClutterSpec, JitterSpec, NoiseSpec, RadarSpec, Scene, TargetSpec
