@@ -17,13 +17,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-<<<<<<< HEAD
-from emulator.chip.pace import Pace
-from xethru_protocol.system import StopFlag
-=======
 from emulator.chip import Pace
-from xethru_protocol.system import Stop, stop_signals
->>>>>>> 5fc74c2e7bafec597fe47f8268cbe50b11348506
+from xethru_protocol.system import StopFlag
 
 if TYPE_CHECKING:
     from emulator.faults.kind import Kind
@@ -352,12 +347,7 @@ who opens a port, a host's first command counts as opening it.)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-<<<<<<< HEAD
-    """Run the command line; return its exit code."""
     with StopFlag("same") as stop:  # the imports take most of a second: a signal may come in them
-=======
-    with stop_signals() as stop:  # the imports take most of a second: a signal may come in them
->>>>>>> 5fc74c2e7bafec597fe47f8268cbe50b11348506
         arguments = _parse(argv)
         if arguments.command not in COMMANDS:
             return _run(arguments, stop)
