@@ -103,7 +103,6 @@ SCHEMAS = {
 
 
 def pack_string(text: str) -> bytes:
-    """Return the bytes of a String."""
     return _LITTLE_ENDIAN + _counted(text)
 
 
@@ -465,7 +464,7 @@ class Channel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Message:
-    """One message as stored."""
+    """A message as stored; times in ns."""
 
     channel: Channel
     sequence: int
@@ -576,7 +575,6 @@ class McapWriter(Writer):
         self._Writer__finalize_chunk()  # type: ignore[attr-defined]  # see above
 
     def finish(self) -> None:
-        """Write index and footer."""
         super().finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
 
 
@@ -618,7 +616,6 @@ class _RecordingWriter:
         self._settings: dict[str, X4Value] = {}  # as the recorded module read them back
 
     def write(self, message: Response, t_ns: int | None) -> None:
-        """Add a message."""
         if isinstance(message, DataFloat) and message.content_id == 0:
             self._info(message, t_ns)
             data = pack_array(FLOAT_ARRAY, message.values)

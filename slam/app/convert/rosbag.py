@@ -86,7 +86,6 @@ def frames_topic(radar: int) -> str:
 
 
 def info_topic(radar: int) -> str:
-    """Return the topic that says what a radar is."""
     return f"/UWBradar{radar + 1}/info"
 
 
@@ -101,7 +100,6 @@ def radar_of_frames(topic: str) -> str | None:
 
 
 def radar_of_info(topic: str) -> str | None:
-    """Return the radar that a topic tells of, None for other topics."""
     found = _INFO.fullmatch(topic)
     return found[1] if found else None
 
@@ -436,7 +434,6 @@ class _Bag:
         self._writer.write(self._connections[topic], t_ns, data)
 
     def close(self) -> None:
-        """Write the index."""
         self._writer.close()
 
 

@@ -88,7 +88,6 @@ class SlowTime:
 
     @property
     def strongest(self) -> int:
-        """Return the bin of the largest mean amplitude."""
         return int(np.argmax(self.amplitude))
 
     @property
@@ -195,7 +194,6 @@ def _neighbours(values: NDArray[np.complex128]) -> float:
 
 
 def spread_of(values: Sequence[float]) -> tuple[float, float, float]:
-    """Return the 10th percentile, the median and the 90th percentile."""
     low, middle, high = np.percentile(values, (10, 50, 90))
     return float(low), float(middle), float(high)
 

@@ -63,18 +63,15 @@ class Drive:
 
     @property
     def n_observations(self) -> int:
-        """Return how often a landmark was seen."""
         return sum(len(points) for points in self.seen)
 
     @property
     def labels(self) -> frozenset[int]:
-        """Return the ids of all landmarks."""
         return frozenset(
             point.label for points in self.seen for point in points if point.label is not None
         )
 
     def first(self, n_steps: int) -> Drive:
-        """Return the drive up to a pose."""
         return Drive(
             increments=self.increments[:n_steps],
             covariances=self.covariances[:n_steps],
@@ -353,7 +350,7 @@ def batch_reference(drive: Drive, check: Callable[[], None] = lambda: None) -> R
     )
 
 
-def _vector(pose: Any) -> Array:  # noqa: ANN401 - GTSAM's own types, see gtsam_door
+def _vector(pose: Any) -> Array:  # noqa: ANN401 - GTSAM's own types
     return np.array([pose.x(), pose.y(), wrap_angle(pose.theta())])
 
 
@@ -389,7 +386,6 @@ class PathScore:
 
 
 def scores(drive: Drive, reference: Reference, runs: Mapping[str, ParkRun]) -> list[PathScore]:
-    """Return the scores of odometry, of ISAM2's causal path, and of our runs."""
     rows = [
         _score("odometry", odometry_path(drive), reference),
         _score("ISAM2, true ids", reference.causal, reference),
@@ -532,7 +528,6 @@ def _map(axes: Axes, odometry: Array, reference: Reference, run: ParkRun) -> Non
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
-    """Drive through the park with and without ids; compare with GTSAM on the same data."""
     drive = read_drive(shipped_file())
     if arguments.steps is not None:
         drive = drive.first(arguments.steps)

@@ -55,7 +55,6 @@ class FixedClock:
         self._line = ClockLine(origin_ns=origin_ns)
 
     def session_ns(self, host_ns: int) -> int:
-        """Return the session time of a host time."""
         return self._line.nominal_ns(host_ns)
 
 
@@ -93,17 +92,14 @@ class LiveOdometry:
 
     @property
     def has_pose(self) -> bool:
-        """Whether a pose came."""
         return self._track is not None
 
     @property
     def first_ns(self) -> int:
-        """Session time of the first pose."""
         return self._whole().first_ns
 
     @property
     def last_ns(self) -> int:
-        """Session time of the newest pose."""
         return self._whole().last_ns
 
     @property
@@ -112,7 +108,6 @@ class LiveOdometry:
         return None if self._fixed else self._envelope.line.drift_ppm
 
     def session_ns(self, host_ns: int) -> int:
-        """Return the session time of a host time; needs a pose, unless the clock is known."""
         if self._fixed is not None:
             return self._fixed.session_ns(host_ns)
         return self._envelope.line.nominal_ns(host_ns)
@@ -187,7 +182,6 @@ class LiveOdometry:
         return ""
 
     def end(self, trouble: str) -> None:
-        """Take note that no more lines will come."""
         if not trouble and self._track is None:
             trouble = f"odometry from {self._name}: ended before its first pose"
             trouble += f": {self._trouble}" if self._trouble else ""
@@ -225,7 +219,6 @@ class LiveOdometry:
         )
 
     def covers(self, t_ns: int) -> bool:
-        """Return whether a pose at or after this time is known."""
         return self._track is not None and t_ns <= self._track.last_ns
 
     def is_known(self, t_ns: int) -> bool:
@@ -233,7 +226,6 @@ class LiveOdometry:
         return self._track is not None and self._track.gap_ns(t_ns) <= MOST_GAP_NS
 
     def pose_at(self, t_ns: int) -> NDArray[np.float64]:
-        """Return the pose at a session time; see `OdometryTrack.pose_at`."""
         return self._whole().pose_at(t_ns)
 
     def _whole(self) -> OdometryTrack:
@@ -267,7 +259,7 @@ HELP = (
 
 
 class SourceKind(StrEnum):
-    """What stands behind a source."""
+    """What stands behind a source, in words for messages."""
 
     STDIN = "stdin"
     FILE = "file"
@@ -287,7 +279,6 @@ class LineSource:
 
     @property
     def name(self) -> str:
-        """Return what to call it in messages to people."""
         if self.kind is SourceKind.STDIN:
             return "stdin"
         where = f"{self.place}:{self.number}" if self.kind is SourceKind.TCP else self.place

@@ -114,7 +114,6 @@ def format_tum_line(t_ns: int, pose: NDArray[np.float64]) -> str:
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
-    """Write a trajectory as a TUM file."""
     lines = map(format_tum_line, trajectory.stamps_ns.tolist(), trajectory.poses)
     path.write_text("".join(f"{line}\n" for line in lines), encoding="ascii")
 
@@ -152,7 +151,6 @@ def read_tum(path: Path) -> Trajectory:
 
 
 def trajectory_of(samples: Iterable[TumSample]) -> Trajectory:
-    """Stack samples into arrays."""
     rows = [(s.t_ns, s.x_m, s.y_m, s.heading_rad) for s in samples]
     return Trajectory(
         stamps_ns=np.array([row[0] for row in rows], dtype=np.int64),

@@ -95,7 +95,6 @@ class EmulatorProcess:
         self._control_socket = ""
 
     def __enter__(self) -> Self:
-        """Start the process; its ports are there after `wait_until_ready`."""
         with self._cleanup:
             self._errors: IO[bytes] = self._cleanup.enter_context(tempfile.TemporaryFile())
             # -P: a folder "emulator" where the user happens to stand must not come first
@@ -119,7 +118,6 @@ class EmulatorProcess:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Do what `end` does."""
         self.end()
 
     def end(self) -> None:
@@ -338,7 +336,6 @@ def end_counter(duration_ns: int) -> int:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions a run depends on."""
     return {"python": python_version()} | {name: version(name) for name in _VERSIONED}
 
 

@@ -74,7 +74,6 @@ class RigWheels(BaseModel):
 
     @property
     def noise(self) -> WheelNoise:
-        """Return what SLAM is told."""
         return WheelNoise(
             along_m_per_sqrt_m=float(self.along_sigma_m_per_sqrt_m),
             across_m_per_sqrt_m=float(self.across_sigma_m_per_sqrt_m),
@@ -96,7 +95,6 @@ class RigFile(BaseModel):
 
     @property
     def rig(self) -> Rig:
-        """Return the mounts; gains play no part in them."""
         return Rig(
             mounts=tuple(
                 Mount(

@@ -219,7 +219,6 @@ class SessionFile:
         self._chunk_started_ns = clock_ns()
 
     def add_metadata(self, name: str, table: Mapping[str, str]) -> None:
-        """Write a named table."""
         if self._disk.gave_up:
             return
         with self._giving_up():

@@ -135,7 +135,6 @@ def schema_text(message_type: str) -> bytes:
 
 
 def serialise(message: Message) -> memoryview:
-    """Serialise any of the messages of this module to CDR."""
     data: memoryview = _typestore().serialize_cdr(message, message.__msgtype__)
     return data
 
@@ -167,7 +166,6 @@ def odometry(sample: TumSample) -> Message:
 
 
 def odometry_sample(message: Message) -> TumSample:
-    """Read an odometry message back."""
     pose = message.pose.pose
     stamp = message.header.stamp
     return TumSample(
@@ -315,7 +313,6 @@ def settings_text(config: SlamConfig) -> str:
 
 
 def radar_text(radar: RadarInfo) -> str:
-    """Return what a session says of a radar."""
     return json.dumps(asdict(radar) | {"length_unit": LENGTH_UNIT})
 
 

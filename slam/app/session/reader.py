@@ -209,7 +209,6 @@ class RecordedSession:
 
     @property
     def rig(self) -> Rig:
-        """Return the mounts as the run knew them."""
         return Rig(
             mounts=tuple(
                 Mount(

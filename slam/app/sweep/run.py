@@ -264,7 +264,6 @@ class Case:
 
     @property
     def key(self) -> Key:
-        """Return what tells the run from all others of its sweep."""
         return (self.scene.name, self.preset, self.settings, self.stress, self.seed)
 
 
@@ -293,7 +292,6 @@ class SweepRun(Summary):
 
     @property
     def key(self) -> Key:
-        """Return what tells the run from all others of its sweep."""
         return (self.scene, self.preset, tuple(self.settings.items()), self.stress, self.seed)
 
 
