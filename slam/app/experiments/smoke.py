@@ -117,7 +117,7 @@ def drive_in_clear_air_and_smoke(
     """Return the runs: clear air, smoke, smoke under other receiver noise, and the lab.
 
     The first two share receiver noise and odometry, so what differs is the smoke's doing; the
-    third tells how much another noise of the receivers does. The lab, in clear air, is there for
+    third shows the effect of other receiver noise. The lab, in clear air, is there for
     its ghosts: with one landmark there are none.
 
     Parameters

@@ -41,7 +41,7 @@ _DENSITY_PER_M2 = 1.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reference:
-    """A number somebody else's code takes at 1000 landmarks, as quoted: low and high [ms]."""
+    """What other code takes at 1000 landmarks, as quoted: low and high [ms]."""
 
     name: str
     low_ms: float

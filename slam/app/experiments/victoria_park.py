@@ -102,7 +102,7 @@ def read_drive(path: Path) -> Drive:
     Raises
     ------
     AppError
-        It cannot be read, or a line is not as the module's text says; file and line are named.
+        It cannot be read, or a line is not in the format above; file and line are named.
     """
     increments: list[list[float]] = []
     covariances: list[Array] = []
@@ -218,7 +218,7 @@ def drive_back_end(
     drive
         The data; the noise of each step is in it.
     with_ids
-        Whether the back end is told which tree each observation is of.
+        Whether the back end gets the id of the tree of each observation.
     wheels
         Standard deviations of the wheels' calibration errors; the reference's model has none.
     check
@@ -234,8 +234,8 @@ def drive_back_end(
         check()
         if step > 0:
             back_end.predict(drive.increments[step - 1], drive.covariances[step - 1])
-        told = points if with_ids else [replace(point, label=None) for point in points]
-        ids = back_end.update_points(told)
+        given_points = points if with_ids else [replace(point, label=None) for point in points]
+        ids = back_end.update_points(given_points)
         given += [
             (point.label, id_)
             for point, id_ in zip(points, ids, strict=True)
@@ -368,7 +368,7 @@ class PathScore:
         Landmarks in the map.
     right_share
         Share of the observations taken in whose landmark is the one that its tree is mostly
-        called, and is mostly called so for its tree; None where the ids were told.
+        called, and is mostly called so for its tree; None where the ids were given.
     left_out
         Observations that were in doubt and not taken in.
     seconds
@@ -391,14 +391,14 @@ def scores(drive: Drive, reference: Reference, runs: Mapping[str, ParkRun]) -> l
         _score("ISAM2, true ids", reference.causal, reference),
     ]
     for name, run in runs.items():
-        told = name.startswith("true ids")
+        has_ids = name.startswith("true ids")
         rows.append(
             _score(
                 f"robust, {name}",
                 run.poses,
                 reference,
                 n_landmarks=len(run.landmarks_m),
-                right_share=None if told else right_share(run.given),
+                right_share=None if has_ids else right_share(run.given),
                 left_out=sum(given is None for _, given in run.given),
                 seconds=run.seconds,
             )

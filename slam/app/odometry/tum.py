@@ -20,13 +20,13 @@ from slam.app.errors import AppError
 NS_PER_S = 1_000_000_000
 _FIELDS = 8
 _MAX_BYTES = 1 << 28
-"""Weeks of poses; what is longer, or endless, is no trajectory."""
+"""Weeks of poses; a longer or endless file is not a trajectory."""
 _MAX_STAMP_S = Decimal(2**63) / NS_PER_S
 """Where int64 nanoseconds end; a larger stamp was written in another unit."""
 
 
 class TumError(AppError):
-    """A line is not TUM text; says which line and what is expected."""
+    """A line is not TUM text; the message names the line and what is expected."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

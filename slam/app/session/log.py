@@ -56,7 +56,7 @@ class SessionLog(SessionObserver):
     odometry
         The whole track where it is known before the run; None where `on_odometry` brings it.
     truth_at
-        The robot's true pose; None where nobody knows.
+        The robot's true pose; None if unknown.
     start_ns
         Session time [ns] at which the file begins.
     clock_ns

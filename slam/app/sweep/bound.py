@@ -55,7 +55,7 @@ def load_gtsam(purpose: str) -> Any:  # noqa: ANN401 - types must not depend on 
     Raises
     ------
     AppError
-        It is not installed; one line that says what it was wanted for and how to get it.
+        It is not installed; one line with the purpose and how to install it.
     """
     try:
         return import_module("gtsam")
@@ -150,7 +150,7 @@ class KnownRange:
     """One range of one true landmark.
 
     ``motion`` (3,) leads from the pose to where the body was when the radar sampled, as odometry
-    tells it; ``sigma_m`` is the standard deviation of ``range_m``.
+    has it; ``sigma_m`` is the standard deviation of ``range_m``.
     """
 
     radar: int
@@ -203,9 +203,9 @@ def known_run(
         pose = result.odometry_pose
         increments.append(between(last, pose))
         last = pose
-        told = result.range_sigmas_m or (range_sigma_m,) * len(result.detections)
+        used = result.range_sigmas_m or (range_sigma_m,) * len(result.detections)
         by_frame: dict[tuple[int, int], list[tuple[Detection, float]]] = {}
-        for detection, sigma in zip(result.detections, told, strict=True):
+        for detection, sigma in zip(result.detections, used, strict=True):
             if sigma < math.inf:  # else SLAM was not given it
                 frame = by_frame.setdefault((detection.radar, detection.t_ns), [])
                 frame.append((detection, sigma))
@@ -332,7 +332,7 @@ def first_position(rig: Rig, seen: Sequence[SeenFrom], poses: Sequence[Array]) -
 
 
 def _from_many(seen: Sequence[SeenFrom], poses: Sequence[Array]) -> Array | None:
-    """Return the least-squares point of many ranges if they tell it to ``ALONE_SIGMA_M``."""
+    """Return the least-squares point of many ranges if they determine it to ``ALONE_SIGMA_M``."""
     antennas = [mount_at(item.antenna, poses[item.step]) for item in seen]
     at = np.array([[antenna.x_m, antenna.y_m] for antenna in antennas])
     ranges = np.array([item.known.range_m for item in seen])

@@ -400,7 +400,7 @@ def run_case(
     case
         What to run.
     program
-        `program_version` of whoever asks, if that may be another machine.
+        `program_version` of the caller, if that may be another machine.
     check
         Called once per scan; may raise to stop.
 
