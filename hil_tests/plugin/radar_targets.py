@@ -187,7 +187,7 @@ class InProcessTarget(RadarTarget):
 
     def begin_test(self) -> None:
         """Make a new module, so that no test sees what an earlier one left."""
-        from emulator.chip.pace import Pace
+        from emulator.chip import Pace
         from emulator.device import radar_device
         from emulator.echo.echo import echo_source
         from emulator.module.memory import Identity

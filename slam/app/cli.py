@@ -13,10 +13,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from slam.app.commands.options import add_rerun, count, folder, seconds, seed
-from slam.app.errors import EXIT_FAILED, AppError, StopFlag, StopRequestedError, naming
+from slam.app.errors import EXIT_FAILED, AppError
 from slam.app.experiments import add_experiments
 from slam.app.sweep.stress import STRESSES
-from xethru_protocol.system import drop_what_cannot_be_said, open_closed_streams
+from xethru_protocol.system import StopFlag, StopRequestedError, flush_streams, open_closed_streams
 
 
 def add_view(parser: argparse.ArgumentParser) -> None:
@@ -215,7 +215,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:  # before a command took note of signals
         return _end("stopped by SIGINT", 128 + signal.SIGINT)
     finally:
-        drop_what_cannot_be_said()
+        flush_streams()
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -368,7 +368,6 @@ def _parser() -> argparse.ArgumentParser:
         "numbers are simulated.",
     )
     add_experiments(experiment)
-    experiment.set_defaults(command=_experiment)
     return parser
 
 
@@ -490,13 +489,6 @@ def _sweep(arguments: argparse.Namespace, stop: StopFlag) -> None:
         dask=arguments.dask,
     )
     run_sweep(options, stop)
-
-
-def _experiment(arguments: argparse.Namespace, stop: StopFlag) -> None:
-    out: Path = arguments.out
-    with naming(out):
-        out.mkdir(parents=True, exist_ok=True)
-    arguments.experiment.run(arguments, stop)
 
 
 if __name__ == "__main__":

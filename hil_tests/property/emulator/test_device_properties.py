@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.device import Device, radar_device
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource, ramp_device
 from xethru_protocol.wire import messages as m

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from hil_tests.bench.corrupted_traffic import (
     SWALLOWED_BULK,
     SWALLOWED_MERGED,

@@ -79,7 +79,7 @@ def test_mistake_in_a_file_is_one_line_naming_file_and_key(tables: dict[str, obj
     assert message.startswith("x.toml: ")
     assert "\n" not in message
     ((part, value),) = tables.items()
-    assert (next(iter(value)) if isinstance(value, dict) else part) in message
+    assert (next(iter(value), part) if isinstance(value, dict) else part) in message
 
 
 def test_environment_of_a_file_must_be_tables() -> None:

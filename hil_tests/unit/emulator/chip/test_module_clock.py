@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulator.chip.clock import ModuleClock
+from emulator.chip.chip import ModuleClock
 from emulator.echo.echo import SceneEcho
 from emulator.scene.scene import LeakageSpec, NoiseSpec, PathSpec, RadarSpec, Scene
 from hil_tests.unit.emulator.rooms import PAPER, radar_at, room, target
