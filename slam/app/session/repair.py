@@ -18,7 +18,7 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from slam.app.errors import AppError
+from slam.app.errors import AppError, StopFlag
 from slam.app.session import mcap
 from slam.app.session.mcap import open_mcap
 from xethru_protocol.system import PathInUseError, locked
@@ -102,6 +102,11 @@ class Repair:
         if self.kept is not None:
             lines.append(f"  as it was: {self.kept}")
         return "\n".join(lines)
+
+
+def run_repair(stop: StopFlag, *, session: Path, out: Path | None) -> None:
+    """Repair a recording and print the outcome; see `repair`."""
+    print(repair(session, out, stop.check))  # noqa: T201 - the result
 
 
 def repair(path: Path, out: Path | None, check: Callable[[], None]) -> Repair:

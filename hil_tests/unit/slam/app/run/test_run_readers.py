@@ -17,7 +17,7 @@ from slam.app.rig.sources import RadarLink
 from slam.app.run import live_source as run_readers
 from slam.app.run.live_source import (
     Event,
-    FrameCame,
+    FrameArrived,
     Inbox,
     OdometryEnded,
     OdometryLine,
@@ -88,7 +88,7 @@ def test_a_radar_that_vanishes_is_looked_for_until_it_is_back(
     driver = ScriptedDriver(7, 8, Disconnected("unplugged"), 9)
     driver.reconnects = [Disconnected("not yet"), Disconnected("not yet"), "found"]
     events = told_until([link_of(driver)], silent_fifo, lambda events: len(events) == 5)
-    assert [e.frame.counter for e in events if isinstance(e, FrameCame)] == [7, 8, 9]
+    assert [e.frame.counter for e in events if isinstance(e, FrameArrived)] == [7, 8, 9]
     assert events[2] == RadarLost(radar=0, text="unplugged")
     assert events[3] == RadarBack(radar=0, port="somewhere else")
 

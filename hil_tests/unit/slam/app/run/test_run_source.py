@@ -19,12 +19,12 @@ from hil_tests.unit.slam.app.virtual_rig import (
     odometry_events,
     radar_events,
 )
-from slam.app.errors import AppError
+from slam.app.errors import AppError, StopFlag
 from slam.app.odometry.live import FixedClock, LiveOdometry
 from slam.app.records import RadarInfo, Scan, SessionObserver
 from slam.app.rig.emulated import RAW_CONFIG, rig_of, wheels_of
 from slam.app.rig.sources import sampler_limits
-from slam.app.run.live_source import FrameCame, LiveSource, OdometryLine, RadarBack, RadarLost
+from slam.app.run.live_source import FrameArrived, LiveSource, OdometryLine, RadarBack, RadarLost
 from slam.app.run.runner import RunRecord, run_slam
 from slam.config import load_preset
 from slam.evaluation import ate_rmse_m
@@ -86,7 +86,7 @@ def source_on(
         odometry,
         inbox,
         words,
-        lambda: None,
+        StopFlag(),
         clock_ns=inbox.clock_ns,
     )
     return source, odometry, words
@@ -134,7 +134,7 @@ def test_a_dead_radar_is_told_and_the_others_go_on(drive: Drive) -> None:
     lost, back = round(10 * NS_PER_S), round(20 * NS_PER_S)
 
     def keep(row: Timed) -> bool:
-        is_theirs = isinstance(row.event, FrameCame) and row.event.radar == 2
+        is_theirs = isinstance(row.event, FrameArrived) and row.event.radar == 2
         return row.t_ns < END_S * NS_PER_S and not (is_theirs and lost < row.t_ns < back)
 
     source, odometry, words = source_of(
@@ -202,14 +202,14 @@ def test_odometry_that_falls_silent_ends_the_run_with_all_its_states(drive: Driv
 
 
 def test_a_rig_without_odometry_does_not_begin(drive: Drive) -> None:
-    source, _, _ = source_of(drive, lambda row: isinstance(row.event, FrameCame))
+    source, _, _ = source_of(drive, lambda row: isinstance(row.event, FrameArrived))
     with pytest.raises(AppError, match="odometry from the test: no line for 10 s"):
         source.settle()
 
 
 def test_a_radar_that_never_streams_is_named(drive: Drive) -> None:
     source, _, _ = source_of(
-        drive, lambda row: not (isinstance(row.event, FrameCame) and row.event.radar == 1)
+        drive, lambda row: not (isinstance(row.event, FrameArrived) and row.event.radar == 1)
     )
     with pytest.raises(AppError, match="radar rear_left: no frame in 15 s"):
         source.settle()
@@ -239,7 +239,7 @@ def test_a_counter_that_goes_back_by_one_loses_no_frame(drive: Drive) -> None:
         if row.t_ns > 14 * NS_PER_S:
             continue
         event = row.event
-        if isinstance(event, FrameCame) and event.radar == 1 and row.t_ns > 10 * NS_PER_S:
+        if isinstance(event, FrameArrived) and event.radar == 1 and row.t_ns > 10 * NS_PER_S:
             event = replace(event, frame=replace(event.frame, counter=event.frame.counter - 2))
         events.append(replace(row, event=event))
     source, _, _ = source_on(drive, VirtualInbox(events))

@@ -12,7 +12,7 @@ from hil_tests.unit.slam.app.sessions import FRAME_NS, scan
 from slam.app.odometry.track import OdometryTrack
 from slam.app.odometry.tum import TumSample
 from slam.app.records import Scan, SessionObserver, Snapshot
-from slam.app.run.runner import nobody_knows, run_slam
+from slam.app.run.runner import run_slam, unknown_truth
 from slam.frames import RadarFrame
 from slam.paper.ekf import Belief
 from slam.paper.pipeline import PoseAt, StepResult, UwbRadarSlam
@@ -104,7 +104,7 @@ def test_an_unused_scan_is_told_and_not_stepped() -> None:
     listener = Listener()
     scans = [replace(scan(counter), used=counter not in (5, 8)) for counter in COUNTERS]
     slam = cast(UwbRadarSlam, LateSlam())
-    record = run_slam(scans, OdometryTrack(ends), slam, nobody_knows, [listener])
+    record = run_slam(scans, OdometryTrack(ends), slam, unknown_truth, [listener])
     assert tuple(listener.scans) == COUNTERS
     assert [snapshot.counter for snapshot in listener.snapshots] == [6, 11, 12]
     assert record.n_frames == 2 * 3
@@ -133,7 +133,7 @@ def test_slam_hears_radars_less_their_gains_and_observers_as_they_are() -> None:
         [made],
         OdometryTrack(ends),
         cast(UwbRadarSlam, Hearing()),
-        nobody_knows,
+        unknown_truth,
         gains_db=[0.0, 20.0 * math.log10(2.0)],
     )
     as_it_was, halved = heard

@@ -5,7 +5,6 @@ import os
 import signal
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -17,12 +16,12 @@ from slam.app.cli import main
 from slam.app.errors import AppError, StopFlag, StopRequestedError, UsageError
 from slam.app.sweep import sweep
 from slam.app.sweep.run import Case, Key, SweepRun
-from slam.app.sweep.sweep import SweepOptions, run_sweep
+from slam.app.sweep.sweep import run_sweep
 
 
 def test_two_scenes_of_one_name_are_refused(tmp_path: Path) -> None:
     scene = write_short_scene(tmp_path)
-    options = SweepOptions(
+    options: dict[str, Any] = dict(
         scenes=(str(scene), str(scene)),
         presets=("paper",),
         n_seeds=1,
@@ -30,7 +29,7 @@ def test_two_scenes_of_one_name_are_refused(tmp_path: Path) -> None:
         out=tmp_path / "out.json",
     )
     with StopFlag() as stop, pytest.raises(UsageError, match="same name"):
-        run_sweep(options, stop)
+        run_sweep(stop, **options)
     assert not (tmp_path / "out.json").exists()
 
 
@@ -41,20 +40,20 @@ def test_a_worker_that_dies_is_one_line_and_leaves_nothing(
         raise BrokenExecutor
 
     monkeypatch.setattr(sweep, "worker_results", dying)
-    options = SweepOptions(
+    options: dict[str, Any] = dict(
         scenes=("lab",), presets=("paper",), n_seeds=2, jobs=2, out=tmp_path / "out.json"
     )
     with StopFlag() as stop, pytest.raises(AppError, match=r"^a worker process died; did memory"):
-        run_sweep(options, stop)
+        run_sweep(stop, **options)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_what_is_no_regular_file_is_never_replaced(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
-    options = SweepOptions(scenes=("lab",), presets=("paper",), n_seeds=1, jobs=1, out=pipe)
+    options: dict[str, Any] = dict(scenes=("lab",), presets=("paper",), n_seeds=1, jobs=1, out=pipe)
     with StopFlag() as stop, pytest.raises(AppError, match="no regular file"):
-        run_sweep(options, stop)
+        run_sweep(stop, **options)
     assert pipe.is_fifo()
     assert list(tmp_path.iterdir()) == [pipe]
 
@@ -65,26 +64,24 @@ def test_the_folder_of_the_results_is_made(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(sweep, "worker_results", dying)
     out = tmp_path / "new" / "out.json"
-    options = SweepOptions(scenes=("lab",), presets=("paper",), n_seeds=2, jobs=2, out=out)
+    options: dict[str, Any] = dict(scenes=("lab",), presets=("paper",), n_seeds=2, jobs=2, out=out)
     with StopFlag() as stop, pytest.raises(AppError, match="worker process died"):
-        run_sweep(options, stop)
+        run_sweep(stop, **options)
     assert out.parent.is_dir()
 
 
-def options_of(out: Path, **changes: Any) -> SweepOptions:  # noqa: ANN401 - any field
+def options_of(out: Path, **changes: Any) -> dict[str, Any]:  # noqa: ANN401 - any option
     """Return a sweep of two presets' worth of settings, a stress and three seeds: 12 runs."""
-    return replace(
-        SweepOptions(
-            scenes=("lab",),
-            presets=("paper",),
-            n_seeds=3,
-            jobs=1,
-            out=out,
-            settings=(("association.gate", ("0.6", "9.2")),),
-            stresses=("skew",),
-        ),
-        **changes,
-    )
+    options = {
+        "scenes": ("lab",),
+        "presets": ("paper",),
+        "n_seeds": 3,
+        "jobs": 1,
+        "out": out,
+        "settings": (("association.gate", ("0.6", "9.2")),),
+        "stresses": ("skew",),
+    }
+    return options | changes
 
 
 def interrupted_after(count: int, calls: list[Key]) -> Callable[..., SweepRun]:
@@ -107,10 +104,10 @@ def test_a_stopped_sweep_goes_on_with_the_missing_runs(
             if first < 12:
                 monkeypatch.setattr(sweep, "run_case", interrupted_after(first, calls))
                 with pytest.raises(StopRequestedError, match="5 of 12 runs are in"):
-                    run_sweep(options_of(out), stop)
+                    run_sweep(stop, **options_of(out))
                 assert not out.exists()
             monkeypatch.setattr(sweep, "run_case", interrupted_after(99, calls))
-            run_sweep(options_of(out), stop)
+            run_sweep(stop, **options_of(out))
         assert len(calls) == len(set(calls)) == 12
         assert list(tmp_path.glob("*.part")) == []
         results.append(json.loads(out.read_text()))
@@ -141,10 +138,10 @@ def test_a_changed_command_does_not_go_on(
     part = tmp_path / "out.part"
     with StopFlag() as stop:
         with pytest.raises(StopRequestedError):
-            run_sweep(options_of(tmp_path / "out"), stop)
+            run_sweep(stop, **options_of(tmp_path / "out"))
         before = part.read_bytes()
         with pytest.raises(AppError, match=said):
-            run_sweep(options_of(tmp_path / "out", **changes), stop)
+            run_sweep(stop, **options_of(tmp_path / "out", **changes))
     assert part.read_bytes() == before
 
 
@@ -156,10 +153,10 @@ def test_another_version_of_a_scene_file_does_not_go_on(
     monkeypatch.setattr(sweep, "run_case", interrupted_after(2, []))
     with StopFlag() as stop:
         with pytest.raises(StopRequestedError):
-            run_sweep(options, stop)
+            run_sweep(stop, **options)
         scene.write_text(scene.read_text().replace("0.05", "0.06"))
         with pytest.raises(AppError, match="other: scene file short"):
-            run_sweep(options, stop)
+            run_sweep(stop, **options)
 
 
 @pytest.mark.parametrize(
