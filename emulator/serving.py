@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.device import Device, radar_device
 from emulator.echo.echo import echo_source
 from emulator.faults.faulty_device import FaultyDevice, wrap
@@ -76,7 +76,6 @@ class FaultBench:
             self.truth = TruthLog(stream.write)
 
     def wrap(self, device: InnerDevice, name: str) -> FaultyDevice:
-        """Return a device with the faults of the plan."""
         faulty = wrap(device, name, self._plan, self.truth, zero_ns=self._zero_ns)
         self.devices[name] = faulty
         return faulty

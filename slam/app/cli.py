@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from slam.app.commands.options import add_rerun, count, folder, seconds, seed
 from slam.app.errors import EXIT_FAILED, AppError, StopFlag, StopRequestedError, naming
-from slam.app.experiments import EXPERIMENTS, Experiment, ExperimentModule
+from slam.app.experiments import add_experiments
 from slam.app.sweep.stress import STRESSES
 from xethru_protocol.system import drop_what_cannot_be_said, open_closed_streams
 
@@ -238,6 +238,7 @@ def _add_convert(convert: argparse.ArgumentParser) -> None:
     convert.add_argument(
         "--rate",
         dest="rate_hz",
+        metavar="RATE",
         type=count,
         default=5,
         help="states/s of a .mat, which has no stamps (default: 5)",
@@ -263,6 +264,7 @@ def _add_sweep(sweep: argparse.ArgumentParser) -> None:
     sweep.add_argument(
         "--scene",
         dest="scenes",
+        metavar="SCENE",
         nargs="+",
         action="extend",
         help="names or files (default: lab)",
@@ -270,12 +272,18 @@ def _add_sweep(sweep: argparse.ArgumentParser) -> None:
     sweep.add_argument(
         "--preset",
         dest="presets",
+        metavar="PRESET",
         nargs="+",
         action="extend",
         help="settings of SLAM (default: robust)",
     )
     sweep.add_argument(
-        "--seeds", dest="n_seeds", type=count, default=20, help="number of seeds, from 0"
+        "--seeds",
+        dest="n_seeds",
+        metavar="SEEDS",
+        type=count,
+        default=20,
+        help="number of seeds, from 0",
     )
     sweep.add_argument(
         "--set",
@@ -427,38 +435,16 @@ def _parser() -> argparse.ArgumentParser:
         description="Runs one experiment on emulated radars; writes NAME.png and NAME.json. All "
         "numbers are simulated.",
     )
-    names = experiment.add_subparsers(
-        required=True, metavar="NAME", dest="name", parser_class=_ExperimentParser
-    )
-    for shown in EXPERIMENTS.values():
-        parser_of_row = names.add_parser(shown.name, help=shown.help, description=shown.help)
-        parser_of_row.experiment = shown
-        parser_of_row.add_argument(
-            "--out", type=folder, default=Path("out/experiments"), help="folder for the results"
-        )
+    add_experiments(experiment)
+    experiment.set_defaults(start=_experiment)
     return parser
 
 
-class _ExperimentParser(argparse.ArgumentParser):
-    """Imports its experiment, which adds its own options, only once it is named."""
-
-    experiment: Experiment
-
-    def parse_known_args(  # type: ignore[override]  # of its overloads, argparse uses this one
-        self, args: Sequence[str] | None = None, namespace: None = None
-    ) -> tuple[argparse.Namespace, list[str]]:
-        module = self.experiment.load()
-        module.add_arguments(self)
-        self.set_defaults(start=_experiment, module=module)
-        return super().parse_known_args(args, namespace)
-
-
 def _experiment(arguments: argparse.Namespace, stop: StopFlag) -> None:
-    module: ExperimentModule = arguments.module
     out: Path = arguments.out
     with naming(out):
         out.mkdir(parents=True, exist_ok=True)
-    module.run(arguments, stop)
+    arguments.experiment.run(arguments, stop)
 
 
 if __name__ == "__main__":

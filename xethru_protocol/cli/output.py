@@ -1,5 +1,7 @@
 """What commands print: lines, progress, names for people."""
 
+from __future__ import annotations
+
 import json
 import math
 import os
@@ -7,12 +9,14 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
-from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.recordings import RecordingFault
 from xethru_protocol.wire.codes import ProfileId
 from xethru_protocol.wire.errors import Disconnected, XeThruError
+
+if TYPE_CHECKING:
+    from xethru_protocol.driver.radar import X4M300
+    from xethru_protocol.recordings import RecordingFault
 
 
 def profile_name(profile_id: int) -> str:
@@ -232,6 +236,8 @@ def module_at(port: str, baudrate: int) -> Iterator[X4M300]:
     CommandFailed
         If the block failed, and then the module could not be stopped.
     """
+    from xethru_protocol.driver.radar import X4M300  # heavy, and --help needs this module
+
     radar = X4M300.open(port, baudrate=baudrate)
     losses = ""
     try:

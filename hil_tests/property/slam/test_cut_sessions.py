@@ -1,7 +1,5 @@
 """A session cut or damaged anywhere: what is left is a prefix, and `repair` makes it whole."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 from contextlib import suppress
@@ -113,9 +111,10 @@ def test_a_cut_at_any_byte_leaves_a_prefix(whole: Content, tmp_path: Path) -> No
     path.write_bytes(whole)
     everything = messages(path)
     assert len(everything) == 2 + 1 + 1 + N_SCANS * (3 + 5)
-    longest = 0
+    longest, whole_until_ns = 0, -1
     # every record's first bytes, all of a chunk's head, and a comb through the rest
     starts = list(top_level_places(whole))
+    before = starts[0]
     places = {at + k for at in starts for k in (-1, 0, 1, 9)}
     places |= {at + k for at in starts if whole[at] == CHUNK for k in range(0, 60, 3)}
     places |= set(range(8, len(whole), 101))
@@ -125,6 +124,10 @@ def test_a_cut_at_any_byte_leaves_a_prefix(whole: Content, tmp_path: Path) -> No
         assert found == everything[: len(found)], cut
         assert len(found) >= longest, cut  # more bytes never give less
         longest = len(found)
+        if cut in starts and whole[before] == CHUNK:  # and no whole chunk is lost
+            whole_until_ns = struct.unpack_from("<Q", whole, before + 17)[0]
+        assert whole_until_ns < 0 or found[-1][2] >= whole_until_ns, cut
+        before = cut if cut in starts else before
     assert longest == len(everything)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 from matplotlib.axes import Axes
 
 from slam.app.errors import StopFlag
-from slam.app.experiments.stress import add_sweep_argument, read_groups
+from slam.app.experiments.stress import read_groups
 from slam.app.run.pictures import ESTIMATE, GRID, INK, LANDMARK, ODOMETRY, TRUTH, label, picture
 
 _COLOURS = (ESTIMATE, ODOMETRY, LANDMARK, "#2b8a3e", "#7048b8")
@@ -77,11 +77,6 @@ def _name(group: dict[str, Any]) -> str:
 
 
 NAME = "consistency"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the sweep to look at."""
-    add_sweep_argument(parser, "out/sweep.json", "`uwb-slam sweep`, like `make sweep`")
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> None:

@@ -17,7 +17,6 @@ from matplotlib.colors import LinearSegmentedColormap
 from numpy.typing import NDArray
 
 from emulator.scene.scene import PathSpec, RadarSpec, Scene, TargetSpec, load_scene
-from slam.app.commands.options import count, seed
 from slam.app.errors import StopFlag
 from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, open_loopback
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label, picture
@@ -396,19 +395,6 @@ def _draw_residuals(axes: Axes, steps: Steps, errors: Mapping[str, RangeErrors])
 
 
 NAME = "figure7"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the seed and how many frames are taken of each position."""
-    parser.add_argument(
-        "--seed", type=seed, default=0, help="seed of the receiver noise (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--frames",
-        type=count,
-        default=20,
-        help="frames taken at each position of the target (default: %(default)s)",
-    )
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> None:

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from emulator.scene.scene import Scene
 from emulator.scene.wheels import scene_odometry
-from slam.app.commands.options import seed
 from slam.app.errors import StopFlag
 from slam.app.odometry.track import OdometryTrack
 from slam.app.odometry.tum import NS_PER_S
@@ -343,22 +342,6 @@ def _differs_only_in(value: _Value, setting: Setting) -> bool:
 
 
 NAME = "filter"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add seed and scenes."""
-    parser.add_argument(
-        "--seed",
-        type=seed,
-        default=0,
-        help="seed of receiver noise and odometry drift (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--scene",
-        nargs="+",
-        default=["lab"],
-        help="names or files of scenes (default: lab); in two_rooms walls make most of the fixes",
-    )
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> None:

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from slam.app.commands.options import count, seed
 from slam.app.errors import StopFlag
 from slam.app.experiments.limit_cells import (
     BIN_LENGTH_M,
@@ -202,19 +201,6 @@ def false_alarms(trials: int, seed: int, check: Callable[[], None]) -> list[dict
 
 
 NAME = "limits"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add seed and number of trials."""
-    parser.add_argument(
-        "--seed",
-        type=seed,
-        default=0,
-        help="seed of places, phases and noise (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--trials", type=count, default=2000, help="frames per cell (default: %(default)s)"
-    )
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> None:

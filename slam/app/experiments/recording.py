@@ -35,15 +35,14 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from scipy.signal import welch
 
+from emulator.chip import Pace
 from emulator.chip.downconversion import CHANNELS, LEAD_SAMPLES, TAP_COUNT
-from emulator.chip.pace import Pace
 from emulator.device import radar_device
 from emulator.echo.echo import SPEED_OF_LIGHT_MPS, echo_source
-from emulator.echo.pulse import CARRIER_CYCLES_PER_SAMPLE, SIGMA_S
+from emulator.echo.reflections import CARRIER_CYCLES_PER_SAMPLE, SIGMA_S
 from emulator.loopback import LoopbackTransport
 from emulator.module.memory import Identity
 from emulator.scene.scene import ClutterSpec, JitterSpec, NoiseSpec, RadarSpec, Scene, TargetSpec
-from slam.app.commands.options import count, seed
 from slam.app.errors import AppError, StopFlag
 from slam.app.run.pictures import ESTIMATE, INK, ODOMETRY, TRUTH, label, picture
 from xethru_protocol.driver.link import RawConfig
@@ -438,27 +437,6 @@ def _draw_increments(
 
 
 NAME = "recording"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the recording, the first seed and the number of emulated runs."""
-    parser.add_argument(
-        "--recording",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help="recording of a standing module's baseband frames, in any format `xethru dump` reads",
-    )
-    parser.add_argument("--radar", metavar="NAME", help="which radar of a recording of several")
-    parser.add_argument(
-        "--seed", type=seed, default=0, help="seed of the run drawn in full (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--runs",
-        type=count,
-        default=20,
-        help="emulated runs, with seeds from there on (default: %(default)s)",
-    )
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> None:

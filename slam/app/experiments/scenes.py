@@ -15,7 +15,6 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 from slam.app.errors import StopFlag
 from slam.app.experiments.stress import (
-    add_sweep_argument,
     draw_consistency,
     legend_below,
     read_groups,
@@ -67,11 +66,6 @@ def _draw_errors(axes: Axes, groups: Sequence[dict[str, Any]], names: Sequence[s
 
 
 NAME = "scenes"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the sweep to look at."""
-    add_sweep_argument(parser, "out/scenes.json", "`uwb-slam sweep --scene ...`")
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> None:

@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 
 from emulator.scene.scene import Scene
 from emulator.scene.wheels import scene_odometry
-from slam.app.commands.options import seed
 from slam.app.errors import StopFlag
 from slam.app.odometry.track import OdometryTrack
 from slam.app.rig.emulated import (
@@ -310,16 +309,6 @@ def _draw(axes: Axes, run: ObservedRun, points: NDArray[np.float64], colour: str
 
 
 NAME = "smoke"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the seed."""
-    parser.add_argument(
-        "--seed",
-        type=seed,
-        default=0,
-        help="seed of receiver noise and odometry drift (default: %(default)s)",
-    )
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> None:

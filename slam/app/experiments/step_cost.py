@@ -22,7 +22,6 @@ import scipy
 from scipy.linalg.blas import dsyr2, dsyrk
 from threadpoolctl import threadpool_limits
 
-from slam.app.commands.options import count
 from slam.app.errors import StopFlag, UsageError
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label, picture
 from slam.geometry import paper_rig
@@ -301,25 +300,6 @@ def draw_step_cost(path: Path, costs: Sequence[StepCost]) -> None:
 
 NAME = "step-cost"
 _FEWEST = 2
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add sizes and repetitions."""
-    parser.add_argument(
-        "--landmarks",
-        nargs="+",
-        type=count,
-        default=[10, 20, 50, 100, 200, 500, 1000, 2000],
-        metavar="N",
-        help="sizes of the map (default: 10 20 50 100 200 500 1000 2000)",
-    )
-    parser.add_argument(
-        "--repetitions",
-        type=count,
-        default=7,
-        metavar="N",
-        help="how often every step is timed; the least counts (default: %(default)s)",
-    )
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> None:

@@ -24,17 +24,6 @@ _MOST_BYTES = 1 << 28
 _NEEDED = {"scene", "preset", "settings", "stress", "ate_rmse_m", "anees_pose", "nis_times"}
 
 
-def add_sweep_argument(parser: argparse.ArgumentParser, default: str, made_by: str) -> None:
-    """Add `--sweep`, the result file to look at."""
-    parser.add_argument(
-        "--sweep",
-        type=Path,
-        default=Path(default),
-        metavar="JSON",
-        help=f"result of {made_by} (default: %(default)s)",
-    )
-
-
 def read_groups(path: Path, result: Path) -> list[dict[str, Any]]:
     """Return the groups of a sweep's result file, in its order.
 
@@ -173,11 +162,6 @@ def legend_below(figure: Figure, *panels: Axes) -> None:
 
 
 NAME = "stress"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the sweep to look at."""
-    add_sweep_argument(parser, "out/stress.json", "`uwb-slam sweep --stress ...`")
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> None:

@@ -28,7 +28,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from slam.app.commands.options import count
 from slam.app.errors import AppError, StopFlag
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, TRUTH, label, picture
 from slam.app.sweep.bound import load_gtsam
@@ -545,16 +544,6 @@ def _map(axes: Axes, odometry: np.ndarray, reference: Reference, run: ParkRun) -
 
 
 NAME = "victoria-park"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add how much of the drive to take."""
-    parser.add_argument(
-        "--steps",
-        type=count,
-        default=None,
-        help="take the first steps of the drive only (default: all 6968)",
-    )
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> None:

@@ -1,92 +1,18 @@
-"""`uwb-slam` itself: help is light, wrong usage is 2, nobody sees a traceback."""
+"""uwb-slam itself: help is light, wrong usage is 2, signals, and no traceback."""
 
 import os
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
 
-from hil_tests.unit.slam.app.sessions import session_info
+from hil_tests.patience import seconds
 from slam.app.cli import main
-from slam.app.session.log import SessionLog
+from slam.app.errors import StopFlag, StopRequestedError
 from xethru_protocol.system import locked
-
-HEAVY = {
-    "numpy",
-    "scipy",
-    "sklearn",
-    "rerun",
-    "matplotlib",
-    "pydantic",
-    "mcap",
-    "rosbags",
-    "joblib",
-    "rich",
-    "serial",
-    "emulator",
-}
-
-
-@pytest.mark.parametrize(
-    "arguments", [["--help"], ["demo", "--help"], ["evaluate", "--help"], ["sweep", "--help"]]
-)
-def test_help_loads_nothing_heavy(arguments: list[str]) -> None:
-    script = (
-        "import sys\n"
-        "from slam.app.cli import main\n"
-        f"try: main({arguments!r})\n"
-        "except SystemExit as end: assert end.code == 0\n"
-        "print('LOADED', *{name.partition('.')[0] for name in sys.modules})\n"
-    )
-    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert "usage: uwb-slam" in run.stdout
-    loaded = set(run.stdout.partition("LOADED")[2].split())
-    assert loaded & HEAVY == set()
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        [],
-        ["fly"],
-        ["demo", "--seed", "-1"],
-        ["demo", "--seed", "x"],
-        ["demo", "--out", os.fsdecode(b"\xff")],
-        ["sweep", "--json", "o.json", "--seeds", "0"],
-        ["evaluate", "one.tum"],
-    ],
-)
-def test_wrong_usage_is_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(arguments)
-    assert caught.value.code == 2
-    assert "Traceback" not in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("wrong", "code"), [("--scene mars", 2), ("--scene no/such.toml", 1), ("--preset magic", 2)]
-)
-@pytest.mark.parametrize("command", ["demo --out", "sweep --json"])
-def test_an_unknown_name_is_2_a_missing_file_1_both_one_line(
-    command: str, wrong: str, code: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    option, value = wrong.split()
-    assert main([*command.split(), str(tmp_path / "out"), option, value]) == code
-    text = capsys.readouterr()
-    assert text.out == ""
-    assert value in text.err
-    assert text.err.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_folder_that_cannot_be_written_is_1(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "file").write_text("in the way")
-    assert main(["demo", "--out", str(tmp_path / "file" / "o")]) == 1
-    assert "cannot be written: Not a directory" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -166,13 +92,75 @@ def test_a_signal_before_a_command_takes_note_of_signals_is_one_line(
     assert capsys.readouterr().err == "uwb-slam: stopped by SIGINT\n"
 
 
-@pytest.mark.parametrize("command", ["view", "report"])
-def test_no_result_takes_the_place_of_another_recording(
-    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log = SessionLog(session := tmp_path / "session.mcap", session_info())
-    log.close()
-    (other := tmp_path / "other.mcap").write_bytes(session.read_bytes())
-    assert main([command, str(session), "--out", str(other)]) == 2
-    assert f"{other}: is a recording, which cannot be repeated" in capsys.readouterr().err
-    assert other.read_bytes() == session.read_bytes()
+@pytest.mark.parametrize(
+    ("which", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+)
+def test_a_signal_raises_at_the_next_check_only(which: signal.Signals, code: int) -> None:
+    with StopFlag() as stop:
+        stop.check()
+        os.kill(os.getpid(), which)
+        done = "work goes on until the check"
+        with pytest.raises(StopRequestedError, match=f"stopped by {which.name}") as caught:
+            stop.check()
+    assert done
+    assert caught.value.exit_code == code
+
+
+def test_while_waiting_a_signal_raises_where_it_arrives() -> None:
+    with StopFlag() as stop:
+        threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGTERM)).start()
+        with pytest.raises(StopRequestedError), stop.at_once():
+            pytest.fail(f"it waited to the end: {threading.Event().wait(seconds(10))}")
+
+
+def test_a_second_signal_gets_the_systems_default() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    with StopFlag():
+        os.kill(os.getpid(), signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_closing_terminals_second_hang_up_does_not_end_the_clean_stop() -> None:
+    before = signal.getsignal(signal.SIGHUP)
+    with StopFlag() as stop:
+        os.kill(os.getpid(), signal.SIGHUP)
+        os.kill(os.getpid(), signal.SIGHUP)
+        with pytest.raises(StopRequestedError):
+            stop.check()
+    assert signal.getsignal(signal.SIGHUP) is before
+
+
+def test_nohup_is_respected() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with StopFlag() as stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            stop.check()
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_a_signal_before_waiting_begins_is_not_lost() -> None:
+    with StopFlag() as stop:
+        os.kill(os.getpid(), signal.SIGINT)
+        with pytest.raises(StopRequestedError), stop.at_once():
+            pytest.fail("must not begin to wait")
+
+
+class StopFlagWithASlowCheck(StopFlag):
+    """A signal comes just after the check found nothing, where a lost one would go unseen."""
+
+    def check(self) -> None:
+        first = self._received is None
+        super().check()
+        if first:
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_a_signal_just_after_the_check_is_not_lost() -> None:
+    with StopFlagWithASlowCheck() as stop:
+        with pytest.raises(StopRequestedError), stop.at_once():
+            pytest.fail("must not begin to wait")
+        assert not stop._at_once

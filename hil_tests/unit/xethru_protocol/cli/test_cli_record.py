@@ -11,9 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.unit.xethru_protocol.pty_module import PtyModule
+from hil_tests.unit.xethru_protocol.pty_module import PtyModule, Said, silent
 from hil_tests.unit.xethru_protocol.scripted import frame
-from hil_tests.unit.xethru_protocol.sick_module import Said, SickModule, silent
 from xethru_protocol.cli import main, record
 from xethru_protocol.cli.output import Progress
 from xethru_protocol.cli.record import Recorder
@@ -118,7 +117,7 @@ def test_a_module_that_does_not_answer_costs_no_older_recording(
     assert main(["record", "--port", module.path, "--out", str(out), "--count", "2"]) == 0
     before = {path: path.read_bytes() for path in out.iterdir()}
     assert main(["record", "--port", str(tmp_path / "none"), "--out", str(out), "--force"]) == 1
-    with SickModule(silent) as deaf:
+    with PtyModule(silent) as deaf:
         assert main(["record", "--port", deaf.path, "--out", str(out), "--force"]) == 1
     assert {path: path.read_bytes() for path in out.iterdir()} == before
 
@@ -152,7 +151,7 @@ def test_the_wire_alone(module: PtyModule, tmp_path: Path) -> None:
 
 def test_listening_sends_nothing(tmp_path: Path) -> None:
     out = tmp_path / "recording"
-    with SickModule(silent, unasked=frame(7)) as module:
+    with PtyModule(silent, unasked=frame(7)) as module:
         arguments = ["--out", str(out), "--profile", "none", "--count", "4"]
         assert main(["record", "--port", module.path, *arguments]) == 0
         assert module.received == []
@@ -167,7 +166,7 @@ def test_presence_is_loaded_run_and_recorded(tmp_path: Path, capsys: Capture) ->
         return [m.Ack(), PRESENCE, PRESENCE] if is_run else [m.Ack()]
 
     out = tmp_path / "recording"
-    with SickModule(answer) as module:
+    with PtyModule(answer) as module:
         arguments = ["--out", str(out), "--profile", "presence", "--count", "2"]
         assert main(["record", "--port", module.path, *arguments]) == 0
         asked = [command for command in module.received if not isinstance(command, m.Ping)]
@@ -183,7 +182,7 @@ def test_presence_is_loaded_run_and_recorded(tmp_path: Path, capsys: Capture) ->
 
 def test_nothing_to_record_leaves_nothing(tmp_path: Path, capsys: Capture) -> None:
     out, wire = tmp_path / "recording", tmp_path / "port.xtwire"
-    with SickModule(silent) as module:
+    with PtyModule(silent) as module:
         arguments = ["--out", str(out), "--wire", str(wire), "--profile", "none"]
         assert main(["record", "--port", module.path, *arguments, "--duration", "0.2"]) == 1
     assert capsys.readouterr().err == (
