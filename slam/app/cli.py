@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from slam.app.commands.options import add_rerun, count, folder, seconds, seed
-from slam.app.errors import EXIT_FAILED, AppError, StopFlag, StopRequestedError, naming
+from slam.app.errors import EXIT_FAILED, AppError, StopFlag, StopRequestedError
 from slam.app.experiments import add_experiments
 from slam.app.sweep.stress import STRESSES
 from xethru_protocol.system import drop_what_cannot_be_said, open_closed_streams
@@ -66,7 +66,7 @@ def _run(arguments: argparse.Namespace) -> int:
     try:
         try:
             with stop:
-                arguments.start(arguments, stop)
+                arguments.command(arguments, stop)
                 sys.stdout.flush()
         except OSError:
             stop.check()  # a terminal that closes sends SIGHUP and takes no more output
@@ -107,7 +107,7 @@ class _Command(NamedTuple):
 
     def start(self, arguments: argparse.Namespace, stop: StopFlag) -> None:
         module, _, name = self.function.partition(":")
-        options: dict[str, Any] = {k: v for k, v in vars(arguments).items() if k != "start"}
+        options: dict[str, Any] = {k: v for k, v in vars(arguments).items() if k != "command"}
         getattr(import_module(module), name)(stop, **options)
 
 
@@ -427,7 +427,7 @@ def _parser() -> argparse.ArgumentParser:
             row.name, help=row.help, description=row.description, epilog=row.epilog
         )
         row.add_arguments(command)
-        command.set_defaults(start=row.start)
+        command.set_defaults(command=row.start)
 
     experiment = commands.add_parser(
         "experiment",
@@ -436,15 +436,7 @@ def _parser() -> argparse.ArgumentParser:
         "numbers are simulated.",
     )
     add_experiments(experiment)
-    experiment.set_defaults(start=_experiment)
     return parser
-
-
-def _experiment(arguments: argparse.Namespace, stop: StopFlag) -> None:
-    out: Path = arguments.out
-    with naming(out):
-        out.mkdir(parents=True, exist_ok=True)
-    arguments.experiment.run(arguments, stop)
 
 
 if __name__ == "__main__":
