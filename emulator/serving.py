@@ -31,7 +31,7 @@ from emulator.scene.scene import Scene, SceneError, UnknownSceneError, empty_roo
 from emulator.scene.wheels import scene_odometry
 from xethru_protocol.recordings import RecordingError
 from xethru_protocol.recordings.wire_capture import Way, WireCapture
-from xethru_protocol.system import Stop
+from xethru_protocol.system import StopFlag
 
 
 class FaultBench:
@@ -121,7 +121,7 @@ def serve(
     seed: int,
     pace: Pace,
     link_dir: Path | None,
-    stop: Stop,
+    stop: StopFlag,
     *,
     links: LinkOptions,
     faults: Path | str | None = None,
@@ -193,7 +193,7 @@ def play(
     link_dir: Path | None,
     *,
     warn: Callable[[str], None],
-    stop: Stop,
+    stop: StopFlag,
 ) -> None:
     """Play a recording, each radar at a port of its own, until a signal asks for the end.
 
@@ -254,7 +254,7 @@ def proxy(
     port: Path,
     baud: int,
     link_dir: Path | None,
-    stop: Stop,
+    stop: StopFlag,
     *,
     faults: Path | str | None,
     truth: Path | None,
@@ -283,7 +283,7 @@ def proxy(
     def gone() -> None:
         nonlocal lost
         lost = True
-        stop.request(0, None)
+        stop.request()
 
     with contextlib.ExitStack() as cleanup:
         try:
@@ -375,14 +375,14 @@ def _run(
     ports: DevicePorts,
     services: Sequence[Service],
     ready: dict[str, object],
-    stop: Stop,
+    stop: StopFlag,
     cleanup: contextlib.ExitStack,
 ) -> None:
     if stop.requested:
         return  # nobody shall learn of ports that go away at once
     server = Server(ports.ports, [*services, *ports.services])
     cleanup.callback(server.close)
-    stop.attach(server)
+    stop.attach(server.stop)
     cleanup.callback(stop.detach)  # a second signal must not reach a loop that is being closed
     announcement = Announcement(ready)
     cleanup.callback(announcement.close)

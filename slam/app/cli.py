@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from slam.app.commands.options import add_rerun, count, folder, seconds, seed
-from slam.app.errors import EXIT_FAILED, AppError, StopFlag, StopRequestedError
+from slam.app.errors import EXIT_FAILED, AppError
 from slam.app.experiments import add_experiments
 from slam.app.sweep.stress import STRESSES
-from xethru_protocol.system import drop_what_cannot_be_said, open_closed_streams
+from xethru_protocol.system import StopFlag, StopRequestedError, flush_streams, open_closed_streams
 
 _TYPICAL_SEED = 19
 """Of seeds 0-19 in the lab, the one whose errors lie nearest the medians; see DECISIONS."""
@@ -58,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:  # before a command took note of signals
         return _end("stopped by SIGINT", 128 + signal.SIGINT)
     finally:
-        drop_what_cannot_be_said()
+        flush_streams()
 
 
 def _run(arguments: argparse.Namespace) -> int:

@@ -25,7 +25,7 @@ from hil_tests.system.recorded_session import (
 )
 from slam.app.cli import main
 from slam.app.commands.view import is_finished, session_file
-from slam.app.errors import AppError, StopFlag
+from slam.app.errors import AppError
 from slam.app.run.replay import recorded_source
 from slam.app.run.runner import execute
 from slam.app.session.reader import open_session
@@ -33,6 +33,7 @@ from slam.app.view import rerun_recording
 from slam.app.view.rerun_recording import count_rows
 from slam.app.view.rerun_sdk import RrdReader, rr
 from slam.app.view.viewer import LiveView, executable
+from xethru_protocol.system import StopFlag
 
 pytestmark = pytest.mark.slow
 

@@ -151,25 +151,6 @@ def test_values_out_of_range_are_refused(command: m.Command[m.Ack]) -> None:
     assert loaded().ask(command) == m.Error(code=0x21)
 
 
-# 8.3: a profile setting in each state
-PLACES = [
-    ([], 0x21),
-    ([m.SetMode(mode=0x11)], 0x21),
-    ([STOP], 1),
-    ([STOP, m.SetMode(mode=0x12)], 0x21),
-]
-
-
-@pytest.mark.parametrize(("way", "code"), PLACES)
-def test_settings_are_taken_only_from_a_stopped_profile(
-    way: list[m.Command[m.Ack]], code: int
-) -> None:
-    host = BareHost(device())
-    for command in way:
-        assert host.ask(command) == m.Ack()
-    assert host.ask(m.SetSensitivity(sensitivity=1)) == m.Error(code=code)
-
-
 def test_gets_without_a_profile() -> None:
     """4.4: sensitivity and band ERROR 1, several others no reply at all."""
     for silence in ("silence", "error"):

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from emulator.scene.scene import Scene
-from slam.app.errors import AppError, EmulatorError, RadarSilentError, StopFlag
+from slam.app.errors import AppError, EmulatorError, RadarSilentError
 from slam.app.odometry.track import read_odometry_socket
 from slam.app.records import Scan, SessionInfo, SessionObserver
 from slam.app.rig.emulated import (
@@ -35,6 +35,7 @@ from slam.app.session.messages import settings_text
 from slam.app.view.viewer import LiveView
 from slam.config import SlamConfig
 from slam.robust.pipeline import make_slam
+from xethru_protocol.system import StopFlag
 
 _OUTPUTS = ("session.mcap", "session.rrd", "report.html", *RESULTS)
 

@@ -20,7 +20,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from slam.app.commands.view import refuse_overwriting, session_file
-from slam.app.errors import AppError, StopFlag, naming
+from slam.app.errors import AppError, naming
 from slam.app.odometry.tum import NS_PER_S
 from slam.app.records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.run.evaluation import (
@@ -48,6 +48,7 @@ from slam.app.run.runner import LinkChange, LinkState, LinkStates, RunRecord, Ru
 from slam.app.session.reader import RecordedSession, open_session
 from slam.evaluation import LANDMARK_MATCH_M
 from slam.geometry import transform
+from xethru_protocol.system import StopFlag
 
 _KEPT_WARNINGS = 200
 

@@ -12,7 +12,7 @@ from queue import SimpleQueue
 
 import numpy as np
 
-from slam.app.errors import AppError, StopFlag, UsageError
+from slam.app.errors import AppError, UsageError
 from slam.app.odometry.live import FixedClock, LineSource, LiveOdometry, parse_source
 from slam.app.odometry.tum import NS_PER_S
 from slam.app.records import RadarInfo, SessionInfo, SessionObserver
@@ -36,6 +36,7 @@ from slam.app.session.messages import settings_text
 from slam.app.view.viewer import LiveView
 from slam.config import ConfigError, load_preset
 from slam.robust.pipeline import make_slam
+from xethru_protocol.system import StopFlag
 
 _SESSION = "session.mcap"
 _STALE = ("session.rrd", "report.html")

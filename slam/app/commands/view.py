@@ -16,7 +16,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from slam.app.errors import AppError, StopFlag, UsageError, naming
+from slam.app.errors import AppError, UsageError, naming
 from slam.app.records import SessionObserver
 from slam.app.run.output import Progress
 from slam.app.run.replay import recorded_source
@@ -27,6 +27,7 @@ from slam.app.view.rerun_recording import DEVICE_TIME
 from slam.app.view.rerun_sdk import ViewerClient
 from slam.app.view.viewer import LiveView, ViewerKind, ViewerProcess
 from xethru_protocol.recordings.mcap import MAGIC
+from xethru_protocol.system import StopFlag
 
 _MAGIC = b"RRF"
 _END = b"FOOT"

@@ -11,7 +11,7 @@ from pathlib import Path
 from slam.app.convert import rosbag as layout
 from slam.app.convert.matlab import MatOptions, convert_mat, write_detections
 from slam.app.convert.rosbag import BagOptions, convert_bag, write_bag
-from slam.app.errors import AppError, StopFlag, UsageError
+from slam.app.errors import AppError, UsageError
 from slam.app.rig.files import load_rig
 from slam.app.run.replay import recorded_config
 from slam.app.session.messages import SlamSettings, settings_text
@@ -19,6 +19,7 @@ from slam.app.session.reader import RecordedSession, open_session
 from slam.config import ConfigError, SlamConfig, load_preset
 from slam.robust.parameters import WheelNoise
 from xethru_protocol.recordings import RecordingError, WireCapture
+from xethru_protocol.system import StopFlag
 
 
 def write_wire(session: RecordedSession, out: Path, radar: str | None, stop: StopFlag) -> str:

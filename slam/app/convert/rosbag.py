@@ -34,7 +34,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from slam.app.errors import AppError, OdometryError, StopRequestedError
+from slam.app.errors import AppError, OdometryError
 from slam.app.odometry.track import OdometryTrack
 from slam.app.odometry.tum import NS_PER_S, TumSample
 from slam.app.records import RadarInfo, Scan, SessionInfo
@@ -54,6 +54,7 @@ from slam.app.session.reader import RecordedSession, ScanEnd
 from slam.frames import RadarFrame
 from slam.geometry import Mount, Rig
 from xethru_protocol.recordings.mcap import FLOAT_ARRAY, STRING, pack_array, pack_string
+from xethru_protocol.system import StopRequestedError
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.x4 import frame_area
 

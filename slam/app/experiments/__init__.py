@@ -16,7 +16,8 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from slam.app.commands.options import count, folder, seed
-from slam.app.errors import StopFlag, naming
+from slam.app.errors import naming
+from xethru_protocol.system import StopFlag
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

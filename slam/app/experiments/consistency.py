@@ -9,11 +9,11 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from slam.app.errors import StopFlag
 from slam.app.experiments import Result
 from slam.app.experiments.stress import clean_groups
 from slam.app.run.pictures import ESTIMATE, GRID, LANDMARK, ODOMETRY, TRUTH, label
 from slam.app.sweep.statistics import group_name, in_band, nis_in_band
+from xethru_protocol.system import StopFlag
 
 _COLOURS = (ESTIMATE, ODOMETRY, LANDMARK, "#2b8a3e", "#7048b8")
 

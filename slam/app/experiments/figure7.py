@@ -14,13 +14,13 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from emulator.scene.scene import PathSpec, RadarSpec, Scene, TargetSpec, load_scene
-from slam.app.errors import StopFlag
 from slam.app.experiments import Result
 from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, open_loopback
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label
 from slam.config import DetectionConfig, FrontEnd, SlamConfig, load_preset
 from slam.frames import Detection, RadarFrame
 from slam.front_end.paper import PaperDetector, make_detector
+from xethru_protocol.system import StopFlag
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,6 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from emulator.scene.scene import Scene
-from slam.app.errors import StopFlag
 from slam.app.experiments import Result
 from slam.app.odometry.tum import NS_PER_S
 from slam.app.rig.emulated import rig_of, scene_and_config, true_landmarks_m
@@ -30,6 +29,7 @@ from slam.geometry import Rig, transform
 from slam.paper.clustering import CollectedState, filter_window
 from slam.paper.pipeline import UwbRadarSlam
 from slam.paper.trilateration import Fix
+from xethru_protocol.system import StopFlag
 
 Array = NDArray[np.float64]
 

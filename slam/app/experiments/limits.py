@@ -10,7 +10,6 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from slam.app.errors import StopFlag
 from slam.app.experiments import Result, Table
 from slam.app.experiments.limit_cells import (
     AMPLITUDE,
@@ -26,6 +25,7 @@ from slam.app.experiments.limit_cells import (
     saturation,
 )
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label
+from xethru_protocol.system import StopFlag
 
 METHODS = (*FRONT_ENDS, "lasso", "omp", "clean")
 _LOOKS: Mapping[str, dict[str, Any]] = {

@@ -41,12 +41,13 @@ from emulator.echo.reflections import CARRIER_CYCLES_PER_SAMPLE, SIGMA_S
 from emulator.loopback import LoopbackTransport
 from emulator.module.memory import Identity
 from emulator.scene.scene import ClutterSpec, JitterSpec, NoiseSpec, RadarSpec, Scene, TargetSpec
-from slam.app.errors import AppError, StopFlag
+from slam.app.errors import AppError
 from slam.app.experiments import Result
 from slam.app.run.pictures import ESTIMATE, INK, ODOMETRY, TRUTH, label
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings import RecordingError, read_recording
+from xethru_protocol.system import StopFlag
 from xethru_protocol.wire.messages import BasebandIq
 from xethru_protocol.wire.x4 import MODULE_SPEED_MPS, SAMPLING_RATE_HZ, real_frame_rate
 

@@ -11,13 +11,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
-from slam.app.errors import StopFlag
 from slam.app.experiments import Result
 from slam.app.experiments.stress import clean_groups, draw_consistency, legend_below
 from slam.app.run.evaluation import ratio
 from slam.app.run.output import mm_text, share_text
 from slam.app.run.pictures import ESTIMATE, GRID, LANDMARK, ODOMETRY, label
 from slam.app.sweep.statistics import group_name, in_band
+from xethru_protocol.system import StopFlag
 
 
 def _draw(figure: Figure, groups: Sequence[dict[str, Any]]) -> None:

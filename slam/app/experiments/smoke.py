@@ -25,7 +25,6 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from emulator.scene.scene import Scene
-from slam.app.errors import StopFlag
 from slam.app.experiments import Result
 from slam.app.rig.emulated import rig_of, scene_and_config, true_landmarks_m
 from slam.app.run.output import mm_text
@@ -36,6 +35,7 @@ from slam.geometry import transform
 from slam.paper.clustering import Observation
 from slam.paper.pipeline import StepResult, UwbRadarSlam
 from slam.paper.trilateration import Fix
+from xethru_protocol.system import StopFlag
 
 Array = NDArray[np.float64]
 

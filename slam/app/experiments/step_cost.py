@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from scipy.linalg.blas import dsyr2, dsyrk
 from threadpoolctl import threadpool_limits
 
-from slam.app.errors import StopFlag, UsageError
+from slam.app.errors import UsageError
 from slam.app.experiments import Result
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label
 from slam.geometry import paper_rig
@@ -28,6 +28,7 @@ from slam.robust.matching import sure_landmarks
 from slam.robust.parameters import ContinuationRule, RangeNoise, WheelNoise
 from slam.robust.ranges import antennas_of, rows_of, sides_of, view
 from slam.robust.state import Motion, State, SymmetricMatrix, calibrated_motion, predict
+from xethru_protocol.system import StopFlag
 
 N_UPDATES = 4
 BAR_MS, BAR_LANDMARKS = 4.0, 1000

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
-from slam.app.errors import AppError, StopFlag
+from slam.app.errors import AppError
 from slam.app.experiments import Result
 from slam.app.run.pictures import ESTIMATE, GRID, LANDMARK, PALE_INK, label
 from slam.app.sweep.statistics import (
@@ -23,7 +23,7 @@ from slam.app.sweep.statistics import (
     times_clean,
 )
 from slam.app.sweep.stress import CLEAN
-from xethru_protocol.system import read_bounded
+from xethru_protocol.system import StopFlag, read_bounded
 
 _MOST_BYTES = 1 << 28
 _NEEDED = {"scene", "preset", "settings", "stress", "ate_rmse_m", "anees_pose", "nis_times"}

@@ -27,7 +27,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from slam.app.errors import AppError, StopFlag
+from slam.app.errors import AppError
 from slam.app.experiments import Result
 from slam.app.run.output import share_text
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, TRUTH, label
@@ -38,6 +38,7 @@ from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import RangeBearing
 from slam.robust.parameters import BackEndParameters, RelinearisationRule, WheelNoise
 from slam.robust.state import CALIBRATION
+from xethru_protocol.system import StopFlag
 
 Array = NDArray[np.float64]
 

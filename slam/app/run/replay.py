@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from slam.app.errors import AppError, OdometryError, StopFlag
+from slam.app.errors import AppError, OdometryError
 from slam.app.odometry.track import OdometryTrack
 from slam.app.odometry.tum import TumSample
 from slam.app.records import LogLine, Scan, SessionObserver, Snapshot
@@ -32,6 +32,7 @@ from slam.frames import Detection, RadarFrame
 from slam.paper.pipeline import PoseAt, Slam, StepResult
 from slam.robust.parameters import WheelNoise
 from slam.robust.pipeline import make_slam
+from xethru_protocol.system import StopFlag
 
 
 class RecordedSlam:

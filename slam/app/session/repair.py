@@ -14,10 +14,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from slam.app.errors import AppError, StopFlag
+from slam.app.errors import AppError
 from slam.app.session.mcap import open_mcap
 from xethru_protocol.recordings import mcap
-from xethru_protocol.system import PathInUseError, locked
+from xethru_protocol.system import PathInUseError, StopFlag, locked
 
 KEPT_SUFFIX = ".unrepaired"
 """Of the name under which the file is kept as it was."""

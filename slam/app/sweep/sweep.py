@@ -22,7 +22,7 @@ from pathlib import Path
 from joblib import cpu_count
 from pydantic import TypeAdapter, ValidationError
 
-from slam.app.errors import AppError, StopFlag, StopRequestedError, UsageError, naming
+from slam.app.errors import AppError, UsageError, naming
 from slam.app.run.output import print_table
 from slam.app.sweep.bound import require_gtsam
 from slam.app.sweep.run import (
@@ -40,7 +40,7 @@ from slam.app.sweep.statistics import (
 )
 from slam.app.sweep.stress import CLEAN
 from slam.app.sweep.workers import ClusterLostError, dask_results, worker_results
-from xethru_protocol.system import PathInUseError, locked
+from xethru_protocol.system import PathInUseError, StopFlag, StopRequestedError, locked
 
 _TAIL = b"\n]}\n"
 

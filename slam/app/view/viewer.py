@@ -22,10 +22,11 @@ from types import TracebackType
 from typing import Self
 from urllib.parse import quote, urlsplit
 
-from slam.app.errors import AppError, StopFlag
+from slam.app.errors import AppError
 from slam.app.records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.rig.emulated import signal_at_parents_death
 from slam.app.view import SERVE_WEB, SPAWN
+from xethru_protocol.system import StopFlag
 
 _HERE = "127.0.0.1"
 _DEFAULT_PORT = 9876

@@ -3,7 +3,6 @@
 import io
 import json
 import resource
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -13,7 +12,7 @@ import pytest
 
 from hil_tests.unit.xethru_protocol.pty_module import PtyModule, Said, silent
 from hil_tests.unit.xethru_protocol.scripted import frame
-from xethru_protocol.cli import main, record
+from xethru_protocol.cli import main
 from xethru_protocol.cli.output import Progress
 from xethru_protocol.cli.record import Recorder
 from xethru_protocol.recordings import describe_recording, read_note, read_recording
@@ -206,32 +205,11 @@ def test_a_full_disk_keeps_what_is_there(module: PtyModule, tmp_path: Path) -> N
     assert counters(out) == [0, 1, 2]
 
 
-def test_the_second_signal_insists() -> None:
-    noted: list[int] = []
-
-    def twice() -> None:
-        with record._noted(noted):
-            signal.raise_signal(signal.SIGINT)
-            assert noted == [signal.SIGINT]
-            signal.raise_signal(signal.SIGINT)
-
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            twice()
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
 # --- progress -------------------------------------------------------------------------------------
 
 
 class Screen(io.StringIO):
-    """A terminal."""
-
     def isatty(self) -> bool:
-        """Be one."""
         return True
 
 

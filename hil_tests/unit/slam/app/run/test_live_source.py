@@ -24,7 +24,7 @@ from hil_tests.unit.slam.app.virtual_rig import (
     odometry_events,
     radar_events,
 )
-from slam.app.errors import AppError, StopFlag
+from slam.app.errors import AppError
 from slam.app.odometry.live import FixedClock, LiveOdometry, parse_source
 from slam.app.records import RadarInfo, Scan, SessionObserver
 from slam.app.rig.emulated import RAW_CONFIG, rig_of, wheels_of
@@ -51,6 +51,7 @@ from slam.frames import RadarFrame
 from slam.geometry import Mount
 from slam.robust.pipeline import make_slam
 from xethru_protocol.driver.frames import Frame, FrameGeometry
+from xethru_protocol.system import StopFlag
 from xethru_protocol.wire.errors import Disconnected, ResponseTimeout
 from xethru_protocol.wire.x4 import frame_time_ns
 

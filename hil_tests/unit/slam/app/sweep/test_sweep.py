@@ -13,10 +13,11 @@ import pytest
 
 from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.sweep_runs import run_of
-from slam.app.errors import AppError, StopFlag, StopRequestedError
+from slam.app.errors import AppError
 from slam.app.sweep import sweep
 from slam.app.sweep.run import Case, Key, SweepRun, finite, make_case
 from slam.app.sweep.sweep import PartFile, run_sweep
+from xethru_protocol.system import StopFlag, StopRequestedError
 
 
 def test_a_worker_that_dies_is_one_line_and_leaves_nothing(
