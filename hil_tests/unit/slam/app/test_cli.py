@@ -12,15 +12,9 @@ from slam.app.cli import main
 from xethru_protocol.system import locked
 
 
-@pytest.mark.parametrize(
-    ("command", "option", "said"),
-    [
-        ("demo", "--out", "another run is writing there"),
-        ("sweep", "--json", "another sweep is writing there"),
-    ],
-)
+@pytest.mark.parametrize(("command", "option"), [("demo", "--out"), ("sweep", "--json")])
 def test_two_runs_into_one_place_are_refused_and_the_first_goes_on(
-    command: str, option: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    command: str, option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
     first = out / "summary.json" if command == "demo" else tmp_path / "out.part"
@@ -29,7 +23,6 @@ def test_two_runs_into_one_place_are_refused_and_the_first_goes_on(
     with locked(out if command == "demo" else first):
         assert main([command, option, str(out)]) == 1
     text = capsys.readouterr()
-    assert said in text.err
     assert (text.out, text.err.count("\n")) == ("", 1)
     assert first.read_text() == "of the first run"
 
