@@ -34,7 +34,7 @@ from slam.app.errors import AppError, EmulatorError, UsageError
 from slam.app.odometry.tum import NS_PER_S
 from slam.app.rig.sources import RadarLink, RigSource
 from slam.config import ConfigError, SlamConfig, load_preset
-from slam.geometry import Mount, Rig
+from slam.geometry import Mount, Rig, transform
 from slam.robust.parameters import WheelNoise
 from xethru_protocol.driver.conversation import ProtocolRecord
 from xethru_protocol.driver.link import RawConfig
@@ -266,6 +266,17 @@ def wheels_of(scene: Scene) -> WheelNoise:
 def true_landmarks_m(scene: Scene) -> NDArray[np.float64]:
     """Return where the targets stand, shape (n, 2), world frame."""
     return np.array([(target.x_m, target.y_m) for target in scene.targets]).reshape(-1, 2)
+
+
+def outlines_m(scene: Scene) -> tuple[NDArray[np.float64], ...]:
+    """Return a line for each wall and a closed one for each box, shape (k, 2) [m], world frame."""
+    walls = [np.array([wall.from_m, wall.to_m]) for wall in scene.walls]
+    boxes = []
+    for box in scene.objects:
+        half = np.array([box.width_m, box.depth_m]) / 2
+        corners = half * np.array([(1, 1), (-1, 1), (-1, -1), (1, -1), (1, 1)])
+        boxes.append(transform(np.array([box.x_m, box.y_m, math.radians(box.yaw_deg)]), corners))
+    return (*walls, *boxes)
 
 
 def open_ports(

@@ -17,7 +17,7 @@ from pathlib import Path
 from slam.app.errors import AppError
 from slam.app.session.mcap import open_mcap
 from xethru_protocol.recordings import mcap
-from xethru_protocol.system import PathInUseError, locked
+from xethru_protocol.system import PathInUseError, StopFlag, locked
 
 KEPT_SUFFIX = ".unrepaired"
 """Of the name under which the file is kept as it was."""
@@ -92,6 +92,11 @@ class Repair:
         if self.kept is not None:
             lines.append(f"  as it was: {self.kept}")
         return "\n".join(lines)
+
+
+def run_repair(stop: StopFlag, *, session: Path, out: Path | None) -> None:
+    """Repair a recording and print the outcome; see `repair`."""
+    print(repair(session, out, stop.check))  # noqa: T201 - the result
 
 
 def repair(path: Path, out: Path | None, check: Callable[[], None]) -> Repair:

@@ -30,6 +30,7 @@ from slam.app.rig.emulated import (
     RAW_CONFIG,
     end_counter,
     open_loopback,
+    outlines_m,
     rig_of,
     scene_and_config,
     true_landmarks_m,
@@ -37,7 +38,6 @@ from slam.app.rig.emulated import (
     wheels_of,
 )
 from slam.app.run.evaluation import Summary, summarise
-from slam.app.run.pictures import outlines_m
 from slam.app.run.runner import RunRecord, run_slam
 from slam.app.sweep.bound import BoundSummary, bound_of
 from slam.app.sweep.stress import CLEAN, STRESSES, Stress
