@@ -71,7 +71,8 @@ def test_a_signal_after_a_commands_last_check_counts_too(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("slam.app.cli._evaluate", lambda *_: os.kill(os.getpid(), which))
+    interrupted = lambda *_, **__: os.kill(os.getpid(), which)  # noqa: E731
+    monkeypatch.setattr("slam.app.run.results.run_evaluate", interrupted)
     assert main(["evaluate", "one.tum", "two.tum"]) == code
     assert capsys.readouterr().err == f"uwb-slam: stopped by {which.name}\n"
 
