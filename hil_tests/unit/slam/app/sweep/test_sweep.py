@@ -16,7 +16,7 @@ from hil_tests.unit.slam.app.sweep_runs import run_of
 from slam.app.errors import AppError
 from slam.app.sweep import sweep
 from slam.app.sweep.run import Case, Key, SweepRun, finite, make_case
-from slam.app.sweep.sweep import PartFile, SweepOptions, run_sweep
+from slam.app.sweep.sweep import PartFile, run_sweep
 from xethru_protocol.system import StopFlag, StopRequestedError
 
 
@@ -29,26 +29,24 @@ def test_a_worker_that_dies_leaves_nothing_but_the_folder_of_the_results(
 
     monkeypatch.setattr(sweep, "worker_results", dying)
     out = tmp_path / folder / "out.json"
-    options = SweepOptions(scenes=("lab",), presets=("paper",), n_seeds=2, jobs=2, out=out)
+    options: dict[str, Any] = dict(scenes=("lab",), presets=("paper",), n_seeds=2, jobs=2, out=out)
     with StopFlag() as stop, pytest.raises(AppError):
-        run_sweep(options, stop)
+        run_sweep(stop, **options)
     assert list(tmp_path.rglob("*")) == ([out.parent] if folder == "new" else [])
 
 
-def options_of(out: Path, **changes: Any) -> SweepOptions:  # noqa: ANN401 - any field
+def options_of(out: Path, **changes: Any) -> dict[str, Any]:  # noqa: ANN401 - any option
     """Return a sweep of two presets' worth of settings, a stress and three seeds: 12 runs."""
-    return replace(
-        SweepOptions(
-            scenes=("lab",),
-            presets=("paper",),
-            n_seeds=3,
-            jobs=1,
-            out=out,
-            settings=(("association.gate", ("0.6", "9.2")),),
-            stresses=("skew",),
-        ),
-        **changes,
-    )
+    options = {
+        "scenes": ("lab",),
+        "presets": ("paper",),
+        "n_seeds": 3,
+        "jobs": 1,
+        "out": out,
+        "settings": (("association.gate", ("0.6", "9.2")),),
+        "stresses": ("skew",),
+    }
+    return options | changes
 
 
 def interrupted_after(count: int, calls: list[Key]) -> Callable[..., SweepRun]:
@@ -71,10 +69,10 @@ def test_a_stopped_sweep_goes_on_with_the_missing_runs(
             if first < 12:
                 monkeypatch.setattr(sweep, "run_case", interrupted_after(first, calls))
                 with pytest.raises(StopRequestedError):
-                    run_sweep(options_of(out), stop)
+                    run_sweep(stop, **options_of(out))
                 assert not out.exists()
             monkeypatch.setattr(sweep, "run_case", interrupted_after(99, calls))
-            run_sweep(options_of(out), stop)
+            run_sweep(stop, **options_of(out))
         assert len(calls) == len(set(calls)) == 12
         assert list(tmp_path.glob("*.part")) == []
         results.append(json.loads(out.read_text()))
@@ -106,10 +104,10 @@ def test_a_changed_command_does_not_go_on(
     part = tmp_path / "out.part"
     with StopFlag() as stop:
         with pytest.raises(StopRequestedError):
-            run_sweep(options_of(tmp_path / "out"), stop)
+            run_sweep(stop, **options_of(tmp_path / "out"))
         before = part.read_bytes()
         with pytest.raises(AppError):
-            run_sweep(options_of(tmp_path / "out", **changes), stop)
+            run_sweep(stop, **options_of(tmp_path / "out", **changes))
     assert part.read_bytes() == before
 
 
@@ -121,10 +119,10 @@ def test_another_version_of_a_scene_file_does_not_go_on(
     monkeypatch.setattr(sweep, "run_case", interrupted_after(2, []))
     with StopFlag() as stop:
         with pytest.raises(StopRequestedError):
-            run_sweep(options, stop)
+            run_sweep(stop, **options)
         scene.write_text(scene.read_text().replace("0.05", "0.06"))
         with pytest.raises(AppError):
-            run_sweep(options, stop)
+            run_sweep(stop, **options)
 
 
 COMMAND = {"seeds": "3", "scene file lab": "12ab"}
