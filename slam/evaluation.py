@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
-from slam.geometry import Mount, Rig, compose, transform, wrap_angle, wrap_angles
-from slam.paper.association import Association
-from slam.paper.pipeline import StepResult
+from slam.geometry import Mount, Rig, compose, has_moved, transform, wrap_angle, wrap_angles
+from slam.results import Association, StepResult
 
 Array = NDArray[np.float64]
 
@@ -414,11 +413,7 @@ def _distinct(poses: Array) -> Array:
     """Return the poses that differ from the one kept before them."""
     kept: list[Array] = []
     for pose in poses:
-        if (
-            not kept
-            or math.dist(kept[-1][:2], pose[:2]) >= DISTINCT_M
-            or abs(wrap_angle(pose[2] - kept[-1][2])) >= DISTINCT_RAD
-        ):
+        if not kept or has_moved(kept[-1], pose, DISTINCT_M, DISTINCT_RAD):
             kept.append(pose)
     return np.array(kept).reshape(-1, 3)
 

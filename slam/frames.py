@@ -10,6 +10,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.geometry import Rig
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RadarFrame:
@@ -117,6 +119,13 @@ class Detector(Protocol):
         The frames may be of several radars; those that agree in length are filtered together.
         """
         ...
+
+
+def detect_all(detector: Detector, frames: Sequence[RadarFrame], rig: Rig) -> tuple[Detection, ...]:
+    """Return the echoes of all frames of one scan, frame by frame."""
+    offsets_m = [rig.mounts[frame.radar].range_offset_m for frame in frames]
+    found = detector.detect_many(frames, offsets_m)
+    return tuple(detection for of_frame in found for detection in of_frame)
 
 
 def usable_samples(frame: RadarFrame) -> NDArray[np.bool_]:

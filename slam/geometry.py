@@ -65,6 +65,16 @@ def between(origin: Array, pose: Array) -> Array:
     )
 
 
+def has_moved(previous: Array, pose: Array, min_distance_m: float, min_turn_rad: float) -> bool:
+    """Tell whether two poses of shape (3,) differ by at least a distance or a turn.
+
+    The turn is wrapped, so a heading that passes pi is no motion.
+    """
+    distance_m = math.hypot(pose[0] - previous[0], pose[1] - previous[1])
+    turn_rad = abs(wrap_angle(pose[2] - previous[2]))
+    return distance_m >= min_distance_m or turn_rad >= min_turn_rad
+
+
 def transform(pose: Array, points: Array) -> Array:
     """Return points of the frame ``pose`` in the frame the pose is given in.
 

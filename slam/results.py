@@ -1,13 +1,176 @@
-"""What a SLAM pipeline reports of each step."""
+"""What a SLAM pipeline estimates and reports, and the protocol that every pipeline follows."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.config import SlamConfig
+from slam.frames import Detection, RadarFrame
+
 Array = NDArray[np.float64]
+
+POSE_SIZE = 3
+LANDMARK_SIZE = 2
+_NIS_DOF = 2
+
+PoseAt = Callable[[int], Array]
+"""Odometry pose at a session time [ns]: shape (3,), [x m, y m, heading rad], odometry frame."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fix:
+    """One trilaterated point, seen once.
+
+    Attributes
+    ----------
+    pair
+        Index into ``Rig.pairs()``.
+    t_ns
+        Session time of the pose in whose body frame the position is given; the two detections
+        keep their own times.
+    x_m, y_m
+        Position in that body frame.
+    detections
+        The two ranges it was made of, first and second radar of the pair.
+    """
+
+    pair: int
+    t_ns: int
+    x_m: float
+    y_m: float
+    detections: tuple[Detection, Detection]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Observation:
+    """A confirmed point, as the filter gets it: range and bearing from the base footprint.
+
+    Attributes
+    ----------
+    x_m, y_m
+        Position in the body frame of the window's first pose.
+    n_fixes, n_poses
+        How many fixes, from how many poses, the confirming cluster holds.
+    fixes
+        The fixes whose mean this is.
+    """
+
+    x_m: float
+    y_m: float
+    n_fixes: int
+    n_poses: int
+    fixes: tuple[Fix, ...]
+
+    @property
+    def range_m(self) -> float:
+        """Return the distance from the base footprint."""
+        return math.hypot(self.x_m, self.y_m)
+
+    @property
+    def bearing_rad(self) -> float:
+        """Return the direction from the base footprint, in [-pi, pi]."""
+        return math.atan2(self.y_m, self.x_m)
+
+
+def landmark_slice(row: int) -> slice:
+    """Return where one landmark lies in the state."""
+    begin = POSE_SIZE + LANDMARK_SIZE * row
+    return slice(begin, begin + LANDMARK_SIZE)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Belief:
+    """What the filter knows: a Gaussian over pose and landmarks.
+
+    Attributes
+    ----------
+    mean
+        shape (3 + 2 n,), [m, m, rad, m, m, ...], map frame; the heading lies in [-pi, pi).
+    covariance
+        shape (3 + 2 n, 3 + 2 n), symmetric.
+    landmark_ids
+        n ids in the order of the rows.
+    next_id
+        The id the next new landmark gets; ids are never used twice.
+    """
+
+    mean: Array
+    covariance: Array
+    landmark_ids: tuple[int, ...] = ()
+    next_id: int = 0
+
+    def __post_init__(self) -> None:
+        """Check that the shapes belong together and make the fields read-only views.
+
+        The arrays are not copied, a dense map's covariance is large: who hands them over may
+        still write to them, and must not.
+        """
+        size = POSE_SIZE + LANDMARK_SIZE * len(self.landmark_ids)
+        if self.mean.shape != (size,) or self.covariance.shape != (size, size):
+            raise ValueError(
+                f"{len(self.landmark_ids)} landmarks need mean ({size},) and covariance "
+                f"({size}, {size}), got {self.mean.shape} and {self.covariance.shape}"
+            )
+        for name, array in (("mean", self.mean), ("covariance", self.covariance)):
+            view = array.view()
+            view.setflags(write=False)
+            object.__setattr__(self, name, view)
+
+    @property
+    def pose(self) -> Array:
+        """Return the pose, shape (3,), [x m, y m, heading rad], map frame."""
+        return self.mean[:POSE_SIZE]
+
+    @property
+    def pose_covariance(self) -> Array:
+        """Return the covariance of the pose, shape (3, 3)."""
+        return self.covariance[:POSE_SIZE, :POSE_SIZE]
+
+    @property
+    def landmarks(self) -> Array:
+        """Return the landmarks' positions, shape (n, 2) [m], map frame, in row order."""
+        return self.mean[POSE_SIZE:].reshape(-1, LANDMARK_SIZE)
+
+    def landmark_covariance(self, row: int) -> Array:
+        """Return the covariance of one landmark's position, shape (2, 2) [m^2]."""
+        block = landmark_slice(row)
+        return self.covariance[block, block]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Association:
+    """What became of one observation.
+
+    Attributes
+    ----------
+    landmark_id
+        The landmark it updated, or the one born from it.
+    is_new
+        True if the landmark was born from this observation.
+    mahalanobis_sq
+        shape (n,): squared distance to every landmark of the map before this observation, before
+        any gate; inf for one under the robot's own position. Two degrees of freedom.
+    candidate_ids
+        n landmark ids belonging to ``mahalanobis_sq``.
+    """
+
+    landmark_id: int
+    is_new: bool
+    mahalanobis_sq: Array
+    candidate_ids: tuple[int, ...]
+
+    @property
+    def nis(self) -> float | None:
+        """Return the normalised innovation squared (2 dof), None for a new landmark."""
+        if self.is_new:
+            return None
+        return float(self.mahalanobis_sq[self.candidate_ids.index(self.landmark_id)])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -105,3 +268,78 @@ class UpdateReport:
     carried: bool = False
     lost: bool = False
     relocated: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StepResult:
+    """One estimated state, everything that led to it included.
+
+    Attributes
+    ----------
+    t_ns
+        Session time of the state; under the paper's window - 1 states before the newest one.
+    odometry_pose
+        shape (3,), what odometry said there, odometry frame.
+    belief
+        Pose and landmarks after this state's observations, map frame.
+    detections, fixes
+        Ranges and trilaterated points of this state.
+    observations, associations
+        What the outlier filter let through, and what became of each.
+    rejected
+        Fixes of this state that no cluster confirmed.
+    report
+        What the robust back end made of the detections; it has no fixes nor observations.
+    range_sigmas_m
+        Standard deviation of every detection as the robust back end was told it; infinite for one
+        that it was not given.
+    """
+
+    t_ns: int
+    odometry_pose: Array
+    belief: Belief
+    detections: tuple[Detection, ...]
+    fixes: tuple[Fix, ...] = ()
+    observations: tuple[Observation, ...] = ()
+    associations: tuple[Association, ...] = ()
+    rejected: tuple[Fix, ...] = ()
+    report: UpdateReport | None = None
+    range_sigmas_m: tuple[float, ...] = ()
+
+    @property
+    def nis(self) -> tuple[float, ...]:
+        """Return the normalised innovation squared (2 dof) of each landmark seen again."""
+        return tuple(a.nis for a in self.associations if a.nis is not None)
+
+    @property
+    def nis_per_dof(self) -> tuple[float, ...]:
+        """Return the same over its degrees of freedom; of a report, that of all ranges together."""
+        if self.report is not None:
+            return (self.report.nis / self.report.dof,) if self.report.dof else ()
+        return tuple(nis / _NIS_DOF for nis in self.nis)
+
+
+class Slam(Protocol):
+    """What runs a session: the paper's pipeline or the robust one."""
+
+    config: SlamConfig
+
+    def step(
+        self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
+    ) -> tuple[StepResult, ...]:
+        """Take in what sensors say around one time; return the states that became ready."""
+        ...
+
+    def step_detections(
+        self, detections: Sequence[Detection], pose_at: PoseAt, t_ns: int
+    ) -> tuple[StepResult, ...]:
+        """Do what ``step`` does, from ranges that some other front end found."""
+        ...
+
+    def flush(self) -> tuple[StepResult, ...]:
+        """Return the states still held back at the end of a run."""
+        ...
+
+    def wall_spans_m(self) -> Array:
+        """Return the ends of the stretches of wall that answered, (k, 2, 2) [m], map frame."""
+        ...

@@ -13,20 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
-from slam.config import BackgroundFilter, DetectionConfig, FrontEnd, PeakPosition, SlamConfig
-from slam.frames import Detection, Detector, RadarFrame
-from slam.front_end.matched_filter import MatchedFilterDetector
-
-__all__ = ["Detection", "Detector", "PaperDetector", "SavitzkyGolay", "make_detector"]
+from slam.config import BackgroundFilter, DetectionConfig, PeakPosition
+from slam.frames import Detection, RadarFrame
 
 Array = NDArray[np.float64]
-
-
-def make_detector(config: SlamConfig) -> Detector:
-    """Return the front end that ``config`` names."""
-    if config.detection.front_end is FrontEnd.PAPER:
-        return PaperDetector(config.detection)
-    return MatchedFilterDetector(config)
 
 
 class PaperDetector:

@@ -3,55 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from slam.config import Assignment, AssociationConfig
-from slam.paper.ekf import (
-    LANDMARK_SIZE,
-    POSE_SIZE,
-    Belief,
-    augment,
-    expected_observations,
-    innovation,
-    observation_jacobians,
-    update,
-)
+from slam.paper.ekf import augment, expected_observations, innovation, observation_jacobians, update
+from slam.results import LANDMARK_SIZE, POSE_SIZE, Association, Belief
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Association:
-    """What became of one observation.
-
-    Attributes
-    ----------
-    landmark_id
-        The landmark it updated, or the one born from it.
-    is_new
-        True if the landmark was born from this observation.
-    mahalanobis_sq
-        shape (n,): squared distance to every landmark of the map before this observation, before
-        any gate; inf for one under the robot's own position. Two degrees of freedom.
-    candidate_ids
-        n landmark ids belonging to ``mahalanobis_sq``.
-    """
-
-    landmark_id: int
-    is_new: bool
-    mahalanobis_sq: Array
-    candidate_ids: tuple[int, ...]
-
-    @property
-    def nis(self) -> float | None:
-        """Return the normalised innovation squared (2 dof), None for a new landmark."""
-        if self.is_new:
-            return None
-        return float(self.mahalanobis_sq[self.candidate_ids.index(self.landmark_id)])
 
 
 def mahalanobis_sq(belief: Belief, observed: Array, Q: Array) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from slam.config import ClusterCount, ClusteringConfig, Emission, Evidence, WindowConfig
+from slam.config import ClusterCount, ClusteringConfig, Emission, Evidence
 from slam.frames import Detection
-from slam.geometry import between, transform, wrap_angle
-from slam.paper.trilateration import Fix
+from slam.geometry import between, transform
+from slam.results import Fix, Observation
 
 Array = NDArray[np.float64]
 
@@ -40,48 +39,7 @@ class CollectedState:
     fixes: tuple[Fix, ...]
 
 
-def has_moved(previous: Array, pose: Array, config: WindowConfig) -> bool:
-    """Tell whether a pose is far enough from the last collected one, by distance or by turn.
-
-    Both poses have shape (3,). The turn is wrapped, so a heading that passes pi is no motion.
-    """
-    distance_m = math.hypot(pose[0] - previous[0], pose[1] - previous[1])
-    turn_rad = abs(wrap_angle(pose[2] - previous[2]))
-    return distance_m >= config.min_distance_m or turn_rad >= config.min_turn_rad
-
-
 NOISE = -1
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Observation:
-    """A confirmed point, as the filter gets it: range and bearing from the base footprint.
-
-    Attributes
-    ----------
-    x_m, y_m
-        Position in the body frame of the window's first pose.
-    n_fixes, n_poses
-        How many fixes, from how many poses, the confirming cluster holds.
-    fixes
-        The fixes whose mean this is.
-    """
-
-    x_m: float
-    y_m: float
-    n_fixes: int
-    n_poses: int
-    fixes: tuple[Fix, ...]
-
-    @property
-    def range_m(self) -> float:
-        """Return the distance from the base footprint."""
-        return math.hypot(self.x_m, self.y_m)
-
-    @property
-    def bearing_rad(self) -> float:
-        """Return the direction from the base footprint, in [-pi, pi]."""
-        return math.atan2(self.y_m, self.x_m)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,88 +10,20 @@ with it for good.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.config import MotionConfig, MotionNoise
 from slam.geometry import compose, wrap_angle, wrap_angles
+from slam.results import LANDMARK_SIZE, POSE_SIZE, Belief, landmark_slice
 
 Array = NDArray[np.float64]
-
-POSE_SIZE = 3
-LANDMARK_SIZE = 2
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Belief:
-    """What the filter knows: a Gaussian over pose and landmarks.
-
-    Attributes
-    ----------
-    mean
-        shape (3 + 2 n,), [m, m, rad, m, m, ...], map frame; the heading lies in [-pi, pi).
-    covariance
-        shape (3 + 2 n, 3 + 2 n), symmetric.
-    landmark_ids
-        n ids in the order of the rows.
-    next_id
-        The id the next new landmark gets; ids are never used twice.
-    """
-
-    mean: Array
-    covariance: Array
-    landmark_ids: tuple[int, ...] = ()
-    next_id: int = 0
-
-    def __post_init__(self) -> None:
-        """Check that the shapes belong together and make the fields read-only views.
-
-        The arrays are not copied, a dense map's covariance is large: who hands them over may
-        still write to them, and must not.
-        """
-        size = POSE_SIZE + LANDMARK_SIZE * len(self.landmark_ids)
-        if self.mean.shape != (size,) or self.covariance.shape != (size, size):
-            raise ValueError(
-                f"{len(self.landmark_ids)} landmarks need mean ({size},) and covariance "
-                f"({size}, {size}), got {self.mean.shape} and {self.covariance.shape}"
-            )
-        for name, array in (("mean", self.mean), ("covariance", self.covariance)):
-            view = array.view()
-            view.setflags(write=False)
-            object.__setattr__(self, name, view)
-
-    @property
-    def pose(self) -> Array:
-        """Return the pose, shape (3,), [x m, y m, heading rad], map frame."""
-        return self.mean[:POSE_SIZE]
-
-    @property
-    def pose_covariance(self) -> Array:
-        """Return the covariance of the pose, shape (3, 3)."""
-        return self.covariance[:POSE_SIZE, :POSE_SIZE]
-
-    @property
-    def landmarks(self) -> Array:
-        """Return the landmarks' positions, shape (n, 2) [m], map frame, in row order."""
-        return self.mean[POSE_SIZE:].reshape(-1, LANDMARK_SIZE)
-
-    def landmark_covariance(self, row: int) -> Array:
-        """Return the covariance of one landmark's position, shape (2, 2) [m^2]."""
-        block = landmark_slice(row)
-        return self.covariance[block, block]
 
 
 def start() -> Belief:
     """Return the belief before any motion: at the origin of the map, certain, no landmarks."""
     return Belief(mean=np.zeros(POSE_SIZE), covariance=np.zeros((POSE_SIZE, POSE_SIZE)))
-
-
-def landmark_slice(row: int) -> slice:
-    """Return where one landmark lies in the state."""
-    begin = POSE_SIZE + LANDMARK_SIZE * row
-    return slice(begin, begin + LANDMARK_SIZE)
 
 
 def motion_noise(increment: Array, heading_rad: float, config: MotionConfig) -> Array:

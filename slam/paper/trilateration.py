@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
@@ -18,6 +17,7 @@ from scipy.optimize import linear_sum_assignment
 from slam.config import Pairing, TrilaterationConfig
 from slam.frames import Detection
 from slam.geometry import RadarPair, Rig, mount_at, pair_of
+from slam.results import Fix
 
 Array = NDArray[np.float64]
 
@@ -30,30 +30,6 @@ _AMPLITUDES = (1e-12, 1e12)
 NO_MOTIONS: Mapping[int, Array] = MappingProxyType({})
 """All radars sampled at one time, or are taken to have."""
 _STANDING: Array = np.zeros(3)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Fix:
-    """One trilaterated point, seen once.
-
-    Attributes
-    ----------
-    pair
-        Index into ``Rig.pairs()``.
-    t_ns
-        Session time of the pose in whose body frame the position is given; the two detections
-        keep their own times.
-    x_m, y_m
-        Position in that body frame.
-    detections
-        The two ranges it was made of, first and second radar of the pair.
-    """
-
-    pair: int
-    t_ns: int
-    x_m: float
-    y_m: float
-    detections: tuple[Detection, Detection]
 
 
 def bilaterate(

@@ -5,45 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config import BackEnd, SlamConfig
-from slam.frames import Detection, Detector, RadarFrame
-from slam.front_end.paper import make_detector
-from slam.geometry import Rig, between
-from slam.paper.clustering import has_moved
-from slam.paper.ekf import Belief
-from slam.paper.pipeline import PoseAt, Slam, StepResult, UwbRadarSlam
+from slam.config import SlamConfig
+from slam.frames import Detection, Detector, RadarFrame, detect_all
+from slam.front_end import make_detector
+from slam.geometry import Rig, between, has_moved
+from slam.results import Belief, PoseAt, StepResult
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.parameters import BackEndParameters, RangeNoise, WheelNoise
 from slam.robust.ranges import RangeScan
 from slam.robust.state import quarter_turn
 
 Array = NDArray[np.float64]
-
-
-def make_slam(
-    config: SlamConfig, rig: Rig, wheels: WheelNoise, detector: Detector | None = None
-) -> Slam:
-    """Return the pipeline that a configuration names.
-
-    Parameters
-    ----------
-    config
-        ``back_end`` decides.
-    rig
-        Where the radars sit.
-    wheels
-        How the robot's odometry errs, as its specification says; preset ``paper`` has numbers of
-        its own.
-    detector
-        The front end, if not the one that the configuration names.
-    """
-    if config.back_end is BackEnd.ROBUST:
-        return RobustSlam(config, rig, wheels, detector)
-    return UwbRadarSlam(config, rig, detector)
 
 
 class RobustSlam:
@@ -90,7 +67,8 @@ class RobustSlam:
             Session time of the state.
         """
         stamps_ns = {frame.radar: frame.t_ns for frame in frames}
-        return self._take(lambda: self._detect(frames), stamps_ns, pose_at, t_ns)
+        detect = partial(detect_all, self._detector, frames, self.rig)
+        return self._take(detect, stamps_ns, pose_at, t_ns)
 
     def step_detections(
         self, detections: Sequence[Detection], pose_at: PoseAt, t_ns: int
@@ -127,7 +105,8 @@ class RobustSlam:
             self._pose = pose
             return ()
         # What is seen again from one place is no new evidence: clutter and aspect stay the same.
-        if not has_moved(self._pose, pose, self.config.window):
+        window = self.config.window
+        if not has_moved(self._pose, pose, window.min_distance_m, window.min_turn_rad):
             return ()
         detections = detect()
         sigmas_m = tuple(self._sigma_m(detection) for detection in detections)
@@ -192,11 +171,6 @@ class RobustSlam:
             )
             for radar, motion in moved.items()
         ]
-
-    def _detect(self, frames: Sequence[RadarFrame]) -> tuple[Detection, ...]:
-        offsets_m = [self.rig.mounts[frame.radar].range_offset_m for frame in frames]
-        found = self._detector.detect_many(frames, offsets_m)
-        return tuple(detection for of_frame in found for detection in of_frame)
 
 
 def back_end_parameters(config: SlamConfig, wheels: WheelNoise) -> BackEndParameters:

@@ -23,7 +23,7 @@ from slam.config import Assignment, AssociationConfig
 from slam.geometry import compose
 from slam.paper import ekf as ekf_slam
 from slam.paper.association import mahalanobis_sq, update_map
-from slam.paper.ekf import Belief
+from slam.results import Belief, landmark_slice
 
 
 @pytest.mark.slow
@@ -140,7 +140,7 @@ def test_turning_the_world_turns_the_estimate_and_keeps_the_innovations(
         T = np.eye(len(b.mean))
         T[:2, :2] = rotation
         for row in range(n):
-            block = ekf_slam.landmark_slice(row)
+            block = landmark_slice(row)
             T[block, block] = rotation
         return Belief(
             mean=np.concatenate(

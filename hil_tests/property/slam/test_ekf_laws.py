@@ -30,7 +30,7 @@ from hil_tests.property.ekf_oracles import (
     turn_between,
 )
 from slam.paper import ekf as ekf_slam
-from slam.paper.ekf import Belief
+from slam.results import Belief, landmark_slice
 
 Check = Callable[..., None]
 
@@ -62,7 +62,7 @@ def check_observation_jacobians(filter_: Filter, law: settings = thorough) -> No
         for row in range(len(belief.landmark_ids)):
             H = observation_matrix(belief, row)
             assert np.abs(H_pose[row] - H[:, :3]).max() <= 1e-10
-            assert np.abs(H_landmark[row] - H[:, ekf_slam.landmark_slice(row)]).max() <= 1e-10
+            assert np.abs(H_landmark[row] - H[:, landmark_slice(row)]).max() <= 1e-10
             assert H_pose[row, 1, 2] == -1.0
 
     jacobians()

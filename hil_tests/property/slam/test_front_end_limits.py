@@ -9,7 +9,7 @@ from scipy.stats import ncx2
 
 from slam.config import SlamConfig, override
 from slam.frames import RadarFrame
-from slam.front_end.paper import make_detector
+from slam.front_end import make_detector
 
 Array = NDArray[np.float64]
 

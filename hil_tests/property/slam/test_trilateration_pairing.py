@@ -20,7 +20,8 @@ from hil_tests.property.trilateration_oracles import (
 from slam.config import Pairing, TrilaterationConfig
 from slam.frames import Detection
 from slam.geometry import Rig, paper_rig
-from slam.paper.trilateration import Fix, Trilaterator
+from slam.paper.trilateration import Trilaterator
+from slam.results import Fix
 
 
 def echoes(rig: Rig, targets: Sequence[Array]) -> list[Detection]:

@@ -5,10 +5,8 @@ import pytest
 from numpy.typing import NDArray
 
 from slam.evaluation import TrueAssociationNis
-from slam.paper.association import Association
-from slam.paper.clustering import Observation
 from slam.paper.ekf import start
-from slam.paper.pipeline import StepResult
+from slam.results import Association, Observation, StepResult
 
 Array = NDArray[np.float64]
 TRUE = np.array([[0.0, 1.0], [0.0, -1.0]])

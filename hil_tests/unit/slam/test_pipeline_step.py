@@ -19,7 +19,8 @@ from slam.config import (
 )
 from slam.frames import Detection, RadarFrame
 from slam.geometry import Mount, Rig, paper_rig
-from slam.paper.pipeline import StepResult, UwbRadarSlam
+from slam.paper.pipeline import UwbRadarSlam
+from slam.results import StepResult
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,7 @@ import pytest
 from slam.evaluation import ECHO_LENGTH_M, true_range_nis
 from slam.frames import Detection
 from slam.paper.ekf import start
-from slam.paper.pipeline import StepResult
-from slam.results import ExpectedRange, UpdateReport
+from slam.results import ExpectedRange, StepResult, UpdateReport
 
 POSE = np.array([1.0, 2.0, math.pi / 2])
 """Body x is world y."""

@@ -38,7 +38,7 @@ from slam.app.session.messages import settings_text
 from slam.app.view.viewer import LiveView
 from slam.config import ConfigError, load_preset
 from slam.geometry import Rig
-from slam.robust.pipeline import make_slam
+from slam.pipelines import make_slam
 
 
 class LoggingListener(SessionObserver):

@@ -45,9 +45,8 @@ from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, TRUTH, labe
 from slam.app.run.runner import RunRecord, run_slam
 from slam.config import SlamConfig
 from slam.geometry import transform
-from slam.paper.clustering import Observation
-from slam.paper.pipeline import StepResult, UwbRadarSlam
-from slam.paper.trilateration import Fix
+from slam.paper.pipeline import UwbRadarSlam
+from slam.results import Fix, Observation, StepResult
 
 Array = NDArray[np.float64]
 

@@ -31,9 +31,9 @@ from slam.app.session.messages import state_row
 from slam.app.session.reader import RecordedSession, open_session
 from slam.config import ConfigError, SlamConfig, without_removed_keys
 from slam.frames import Detection, RadarFrame
-from slam.paper.pipeline import PoseAt, Slam, StepResult
+from slam.pipelines import make_slam
+from slam.results import PoseAt, Slam, StepResult
 from slam.robust.parameters import WheelNoise
-from slam.robust.pipeline import make_slam
 
 
 class RecordedSlam:

@@ -13,7 +13,8 @@ from slam.config import EndOfRun, SampleTime, SlamConfig, WindowConfig, load_pre
 from slam.evaluation import ate_rmse_m
 from slam.frames import Detection, RadarFrame
 from slam.geometry import paper_rig
-from slam.paper.pipeline import StepResult, UwbRadarSlam
+from slam.paper.pipeline import UwbRadarSlam
+from slam.results import StepResult
 
 Array = NDArray[np.float64]
 

@@ -13,10 +13,11 @@ from slam.config import RobustConfig, SlamConfig, load_preset, override
 from slam.evaluation import nees_pose
 from slam.frames import Detection, RadarFrame
 from slam.geometry import between, compose, paper_rig, transform
-from slam.paper.ekf import Belief
-from slam.paper.pipeline import PoseAt, UwbRadarSlam
+from slam.paper.pipeline import UwbRadarSlam
+from slam.pipelines import make_slam
+from slam.results import Belief, PoseAt
 from slam.robust.parameters import WheelNoise
-from slam.robust.pipeline import RobustSlam, back_end_parameters, belief_of, make_slam
+from slam.robust.pipeline import RobustSlam, back_end_parameters, belief_of
 
 Array = NDArray[np.float64]
 

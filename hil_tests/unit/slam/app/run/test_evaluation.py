@@ -8,10 +8,7 @@ import pytest
 from slam.app.run.evaluation import NEES_AT, Summary, summarise
 from slam.app.run.runner import RunRecord
 from slam.geometry import Mount, Rig
-from slam.paper.association import Association
-from slam.paper.clustering import Observation
-from slam.paper.ekf import Belief
-from slam.paper.pipeline import StepResult
+from slam.results import Association, Belief, Observation, StepResult
 
 N = 201
 PERIOD_NS = 200_000_000

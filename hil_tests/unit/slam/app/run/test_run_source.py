@@ -28,7 +28,7 @@ from slam.app.run.live_source import FrameCame, LiveSource, OdometryLine, RadarB
 from slam.app.run.runner import RunRecord, run_slam
 from slam.config import load_preset
 from slam.evaluation import ate_rmse_m
-from slam.robust.pipeline import make_slam
+from slam.pipelines import make_slam
 from xethru_protocol.wire.x4 import frame_time_ns
 
 PPM = (80.0, -50.0, 5.0, -120.0)

@@ -14,8 +14,8 @@ from slam.app.odometry.tum import TumSample
 from slam.app.records import Scan, SessionObserver, Snapshot
 from slam.app.run.runner import nobody_knows, run_slam
 from slam.frames import RadarFrame
-from slam.paper.ekf import Belief
-from slam.paper.pipeline import PoseAt, StepResult, UwbRadarSlam
+from slam.paper.pipeline import UwbRadarSlam
+from slam.results import Belief, PoseAt, StepResult
 
 COUNTERS = (5, 6, 8, 11, 12)
 LAG = 2

@@ -12,8 +12,7 @@ import pytest
 from emulator.scene.scene import ObjectSpec, Scene, TargetSpec, WallSpec, empty_room
 from slam.app.run.runner import RunRecord
 from slam.app.sweep.run import distance_m, false_landmarks
-from slam.paper.ekf import Belief
-from slam.paper.pipeline import StepResult
+from slam.results import Belief, StepResult
 
 ROOM: Scene = empty_room().model_copy(
     update={

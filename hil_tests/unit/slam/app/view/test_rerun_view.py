@@ -16,11 +16,8 @@ from slam.app.view.panels import RerunView
 from slam.app.view.rerun_recording import count_rows
 from slam.frames import Detection
 from slam.geometry import compose, transform
-from slam.paper.clustering import Observation
 from slam.paper.ekf import start
-from slam.paper.pipeline import StepResult
-from slam.paper.trilateration import Fix
-from slam.results import UpdateReport
+from slam.results import Fix, Observation, StepResult, UpdateReport
 
 N_SCANS = 150  # more than a block, and not a multiple of it
 
