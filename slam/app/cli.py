@@ -7,67 +7,16 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import math
 import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from slam.app.commands.options import add_rerun, count, folder, seconds, seed
 from slam.app.errors import EXIT_FAILED, AppError, StopFlag, StopRequestedError, naming
 from slam.app.experiments import EXPERIMENTS, Experiment, ExperimentModule
 from slam.app.sweep.stress import STRESSES
-from slam.app.view import CONNECT, DEFAULT_VIEWER_URL, SERVE_WEB, SPAWN
 from xethru_protocol.system import drop_what_cannot_be_said, open_closed_streams
-
-
-def folder(text: str) -> Path:
-    """Return a folder to write into; its name must be UTF-8, Rerun's writer takes no other."""
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        raise argparse.ArgumentTypeError(f"must be a UTF-8 name, not {text!r}") from None
-    return Path(text)
-
-
-def seed(text: str) -> int:
-    """Return the seed of a random generator: a whole number, 0 or more."""
-    return _whole_number(text, least=0)
-
-
-def count(text: str) -> int:
-    """Return how many of something: a whole number, 1 or more."""
-    return _whole_number(text, least=1)
-
-
-def _whole_number(text: str, *, least: int) -> int:
-    if not text.isascii() or not text.isdigit() or not least <= int(text) < 2**63:
-        raise argparse.ArgumentTypeError(f"must be a whole number, {least} or more, not {text!r}")
-    return int(text)
-
-
-def rerun_target(text: str) -> str:
-    """Return `spawn`, `serve-web`, or the address of a viewer."""
-    if text in {SPAWN, SERVE_WEB}:
-        return text
-    if text == CONNECT:
-        return DEFAULT_VIEWER_URL
-    if text.startswith(("rerun+http://", "rerun+https://")) and text.endswith("/proxy"):
-        return text
-    raise argparse.ArgumentTypeError(
-        f"must be {SPAWN}, {CONNECT}, {SERVE_WEB}, or an address like {DEFAULT_VIEWER_URL}, "
-        f"not {text!r}"
-    )
-
-
-def add_rerun(parser: argparse.ArgumentParser) -> None:
-    """Add `--rerun`: watch a run while it happens."""
-    parser.add_argument(
-        "--rerun",
-        type=rerun_target,
-        metavar="WHERE",
-        help="watch live: spawn (a window), serve-web (a page for a browser), connect (a viewer "
-        f"at {DEFAULT_VIEWER_URL}), or the address of another viewer",
-    )
 
 
 def add_view(parser: argparse.ArgumentParser) -> None:
@@ -83,7 +32,7 @@ def add_view(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--at",
-        type=_seconds,
+        type=seconds,
         metavar="S",
         help="when the screenshot is taken, since the first scan (default: the end)",
     )
@@ -97,16 +46,6 @@ def add_report(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=folder, metavar="FILE.html", help="(default: report.html beside the session)"
     )
-
-
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value >= 0.0):
-        raise argparse.ArgumentTypeError(f"must be seconds, 0 or more, not {text!r}")
-    return value
 
 
 CSV_TO_TUM = (

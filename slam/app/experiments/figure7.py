@@ -17,7 +17,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from numpy.typing import NDArray
 
 from emulator.scene.scene import PathSpec, RadarSpec, Scene, TargetSpec, load_scene
-from slam.app.cli import count, seed
+from slam.app.commands.options import count, seed
 from slam.app.errors import StopFlag
 from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, open_loopback
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label, picture

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from slam.app.cli import count, seed
+from slam.app.commands.options import count, seed
 from slam.app.errors import StopFlag
 from slam.app.experiments.limit_cells import (
     BIN_LENGTH_M,

@@ -43,7 +43,7 @@ from emulator.echo.pulse import CARRIER_CYCLES_PER_SAMPLE, SIGMA_S
 from emulator.loopback import LoopbackTransport
 from emulator.module.memory import Identity
 from emulator.scene.scene import ClutterSpec, JitterSpec, NoiseSpec, RadarSpec, Scene, TargetSpec
-from slam.app.cli import count, seed
+from slam.app.commands.options import count, seed
 from slam.app.errors import AppError, StopFlag
 from slam.app.run.pictures import ESTIMATE, INK, ODOMETRY, TRUTH, label, picture
 from xethru_protocol.driver.link import RawConfig

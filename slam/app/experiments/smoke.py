@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from emulator.scene.scene import Scene
 from emulator.scene.wheels import scene_odometry
-from slam.app.cli import seed
+from slam.app.commands.options import seed
 from slam.app.errors import StopFlag
 from slam.app.odometry.track import OdometryTrack
 from slam.app.rig.emulated import (

@@ -22,7 +22,7 @@ import scipy
 from scipy.linalg.blas import dsyr2, dsyrk
 from threadpoolctl import threadpool_limits
 
-from slam.app.cli import count
+from slam.app.commands.options import count
 from slam.app.errors import StopFlag, UsageError
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label, picture
 from slam.geometry import paper_rig

@@ -28,7 +28,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from slam.app.cli import count
+from slam.app.commands.options import count
 from slam.app.errors import AppError, StopFlag
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, TRUTH, label, picture
 from slam.app.sweep.bound import load_gtsam

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hil_tests.property.slam.test_detection import N_BINS, frame, pulse
+from hil_tests.property.slam.front_end.test_detection import N_BINS, frame, pulse
 from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.pose_tracks import at_rest
 from hil_tests.unit.slam.simulation import FRAME_NS, LAB, World, integrate, simulate

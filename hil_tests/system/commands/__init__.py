@@ -1,0 +1,1 @@
+"""Other commands from end to end."""

@@ -1,0 +1,1 @@
+"""The emulator as a process at its ports."""

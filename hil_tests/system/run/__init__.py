@@ -1,0 +1,1 @@
+"""Whole runs: demo and run."""
