@@ -47,7 +47,6 @@ class RadarFrame:
     limits: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse anything that is not one real-valued frame."""
         if self.samples.ndim != 1 or self.samples.dtype != np.float32:
             raise ValueError(
                 f"a radar frame is one row of float32 samples, not shape {self.samples.shape} "
@@ -116,13 +115,12 @@ class Detector(Protocol):
     ) -> list[tuple[Detection, ...]]:
         """Return what ``detect`` returns, for each frame with its range offset.
 
-        The frames may be of several radars; those that agree in length are filtered together.
+        The frames may be of several radars.
         """
         ...
 
 
 def detect_all(detector: Detector, frames: Sequence[RadarFrame], rig: Rig) -> tuple[Detection, ...]:
-    """Return the echoes of all frames of one scan, frame by frame."""
     offsets_m = [rig.mounts[frame.radar].range_offset_m for frame in frames]
     found = detector.detect_many(frames, offsets_m)
     return tuple(detection for of_frame in found for detection in of_frame)

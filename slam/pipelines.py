@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from slam.config import BackEnd, SlamConfig
+from slam.config import BackEnd, SlamConfig, WheelNoise
 from slam.frames import Detector
 from slam.geometry import Rig
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import Slam
-from slam.robust.parameters import WheelNoise
 from slam.robust.pipeline import RobustSlam
 
 

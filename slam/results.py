@@ -69,17 +69,14 @@ class Observation:
 
     @property
     def range_m(self) -> float:
-        """Return the distance from the base footprint."""
         return math.hypot(self.x_m, self.y_m)
 
     @property
     def bearing_rad(self) -> float:
-        """Return the direction from the base footprint, in [-pi, pi]."""
         return math.atan2(self.y_m, self.x_m)
 
 
 def landmark_slice(row: int) -> slice:
-    """Return where one landmark lies in the state."""
     begin = POSE_SIZE + LANDMARK_SIZE * row
     return slice(begin, begin + LANDMARK_SIZE)
 
@@ -106,10 +103,10 @@ class Belief:
     next_id: int = 0
 
     def __post_init__(self) -> None:
-        """Check that the shapes belong together and make the fields read-only views.
+        """Check the shapes and make the fields read-only views.
 
-        The arrays are not copied, a dense map's covariance is large: who hands them over may
-        still write to them, and must not.
+        The arrays are not copied, a dense map's covariance is large: whoever passes them must not
+        write to them any more.
         """
         size = POSE_SIZE + LANDMARK_SIZE * len(self.landmark_ids)
         if self.mean.shape != (size,) or self.covariance.shape != (size, size):
@@ -124,12 +121,11 @@ class Belief:
 
     @property
     def pose(self) -> Array:
-        """Return the pose, shape (3,), [x m, y m, heading rad], map frame."""
+        """Return [x m, y m, heading rad], map frame, shape (3,)."""
         return self.mean[:POSE_SIZE]
 
     @property
     def pose_covariance(self) -> Array:
-        """Return the covariance of the pose, shape (3, 3)."""
         return self.covariance[:POSE_SIZE, :POSE_SIZE]
 
     @property
@@ -138,7 +134,6 @@ class Belief:
         return self.mean[POSE_SIZE:].reshape(-1, LANDMARK_SIZE)
 
     def landmark_covariance(self, row: int) -> Array:
-        """Return the covariance of one landmark's position, shape (2, 2) [m^2]."""
         block = landmark_slice(row)
         return self.covariance[block, block]
 
@@ -207,7 +202,7 @@ class MapWall:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ExpectedRange:
+class PredictedRange:
     """A range that could have continued a track, as predicted before any was looked at.
 
     Attributes
@@ -238,7 +233,7 @@ class UpdateReport:
     ----------
     continued
         (radar, index of the range in its scan, landmark id).
-    born, seen_again
+    initialised, seen_again
         Ids of landmarks that tracklets made, or were recognised as.
     merged
         (kept, gone) ids.
@@ -249,22 +244,22 @@ class UpdateReport:
         and its degrees of freedom.
     relinearised
         Whether all poses were solved for.
-    expected
+    predicted
         Every range of a landmark, not of walls, that took part, measured or not.
     carried, lost, relocated
-        Whether it was found now that the robot was carried away; whether its place on the map is
-        unknown, so that pose and covariance say nothing but that; whether it was found again now.
+        Whether a kidnapping was detected now; whether the place on the map is unknown, so that pose
+        and covariance say nothing but that; whether the place was found again now.
     """
 
     continued: tuple[tuple[int, int, int], ...]
-    born: tuple[int, ...]
+    initialised: tuple[int, ...]
     seen_again: tuple[int, ...]
     merged: tuple[tuple[int, int], ...]
     deleted: tuple[int, ...]
     nis: float
     dof: int
     relinearised: bool
-    expected: tuple[ExpectedRange, ...] = ()
+    predicted: tuple[PredictedRange, ...] = ()
     carried: bool = False
     lost: bool = False
     relocated: bool = False
@@ -272,27 +267,26 @@ class UpdateReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StepResult:
-    """One estimated state, everything that led to it included.
+    """One estimated state, and all that led to it.
 
     Attributes
     ----------
     t_ns
         Session time of the state; under the paper's window - 1 states before the newest one.
     odometry_pose
-        shape (3,), what odometry said there, odometry frame.
+        shape (3,), odometry frame.
     belief
         Pose and landmarks after this state's observations, map frame.
     detections, fixes
         Ranges and trilaterated points of this state.
     observations, associations
-        What the outlier filter let through, and what became of each.
+        Points that passed the outlier filter, and what became of each.
     rejected
         Fixes of this state that no cluster confirmed.
     report
-        What the robust back end made of the detections; it has no fixes nor observations.
+        Of the robust back end, which has no fixes nor observations.
     range_sigmas_m
-        Standard deviation of every detection as the robust back end was told it; infinite for one
-        that it was not given.
+        Standard deviation of every detection in the robust back end; infinite for one left out.
     """
 
     t_ns: int
@@ -313,21 +307,21 @@ class StepResult:
 
     @property
     def nis_per_dof(self) -> tuple[float, ...]:
-        """Return the same over its degrees of freedom; of a report, that of all ranges together."""
+        """Return the same over its dof; of a report, that of all ranges together."""
         if self.report is not None:
             return (self.report.nis / self.report.dof,) if self.report.dof else ()
         return tuple(nis / _NIS_DOF for nis in self.nis)
 
 
 class Slam(Protocol):
-    """What runs a session: the paper's pipeline or the robust one."""
+    """The paper's pipeline or the robust one."""
 
     config: SlamConfig
 
     def step(
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
-        """Take in what sensors say around one time; return the states that became ready."""
+        """Take in the frames and odometry around one time; return the states now ready."""
         ...
 
     def step_detections(
@@ -341,5 +335,5 @@ class Slam(Protocol):
         ...
 
     def wall_spans_m(self) -> Array:
-        """Return the ends of the stretches of wall that answered, (k, 2, 2) [m], map frame."""
+        """Return the ends of the reported stretches of wall, (k, 2, 2) [m], map frame."""
         ...

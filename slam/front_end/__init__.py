@@ -9,7 +9,6 @@ from slam.front_end.paper import PaperDetector
 
 
 def make_detector(config: SlamConfig) -> Detector:
-    """Return the front end that ``config`` names."""
     if config.detection.front_end is FrontEnd.PAPER:
         return PaperDetector(config.detection)
     return MatchedFilterDetector(config)

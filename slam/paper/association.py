@@ -16,24 +16,11 @@ Array = NDArray[np.float64]
 
 
 def mahalanobis_sq(belief: Belief, observed: Array, Q: Array) -> Array:
-    """Return nu^T S^-1 nu of one observation against every landmark.
+    """Return nu^T S^-1 nu of one observation against every landmark, shape (n,).
 
-    S = H P H^T + Q per landmark, nu the innovation with its angle wrapped.
-
-    Parameters
-    ----------
-    belief
-        Pose and n landmarks.
-    observed
-        shape (2,), range [m] and bearing [rad].
-    Q
-        shape (2, 2), observation noise.
-
-    Returns
-    -------
-    distances
-        shape (n,), squared Mahalanobis distances; inf where a landmark coincides with the pose,
-        because a bearing to it does not exist.
+    S = H P H^T + Q per landmark, nu the innovation with its angle wrapped; inf where a landmark
+    coincides with the pose, because a bearing to it does not exist. ``observed`` is (range [m],
+    bearing [rad]), Q its noise, shape (2, 2).
     """
     n = len(belief.landmark_ids)
     distances = np.full(n, np.inf)
@@ -68,15 +55,8 @@ def nearest(distances: Array, gate_threshold: float) -> int | None:
 def one_to_one(distances: Array, gate_threshold: float) -> list[int | None]:
     """Return for each observation its landmark's row, or None, no landmark twice.
 
-    Among all such assignments the one of least total squared distance is chosen, where leaving
-    an observation unmatched costs the gate.
-
-    Parameters
-    ----------
-    distances
-        shape (n_observations, n_landmarks).
-    gate_threshold
-        Bound on the squared distance of a match.
+    Among all such assignments the one of least total squared distance is chosen, where leaving an
+    observation unmatched costs the gate. ``distances`` has shape (n_observations, n_landmarks).
     """
     n_observations, n_landmarks = distances.shape
     cost = np.full((n_observations, n_landmarks + n_observations), gate_threshold)
@@ -98,21 +78,8 @@ def update_map(
     distance given all before it, or becomes a landmark if none lies within the gate. With
     ``one_to_one`` all are assigned jointly against the belief before any of them.
 
-    Parameters
-    ----------
-    belief
-        Predicted belief.
-    observations
-        shape (2,) each, range [m] and bearing [rad] from the base footprint.
-    Q
-        shape (2, 2), observation noise.
-    config
-        Gate and assignment rule.
-
-    Returns
-    -------
-    belief, associations
-        Belief after all observations, and what became of each, in their order.
+    Returns the belief after all observations, (range [m], bearing [rad]) each with noise Q, and
+    what became of each, in their order.
     """
     planned: list[int | None] | None = None
     if config.assignment is Assignment.ONE_TO_ONE and observations:

@@ -59,22 +59,10 @@ class FilteredWindow:
 
 
 def cluster_labels(points: Array, config: ClusteringConfig) -> NDArray[np.int64]:
-    """Return the DBSCAN cluster of each point; -1 means noise.
+    """Return the DBSCAN cluster of each point, shape (n,), by first appearance; -1 is noise.
 
-    ``min_observations`` points within ``search_radius_m``, the point itself among them, make a
-    core point (scikit-learn's convention).
-
-    Parameters
-    ----------
-    points
-        shape (n, 2) [m], any frame. Memory grows with n^2; a window holds tens.
-    config
-        Radius and count.
-
-    Returns
-    -------
-    labels
-        shape (n,), clusters numbered from 0 by first appearance.
+    ``min_observations`` points within ``search_radius_m``, the point itself among them, make a core
+    point (scikit-learn's convention). ``points`` has shape (n, 2) [m]; memory grows with n^2.
     """
     # Here, since it takes a second, for which every command would wait.
     from sklearn import config_context
@@ -96,15 +84,9 @@ def cluster_labels(points: Array, config: ClusteringConfig) -> NDArray[np.int64]
 def filter_window(window: Sequence[CollectedState], config: ClusteringConfig) -> FilteredWindow:
     """Return the observations of the window's first pose, confirmed by the poses after it.
 
-    All fixes are expressed, through odometry, in the frame of the first pose and clustered there.
-    A cluster that holds a fix of the first pose becomes one observation of that pose.
-
-    Parameters
-    ----------
-    window
-        States in time order, at least one; the first is the one to estimate.
-    config
-        Which clusters count and what they send; see ClusteringConfig.
+    All fixes are expressed, through odometry, in the frame of the first pose and clustered there. A
+    cluster that holds a fix of the first pose becomes one observation of that pose. ``window`` is
+    in time order and not empty.
     """
     fixes = [fix for state in window for fix in state.fixes]
     state_of_fix = np.repeat(np.arange(len(window)), [len(state.fixes) for state in window])

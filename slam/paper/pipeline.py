@@ -26,15 +26,6 @@ class UwbRadarSlam:
     """UWB radar SLAM as in the paper: fixes of two radars, DBSCAN over a window, EKF SLAM.
 
     The map frame is the body frame at the first odometry pose.
-
-    Parameters
-    ----------
-    config
-        Table I and the options around it.
-    rig
-        Where the radars sit.
-    detector
-        The front end, if not the one that the configuration names.
     """
 
     def __init__(self, config: SlamConfig, rig: Rig, detector: Detector | None = None) -> None:
@@ -53,13 +44,13 @@ class UwbRadarSlam:
     def step(
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
-        """Take in what sensors say around one time; return the state that became ready, if any.
+        """Take in the frames and odometry around one time; return the state now ready, if any.
 
         Parameters
         ----------
         frames
-            At most one frame per radar, each with the time it was taken at; a radar whose frame
-            was lost is simply absent.
+            At most one frame per radar, each with the time it was taken at; a radar whose frame was
+            lost is absent.
         pose_at
             Odometry; asked for the pose at ``t_ns`` and, where ``trilateration.sample_time`` is
             "own", at the time of every frame with an echo.
@@ -72,11 +63,9 @@ class UwbRadarSlam:
     def step_detections(
         self, detections: Sequence[Detection], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
-        """Do what ``step`` does, from ranges that some other front end found."""
         return self._take(lambda: tuple(detections), pose_at, t_ns)
 
     def flush(self) -> tuple[StepResult, ...]:
-        """Return the states still in the window at the end of a run, if the preset wants them."""
         if self.config.window.end_of_run is EndOfRun.DROP:
             self._window.clear()
         return tuple(self._estimate() for _ in range(len(self._window)))
@@ -134,7 +123,7 @@ class UwbRadarSlam:
     def _motions(
         self, detections: Sequence[Detection], pose: Array, pose_at: PoseAt, t_ns: int
     ) -> Mapping[int, Array]:
-        """Return how the robot moved from the state to each detection's own time, if it counts."""
+        """Return the motion from the state to each detection's own time."""
         if self.config.trilateration.sample_time is SampleTime.NOMINAL:
             return NO_MOTIONS
         stamps_ns = {detection.t_ns for detection in detections} - {t_ns}

@@ -90,15 +90,8 @@ class Trilaterator:
     """Pairs the detections of one pose, those of one radar with those of the other.
 
     K echoes seen by both radars give up to K^2 fixes. As printed, all that pass the geometry are
-    kept, and the ghosts among them are left to the outlier filter. With ``Pairing.ONE_TO_ONE``
-    each detection takes part in at most one fix of a pair of radars, see ``one_to_one``.
-
-    Parameters
-    ----------
-    config
-        Field of view, stamp tolerance and pairing rule.
-    rig
-        The mounts; its pairs are worked out once.
+    kept, and the ghosts among them are left to the outlier filter. With ``Pairing.ONE_TO_ONE`` each
+    detection takes part in at most one fix of a pair of radars, see ``one_to_one``.
     """
 
     def __init__(self, config: TrilaterationConfig, rig: Rig) -> None:
@@ -112,20 +105,12 @@ class Trilaterator:
         t_ns: int,
         motions: Mapping[int, Array] = NO_MOTIONS,
     ) -> tuple[Fix, ...]:
-        """Return the fixes of one pose from the detections of all radars.
+        """Return the fixes of one pose, at ``t_ns`` and in its body frame, from all detections.
 
-        Which radars are a pair follows from the rig; the triangle of two detections has its base
-        between the mounts at the detections' own times, and their own two boresights.
-
-        Parameters
-        ----------
-        detections
-            Ranges of all radars.
-        t_ns
-            Session time of the pose, in whose body frame the fixes are.
-        motions
-            By session time: pose of the robot then, seen from the pose at ``t_ns``, shape (3,).
-            Detections of a time without entry were made at ``t_ns``.
+        The radars of a pair follow from the rig; the triangle of two detections has its base
+        between the mounts at the detections' own times, and their own two boresights. ``motions``
+        has, by session time, the pose of the robot then as seen from the pose at ``t_ns``, shape
+        (3,); detections of a time without entry were made at ``t_ns``.
         """
         by_radar: dict[int, list[Detection]] = {}
         for detection in detections:

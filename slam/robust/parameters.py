@@ -1,7 +1,7 @@
-"""What the robust back end is told: noise of wheels and radars, and the rules of its decisions.
+"""Parameters of the robust back end: noise of wheels and radars, and the rules of its decisions.
 
-The noise numbers come from specifications of the robot and of the front end; the rules are the
-same for every scene. Lengths in metres, angles in radians.
+The noise comes from specifications of the robot and of the front end; the rules are the same for
+every scene. Lengths in metres, angles in radians.
 """
 
 from __future__ import annotations
@@ -9,63 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WheelNoise:
-    """Errors of wheel odometry: three calibration errors and white noise.
-
-    A step of true body increment (dx, dy) of length D and turn a is reported as
-    ``(1 + s) (dx, dy) + white`` and ``(1 + w) a + kappa D + white``.
-
-    Attributes
-    ----------
-    along_m_per_sqrt_m, across_m_per_sqrt_m, heading_rad_per_sqrt_m
-        White noise of a step, in proportion to the square root of its length.
-    heading_rad_per_rad
-        White noise of a turn, in proportion to its angle.
-    scale_sigma, turn_scale_sigma, curvature_sigma_rad_per_m
-        Standard deviations of s (mean wheel radius), w (track width) and kappa (difference of
-        the radii) at the start.
-    walk_per_sqrt_m
-        How far each of the three wanders per square root of a metre travelled, as a share of its
-        standard deviation; a radian turned counts as ``walk_lever_m``. Zero: constants.
-    walk_lever_m
-        See above.
-    floor_m, floor_rad
-        Smallest standard deviation of one step.
-    """
-
-    along_m_per_sqrt_m: float = 2e-3
-    across_m_per_sqrt_m: float = 6e-4
-    heading_rad_per_sqrt_m: float = 4.2e-3
-    heading_rad_per_rad: float = 0.01
-    scale_sigma: float = 0.007
-    turn_scale_sigma: float = 0.007
-    curvature_sigma_rad_per_m: float = 0.0042
-    walk_per_sqrt_m: float = 0.0
-    walk_lever_m: float = 0.3
-    floor_m: float = 3e-6
-    floor_rad: float = 1e-6
-
-    @property
-    def calibration_sigmas(self) -> tuple[float, float, float]:
-        """Return the standard deviations of s, w and kappa."""
-        return (self.scale_sigma, self.turn_scale_sigma, self.curvature_sigma_rad_per_m)
-
-    def step_variances(self, distance_m: float, turn_rad: float) -> tuple[float, float, float]:
-        """Return the variances of one step: along [m^2], across [m^2], heading [rad^2]."""
-        floor = self.floor_m**2
-        heading = self.heading_rad_per_sqrt_m * math.sqrt(distance_m)
-        heading += self.heading_rad_per_rad * abs(turn_rad)
-        return (
-            self.along_m_per_sqrt_m**2 * distance_m + floor,
-            self.across_m_per_sqrt_m**2 * distance_m + floor,
-            heading**2 + self.floor_rad**2,
-        )
-
-    def walk_variance(self, distance_m: float, turn_rad: float) -> float:
-        """Return the variance one step adds to a calibration error, in units of its own."""
-        return self.walk_per_sqrt_m**2 * (distance_m + self.walk_lever_m * abs(turn_rad))
+from slam.config import WheelNoise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,9 +20,9 @@ class RangeNoise:
     ----------
     sigma_m
         Standard deviation of a range.
-    doubt_m
-        Added in squares to what a front end tells of each range, wherever it is decided whose the
-        range is: a neighbour's echo may shift it by so much. The ranges of a tracklet keep it.
+    association_sigma_m
+        Added in squares to the front end's sigma of each range, wherever ranges are assigned: a
+        neighbour's echo may shift it by so much. The ranges of a tracklet keep it.
     huber_sigmas
         Innovations of more standard deviations weigh less, as in Huber's estimator.
     offset_sigma_m
@@ -94,7 +38,7 @@ class RangeNoise:
     """
 
     sigma_m: float = 7.4e-3
-    doubt_m: float = 0.0
+    association_sigma_m: float = 0.0
     huber_sigmas: float = math.inf
     offset_sigma_m: float = 0.0
     detection_probability: float = 0.92
@@ -110,7 +54,7 @@ class ContinuationRule:
 
     ``view_margin_rad`` widens the field of view. A landmark takes part while its predicted ranges
     are surer than ``tight_sigmas`` range standard deviations. ``gates`` bounds the squared
-    Mahalanobis distance by the number of ranges, the last one holding for more.
+    Mahalanobis distance by the number of ranges, the last one for all higher numbers.
     """
 
     view_margin_rad: float = 0.25
@@ -167,10 +111,10 @@ class MapRule:
     ----------
     unmapped_per_m2
         Density beta of landmarks not yet in the map: the likelihood of a match must exceed it.
-    match_gate, match_lead
+    match_gate, match_margin
         Bound on d^2 of a point and a landmark (2 dof), and by how much ``d^2 + ln det S`` must
         beat the next.
-    merge_every, merge_reach_m, merge_gate, merge_gate_joint, merge_lead
+    merge_every, merge_reach_m, merge_gate, merge_gate_joint, merge_margin
         Frames between looks, largest distance, bounds on d^2 of one merge and of two together
         (2 and 4 dof), and by how many nats a merge must beat its competitors.
     merge_sigma_m
@@ -187,12 +131,12 @@ class MapRule:
 
     unmapped_per_m2: float = 1.0
     match_gate: float = 13.8
-    match_lead: float = 6.0
+    match_margin: float = 6.0
     merge_every: int = 5
     merge_reach_m: float = 1.5
     merge_gate: float = 11.8
     merge_gate_joint: float = 18.5
-    merge_lead: float = 3.0
+    merge_margin: float = 3.0
     merge_sigma_m: float = 1e-5
     apart_frames: int = 3
     hit: float = 1.0
@@ -212,9 +156,9 @@ class WallRule:
     ----------
     window, min_frames, min_way_m
         Frames looked back, fewest that hit, and how far the echo must have moved along the wall.
-    wall_lead, point_lead
+    wall_margin, point_margin
         By how much chi-square must be less under a law for a wall, or a point, to be believed.
-    match_gate, match_lead
+    match_gate, match_margin
         Bound on d^2 of a wall seen and one mapped (2 dof), and by how much ``d^2 + ln det S`` must
         beat the next.
     unmapped_per_rad_m
@@ -233,10 +177,10 @@ class WallRule:
     window: int = 40
     min_frames: int = 25
     min_way_m: float = 0.25
-    wall_lead: float = 30.0
-    point_lead: float = 0.0
+    wall_margin: float = 30.0
+    point_margin: float = 0.0
     match_gate: float = 13.8
-    match_lead: float = 6.0
+    match_margin: float = 6.0
     unmapped_per_rad_m: float = 0.3
     cell_m: float = 0.1
     reach_m: float = 1.0
@@ -259,7 +203,7 @@ class RoundnessRule:
         Frames that hit a landmark between two looks at it.
     sigmas, largest_m
         How many standard deviations a radius must be from zero to be likely, and what none exceeds.
-    lead
+    margin
         By how much the cost of the solution over all poses must fall for it to be believed.
     sharper
         Share of the standard deviation at the last look that is worth another one.
@@ -274,7 +218,7 @@ class RoundnessRule:
     every: int = 10
     sigmas: float = 3.0
     largest_m: float = 0.5
-    lead: float = 9.0
+    margin: float = 9.0
     sharper: float = 0.9
     excess_sigmas: float = 3.1
 
@@ -315,7 +259,7 @@ class SurpriseRule:
     ----------
     gate_sigmas, most_sigma_m
         A range is near a prediction within so many standard deviations; predictions less sure than
-        that are no trials.
+        that are no evidence.
     view_inset_rad, view_inset_m
         How far inside a radar's limits a landmark must lie to be a trial.
     least_chance
@@ -326,7 +270,7 @@ class SurpriseRule:
     every, hypotheses
         Frames between two moments at which the robot may have been carried; how many are tested.
     suspicious, carried
-        Evidence from which on nothing is undone for good, and from which on the robot is elsewhere.
+        Evidence from which on nothing is undone for good, and from which on the robot is old_map.
     """
 
     gate_sigmas: float = 3.0
@@ -350,7 +294,7 @@ class RelocationRule:
     ----------
     least_landmarks
         Fewest landmarks a join rests on.
-    evidence, lead
+    evidence, margin
         Least evidence [nats] of a join against all new landmarks, and over every other join.
     least_base_m, reach_m, turn_rad
         Least distance of two landmarks that a guess is made from, how far lengths and places may
@@ -363,7 +307,7 @@ class RelocationRule:
 
     least_landmarks: int = 3
     evidence: float = 8.0
-    lead: float = 8.0
+    margin: float = 8.0
     least_base_m: float = 0.3
     reach_m: float = 0.2
     turn_rad: float = 0.2
@@ -386,7 +330,7 @@ class PointRule:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BackEndParameters:
-    """Everything the back end is told."""
+    """All parameters of the back end."""
 
     wheels: WheelNoise = field(default_factory=WheelNoise)
     ranges: RangeNoise = field(default_factory=RangeNoise)

@@ -7,7 +7,7 @@ clipping) and the module's normalisation. ``closed_form_frames`` writes the puls
 NumPy's noise; neither counts nor clips. That both give the same numbers shows that neither carries
 a mistake of its own.
 
-All see the same windows as `slam.front_end.overlapping.fit_many`, know the same pulse and believe
+All see the same windows as `slam.front_end.overlapping.fit_echoes`, know the same pulse and believe
 one more echo by the same test; they differ in how they look for it. Each works on the correlation
 of the window with pulses on a fine grid of positions, cosine and sine taken as orthogonal.
 

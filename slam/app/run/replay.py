@@ -29,11 +29,10 @@ from slam.app.run.results import RESULTS, prepare_folder, saying_what_is_left, w
 from slam.app.run.runner import RunRecord, run_slam
 from slam.app.session.messages import state_row
 from slam.app.session.reader import RecordedSession, open_session
-from slam.config import ConfigError, SlamConfig, without_removed_keys
+from slam.config import ConfigError, SlamConfig, WheelNoise, without_removed_keys
 from slam.frames import Detection, RadarFrame
 from slam.pipelines import make_slam
 from slam.results import PoseAt, Slam, StepResult
-from slam.robust.parameters import WheelNoise
 
 
 class RecordedSlam:

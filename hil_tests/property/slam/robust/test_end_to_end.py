@@ -21,14 +21,13 @@ from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.pose_tracks import at_rest
 from hil_tests.unit.slam.simulation import FRAME_NS, LAB, World, integrate, simulate
 from slam.app.sweep.run import run_in_process
-from slam.config import load_preset, override
+from slam.config import WheelNoise, load_preset, override
 from slam.evaluation import align_se2, ate_rmse_m
 from slam.frames import Detection, RadarFrame
 from slam.front_end import make_detector
 from slam.geometry import paper_rig, transform
 from slam.pipelines import make_slam
 from slam.results import PoseAt, StepResult
-from slam.robust.parameters import WheelNoise
 
 Array = NDArray[np.float64]
 

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from hil_tests.property.robust_oracles import derivative
 from hil_tests.unit.slam.robust.range_world import LAB, parameters_for, simulate
+from slam.config import WheelNoise
 from slam.geometry import paper_rig
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import RangeBearing
-from slam.robust.parameters import RelinearisationRule, WheelNoise
+from slam.robust.parameters import RelinearisationRule
 from slam.robust.ranges import RangeScan
 from slam.robust.run_log import Condensed, Estimate, Prior, Problem, RunLog, start_prior
 from slam.robust.smoother import Smoother, first_values, prior_cost, prior_terms

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from hil_tests.unit.slam.robust.test_roundness import RODS, SIGMA_M, drive
-from slam.robust.parameters import RelinearisationRule, WheelNoise
+from slam.config import WheelNoise
+from slam.robust.parameters import RelinearisationRule
 from slam.robust.run_log import start_prior
 from slam.robust.smoother import is_determined, relinearise
 from slam.robust.state import State

@@ -8,7 +8,7 @@ import pytest
 from slam.evaluation import nees_pose
 from slam.geometry import paper_rig
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.initialisation import Leftover, Slot
+from slam.robust.initialisation import Slot, UnassignedRange
 from slam.robust.parameters import BackEndParameters, RangeNoise, WallRule
 from slam.robust.ranges import RangeScan
 from slam.robust.state import Array
@@ -62,7 +62,7 @@ def tracklet_of(shape: Array, offset_sigma_m: float) -> tuple[WallTracker, WallT
         for radar, mount in enumerate(paper_rig().mounts[:2]):
             range_m = WALL_Y_M - mount.y_m + OFFSET_M + miss
             x = mount.x_m - back * STEP_M
-            heard = [Leftover(range_m, None, SIGMA_M)]
+            heard = [UnassignedRange(range_m, None, SIGMA_M)]
             slots.append(
                 Slot(back, radar, x, mount.y_m, mount.yaw_rad, 0.0, heard, (mount.x_m, mount.y_m))
             )

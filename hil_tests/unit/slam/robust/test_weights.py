@@ -41,7 +41,7 @@ def test_without_a_bound_every_range_counts_in_full() -> None:
 
 def test_a_doubt_is_added_to_what_the_front_end_tells_and_to_nothing_else() -> None:
     told = RangeScan(radar=0, ranges_m=(1.0, 2.0), sigmas_m=(3e-3, 4e-3))
-    assert told.doubted(4e-3).sigmas_m == pytest.approx((5e-3, np.sqrt(32) * 1e-3))
-    assert told.doubted(0.0) is told
+    assert told.with_added_sigma(4e-3).sigmas_m == pytest.approx((5e-3, np.sqrt(32) * 1e-3))
+    assert told.with_added_sigma(0.0) is told
     untold = RangeScan(radar=0, ranges_m=(1.0,))
-    assert untold.doubted(4e-3) is untold
+    assert untold.with_added_sigma(4e-3) is untold

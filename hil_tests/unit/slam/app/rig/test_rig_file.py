@@ -9,7 +9,7 @@ import pytest
 
 from slam.app.errors import AppError
 from slam.app.rig.files import RigFile, RigRadar, RigWheels, load_rig, write_rig
-from slam.robust.parameters import WheelNoise
+from slam.config import WheelNoise
 
 RADAR = """\
 [[radars]]

@@ -299,7 +299,7 @@ def step(*, robust: bool) -> StepResult:
     observation = Observation(x_m=0.3, y_m=0.9, n_fixes=5, n_poses=5, fixes=(fix,))
     report = UpdateReport(
         continued=((0, 0, 7),),  # the first of those given: the other one was unfit
-        born=(),
+        initialised=(),
         seen_again=(),
         merged=(),
         deleted=(),
