@@ -233,34 +233,23 @@ class WheelNoise:
 
     A step of true body increment (dx, dy) of length D and turn a is reported as
     ``(1 + s) (dx, dy) + white`` and ``(1 + w) a + kappa D + white``.
-
-    Attributes
-    ----------
-    along_m_per_sqrt_m, across_m_per_sqrt_m, heading_rad_per_sqrt_m
-        White noise of a step, in proportion to the square root of its length.
-    heading_rad_per_rad
-        White noise of a turn, in proportion to its angle.
-    scale_sigma, turn_scale_sigma, curvature_sigma_rad_per_m
-        Standard deviations of s (mean wheel radius), w (track width) and kappa (difference of
-        the radii) at the start.
-    walk_per_sqrt_m
-        How far each of the three wanders per square root of a metre travelled, as a share of its
-        standard deviation; a radian turned counts as ``walk_lever_m``. Zero: constants.
-    walk_lever_m
-        See above.
-    floor_m, floor_rad
-        Smallest standard deviation of one step.
     """
 
+    # White noise of a step, in proportion to the square root of its length
     along_m_per_sqrt_m: float = 2e-3
     across_m_per_sqrt_m: float = 6e-4
     heading_rad_per_sqrt_m: float = 4.2e-3
-    heading_rad_per_rad: float = 0.01
+    heading_rad_per_rad: float = 0.01  # white noise of a turn, in proportion to its angle
+    # Standard deviations of s (mean wheel radius), w (track width) and kappa (difference of the
+    # radii) at the start
     scale_sigma: float = 0.007
     turn_scale_sigma: float = 0.007
     curvature_sigma_rad_per_m: float = 0.0042
+    # How far each of the three wanders per square root of a metre travelled, as a share of its
+    # standard deviation; a radian turned counts as ``walk_lever_m``. Zero: constants.
     walk_per_sqrt_m: float = 0.0
-    walk_lever_m: float = 0.3
+    walk_lever_m: float = 0.3  # see above
+    # Smallest standard deviation of one step
     floor_m: float = 3e-6
     floor_rad: float = 1e-6
 

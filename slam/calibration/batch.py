@@ -68,15 +68,10 @@ class Square:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cauchy:
-    """Lorentzian cost: an outlier pulls the less the farther it is off.
+    """Lorentzian cost: an outlier pulls the less the farther it is off."""
 
-    Attributes
-    ----------
-    scale
-        Residual, in standard deviations, at which the weight is one half; 2.385 keeps 95 % of the
-        efficiency under Gaussian noise.
-    """
-
+    # Residual, in standard deviations, at which the weight is one half; 2.385 keeps 95 % of the
+    # efficiency under Gaussian noise
     scale: float = 2.385
 
     def costs(self, residuals: Array) -> Array:
@@ -89,46 +84,27 @@ class Cauchy:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Damping:
-    """When the iteration stops and how it is held back.
+    """When the iteration stops and how it is held back."""
 
-    Attributes
-    ----------
-    initial, least
-        Share of the diagonal that is added to the normal equations, at first and at least.
-    most_iterations
-        Linear solves, refused steps included.
-    relative_decrease
-        The iteration has converged once an accepted step lowers the cost by less than this share
-        of it.
-    """
-
+    # Share of the diagonal that is added to the normal equations, at first and at least
     initial: float = 1e-4
     least: float = 1e-12
-    most_iterations: int = 60
+    most_iterations: int = 60  # linear solves, refused steps included
+    # The iteration has converged once an accepted step lowers the cost by less than this share of
+    # it
     relative_decrease: float = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Solution:
-    """The most likely state and how well it is known.
+    """The most likely state and how well it is known."""
 
-    Attributes
-    ----------
-    state
-        Shape (n,).
-    cost
-        Sum over all residuals, and `costs` that of every accepted state, descending.
-    information
-        Shape (n, n), weighted normal matrix at `state`, without damping.
-    converged
-        False where `most_iterations` came first.
-    """
-
-    state: Array
-    cost: float
+    state: Array  # shape (n,)
+    cost: float  # sum over all residuals, and `costs` that of every accepted state, descending
     costs: tuple[float, ...]
+    # Shape (n, n), weighted normal matrix at `state`, without damping
     information: csc_array[np.float64]
-    converged: bool
+    converged: bool  # false where `most_iterations` came first
 
     def covariance(self, indices: Sequence[int] | NDArray[np.intp]) -> Array:
         """Return the joint posterior covariance of some entries of the state, shape (k, k).
@@ -283,18 +259,11 @@ class OdometryTerm:
     kappa)::
 
         u_xy = (1 + s) d + white        u_a = (1 + w) a + kappa |u_xy| / (1 + s) + white
-
-    Attributes
-    ----------
-    steps
-        Shape (n_poses - 1, 3): reported ux [m], uy [m], ua [rad].
-    sigmas
-        Shape (n_poses - 1, 3), standard deviations in the same units.
     """
 
     layout: Layout
-    steps: Array
-    sigmas: Array
+    steps: Array  # shape (n_poses - 1, 3): reported ux [m], uy [m], ua [rad]
+    sigmas: Array  # shape (n_poses - 1, 3), standard deviations in the same units
     kernel: Kernel = field(default_factory=Square)
 
     def residuals(self, state: Array) -> Array:
@@ -363,22 +332,16 @@ class RangeTerm:
 
     z = |l - p - R m| + b + noise; the pose at the sample's own time lies between two poses,
     linear in position and in heading, which is exact on straights and for turns on the spot.
-
-    Attributes
-    ----------
-    pose, fraction
-        Shape (m,) each: index of the pose before the sample, and how far on to the next, [0, 1].
-    landmark, radar
-        Shape (m,), indices.
-    range_m, sigma_m
-        Shape (m,), true metres, no offset removed; and its standard deviation.
     """
 
     layout: Layout
+    # Shape (m,) each: index of the pose before the sample, and how far on to the next, [0, 1]
     pose: Indices
     fraction: Array
+    # Shape (m,), indices
     landmark: Indices
     radar: Indices
+    # Shape (m,), true metres, no offset removed; and its standard deviation
     range_m: Array
     sigma_m: Array
     kernel: Kernel = field(default_factory=Square)

@@ -60,84 +60,44 @@ UNKNOWN_WHEELS = WheelNoise(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrationPriors:
-    """Standard deviations before the drive.
+    """Standard deviations before the drive."""
 
-    Attributes
-    ----------
-    offset_m
-        Range offset of a module.
-    mount_m
-        Mount position in x and in y: how well the rig was measured.
-    reflector_m
-        Survey of known reflectors.
-    start_m, start_rad
-        Start pose among known reflectors; without any, the start is the origin of the map.
-    wheels
-        Constants and white noise of the wheels.
-    """
-
-    offset_m: float = 0.03
-    mount_m: float = 0.003
-    reflector_m: float = 0.001
+    offset_m: float = 0.03  # range offset of a module
+    mount_m: float = 0.003  # mount position in x and in y: how well the rig was measured
+    reflector_m: float = 0.001  # survey of known reflectors
+    # Start pose among known reflectors; without any, the start is the origin of the map
     start_m: float = 0.1
     start_rad: float = 0.1
-    wheels: WheelNoise = UNKNOWN_WHEELS
+    wheels: WheelNoise = UNKNOWN_WHEELS  # constants and white noise of the wheels
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Drive:
-    """A recorded drive, ready for calibration.
+    """A recorded drive, ready for calibration."""
 
-    Attributes
-    ----------
-    rig
-        Nominal mounts; their range offsets are not removed from the ranges.
-    path
-        Odometry, odometry frame.
-    step_sigmas
-        Shape (n_nodes - 1, 3), standard deviation of each step's white noise in the body frame:
-        along [m], across [m], turn [rad].
-    ranges
-        All single ranges.
-    """
-
-    rig: Rig
-    path: PathNodes
+    rig: Rig  # nominal mounts; their range offsets are not removed from the ranges
+    path: PathNodes  # odometry, odometry frame
+    # Shape (n_nodes - 1, 3), standard deviation of each step's white noise in the body frame: along
+    # [m], across [m], turn [rad]
     step_sigmas: Array
-    ranges: RangeSet
+    ranges: RangeSet  # all single ranges
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Calibration:
-    """The result of a calibration.
+    """The result of a calibration."""
 
-    Attributes
-    ----------
-    offsets_m, mount_shifts_m
-        Shapes (r,) and (r, 2): offset of each radar, and how far its mount is from nominal, x and
-        y, body frame.
-    covariance_m2
-        Shape (3 r, 3 r), [m2]: for each radar its offset, mount x, mount y.
-    landmarks_m
-        Shape (k, 2), map frame: the body frame at the start, or the frame of known reflectors.
-    path
-        The most likely path, map frame.
-    wheels
-        Shape (3,): scale, turn scale, curvature [rad/m].
-    landmark
-        Shape (n_ranges,): the landmark each range was used for, or UNASSIGNED.
-    sigma_m
-        Standard deviation of a used range, as found.
-    """
-
+    # Shapes (r,) and (r, 2): offset of each radar, and how far its mount is from nominal, x and y,
+    # body frame
     offsets_m: Array
     mount_shifts_m: Array
-    covariance_m2: Array
+    covariance_m2: Array  # shape (3 r, 3 r), [m2]: for each radar its offset, mount x, mount y
+    # Shape (k, 2), map frame: the body frame at the start, or the frame of known reflectors
     landmarks_m: Array
-    path: PathNodes
-    wheels: Array
-    landmark: Indices
-    sigma_m: float
+    path: PathNodes  # the most likely path, map frame
+    wheels: Array  # shape (3,): scale, turn scale, curvature [rad/m]
+    landmark: Indices  # shape (n_ranges,): the landmark each range was used for, or UNASSIGNED
+    sigma_m: float  # standard deviation of a used range, as found
 
     @property
     def offset_sigmas_m(self) -> Array:

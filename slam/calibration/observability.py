@@ -128,24 +128,12 @@ _REMEDY = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class WeakDirection:
-    """A combination of offsets and mounts that the drive leaves open.
+    """A combination of offsets and mounts that the drive leaves open."""
 
-    Attributes
-    ----------
-    sigma_m
-        Standard deviation along the direction.
-    direction
-        Shape (3 r,), unit vector: offset, mount x, mount y of each radar.
-    words
-        Which unknowns cannot be told apart, in one sentence.
-    remedy
-        A drive that would determine it.
-    """
-
-    sigma_m: float
-    direction: Array
-    words: str
-    remedy: str
+    sigma_m: float  # standard deviation along the direction
+    direction: Array  # shape (3 r,), unit vector: offset, mount x, mount y of each radar
+    words: str  # which unknowns cannot be told apart, in one sentence
+    remedy: str  # A drive that would determine it
 
 
 def weak_directions(

@@ -37,19 +37,12 @@ _OFFSET_SIGMA_M = 0.03
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RangeSet:
-    """All single ranges of a recording, in time order.
+    """All single ranges of a recording, in time order."""
 
-    Attributes
-    ----------
-    radar, t_ns
-        Shape (n,): mount index and session time.
-    range_m, amplitude, sigma_m
-        Shape (n,), true metres without any offset removed; sigma is NaN where the front end has
-        none.
-    """
-
+    # Shape (n,): mount index and session time
     radar: Indices
     t_ns: NDArray[np.int64]
+    # Shape (n,), true metres without any offset removed; sigma is NaN where the front end has none
     range_m: Array
     amplitude: Array
     sigma_m: Array
@@ -71,18 +64,11 @@ class RangeSet:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PathNodes:
-    """The robot's path as poses at some times; between two of them it is linear.
+    """The robot's path as poses at some times; between two of them it is linear."""
 
-    Attributes
-    ----------
-    t_ns
-        Shape (n,), ascending, int64.
-    poses
-        Shape (n, 3), x [m], y [m], heading [rad], continuous; odometry frame as measured, map frame
-        as estimated.
-    """
-
-    t_ns: NDArray[np.int64]
+    t_ns: NDArray[np.int64]  # shape (n,), ascending, int64
+    # Shape (n, 3), x [m], y [m], heading [rad], continuous; odometry frame as measured, map frame
+    # as estimated
     poses: Array
 
     def between(self, t_ns: NDArray[np.int64]) -> tuple[Indices, Array]:
@@ -103,21 +89,12 @@ class PathNodes:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Track:
-    """One echo followed by one radar, and the still point that explains its ranges.
+    """One echo followed by one radar, and the still point that explains its ranges."""
 
-    Attributes
-    ----------
-    radar
-        Mount index.
-    rows
-        Shape (m,), rows of the RangeSet.
-    point_m, covariance_m2
-        Shapes (2,) [m] and (2, 2) [m2], frame of the path; the radar's unknown offset is in
-        the covariance.
-    """
-
-    radar: int
-    rows: Indices
+    radar: int  # mount index
+    rows: Indices  # shape (m,), rows of the RangeSet
+    # Shapes (2,) [m] and (2, 2) [m2], frame of the path; the radar's unknown offset is in the
+    # covariance
     point_m: Array
     covariance_m2: Array
 

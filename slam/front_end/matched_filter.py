@@ -196,55 +196,26 @@ _POSITION, _AMPLITUDE, _PHASE, _SIGMA = range(4)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Peaks:
-    """Echoes of one frame, k of them, nearest first; every array has shape (k,).
+    """Echoes of one frame, k of them, nearest first; every array has shape (k,)."""
 
-    Attributes
-    ----------
-    position_bins
-        From sample 0.
-    amplitude
-        Of the pulse, in the unit of the samples.
-    phase_rad
-        Of the carrier at the position, up to whole turns.
-    sigma_bins
-        Predicted standard deviation of the position.
-    misfit
-        Unexplained over expected energy near the peak.
-    saturated
-        Whether samples within reach of the peak were missing inside the frame.
-    """
-
-    position_bins: Array
-    amplitude: Array
-    phase_rad: Array
-    sigma_bins: Array
-    misfit: Array
-    saturated: BoolArray
+    position_bins: Array  # from sample 0
+    amplitude: Array  # of the pulse, in the unit of the samples
+    phase_rad: Array  # of the carrier at the position, up to whole turns
+    sigma_bins: Array  # predicted standard deviation of the position
+    misfit: Array  # unexplained over expected energy near the peak
+    saturated: BoolArray  # whether samples within reach of the peak were missing inside the frame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Filtered:
-    """One frame behind the filter.
+    """One frame behind the filter."""
 
-    Attributes
-    ----------
-    samples
-        shape (n_bins,): mean removed, unknown samples zero.
-    usable
-        shape (n_bins,): samples that are known and not at a limit of the sampler; None: all.
-    y
-        shape (n_steps,), complex: correlation with the pulse, at every second bin.
-    power
-        shape (n_steps,): squared magnitude of y.
-    sigma_y
-        Standard deviation of its noise, per quadrature.
-    """
-
-    samples: Array
+    samples: Array  # shape (n_bins,): mean removed, unknown samples zero
+    # shape (n_bins,): samples that are known and not at a limit of the sampler; None: all
     usable: BoolArray | None
-    y: ComplexArray
-    power: Array
-    sigma_y: float
+    y: ComplexArray  # shape (n_steps,), complex: correlation with the pulse, at every second bin
+    power: Array  # shape (n_steps,): squared magnitude of y
+    sigma_y: float  # standard deviation of its noise, per quadrature
     pulse_filter: PulseFilter
 
 

@@ -273,63 +273,33 @@ _COARSE, _FINE = 1.0, 1e-4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EchoFit:
-    """One echo of a window.
+    """One echo of a window."""
 
-    Attributes
-    ----------
-    position_bins
-        Centre of the pulse, in bins from the window's first sample.
-    amplitude
-        Peak of the envelope, in the unit of the samples.
-    phase_rad
-        Phase of the carrier at the pulse's centre, in (-pi, pi].
-    sigma_bins
-        Standard deviation of the position: the Cramer-Rao bound at this fit, the amplitudes and
-        phases of all echoes and the other positions unknown.
-    """
-
-    position_bins: float
-    amplitude: float
-    phase_rad: float
+    position_bins: float  # centre of the pulse, in bins from the window's first sample
+    amplitude: float  # peak of the envelope, in the unit of the samples
+    phase_rad: float  # phase of the carrier at the pulse's centre, in (-pi, pi]
+    # Standard deviation of the position: the Cramer-Rao bound at this fit, the amplitudes and
+    # phases of all echoes and the other positions unknown
     sigma_bins: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KnownPulse:
-    """What the fit knows of the pulse.
+    """What the fit knows of the pulse."""
 
-    Attributes
-    ----------
-    envelope_sigma_bins
-        Standard deviation of the Gaussian envelope, in bins.
-    carrier_rad_per_bin
-        Advance of the carrier's phase per bin.
-    """
-
-    envelope_sigma_bins: float
-    carrier_rad_per_bin: float
+    envelope_sigma_bins: float  # standard deviation of the Gaussian envelope, in bins
+    carrier_rad_per_bin: float  # advance of the carrier's phase per bin
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SplitTest:
-    """When one more echo is accepted.
+    """When one more echo is accepted."""
 
-    Attributes
-    ----------
-    max_echoes
-        Most echoes of a window.
-    false_split
-        Probability that noise alone makes one more echo in a window.
-    model_error
-        Amplitude error of the pulse model, relative. 0.08 covers a bandwidth wrong by 10 %.
-    min_separation
-        Closest echoes told apart, in standard deviations of the envelope.
-    """
-
-    max_echoes: int = 4
-    false_split: float = 1e-3
+    max_echoes: int = 4  # most echoes of a window
+    false_split: float = 1e-3  # probability that noise alone makes one more echo in a window
+    # Amplitude error of the pulse model, relative. 0.08 covers a bandwidth wrong by 10 %.
     model_error: float = 0.08
-    min_separation: float = 0.5
+    min_separation: float = 0.5  # closest echoes told apart, in standard deviations of the envelope
 
 
 def fit_echoes(

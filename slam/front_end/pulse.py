@@ -39,18 +39,10 @@ _HALF_LENGTH_SIGMAS = 6.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PulseModel:
-    """Gaussian envelope on a carrier.
+    """Gaussian envelope on a carrier."""
 
-    Attributes
-    ----------
-    carrier_hz
-        Centre frequency.
-    bandwidth_hz
-        Full width of the power spectrum at -10 dB.
-    """
-
-    carrier_hz: float = 7.29e9
-    bandwidth_hz: float = 1.4e9
+    carrier_hz: float = 7.29e9  # centre frequency
+    bandwidth_hz: float = 1.4e9  # full width of the power spectrum at -10 dB
 
     @property
     def sigma_m(self) -> float:

@@ -19,24 +19,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CollectedState:
-    """One entry of Odom[] and Obs[] of Algorithm 1.
+    """One entry of Odom[] and Obs[] of Algorithm 1."""
 
-    Attributes
-    ----------
-    t_ns
-        Session time.
-    odometry_pose
-        shape (3,), [x m, y m, heading rad], odometry frame.
-    detections
-        Ranges of all radars at this pose.
-    fixes
-        Trilaterated points, body frame of this pose.
-    """
-
-    t_ns: int
-    odometry_pose: Array
-    detections: tuple[Detection, ...]
-    fixes: tuple[Fix, ...]
+    t_ns: int  # session time
+    odometry_pose: Array  # shape (3,), [x m, y m, heading rad], odometry frame
+    detections: tuple[Detection, ...]  # ranges of all radars at this pose
+    fixes: tuple[Fix, ...]  # trilaterated points, body frame of this pose
 
 
 NOISE = -1
@@ -44,18 +32,11 @@ NOISE = -1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilteredWindow:
-    """What DBSCAN makes of one window.
+    """What DBSCAN makes of one window."""
 
-    Attributes
-    ----------
-    observations
-        One per emitted cluster, in the order of first appearance.
-    rejected
-        Fixes of the window's first pose that belong to no cluster.
-    """
-
+    # One per emitted cluster, in the order of first appearance
     observations: tuple[Observation, ...]
-    rejected: tuple[Fix, ...]
+    rejected: tuple[Fix, ...]  # fixes of the window's first pose that belong to no cluster
 
 
 def cluster_labels(points: Array, config: ClusteringConfig) -> NDArray[np.int64]:

@@ -64,21 +64,12 @@ def huber_weighted_sigmas_m(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Matches:
-    """Ranges of known landmarks among the scans of one side.
+    """Ranges of known landmarks among the scans of one side."""
 
-    Attributes
-    ----------
-    continued
-        Which range is of which landmark.
-    predicted
-        The ranges of every landmark that took part, measured or not.
-    evidence
-        For or against the present pose, by landmark.
-    """
-
-    continued: Sequence[Continuation] = ()
+    continued: Sequence[Continuation] = ()  # which range is of which landmark
+    # The ranges of every landmark that took part, measured or not
     predicted: Sequence[PredictedRange] = ()
-    evidence: Sequence[Evidence] = ()
+    evidence: Sequence[Evidence] = ()  # for or against the present pose, by landmark
 
 
 def match_known_landmarks(  # noqa: PLR0917 - scans, where they were taken, and the belief
@@ -302,15 +293,17 @@ class RobustBackEnd:
         Not while the robot is lost or evidence speaks against its pose: a wrong measurement would
         be spread over the whole run.
         """
-        if self._localisation.is_lost or self._localisation.is_suspicious:
+        if not self._is_located():
             return False
         return relinearise(self._log, self.state, self.parameters)
+
+    def _is_located(self) -> bool:
+        return not (self._localisation.is_lost or self._localisation.surprise.is_suspicious)
 
     def _smooth_if_due(self) -> bool:
         """Give landmarks their radii and solve for all poses; tell whether they were solved for."""
         relinearised = False
-        localisation = self._localisation
-        if not (self._roundness is None or localisation.is_lost or localisation.is_suspicious):
+        if self._roundness is not None and self._is_located():
             hits = self._existence.hits
             relinearised = self._roundness.give(self.state, self._log, self.parameters, hits)
         if relinearised or is_due(self._log, self.state, self.parameters):
@@ -358,7 +351,7 @@ class RobustBackEnd:
 
         Returns (radar, index, landmark id) of each range, and the NIS before the weights.
         """
-        if not found or self._localisation.is_carried:
+        if not found or self._localisation.surprise.is_carried:
             return (), 0.0
         state, ids = self.state, self.state.feature_ids
         continued = tuple((c.radar, c.index, ids[c.row]) for c in found)
@@ -394,7 +387,7 @@ class RobustBackEnd:
         return continued, nis
 
     def _begin_submap_if_carried(self) -> bool:
-        carried = self._localisation.is_carried
+        carried = self._localisation.surprise.is_carried
         if carried:
             self._localisation.begin_submap(self.state, self._existence, self._log)
             self._unassigned.clear()
@@ -472,7 +465,7 @@ class RobustBackEnd:
             )
 
     def _delete_vanished(self) -> tuple[int, ...]:
-        if self._localisation.is_suspicious:
+        if self._localisation.surprise.is_suspicious:
             return ()
         vanished = self._existence.lost()
         for landmark_id in vanished:

@@ -24,16 +24,17 @@ least Mahalanobis distance, all points of one time together and no landmark twic
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from slam.geometry import compose, wrap_angle
-from slam.robust.parameters import MapRule, RangeNoise, TrackletRule
+from slam.robust.parameters import MapRule, RangeNoise, TrackletRule, chi_square_limit
 from slam.robust.ranges import LONGEST_M, Antennas, RangeScan, fix_of_pair
 from slam.robust.state import POSITION, Array, Indices, Motion, State, rotation
 
@@ -53,28 +54,15 @@ class UnassignedRange:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SeenFrame:
-    """One frame: where the antennas were in the odometry frame, and the ranges still unused.
+    """One frame: where the antennas were in the odometry frame, and the ranges still unused."""
 
-    Attributes
-    ----------
-    pose_index
-        Index of its pose in the run.
-    pose
-        shape (3,), odometry frame.
-    path_m, turned_rad
-        Way and turn since the start, always growing.
-    antennas
-        In the odometry frame.
-    unused
-        One list per radar; a range that is used is removed.
-    """
-
-    pose_index: int
-    pose: Array
+    pose_index: int  # index of its pose in the run
+    pose: Array  # shape (3,), odometry frame
+    # Way and turn since the start, always growing
     path_m: float
     turned_rad: float
-    antennas: Antennas
-    unused: tuple[list[UnassignedRange], ...]
+    antennas: Antennas  # in the odometry frame
+    unused: tuple[list[UnassignedRange], ...]  # one list per radar; a range that is used is removed
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,15 +265,22 @@ def match(
             continue
         rows = point_rows(state, int(row), point)
         scored.append((rows.mahalanobis_sq + rows.log_det, rows.mahalanobis_sq, int(row)))
+    return clear_match(scored, rule.match_gate, rule.unmapped_per_m2, rule.match_margin)
+
+
+def clear_match(
+    scored: list[tuple[float, float, int]], gate: float, density: float, margin: float
+) -> int | None:
+    """Return the row of the best (d^2 + ln det S, d^2, row), or None where no match is clear."""
     if not scored:
         return None
     scored.sort()
     score, distance, best = scored[0]
-    if distance > rule.match_gate:
+    if distance > gate:
         return None
-    if -0.5 * score - math.log(math.tau) <= math.log(rule.unmapped_per_m2):
+    if -0.5 * score - math.log(math.tau) <= math.log(density):
         return None
-    if len(scored) > 1 and scored[1][0] - score < rule.match_margin:
+    if len(scored) > 1 and scored[1][0] - score < margin:
         return None
     return best
 
@@ -335,30 +330,28 @@ class Guess:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Tracklet:
-    """A point at rest, and the ranges that it explains.
+class Followed:
+    """A target at rest in the newest body frame, and the ranges that it explains."""
 
-    Attributes
-    ----------
-    point_m, covariance
-        In the newest body frame, shapes (2,) and (2, 2), for the range offsets of the state.
-    by_offsets
-        shape (2, r), d(point) / d(offsets).
-    members
-        Newest first.
-    chi_square, dof
-        Of the residuals.
-    share
-        Part of the frames with the point in view that hold a member.
-    """
-
-    point_m: Array
-    covariance: Array
-    by_offsets: Array
-    members: tuple[Member, ...]
+    covariance: Array  # shape (2, 2), for the range offsets of the state
+    by_offsets: Array  # shape (2, r), d(target) / d(offsets)
+    members: tuple[Member, ...]  # newest first
+    # Of the residuals
     chi_square: float
     dof: int
-    share: float
+    share: float  # part of the frames with the target in view that hold a member
+
+    @property
+    def score(self) -> float:
+        """Return 4 dof - chi-square, by which tracklets compete for ranges."""
+        return 4.0 * self.dof - self.chi_square
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Tracklet(Followed):
+    """A point at rest."""
+
+    point_m: Array  # shape (2,)
     label: int | None
 
     def body_point(self) -> BodyPoint:
@@ -371,10 +364,9 @@ class Tracklet:
             outward=away / max(math.hypot(away[0], away[1]), 1e-6),
         )
 
-    @property
-    def score(self) -> float:
-        """Return 4 dof - chi-square, by which tracklets compete for ranges."""
-        return 4.0 * self.dof - self.chi_square
+
+F = TypeVar("F", bound=Followed)
+G = TypeVar("G")
 
 
 def guesses_of(
@@ -563,24 +555,42 @@ def is_believable(tracklet: Tracklet, n_radars: int, rule: TrackletRule) -> bool
     alone = n_radars == 1
     if len(frames) < (rule.single_min_frames if alone else rule.min_frames):
         return False
-    hits: dict[int, int] = {}
-    for member in tracklet.members:
-        hits[member.slot.radar] = hits.get(member.slot.radar, 0) + 1
-    if len(hits) < n_radars or min(hits.values()) < rule.min_hits_per_radar:
-        return False
-    if tracklet.share < rule.min_share:
+    if not is_consistent(tracklet, n_radars, rule):
         return False
     if alone:
         spread = float(np.linalg.eigvalsh(tracklet.covariance)[-1])
         if spread > rule.single_max_sigma_m**2:
             return False
-    limit = tracklet.dof + rule.excess_sigmas * math.sqrt(2.0 * max(tracklet.dof, 0))
-    return tracklet.chi_square <= limit
+    return True
 
 
-def take(members: Iterable[Member]) -> None:
-    for member in members:
-        member.slot.unused.remove(member.measured)
+def is_consistent(followed: Followed, n_radars: int, rule: TrackletRule) -> bool:
+    """Tell whether enough radars and frames hold it, with residuals as small as their noise."""
+    hits = Counter(member.slot.radar for member in followed.members)
+    if len(hits) < n_radars or min(hits.values()) < rule.min_hits_per_radar:
+        return False
+    limit = chi_square_limit(followed.dof, rule.excess_sigmas)
+    return followed.share >= rule.min_share and followed.chi_square <= limit
+
+
+def best_first(
+    guesses: Sequence[G], follow: Callable[[G], F], accepts: Callable[[F], bool]
+) -> list[F]:
+    """Return what guesses lead to, best first; the ranges are taken out of the frames."""
+    found: list[F] = []
+    waiting = list(guesses)
+    while waiting:
+        followed = [(follow(guess), guess) for guess in waiting]
+        accepted = [pair for pair in followed if accepts(pair[0])]
+        if not accepted:
+            break
+        best, chosen = max(accepted, key=lambda pair: pair[0].score)
+        for member in best.members:
+            member.slot.unused.remove(member.measured)
+        found.append(best)
+        # What is left may have lost its ranges: follow it again.
+        waiting = [guess for _, guess in accepted if guess is not chosen]
+    return found
 
 
 def find_tracklets(
@@ -602,21 +612,13 @@ def find_tracklets(
             available[slot.radar] = available.get(slot.radar, 0) + bool(slot.unused)
     if len(available) < n_radars or min(available.values()) < rule.min_hits_per_radar:
         return []
-    found: list[Tracklet] = []
-    waiting = list(guesses)
-    while waiting:
-        followed = [(tracker.follow(guess, frames), guess) for guess in waiting]
-        believed = [pair for pair in followed if is_believable(pair[0], n_radars, rule)]
-        if is_point is not None:
-            believed = [pair for pair in believed if pair[0].label is not None or is_point(pair[0])]
-        if not believed:
-            break
-        best, chosen = max(believed, key=lambda pair: pair[0].score)
-        take(best.members)
-        found.append(best)
-        # What is left may have lost its ranges: follow it again.
-        waiting = [guess for _, guess in believed if guess is not chosen]
-    return found
+
+    def accepts(tracklet: Tracklet) -> bool:
+        if not is_believable(tracklet, n_radars, rule):
+            return False
+        return is_point is None or tracklet.label is not None or is_point(tracklet)
+
+    return best_first(guesses, lambda guess: tracker.follow(guess, frames), accepts)
 
 
 _FORBIDDEN = 1e9

@@ -377,32 +377,21 @@ class Localisation:
 
     Attributes
     ----------
+    surprise
+        The evidence against the pose.
+    is_lost
+        Whether the place of the robot on the map is unknown. It stays so where nothing of the map
+        is left: then there is no way back.
     old_map
         Ids of the old map's landmarks while there is a submap; else empty.
     """
 
     def __init__(self, parameters: BackEndParameters) -> None:
         self.parameters = parameters
-        self._surprise = Surprise(parameters.surprise)
+        self.surprise = Surprise(parameters.surprise)
         self._first_pose = 0
-        self._is_lost = False
+        self.is_lost = False
         self.old_map: frozenset[int] = frozenset()
-
-    @property
-    def is_lost(self) -> bool:
-        """Tell whether the place of the robot on the map is unknown.
-
-        It stays so where nothing of the map is left: then there is no way back.
-        """
-        return self._is_lost
-
-    @property
-    def is_suspicious(self) -> bool:
-        return self._surprise.is_suspicious
-
-    @property
-    def is_carried(self) -> bool:
-        return self._surprise.is_carried
 
     @property
     def lost_covariance(self) -> Array:
@@ -416,7 +405,7 @@ class Localisation:
 
     def look(self, evidence: Sequence[Evidence], state: State, log: RunLog) -> None:
         """Judge one frame; to be called before anything is learned from it."""
-        self._surprise.look(evidence, log.n_poses - 1, state.feature_ids)
+        self.surprise.look(evidence, log.n_poses - 1, state.feature_ids)
 
     def begin_submap(self, state: State, existence: Existence, log: RunLog) -> None:
         """Begin a submap at the present pose, and forget all measurements since the pose was wrong.
@@ -424,9 +413,9 @@ class Localisation:
         Landmarks mapped since are removed; the rest is solved for without the ranges since then. A
         submap that exists already is given up: what is left is the old map.
         """
-        first = self._surprise.first_pose
+        first = self.surprise.first_pose
         log.forget_from(first)
-        known = self.old_map if self._is_lost else self._surprise.witnesses
+        known = self.old_map if self.is_lost else self.surprise.witnesses
         for id_ in state.feature_ids:
             if id_ not in known:
                 forget(id_, state, existence, log)
@@ -436,9 +425,9 @@ class Localisation:
         begin_submap(state, pose)
         log.break_odometry(pose)
         self.old_map = frozenset(state.feature_ids)
-        self._is_lost = True
+        self.is_lost = True
         self._first_pose = log.n_poses - 1
-        self._surprise.reset()
+        self.surprise.reset()
 
     def find(self, state: State, existence: Existence, log: RunLog) -> tuple[tuple[int, int], ...]:
         """Join the submap with the old map if one join stands out; return (kept, gone) ids."""
@@ -457,8 +446,8 @@ class Localisation:
             existence.merge(kept, gone)
             log.rename(gone, kept)
         self.old_map = frozenset()
-        self._is_lost = False
-        self._surprise.reset()
+        self.is_lost = False
+        self.surprise.reset()
         return tuple(ids)
 
 

@@ -42,7 +42,7 @@ from scipy.spatial import cKDTree
 
 from slam.config import WheelNoise
 from slam.geometry import between, transform
-from slam.robust.parameters import BackEndParameters, MapRule, RoundnessRule
+from slam.robust.parameters import BackEndParameters, MapRule, RoundnessRule, chi_square_limit
 from slam.robust.run_log import LoggedSightings, RunLog
 from slam.robust.smoother import give_radius
 from slam.robust.state import Array, Indices, State, quarter_turn
@@ -285,47 +285,27 @@ class Law(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sightings:
-    """Ranges of one reflector from several places.
+    """Ranges of one reflector from several places."""
 
-    Attributes
-    ----------
-    antennas_m
-        shape (k, 2), in one frame.
-    ranges_m, variances
-        shape (k,): measured, the offsets of the state removed, and their variances [m^2].
-    radars
-        shape (k,): index into the offsets.
-    offset_covariance
-        shape (r, r), of the radars' offsets; None where they are known.
-    """
-
-    antennas_m: Array
+    antennas_m: Array  # shape (k, 2), in one frame
+    # shape (k,): measured, the offsets of the state removed, and their variances [m^2]
     ranges_m: Array
     variances: Array
-    radars: Array
+    radars: Array  # shape (k,): index into the offsets
+    # shape (r, r), of the radars' offsets; None where they are known
     offset_covariance: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fit:
-    """A law of least chi-square.
+    """A law of least chi-square."""
 
-    Attributes
-    ----------
-    unknown
-        shape (2,): the law's own two.
-    offsets_m, radars
-        shape (q,): errors of the offsets of these radars.
-    chi_square
-        Of the residuals and of the offsets.
-    by_law, extra
-        d(range) / d(unknown), shape (k, 2), and d(range) / d(offset), shape (k, q).
-    """
-
-    unknown: Array
+    unknown: Array  # shape (2,): the law's own two
+    # shape (q,): errors of the offsets of these radars
     offsets_m: Array
     radars: tuple[int, ...]
-    chi_square: float
+    chi_square: float  # of the residuals and of the offsets
+    # d(range) / d(unknown), shape (k, 2), and d(range) / d(offset), shape (k, q)
     by_law: Array
     extra: Array
 
@@ -439,29 +419,17 @@ _KNOTS = 8
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Arc:
-    """Ranges of one target along one piece of way, in the odometry frame of its first pose.
+    """Ranges of one target along one piece of way, in the odometry frame of its first pose."""
 
-    Attributes
-    ----------
-    antennas_m, ranges_m, variances
-        shapes (k, 2), (k,), (k,); ranges without the offsets known.
-    nuisance
-        shape (k, 2, q): d(antenna) / d(scale, curvature, offsets, wheel noise in steps).
-    by_offset
-        shape (k, q): d(range) / d(the same), of the offsets alone.
-    prior
-        shape (q, q): information about all q.
-    start_m
-        shape (2,): where the landmark is believed to be.
-    """
-
+    # shapes (k, 2), (k,), (k,); ranges without the offsets known
     antennas_m: Array
     ranges_m: Array
     variances: Array
+    # shape (k, 2, q): d(antenna) / d(scale, curvature, offsets, wheel noise in steps)
     nuisance: Array
-    by_offset: Array
-    prior: Array
-    start_m: Array
+    by_offset: Array  # shape (k, q): d(range) / d(the same), of the offsets alone
+    prior: Array  # shape (q, q): information about all q
+    start_m: Array  # shape (2,): where the landmark is believed to be
 
 
 @dataclass(frozen=True, slots=True)
@@ -612,7 +580,7 @@ class Roundness:
 
     def _is_news(self, id_: int, radius: Radius) -> bool:
         """Tell whether a radius is worth a solution over all poses."""
-        limit = radius.dof + self._rule.excess_sigmas * math.sqrt(2.0 * max(radius.dof, 0))
+        limit = chi_square_limit(radius.dof, self._rule.excess_sigmas)
         before_m = self._sigmas_m.get(id_)
         if radius.chi_square > limit:
             return False

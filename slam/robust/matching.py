@@ -49,21 +49,11 @@ NOTHING = Option((), 0.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SureLandmarks:
-    """Landmarks that one side of the robot may see, or those of them that may be continued.
+    """Landmarks that one side of the robot may see, or those of them that may be continued."""
 
-    Attributes
-    ----------
-    landmarks
-        Rows of the landmarks, shape (c,).
-    rows
-        Their predicted ranges: landmark by landmark, radar by radar.
-    prior
-        H P H^T of those rows, shape (k, k).
-    """
-
-    landmarks: Indices
-    rows: Rows
-    prior: Array
+    landmarks: Indices  # rows of the landmarks, shape (c,)
+    rows: Rows  # their predicted ranges: landmark by landmark, radar by radar
+    prior: Array  # H P H^T of those rows, shape (k, k)
 
     def surer_than(self, limit_m: float) -> SureLandmarks | None:
         """Return those with more certain ranges of all radars; None without any."""
@@ -73,10 +63,10 @@ class SureLandmarks:
         if not sure.any():
             return None
         keep = np.flatnonzero(np.repeat(sure, per_landmark))
-        rows = Rows(
+        rows = replace(
+            self.rows,
             radars=self.rows.radars[keep],
             landmarks=self.rows.landmarks[keep],
-            at=self.rows.at,
             H=self.rows.H[keep],
             predicted_m=self.rows.predicted_m[keep],
         )

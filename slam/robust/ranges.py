@@ -33,34 +33,21 @@ BLUR_M = 0.12
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RangeScan:
-    """The detections of one radar in one frame; an empty scan says that it looked and saw nothing.
+    """Detections of one radar in one frame; an empty scan means that nothing was seen."""
 
-    Attributes
-    ----------
-    radar
-        Index of the mount in the rig.
-    ranges_m
-        Ranges in true metres.
-    sampled_after
-        When it sampled, in steps after the pose: 0 with it, -0.5 half a step before it.
-    labels
-        Which target each range is of, where that is known; it replaces association.
-    sigmas_m
-        Standard deviation of each range, where the front end predicts it.
-    moved
-        Reported motion from the pose to the sample, (dx, dy) [m] and turn [rad] in the body frame
-        of the pose. It replaces ``sampled_after``, which is limited to one step.
-    blurred_m
-        Ranges of echoes that several targets may share: no evidence of where anything is, nor that
-        nothing is there.
-    """
-
-    radar: int
-    ranges_m: tuple[float, ...]
+    radar: int  # index of the mount in the rig
+    ranges_m: tuple[float, ...]  # ranges in true metres
+    # When it sampled, in steps after the pose: 0 with it, -0.5 half a step before it
     sampled_after: float = 0.0
+    # Which target each range is of, where that is known; it replaces association
     labels: tuple[int, ...] | None = None
+    # Standard deviation of each range, where the front end predicts it
     sigmas_m: tuple[float, ...] | None = None
+    # Reported motion from the pose to the sample, (dx, dy) [m] and turn [rad] in the body frame of
+    # the pose. It replaces ``sampled_after``, which is limited to one step.
     moved: tuple[float, float, float] | None = None
+    # Ranges of echoes that several targets may share: no evidence of where anything is, nor that
+    # nothing is there
     blurred_m: tuple[float, ...] = ()
 
     def label(self, index: int) -> int | None:
@@ -136,24 +123,12 @@ def antennas_of(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class View:
-    """All n landmarks and behind them all w walls as all radars should see them.
+    """All n landmarks and behind them all w walls as all radars should see them."""
 
-    Attributes
-    ----------
-    ranges_m
-        shape (r, n + w), offsets included; negative behind a wall.
-    off_boresight_rad
-        shape (r, n + w), in [-pi, pi).
-    directions
-        shape (r, n + w, 2), unit vectors u or n in the map frame.
-    by_feature
-        shape (r, n + w, 2), d(range) / d(error of the landmark or wall).
-    """
-
-    ranges_m: Array
-    off_boresight_rad: Array
-    directions: Array
-    by_feature: Array
+    ranges_m: Array  # shape (r, n + w), offsets included; negative behind a wall
+    off_boresight_rad: Array  # shape (r, n + w), in [-pi, pi)
+    directions: Array  # shape (r, n + w, 2), unit vectors u or n in the map frame
+    by_feature: Array  # shape (r, n + w, 2), d(range) / d(error of the landmark or wall)
 
     def inside(
         self, noise: RangeNoise, widen_rad: float = 0.0, widen_m: float = 0.0
@@ -206,25 +181,14 @@ def view(state: State, antennas: Antennas) -> View:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Rows:
-    """Range measurements that could be made: row i is of radar ``radars[i]``, one landmark each.
+    """Range measurements that could be made: row i is of radar ``radars[i]``, one landmark each."""
 
-    Attributes
-    ----------
-    radars, landmarks
-        shape (k,): index of the radar, row of the landmark; walls are the rows from n on.
-    at
-        Columns of the error that H has entries for, shape (c,).
-    H
-        shape (k, c).
-    predicted_m
-        shape (k,).
-    """
-
+    # shape (k,): index of the radar, row of the landmark; walls are the rows from n on
     radars: Indices
     landmarks: Indices
-    at: Indices
-    H: Array
-    predicted_m: Array
+    at: Indices  # columns of the error that H has entries for, shape (c,)
+    H: Array  # shape (k, c)
+    predicted_m: Array  # shape (k,)
 
 
 def rows_of(state: State, seen: View, radars: Indices, landmarks: Indices) -> Rows:

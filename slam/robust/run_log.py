@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -23,20 +23,11 @@ _LEAST_OFFSET_M = 1e-7
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Estimate:
-    """Values of all unknowns.
+    """Values of all unknowns."""
 
-    Attributes
-    ----------
-    poses
-        shape (k + 1, 3): x, y, heading.
-    calibration
-        shape (k + 1, 3) if it walks, else (1, 3): s, w, kappa.
-    offsets_m, landmarks_m
-        shapes (r,) and (n, 2); the last of the landmarks may be walls, (phi, d).
-    """
-
-    poses: Array
-    calibration: Array
+    poses: Array  # shape (k + 1, 3): x, y, heading
+    calibration: Array  # shape (k + 1, 3) if it walks, else (1, 3): s, w, kappa
+    # shapes (r,) and (n, 2); the last of the landmarks may be walls, (phi, d)
     offsets_m: Array
     landmarks_m: Array
 
@@ -58,44 +49,29 @@ class Prior:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Problem:
-    """All that was measured.
+    """All that was measured."""
 
-    Attributes
-    ----------
-    increments, covariances
-        shapes (k, 3) and (k, 3, 3): reported steps from pose to pose, and their noise.
-    walks
-        shape (k, 3): variance each calibration error gains per step; all zero: constants.
-    prior
-        Of the first pose and everything that does not move.
-    range_poses, range_radars, range_landmarks
-        shape (m,) each: which pose, radar and landmark a range belongs to.
-    range_antennas, ranges_m
-        shapes (m, 2) and (m,): antenna in the body frame of the pose.
-    range_sigmas_m
-        shape (m,), noise of the ranges.
-    point_poses, point_landmarks, points, point_roots
-        shapes (q,), (q,), (q, 2), (q, 2, 2): range and bearing seen from the body's origin,
-        and a matrix that makes their noise white.
-    n_walls
-        How many of the landmarks, the last ones, are walls.
-    """
-
+    # shapes (k, 3) and (k, 3, 3): reported steps from pose to pose, and their noise
     increments: Array
     covariances: Array
+    # shape (k, 3): variance each calibration error gains per step; all zero: constants
     walks: Array
-    prior: Prior
+    prior: Prior  # of the first pose and everything that does not move
+    # shape (m,) each: which pose, radar and landmark a range belongs to
     range_poses: Indices
     range_radars: Indices
     range_landmarks: Indices
+    # shapes (m, 2) and (m,): antenna in the body frame of the pose
     range_antennas: Array
     ranges_m: Array
-    range_sigmas_m: Array
+    range_sigmas_m: Array  # shape (m,), noise of the ranges
+    # shapes (q,), (q,), (q, 2), (q, 2, 2): range and bearing seen from the body's origin, and a
+    # matrix that makes their noise white
     point_poses: Indices
     point_landmarks: Indices
     points: Array
     point_roots: Array
-    n_walls: int = 0
+    n_walls: int = 0  # how many of the landmarks, the last ones, are walls
 
     @property
     def is_walking(self) -> bool:
@@ -106,11 +82,11 @@ class Problem:
         """Return the steps up to pose ``n_steps`` and the measurements before it."""
         ranges = self.range_poses < n_steps
         points = self.point_poses < n_steps
-        return Problem(
+        return replace(
+            self,
             increments=self.increments[:n_steps],
             covariances=self.covariances[:n_steps],
             walks=self.walks[:n_steps],
-            prior=self.prior,
             range_poses=self.range_poses[ranges],
             range_radars=self.range_radars[ranges],
             range_landmarks=self.range_landmarks[ranges],
@@ -121,7 +97,6 @@ class Problem:
             point_landmarks=self.point_landmarks[points],
             points=self.points[points],
             point_roots=self.point_roots[points],
-            n_walls=self.n_walls,
         )
 
 
@@ -244,15 +219,6 @@ class _Ranges:
     sigmas_m: list[float] = field(default_factory=list)
     alone: list[bool] = field(default_factory=list)
 
-    def keep(self, at: Sequence[int]) -> None:
-        self.poses = [self.poses[i] for i in at]
-        self.radars = [self.radars[i] for i in at]
-        self.landmarks = [self.landmarks[i] for i in at]
-        self.antennas = [self.antennas[i] for i in at]
-        self.ranges_m = [self.ranges_m[i] for i in at]
-        self.sigmas_m = [self.sigmas_m[i] for i in at]
-        self.alone = [self.alone[i] for i in at]
-
 
 @dataclass(slots=True)
 class _Points:
@@ -261,37 +227,28 @@ class _Points:
     points: list[Array] = field(default_factory=list)
     roots: list[Array] = field(default_factory=list)
 
-    def keep(self, at: Sequence[int]) -> None:
-        self.poses = [self.poses[i] for i in at]
-        self.landmarks = [self.landmarks[i] for i in at]
-        self.points = [self.points[i] for i in at]
-        self.roots = [self.roots[i] for i in at]
+
+def _keep(table: _Ranges | _Points, at: Sequence[int]) -> None:
+    """Drop all rows of a table but some."""
+    for name in (column.name for column in fields(table)):
+        values = getattr(table, name)
+        setattr(table, name, [values[i] for i in at])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LoggedSightings:
-    """Ranges of one landmark over the last frames, where odometry alone has the antennas.
+    """Ranges of one landmark over the last frames, where odometry alone has the antennas."""
 
-    Attributes
-    ----------
-    antennas_m
-        shape (k, 2), in the frame of the first pose looked back to.
-    places_m, headings_rad, way_m
-        shapes (k, 2), (k,), (k,): of the robot, and its way since that pose.
-    ranges_m, sigmas_m, radars
-        shape (k,).
-    newest
-        shape (3,): the newest pose in that frame.
-    """
-
-    antennas_m: Array
+    antennas_m: Array  # shape (k, 2), in the frame of the first pose looked back to
+    # shapes (k, 2), (k,), (k,): of the robot, and its way since that pose
     places_m: Array
     headings_rad: Array
     way_m: Array
+    # shape (k,)
     ranges_m: Array
     sigmas_m: Array
     radars: Indices
-    newest: Array
+    newest: Array  # shape (3,): the newest pose in that frame
 
 
 class RunLog:
@@ -359,7 +316,7 @@ class RunLog:
     def forget_from(self, pose: int) -> None:
         """Forget all measurements from a pose on; the steps stay."""
         for table in (self._ranges, self._points):
-            table.keep(np.flatnonzero(np.array(table.poses) < pose).tolist())
+            _keep(table, np.flatnonzero(np.array(table.poses) < pose).tolist())
 
     def break_odometry(self, pose: Array) -> None:
         """Make the last step uninformative, and set the newest pose."""
@@ -520,10 +477,7 @@ class RunLog:
         }
         causal = np.array(self._causal)
         causal[-1] = state.pose
-        return [
-            Estimate(poses=causal, **common),
-            Estimate(poses=chained, **common),
-        ]
+        return [Estimate(poses=causal, **common), Estimate(poses=chained, **common)]
 
     def solved(self, estimate: Estimate) -> None:
         self._causal = list(estimate.poses)
@@ -541,7 +495,7 @@ class RunLog:
         for table in (self._ranges, self._points):
             names = self._rows_of(table.landmarks, rows)
             table.landmarks = names.tolist()
-            table.keep(np.flatnonzero(names >= 0).tolist())
+            _keep(table, np.flatnonzero(names >= 0).tolist())
         self._names.clear()
         self._forget_to(self._first + n_steps)
 
@@ -550,7 +504,7 @@ class RunLog:
             del kept[: pose - self._first]
         self._first = pose
         for table in (self._ranges, self._points):
-            table.keep(np.flatnonzero(np.array(table.poses) >= pose).tolist())
+            _keep(table, np.flatnonzero(np.array(table.poses) >= pose).tolist())
 
     def _rows_of(
         self, ids: list[int], rows: dict[int, int]

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -211,14 +211,9 @@ def measurement_residuals(problem: Problem, estimate: Estimate) -> Rows:
     if not len(problem.points):
         return ranges
     points = _point_rows(problem, estimate)
+    names = [column.name for column in fields(Rows)]
     return Rows(
-        poses=np.concatenate([ranges.poses, points.poses]),
-        landmarks=np.concatenate([ranges.landmarks, points.landmarks]),
-        residual=np.concatenate([ranges.residual, points.residual]),
-        by_pose=np.vstack([ranges.by_pose, points.by_pose]),
-        by_landmark=np.vstack([ranges.by_landmark, points.by_landmark]),
-        radars=np.concatenate([ranges.radars, points.radars]),
-        by_offset=np.concatenate([ranges.by_offset, points.by_offset]),
+        **{name: np.concatenate([getattr(ranges, name), getattr(points, name)]) for name in names}
     )
 
 

@@ -25,7 +25,17 @@ import numpy as np
 
 from slam.geometry import wrap_angle
 from slam.results import MapWall
-from slam.robust.initialisation import FeatureRows, Member, Slot, Tracklet, UnassignedRanges
+from slam.robust.initialisation import (
+    FeatureRows,
+    Followed,
+    Member,
+    Slot,
+    Tracklet,
+    UnassignedRanges,
+    best_first,
+    clear_match,
+    is_consistent,
+)
 from slam.robust.map import Law, Sightings, compare, fit_wall
 from slam.robust.parameters import BackEndParameters, RangeNoise, WallRule
 from slam.robust.ranges import Antennas, View
@@ -36,25 +46,10 @@ _MARGIN_RAD = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class WallTracklet:
-    """A wall in the newest body frame, and the ranges that it explains.
-
-    ``wall``, ``covariance``: phi [rad] and d [m], shapes (2,) and (2, 2); the rest as in
-    ``Tracklet``.
-    """
+class WallTracklet(Followed):
+    """A wall; ``wall`` (2,) and its covariance are of phi [rad] and d [m]."""
 
     wall: Array
-    covariance: Array
-    by_offsets: Array
-    members: tuple[Member, ...]
-    chi_square: float
-    dof: int
-    share: float
-
-    @property
-    def score(self) -> float:
-        """Return 4 dof - chi-square, by which tracklets compete for ranges."""
-        return 4.0 * self.dof - self.chi_square
 
 
 def wall_guesses(newest: Sequence[Slot], noise: RangeNoise) -> list[Array]:
@@ -201,18 +196,12 @@ class WallTracker:
 
     def is_wall(self, tracklet: WallTracklet) -> bool:
         """Tell whether a tracklet is evidence of a wall and not of a point."""
-        rule, members = self._rule, tracklet.members
+        members = tracklet.members
         if len({member.slot.back for member in members}) < self._walls.min_frames:
             return False
         if self._way_m(tracklet) < self._walls.min_way_m:
             return False
-        hits: dict[int, int] = {}
-        for member in members:
-            hits[member.slot.radar] = hits.get(member.slot.radar, 0) + 1
-        if len(hits) < 2 or min(hits.values()) < rule.min_hits_per_radar:
-            return False
-        limit = tracklet.dof + rule.excess_sigmas * math.sqrt(2.0 * max(tracklet.dof, 0))
-        if tracklet.share < rule.min_share or tracklet.chi_square > limit:
+        if not is_consistent(tracklet, 2, self._rule):
             return False
         verdict = compare(self.sightings(members), float(tracklet.wall[0]))
         return verdict.law(self._walls.wall_margin) is Law.WALL
@@ -234,25 +223,6 @@ class WallTracker:
             radars=np.array([m.slot.radar for m in members]),
             offset_covariance=self._offset_covariance,
         )
-
-
-def find_wall_tracklets(
-    tracker: WallTracker, guesses: Sequence[Array], frames: Sequence[Sequence[Slot]]
-) -> list[WallTracklet]:
-    """Return the walls, best first; their ranges are taken out of the frames."""
-    found: list[WallTracklet] = []
-    waiting = list(guesses)
-    while waiting:
-        followed = [(tracker.follow(guess, frames), guess) for guess in waiting]
-        walls = [pair for pair in followed if tracker.is_wall(pair[0])]
-        if not walls:
-            break
-        best, chosen = max(walls, key=lambda pair: pair[0].score)
-        for member in best.members:
-            member.slot.unused.remove(member.measured)
-        found.append(best)
-        waiting = [guess for _, guess in walls if guess is not chosen]
-    return found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -354,17 +324,7 @@ def match_wall(state: State, seen: BodyWall, cells: WallCells, rule: WallRule) -
             continue
         rows = wall_rows(state, row, seen)
         scored.append((rows.mahalanobis_sq + rows.log_det, rows.mahalanobis_sq, row))
-    if not scored:
-        return None
-    scored.sort()
-    score, distance, best = scored[0]
-    if distance > rule.match_gate:
-        return None
-    if -0.5 * score - math.log(math.tau) <= math.log(rule.unmapped_per_rad_m):
-        return None
-    if len(scored) > 1 and scored[1][0] - score < rule.match_margin:
-        return None
-    return best
+    return clear_match(scored, rule.match_gate, rule.unmapped_per_rad_m, rule.match_margin)
 
 
 def is_unresolved(state: State, seen: BodyWall, cells: WallCells, rule: WallRule) -> bool:
@@ -494,7 +454,10 @@ class WallKeeper:
             return []
         frames = unassigned.slots(radars, self._rule.window)
         guesses = wall_guesses(frames[0], self._parameters.ranges)
-        return find_wall_tracklets(self._tracker(), guesses, frames) if guesses else []
+        if not guesses:
+            return []
+        tracker = self._tracker()
+        return best_first(guesses, lambda guess: tracker.follow(guess, frames), tracker.is_wall)
 
     def place(self, tracklet: WallTracklet) -> tuple[int, bool] | None:
         """Bring a wall into the map; return its id and whether it is new.

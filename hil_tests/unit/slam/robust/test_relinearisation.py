@@ -9,7 +9,7 @@ import pytest
 from hil_tests.unit.slam.robust.test_roundness import RODS, SIGMA_M, drive
 from slam.config import WheelNoise
 from slam.robust.parameters import RelinearisationRule
-from slam.robust.run_log import start_prior
+from slam.robust.run_log import _keep, start_prior
 from slam.robust.smoother import is_determined, relinearise
 from slam.robust.state import State
 
@@ -42,7 +42,7 @@ def test_a_range_beyond_the_limit_is_no_part_of_what_is_condensed() -> None:
         if is_measured:
             ranges.ranges_m[5] += 50 * SIGMA_M
         else:
-            ranges.keep([row for row in range(len(ranges.poses)) if row != 5])
+            _keep(ranges, [row for row in range(len(ranges.poses)) if row != 5])
         assert relinearise(log, state, parameters)
         assert log.n_kept < 60
         unused = start_prior((1.0,) * 3, (1.0,) * 4, len(state.feature_ids))
