@@ -17,8 +17,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emulator.chip.pace import Pace
-from xethru_protocol.system import Stop, stop_signals
+from emulator.chip import Pace
+from xethru_protocol.system import StopFlag
 
 if TYPE_CHECKING:
     from emulator.faults.kind import Kind
@@ -53,7 +53,6 @@ Prints the answer as one JSON line. Exit 1 when the emulator refuses. For exampl
 
 
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the sub-commands to a parser."""
     faults = commands.add_parser(
         "faults",
         help="list the kinds of faults",
@@ -78,7 +77,6 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def add_proxy(
     commands: argparse._SubParsersAction[argparse.ArgumentParser],
 ) -> argparse.ArgumentParser:
-    """Add the sub-command ``proxy``, and return its parser."""
     proxy = commands.add_parser(
         "proxy", help="put faults on the line of a real module", description=_PROXY_HELP
     )
@@ -102,7 +100,6 @@ def add_proxy(
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run one of them; return the exit code."""
     try:
         return _list(arguments) if arguments.command == "faults" else _control(arguments)
     except KeyboardInterrupt:
@@ -119,7 +116,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _list(arguments: argparse.Namespace) -> int:
-    from emulator.faults.plan import KINDS, described
+    from emulator.faults.kinds import KINDS
+    from emulator.faults.plan import described
 
     kinds = list(KINDS.values())
     if arguments.kind is not None:
@@ -349,15 +347,14 @@ who opens a port, a host's first command counts as opening it.)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return its exit code."""
-    with stop_signals() as stop:  # the imports take most of a second: a signal may come in them
+    with StopFlag("same") as stop:  # the imports take most of a second: a signal may come in them
         arguments = _parse(argv)
         if arguments.command not in COMMANDS:
             return _run(arguments, stop)
     return run(arguments)  # a signal ends these at once: there is nothing to clean up
 
 
-def _run(arguments: argparse.Namespace, stop: Stop) -> int:
+def _run(arguments: argparse.Namespace, stop: StopFlag) -> int:
     # heavy imports only now: --help and usage errors answer at once
     from emulator.playback import PlayOptions
     from emulator.serving import CannotServeError, play, proxy, serve

@@ -120,11 +120,9 @@ class PlayClock:
 
     @property
     def begins_ns(self) -> int:
-        """When the piece in force begins, or began."""
         return self._anchor_ns
 
     def begin_at(self, at_ns: int) -> None:
-        """Begin the piece in force, which has not begun, at another time."""
         self._anchor_ns = at_ns
 
     def due_ns(self, position_ns: int) -> int | None:
@@ -136,7 +134,6 @@ class PlayClock:
         return self._anchor_ns + round((position_ns - self._anchor_position_ns) / self.rate)
 
     def position_ns(self, now_ns: int) -> int:
-        """Return the position that a time of the device has reached."""
         if self.paused or not self.rate or now_ns <= self._anchor_ns:
             return self._anchor_position_ns
         return self._anchor_position_ns + math.floor((now_ns - self._anchor_ns) * self.rate)
@@ -151,18 +148,15 @@ class PlayClock:
         self._anchor_position_ns -= round_ns
 
     def pause(self, now_ns: int) -> None:
-        """Stand still."""
         self._settle(now_ns)
         self.paused = True
 
     def resume(self, now_ns: int) -> None:
-        """Go on from where it stood still, if it does."""
         if self.paused:
             self.paused = False
             self._anchor_ns = max(self._anchor_ns, now_ns)
 
     def set_rate(self, rate: float, now_ns: int) -> None:
-        """Go on from the position of now at another rate."""
         self._settle(now_ns)
         self.rate = rate
 
@@ -188,7 +182,6 @@ class KindSteps:
         return self._steps[-1][1]
 
     def change(self, kinds: frozenset[str] | None, position_ns: int) -> None:
-        """Play other kinds from a position on."""
         while len(self._steps) > 1 and self._steps[-1][0] >= position_ns:
             self._steps.pop()
         self._steps.append((position_ns, kinds))
@@ -198,12 +191,10 @@ class KindSteps:
         self._steps = [(0, self.newest)]
 
     def forget_before(self, position_ns: int) -> None:
-        """Drop what only concerns messages before a position."""
         while len(self._steps) > 1 and self._steps[1][0] <= position_ns:
             del self._steps[0]
 
     def passes(self, position_ns: int, message: Response) -> bool:
-        """Whether a message at a position is played."""
         _, kinds = self._steps[0]
         for begin_ns, later in self._steps[1:]:
             if begin_ns <= position_ns:
@@ -243,7 +234,6 @@ def kinds(names: Iterable[str]) -> frozenset[str]:
 
 
 def is_answer(message: Response) -> bool:
-    """Whether a message answers a command; nobody asks for recorded ones."""
     if isinstance(message, UnknownMessage):
         return message.code in _ANSWERS
     return ROWS[type(message)].prefix[0] in _ANSWERS
@@ -372,7 +362,6 @@ class PlayStream(MessageStream):
         return self._clock.due_ns(self._next.time_ns)
 
     def take(self) -> Response:
-        """Return the next message; there must be one."""
         taken = self._next
         assert taken is not None
         self._begun = True
@@ -387,7 +376,6 @@ class PlayStream(MessageStream):
 
     def skip_due_before(self, time_ns: int) -> int:
         """Skip nothing: a recording is played whole."""
-        del time_ns
         return 0
 
     def command_done(self, command: Command[Response], now_ns: int) -> None:
@@ -407,14 +395,11 @@ class PlayStream(MessageStream):
         self._sought_ns = None
 
     def port_closed(self, now_ns: int) -> None:
-        """Stop playing."""
-        del now_ns
         self._begun = self._listening = self._round_waits = False
         self._coming = iter(())
         self._next = None
 
     def state(self, now_ns: int) -> PlayState:
-        """Return what the playback is doing."""
         return PlayState(
             playing=self._listening and self._next is not None,
             paused=self._clock.paused,
@@ -490,7 +475,6 @@ class PlayStream(MessageStream):
             self._next_round()
 
     def _go(self, position_ns: int, at_ns: int) -> None:
-        """Be at a position of the recording at a time of the device."""
         self._kinds.forget()
         self._first = (0, position_ns)
         self._round_waits = False
@@ -508,7 +492,6 @@ class PlayStream(MessageStream):
         self._open()
 
     def _open(self) -> None:
-        """Go through the recording up to the next message to play."""
         self._coming = enumerate(self._timed)
         self._last_ns = 0
         self._advance()
@@ -558,7 +541,6 @@ class FrameSurvey:
         self._area_m: tuple[float, float] | None = None
 
     def look_at(self, message: Response) -> None:
-        """Look at the next message."""
         if isinstance(message, DataFloat) and message.content_id == 0:
             self._sizes[message.values.size] += 1
         elif (
@@ -591,7 +573,6 @@ class PlayedChip(Chip):
         super().__init__(echo_source(empty_room(), 0, 0))
 
     def get(self, setting: X4Setting) -> X4Value:
-        """Return what GET answers, or raise `Refusal` for a setting without getter."""
         downconverted = bool(self.settings.downconversion)
         n_bins = self._frames.n_values // 2 if downconverted else self._frames.n_values
         if setting is X4Setting.FRAMEBINCOUNT:
@@ -740,7 +721,6 @@ class _Survey:
         return 0 if self.first_ns is None else self.first_ns - zero_ns
 
     def _played(self, records: Iterable[tuple[Response, int | None]]) -> TimedMessages:
-        """Pass on what will be played."""
         for message, stamp_ns in records:
             self.messages += 1
             self._frames.look_at(message)
@@ -751,7 +731,6 @@ class _Survey:
 
 
 def _check(recording: Path, surveys: Iterable[_Survey], zero_ns: int, options: PlayOptions) -> None:
-    """Refuse what would play nothing, or for ever."""
     if not any(survey.messages for survey in surveys):
         raise RecordingError(f"{recording}: the recording holds no messages")
     if not any(survey.plays for survey in surveys):

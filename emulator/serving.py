@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.device import Device, radar_device
 from emulator.echo.echo import echo_source
 from emulator.faults.faulty_device import FaultyDevice, wrap
@@ -31,7 +31,7 @@ from emulator.scene.scene import Scene, SceneError, UnknownSceneError, empty_roo
 from emulator.scene.wheels import scene_odometry
 from xethru_protocol.recordings import RecordingError
 from xethru_protocol.recordings.wire_capture import Way, WireCapture
-from xethru_protocol.system import Stop
+from xethru_protocol.system import StopFlag
 
 
 class FaultBench:
@@ -76,7 +76,6 @@ class FaultBench:
             self.truth = TruthLog(stream.write)
 
     def wrap(self, device: InnerDevice, name: str) -> FaultyDevice:
-        """Return a device with the faults of the plan."""
         faulty = wrap(device, name, self._plan, self.truth, zero_ns=self._zero_ns)
         self.devices[name] = faulty
         return faulty
@@ -122,7 +121,7 @@ def serve(
     seed: int,
     pace: Pace,
     link_dir: Path | None,
-    stop: Stop,
+    stop: StopFlag,
     *,
     links: LinkOptions,
     faults: Path | str | None = None,
@@ -194,7 +193,7 @@ def play(
     link_dir: Path | None,
     *,
     warn: Callable[[str], None],
-    stop: Stop,
+    stop: StopFlag,
 ) -> None:
     """Play a recording, each radar at a port of its own, until a signal asks for the end.
 
@@ -255,7 +254,7 @@ def proxy(
     port: Path,
     baud: int,
     link_dir: Path | None,
-    stop: Stop,
+    stop: StopFlag,
     *,
     faults: Path | str | None,
     truth: Path | None,
@@ -284,7 +283,7 @@ def proxy(
     def gone() -> None:
         nonlocal lost
         lost = True
-        stop.request(0, None)
+        stop.request()
 
     with contextlib.ExitStack() as cleanup:
         try:
@@ -376,14 +375,14 @@ def _run(
     ports: DevicePorts,
     services: Sequence[Service],
     ready: dict[str, object],
-    stop: Stop,
+    stop: StopFlag,
     cleanup: contextlib.ExitStack,
 ) -> None:
     if stop.requested:
         return  # nobody shall learn of ports that go away at once
     server = Server(ports.ports, [*services, *ports.services])
     cleanup.callback(server.close)
-    stop.attach(server)
+    stop.attach(server.stop)
     cleanup.callback(stop.detach)  # a second signal must not reach a loop that is being closed
     announcement = Announcement(ready)
     cleanup.callback(announcement.close)

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 
 import pytest
 
+from emulator.chip import Pace
 from emulator.chip.chip import EchoSource
-from emulator.chip.pace import Pace
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.faults.faulty_device import FaultyDevice, fault, wrap

@@ -1,8 +1,5 @@
 """Scenario files: which faults hit which radar, when, how often.
 
-To add one, write an effect in the file of its layer and a row in that file's table; the scenario
-files, the command line and the tests that go through the table then know it.
-
 JSON lines, one object per fault: ``t_ns`` (device time), ``radar``, ``kind``, ``parameters``,
 ``counter`` (of the last radar frame, null before the first), ``offset`` (bytes sent to the host
 before the packet that it hit).
@@ -35,7 +32,6 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -50,28 +46,10 @@ from pydantic import (
 )
 
 from emulator.faults.kind import Kind, Parameters, Target
-from emulator.faults.kinds import bytes as byte_kinds
-from emulator.faults.kinds import commands, device, frames, stream
+from emulator.faults.kinds import KINDS
 from xethru_protocol.system import read_bounded
 from xethru_protocol.wire.messages import Command
 from xethru_protocol.wire.table import ROWS
-
-KINDS: Mapping[str, Kind] = MappingProxyType(
-    {
-        kind.name: kind
-        for kind in (
-            *byte_kinds.KINDS,
-            *frames.KINDS,
-            *frames.BULK_KINDS,
-            *commands.KINDS,
-            *stream.KINDS,
-            *device.KINDS,
-            *device.TIME_KINDS,
-            *stream.ENVIRONMENT_KINDS,
-        )
-    }
-)
-"""The catalogue, in the order of its layers."""
 
 _LIMITS = {
     "minimum": "at_least",
@@ -102,7 +80,6 @@ def described(kind: Kind) -> dict[str, Any]:
 
 
 def example(kind: Kind) -> str:
-    """Return a scenario with one fault of a kind, as TOML."""
     parameters = kind.parameters().model_dump(exclude_none=True)
     lines = ["[[fault]]", f'kind = "{kind.name}"', "at_s = 2.0"]
     if parameters:
@@ -159,7 +136,6 @@ class TruthLog:
         self.counts: Counter[str] = Counter()
 
     def note(self, injected: Injected) -> None:
-        """Add a record."""
         self.records.append(injected)
         self.counts[injected.kind] += 1
         if self._write is not None:
@@ -243,11 +219,9 @@ class FaultSpec(_Table):
 
     @property
     def row(self) -> Kind:
-        """The row of the catalogue."""
         return KINDS[self.kind]
 
     def kind_parameters(self) -> Parameters:
-        """Return the parameters of the kind, with its defaults."""
         return self.row.parameters.model_validate(self.parameters)
 
 
@@ -301,7 +275,6 @@ def parse_plan(text: str, source: str = "scenario") -> FaultPlan:
 
 
 def plan_names() -> tuple[str, ...]:
-    """Return the names of the scenarios that ship with the package, sorted."""
     return tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))
 
 

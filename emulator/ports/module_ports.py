@@ -60,20 +60,16 @@ class DeviceSide:
         return not self._has_it or self._shared.device.wants_data
 
     def receive_data(self, data: bytes, now_ns: int) -> None:
-        """Take bytes from the host."""
         if self._has_it:
             self._shared.device.receive_data(data, now_ns)
 
     def advance(self, now_ns: int) -> None:
-        """Let time pass, whoever has the module."""
         self._shared.device.advance(now_ns)
 
     def next_packet(self, now_ns: int) -> bytes | None:
-        """Return the next packet to send now; None without the module."""
         return self._shared.device.next_packet(now_ns) if self._has_it else None
 
     def wake_ns(self, now_ns: int) -> int | None:
-        """Return when time alone changes something; None without the module."""
         return self._shared.device.wake_ns(now_ns) if self._has_it else None
 
     @property
@@ -133,7 +129,6 @@ class Plug(Service):
 
     @property
     def is_in(self) -> bool:
-        """Whether the port is there."""
         return self._link.fileno() >= 0
 
     def register(self, selector: selectors.BaseSelector) -> None:
@@ -141,7 +136,6 @@ class Plug(Service):
         self._selector = selector
 
     def advance(self, now_ns: int) -> None:
-        """Take the port away, or bring it back, when the time has come."""
         wanted = self._present(now_ns) and not self.pulled
         if self.is_in and not wanted:
             self._take_away()
@@ -149,7 +143,6 @@ class Plug(Service):
             self._bring_back()
 
     def wake_ns(self, now_ns: int) -> int | None:
-        """Return when to look again; None while the port is there and nothing says when it goes."""
         return None if self.is_in else now_ns + LOOK_AGAIN_NS
 
     def _take_away(self) -> None:
@@ -261,7 +254,6 @@ class DevicePorts:
     _words: list[tuple[NamedDevice, PtyLink, TcpLink | None]] = field(default_factory=list)
 
     def entries(self) -> list[dict[str, object]]:
-        """Return what the ready line says about the modules."""
         return [
             {
                 "name": named.name,
@@ -364,5 +356,4 @@ def _unheard(now_ns: int) -> None:
 
 
 def _always(now_ns: int) -> bool:
-    del now_ns
     return True

@@ -97,12 +97,10 @@ class TcpLink(Service):
         self._spare_fd = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
 
     def register(self, selector: selectors.BaseSelector) -> None:
-        """Register with the loop."""
         self._selector = selector
         selector.register(self._listener, selectors.EVENT_READ, self._accept)
 
     def fileno(self) -> int:
-        """Return the client's descriptor; -1 while there is none."""
         return -1 if self._client is None else self._client.fileno()
 
     def read(self) -> bytes:
@@ -131,7 +129,6 @@ class TcpLink(Service):
         return len(data)
 
     def hang_up(self) -> None:
-        """Part with the client, if there is one."""
         client, self._client = self._client, None
         if client is None:
             return
@@ -142,7 +139,6 @@ class TcpLink(Service):
         self._left()
 
     def close(self) -> None:
-        """Hang up and stop listening; the loop is not used any more."""
         self._selector = None
         self.hang_up()
         self._listener.close()
@@ -151,7 +147,6 @@ class TcpLink(Service):
             self._spare_fd = -1
 
     def _accept(self, events: int, now_ns: int) -> None:
-        del events, now_ns
         try:
             client, _ = self._listener.accept()
         except OSError as error:

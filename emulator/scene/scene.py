@@ -30,7 +30,7 @@ from pydantic import (
     model_validator,
 )
 
-from emulator.chip.clock import ModuleClock
+from emulator.chip.chip import ModuleClock
 from emulator.scene.motion import AMPLITUDE_OF_1_M2, PersonSpec, Trajectory, carried, drive
 from xethru_protocol.system import read_bounded
 
@@ -69,7 +69,7 @@ class RadarSpec(Table):
     receiver's gain: it scales echoes, leakage and clutter, not the counts. ``start_skew_ms`` is
     how much later than the nominal scene time of counter 0 this radar samples, and ``clock_ppm``
     how fast its clock is: its frames come earlier and its bins are shorter
-    (``emulator.chip.clock``).
+    (``emulator.chip.chip``).
     """
 
     name: Name
@@ -84,7 +84,6 @@ class RadarSpec(Table):
 
     @property
     def clock(self) -> ModuleClock:
-        """Return the clock that this module's skew and error make."""
         return ModuleClock(skew_ns=round(self.start_skew_ms * 1e6), ppm=self.clock_ppm)
 
 
@@ -192,7 +191,7 @@ class ClutterSpec(Table):
 
 
 class JitterSpec(Table):
-    """Jitter of the carrier's phase, common to all echoes of a frame (``emulator.echo.noise``).
+    """Jitter of the carrier's phase, common to all echoes of a frame (``emulator.echo.receiver``).
 
     ``white_rad`` and ``slow_rad`` are the standard deviations of a part that is new with every
     frame and of one that falls to 1/e after ``slow_correlation_s``.
@@ -398,7 +397,6 @@ def empty_room(count: int = 1) -> Scene:
 
 
 def scene_names() -> tuple[str, ...]:
-    """Return the names of the scenes that ship with the package, sorted."""
     return tuple(sorted(path.stem for path in _SHIPPED_SCENES.glob("*.toml")))
 
 

@@ -23,7 +23,7 @@ from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.device import Device, radar_device
 from emulator.echo.echo import echo_source
 from emulator.module.memory import Identity

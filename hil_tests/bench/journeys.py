@@ -24,7 +24,7 @@ from pathlib import Path
 from types import CodeType, FrameType, TracebackType
 from typing import Self
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport

@@ -1,7 +1,5 @@
 """A short recorded session without ports: the emulated robot in this process, in two seconds."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path

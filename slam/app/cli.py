@@ -13,10 +13,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from slam.app.commands.options import add_rerun, count, folder, seconds, seed
-from slam.app.errors import EXIT_FAILED, AppError, StopFlag, StopRequestedError, naming
-from slam.app.experiments import EXPERIMENTS, Experiment, ExperimentModule
+from slam.app.errors import EXIT_FAILED, AppError
+from slam.app.experiments import add_experiments
 from slam.app.sweep.stress import STRESSES
-from xethru_protocol.system import drop_what_cannot_be_said, open_closed_streams
+from xethru_protocol.system import StopFlag, StopRequestedError, flush_streams, open_closed_streams
 
 
 def add_view(parser: argparse.ArgumentParser) -> None:
@@ -215,7 +215,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:  # before a command took note of signals
         return _end("stopped by SIGINT", 128 + signal.SIGINT)
     finally:
-        drop_what_cannot_be_said()
+        flush_streams()
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -367,30 +367,8 @@ def _parser() -> argparse.ArgumentParser:
         description="Runs one experiment on emulated radars; writes NAME.png and NAME.json. All "
         "numbers are simulated.",
     )
-    names = experiment.add_subparsers(
-        required=True, metavar="NAME", dest="name", parser_class=_ExperimentParser
-    )
-    for row in EXPERIMENTS.values():
-        parser_of_row = names.add_parser(row.name, help=row.help, description=row.help)
-        parser_of_row.experiment = row
-        parser_of_row.add_argument(
-            "--out", type=folder, default=Path("out/experiments"), help="folder for the results"
-        )
+    add_experiments(experiment)
     return parser
-
-
-class _ExperimentParser(argparse.ArgumentParser):
-    """Imports its experiment, which adds its own options, only once it is named."""
-
-    experiment: Experiment
-
-    def parse_known_args(  # type: ignore[override]  # of its overloads, argparse uses this one
-        self, args: Sequence[str] | None = None, namespace: None = None
-    ) -> tuple[argparse.Namespace, list[str]]:
-        module = self.experiment.load()
-        module.add_arguments(self)
-        self.set_defaults(command=_experiment, module=module)
-        return super().parse_known_args(args, namespace)
 
 
 def _demo(arguments: argparse.Namespace, stop: StopFlag) -> None:
@@ -511,14 +489,6 @@ def _sweep(arguments: argparse.Namespace, stop: StopFlag) -> None:
         dask=arguments.dask,
     )
     run_sweep(options, stop)
-
-
-def _experiment(arguments: argparse.Namespace, stop: StopFlag) -> None:
-    module: ExperimentModule = arguments.module
-    out: Path = arguments.out
-    with naming(out):
-        out.mkdir(parents=True, exist_ok=True)
-    module.run(arguments, stop)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ import pytest
 
 from hil_tests.patience import seconds, wait_until
 from hil_tests.system.short_scene import write_short_scene
-from slam.app.cli import main
 from slam.app.rig.emulated import end_counter
 from slam.app.sweep.run import make_case, run_case
 
@@ -97,17 +96,6 @@ def test_ctrl_c_while_workers_start(tmp_path: Path) -> None:
     assert (process.returncode, process.stdout) == (130, "")
     assert process.stderr == "uwb-slam: stopped by SIGINT\n"
     assert list(tmp_path.iterdir()) == [script]
-
-
-def test_an_out_that_cannot_be_written_fails_before_the_first_run(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "file").touch()
-    for out, said in ((tmp_path, "is a folder"), (tmp_path / "file" / "o", "file")):
-        assert main(["sweep", "--seeds", "1000", "--json", str(out)]) == 1
-        text = capsys.readouterr()
-        assert said in text.err
-        assert (text.out, text.err.count("\n")) == ("", 1)
 
 
 def test_a_stressed_run_loses_frames_and_has_a_bound_on_what_is_left(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """`uwb-slam sweep --dask`: a scheduler and two workers give what this machine gives alone."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """An emulated module whose process dies and starts again: the driver goes on."""
 
-from __future__ import annotations
-
 import signal
 from pathlib import Path
 

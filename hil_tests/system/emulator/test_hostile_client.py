@@ -1,7 +1,5 @@
 """A small ``python -m hil_tests.bench.hostile_client``, and the same at real ports."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import select
@@ -10,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from hil_tests.bench.hostile_client import MOST_OBJECTS_GROWN, run
 from hil_tests.device.serving import Served, emulator
 from hil_tests.patience import seconds

@@ -1,7 +1,5 @@
 """`proxy`: a module behind a pseudo-terminal, which here is an emulated one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from hil_tests.device.serving import emulator, open_radar

@@ -1,7 +1,5 @@
 """`xethru-emulator serve --state-dir`: another process finds a module as it was left."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from hil_tests.device.serving import emulator, open_radar

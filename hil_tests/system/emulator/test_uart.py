@@ -1,7 +1,5 @@
 """A served module on a UART: the driver sets its speed, changes it, comes back after a reset."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

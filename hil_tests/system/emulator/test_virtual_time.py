@@ -1,7 +1,5 @@
 """Minutes of device time in a second or less: every frame and every counter is there."""
 
-from __future__ import annotations
-
 import pytest
 
 from hil_tests.bench.virtual_time import counters_of

@@ -5,8 +5,6 @@ front end's ranges are at the Cramer-Rao bound of quiet receivers, so what is le
 the error of the sample times and below a millimetre of noise.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace

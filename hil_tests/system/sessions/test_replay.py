@@ -68,11 +68,3 @@ def test_what_is_left_of_a_cut_file_is_the_beginning_of_the_run(
     n_flushed = 14  # of preset paper: states that were in the window when the file ended
     assert len(expected) / 4 < len(lines) < len(expected)
     assert lines[:-n_flushed] == expected[: len(lines) - n_flushed]
-
-
-def test_a_file_that_is_none_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (foreign := tmp_path / "notes.mcap").write_text("a list of things to buy")
-    assert main(["replay", str(foreign), "--out", str(tmp_path / "out")]) == 1
-    said = capsys.readouterr().err
-    assert said.startswith(f"uwb-slam: {foreign}: is no MCAP file")
-    assert len(said.splitlines()) == 1

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.chip import Pace
 from emulator.chip.chip import CaptureSettings
-from emulator.chip.pace import Pace
 from emulator.device import BootTiming, Device, radar_device
 from emulator.module.memory import Identity
 from xethru_protocol.wire import messages as m

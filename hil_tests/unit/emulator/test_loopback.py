@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport

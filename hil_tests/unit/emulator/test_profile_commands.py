@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.device import Device, radar_device
 from emulator.module.settings import DeviceOptions
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource

@@ -5,8 +5,6 @@ noise, and a wheel odometry with per-run biases. No product code takes part: geo
 out again here, so the pipeline is judged by an independent world.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

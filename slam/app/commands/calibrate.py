@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from emulator.scene.scene import Scene, SceneError, load_scene
-from slam.app.errors import AppError, StopFlag, UsageError
+from slam.app.errors import AppError, UsageError
 from slam.app.odometry.track import OdometryTrack
 from slam.app.odometry.tum import TumSample
 from slam.app.records import SessionInfo
@@ -37,7 +37,7 @@ from slam.config import FrontEnd, SlamConfig, override
 from slam.frames import Detection, RadarFrame
 from slam.front_end import make_detector
 from slam.geometry import Rig
-from xethru_protocol.system import read_bounded
+from xethru_protocol.system import StopFlag, read_bounded
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal, Protocol
 
 from emulator.scene.scene import Scene
-from slam.app.errors import AppError, EmulatorError, RadarSilentError, StopFlag, naming
+from slam.app.errors import AppError, EmulatorError, RadarSilentError, naming
 from slam.app.odometry.track import read_odometry_socket
 from slam.app.records import RadarInfo, SessionInfo, SessionObserver
 from slam.app.rig.emulated import (
@@ -37,6 +37,7 @@ from slam.app.session.messages import settings_text
 from slam.app.view.viewer import LiveView
 from slam.config import SlamConfig
 from slam.pipelines import make_slam
+from xethru_protocol.system import StopFlag
 
 
 class WireSink(Protocol):

@@ -20,7 +20,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from slam.app.commands.view import refuse_overwriting, session_file
-from slam.app.errors import AppError, StopFlag, naming
+from slam.app.errors import AppError, naming
 from slam.app.odometry.tum import NS_PER_S
 from slam.app.records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.run.evaluation import (
@@ -40,6 +40,7 @@ from slam.app.run.results import has_truth
 from slam.app.run.runner import LinkChange, LinkLanes, LinkState, RunRecord
 from slam.app.session.reader import RecordedSession, open_session
 from slam.geometry import transform
+from xethru_protocol.system import StopFlag
 
 _KEPT_WARNINGS = 200
 

@@ -13,7 +13,7 @@ from queue import SimpleQueue
 
 import numpy as np
 
-from slam.app.errors import AppError, StopFlag, UsageError
+from slam.app.errors import AppError, UsageError
 from slam.app.odometry.live import FixedClock, LineSource, LiveOdometry, parse_source
 from slam.app.odometry.tum import NS_PER_S, TumSample
 from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, SessionObserver, Snapshot
@@ -39,6 +39,7 @@ from slam.app.view.viewer import LiveView
 from slam.config import ConfigError, load_preset
 from slam.geometry import Rig
 from slam.pipelines import make_slam
+from xethru_protocol.system import StopFlag
 
 
 class LoggingListener(SessionObserver):

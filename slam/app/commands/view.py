@@ -20,16 +20,17 @@ from pathlib import Path
 
 from PIL import Image
 
-from slam.app.errors import AppError, StopFlag, UsageError, naming
+from slam.app.errors import AppError, UsageError, naming
 from slam.app.records import SessionObserver
 from slam.app.run.output import Progress
 from slam.app.run.replay import LostFrames, replay_session, settings_of
-from slam.app.session.mcap import MAGIC
 from slam.app.session.reader import RecordedSession, open_session
 from slam.app.view import SERVE_WEB, SPAWN
 from slam.app.view.rerun_recording import DEVICE_TIME
 from slam.app.view.rerun_sdk import ViewerClient
 from slam.app.view.viewer import LiveView, ViewerKind, ViewerProcess
+from xethru_protocol.recordings.mcap import MAGIC
+from xethru_protocol.system import StopFlag
 
 _MAGIC = b"RRF"
 _END = b"FOOT"

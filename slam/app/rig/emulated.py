@@ -24,7 +24,7 @@ from typing import IO, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport

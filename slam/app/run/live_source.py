@@ -23,7 +23,7 @@ from queue import Empty, SimpleQueue
 from types import TracebackType
 from typing import Literal, Protocol, Self, TypeAlias
 
-from slam.app.errors import AppError, OdometryError, StopRequestedError
+from slam.app.errors import AppError, OdometryError
 from slam.app.odometry.arrival import ArrivalClock
 from slam.app.odometry.live import LineSource, LiveOdometry, read_lines
 from slam.app.odometry.tum import NS_PER_S, TumSample
@@ -32,6 +32,7 @@ from slam.app.rig.sources import RadarLink, radar_frame
 from slam.frames import RadarFrame
 from xethru_protocol.driver.conversation import ProtocolRecord
 from xethru_protocol.driver.frames import Frame
+from xethru_protocol.system import StopRequestedError
 from xethru_protocol.wire.errors import ResponseTimeout, XeThruError
 
 

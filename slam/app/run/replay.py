@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from slam.app.errors import AppError, OdometryError, StopFlag
+from slam.app.errors import AppError, OdometryError
 from slam.app.odometry.track import OdometryTrack
 from slam.app.odometry.tum import TumSample
 from slam.app.records import LogLine, RadarInfo, Scan, SessionObserver, Snapshot
@@ -33,6 +33,7 @@ from slam.config import ConfigError, SlamConfig, WheelNoise, without_removed_key
 from slam.frames import Detection, RadarFrame
 from slam.pipelines import make_slam
 from slam.results import PoseAt, Slam, StepResult
+from xethru_protocol.system import StopFlag
 
 
 class RecordedSlam:

@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.app.errors import AppError, StopRequestedError, naming
+from slam.app.errors import AppError, naming
 from slam.app.odometry.tum import NS_PER_S, Trajectory, read_tum, write_tum
 from slam.app.records import SessionInfo
 from slam.app.run.evaluation import Summary, summarise
 from slam.app.run.runner import RunRecord
 from slam.evaluation import associate_times, ate_rmse_m
 from slam.geometry import Rig
-from xethru_protocol.system import PathInUseError, locked
+from xethru_protocol.system import PathInUseError, StopRequestedError, locked
 
 RESULTS = ("map.png", "summary.json", "estimate.tum", "truth.tum", "odometry.tum")
 

@@ -92,10 +92,6 @@ def snapshot_of(counter: int, t_ns: int, row: NDArray[np.float64]) -> Snapshot:
     )
 
 
-FLOAT_ARRAY = "std_msgs/msg/Float32MultiArray"
-DOUBLE_ARRAY = "std_msgs/msg/Float64MultiArray"
-BYTE_ARRAY = "std_msgs/msg/UInt8MultiArray"
-STRING = "std_msgs/msg/String"
 ODOMETRY = "nav_msgs/msg/Odometry"
 POSE = "geometry_msgs/msg/PoseStamped"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
@@ -147,26 +143,6 @@ def serialise(message: Message) -> memoryview:
 def deserialise(data: bytes, message_type: str) -> Message:
     """Read CDR bytes back; arrays come as numpy arrays."""
     return _typestore().deserialize_cdr(data, message_type)
-
-
-def float_array(samples: NDArray[np.float32]) -> Message:
-    """Wrap one frame, shape (n_bins,), as an array with the dimension `range_bin`."""
-    return _array(FLOAT_ARRAY, "range_bin", samples)
-
-
-def double_array(label: str, values: NDArray[np.float64]) -> Message:
-    """Wrap numbers, shape (n,), as an array with one labelled dimension."""
-    return _array(DOUBLE_ARRAY, label, values)
-
-
-def byte_array(label: str, data: bytes) -> Message:
-    """Wrap bytes as an array with one labelled dimension."""
-    return _array(BYTE_ARRAY, label, np.frombuffer(data, dtype=np.uint8))
-
-
-def string(text: str) -> Message:
-    """Wrap text."""
-    return _type(STRING)(data=text)
 
 
 def odometry(sample: TumSample) -> Message:
@@ -273,14 +249,6 @@ def _landmark_fields() -> list[Message]:
         )
         for name in LANDMARK_DTYPE.names or ()
     ]
-
-
-def _array(message_type: str, label: str, values: NDArray[Any]) -> Message:
-    size = len(values)
-    dimension = _type("std_msgs/msg/MultiArrayDimension")(label=label, size=size, stride=size)
-    layout = _type("std_msgs/msg/MultiArrayLayout")(dim=[dimension], data_offset=0)
-    # a row of an array in Fortran order is none that can be written as it lies
-    return _type(message_type)(layout=layout, data=np.ascontiguousarray(values))
 
 
 def _time(t_ns: int) -> Message:

@@ -24,7 +24,7 @@ from slam.app.odometry.tum import TumSample
 from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, Snapshot
 from slam.app.rig.sources import TRUE_PER_MODULE_METRE, sampler_limits
 from slam.app.session import messages as ros
-from slam.app.session.mcap import Metadata, RawMessage, read_entries
+from slam.app.session.mcap import read_entries
 from slam.app.session.messages import (
     METADATA_NAME,
     check_format,
@@ -35,6 +35,15 @@ from slam.app.session.messages import (
 from slam.frames import Detection, RadarFrame
 from slam.geometry import Mount, Rig
 from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.recordings.mcap import (
+    BYTE_ARRAY,
+    DOUBLE_ARRAY,
+    FLOAT_ARRAY,
+    Message,
+    Metadata,
+    unpack_array,
+    unpack_string,
+)
 
 _LOG_WARN = 30
 
@@ -77,7 +86,7 @@ FrameTopics: TypeAlias = Mapping[str, tuple[int, RadarInfo, tuple[float, float] 
 """By topic: index and description of a radar, and the limits of its sampler."""
 
 
-def read_record(message: RawMessage, frame_of: FrameTopics) -> Recorded | None:
+def read_record(message: Message, frame_of: FrameTopics) -> Recorded | None:
     """Return what a message says; None for those that say nothing new."""
     found = frame_of.get(message.topic)
     if found is not None:
@@ -88,9 +97,9 @@ def read_record(message: RawMessage, frame_of: FrameTopics) -> Recorded | None:
 
 
 def _frame(
-    message: RawMessage, index: int, radar: RadarInfo, limits: tuple[float, float] | None
+    message: Message, index: int, radar: RadarInfo, limits: tuple[float, float] | None
 ) -> RadarFrame:
-    samples = np.asarray(ros.deserialise(message.data, ros.FLOAT_ARRAY).data, dtype=np.float32)
+    samples = unpack_array(FLOAT_ARRAY, message.data)
     if len(samples) != radar.n_bins:
         raise ValueError(f"{len(samples)} samples, but the radar was set to {radar.n_bins}")
     return RadarFrame(
@@ -112,8 +121,8 @@ def limits_of(radar: RadarInfo) -> tuple[float, float] | None:
     return sampler_limits(RawConfig(**dict(radar.settings)))  # type: ignore[arg-type]  # from JSON
 
 
-def _scan_end(message: RawMessage) -> ScanEnd:
-    values = ros.deserialise(message.data, ros.DOUBLE_ARRAY).data
+def _scan_end(message: Message) -> ScanEnd:
+    values = unpack_array(DOUBLE_ARRAY, message.data)
     n_frames = int(values[0]) if len(values) else -1
     members, truth = np.split(values[1:], [2 * n_frames])
     if n_frames < 0 or len(members) != 2 * n_frames or len(truth) not in (0, 3):
@@ -127,16 +136,16 @@ def _scan_end(message: RawMessage) -> ScanEnd:
     )
 
 
-def _state(message: RawMessage) -> Snapshot:
-    row = ros.deserialise(message.data, ros.DOUBLE_ARRAY).data
+def _state(message: Message) -> Snapshot:
+    row = unpack_array(DOUBLE_ARRAY, message.data)
     return snapshot_of(message.sequence, message.t_ns, row)
 
 
-def _odometry(message: RawMessage) -> TumSample:
+def _odometry(message: Message) -> TumSample:
     return ros.odometry_sample(ros.deserialise(message.data, ros.ODOMETRY))
 
 
-def _truth(message: RawMessage) -> TruthPose:
+def _truth(message: Message) -> TruthPose:
     pose = ros.deserialise(message.data, ros.POSE).pose
     heading_rad = 2.0 * math.atan2(pose.orientation.z, pose.orientation.w)
     return TruthPose(
@@ -144,14 +153,14 @@ def _truth(message: RawMessage) -> TruthPose:
     )
 
 
-def _log_line(message: RawMessage) -> LogLine:
+def _log_line(message: Message) -> LogLine:
     line = ros.deserialise(message.data, ros.LOG)
     return LogLine(
         t_ns=message.t_ns, radar=line.name, warning=line.level >= _LOG_WARN, text=line.msg
     )
 
 
-_READERS: Mapping[str, Callable[[RawMessage], Recorded]] = {
+_READERS: Mapping[str, Callable[[Message], Recorded]] = {
     "/scan": _scan_end,
     "/scan_unused": _scan_end,
     "/slam/state": _state,
@@ -262,11 +271,11 @@ class RecordedSession:
         of_scan: dict[int, tuple[Detection, ...]] = {}
         held: list[Detection] = []
         for entry in read_entries(self.path, self._on_cut, self._size):
-            if not isinstance(entry, RawMessage):
+            if not isinstance(entry, Message):
                 continue
             if entry.topic in index_of:
                 with self._naming(entry):
-                    ranges_m = ros.deserialise(entry.data, ros.DOUBLE_ARRAY).data.tolist()
+                    ranges_m = unpack_array(DOUBLE_ARRAY, entry.data).tolist()
                 radar, t_ns = index_of[entry.topic], entry.t_ns
                 held += [
                     Detection(radar=radar, t_ns=t_ns, range_m=range_m, amplitude=math.nan)
@@ -284,9 +293,9 @@ class RecordedSession:
             ways[f"/radar/{radar.name}/rx"] = (radar.name, "rx")
             ways[f"/radar/{radar.name}/tx"] = (radar.name, "tx")
         for entry in read_entries(self.path, self._on_cut, self._size):
-            if isinstance(entry, RawMessage) and (found := ways.get(entry.topic)):
+            if isinstance(entry, Message) and (found := ways.get(entry.topic)):
                 with self._naming(entry):
-                    data = ros.deserialise(entry.data, ros.BYTE_ARRAY).data.tobytes()
+                    data = unpack_array(BYTE_ARRAY, entry.data).tobytes()
                 yield WireBytes(
                     radar=found[0],
                     way=found[1],
@@ -315,7 +324,7 @@ class RecordedSession:
             for index, radar in enumerate(self.info.radars)
         }
         for entry in read_entries(self.path, self._on_cut, self._size):
-            if not isinstance(entry, RawMessage):
+            if not isinstance(entry, Message):
                 continue
             with self._naming(entry):
                 record = read_record(entry, frame_of)
@@ -323,7 +332,7 @@ class RecordedSession:
                 yield record
 
     @contextmanager
-    def _naming(self, entry: RawMessage) -> Iterator[None]:
+    def _naming(self, entry: Message) -> Iterator[None]:
         try:
             yield
         except (ValueError, TypeError, AssertionError, IndexError, struct.error) as error:
@@ -373,9 +382,9 @@ def open_session(path: Path) -> RecordedSession:
     return RecordedSession(path, read_session_table(path, head, tuple(radars)), size=size)
 
 
-def _radar_info(path: Path, message: RawMessage) -> RadarInfo:
+def _radar_info(path: Path, message: Message) -> RadarInfo:
     try:
-        text = str(ros.deserialise(message.data, ros.STRING).data)
+        text = unpack_string(message.data)
     except (ValueError, TypeError, AssertionError, IndexError, struct.error) as error:
         raise AppError(f"{path}: {message.topic} cannot be read: {error!r}") from None
     return read_radar_text(path, message.topic, text)

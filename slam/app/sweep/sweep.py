@@ -20,7 +20,8 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
-from slam.app.errors import AppError, StopFlag, StopRequestedError, UsageError, naming
+from slam.app.errors import AppError, UsageError, naming
+from slam.app.run.output import print_table
 from slam.app.sweep.bound import require_gtsam
 from slam.app.sweep.run import (
     Case,
@@ -29,10 +30,15 @@ from slam.app.sweep.run import (
     program_version,
     run_case,
 )
-from slam.app.sweep.statistics import group_line, print_stress_tables, summarise_groups
+from slam.app.sweep.statistics import (
+    group_line,
+    stress_table,
+    stress_tables,
+    summarise_groups,
+)
 from slam.app.sweep.stress import CLEAN
 from slam.app.sweep.workers import ClusterLostError, dask_results, worker_results
-from xethru_protocol.system import PathInUseError, locked
+from xethru_protocol.system import PathInUseError, StopFlag, StopRequestedError, locked
 
 _TAIL = b"\n]}\n"
 
@@ -263,7 +269,8 @@ def _finish(options: SweepOptions, cases: Sequence[Case], part: PartFile) -> Non
         part.path.replace(options.out)
     for group in groups:
         sys.stdout.write(f"{group_line(group)}\n")
-    print_stress_tables(groups)
+    for clean, rows in stress_tables(groups):
+        print_table(*stress_table(clean, rows))
 
 
 def _run_line(run: SweepRun) -> str:

@@ -12,13 +12,12 @@ from scipy.optimize import least_squares
 from hil_tests.property.robust_oracles import (
     N_RADARS,
     Array,
-    random_covariance,
     random_state,
     seeds,
     twin,
 )
 from slam.config import WheelNoise
-from slam.robust.initialisation import BodyPoint, initialise_landmark, point_rows, update_with_point
+from slam.robust.initialisation import BodyPoint, initialise_landmark, update_with_point
 from slam.robust.map import apply_merge, merge_rows
 from slam.robust.matching import NOTHING, Option, cheapest
 from slam.robust.parameters import RelinearisationRule
@@ -46,24 +45,6 @@ def measure(
     rows = rows_of(state, view(state, ANTENNAS), radars, landmarks)
     nis, _ = state.update(rows.at, rows.H, residual, np.full(len(residual), sigma**2))
     return nis
-
-
-@few
-@given(seeds)
-def test_the_triangle_does_what_a_full_matrix_does(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    P = random_covariance(9, rng)
-    stored = SymmetricMatrix(P)
-    a, b, W = rng.standard_normal(9), rng.standard_normal(9), rng.standard_normal((9, 3))
-    at = np.array([1, 4, 8])
-    assert np.array_equal(stored.columns(at), P[:, at])
-    assert np.array_equal(stored.block(at), P[np.ix_(at, at)])
-    stored.add_products(a, b)
-    stored.subtract_gram(W)
-    wanted = P + np.outer(a, b) + np.outer(b, a) - W @ W.T
-    assert np.abs(stored.full() - wanted).max() <= 1e-12
-    stored.keep(at)
-    assert np.abs(stored.full() - wanted[np.ix_(at, at)]).max() <= 1e-12
 
 
 def test_covariance_stays_symmetric_and_positive_over_ten_thousand_operations() -> None:
@@ -115,32 +96,6 @@ def test_three_directions_stay_unobservable_whatever_the_filter_believes() -> No
     # Predictions rotate the heading's doubt about the origin of the map: N is constant.
     assert np.abs(difference - added).max() <= 1e-9 * np.abs(added).max()
     assert int(np.sum(np.linalg.svd(difference)[1] > 1e-9)) == 3
-
-
-@few
-@given(seeds)
-def test_a_new_landmark_is_the_limit_of_a_boundless_prior(seed: int) -> None:
-    state = random_state(seed, 2, 1.0)
-    rng = np.random.default_rng(seed)
-    point = BodyPoint(
-        point_m=rng.uniform(-1, 1, 2),
-        covariance=1e-4 * np.eye(2),
-        by_offsets=rng.standard_normal((2, N_RADARS)),
-    )
-    born = twin(state)
-    initialise_landmark(born, point)
-    # The same by an update of a landmark with a huge prior, where its birth would put it.
-    limit = twin(born)
-    size = state.P.size
-    P = np.zeros((size + 2, size + 2))
-    P[:size, :size] = state.P.full()
-    P[size:, size:] = 1e6 * np.eye(2)
-    limit.P = SymmetricMatrix(P)
-    update_with_point(limit, 2, point)
-    assert np.abs(limit.P.full() - born.P.full()).max() <= 1e-7
-    # Seen again without noise it is where it was expected, bit by bit of rounding.
-    residual = point_rows(born, 2, point).residual
-    assert np.abs(residual).max() <= 1e-12
 
 
 @few

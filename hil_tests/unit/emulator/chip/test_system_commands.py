@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.device import radar_device
 from emulator.module.settings import DeviceOptions
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from emulator.faults.kinds import KINDS
 from emulator.faults.plan import (
-    KINDS,
     FaultPlanError,
     described,
     example,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from emulator.chip import Pace
 from emulator.chip.chip import Refusal
-from emulator.chip.pace import Pace
 from emulator.device import radar_device
 from emulator.module.memory import FileSystem
 from emulator.module.settings import DeviceOptions

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.device import radar_device
 from emulator.module.modes import permission_table, state_diagram
 from emulator.module.settings import DeviceOptions

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.device import radar_device
 from emulator.module.settings import DeviceOptions
 from emulator.ports.module_ports import DevicePorts, LinkOptions, NamedDevice, open_ports

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.device import Device
 from emulator.ports.pty import PtyLink
 from emulator.ports.server import PACKETS_PER_TURN, Port, Server

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.device import radar_device
 from emulator.ports.folders import DirectoryMemory
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource

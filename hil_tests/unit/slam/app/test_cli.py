@@ -1,4 +1,4 @@
-"""`uwb-slam` itself: help is light, wrong usage is 2, nobody sees a traceback."""
+"""uwb-slam itself: help is light, wrong usage is 2, signals, and no traceback."""
 
 import os
 import signal
@@ -8,85 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.unit.slam.app.sessions import session_info
 from slam.app.cli import main
-from slam.app.session.log import SessionLog
 from xethru_protocol.system import locked
-
-HEAVY = {
-    "numpy",
-    "scipy",
-    "sklearn",
-    "rerun",
-    "matplotlib",
-    "pydantic",
-    "mcap",
-    "rosbags",
-    "joblib",
-    "rich",
-    "serial",
-    "emulator",
-}
-
-
-@pytest.mark.parametrize(
-    "arguments", [["--help"], ["demo", "--help"], ["evaluate", "--help"], ["sweep", "--help"]]
-)
-def test_help_loads_nothing_heavy(arguments: list[str]) -> None:
-    script = (
-        "import sys\n"
-        "from slam.app.cli import main\n"
-        f"try: main({arguments!r})\n"
-        "except SystemExit as end: assert end.code == 0\n"
-        "print('LOADED', *{name.partition('.')[0] for name in sys.modules})\n"
-    )
-    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert "usage: uwb-slam" in run.stdout
-    loaded = set(run.stdout.partition("LOADED")[2].split())
-    assert loaded & HEAVY == set()
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        [],
-        ["fly"],
-        ["demo", "--seed", "-1"],
-        ["demo", "--seed", "x"],
-        ["demo", "--out", os.fsdecode(b"\xff")],
-        ["sweep", "--json", "o.json", "--seeds", "0"],
-        ["evaluate", "one.tum"],
-    ],
-)
-def test_wrong_usage_is_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(arguments)
-    assert caught.value.code == 2
-    assert "Traceback" not in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("wrong", "code"), [("--scene mars", 2), ("--scene no/such.toml", 1), ("--preset magic", 2)]
-)
-@pytest.mark.parametrize("command", ["demo --out", "sweep --json"])
-def test_an_unknown_name_is_2_a_missing_file_1_both_one_line(
-    command: str, wrong: str, code: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    option, value = wrong.split()
-    assert main([*command.split(), str(tmp_path / "out"), option, value]) == code
-    text = capsys.readouterr()
-    assert text.out == ""
-    assert value in text.err
-    assert text.err.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_folder_that_cannot_be_written_is_1(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "file").write_text("in the way")
-    assert main(["demo", "--out", str(tmp_path / "file" / "o")]) == 1
-    assert "cannot be written: Not a directory" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -163,15 +86,3 @@ def test_a_signal_before_a_command_takes_note_of_signals_is_one_line(
     monkeypatch.setattr("slam.app.cli._parser", interrupted)
     assert main(["run"]) == 130
     assert capsys.readouterr().err == "uwb-slam: stopped by SIGINT\n"
-
-
-@pytest.mark.parametrize("command", ["view", "report"])
-def test_no_result_takes_the_place_of_another_recording(
-    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log = SessionLog(session := tmp_path / "session.mcap", session_info())
-    log.close()
-    (other := tmp_path / "other.mcap").write_bytes(session.read_bytes())
-    assert main([command, str(session), "--out", str(other)]) == 2
-    assert f"{other}: is a recording, which cannot be repeated" in capsys.readouterr().err
-    assert other.read_bytes() == session.read_bytes()

@@ -3,8 +3,6 @@
 What the threads of a run would put into its inbox, each event at its own virtual time.
 """
 
-from __future__ import annotations
-
 import heapq
 import math
 from collections.abc import Callable, Iterator
@@ -13,7 +11,7 @@ from queue import Empty
 
 import numpy as np
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport

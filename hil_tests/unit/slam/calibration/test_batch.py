@@ -1,7 +1,5 @@
 """The sparse batch optimiser against closed forms, derivatives and planted outliers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Offsets, mounts and gains from made-up drives whose truth is known exactly."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 from itertools import pairwise

@@ -3,8 +3,6 @@
 Run as a module for Monte Carlo tables, ``--help`` tells how.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -5,8 +5,6 @@ Radars detect with a probability and see clutter; wheels have calibration errors
 may walk. Geometry is written out again here, so that the back end is judged by another hand.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
