@@ -20,10 +20,10 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
 
 from emulator.device import ByteDevice
 from emulator.scene.philox import Dice
+from emulator.scene.tables import Table
 from xethru_protocol.driver.frames import Lattice
 from xethru_protocol.wire.codes import ElementType, ResponseCode
 from xethru_protocol.wire.connection import Connection, Role
@@ -183,10 +183,8 @@ class Target(Enum):
     MOMENT = "a moment"
 
 
-class Parameters(BaseModel):
-    """Parameters of a kind: frozen, and an unknown one is an error."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
+class Parameters(Table):
+    """Parameters of a kind."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -86,7 +86,7 @@ def test_a_mistake_is_one_line_with_the_remedy(text: str, said: str) -> None:
 
 
 def test_a_missing_file_and_an_unknown_name_are_told(tmp_path: Path) -> None:
-    with pytest.raises(FaultPlanError, match="cannot read the scenario: No such file"):
+    with pytest.raises(FaultPlanError, match="cannot read the scenario file: No such file"):
         load_plan(tmp_path / "none.toml")
     with pytest.raises(FaultPlanError, match="no such scenario; known are bad_day,"):
         load_plan("good_day")

@@ -124,7 +124,7 @@ def test_a_scene_is_frozen() -> None:
         (GOOD + '[[targets]]\nname = "Bad Name"\n', ["targets[0].name", "pattern", "(and 3 more)"]),
         (GOOD + "[path\n", ["not valid TOML", "line"]),
         ("a = " + "[" * 100_000, ["brackets are nested too deep"]),
-        ("radars = 3\n" + HEAD, ["radars", "tuple", "got 3"]),
+        ("radars = 3\n" + HEAD, ["radars", "list", "got 3"]),
         ("", ["missing", "(and 3 more)"]),
         (GOOD + '[walls]\nname = "w"\n', ["walls: must be a list", "begin each with [[walls]]"]),
     ],
