@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from emulator.chip import Pace
-from xethru_protocol.system import Stop, stop_signals
+from xethru_protocol.system import StopFlag
 
 if TYPE_CHECKING:
     from emulator.faults.kind import Kind
@@ -283,7 +283,7 @@ who opens a port, a host's first command counts as opening it.)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    with stop_signals() as stop:  # the imports take most of a second: a signal may come in them
+    with StopFlag("same") as stop:  # the imports take most of a second: a signal may come in them
         arguments = _parse(argv)
         if arguments.command not in ("faults", "ctl"):
             return _run(arguments, stop)
@@ -300,7 +300,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _failed(f"stdout: cannot write: {error.strerror}")
 
 
-def _run(arguments: argparse.Namespace, stop: Stop) -> int:
+def _run(arguments: argparse.Namespace, stop: StopFlag) -> int:
     # heavy imports only now: --help and usage errors answer at once
     from emulator import serving
 

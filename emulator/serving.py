@@ -39,7 +39,7 @@ from emulator.scene.scene import SceneError, UnknownSceneError, empty_room, load
 from emulator.scene.wheels import scene_odometry
 from xethru_protocol.recordings import RecordingError
 from xethru_protocol.recordings.wire_capture import Way, WireCapture
-from xethru_protocol.system import Stop
+from xethru_protocol.system import StopFlag
 
 
 class FaultSession:
@@ -131,7 +131,7 @@ Warn = Callable[[str], None]
 """Gets a warning in one line."""
 
 
-def serve(options: Namespace, stop: Stop, warn: Warn) -> None:
+def serve(options: Namespace, stop: StopFlag, warn: Warn) -> None:
     """Emulate the radars of a scene until a signal asks for the end.
 
     Parameters
@@ -197,7 +197,7 @@ def serve(options: Namespace, stop: Stop, warn: Warn) -> None:
         _run(ports, services, ready, stop, cleanup)
 
 
-def play(options: Namespace, stop: Stop, warn: Warn) -> None:
+def play(options: Namespace, stop: StopFlag, warn: Warn) -> None:
     """Play a recording, each radar at a port of its own, until a signal asks for the end.
 
     Raises
@@ -246,7 +246,7 @@ def play(options: Namespace, stop: Stop, warn: Warn) -> None:
         _run(ports, [*watches, control], ready, stop, cleanup)
 
 
-def proxy(options: Namespace, stop: Stop, warn: Warn) -> None:
+def proxy(options: Namespace, stop: StopFlag, warn: Warn) -> None:
     """Put faults on the line of a real module until a signal asks for the end.
 
     Raises
@@ -259,7 +259,7 @@ def proxy(options: Namespace, stop: Stop, warn: Warn) -> None:
     def gone() -> None:
         nonlocal lost
         lost = True
-        stop.request(0, None)
+        stop.request()
 
     with contextlib.ExitStack() as cleanup:
         try:
@@ -339,14 +339,14 @@ def _run(
     ports: DevicePorts,
     services: Sequence[Service],
     ready: dict[str, object],
-    stop: Stop,
+    stop: StopFlag,
     cleanup: contextlib.ExitStack,
 ) -> None:
     if stop.requested:
         return  # nobody shall learn of ports that go away at once
     server = Server(ports.ports, [*services, *ports.services])
     cleanup.callback(server.close)
-    stop.attach(server)
+    stop.attach(server.stop)
     cleanup.callback(stop.detach)  # a second signal must not reach a loop that is being closed
     announcement = Announcement(ready)
     cleanup.callback(announcement.close)

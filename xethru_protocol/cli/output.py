@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TextIO
 
+from xethru_protocol.system import flush_streams
 from xethru_protocol.wire.codes import ProfileId
 from xethru_protocol.wire.errors import Disconnected, XeThruError
 
@@ -86,21 +87,7 @@ def show(text: str) -> None:
         sys.stderr.write(text)
         sys.stderr.flush()
     except OSError:
-        _mute(sys.stderr)
-
-
-def end_output() -> bool:
-    """Write out what waits on stdout; False if that cannot be done.
-
-    Python does the same at its exit, but complains with a traceback.
-    """
-    try:
-        if sys.stdout is not None:
-            sys.stdout.flush()
-    except OSError:
-        _mute(sys.stdout)
-        return False
-    return True
+        flush_streams()
 
 
 def is_terminal(stream: TextIO | None) -> bool:
@@ -111,11 +98,6 @@ def is_terminal(stream: TextIO | None) -> bool:
 def one_line(text: str) -> str:
     """Write control characters out: a file name may hold line ends."""
     return "".join(part if part.isprintable() else ascii(part)[1:-1] for part in text)
-
-
-def _mute(stream: TextIO) -> None:
-    """Send what is written from now on nowhere, and what is buffered too."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _printable(text: str, stream: TextIO) -> str:

@@ -4,14 +4,13 @@ Whatever ends it, the recording is closed and complete: a signal only asks for t
 none comes while a record is half written; a second one insists.
 """
 
-import signal
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import TracebackType
 from typing import Any, Literal, Protocol, Self
 
 from xethru_protocol.cli.output import (
@@ -29,6 +28,7 @@ from xethru_protocol.cli.output import (
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings import RecordingError, RecordingWriter, WireCapture
+from xethru_protocol.system import StopFlag
 from xethru_protocol.wire.codes import ProfileId
 from xethru_protocol.wire.errors import ResponseTimeout, XeThruError
 from xethru_protocol.wire.framing import LinkStatistics
@@ -461,7 +461,7 @@ def record(
 ) -> int:
     """Record until ``count`` messages, ``duration_s``, a signal, unplugging or a full disk."""
     targets.check(replace=replace)
-    signals: list[int] = []
+    stop = StopFlag("previous")
     with Recorder(targets, count) as recorder:
         try:
             with module_at(port, baudrate) as radar:
@@ -469,12 +469,12 @@ def record(
                 mode.prepare(radar)
                 say_warnings(radar)
                 recorder.open(replace=replace)
-                with _noted(signals):
-                    _record_from(radar, recorder, mode, duration_s, signals)
+                with stop:
+                    _record_from(radar, recorder, mode, duration_s, stop)
         except XeThruError as error:
             recorder.fail(error)
     if as_json:
-        print_json(recorder.summary() | {"ended_by": _end(recorder, signals)})
+        print_json(recorder.summary() | {"ended_by": _end(recorder, stop)})
     elif recorder.failure is None and recorder.messages:
         print_line(f"{targets.text}: {recorder.numbers()}")
     elif recorder.failure is None:
@@ -483,10 +483,10 @@ def record(
         text = str(recorder.failure)
         if recorder.messages:
             text += f"; kept {counted(recorder.messages, 'message')} in {targets.text}"
-        if not signals:
+        if stop.received is None:
             raise CommandFailed(text)
         warn(f"xethru record: {one_line(text)}")
-    return 128 + signals[0] if signals else 0
+    return 0 if stop.received is None else 128 + stop.received
 
 
 def _record_from(
@@ -494,14 +494,14 @@ def _record_from(
     recorder: Recorder,
     mode: RecordingMode,
     duration_s: float | None,
-    signals: list[int],
+    stop: StopFlag,
 ) -> None:
     progress = Progress("xethru record")
     recorder.listen_to(radar)
     try:
         silence_s = mode.start(radar)
         say_warnings(radar)
-        while not (signals or recorder.is_enough):
+        while not (stop.requested or recorder.is_enough):
             if duration_s is not None and recorder.elapsed_s >= duration_s:
                 if not recorder.messages:
                     raise ResponseTimeout(f"the module sent nothing to record in {duration_s:g} s")
@@ -519,29 +519,9 @@ def _record_from(
         progress.finish(recorder.numbers)
 
 
-def _end(recorder: Recorder, signals: list[int]) -> str:
+def _end(recorder: Recorder, stop: StopFlag) -> str:
     if recorder.failure is not None:
         return "failure"
-    if signals:
+    if stop.requested:
         return "signal"
     return "count" if recorder.is_enough else "duration"
-
-
-@contextmanager
-def _noted(signals: list[int]) -> Iterator[None]:
-    """Note the first signal to end; the second does what it did before."""
-
-    def note(number: int, frame: FrameType | None) -> None:
-        signals.append(number)
-        signal.signal(number, previous[signal.Signals(number)])
-
-    previous = {
-        number: signal.signal(number, note)
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-        if signal.getsignal(number) is not signal.SIG_IGN  # after nohup
-    }
-    try:
-        yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)

@@ -17,12 +17,13 @@ from rosbags.highlevel import AnyReader
 from hil_tests.unit.slam.app.sessions import FRAME_NS, session_info, snapshot
 from slam.app.errors import AppError
 from slam.app.records import Scan
-from slam.app.session import messages as ros
 from slam.app.session.log import SessionLog
-from slam.app.session.mcap import CHUNK, RawMessage, read_entries
+from slam.app.session.mcap import read_entries
 from slam.app.session.reader import open_session
 from slam.app.session.repair import KEPT_SUFFIX, repair
 from slam.frames import RadarFrame
+from xethru_protocol.recordings.mcap import CHUNK, FLOAT_ARRAY
+from xethru_protocol.recordings.mcap import Message as StoredMessage
 
 N_BINS = 32
 N_SCANS = 16
@@ -80,7 +81,7 @@ def messages(path: Path) -> list[Message]:
     return [
         (entry.topic, entry.sequence, entry.t_ns, entry.publish_ns, entry.data)
         for entry in read_entries(path, lambda _: None)
-        if isinstance(entry, RawMessage)
+        if isinstance(entry, StoredMessage)
     ]
 
 
@@ -253,7 +254,7 @@ def test_ros_types_survive(whole: Content, tmp_path: Path) -> None:
         connection = next(c for c in reader.connections if c.topic == "/radar/radar1/frame")
         _, t_ns, raw = next(reader.messages([connection]))
         message = reader.deserialize(raw, connection.msgtype)
-    assert connection.msgtype == ros.FLOAT_ARRAY
+    assert connection.msgtype == FLOAT_ARRAY
     assert (t_ns, len(message.data)) == (0, N_BINS)  # type: ignore[attr-defined]  # made at run time
 
 

@@ -181,7 +181,7 @@ def test_messages_nobody_asked_for_are_not_kept(driver_on: DriverOn) -> None:
     radar.configure_raw()
     line.say(*(presence(k, PRESENCE) for k in range(9)), frame(1))
     radar.read_frame()
-    assert radar._core.messages is None
+    assert radar._link.messages is None
 
 
 def test_messages_that_pile_up_are_dropped_and_told_of(driver_on: DriverOn) -> None:
@@ -189,8 +189,8 @@ def test_messages_that_pile_up_are_dropped_and_told_of(driver_on: DriverOn) -> N
     radar.presence.load()
     said = presence(1, PRESENCE)
     for _ in range(4100):
-        radar._core._take(said, 0)
-    radar._core._take(presence(2, PRESENCE), 0)
+        radar._link._take(said, 0)
+    radar._link._take(presence(2, PRESENCE), 0)
     assert radar.messages_dropped == 5
     assert radar.warnings == ["4096 messages wait unread, so the oldest are dropped"]
     assert line.pending == []

@@ -4,26 +4,17 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import pytest
 
-from hil_tests.patience import seconds
 from slam.app.cli import main
-from slam.app.errors import StopFlag, StopRequestedError
 from xethru_protocol.system import locked
 
 
-@pytest.mark.parametrize(
-    ("command", "option", "said"),
-    [
-        ("demo", "--out", "another run is writing there"),
-        ("sweep", "--json", "another sweep is writing there"),
-    ],
-)
+@pytest.mark.parametrize(("command", "option"), [("demo", "--out"), ("sweep", "--json")])
 def test_two_runs_into_one_place_are_refused_and_the_first_goes_on(
-    command: str, option: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    command: str, option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
     first = out / "summary.json" if command == "demo" else tmp_path / "out.part"
@@ -32,7 +23,6 @@ def test_two_runs_into_one_place_are_refused_and_the_first_goes_on(
     with locked(out if command == "demo" else first):
         assert main([command, option, str(out)]) == 1
     text = capsys.readouterr()
-    assert said in text.err
     assert (text.out, text.err.count("\n")) == ("", 1)
     assert first.read_text() == "of the first run"
 
@@ -75,7 +65,8 @@ def test_a_signal_after_a_commands_last_check_counts_too(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("slam.app.cli._evaluate", lambda *_: os.kill(os.getpid(), which))
+    interrupted = lambda *_, **__: os.kill(os.getpid(), which)  # noqa: E731
+    monkeypatch.setattr("slam.app.run.results.run_evaluate", interrupted)
     assert main(["evaluate", "one.tum", "two.tum"]) == code
     assert capsys.readouterr().err == f"uwb-slam: stopped by {which.name}\n"
 
@@ -89,77 +80,3 @@ def test_a_signal_before_a_command_takes_note_of_signals_is_one_line(
     monkeypatch.setattr("slam.app.cli._parser", interrupted)
     assert main(["run"]) == 130
     assert capsys.readouterr().err == "uwb-slam: stopped by SIGINT\n"
-
-
-@pytest.mark.parametrize(
-    ("which", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
-)
-def test_a_signal_raises_at_the_next_check_only(which: signal.Signals, code: int) -> None:
-    with StopFlag() as stop:
-        stop.check()
-        os.kill(os.getpid(), which)
-        done = "work goes on until the check"
-        with pytest.raises(StopRequestedError, match=f"stopped by {which.name}") as caught:
-            stop.check()
-    assert done
-    assert caught.value.exit_code == code
-
-
-def test_while_waiting_a_signal_raises_where_it_arrives() -> None:
-    with StopFlag() as stop:
-        threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGTERM)).start()
-        with pytest.raises(StopRequestedError), stop.at_once():
-            pytest.fail(f"it waited to the end: {threading.Event().wait(seconds(10))}")
-
-
-def test_a_second_signal_gets_the_systems_default() -> None:
-    before = signal.getsignal(signal.SIGINT)
-    with StopFlag():
-        os.kill(os.getpid(), signal.SIGINT)
-        assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
-    assert signal.getsignal(signal.SIGINT) is before
-
-
-def test_a_closing_terminals_second_hang_up_does_not_end_the_clean_stop() -> None:
-    before = signal.getsignal(signal.SIGHUP)
-    with StopFlag() as stop:
-        os.kill(os.getpid(), signal.SIGHUP)
-        os.kill(os.getpid(), signal.SIGHUP)
-        with pytest.raises(StopRequestedError):
-            stop.check()
-    assert signal.getsignal(signal.SIGHUP) is before
-
-
-def test_nohup_is_respected() -> None:
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        with StopFlag() as stop:
-            os.kill(os.getpid(), signal.SIGHUP)
-            stop.check()
-        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGHUP, before)
-
-
-def test_a_signal_before_waiting_begins_is_not_lost() -> None:
-    with StopFlag() as stop:
-        os.kill(os.getpid(), signal.SIGINT)
-        with pytest.raises(StopRequestedError), stop.at_once():
-            pytest.fail("must not begin to wait")
-
-
-class StopFlagWithASlowCheck(StopFlag):
-    """A signal comes just after the check found nothing, where a lost one would go unseen."""
-
-    def check(self) -> None:
-        first = self._received is None
-        super().check()
-        if first:
-            os.kill(os.getpid(), signal.SIGINT)
-
-
-def test_a_signal_just_after_the_check_is_not_lost() -> None:
-    with StopFlagWithASlowCheck() as stop:
-        with pytest.raises(StopRequestedError), stop.at_once():
-            pytest.fail("must not begin to wait")
-        assert not stop._at_once

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from hil_tests.patience import patient_ns, seconds
-from hil_tests.unit.xethru_protocol.pty_machine import PtyMachine
+from hil_tests.unit.xethru_protocol.pty_module import PtyMachine
 from xethru_protocol.driver.async_radar import AsyncX4M300
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.transport import AsyncSerialTransport

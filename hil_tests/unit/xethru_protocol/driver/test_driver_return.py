@@ -242,7 +242,7 @@ def test_module_without_a_number_is_known_by_its_port_only(
     radar, line = driver_on(PlainModule(None), ports=machine.ports, name=HOME, reconnect_s=9.0)
     machine.runs_on(line)
     radar.configure_raw()
-    assert "does not tell its serial number" in radar.warnings[0]
+    assert "does not report its serial number" in radar.warnings[0]
     unplug(line)
     radar.ping()
     assert radar.port == HOME
@@ -373,7 +373,7 @@ def test_uart_is_found_again_at_either_rate(
     radar, line = driver_on(uart, ports=machine.ports, name=HOME, reconnect_s=9.0)
     machine.runs_on(line)
     uart.connect(line, 115200)
-    radar._core.bytes_per_s = line.bytes_per_s
+    radar._link.bytes_per_s = line.bytes_per_s
     radar.set_baud_rate(921600)
     radar.ping()
     unplug(line)

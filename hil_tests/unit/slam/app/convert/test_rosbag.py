@@ -22,13 +22,13 @@ from hil_tests.unit.slam.app.authors_bag import (
 from hil_tests.unit.slam.app.sessions import FRAME_NS, feed, scan, session_info, snapshot
 from slam.app.cli import main
 from slam.app.convert.rosbag import BagOptions, convert_bag, write_bag
-from slam.app.errors import StopRequestedError
 from slam.app.odometry.track import OdometryTrack
 from slam.app.odometry.tum import format_tum_line
 from slam.app.records import Scan
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import SlamSettings
 from slam.app.session.reader import RecordedSession, open_session
+from xethru_protocol.system import StopRequestedError
 
 KINDS = ("bag.bag", "bag")
 

@@ -94,7 +94,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Seen:
 
 
 def test_a_true_fix_lies_where_a_landmark_is(seen: Seen) -> None:
-    assert seen.n_true > 50
+    assert seen.count(Origin.TRUE) > 50
     gaps = [
         np.linalg.norm(transform(pose, np.array([[fix.x_m, fix.y_m]])) - seen.landmarks_m, axis=1)
         for state, pose, origins in zip(seen.states, seen.truth, seen.origins, strict=True)

@@ -8,11 +8,10 @@ import pytest
 
 from hil_tests.unit.slam.app.sessions import feed, session_info
 from slam.app.cli import main
-from slam.app.errors import StopRequestedError
 from slam.app.session.log import SessionLog
 from slam.app.session.reader import open_session
 from slam.app.session.repair import repair
-from xethru_protocol.system import locked
+from xethru_protocol.system import StopRequestedError, locked
 
 
 @pytest.fixture
