@@ -130,6 +130,7 @@ def loaded(program: str) -> set[str]:
 
 def test_importing_the_protocol_loads_no_heavy_library() -> None:
     assert not loaded("import xethru_protocol") & HEAVY
+    assert not loaded("import xethru_protocol.recordings") & HEAVY - {"numpy"}
 
 
 def test_loading_the_plugin_loads_no_library() -> None:

@@ -16,13 +16,13 @@ from slam.app.rig.emulated import (
     RAW_CONFIG,
     end_counter,
     open_loopback,
+    outlines_m,
     rig_of,
     scene_and_config,
     true_landmarks_m,
     versions,
     wheels_of,
 )
-from slam.app.run.pictures import outlines_m
 from slam.app.run.runner import RunRecord, run_slam
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import settings_text

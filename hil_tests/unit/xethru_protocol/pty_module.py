@@ -66,7 +66,6 @@ def stock(
 
 
 def silent(command: m.Message) -> Sequence[Said]:
-    """Answer nothing."""
     return []
 
 
@@ -204,7 +203,6 @@ class PtyMachine:
         self._plugged.pop(name).__exit__(None, None, None)
 
     def received(self, name: str) -> list[m.Message]:
-        """Commands a plugged module got."""
         return list(self._plugged[name].received)
 
     def __enter__(self) -> Self:

@@ -24,7 +24,6 @@ class FileModule:
     def __call__(  # noqa: PLR0911 - one return per command
         self, command: m.Message
     ) -> Sequence[m.Message | bytes]:
-        """Answer a command."""
         self.received.append(command)
         match command:
             case m.Ping():

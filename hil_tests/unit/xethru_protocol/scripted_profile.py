@@ -29,7 +29,6 @@ class ProfileModule:
     def __call__(  # noqa: PLR0911 - one return per command
         self, command: m.Message
     ) -> Sequence[m.Message | bytes]:
-        """Answer a command."""
         self.received.append(command)
         match command:
             case m.Ping():
@@ -105,7 +104,6 @@ class ProfileModule:
 
 
 def presence(counter: int, state: int) -> m.PresenceSingle:
-    """Make a presence message."""
     return m.PresenceSingle(
         counter=counter, state=state, distance_m=1.5, direction=1, signal_quality=4
     )

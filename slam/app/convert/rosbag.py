@@ -4,7 +4,7 @@ Their bags hold, per radar, `/UWBradar<k>/readings` (in earlier ones `/UWBradar<
 per message as std_msgs/Float32MultiArray, which has neither stamp nor counter; `/odom` as
 nav_msgs/Odometry; and a pose by laser as truth: Hector SLAM's `/slam_out_pose`, a
 geometry_msgs/PoseStamped. Radars 2 and 4 look to the left, 1 and 3 to the right, as their public
-launch file pairs them; each data set says so in a file of its own, so a rig file can say otherwise.
+launch file pairs them; each data set has a file of its own for that, so a rig file can change it.
 
 What this program writes has two more kinds of topic, std_msgs/String with JSON, so that nothing is
 lost on the way back: `/UWBradar<k>/info` and `/session`.
@@ -86,7 +86,6 @@ def frames_topic(radar: int) -> str:
 
 
 def info_topic(radar: int) -> str:
-    """Return the topic that says what a radar is."""
     return f"/UWBradar{radar + 1}/info"
 
 
@@ -101,7 +100,6 @@ def radar_of_frames(topic: str) -> str | None:
 
 
 def radar_of_info(topic: str) -> str | None:
-    """Return the radar that a topic tells of, None for other topics."""
     found = _INFO.fullmatch(topic)
     return found[1] if found else None
 
@@ -119,12 +117,12 @@ _PAPER_BINS, _PAPER_AREA_M = 1431, (0.2, 9.4)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BagOptions:
-    """What a bag does not say itself.
+    """What a bag does not contain.
 
     Attributes
     ----------
     rig
-        Mounts under the names of the topics (UWBradar1, ...); ignored where the bag tells.
+        Mounts under the names of the topics (UWBradar1, ...); ignored if the bag has them.
     area_m
         Frame area that the modules were asked for, module metres; None: the paper's.
     truth_topic
@@ -164,7 +162,7 @@ class _Contents:
 def convert_bag(
     bag: Path, out: Path, options: BagOptions, check: Callable[[], None]
 ) -> tuple[str, list[str]]:
-    """Write a bag as a session; return what was written, in words, and what was odd about it.
+    """Write a bag as a session; return a line about it, and warnings.
 
     Raises
     ------
@@ -277,7 +275,7 @@ def _open(bag: Path) -> Iterator[Any]:
         raise AppError(f"{bag}: no bag is there") from None
     except OSError as error:
         raise AppError(f"{bag}: cannot read: {error.strerror or error}") from None
-    except Exception as error:  # rosbags does not say what it may raise of a damaged bag
+    except Exception as error:  # rosbags documents no exceptions for damaged bags
         words = " ".join(str(error).split()) or type(error).__name__
         raise AppError(
             f"{bag}: no bag of ROS 1 or 2, or a damaged one: {words}; `rosbag reindex` or "
@@ -436,12 +434,11 @@ class _Bag:
         self._writer.write(self._connections[topic], t_ns, data)
 
     def close(self) -> None:
-        """Write the index."""
         self._writer.close()
 
 
 def write_bag(session: RecordedSession, out: Path, check: Callable[[], None]) -> str:
-    """Write frames, odometry and truth of a session; return what was written, in words.
+    """Write frames, odometry and truth of a session; return a line about it.
 
     Parameters
     ----------
@@ -469,7 +466,7 @@ def write_bag(session: RecordedSession, out: Path, check: Callable[[], None]) ->
         _remove(out)
         if isinstance(
             error, OSError | sqlite3.Error
-        ):  # SQLite has words of its own for a full disk
+        ):  # SQLite has an error of its own for a full disk
             reason = getattr(error, "strerror", None) or error
             raise AppError(f"{out}: cannot be written: {reason}") from None
         raise

@@ -40,7 +40,7 @@ WRONG_M = 0.15
 
 
 class Origin(Enum):
-    """What a fix is of."""
+    """What a fix is of, see the module."""
 
     TRUE = "true"
     GHOST = "ghost"
@@ -56,7 +56,6 @@ class Setting:
     search_rad_m: float
 
     def __str__(self) -> str:
-        """Return the three numbers as a row of a table has them."""
         return f"{self.window_size}, {self.min_opc}, {1e2 * self.search_rad_m:g} cm"
 
 
@@ -101,11 +100,9 @@ class Seen:
     landmarks_m: Array
 
     def count(self, origin: Origin) -> int:
-        """Return how many fixes are of this origin."""
         return sum(each is origin for of_state in self.origins for each in of_state)
 
     def numbers(self) -> dict[str, object]:
-        """Return what goes into the JSON file."""
         return {
             "scene": self.scene,
             "states": len(self.states),
@@ -259,7 +256,6 @@ _PARAMETERS: tuple[tuple[str, str, _Value], ...] = (
 
 
 def _draw_studies(figure: Figure, studies: Sequence[tuple[Seen, Sequence[Outcome]]]) -> None:
-    """Draw the shares kept over each of the three parameters, a row per scene."""
     panels = figure.subplots(len(studies), len(_PARAMETERS), squeeze=False, sharey=True)
     for row, (seen, outcomes) in zip(panels, studies, strict=True):
         for axes, (name, x_label, value) in zip(row, _PARAMETERS, strict=True):
@@ -308,7 +304,6 @@ _HEADER = (
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
-    """Drive one lap per scene and filter what was seen with every setting."""
     for scene in arguments.scene:
         scene_and_config(scene, "paper")  # a bad one is refused before the first is driven
     studies = []

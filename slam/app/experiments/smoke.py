@@ -97,7 +97,6 @@ class ObservedRun:
     landmarks_m: Array
 
     def numbers(self) -> dict[str, object]:
-        """Return what goes into the JSON file."""
         return {
             "name": self.name,
             "detections": self.n_detections,
@@ -118,7 +117,7 @@ def drive_in_clear_air_and_smoke(
     """Return the runs: clear air, smoke, smoke under other receiver noise, and the lab.
 
     The first two share receiver noise and odometry, so what differs is the smoke's doing; the
-    third tells how much another noise of the receivers does. The lab, in clear air, is there for
+    third shows the effect of other receiver noise. The lab, in clear air, is there for
     its ghosts: with one landmark there are none.
 
     Parameters
@@ -224,7 +223,6 @@ _SHOWN = ("clear air", "smoke", "lab, clear air")
 
 
 def _draw_runs(figure: Figure, runs: Sequence[ObservedRun]) -> None:
-    """Draw raw observations above filtered ones, run by run, on odometry poses."""
     shown = [run for run in runs if run.name in _SHOWN]
     panels = figure.subplots(2, len(shown), sharex="col", sharey="col")
     for column, run in zip(panels.T, shown, strict=True):
@@ -278,7 +276,6 @@ def _draw(axes: Axes, run: ObservedRun, points: NDArray[np.float64], colour: str
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
-    """Drive round one point feature in clear air and in smoke; filter what was observed."""
     runs = drive_in_clear_air_and_smoke(seed=arguments.seed, check=stop.check)
     radar_db = smoke_attenuation_db(_LARGEST_RANGE_M)
     light_db = light_attenuation_db(_LARGEST_RANGE_M)

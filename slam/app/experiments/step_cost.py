@@ -41,7 +41,7 @@ _DENSITY_PER_M2 = 1.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reference:
-    """A number somebody else's code takes at 1000 landmarks, as quoted: low and high [ms]."""
+    """What other code takes at 1000 landmarks, as quoted: low and high [ms]."""
 
     name: str
     low_ms: float
@@ -169,7 +169,6 @@ def slope_of(costs: Sequence[StepCost]) -> float | None:
 
 
 def numbers_of(costs: Sequence[StepCost], *, repetitions: int) -> dict[str, object]:
-    """Return what goes into the JSON file."""
     return {
         "measured": "CPU time of one thread, one BLAS thread, the least of the repetitions of "
         "every step; mean and slowest over a cycle of steps",
@@ -234,7 +233,6 @@ def _at_rest() -> Motion:
 
 
 def _draw(figure: Figure, costs: Sequence[StepCost]) -> None:
-    """Draw the cost of a step over the number of landmarks, both logarithmic."""
     n = np.array([cost.n_landmarks for cost in costs])
     slope = slope_of(costs)
     fitted = "" if slope is None else f", slope {slope:.2f} from n = {SLOPE_FROM} on"

@@ -30,6 +30,7 @@ from slam.app.rig.emulated import (
     RAW_CONFIG,
     end_counter,
     open_loopback,
+    outlines_m,
     rig_of,
     scene_and_config,
     true_landmarks_m,
@@ -37,7 +38,6 @@ from slam.app.rig.emulated import (
     wheels_of,
 )
 from slam.app.run.evaluation import Summary, summarise
-from slam.app.run.pictures import outlines_m
 from slam.app.run.runner import RunRecord, run_slam
 from slam.app.sweep.bound import BoundSummary, bound_of
 from slam.app.sweep.stress import CLEAN, STRESSES, Stress
@@ -264,7 +264,6 @@ class Case:
 
     @property
     def key(self) -> Key:
-        """Return what tells the run from all others of its sweep."""
         return (self.scene.name, self.preset, self.settings, self.stress, self.seed)
 
 
@@ -293,7 +292,6 @@ class SweepRun(Summary):
 
     @property
     def key(self) -> Key:
-        """Return what tells the run from all others of its sweep."""
         return (self.scene, self.preset, tuple(self.settings.items()), self.stress, self.seed)
 
 
@@ -402,7 +400,7 @@ def run_case(
     case
         What to run.
     program
-        `program_version` of whoever asks, if that may be another machine.
+        `program_version` of the caller, if that may be another machine.
     check
         Called once per scan; may raise to stop.
 

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from hil_tests.property.ekf_oracles import complex_step, move, observe, place
 from hil_tests.unit.slam.pose_tracks import at_rest
-from hil_tests.unit.slam.simulation import CLASSROOM, FRAME_NS, LAB, Room, World, simulate
+from hil_tests.unit.slam.robust.range_world import CLASSROOM, LAB, Room
+from hil_tests.unit.slam.simulation import FRAME_NS, World, simulate
 from slam.config import (
     AssociationConfig,
     ClusteringConfig,

@@ -144,11 +144,9 @@ class Hanging:
         self.fault_count = 1
 
     def __enter__(self) -> "Hanging":
-        """Open."""
         return self
 
     def __exit__(self, *reason: object) -> None:
-        """Fail to stop it."""
         self.warnings.append("the module was not stopped: no answer")
 
 

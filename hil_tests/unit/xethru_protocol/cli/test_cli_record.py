@@ -209,10 +209,7 @@ def test_a_full_disk_keeps_what_is_there(module: PtyModule, tmp_path: Path) -> N
 
 
 class Screen(io.StringIO):
-    """A terminal."""
-
     def isatty(self) -> bool:
-        """Be one."""
         return True
 
 

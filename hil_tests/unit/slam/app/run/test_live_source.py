@@ -33,7 +33,7 @@ from slam.app.run import live_source as run_readers
 from slam.app.run.live_source import (
     GRACE_NS,
     Event,
-    FrameCame,
+    FrameArrived,
     Inbox,
     LiveSource,
     OdometryEnded,
@@ -51,6 +51,7 @@ from slam.frames import RadarFrame
 from slam.geometry import Mount
 from slam.robust.pipeline import make_slam
 from xethru_protocol.driver.frames import Frame, FrameGeometry
+from xethru_protocol.system import StopFlag
 from xethru_protocol.wire.errors import Disconnected, ResponseTimeout
 from xethru_protocol.wire.x4 import frame_time_ns
 
@@ -113,7 +114,7 @@ def test_a_radar_that_vanishes_is_looked_for_until_it_is_back(
     driver = ScriptedDriver(7, 8, Disconnected("unplugged"), 9)
     driver.reconnects = [Disconnected("not yet"), Disconnected("not yet"), "found"]
     events = told_until([link_of(driver)], silent_fifo, lambda events: len(events) == 5)
-    assert [e.frame.counter for e in events if isinstance(e, FrameCame)] == [7, 8, 9]
+    assert [e.frame.counter for e in events if isinstance(e, FrameArrived)] == [7, 8, 9]
     assert events[2] == RadarLost(radar=0, text="unplugged")
     assert events[3] == RadarBack(radar=0, port="somewhere else")
 
@@ -421,7 +422,7 @@ def source_on(
         odometry,
         inbox,
         words,
-        lambda: None,
+        StopFlag(),
         clock_ns=inbox.clock_ns,
     )
     return source, odometry, words
@@ -469,7 +470,7 @@ def test_a_dead_radar_is_told_and_the_others_go_on(drive: Drive) -> None:
     lost, back = round(10 * NS_PER_S), round(20 * NS_PER_S)
 
     def keep(row: Timed) -> bool:
-        is_theirs = isinstance(row.event, FrameCame) and row.event.radar == 2
+        is_theirs = isinstance(row.event, FrameArrived) and row.event.radar == 2
         return row.t_ns < END_S * NS_PER_S and not (is_theirs and lost < row.t_ns < back)
 
     source, odometry, words = source_of(
@@ -537,14 +538,14 @@ def test_odometry_that_falls_silent_ends_the_run_with_all_its_states(drive: Driv
 
 
 def test_a_rig_without_odometry_does_not_begin(drive: Drive) -> None:
-    source, _, _ = source_of(drive, lambda row: isinstance(row.event, FrameCame))
+    source, _, _ = source_of(drive, lambda row: isinstance(row.event, FrameArrived))
     with pytest.raises(AppError, match="odometry from the test: no line for 10 s"):
         source.settle()
 
 
 def test_a_radar_that_never_streams_is_named(drive: Drive) -> None:
     source, _, _ = source_of(
-        drive, lambda row: not (isinstance(row.event, FrameCame) and row.event.radar == 1)
+        drive, lambda row: not (isinstance(row.event, FrameArrived) and row.event.radar == 1)
     )
     with pytest.raises(AppError, match="radar rear_left: no frame in 15 s"):
         source.settle()
@@ -574,7 +575,7 @@ def test_a_counter_that_goes_back_by_one_loses_no_frame(drive: Drive) -> None:
         if row.t_ns > 14 * NS_PER_S:
             continue
         event = row.event
-        if isinstance(event, FrameCame) and event.radar == 1 and row.t_ns > 10 * NS_PER_S:
+        if isinstance(event, FrameArrived) and event.radar == 1 and row.t_ns > 10 * NS_PER_S:
             event = replace(event, frame=replace(event.frame, counter=event.frame.counter - 2))
         events.append(replace(row, event=event))
     source, _, _ = source_on(drive, VirtualInbox(events))
