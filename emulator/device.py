@@ -12,14 +12,13 @@ Source: protocol reference 8.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
-from emulator.chip.chip import Chip, EchoSource
-from emulator.chip.clock import ModuleClock
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
+from emulator.chip.chip import Chip, EchoSource, ModuleClock
 from emulator.module.commands import answer
 from emulator.module.memory import Identity, Memory
-from emulator.module.modes import State
+from emulator.module.modes import STREAMING, State
 from emulator.module.module import Module
 from emulator.module.outbox import (
     FirmwareOutbox,
@@ -31,7 +30,7 @@ from emulator.module.outbox import (
 from emulator.module.settings import DeviceOptions
 from emulator.profiles.run import ProfileStream
 from xethru_protocol.wire.codec import encode
-from xethru_protocol.wire.codes import SensorMode, SystemCode
+from xethru_protocol.wire.codes import SystemCode
 from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.framing import NeedData
 from xethru_protocol.wire.messages import (
@@ -86,7 +85,7 @@ class ChipStream(MessageStream):
     def streaming(self) -> bool:
         """Whether frames go to the host. Protocol reference 8.3 and 8.4."""
         module = self._module
-        return module.modes.mode is SensorMode.XTID_SM_MANUAL and module.chip.running
+        return module.state in STREAMING and module.chip.running
 
     def next_due_ns(self) -> int | None:
         """Return when the next frame is due; 0, long past, under `Pace.ASAP`."""
@@ -104,13 +103,11 @@ class ChipStream(MessageStream):
         return self._zero_ns + self._clock.scene_time_ns(nominal_ns)
 
     def take(self) -> Response:
-        """Return the next frame; its counter moves on."""
         self._known = False
         frame = self._module.chip.next_frame()
         return DataFloat(info=frame.counter, values=frame.values)
 
     def skip_due_before(self, time_ns: int) -> int:
-        """Let the counter run past every frame due before a time."""
         due_ns = self.next_due_ns()
         if due_ns is None or due_ns >= time_ns or self._pace is Pace.ASAP:
             return 0
@@ -126,7 +123,6 @@ class ChipStream(MessageStream):
 
     def command_done(self, command: Command[Response], now_ns: int) -> None:
         """Begin with the first frame still ahead when a command started the stream."""
-        del command  # any command may have started or stopped it
         self._known = False
         streaming = self.streaming
         if streaming and not self._was_streaming:
@@ -156,37 +152,30 @@ class CombinedStream(MessageStream):
 
     @property
     def profile(self) -> ProfileStream:
-        """The running profile, for inspection."""
         return self._profile
 
     def next_due_ns(self) -> int | None:
-        """Return when the next message is due; None while nothing streams."""
         return self._active.next_due_ns()
 
     def take(self) -> Response:
-        """Return the next message; there must be one."""
         message = self._active.take()
         self._active = self._choice()  # a transmitter that saw nothing for long is off now
         return message
 
     def skip_due_before(self, time_ns: int) -> int:
-        """Give up every message due before a time; return how many."""
         return self._active.skip_due_before(time_ns)
 
     def command_done(self, command: Command[Response], now_ns: int) -> None:
-        """Let both see the command: it may have ended the one and begun the other."""
         self._raw.command_done(command, now_ns)
         self._profile.command_done(command, now_ns)
         self._active = self._choice()
 
     def restarted(self, ready_ns: int) -> None:
-        """Let both start anew."""
         self._raw.restarted(ready_ns)
         self._profile.restarted(ready_ns)
         self._active = self._choice()
 
     def _choice(self) -> ChipStream | ProfileStream:
-        """Return who speaks until a message, a command or a restart changes it."""
         return self._raw if self._raw.streaming else self._profile
 
 
@@ -232,6 +221,25 @@ def _is_oversized(command: Command[Response]) -> bool:
     return isinstance(command, _LONG_COMMANDS) and len(encode(command)) > LARGEST_POOL_BLOCK
 
 
+class ByteDevice(Protocol):
+    """What the owner of a line needs of a device; all times are of one monotonic clock."""
+
+    @property
+    def wants_data(self) -> bool: ...
+
+    def receive_data(self, data: bytes, now_ns: int) -> None: ...
+
+    def advance(self, now_ns: int) -> None: ...
+
+    def next_packet(self, now_ns: int) -> bytes | None:
+        """Return the next packet to send now."""
+        ...
+
+    def wake_ns(self, now_ns: int) -> int | None:
+        """Return when time alone changes something."""
+        ...
+
+
 class _Held(NamedTuple):
     """A reply that takes its time; further commands wait behind it."""
 
@@ -267,7 +275,6 @@ class Device:
 
     @property
     def module(self) -> Module:
-        """The state behind the port, for inspection."""
         return self._module
 
     @property
@@ -371,7 +378,6 @@ class Device:
 
     @property
     def _sends(self) -> bool:
-        """Whether the module makes messages of its own accord."""
         return not self._module.asleep and self._module.state is not State.BOOTLOADER
 
     def next_packet(self, now_ns: int) -> bytes | None:
@@ -401,11 +407,9 @@ class Device:
         return min((time_ns for time_ns in candidates if time_ns is not None), default=None)
 
     def port_opened(self, now_ns: int) -> None:
-        """Learn that a host opened the port."""
         self._stream.port_opened(now_ns)
 
     def port_closed(self, now_ns: int) -> None:
-        """Learn that the last host closed the port."""
         self._stream.port_closed(now_ns)
 
 

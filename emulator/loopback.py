@@ -38,7 +38,6 @@ class LoopbackTransport:
 
     @property
     def name(self) -> str:
-        """Name of the port."""
         return self._name
 
     def clock_ns(self) -> int:
@@ -78,7 +77,6 @@ class LoopbackTransport:
         self._device.receive_data(data, self._now_ns)
 
     def close(self) -> None:
-        """Close the port; closing twice does nothing."""
         if self._open:
             self._open = False
             self._device.port_closed(self._now_ns)

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 
 import pytest
 
+from emulator.chip import Pace
 from emulator.chip.chip import EchoSource
-from emulator.chip.pace import Pace
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.faults.faulty_device import FaultyDevice, fault, wrap
@@ -101,11 +101,9 @@ class FaultyLine:
         self.device: FaultyDevice = wrap(inner, "radar_1", plan, self.truth, zero_ns=0)
 
     def clock_ns(self) -> int:
-        """Return the virtual time, ns."""
         return self._now_ns
 
     def sleep(self, seconds: float) -> None:
-        """Let time pass."""
         self.next_bytes_until(self._now_ns + round(seconds * NS_PER_S), send=False)
 
     def next_bytes(self, timeout_s: float) -> bytes:
@@ -130,7 +128,6 @@ class FaultyLine:
             self._now_ns = max(wake_ns, self._now_ns)
 
     def open(self, path: str, baudrate: int) -> Transport:
-        """Open the port, if it is there."""
         del baudrate
         if not self.device.port_present(self._now_ns):
             raise PortUnavailable(f"{path}: no such port")
@@ -138,11 +135,9 @@ class FaultyLine:
         return _Line(self)
 
     def ports(self) -> Sequence[str]:
-        """Return the ports that there are."""
         return [PATH] if self.device.port_present(self._now_ns) else []
 
     def radar(self, reconnect_s: float = 0.0) -> X4M300:
-        """Return a driver on the line."""
         return X4M300(
             self.open(PATH, 115200),
             clock=self.clock_ns,

@@ -1,21 +1,20 @@
 """The operating system for command lines: signals, closed streams, bounded files, locks.
 
-Imports nothing heavy, so that a command line can stand under it while it imports the rest.
+Imports nothing heavy: a command line uses it while it imports the rest.
 """
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import fcntl
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
-from typing import Protocol
+from types import FrameType, TracebackType
+from typing import Any, Literal, Self
 
 MOST_BYTES = 1 << 20
 
@@ -36,19 +35,19 @@ def read_bounded(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
 
 
 class PathInUseError(Exception):
-    """Somebody else who still runs holds the path."""
+    """Another running process holds the path."""
 
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
     """Hold an existing file or folder while the block runs.
 
-    Only those who ask here keep each other out. A file system without locks keeps nobody out.
+    The lock is advisory, and has no effect on a file system without locks.
 
     Raises
     ------
     PathInUseError
-        Another holds it.
+        Another process holds it.
     OSError
         It cannot be opened.
     """
@@ -65,85 +64,147 @@ def locked(path: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-class _Loop(Protocol):
-    """What a request ends."""
-
-    def stop(self) -> None:
-        """End soon."""
-        ...
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-class Stop:
-    """A request to end that may come before there is a loop to end.
+class StopRequestedError(BaseException):
+    """SIGINT, SIGTERM or SIGHUP arrived; like KeyboardInterrupt, no ordinary handler catches it."""
+
+    def __init__(self, received: signal.Signals, left_behind: str = "") -> None:
+        super().__init__(f"stopped by {received.name}{left_behind}")
+        self.received = received
+
+    @property
+    def exit_code(self) -> int:
+        """What a shell expects of a program ended by this signal: 130, 143 or 129."""
+        return 128 + int(self.received)
+
+
+class StopFlag:
+    """Catches SIGINT, SIGTERM and SIGHUP while it is entered.
+
+    A signal only sets the flag, calls what is attached, and makes `check` raise, so that no
+    file is left in the middle of a record. A SIGHUP that is ignored already stays so, as `nohup`
+    wants.
+
+    Parameters
+    ----------
+    second
+        What a second signal of the same kind gets: ``"default"``, the system's handler, which
+        ends the process where it stands (SIGHUP is ignored then: a closing terminal sends two);
+        ``"previous"``, the handler of before; ``"same"``, the same as the first.
 
     Attributes
     ----------
+    received
+        The last signal that arrived; None: none did.
     requested
-        Whether a signal came.
+        Whether the end was requested, by a signal or by `request`.
+
+    Examples
+    --------
+    >>> with StopFlag() as stop:
+    ...     stop.check()  # nothing arrived: returns
     """
 
-    def __init__(self) -> None:
-        self._loop: _Loop | None = None
+    def __init__(self, second: Literal["default", "previous", "same"] = "default") -> None:
+        self.received: signal.Signals | None = None
         self.requested = False
+        self._second = second
+        self._previous: dict[signal.Signals, Any] = {}
+        self._at_once = False
+        self._end: Callable[[], None] | None = None
 
-    def attach(self, loop: _Loop) -> None:
-        """Name the loop that a request ends; one that came earlier ends it now."""
-        self._loop = loop
+    def __enter__(self) -> Self:
+        """Install the handlers. Main thread only, as Python demands."""
+        for which in _SIGNALS:
+            if which is not signal.SIGHUP or signal.getsignal(which) is not signal.SIG_IGN:
+                self._previous[which] = signal.signal(which, self._on_signal)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Put the previous handlers back."""
+        for which, handler in self._previous.items():
+            signal.signal(which, handler)
+
+    def check(self) -> None:
+        """Raise StopRequestedError if a signal arrived since this flag was entered."""
+        if self.received is not None:
+            raise StopRequestedError(self.received)
+
+    @contextmanager
+    def at_once(self) -> Iterator[None]:
+        """Let a signal raise where it arrives: for waiting, where nothing is half-done."""
+        try:
+            # in this order: a signal is seen by the check, or raises where it arrives
+            self._at_once = True
+            self.check()
+            yield
+        finally:
+            self._at_once = False
+
+    def attach(self, end: Callable[[], None]) -> None:
+        """Call ``end`` at every request; at once if there was one already."""
+        self._end = end
         if self.requested:
-            loop.stop()
+            end()
 
     def detach(self) -> None:
-        """Forget the loop, which is about to be closed."""
-        self._loop = None
+        """Call nothing at requests any more."""
+        self._end = None
 
-    def request(self, number: int, frame: FrameType | None) -> None:
-        """Ask for the end; a signal handler."""
-        del number, frame
+    def request(self) -> None:
+        """Request the end without a signal."""
         self.requested = True
-        if self._loop is not None:
-            self._loop.stop()
+        if self._end is not None:
+            self._end()
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        which = signal.Signals(number)
+        self.received = which
+        if self._second == "default":
+            signal.signal(which, signal.SIG_IGN if which is signal.SIGHUP else signal.SIG_DFL)
+        elif self._second == "previous":
+            signal.signal(which, self._previous[which])
+        self.request()
+        if self._at_once:
+            self.check()
 
 
-@contextlib.contextmanager
-def stop_signals() -> Iterator[Stop]:
-    """Turn SIGINT, SIGTERM and SIGHUP into an orderly end, from here to the last clean-up.
-
-    A SIGHUP that is ignored already stays so, as whoever says `nohup` wants.
-    """
-    stop = Stop()
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
-        numbers.append(signal.SIGHUP)
-    before = {number: signal.signal(number, stop.request) for number in numbers}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def open_closed_streams() -> None:
+def open_closed_streams(*, replace: bool = True) -> None:
     """Put the null device where the shell closed a standard stream (`>&-`).
 
     Python has None for such a stream, and the next file that is opened would get its descriptor.
+    With ``replace`` the stream is a file on the null device from now on, else it stays None.
     """
     for descriptor, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
             _null_at(descriptor)
-            setattr(sys, name, os.fdopen(descriptor, "w" if descriptor else "r", closefd=False))
+            if replace:
+                file = os.fdopen(descriptor, "w" if descriptor else "r", closefd=False)
+                setattr(sys, name, file)
 
 
-def drop_what_cannot_be_said() -> None:
-    """Send an output to the null device if it takes no more: its reader or its terminal has gone.
+def flush_streams() -> bool:
+    """Flush both outputs; one that takes no more is sent to the null device.
 
     What is left in a buffer would otherwise make the interpreter complain, and end with an exit
-    code of its own, when it flushes at its end.
+    code of its own, when it flushes at its end. Returns whether standard output took all.
     """
+    taken = True
     for descriptor, stream in enumerate((sys.stdout, sys.stderr), start=1):
         try:
-            stream.flush()
+            if stream is not None:
+                stream.flush()
         except (OSError, ValueError):
             _null_at(descriptor)
+            taken &= descriptor != 1
+    return taken
 
 
 def _null_at(descriptor: int) -> None:

@@ -11,11 +11,11 @@ max)``. Floor, ceiling, elevation, polarisation, and paths of more bounces than 
 out.
 
 Pulse p
-    Gaussian envelope on the carrier (``emulator.echo.pulse``). The real pulse is a little
+    Gaussian envelope on the carrier (``emulator.echo.reflections``). The real pulse is a little
     asymmetric.
 Time t
     Nominal time of the counter, made earlier by the module's fast clock and later by its start
-    skew (``emulator.chip.clock``). The robot stands still within a frame: a sweep at 5 cm/s
+    skew (``emulator.chip.chip``). The robot stands still within a frame: a sweep at 5 cm/s
     moves it by micrometres per pulse.
 Position u = 2 fs (1 + ppm 1e-6) (R + offset) / c - 2 fs L / c_module
     R is half the length of the path; c = 299 792 458 m/s; offset is the module's range error; L is
@@ -56,14 +56,14 @@ Phase
     Each reflector's is fixed by its name (SHA-256), for every radar, aspect and seed.
 Phase jitter j
     White (by frame counter) and slow (by time), common to all echoes and the leakage of a frame
-    (``emulator.echo.noise``): figures of the strongest reflector of a real X4 recording. The
+    (``emulator.echo.receiver``): figures of the strongest reflector of a real X4 recording. The
     envelope is not moved; amplitude jitter is left out.
 Leakage
     The direct pulse at the scene's range and amplitude; antenna ringing is left out.
 Clutter c
     Slow, correlated, inside the transmitted band (``emulator.echo.receiver``): every 8 samples a
     complex Gaussian scatterer that answers with the pulse, of equal strength at all ranges, times
-    TX power and gain; in time three stationary processes (``emulator.echo.noise``) fitted to the
+    TX power and gain; in time three stationary processes (``emulator.echo.receiver``) fitted to the
     ten farthest bins of that recording. It ignores where the robot is, and radars do not share it.
 Noise w
     White and Gaussian (``emulator.scene.philox``), keyed by seed and the radar's serial, selected
@@ -91,15 +91,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.chip.chip import CaptureSettings, EchoSource
-from emulator.echo.noise import CarrierJitter
-from emulator.echo.pulse import sum_of_pulses
-from emulator.echo.receiver import Receiver, one_count
+from emulator.echo.receiver import CarrierJitter, Receiver, one_count
 from emulator.echo.reflections import (
     Reflections,
     Viewpoint,
     direct_reflections,
     person_scatterer,
     reflection_phase_rad,
+    sum_of_pulses,
     target_scatterers,
     viewpoint,
 )

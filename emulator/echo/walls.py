@@ -152,7 +152,6 @@ class Faces:
     closures: tuple[Closure, ...]
 
     def __len__(self) -> int:
-        """Return how many there are."""
         return len(self.length_m)
 
     def along(self, x: Array, y: Array) -> Array:
@@ -191,7 +190,6 @@ class Faces:
 
 
 def faces_of(walls: tuple[WallSpec, ...], objects: tuple[ObjectSpec, ...]) -> Faces:
-    """Return the faces of all walls, then of all boxes."""
     ends: list[tuple[tuple[float, float], tuple[float, float]]] = []
     bodies: list[WallSpec | ObjectSpec] = []
     body: list[int] = []

@@ -93,11 +93,9 @@ class Armed:
 
     @property
     def spent(self) -> bool:
-        """Whether it has been injected as often as it should."""
         return 0 < self.spec.count <= self.firings
 
     def over(self, time_ns: int) -> bool:
-        """Whether nothing of it is left to come."""
         until_s = self.spec.until_s
         if until_s is not None and time_ns >= round(until_s * NS_PER_S):
             return True
@@ -150,7 +148,6 @@ class Armed:
         return spec.probability >= 1 or self.dice.chance(spec.probability)
 
     def fired(self, now_ns: int, counter: int | None) -> None:
-        """Learn that it was injected."""
         self.firings += 1
         self.since_ns = now_ns
         self.first_counter = counter
@@ -234,7 +231,6 @@ class Power:
 
     @property
     def hears(self) -> bool:
-        """Whether the module hears the host."""
         return not self.deaf and (self._inside is None or self._inside.listens)
 
     def crash(self, reason: str, now_ns: int) -> None:
@@ -325,7 +321,6 @@ class FaultyDevice:
 
     @property
     def armed(self) -> Sequence[Armed]:
-        """Faults that may still come or last."""
         return tuple(self._armed)
 
     @property
@@ -336,7 +331,6 @@ class FaultyDevice:
     # --- the port -------------------------------------------------------------------------------
 
     def port_present(self, now_ns: int) -> bool:
-        """Whether the port exists."""
         present = getattr(self.inner, "port_present", None)
         return not self._away and (present is None or bool(present(now_ns)))
 
@@ -361,22 +355,18 @@ class FaultyDevice:
         self._power.crash(reason, now_ns)
 
     def port_opened(self, now_ns: int) -> None:
-        """Learn that a host opened the port."""
         self.inner.port_opened(now_ns)
 
     def port_closed(self, now_ns: int) -> None:
-        """Learn that the last host closed the port."""
         self.inner.port_closed(now_ns)
 
     # --- from the host --------------------------------------------------------------------------
 
     @property
     def wants_data(self) -> bool:
-        """Whether more bytes should be read from the host now."""
         return self.inner.wants_data
 
     def receive_data(self, data: bytes, now_ns: int) -> None:
-        """Take bytes from the host."""
         self.advance(now_ns)
         if self._away or not self._power.hears:
             return
@@ -429,7 +419,6 @@ class FaultyDevice:
     # --- to the host ----------------------------------------------------------------------------
 
     def advance(self, now_ns: int) -> None:
-        """Let time pass."""
         time_ns = self._scenario_ns(now_ns)
         if self._armed:
             self._moments(now_ns, time_ns)
@@ -443,7 +432,6 @@ class FaultyDevice:
         self.inner.advance(now_ns)
 
     def next_packet(self, now_ns: int) -> bytes | None:
-        """Return the next bytes for the line; None if there is nothing to send now."""
         self._again_ns = None
         if self._away:
             return None
@@ -465,7 +453,6 @@ class FaultyDevice:
         return None
 
     def wake_ns(self, now_ns: int) -> int | None:
-        """Return when `advance` (and then `next_packet`) should be called next; None if never."""
         time_ns = self._scenario_ns(now_ns)
         waits = self._armed or self._actions or self._queue
         if not waits and self._again_ns is None and self._back_ns is None:
@@ -621,7 +608,6 @@ class Injection:
 
     @property
     def injected(self) -> int:
-        """How often it was injected so far."""
         return self._armed.firings
 
 

@@ -16,13 +16,14 @@ import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
 
+from emulator.device import ByteDevice
 from emulator.scene.philox import Dice
+from emulator.scene.tables import Table
 from xethru_protocol.driver.frames import Lattice
 from xethru_protocol.wire.codes import ElementType, ResponseCode
 from xethru_protocol.wire.connection import Connection, Role
@@ -127,46 +128,19 @@ def normal_payload(packet: bytes) -> bytes | None:
 
 
 def response_bytes(message: Response) -> bytes:
-    """Return a message as a module sends it."""
     return Connection(Role.MODULE).send(message)
 
 
 def command_bytes(command: Command[Response]) -> bytes:
-    """Return a command as a host sends it."""
     return Connection(Role.HOST).send(command)
 
 
-class InnerDevice(Protocol):
+class InnerDevice(ByteDevice, Protocol):
     """A module as its port sees it: see `emulator.device.Device`."""
 
-    @property
-    def wants_data(self) -> bool:
-        """Whether more bytes should be read from the host now."""
-        ...
+    def port_opened(self, now_ns: int) -> None: ...
 
-    def receive_data(self, data: bytes, now_ns: int) -> None:
-        """Take bytes from the host."""
-        ...
-
-    def advance(self, now_ns: int) -> None:
-        """Let time pass."""
-        ...
-
-    def next_packet(self, now_ns: int) -> bytes | None:
-        """Return the next packet to send now."""
-        ...
-
-    def wake_ns(self, now_ns: int) -> int | None:
-        """Return when time alone changes something."""
-        ...
-
-    def port_opened(self, now_ns: int) -> None:
-        """Learn that a host opened the port."""
-        ...
-
-    def port_closed(self, now_ns: int) -> None:
-        """Learn that the last host closed the port."""
-        ...
+    def port_closed(self, now_ns: int) -> None: ...
 
 
 @runtime_checkable
@@ -209,10 +183,8 @@ class Target(Enum):
     MOMENT = "a moment"
 
 
-class Parameters(BaseModel):
-    """Parameters of a kind: frozen, and an unknown one is an error."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
+class Parameters(Table):
+    """Parameters of a kind."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -319,10 +291,15 @@ class SayToModule:
     command: Command[Response]
 
 
+Pieces = Sequence[Piece] | None
 Action = Restart | Unplug | SayToModule
-PacketEffect = Callable[[bytes, Any, Dice, Context], Sequence[Piece] | None]
+PacketEffect = Callable[[bytes, Any, Dice, Context], Pieces]
 CommandEffect = Callable[[bytes, Any, Dice, Context], Handling | None]
 MomentEffect = Callable[[Any, Dice], Sequence[Action]]
+
+
+Effect = PacketEffect | CommandEffect | MomentEffect
+EffectT = TypeVar("EffectT", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -332,19 +309,11 @@ class Kind:
     Attributes
     ----------
     name
-        As scenario files and the truth log call it.
-    layer
-        Where it stands.
-    target
-        What it waits for.
+        In scenario files and in the truth log.
     summary
         What happens, in a sentence.
     counted
         What an X4M300 driver counts for each one injected.
-    parameters
-        Model of its parameters.
-    effect
-        What it does.
     lasting
         Whether, once fired, it acts on all later packets too.
     hidden
@@ -356,7 +325,40 @@ class Kind:
     target: Target
     summary: str
     counted: str
-    effect: PacketEffect | CommandEffect | MomentEffect
-    parameters: type[Parameters] = Parameters
-    lasting: bool = False
-    hidden: str = ""
+    effect: Effect
+    parameters: type[Parameters]
+    lasting: bool
+    hidden: str
+
+
+ENTERED: list[Kind] = []
+"""All kinds; `emulator.faults.kinds` puts them in order."""
+
+
+def kind(
+    layer: Layer,
+    target: Target,
+    counted: str,
+    parameters: type[Parameters] = Parameters,
+    *,
+    lasting: bool = False,
+    hidden: str = "",
+) -> Callable[[EffectT], EffectT]:
+    """Enter an effect into the catalogue; its name and first docstring line describe the kind."""
+
+    def enter(effect: EffectT) -> EffectT:
+        row = Kind(
+            name=effect.__name__,
+            layer=layer,
+            target=target,
+            summary=(effect.__doc__ or "").partition("\n")[0],
+            counted=counted,
+            effect=effect,
+            parameters=parameters,
+            lasting=lasting,
+            hidden=hidden,
+        )
+        ENTERED.append(row)
+        return effect
+
+    return enter

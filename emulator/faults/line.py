@@ -31,7 +31,6 @@ class LineQueue:
         self.waiting_bytes = 0
 
     def __bool__(self) -> bool:
-        """Whether anything waits."""
         return bool(self._heap or self._held)
 
     def put(self, pieces: Iterable[Piece], packet_class: PacketClass, now_ns: int) -> None:
@@ -64,7 +63,6 @@ class LineQueue:
         self._push(due_ns, piece.data)
 
     def take(self, now_ns: int) -> bytes | None:
-        """Return what is due next."""
         if not self._heap or self._heap[0][0] > now_ns:
             return None
         data = heapq.heappop(self._heap)[2]
@@ -72,11 +70,9 @@ class LineQueue:
         return data
 
     def wake_ns(self) -> int | None:
-        """Return when the next piece is due; None if none has a time."""
         return self._heap[0][0] if self._heap else None
 
     def clear(self) -> None:
-        """Forget everything: the line is gone."""
         self._heap.clear()
         self._held.clear()
         self._aside_due_ns.clear()
@@ -186,7 +182,6 @@ class Watch:
         return pending.command, pending.silent
 
     def sent(self, packet: bytes, packet_class: PacketClass) -> None:
-        """Learn what the module sent."""
         if packet_class is PacketClass.FRAME:
             self.previous_frame, self.frame = self.frame, packet
             self.counter = frame_counter(packet)
@@ -194,12 +189,10 @@ class Watch:
             self.restarted()
 
     def restarted(self) -> None:
-        """Learn that the module forgot everything."""
         self._pending.clear()
         self._settings.clear()
         self._lattice = None
 
     @staticmethod
     def is_booting(packet: bytes) -> bool:
-        """Whether a packet says that the module restarted."""
         return packet == _BOOTING

@@ -1,30 +1,15 @@
-"""What a module answers to each command.
+"""What a module answers to each command: one handler per command, or per group of like ones.
 
-A handler is ``(module, command) -> response``; it raises `Refusal` for an ERROR and `Silence` for
-no answer at all.
+A handler is ``(module, command) -> response``; None stands for an ACK. It raises `Refusal` for an
+ERROR and `Silence` for no answer at all. Commands without a handler get ERROR 1, as the firmware
+does. `emulator.module.modes` says in which modes a command is taken.
 
-Source: protocol reference 4.1 to 4.3, 4.5 and 4.12.
-
-Source: protocol reference 4.10 and 4.11.
-
-Source: protocol reference 4.8.
-
-Source: protocol reference 4.4 to 4.7, 11 and 16.
-
-Source: protocol reference 4.10.
-
-Source: protocol reference 4.9, 11 and 16.
-
-To add a command, write a function ``(module, command) -> response`` under ``@answers(Command)`` in
-the ``handlers_*`` module of its section, and name its group in `permissions`. Commands without a
-handler get ERROR 1, as the firmware does.
-
-Source: protocol reference 3, 4 and 5.
+Source: protocol reference 3, 4, 5, 11 and 16.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 from emulator.chip.chip import Refusal, Silence
@@ -52,7 +37,7 @@ from xethru_protocol.wire.codes import (
     X4Setting,
 )
 
-Handler = Callable[[Module, Any], m.Response]
+Handler = Callable[[Module, Any], m.Response | None]
 HANDLERS: dict[type[m.Message], Handler] = {}
 HandlerT = TypeVar("HandlerT", bound=Handler)
 
@@ -67,6 +52,12 @@ def answers(*commands: type[m.Command[Any]]) -> Callable[[HandlerT], HandlerT]:
     return enter
 
 
+def _signed(value: int) -> int:
+    return value - (1 << 32) if value >> 31 else value
+
+
+# --- modes, profiles, restarts (4.1 to 4.3, 4.5, 4.12)
+
 HIGHEST_TRACE_LEVEL = 9
 
 
@@ -77,22 +68,20 @@ def _ping(module: Module, command: m.Ping) -> m.Response:
 
 
 @answers(m.ModReset)
-def _reset(module: Module, command: m.ModReset) -> m.Response:
+def _reset(module: Module, command: m.ModReset) -> None:
     module.request_restart()
-    return m.Ack()
 
 
 @answers(m.StartBootloader)
-def _start_bootloader(module: Module, command: m.StartBootloader) -> m.Response:
+def _start_bootloader(module: Module, command: m.StartBootloader) -> None:
     if command.key != BootloaderKey.CURRENT:
         module.notices.append(m.DataString(text="Wrong bootloader key."))
         raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
     module.request_restart(into_bootloader=True)
-    return m.Ack()
 
 
 @answers(m.SetMode)
-def _set_mode(module: Module, command: m.SetMode) -> m.Response:
+def _set_mode(module: Module, command: m.SetMode) -> None:
     options, modes = module.options, module.modes
     if options.profile_switch == "restart" and modes.switches_profile(command.mode):
         modes.restart_with_profile()
@@ -105,7 +94,6 @@ def _set_mode(module: Module, command: m.SetMode) -> m.Response:
     if entered and module.state is State.MANUAL and options.manual_settings == "init":
         module.chip.init()
     module.trace(TraceLevel.INFO, f"Mode {SensorMode(command.mode).label}.")
-    return m.Ack()
 
 
 @answers(m.GetMode)
@@ -114,24 +102,21 @@ def _get_mode(module: Module, command: m.GetMode) -> m.Response:
 
 
 @answers(m.LoadApp)
-def _load_app(module: Module, command: m.LoadApp) -> m.Response:
+def _load_app(module: Module, command: m.LoadApp) -> None:
     module.load_profile(command.profile_id)
     module.trace(TraceLevel.INFO, f"Profile {command.profile_id:08X} loaded.")
-    return m.Ack()
 
 
 @answers(m.GetProfileId)
 def _get_profile_id(module: Module, command: m.GetProfileId) -> m.Response:
-    profile_id = module.modes.profile_id
-    return m.ReplyInt(values=(profile_id - (1 << 32) if profile_id >> 31 else profile_id,))
+    return m.ReplyInt(values=(_signed(module.modes.profile_id),))
 
 
 @answers(m.DebugLevel)
-def _debug_level(module: Module, command: m.DebugLevel) -> m.Response:
+def _debug_level(module: Module, command: m.DebugLevel) -> None:
     if command.level > HIGHEST_TRACE_LEVEL:
         raise Refusal(module.options.bad_value_error)
     module.trace_level = command.level
-    return m.Ack()
 
 
 @answers(m.BootloaderGetDeviceInfo, m.BootloaderWritePage)
@@ -151,8 +136,7 @@ def _status(module: Module) -> m.Response:
     return m.UnknownMessage(code=status, payload=bytes([status]))
 
 
-def _signed(value: int) -> int:
-    return value - (1 << 32) if value >> 31 else value
+# --- files (4.10 and 4.11)
 
 
 @answers(m.SearchFileType)
@@ -170,29 +154,25 @@ def _find_all(module: Module, command: m.FindAllFiles) -> m.Response:
 
 
 @answers(m.CreateFile)
-def _create(module: Module, command: m.CreateFile) -> m.Response:
+def _create(module: Module, command: m.CreateFile) -> None:
     module.files.create((command.file_type, command.identifier), command.length)
     module.save()
-    return m.Ack()
 
 
 @answers(m.OpenFile)
-def _open(module: Module, command: m.OpenFile) -> m.Response:
+def _open(module: Module, command: m.OpenFile) -> None:
     module.files.open((command.file_type, command.identifier))
-    return m.Ack()
 
 
 @answers(m.SetFileData)
-def _write(module: Module, command: m.SetFileData) -> m.Response:
+def _write(module: Module, command: m.SetFileData) -> None:
     module.files.write((command.file_type, command.identifier), command.offset, command.data)
     module.save()
-    return m.Ack()
 
 
 @answers(m.CloseFile)
-def _close(module: Module, command: m.CloseFile) -> m.Response:
+def _close(module: Module, command: m.CloseFile) -> None:
     module.files.close((command.file_type, command.identifier))
-    return m.Ack()
 
 
 @answers(m.GetFileLength)
@@ -207,18 +187,16 @@ def _read(module: Module, command: m.GetFileData) -> m.Response:
 
 
 @answers(m.DeleteFile)
-def _delete(module: Module, command: m.DeleteFile) -> m.Response:
+def _delete(module: Module, command: m.DeleteFile) -> None:
     module.files.delete((command.file_type, command.identifier))
     module.reply_delay_ns = module.options.file_delete_ns
     module.save()
-    return m.Ack()
 
 
 @answers(m.FormatFilesystem)
-def _format(module: Module, command: m.FormatFilesystem) -> m.Response:
+def _format(module: Module, command: m.FormatFilesystem) -> None:
     module.files.format(command.key)
     module.save()
-    return m.Ack()
 
 
 @answers(m.GetCrashDumpLength)
@@ -228,13 +206,12 @@ def _crash_dump_length(module: Module, command: m.GetCrashDumpLength) -> m.Respo
 
 
 @answers(m.ClearCrashDump)
-def _clear_crash_dump(module: Module, command: m.ClearCrashDump) -> m.Response:
+def _clear_crash_dump(module: Module, command: m.ClearCrashDump) -> None:
     if module.files.is_open(CRASH_DUMP):
         raise Refusal(ErrorCode.XTS_SPRE_BUSY)
     if module.files.get(CRASH_DUMP) is not None:
         module.files.delete(CRASH_DUMP)
         module.save()
-    return m.Ack()
 
 
 @answers(m.GetCrashDump)
@@ -249,10 +226,12 @@ def _crash_dump(module: Module, command: m.GetCrashDump) -> m.Response:
     return m.ReplyByte(content_id=content_id, values=dump[command.offset : end])
 
 
+# --- IO pins (4.8)
+
+
 @answers(m.IoPinSetControl)
-def _set_control(module: Module, command: m.IoPinSetControl) -> m.Response:
+def _set_control(module: Module, command: m.IoPinSetControl) -> None:
     module.pins.set_control(command.pin_id, command.pin_setup, command.pin_feature)
-    return m.Ack()
 
 
 @answers(m.IoPinGetControl)
@@ -263,9 +242,8 @@ def _get_control(module: Module, command: m.IoPinGetControl) -> m.Response:
 
 
 @answers(m.IoPinSetValue)
-def _set_value(module: Module, command: m.IoPinSetValue) -> m.Response:
+def _set_value(module: Module, command: m.IoPinSetValue) -> None:
     module.pins.set_value(command.pin_id, command.pin_value)
-    return m.Ack()
 
 
 @answers(m.IoPinGetValue)
@@ -274,13 +252,14 @@ def _get_value(module: Module, command: m.IoPinGetValue) -> m.Response:
     return m.ReplyInt(content_id=IoPinCode.XTS_SPCIOP_GETVALUE, values=(level,))
 
 
+# --- profile settings, noise maps, outputs (4.4 to 4.7)
+
 PARAMETER_FILE = (int(FileType.PARAMETER_FILE), 0)
 
 
 @answers(m.SetDetectionZone)
-def _set_zone(module: Module, command: m.SetDetectionZone) -> m.Response:
+def _set_zone(module: Module, command: m.SetDetectionZone) -> None:
     module.profile.set_zone(command.start_m, command.end_m, module.options)
-    return m.Ack()
 
 
 @answers(m.GetDetectionZone)
@@ -295,9 +274,8 @@ def _get_zone_limits(module: Module, command: m.GetDetectionZoneLimits) -> m.Res
 
 
 @answers(m.SetSensitivity)
-def _set_sensitivity(module: Module, command: m.SetSensitivity) -> m.Response:
+def _set_sensitivity(module: Module, command: m.SetSensitivity) -> None:
     module.profile.set_sensitivity(command.sensitivity, module.options)
-    return m.Ack()
 
 
 @answers(m.GetSensitivity)
@@ -306,9 +284,8 @@ def _get_sensitivity(module: Module, command: m.GetSensitivity) -> m.Response:
 
 
 @answers(m.SetTxCenterFrequency)
-def _set_band(module: Module, command: m.SetTxCenterFrequency) -> m.Response:
+def _set_band(module: Module, command: m.SetTxCenterFrequency) -> None:
     module.profile.set_band(command.tx_center_frequency, module.options)
-    return m.Ack()
 
 
 @answers(m.GetTxCenterFrequency)
@@ -318,9 +295,8 @@ def _get_band(module: Module, command: m.GetTxCenterFrequency) -> m.Response:
 
 
 @answers(m.AppSetLedControl, m.SetLedControl)
-def _set_led(module: Module, command: m.AppSetLedControl | m.SetLedControl) -> m.Response:
+def _set_led(module: Module, command: m.AppSetLedControl | m.SetLedControl) -> None:
     module.profile.set_led(command.mode, module.options)
-    return m.Ack()
 
 
 @answers(m.AppGetLedControl)
@@ -329,17 +305,15 @@ def _get_led(module: Module, command: m.AppGetLedControl) -> m.Response:
 
 
 @answers(m.FactoryPreset)
-def _factory_preset(module: Module, command: m.FactoryPreset) -> m.Response:
+def _factory_preset(module: Module, command: m.FactoryPreset) -> None:
     module.restore_factory_settings()
-    return m.Ack()
 
 
 @answers(m.SetParameterFile)
-def _set_parameter_file(module: Module, command: m.SetParameterFile) -> m.Response:
+def _set_parameter_file(module: Module, command: m.SetParameterFile) -> None:
     module.files.replace(PARAMETER_FILE, _as_bytes(command.data))
     module.parameter_file_name = _as_text(command.name)
     module.save()
-    return m.Ack()
 
 
 @answers(m.GetParameterFile)
@@ -357,9 +331,8 @@ def _get_parameter_file(module: Module, command: m.GetParameterFile) -> m.Respon
 
 
 @answers(m.NoiseMapSetControl)
-def _set_noise_map_control(module: Module, command: m.NoiseMapSetControl) -> m.Response:
+def _set_noise_map_control(module: Module, command: m.NoiseMapSetControl) -> None:
     module.profile.set_noise_map_control(command.control)
-    return m.Ack()
 
 
 @answers(m.NoiseMapGetControl)
@@ -369,9 +342,8 @@ def _get_noise_map_control(module: Module, command: m.NoiseMapGetControl) -> m.R
 
 
 @answers(m.NoiseMapSetPeriodicStore)
-def _set_periodic_store(module: Module, command: m.NoiseMapSetPeriodicStore) -> m.Response:
+def _set_periodic_store(module: Module, command: m.NoiseMapSetPeriodicStore) -> None:
     module.profile.noise_map_interval_min = command.interval_min & 0x7FFFFFFF
-    return m.Ack()
 
 
 @answers(m.NoiseMapGetPeriodicStore)
@@ -381,9 +353,8 @@ def _get_periodic_store(module: Module, command: m.NoiseMapGetPeriodicStore) -> 
 
 
 @answers(m.StoreNoiseMap)
-def _store_noise_map(module: Module, command: m.StoreNoiseMap) -> m.Response:
+def _store_noise_map(module: Module, command: m.StoreNoiseMap) -> None:
     module.store_noise_maps()
-    return m.Ack()
 
 
 @answers(m.LoadNoiseMap)
@@ -392,47 +363,44 @@ def _load_noise_map(module: Module, command: m.LoadNoiseMap) -> m.Response:
 
 
 @answers(m.DeleteNoiseMap)
-def _delete_noise_map(module: Module, command: m.DeleteNoiseMap) -> m.Response:
+def _delete_noise_map(module: Module, command: m.DeleteNoiseMap) -> None:
     for key in NOISE_MAPS:
         if module.files.get(key) is not None:
             module.files.delete(key)
     module.save()
-    return m.Ack()
 
 
 _FEATURES: frozenset[int] = frozenset(OutputFeature)
 
 
 @answers(m.OutputSetControl)
-def _set_output(module: Module, command: m.OutputSetControl) -> m.Response:
+def _set_output(module: Module, command: m.OutputSetControl) -> None:
     module.profile.set_output(_known(command.feature), command.control)
-    return m.Ack()
 
 
 @answers(m.OutputGetControl)
 def _get_output(module: Module, command: m.OutputGetControl) -> m.Response:
-    return _control_reply(module.profile.outputs.get(_known(command.feature), 0))
+    return _control_reply(module.profile.outputs, command.feature)
 
 
 @answers(m.DebugOutputSetControl)
-def _set_debug_output(module: Module, command: m.DebugOutputSetControl) -> m.Response:
+def _set_debug_output(module: Module, command: m.DebugOutputSetControl) -> None:
     module.profile.set_debug_output(_known(command.feature), command.control)
-    return m.Ack()
 
 
 @answers(m.DebugOutputGetControl)
 def _get_debug_output(module: Module, command: m.DebugOutputGetControl) -> m.Response:
-    return _control_reply(module.profile.debug_outputs.get(_known(command.feature), 0))
+    return _control_reply(module.profile.debug_outputs, command.feature)
+
+
+def _control_reply(outputs: Mapping[int, int], feature: int) -> m.Response:
+    return m.ReplyInt(values=(_signed(outputs.get(_known(feature), 0)),))
 
 
 def _known(feature: int) -> int:
     if feature not in _FEATURES:
         raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
     return feature
-
-
-def _control_reply(bits: int) -> m.Response:
-    return m.ReplyInt(values=(bits - (1 << 32) if bits >> 31 else bits,))
 
 
 def _as_text(value: str | bytes) -> str:
@@ -442,6 +410,8 @@ def _as_text(value: str | bytes) -> str:
 def _as_bytes(value: str | bytes) -> bytes:
     return value if isinstance(value, bytes) else value.encode("latin-1", errors="replace")
 
+
+# --- identity, UART, tests (4.10)
 
 TEST_REPLY_BYTES = 256
 _TEST_CONTENT_ID = 0x5090
@@ -456,9 +426,8 @@ def _system_get_info(module: Module, command: m.SystemGetInfo) -> m.Response:
 
 
 @answers(m.SetBaudRate)
-def _set_baud_rate(module: Module, command: m.SetBaudRate) -> m.Response:
+def _set_baud_rate(module: Module, command: m.SetBaudRate) -> None:
     module.change_baudrate(accepted_baudrate(command.baudrate, module.uart_baudrate))
-    return m.Ack()
 
 
 @answers(m.PrepareInjectFrame, m.InjectFrame)
@@ -533,21 +502,21 @@ _ACKNOWLEDGED: dict[int, Callable[[Module], None]] = {
 }
 
 
+# --- X4 driver (4.9)
+
 LONGEST_READ = 4096
 """Register bytes one READ may ask for; the firmware checks nothing, its reply buffer would end."""
 
 
 @answers(m.X4DriverInit)
-def _x4_init(module: Module, command: m.X4DriverInit) -> m.Response:
+def _x4_init(module: Module, command: m.X4DriverInit) -> None:
     module.chip.init()
     module.reply_delay_ns = module.options.x4_init_ns
-    return m.Ack()
 
 
 @answers(m.X4DriverSet)
-def _x4_set(module: Module, command: m.X4DriverSet) -> m.Response:
+def _x4_set(module: Module, command: m.X4DriverSet) -> None:
     module.chip.set(command.setting, command.value)
-    return m.Ack()
 
 
 _BYTE_REPLIES = frozenset(
@@ -578,12 +547,11 @@ def _x4_get(module: Module, command: m.X4DriverGet) -> m.Response:
 
 
 @answers(m.X4DriverWrite)
-def _x4_write(module: Module, command: m.X4DriverWrite) -> m.Response:
+def _x4_write(module: Module, command: m.X4DriverWrite) -> None:
     _check_block_access(command.setting)
     # Assumed: consecutive registers, wrapping at 256; the reference names only the first.
     for address, byte in enumerate(command.values, start=command.address):
         module.chip.write_register(command.setting, address, byte)
-    return m.Ack()
 
 
 @answers(m.X4DriverRead)
@@ -602,10 +570,9 @@ def _check_block_access(setting: X4Setting) -> None:
 
 
 @answers(m.X4DriverWriteI2c)
-def _write_i2c(module: Module, command: m.X4DriverWriteI2c) -> m.Response:
+def _write_i2c(module: Module, command: m.X4DriverWriteI2c) -> None:
     module.i2c[command.address] = command.values
     module.i2c_address = command.address
-    return m.Ack()
 
 
 @answers(m.X4DriverReadI2c)
@@ -618,9 +585,8 @@ def _read_i2c(module: Module, command: m.X4DriverReadI2c) -> m.Response:
 
 
 @answers(m.FramePostprocessingSet)
-def _set_postprocessing(module: Module, command: m.FramePostprocessingSet) -> m.Response:
+def _set_postprocessing(module: Module, command: m.FramePostprocessingSet) -> None:
     module.postprocessing[command.setting] = command.value
-    return m.Ack()
 
 
 _POSTPROCESSING_DEFAULTS: dict[int, m.PostprocessingValue] = {
@@ -640,11 +606,8 @@ def _get_postprocessing(module: Module, command: m.FramePostprocessingGet) -> m.
     if isinstance(value, tuple):
         return m.ReplyFloat(content_id=setting, values=(value[1],))
     if setting is FramePostprocessing.DECIMATION_FACTOR:
-        return m.ReplyInt(content_id=setting, values=(value - (1 << 32) if value >> 31 else value,))
+        return m.ReplyInt(content_id=setting, values=(_signed(value),))
     return m.ReplyByte(content_id=setting, values=bytes([value]))
-
-
-# Each of these enters its handlers into the table.
 
 
 def answer(module: Module, command: m.Message) -> m.Response | None:
@@ -657,7 +620,8 @@ def answer(module: Module, command: m.Message) -> m.Response | None:
         handler = HANDLERS.get(type(command))
         if handler is None:
             return m.Error(code=ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
-        return handler(module, command)
+        reply = handler(module, command)
+        return m.Ack() if reply is None else reply
     except Refusal as refusal:
         return m.Error(code=refusal.code)
     except Silence:

@@ -63,7 +63,6 @@ class Identity:
     build: str = "0" * 40
 
     def __post_init__(self) -> None:
-        """Check the one field that scenes choose."""
         if len(self.serial) != 12 or not self.serial.isascii() or not self.serial.isdigit():
             raise ValueError(f"serial number {self.serial!r}: an X4M300 has 12 digits")
 
@@ -144,7 +143,6 @@ class FileSystem:
         return list(self._files)
 
     def create(self, key: FileKey, length: int) -> None:
-        """Create a file; it is open and erased then."""
         if key in self._open:
             raise Refusal(FileError.ALREADY_OPEN)
         if key in self._files:
@@ -156,7 +154,6 @@ class FileSystem:
         self._open.add(key)
 
     def open(self, key: FileKey) -> None:
-        """Open a file."""
         if key in self._open:
             raise Refusal(FileError.ALREADY_OPEN)
         self._check_exists(key)
@@ -164,40 +161,33 @@ class FileSystem:
         self._open.add(key)
 
     def close(self, key: FileKey) -> None:
-        """Close a file."""
         self._check_open(key)
         self._open.remove(key)
 
     def close_all(self) -> None:
-        """Close every file, as a reset does."""
         self._open.clear()
 
     def length(self, key: FileKey) -> int:
-        """Return a file's size [bytes]; it need not be open."""
         self._check_exists(key)
         return len(self._files[key])
 
     def read(self, key: FileKey, offset: int, length: int) -> bytes:
-        """Read from an open file."""
         self._check_open(key)
         self._check_range(key, offset, length)
         return bytes(self._files[key][offset : offset + length])
 
     def write(self, key: FileKey, offset: int, data: bytes) -> None:
-        """Write into an open file."""
         self._check_open(key)
         self._check_range(key, offset, len(data))
         self._files[key][offset : offset + len(data)] = data
 
     def delete(self, key: FileKey) -> None:
-        """Delete a closed file."""
         if key in self._open:
             raise Refusal(FileError.ALREADY_OPEN)
         self._check_exists(key)
         del self._files[key]
 
     def format(self, key: int) -> None:
-        """Delete all files, open ones too."""
         if key != FORMAT_KEY:
             raise Refusal(FileError.INVALID_PARAMETER)
         self._files.clear()
@@ -219,12 +209,10 @@ class FileSystem:
         return None if data is None else bytes(data)
 
     def is_open(self, key: FileKey) -> bool:
-        """Whether a file is open."""
         return key in self._open
 
     @property
     def free_bytes(self) -> int:
-        """Room for further files [bytes]."""
         return self._storage_bytes - sum(len(data) for data in self._files.values())
 
     def _check_room_to_open(self) -> None:
@@ -276,16 +264,13 @@ class Memory(Protocol):
         """Return what was saved; None for a module fresh from the factory."""
         ...
 
-    def save(self, state: SavedState) -> None:
-        """Keep a state."""
-        ...
+    def save(self, state: SavedState) -> None: ...
 
 
 class VolatileMemory:
     """Keeps nothing: every start of the emulator finds a new module."""
 
     def load(self) -> SavedState | None:
-        """Return None."""
         return None
 
     def save(self, state: SavedState) -> None:
@@ -319,22 +304,18 @@ class FaultCounter:
 
     @property
     def safe(self) -> bool:
-        """Whether the module restarts in safe mode."""
         return self.count >= SAFE_MODE_FAULTS
 
     @property
     def hopeless(self) -> bool:
-        """Whether the module restarts in the bootloader."""
         return self.count > BOOTLOADER_FAULTS
 
     def fault(self, now_ns: int) -> None:
-        """Count a reset caused by a fault."""
         if self._last_ns is not None and now_ns - self._last_ns >= self._memory_ns:
             self.count = 0
         self.count += 1
         self._last_ns = now_ns
 
     def clear(self) -> None:
-        """Forget all, as after a reset that was asked for."""
         self.count = 0
         self._last_ns = None

@@ -112,6 +112,10 @@ _MODES: dict[State, SensorMode] = {
 }
 
 
+STREAMING = frozenset(s for s, mode in _MODES.items() if mode is SensorMode.XTID_SM_MANUAL)
+"""States in which radar frames go to the host."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Start:
     """What a module remembers of its modes over a reset.
@@ -148,7 +152,6 @@ class ModeMachine:
 
     @property
     def mode(self) -> SensorMode:
-        """Current mode, as GETMODE answers it."""
         return _MODES[self.state]
 
     def power_up(self, into: State | None) -> None:
@@ -363,7 +366,6 @@ GROUPS: dict[type[m.Message], Group] = {
 
 
 def group_of(command: m.Message) -> Group:
-    """Return the group of a command."""
     if isinstance(command, m.OutputSetControl | m.DebugOutputSetControl):
         return _group_of_output(command)
     return GROUPS.get(type(command), Group.BASIC)

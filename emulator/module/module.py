@@ -140,7 +140,6 @@ class Module:
 
     @property
     def state(self) -> State:
-        """What it is doing."""
         return self.modes.state
 
     @property
@@ -159,7 +158,6 @@ class Module:
         self.restart = Restart(at_ns=now_ns)
 
     def advance(self, now_ns: int) -> None:
-        """Let time pass."""
         self.now_ns = now_ns
         if self._baudrate_change is not None and now_ns >= self._baudrate_change[0]:
             self.uart_baudrate = self._baudrate_change[1]
@@ -220,12 +218,10 @@ class Module:
         self.save()
 
     def restore_factory_settings(self) -> None:
-        """Set the loaded profile back to what it was shipped with."""
         self.profile = ProfileSettings.shipped(self.options)
         self._working[self.modes.profile_id] = self.profile
 
     def save(self) -> None:
-        """Keep what the flash holds."""
         self._memory.save(
             SavedState(
                 start=self.modes.start,

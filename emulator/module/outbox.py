@@ -80,21 +80,15 @@ class Outbox(Protocol):
         """Fetch what is due, because the line takes more."""
         ...
 
-    def take(self, now_ns: int) -> Response | None:
-        """Hand the oldest message to the line; None when the queue is empty."""
-        ...
+    def take(self, now_ns: int) -> Response | None: ...
 
-    def clear(self) -> None:
-        """Forget everything, as a reset does."""
-        ...
+    def clear(self) -> None: ...
 
     def wake_ns(self, stream: MessageStream, now_ns: int) -> int | None:
         """Return when time alone brings the next message; None when only the line's room does."""
         ...
 
-    def __len__(self) -> int:
-        """Return the number of waiting messages."""
-        ...
+    def __len__(self) -> int: ...
 
 
 class LosslessOutbox:
@@ -111,12 +105,9 @@ class LosslessOutbox:
 
     @property
     def takes_replies(self) -> bool:
-        """Whether few enough messages wait."""
         return len(self._messages) < self.MOST_REPLIES
 
     def put(self, kind: MessageKind, message: Response, now_ns: int) -> None:
-        """Queue one message; the owner stops reading commands while many wait."""
-        del kind, now_ns  # every kind is kept for as long as it takes
         self._messages.append(message)
 
     def refill_on_time(self, stream: MessageStream, now_ns: int) -> None:
@@ -130,12 +121,9 @@ class LosslessOutbox:
                 self._messages.append(stream.take())
 
     def take(self, now_ns: int) -> Response | None:
-        """Return the oldest message."""
-        del now_ns
         return self._messages.popleft() if self._messages else None
 
     def clear(self) -> None:
-        """Forget everything."""
         self._messages.clear()
 
     def wake_ns(self, stream: MessageStream, now_ns: int) -> int | None:
@@ -144,7 +132,6 @@ class LosslessOutbox:
         return due_ns if due_ns is not None and due_ns > now_ns else None
 
     def __len__(self) -> int:
-        """Return the number of waiting messages."""
         return len(self._messages)
 
 
@@ -189,7 +176,6 @@ class FirmwareOutbox:
         return any(queued.kind is not MessageKind.REPLY for queued in self._queue)
 
     def put(self, kind: MessageKind, message: Response, now_ns: int) -> None:
-        """Queue one message; see the class for what is lost when."""
         if self._queue and now_ns - self._waiting_since_ns >= self.STALL_NS:
             self._purge()
         if len(self._queue) >= self.SLOTS:
@@ -226,16 +212,13 @@ class FirmwareOutbox:
         return self._queue.popleft().message
 
     def clear(self) -> None:
-        """Forget everything."""
         self._queue.clear()
 
     def wake_ns(self, stream: MessageStream, now_ns: int) -> int | None:
         """Return the next due time, which may be past when a refill was cut short."""
-        del now_ns
         return stream.next_due_ns()
 
     def __len__(self) -> int:
-        """Return the number of waiting messages."""
         return len(self._queue)
 
     def _purge(self) -> None:

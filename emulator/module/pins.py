@@ -84,7 +84,6 @@ class IoPins:
         self._values: dict[int, int] = {}
 
     def follow(self, presence: int, direction: int) -> None:
-        """Let PRESENCE, NO_PRESENCE and MOVEMENT follow what a presence message says."""
         self.presence = presence
         self.movement = presence == PresenceState.PRESENCE and direction != PresenceDirection.STILL
 
@@ -104,7 +103,6 @@ class IoPins:
             self._values[each] = 0
 
     def control(self, pin: int) -> PinControl:
-        """Return what a host asked of a pin."""
         (each,) = self._pins(pin)[:1]
         return self._controls.get(each, PinControl())
 
@@ -114,7 +112,6 @@ class IoPins:
             self._values[each] = int(value != 0)
 
     def value(self, pin: int) -> int:
-        """Return the level of a pin."""
         if pin == IoPin.ALL:
             raise Refusal(IoPinError.WRONG_PIN)
         (each,) = self._pins(pin)

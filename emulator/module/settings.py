@@ -252,7 +252,6 @@ def set_output(outputs: Mapping[int, int], feature: int, control: int) -> dict[i
 
 
 def without_volatile(outputs: Mapping[int, int]) -> dict[int, int]:
-    """Return the table as a reset leaves it."""
     return {feature: bits for feature, bits in outputs.items() if feature not in VOLATILE}
 
 
@@ -332,11 +331,9 @@ class ProfileSettings:
 
     @classmethod
     def shipped(cls, options: DeviceOptions) -> ProfileSettings:
-        """Return the settings a module leaves the factory with."""
         return cls(outputs={int(options.default_output): 1})
 
     def copy(self) -> ProfileSettings:
-        """Return settings that change independently."""
         return replace(self, outputs=dict(self.outputs), debug_outputs=dict(self.debug_outputs))
 
     def after_reset(self) -> ProfileSettings:
@@ -368,16 +365,13 @@ class ProfileSettings:
         self.zone_m = snapped_zone(start_m, end_m)
 
     def set_sensitivity(self, value: int, options: DeviceOptions) -> None:
-        """Choose the sensitivity, 0...9."""
         self.sensitivity = int(_checked(value, 0, MAX_SENSITIVITY, options))
 
     def set_band(self, value: int, options: DeviceOptions) -> None:
-        """Choose the band, 3 or 4."""
         lowest, highest = TxCenterFrequency.LOW_BAND, TxCenterFrequency.HIGH_BAND
         self.tx_center_frequency = int(_checked(value, lowest, highest, options))
 
     def set_led(self, value: int, options: DeviceOptions) -> None:
-        """Choose what the LED shows, 0...2."""
         self.led = int(_checked(value, LedMode.OFF, LedMode.FULL, options))
 
     def set_noise_map_control(self, control: int) -> None:
@@ -389,7 +383,6 @@ class ProfileSettings:
         self.outputs = set_output(self.outputs, feature, control)
 
     def set_debug_output(self, feature: int, control: int) -> None:
-        """Switch a message of the debug line, and with it those it excludes."""
         self.debug_outputs = set_output(self.debug_outputs, feature, control)
 
 

@@ -1,4 +1,4 @@
-"""The unix socket of live control: lines in, lines out; `emulator.ports.control` says which.
+"""The unix socket of live control: one JSON object per line in, one per line out.
 
 | verb | keys | does |
 |---|---|---|
@@ -16,14 +16,12 @@
 | filter | kinds, radar | which kinds of messages are played; null: all |
 
 Without ``radar`` all are meant. The answer is ``{"ok":true,...}``, or
-``{"ok":false,"error":"..."}`` with the remedy. No I/O here.
+``{"ok":false,"error":"..."}`` with the remedy.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 import selectors
 import socket
 from collections.abc import Callable, Mapping
@@ -34,8 +32,7 @@ from typing import Any
 from emulator.faults.faulty_device import FaultyDevice
 from emulator.faults.plan import FaultPlanError, parse_fault
 from emulator.playback import PlayStream, kinds
-from emulator.ports.pty import LinkError
-from emulator.ports.server import Service
+from emulator.ports.sockets import SocketClient, SocketService
 
 NS_PER_S = 1_000_000_000
 _LONGEST_S = 86_400.0 * 365
@@ -77,7 +74,7 @@ class Control:
         try:
             asked = json.loads(line)
         except (ValueError, RecursionError):
-            raise _RefusedError("a line must be one JSON object") from None
+            asked = None
         if not isinstance(asked, dict):
             raise _RefusedError("a line must be one JSON object")
         for key in asked:
@@ -86,7 +83,7 @@ class Control:
         verb = VERBS.get(str(asked.get("verb")))
         if verb is None:
             raise _RefusedError(f"verb: must be one of {', '.join(VERBS)}")
-        return verb(self, asked, now_ns)
+        return verb(self, asked, now_ns) or {}
 
     def _named(self, asked: Mapping[str, Any]) -> list[FaultyDevice]:
         name = asked.get("radar")
@@ -134,7 +131,6 @@ class Control:
         }
 
     def _fault_add(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
-        del now_ns
         spec = parse_fault(asked.get("fault"))
         chosen = [
             device for device in self._named(asked) if not spec.radar or device.name in spec.radar
@@ -144,11 +140,9 @@ class Control:
         return {"ids": {device.name: device.add(spec) for device in chosen}}
 
     def _fault_list(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
-        del now_ns
         return {"faults": {device.name: _faults(device) for device in self._named(asked)}}
 
     def _fault_clear(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
-        del now_ns
         number = asked.get("id")
         if number is not None and (not isinstance(number, int) or isinstance(number, bool)):
             raise _RefusedError("id: must be the number that `fault add` gave")
@@ -157,53 +151,45 @@ class Control:
             raise _RefusedError(f"id: no armed fault has number {number}")
         return {"cleared": cleared}
 
-    def _unplug(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+    def _unplug(self, asked: Mapping[str, Any], now_ns: int) -> None:
         seconds = None if asked.get("seconds") is None else _number(asked, "seconds", _LONGEST_S)
         for device in self._named(asked):
             device.unplug(now_ns, None if seconds is None else round(seconds * NS_PER_S))
-        return {}
 
-    def _plug(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+    def _plug(self, asked: Mapping[str, Any], now_ns: int) -> None:
         for device in self._named(asked):
             device.plug(now_ns)
-        return {}
 
-    def _reset(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+    def _reset(self, asked: Mapping[str, Any], now_ns: int) -> None:
         for device in self._named(asked):
             device.restart(now_ns)
-        return {}
 
-    def _pause(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+    def _pause(self, asked: Mapping[str, Any], now_ns: int) -> None:
         for player in self._played(asked):
             player.pause(now_ns)
-        return {}
 
-    def _resume(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+    def _resume(self, asked: Mapping[str, Any], now_ns: int) -> None:
         for player in self._played(asked):
             player.resume(now_ns)
-        return {}
 
-    def _rate(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+    def _rate(self, asked: Mapping[str, Any], now_ns: int) -> None:
         rate = _number(asked, "value", 1e9)
         for player in self._played(asked):
             player.set_rate(rate, now_ns)
-        return {}
 
-    def _seek(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+    def _seek(self, asked: Mapping[str, Any], now_ns: int) -> None:
         position_ns = round(_number(asked, "seconds", _LONGEST_S) * NS_PER_S)
         for player in self._played(asked):
             player.seek(position_ns, now_ns)
-        return {}
 
-    def _loop(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+    def _loop(self, asked: Mapping[str, Any], now_ns: int) -> None:
         value = asked.get("value")
         if not isinstance(value, bool):
             raise _RefusedError("value: must be true or false")
         for player in self._played(asked):
             player.set_loop(value, now_ns)
-        return {}
 
-    def _filter(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
+    def _filter(self, asked: Mapping[str, Any], now_ns: int) -> None:
         names = asked.get("kinds")
         if names is not None and not (
             isinstance(names, list) and all(isinstance(name, str) for name in names)
@@ -212,10 +198,9 @@ class Control:
         chosen = None if names is None else kinds(names)
         for player in self._played(asked):
             player.set_filter(chosen, now_ns)
-        return {}
 
 
-VERBS: dict[str, Callable[[Control, Mapping[str, Any], int], dict[str, Any]]] = {
+VERBS: dict[str, Callable[[Control, Mapping[str, Any], int], dict[str, Any] | None]] = {
     "state": Control._state,
     "fault add": Control._fault_add,
     "fault list": Control._fault_list,
@@ -230,7 +215,6 @@ VERBS: dict[str, Callable[[Control, Mapping[str, Any], int], dict[str, Any]]] = 
     "loop": Control._loop,
     "filter": Control._filter,
 }
-"""What each verb does."""
 
 
 def _faults(device: FaultyDevice) -> list[dict[str, Any]]:
@@ -259,88 +243,38 @@ def _number(asked: Mapping[str, Any], key: str, most: float) -> float:
 
 MOST_CLIENTS = 16
 LONGEST_LINE = 65_536
-"""Bytes; who sends more without a line end is hung up on."""
+"""Bytes; a client that sends more without a line end is hung up on."""
 MOST_UNREAD = 1 << 20
 """Bytes of answers that wait for a client; then it is hung up on."""
 _READ = 65_536
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
-class _Client:
-    connection: socket.socket
+class _Client(SocketClient):
     asked: bytes = b""
-    unsent: bytes = b""
-    speaks: bool = True
-    watched: int = selectors.EVENT_READ
 
 
-class ControlSocket(Service):
-    """A listening unix socket, as a `Service` of the server's loop.
-
-    Parameters
-    ----------
-    path
-        Where the socket appears, readable by its owner only.
-    control
-        Carries out what is asked.
-
-    Raises
-    ------
-    LinkError
-        When the socket cannot be made.
-    """
+class ControlSocket(SocketService[_Client]):
+    """The socket on which `Control` answers lines; only its owner can connect."""
 
     def __init__(self, path: Path, control: Control) -> None:
-        self.path = path
+        super().__init__(path, "control", most_clients=MOST_CLIENTS, private=True)
         self._control = control
-        self._clients: list[_Client] = []
-        self._selector: selectors.BaseSelector | None = None
-        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        try:
-            if path.is_socket():
-                path.unlink()  # left behind by a killed emulator: the directory is ours
-            self._listener.bind(os.fspath(path))
-            path.chmod(0o600)
-            self._listener.listen()
-            self._listener.setblocking(False)
-        except OSError as error:
-            self._listener.close()
-            reason = error.strerror or str(error)
-            raise LinkError(f"{path}: cannot offer the control socket: {reason}") from error
 
-    def register(self, selector: selectors.BaseSelector) -> None:
-        """Register with the loop."""
-        self._selector = selector
-        selector.register(self._listener, selectors.EVENT_READ, self._accept)
-
-    def close(self) -> None:
-        """Close everything and remove the socket; the loop may be gone."""
-        self._selector = None
-        for client in list(self._clients):
-            self._drop(client)
-        with contextlib.suppress(OSError):
-            self.path.unlink()
-        self._listener.close()
-
-    def _accept(self, events: int, now_ns: int) -> None:
-        del events, now_ns
-        try:
-            connection, _ = self._listener.accept()
-        except OSError:
-            return  # the client gave up, or descriptors have run out
-        connection.setblocking(False)
-        if len(self._clients) >= MOST_CLIENTS or self._selector is None:
-            connection.close()
-            return
+    def _admit(self, connection: socket.socket, now_ns: int) -> None:
         client = _Client(connection=connection)
         self._clients.append(client)
+        self._watch(client)
 
-        def ready(events: int, now_ns: int) -> None:
-            if events & selectors.EVENT_READ:
-                self._read(client, now_ns)
-            self._write(client)
-
-        self._selector.register(connection, selectors.EVENT_READ, ready)
+    def _ready(self, client: _Client, events: int, now_ns: int) -> None:
+        if events & selectors.EVENT_READ:
+            self._read(client, now_ns)
+        if client.unsent and not self._send(client):
+            return
+        if client.speaks or client.unsent:
+            self._watch(client)
+        else:
+            self._drop(client)
 
     def _read(self, client: _Client, now_ns: int) -> None:
         try:
@@ -356,28 +290,3 @@ class ControlSocket(Service):
                 client.unsent += self._control.answer(line, now_ns)
         if len(client.asked) > LONGEST_LINE or len(client.unsent) > MOST_UNREAD:
             client.speaks, client.unsent = False, b""
-
-    def _write(self, client: _Client) -> None:
-        if client not in self._clients:
-            return
-        try:
-            client.unsent = client.unsent[client.connection.send(client.unsent) :]
-        except BlockingIOError:
-            pass
-        except OSError:
-            client.speaks, client.unsent = False, b""
-        if not client.speaks and not client.unsent:
-            self._drop(client)
-            return
-        wanted = selectors.EVENT_READ if client.speaks else 0
-        wanted |= selectors.EVENT_WRITE if client.unsent else 0
-        if self._selector is not None and wanted != client.watched:
-            key = self._selector.get_key(client.connection)
-            self._selector.modify(client.connection, wanted, key.data)
-            client.watched = wanted
-
-    def _drop(self, client: _Client) -> None:
-        if self._selector is not None:
-            self._selector.unregister(client.connection)
-        client.connection.close()
-        self._clients.remove(client)

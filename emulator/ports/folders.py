@@ -37,7 +37,6 @@ _PORTS = "ports-"
 
 
 def fresh_port_folder() -> Path:
-    """Create an empty directory for the ports of this process."""
     return Path(tempfile.mkdtemp(prefix=f"{_PORTS}{os.getpid()}-", dir=_private_run_directory()))
 
 
@@ -77,7 +76,6 @@ class Announcement:
             fresh.replace(self._path)
 
     def close(self) -> None:
-        """Remove the entry."""
         if self._path is not None:
             with contextlib.suppress(OSError):
                 self._path.unlink()
@@ -246,7 +244,6 @@ class DirectoryMemory:
         return None
 
     def save(self, state: SavedState) -> None:
-        """Replace the document, if anything changed."""
         if state == self._last:
             return
         self._last = state

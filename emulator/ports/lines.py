@@ -1,72 +1,23 @@
 """What happens to bytes between a module and its port: USB, UART, delays, rates.
 
-A line is pure: bytes and times in, bytes out. Without one, bytes pass at once.
-
-The baud rate is ignored. Without a latency a port needs no line at all.
-
-Source: protocol reference chapter 10.
-
-What the module sends goes at the module's rate and is heard at the host's, and the other way
-round. Each packet is followed by an idle line, which is where a receiver that lost its way finds
-it again.
+A line is pure: bytes and times in, bytes out. A port without one passes bytes at once. A USB line
+only delays; a baud rate means nothing to it. On a UART, what the module sends goes at the module's
+rate and is received at the host's, and the other way round. Each packet is followed by an idle
+line, which is where a receiver that lost synchronisation finds it again.
 
 Source: protocol reference 4.10 and chapter 10; field notes 4.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
-from typing import Protocol
+from typing import ClassVar
 
 from emulator.module.settings import BITS_PER_BYTE, what_is_heard
 
-
-class Line(Protocol):
-    """What a port needs of a line: see `emulator.ports.lines.UartLine`."""
-
-    @property
-    def takes_packet(self) -> bool:
-        """Whether the module may send another packet."""
-        ...
-
-    @property
-    def takes_bytes(self) -> bool:
-        """Whether more should be read from the host."""
-        ...
-
-    @property
-    def waits_for_host(self) -> bool:
-        """Whether what the host's side has no room for waits; if not, it is lost."""
-        ...
-
-    def from_module(self, packet: bytes, now_ns: int) -> None:
-        """Take a packet of the module."""
-        ...
-
-    def to_host(self, now_ns: int) -> bytes:
-        """Return what has reached the host's side and was not returned before."""
-        ...
-
-    def from_host(self, data: bytes, now_ns: int) -> None:
-        """Take bytes of the host."""
-        ...
-
-    def to_module(self, now_ns: int) -> bytes:
-        """Return what has reached the module and was not returned before."""
-        ...
-
-    def to_host_ns(self) -> int | None:
-        """Return when more reaches the host's side; None if nothing is under way."""
-        ...
-
-    def to_module_ns(self) -> int | None:
-        """Return when more reaches the module; None if nothing is under way."""
-        ...
-
-    def clear(self) -> None:
-        """Lose all that is under way: the line is cut."""
-        ...
+NS_PER_S = 1_000_000_000
 
 
 class Flight:
@@ -77,44 +28,83 @@ class Flight:
         self._size = 0
 
     def put(self, due_ns: int, piece: bytes) -> None:
-        """Send a piece off."""
         self._pieces.append((due_ns, piece))
         self._size += len(piece)
 
-    def take(self, now_ns: int) -> bytes:
-        """Return all that has arrived."""
-        arrived = []
-        while self._pieces and self._pieces[0][0] <= now_ns:
+    def take(self, now_ns: int, *, most: int | None = None) -> bytes:
+        """Return what has arrived, of at most so many pieces."""
+        arrived: list[bytes] = []
+        while self._pieces and self._pieces[0][0] <= now_ns and len(arrived) != most:
             arrived.append(self._pieces.popleft()[1])
         data = b"".join(arrived)
         self._size -= len(data)
         return data
 
-    def take_one(self, now_ns: int) -> bytes:
-        """Return the first piece if it has arrived."""
-        if not self._pieces or self._pieces[0][0] > now_ns:
-            return b""
-        _, piece = self._pieces.popleft()
-        self._size -= len(piece)
-        return piece
-
     def next_ns(self) -> int | None:
-        """Return when the next piece arrives; None if none is under way."""
         return self._pieces[0][0] if self._pieces else None
 
     def clear(self) -> None:
-        """Lose everything."""
         self._pieces.clear()
         self._size = 0
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing is under way, not even a piece of which nothing is heard."""
+        """Whether nothing is under way, not even a piece of which nothing is received."""
         return not self._pieces
 
     def __len__(self) -> int:
-        """Return the number of bytes under way."""
         return self._size
+
+
+class Line(ABC):
+    """What connects a module and the host's side of its port."""
+
+    waits_for_host: ClassVar[bool]
+    """Whether bytes for which the host's side has no room wait; if not, they are lost."""
+    _pieces_at_once: ClassVar[int | None] = None
+
+    def __init__(self) -> None:
+        self._to_host = Flight()
+        self._to_module = Flight()
+
+    @property
+    @abstractmethod
+    def takes_packet(self) -> bool:
+        """Whether the module may send another packet."""
+
+    @property
+    @abstractmethod
+    def takes_bytes(self) -> bool:
+        """Whether more should be read from the host."""
+
+    @abstractmethod
+    def from_module(self, packet: bytes, now_ns: int) -> None:
+        """Take a packet of the module."""
+
+    @abstractmethod
+    def from_host(self, data: bytes, now_ns: int) -> None:
+        """Take bytes of the host."""
+
+    def to_host(self, now_ns: int) -> bytes:
+        """Return what has reached the host's side and was not returned before."""
+        return self._to_host.take(now_ns, most=self._pieces_at_once)
+
+    def to_module(self, now_ns: int) -> bytes:
+        """Return what has reached the module and was not returned before."""
+        return self._to_module.take(now_ns, most=self._pieces_at_once)
+
+    def to_host_ns(self) -> int | None:
+        """Return when more reaches the host's side; None if nothing is under way."""
+        return self._to_host.next_ns()
+
+    def to_module_ns(self) -> int | None:
+        """Return when more reaches the module; None if nothing is under way."""
+        return self._to_module.next_ns()
+
+    def clear(self) -> None:
+        """Lose all that is under way: the line is cut."""
+        self._to_host.clear()
+        self._to_module.clear()
 
 
 LARGEST_TRANSFER = 512
@@ -122,77 +112,42 @@ MOST_UNDER_WAY = 65536
 """Bytes in one direction; more wait at the sender."""
 
 
-class UsbLine:
-    """A line that delays.
+class UsbLine(Line):
+    """A line that delays every transfer by ``latency_ns`` in either direction."""
 
-    Parameters
-    ----------
-    latency_ns
-        From one end to the other, in either direction.
-    """
+    waits_for_host = True  # the host's controller fetches bytes when it has room for them
+    _pieces_at_once = 1
 
     def __init__(self, latency_ns: int) -> None:
+        super().__init__()
         self._latency_ns = latency_ns
-        self._to_host = Flight()
-        self._to_module = Flight()
 
     @property
     def takes_packet(self) -> bool:
-        """Whether not too much is under way."""
         return len(self._to_host) < MOST_UNDER_WAY
 
     @property
-    def waits_for_host(self) -> bool:
-        """True: the host's controller fetches bytes when it has room for them."""
-        return True
-
-    @property
     def takes_bytes(self) -> bool:
-        """Whether not too much is under way."""
         return len(self._to_module) < MOST_UNDER_WAY
 
     def from_module(self, packet: bytes, now_ns: int) -> None:
-        """Take a packet of the module."""
         self._send_off(self._to_host, packet, now_ns)
 
-    def to_host(self, now_ns: int) -> bytes:
-        """Return what has arrived, one transfer at most at a time."""
-        return self._to_host.take_one(now_ns)
-
     def from_host(self, data: bytes, now_ns: int) -> None:
-        """Take bytes of the host."""
         self._send_off(self._to_module, data, now_ns)
-
-    def to_module(self, now_ns: int) -> bytes:
-        """Return what has arrived, one transfer at most at a time."""
-        return self._to_module.take_one(now_ns)
-
-    def to_host_ns(self) -> int | None:
-        """Return when the next transfer arrives."""
-        return self._to_host.next_ns()
-
-    def to_module_ns(self) -> int | None:
-        """Return when the next transfer arrives."""
-        return self._to_module.next_ns()
-
-    def clear(self) -> None:
-        """Lose all that is under way."""
-        self._to_host.clear()
-        self._to_module.clear()
 
     def _send_off(self, flight: Flight, data: bytes, now_ns: int) -> None:
         for begin in range(0, len(data), LARGEST_TRANSFER):
             flight.put(now_ns + self._latency_ns, data[begin : begin + LARGEST_TRANSFER])
 
 
-NS_PER_S = 1_000_000_000
 SLICE_NS = 4_000_000
 """Bytes are handed over in pieces of so much line time, as adapters do."""
 UART_MOST_UNDER_WAY = 4096
 """Bytes of a host; what it writes beyond waits on its side, as in its driver's buffer."""
 
 
-class UartLine:
+class UartLine(Line):
     """A line with a rate at each end.
 
     Parameters
@@ -201,43 +156,27 @@ class UartLine:
         Returns the module's rate now, bit/s.
     host_baud
         Returns the host's, bit/s; None where it has none: then it is always the module's.
-
-    Attributes
-    ----------
-    host_baud
-        As given.
     """
 
+    waits_for_host = False  # without flow control the bits come whether anybody listens or not
+
     def __init__(self, module_baud: Callable[[], int], host_baud: Callable[[], int | None]) -> None:
+        super().__init__()
         self._module_baud = module_baud
         self.host_baud = host_baud
-        self._to_host = Flight()
-        self._to_module = Flight()
         self._host_done_ns = 0
 
     @property
     def takes_packet(self) -> bool:
-        """Whether the last packet has left: a UART has no room for two."""
-        return self._to_host.is_empty
-
-    @property
-    def waits_for_host(self) -> bool:
-        """False: without flow control the bits come whether anybody listens or not."""
-        return False
+        return self._to_host.is_empty  # a UART has no room for two
 
     @property
     def takes_bytes(self) -> bool:
-        """Whether the host may write on."""
         return len(self._to_module) < UART_MOST_UNDER_WAY
 
     def from_module(self, packet: bytes, now_ns: int) -> None:
-        """Take a packet of the module."""
         sent, read = self._module_baud(), self._baud_of_host()
         _send(self._to_host, packet, now_ns, sent, read)
-
-    def to_host(self, now_ns: int) -> bytes:
-        """Return what has arrived."""
-        return self._to_host.take(now_ns)
 
     def from_host(self, data: bytes, now_ns: int) -> None:
         """Take bytes of the host; they follow on those it wrote before."""
@@ -245,25 +184,12 @@ class UartLine:
         sent, read = self._baud_of_host(), self._module_baud()
         self._host_done_ns = _send(self._to_module, data, begin_ns, sent, read)
 
-    def to_module(self, now_ns: int) -> bytes:
-        """Return what has arrived."""
-        return self._to_module.take(now_ns)
-
-    def to_host_ns(self) -> int | None:
-        """Return when the next piece arrives."""
-        return self._to_host.next_ns()
-
-    def to_module_ns(self) -> int | None:
-        """Return when the next piece arrives."""
-        return self._to_module.next_ns()
-
     def flush_output(self) -> None:
         """Lose what the host wrote and did not send yet, as it asked for."""
         self._to_module.clear()
         self._host_done_ns = 0
 
     def clear(self) -> None:
-        """Lose all that is under way."""
         self._to_host.clear()
         self.flush_output()
 
@@ -273,18 +199,18 @@ class UartLine:
 
 
 def _send(flight: Flight, data: bytes, begin_ns: int, sent_baud: int, read_baud: int) -> int:
-    """Send bytes off in slices, as they are heard; return when the last bit has gone."""
+    """Send bytes off in slices, as they are received; return when the last bit has gone."""
     if sent_baud <= 0:
         return begin_ns  # hung up: nothing is sent
     end_ns = begin_ns + -(-len(data) * BITS_PER_BYTE * NS_PER_S // sent_baud)
-    heard = what_is_heard(data, sent_baud, read_baud)
+    received = what_is_heard(data, sent_baud, read_baud)
     n_slices = max(-(-(end_ns - begin_ns) // SLICE_NS), 1)
     done = 0
     for index in range(1, n_slices + 1):
         due_ns = min(begin_ns + index * SLICE_NS, end_ns)
         # all but the last slice hold whole bytes that have passed by then
-        until = len(heard) * (due_ns - begin_ns) // (end_ns - begin_ns) if data else 0
+        until = len(received) * (due_ns - begin_ns) // (end_ns - begin_ns) if data else 0
         if until > done or index == n_slices:
-            flight.put(due_ns, heard[done:until])
+            flight.put(due_ns, received[done:until])
         done = until
     return end_ns

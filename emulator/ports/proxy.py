@@ -61,12 +61,9 @@ class ModuleLine(Service):
 
     @property
     def wants_data(self) -> bool:
-        """Whether the port has taken what came before."""
         return len(self._unsent) < MOST_UNSENT
 
     def receive_data(self, data: bytes, now_ns: int) -> None:
-        """Send bytes to the module."""
-        del now_ns
         if not self._alive or not data:
             return
         self._tap("tx", data)
@@ -74,15 +71,12 @@ class ModuleLine(Service):
         self._write()
 
     def advance(self, now_ns: int) -> None:
-        """Let what stays incomplete go on."""
         if self._since_ns is not None and now_ns - self._since_ns >= HOLD_NS:
             self._put(bytes(self._unjudged[self._passed :]))
             self._passed = len(self._unjudged)
             self._since_ns = None
 
     def next_packet(self, now_ns: int) -> bytes | None:
-        """Return what the module sent next."""
-        del now_ns
         if not self._packets:
             return None
         packet = self._packets.popleft()
@@ -91,8 +85,6 @@ class ModuleLine(Service):
         return packet
 
     def wake_ns(self, now_ns: int) -> int | None:
-        """Return when what is incomplete has waited long enough."""
-        del now_ns
         return None if self._since_ns is None else self._since_ns + HOLD_NS
 
     def port_opened(self, now_ns: int) -> None:
@@ -102,19 +94,15 @@ class ModuleLine(Service):
         """Change nothing."""
 
     def port_present(self, now_ns: int) -> bool:
-        """Whether the module's own port is there."""
-        del now_ns
         return self._alive
 
     # --- as a service ---------------------------------------------------------------------------
 
     def register(self, selector: selectors.BaseSelector) -> None:
-        """Register the module's port with the loop."""
         self._selector = selector
         selector.register(self._descriptor, selectors.EVENT_READ, self._ready)
 
     def close(self) -> None:
-        """Close the port; the loop may be gone."""
         self._selector = None
         if self._descriptor >= 0:
             os.close(self._descriptor)
@@ -163,7 +151,6 @@ class ModuleLine(Service):
         self._watch()
 
     def _watch(self) -> None:
-        """Wait for room when there is something to send, for bytes while they are taken."""
         if self._selector is None or not self._alive:
             return
         wanted = selectors.EVENT_WRITE if self._unsent else 0

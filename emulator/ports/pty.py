@@ -27,6 +27,10 @@ _IN_NONBLOCK = os.O_NONBLOCK
 _EVENT = struct.Struct("iIII")  # watch, mask, cookie, length of a name (none for a device)
 
 
+def _ignore(now_ns: int) -> None:
+    pass
+
+
 class PortWatch(Service):
     """Calls back when the first host opens a terminal and when the last one closes it.
 
@@ -42,7 +46,11 @@ class PortWatch(Service):
     """
 
     def __init__(
-        self, terminal: str, *, opened: Callable[[int], None], closed: Callable[[int], None]
+        self,
+        terminal: str,
+        *,
+        opened: Callable[[int], None] = _ignore,
+        closed: Callable[[int], None] = _ignore,
     ) -> None:
         self._opened = opened
         self._closed = closed
@@ -72,18 +80,15 @@ class PortWatch(Service):
         return self._watch >= 0
 
     def register(self, selector: selectors.BaseSelector) -> None:
-        """Register with the loop."""
         if self.works:
             selector.register(self._fd, selectors.EVENT_READ, self._read)
 
     def close(self) -> None:
-        """Stop watching."""
         if self.works:
             os.close(self._fd)
             self._fd = -1
 
     def _read(self, events: int, now_ns: int) -> None:
-        del events
         try:
             data = os.read(self._fd, 64 * _EVENT.size)
         except BlockingIOError:
@@ -186,7 +191,6 @@ class PtyLink:
         self._open()
 
     def fileno(self) -> int:
-        """Return the master's descriptor, for a selector; -1 while closed."""
         return self._master_fd
 
     def read(self) -> bytes:
@@ -204,7 +208,6 @@ class PtyLink:
         return data[1:]  # of a packet that tells something, nothing is left
 
     def write(self, data: memoryview) -> int:
-        """Write as much as fits; return how much."""
         try:
             return os.write(self._master_fd, data)
         except BlockingIOError:
@@ -237,7 +240,6 @@ class PtyLink:
         self._close_descriptors()
 
     def __enter__(self) -> PtyLink:
-        """Return the link itself."""
         return self
 
     def __exit__(
@@ -246,7 +248,6 @@ class PtyLink:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close the link."""
         self.close()
 
     def _ask_for_packets(self) -> bool:

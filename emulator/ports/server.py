@@ -14,39 +14,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
+from emulator.device import ByteDevice
 from emulator.ports.lines import Line
-
-__all__ = ["ByteDevice", "ByteLink", "Port", "Server", "Service"]
 
 NS_PER_S = 1_000_000_000
 PACKETS_PER_TURN = 8
 LONGEST_WAIT_S = 86400.0
 """The system waits no longer than 24 days; a playback at a small rate may ask for years."""
-
-
-class ByteDevice(Protocol):
-    """What the server needs of a device: see `emulator.device.Device`."""
-
-    @property
-    def wants_data(self) -> bool:
-        """Whether more bytes should be read from the host now."""
-        ...
-
-    def receive_data(self, data: bytes, now_ns: int) -> None:
-        """Take bytes from the host."""
-        ...
-
-    def advance(self, now_ns: int) -> None:
-        """Let time pass."""
-        ...
-
-    def next_packet(self, now_ns: int) -> bytes | None:
-        """Return the next packet to send now."""
-        ...
-
-    def wake_ns(self, now_ns: int) -> int | None:
-        """Return when time alone changes something."""
-        ...
 
 
 class ByteLink(Protocol):
@@ -59,9 +33,7 @@ class ByteLink(Protocol):
         """
         ...
 
-    def read(self) -> bytes:
-        """Return what arrived, without blocking."""
-        ...
+    def read(self) -> bytes: ...
 
     def write(self, data: memoryview) -> int:
         """Write what fits, without blocking; return how much."""
@@ -80,7 +52,6 @@ class Service(ABC):
 
     def wake_ns(self, now_ns: int) -> int | None:
         """Return when `advance` should be called next; None if only descriptors matter."""
-        del now_ns
         return None
 
 
@@ -96,13 +67,11 @@ class Port:
 
     @property
     def events(self) -> int:
-        """Return what the loop should wait for."""
         takes_bytes = self._line is None or self._line.takes_bytes
         reading = selectors.EVENT_READ if self.device.wants_data and takes_bytes else 0
         return reading | (selectors.EVENT_WRITE if self._blocked else 0)
 
     def receive(self, now_ns: int) -> None:
-        """Read what the host wrote."""
         data = self.link.read()
         if data and self._line is not None:
             self.device.advance(now_ns)  # its rate may have changed since
@@ -113,7 +82,6 @@ class Port:
             self.cut()
 
     def advance(self, now_ns: int) -> None:
-        """Let time pass."""
         self.device.advance(now_ns)
         while self._line is not None and self.device.wants_data:
             data = self._line.to_module(now_ns)
@@ -122,7 +90,6 @@ class Port:
             self.device.receive_data(data, now_ns)
 
     def wake_ns(self, now_ns: int) -> int | None:
-        """Return when time alone changes something; None if never."""
         if self._line is None:
             return self.device.wake_ns(now_ns)
         candidates = [self.device.wake_ns(now_ns)]
@@ -133,7 +100,6 @@ class Port:
         return min((time_ns for time_ns in candidates if time_ns is not None), default=None)
 
     def room(self) -> None:
-        """Note that the line takes more."""
         self._blocked = False
 
     def cut(self) -> None:
@@ -211,7 +177,6 @@ class Server:
             service.register(self._selector)
 
     def run(self) -> None:
-        """Serve until `stop`."""
         while not self._stopped:
             self.turn()
 
@@ -278,6 +243,5 @@ class Server:
             self._selector.unregister(descriptor)
 
     def _woken(self, events: int, now_ns: int) -> None:
-        del events, now_ns
         with contextlib.suppress(BlockingIOError):  # woken twice for one byte
             os.read(self._wake_fd, 4096)

@@ -81,8 +81,8 @@ class ProfileSweep:
         Shape (n_bins,), float64: range of each bin [module metres].
     in_zone
         Shape (n_bins,), bool: the bins inside the zone.
-    carrier_hz
-        Centre frequency of the band.
+    timeline
+        Scene times of the counters.
     """
 
     def __init__(
@@ -107,28 +107,23 @@ class ProfileSweep:
         self.in_zone: NDArray[np.bool_] = (self.range_m > start_m - tolerance_m) & (
             self.range_m < end_m + tolerance_m
         )
+        self.timeline = self._chip.timeline
         self.tx_center_frequency = tx_center_frequency
         self.carrier_hz = x4.CARRIER_HZ[tx_center_frequency]
 
     @property
     def n_bins(self) -> int:
-        """Bins per frame."""
         return len(self.range_m)
-
-    def scene_time_ns(self, counter: int) -> int:
-        """Return the scene time of a frame, ns."""
-        return self._chip.timeline.scene_time_ns(counter)
 
     def first_counter_from(self, scene_time_ns: int) -> int:
         """Return the first counter that does not lie before a scene time."""
-        timeline = self._chip.timeline
-        timeline.next_counter = 0
-        timeline.skip_before(scene_time_ns)
-        return timeline.next_counter
+        self.timeline.next_counter = 0
+        self.timeline.skip_before(scene_time_ns)
+        return self.timeline.next_counter
 
     def frame(self, counter: int) -> NDArray[np.complex128]:
         """Return I + jQ of one frame, shape (n_bins,); float32 values, exactly."""
-        self._chip.timeline.next_counter = counter
+        self.timeline.next_counter = counter
         values = self._chip.next_frame().values.astype(np.float64)
         iq: NDArray[np.complex128] = values[: self.n_bins] + 1j * values[self.n_bins :]
         return iq
@@ -165,17 +160,14 @@ class Matrix:
 
     @property
     def rate_hz(self) -> float:
-        """Rate of the pulses."""
         return FRAME_RATE_HZ / self.decimation
 
     @property
     def step_hz(self) -> float:
-        """Step from one frequency to the next."""
         return self.rate_hz / self.pulses
 
     @property
     def start_hz(self) -> float:
-        """Lowest frequency."""
         return -(self.pulses // 2) * self.step_hz
 
     @property
@@ -204,14 +196,12 @@ class SlowTime:
         self.clear()
 
     def clear(self) -> None:
-        """Forget all frames."""
         self._pulses: deque[NDArray[np.complex128]] = deque(maxlen=self._matrix.pulses)
         self._sum: NDArray[np.complex128] | None = None
         self._summed = 0
 
     @property
     def full(self) -> bool:
-        """Whether as many frames have come as the matrix needs."""
         return len(self._pulses) == self._matrix.pulses
 
     def add(self, iq: NDArray[np.complex128]) -> None:
@@ -281,7 +271,6 @@ class NoiseMap:
 
     @property
     def complete(self) -> bool:
-        """Whether it may be used."""
         return self._learned >= CREATION_TICKS
 
     def learn(self, power: Powers) -> None:
@@ -300,7 +289,6 @@ class NoiseMap:
             mean[quiet] += ADAPTATION * (newest[quiet] - mean[quiet])
 
     def copy(self) -> NoiseMap:
-        """Return a map that changes independently."""
         return NoiseMap({instance: power.copy() for instance, power in self.power.items()})
 
 
@@ -357,7 +345,6 @@ class StoredMap:
         return cls(zone_m=(start_m, end_m), tx_center_frequency=band, noise_map=NoiseMap(power))
 
     def fits(self, zone_m: tuple[float, float], tx_center_frequency: int, n_bins: int) -> bool:
-        """Whether it was made in this zone and band."""
         bins = {len(power) for power in self.noise_map.power.values()}
         same_zone = np.allclose(self.zone_m, zone_m, atol=1e-5)
         return same_zone and self.tx_center_frequency == tx_center_frequency and bins == {n_bins}

@@ -81,7 +81,6 @@ class Detection:
 
     @property
     def direction(self) -> PresenceDirection:
-        """Which way it moves."""
         if abs(self.velocity_mps) < _STILL_MPS:
             return PresenceDirection.STILL
         away = self.velocity_mps > 0
@@ -97,7 +96,6 @@ class Excess:
 
     @classmethod
     def of(cls, power: Powers, noise_map: NoiseMap) -> Excess:
-        """Return the excess of matrices."""
         return cls(
             slow=_excess(power, noise_map, SLOW),
             fast=_excess(power, noise_map, FAST),
@@ -105,7 +103,6 @@ class Excess:
 
     @property
     def either(self) -> NDArray[np.float64]:
-        """The larger of the two."""
         return np.maximum(self.slow, self.fast)
 
 
@@ -303,11 +300,9 @@ class PresenceProcessing:
 
     @property
     def full(self) -> bool:
-        """Whether both matrices are."""
         return all(slow_time.full for slow_time in self._slow_time.values())
 
     def add(self, iq: NDArray[np.complex128]) -> None:
-        """Take one frame."""
         for slow_time in self._slow_time.values():
             slow_time.add(iq)
 

@@ -33,19 +33,16 @@ from __future__ import annotations
 
 import contextlib
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from typing import Protocol
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.chip.chip import EchoSource, Refusal
-from emulator.chip.clock import ModuleClock
-from emulator.chip.pace import Pace
-from emulator.module.memory import FileSystem
-from emulator.module.modes import ModeMachine
+from emulator.chip import Pace
+from emulator.chip.chip import EchoSource, ModuleClock, Refusal
+from emulator.module.module import NOISE_MAPS, Module
 from emulator.module.outbox import MessageStream
-from emulator.module.settings import DeviceOptions, ProfileSettings
+from emulator.module.settings import ProfileSettings
 from emulator.profiles.doppler import (
     FRAME_RATE_HZ,
     FRAMES_PER_TICK,
@@ -64,7 +61,6 @@ from emulator.profiles.presence import Presence, PresenceProcessing, threshold_d
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import (
-    FileType,
     MatrixControl,
     NoiseMapControl,
     OutputFeature,
@@ -140,7 +136,6 @@ def presence_single(counter: int, presence: Presence, sensitivity: int) -> m.Pre
 
 
 def moving_list(counter: int, presence: Presence) -> m.PresenceMovingList:
-    """Return movement by range, and the distances of all detections."""
     nothing = (0.0,) * len(presence.detections)
     return m.PresenceMovingList(
         counter=counter & 0xFFFFFFFF,
@@ -223,20 +218,6 @@ _NOISE_MAPS = (OutputFeature.NOISEMAP_FLOAT, OutputFeature.NOISEMAP_BYTE)
 _CYCLE = SLOW.frames
 
 
-class OutputSettings(Protocol):
-    """What of the profile's settings a run obeys while it runs."""
-
-    @property
-    def outputs(self) -> Mapping[int, int]:
-        """Control bits by message id; what is off is absent or 0."""
-        ...
-
-    @property
-    def sensitivity(self) -> int:
-        """0...9."""
-        ...
-
-
 class ProfileRun:
     """A profile from RUN to STOP, or from one pause to the next.
 
@@ -262,7 +243,7 @@ class ProfileRun:
         self,
         sweep: ProfileSweep,
         processing: PresenceProcessing,
-        settings: Callable[[], OutputSettings],
+        settings: Callable[[], ProfileSettings],
         *,
         first_counter: int,
         zero_ns: int,
@@ -282,24 +263,20 @@ class ProfileRun:
 
     @property
     def silent(self) -> bool:
-        """Whether no output is on."""
         return self._next_index() is None and not self._ready
 
     def next_due_ns(self) -> int | None:
-        """Return when the next message is due; None when no output is on."""
         if self._ready:
             return self._due_ns(self._taken - 1)
         index = self._next_index()
         return None if index is None else self._due_ns(index)
 
     def take(self) -> Response:
-        """Return the next message; there must be one."""
         while not self._ready:
             self._frame()
         return self._ready.popleft()
 
     def skip_before(self, time_ns: int) -> int:
-        """Give up every message due before a time; return how many."""
         skipped = 0
         while (due_ns := self.next_due_ns()) is not None and due_ns < time_ns:
             skipped += self._jump(time_ns)
@@ -315,7 +292,7 @@ class ProfileRun:
             self._ready.clear()
 
     def _due_ns(self, index: int) -> int:
-        nominal_ns = self.sweep.scene_time_ns(self._first_counter + index)
+        nominal_ns = self.sweep.timeline.scene_time_ns(self._first_counter + index)
         return self._zero_ns + self._clock.scene_time_ns(nominal_ns)
 
     def _on(self, feature: int) -> int:
@@ -341,7 +318,6 @@ class ProfileRun:
         return [matrix for matrix in MATRICES if wanted[matrix.instance]]
 
     def _frame(self) -> None:
-        """Take one frame, and make ready its messages."""
         index = self._taken
         counter = self._first_counter + index
         iq = self.sweep.frame(counter)
@@ -415,37 +391,6 @@ def _next_multiple(taken: int, period: int) -> int:
     return taken + (-(taken + 1)) % period
 
 
-_FILES = ((int(FileType.NOISEMAP_SLOW), 0), (int(FileType.NOISEMAP_FAST), 0))
-
-
-class ProfileHost(Protocol):
-    """What of a module its profile looks at."""
-
-    @property
-    def modes(self) -> ModeMachine:
-        """The mode, and which profile is loaded."""
-        ...
-
-    @property
-    def profile(self) -> ProfileSettings:
-        """The settings of that profile."""
-        ...
-
-    @property
-    def options(self) -> DeviceOptions:
-        """How open questions are answered."""
-        ...
-
-    @property
-    def files(self) -> FileSystem:
-        """Where noise maps are kept over restarts."""
-        ...
-
-    def save(self) -> None:
-        """Keep what the flash holds."""
-        ...
-
-
 class ProfileStream(MessageStream):
     """Messages of a module in RUN.
 
@@ -467,7 +412,7 @@ class ProfileStream(MessageStream):
 
     def __init__(
         self,
-        module: ProfileHost,
+        module: Module,
         source: EchoSource,
         *,
         pace: Pace,
@@ -493,12 +438,10 @@ class ProfileStream(MessageStream):
         return None if self._paused else self._run
 
     def next_due_ns(self) -> int | None:
-        """Return when the next message is due; None while no profile runs, or says anything."""
         run = self.running
         return None if run is None else run.next_due_ns()
 
     def take(self) -> Response:
-        """Return the next message; there must be one."""
         run = self.running
         assert run is not None
         message = run.take()
@@ -523,7 +466,6 @@ class ProfileStream(MessageStream):
             self._paused = True
         else:
             self._run = None
-        del command  # the mode says all
 
     def restarted(self, ready_ns: int) -> None:
         """Begin anew at a time, if the module is in RUN then."""
@@ -587,7 +529,7 @@ class ProfileStream(MessageStream):
 
     def _stored_map(self, sweep: ProfileSweep) -> StoredMap | None:
         """Return the map in the module's files, if there is one of this zone and band."""
-        slow, fast = (self._module.files.get(key) or b"" for key in _FILES)
+        slow, fast = (self._module.files.get(key) or b"" for key in NOISE_MAPS)
         stored = StoredMap.of_files((slow, fast))
         zone_m = self._module.profile.zone_m
         if stored is None or not stored.fits(zone_m, sweep.tx_center_frequency, sweep.n_bins):
@@ -606,7 +548,7 @@ class ProfileStream(MessageStream):
         self._creating = False
         if wanted:
             with contextlib.suppress(Refusal):  # no room: the next start creates one again
-                for key, data in zip(_FILES, current.files(), strict=True):
+                for key, data in zip(NOISE_MAPS, current.files(), strict=True):
                     self._module.files.replace(key, data)
             self._module.save()
 

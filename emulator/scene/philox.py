@@ -1,4 +1,4 @@
-"""Reproducible chance: fixed maps of Philox bits to integers and Gaussian noise.
+"""Reproducible random numbers: fixed maps of Philox bits to integers, uniforms and Gaussian noise.
 
 NumPy guarantees the bit stream of Philox but not how its generators turn bits into normals, and
 their transcendental functions may differ in the last bit between processors. So the map is ours
@@ -10,8 +10,6 @@ to 2**-20; one normal is the sum of two such entries. The sum is what makes the 
 A stream is keyed by (seed, stream number). Frame ``k`` owns the k-th block of a stream, so its
 noise depends neither on how many frames are asked for at once nor on their order. The streams of a
 module are numbered by its serial number and what they are for (`Purpose`).
-
-NumPy guarantees the bits of Philox on every machine, not what its generators make of them.
 """
 
 from __future__ import annotations
@@ -128,11 +126,6 @@ def counter_normals(counters: NDArray[np.int64], *, seed: int, stream: int) -> N
     return normals
 
 
-def uniform_below(end: int, *, seed: int, stream: int) -> int:
-    """Return the stream's first word as an integer 0 ... end - 1; ``end`` far below 2**64."""
-    return int(_philox(seed, stream, 0).random_raw()) % end
-
-
 def _runs(counters: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
     """Yield start and end of each run of counters that follow each other."""
     breaks = np.flatnonzero(np.diff(counters) != 1) + 1
@@ -141,7 +134,7 @@ def _runs(counters: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
             yield start, stop
 
 
-def _philox(seed: int, stream: int, counter: int) -> np.random.Philox:
+def _philox(seed: int, stream: int, counter: int = 0) -> np.random.Philox:
     largest = (1 << 64) - 1
     if not (0 <= seed <= largest and 0 <= stream <= largest):
         raise ValueError(f"seed {seed} and stream {stream} must each lie in 0 ... 2**64 - 1")
@@ -168,7 +161,7 @@ class Dice:
     """
 
     def __init__(self, seed: int, stream: int = 0) -> None:
-        self._bits = np.random.Philox(key=np.array([seed, stream], dtype=np.uint64))
+        self._bits = _philox(seed, stream)
         self._walked = 0.0
 
     def below(self, count: int) -> int:
@@ -180,7 +173,6 @@ class Dice:
         return (int(self._bits.random_raw()) >> 11) * 2.0**-53
 
     def chance(self, probability: float) -> bool:
-        """Return True with a probability."""
         return self.uniform() < probability
 
     def normal(self) -> float:
@@ -193,5 +185,4 @@ class Dice:
         return self._walked
 
     def data(self, count: int) -> bytes:
-        """Return random bytes."""
         return bytes(self.below(256) for _ in range(count))

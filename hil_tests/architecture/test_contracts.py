@@ -1,130 +1,183 @@
-"""The import contracts of pyproject.toml cover every module, and heavy libraries load late."""
+"""The import contracts of pyproject.toml hold and can fail; folders are small, help is light."""
 
+import shutil
 import subprocess
 import sys
 import tomllib
+from pathlib import Path
 
 import pytest
 
 from hil_tests.paths import REPOSITORY
 
-HEAVY = ("joblib", "matplotlib", "mcap", "pydantic", "rerun", "rosbags", "scipy", "sklearn")
+PYPROJECT = REPOSITORY / "pyproject.toml"
+PRODUCT = ("xethru_protocol", "emulator", "slam", "hil_tests/plugin")
+HEAVY = {
+    *("joblib", "matplotlib", "mcap", "numpy", "pydantic", "rerun", "rosbags", "scipy", "serial"),
+    *("sklearn", "xdist"),
+}
 
 pytestmark = pytest.mark.skipif(
-    not (REPOSITORY / "pyproject.toml").exists(),
-    reason="contracts live in the source tree; run from a clone",
+    not PYPROJECT.exists(), reason="contracts are in the source tree; run from a clone"
 )
 
+# Contract, a file, and an import that the contract forbids there.
+PLANTED = {
+    "house": ("xethru_protocol/wire/__init__.py", "import emulator"),
+    "no-circles": ("xethru_protocol/wire/__init__.py", "import xethru_protocol.driver"),
+    "protocol-light": ("xethru_protocol/cli/__init__.py", "import scipy"),
+    "sans-io": ("emulator/chip/__init__.py", "import time"),
+    "driver-transport": ("xethru_protocol/driver/__init__.py", "import socket"),
+    "pyserial-once": ("emulator/ports/__init__.py", "import serial"),
+    "emulator-light": ("emulator/echo/__init__.py", "import sklearn"),
+    "slam-core": ("slam/front_end/__init__.py", "import xethru_protocol"),
+    "slam-app-on-top": ("slam/robust/__init__.py", "import slam.app"),
+    "pure": ("slam/paper/__init__.py", "import time"),
+    "rerun-once": ("slam/app/run/__init__.py", "import rerun"),
+}
 
-def contract(contract_id: str) -> dict[str, list[str]]:
-    settings = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
-    contracts = settings["tool"]["importlinter"]["contracts"]
-    found: dict[str, list[str]] = next(c for c in contracts if c["id"] == contract_id)
-    return found
-
-
-def test_the_slam_core_contract_names_every_module_of_the_core() -> None:
-    modules = {
-        f"slam.{path.stem}"
-        for path in (REPOSITORY / "slam").iterdir()
-        if path.suffix == ".py" or (path / "__init__.py").exists()
-    } - {"slam.__init__", "slam.app"}
-    assert set(contract("slam-core")["source_modules"]) == modules
-
-
-# What may touch ports, files, sockets or clocks; everything else is pure.
-INPUT_AND_OUTPUT = {
-    "xethru_protocol": {
-        "async_driver",
-        "async_transport",
-        "cli",
-        "driver",
-        "ports",
-        "recordings",
-        "transport",
-    },
-    "emulator": {
-        "cli",
-        "cli_faults",
-        "control_socket",
-        "device_ports",
-        "fault_bench",
-        "link",
-        "link_folder",
-        "odometry_feed",
-        "path_lock",
-        "playback",
-        "plug",
-        "port_watch",
-        "proxy",
-        "run_directory",
-        "scene",
-        "server",
-        "serving",
-        "shared_device",
-        "state_store",
-        "stop",
-        "tcp_link",
-    },
+MOST_ENTRIES = 12
+MARKERS = {"__init__.py", "__main__.py", "__pycache__", "conftest.py", "py.typed"}
+SMALL_LINES = 80
+# Files under 80 lines with one importer, and why they are not part of it.
+SMALL_FILES = {
+    "hil_tests/plugin/scheduling.py": "imports xdist, which need not be installed",
 }
 
 
-def test_the_sans_io_contract_names_every_pure_module() -> None:
-    pure = {
-        f"{package}.{path.stem}"
-        for package, impure in INPUT_AND_OUTPUT.items()
-        for path in (REPOSITORY / package).iterdir()
-        if path.suffix == ".py" or (path / "__init__.py").exists()
-        if path.stem not in impure | {"__init__"}
-    }
-    assert set(contract("sans-io")["source_modules"]) == pure
+def contracts() -> list[str]:
+    settings = tomllib.loads(PYPROJECT.read_text())["tool"]["importlinter"]
+    return [contract["id"] for contract in settings["contracts"]]
 
 
-def loaded_heavy_modules(*python_arguments: str) -> set[str]:
-    """Run Python and return which heavy packages it loaded."""
-    script = "import sys, json\nprint(json.dumps(sorted({m.split('.')[0] for m in sys.modules})))"
-    result = subprocess.run(
-        [sys.executable, *python_arguments[:-1], python_arguments[-1] + "\n" + script],
-        check=True,
+def broken(folder: Path, *ids: str) -> bool:
+    """Return whether import-linter finds one of these contracts broken in the sources there."""
+    chosen = [word for name in ids for word in ("--contract", name)]
+    program = "import sys; from importlinter.cli import lint_imports_command as run; run()"
+    linted = subprocess.run(
+        [sys.executable, "-c", program, *chosen],
+        cwd=folder,
+        env={"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"},
         capture_output=True,
         text=True,
+        check=False,
     )
-    names = result.stdout.strip().splitlines()[-1]
-    return {name for name in HEAVY if f'"{name}"' in names}
+    assert "Contracts: " in linted.stdout, linted.stdout + linted.stderr
+    return linted.returncode != 0
+
+
+@pytest.mark.slow
+def test_every_contract_holds_and_fails_on_a_planted_violation(tmp_path: Path) -> None:
+    pytest.importorskip("importlinter", reason="import-linter is in the extra dev")
+    assert set(PLANTED) == set(contracts())
+    for package in tomllib.loads(PYPROJECT.read_text())["tool"]["importlinter"]["root_packages"]:
+        shutil.copytree(
+            REPOSITORY / package, tmp_path / package, ignore=lambda _, names: ignored(names)
+        )
+    shutil.copy(PYPROJECT, tmp_path)
+    assert not broken(tmp_path)
+    for name, (file, line) in PLANTED.items():
+        whole = (tmp_path / file).read_text()
+        (tmp_path / file).write_text(f"{whole}\n{line}\n")
+        assert broken(tmp_path, name), f"{name}: {line} in {file} was not found"
+        (tmp_path / file).write_text(whole)
+
+
+def ignored(names: list[str]) -> list[str]:
+    return [name for name in names if "." in name and not name.endswith(".py")]
+
+
+def test_no_folder_holds_more_than_12_entries() -> None:
+    packages = {path.partition("/")[0] for path in PRODUCT}
+    unit = REPOSITORY / "hil_tests" / "unit"
+    crowded = {}
+    for folder in {path.parent for name in packages for path in (REPOSITORY / name).rglob("*.py")}:
+        entries = {
+            path.name
+            for path in folder.iterdir()
+            if path.name not in MARKERS and (path.is_file() or any(path.rglob("*.py")))
+        }
+        if len(entries) > MOST_ENTRIES and not folder.is_relative_to(unit):
+            crowded[str(folder.relative_to(REPOSITORY))] = len(entries)
+    assert crowded == {}
+
+
+def test_small_files_with_one_importer_are_part_of_it() -> None:
+    grimp = pytest.importorskip("grimp", reason="import-linter is in the extra dev")
+    graph = grimp.build_graph("xethru_protocol", "emulator", "slam", "hil_tests", cache_dir=None)
+    prefixes = tuple(f"{path.replace('/', '.')}." for path in PRODUCT)
+    found = set()
+    for package in PRODUCT:
+        for path in (REPOSITORY / package).rglob("*.py"):
+            file = path.relative_to(REPOSITORY)
+            module = ".".join(file.with_suffix("").parts)
+            if path.name in MARKERS or len(path.read_text().splitlines()) >= SMALL_LINES:
+                continue
+            importers = graph.find_modules_that_directly_import(module)
+            if sum(f"{importer}.".startswith(prefixes) for importer in importers) == 1:
+                found.add(file.as_posix())
+    assert found == set(SMALL_FILES)
+
+
+def loaded(program: str) -> set[str]:
+    """Run Python; return the names of the packages that it loaded."""
+    script = (
+        f"{program}\nimport sys; print('LOADED', *{{m.partition('.')[0] for m in sys.modules}})"
+    )
+    run = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
+    return set(run.stdout.rpartition("LOADED")[2].split())
 
 
 def test_importing_the_protocol_loads_no_heavy_library() -> None:
-    assert loaded_heavy_modules("-c", "import xethru_protocol") == set()
+    assert not loaded("import xethru_protocol") & HEAVY
+    assert not loaded("import xethru_protocol.recordings") & HEAVY - {"numpy"}
+
+
+def test_loading_the_plugin_loads_no_library() -> None:
+    packages = {"emulator", "slam", "xethru_protocol"}
+    assert not loaded("import pytest, hil_tests.plugin.hooks") & (HEAVY | packages)
+
+
+# Asks a parser for the help of each command and of each command's commands.
+EVERY_HELP = """
+import argparse, contextlib, io, sys
+found = []
+remember = argparse.ArgumentParser.parse_known_args
+def commands(parser):
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for name, command in action.choices.items():
+                yield [name]
+                yield from ([name, *rest] for rest in commands(command))
+def note(parser, *arguments, **named):
+    found.extend(commands(parser))
+    return remember(parser, *arguments, **named)
+argparse.ArgumentParser.parse_known_args = note
+from {module} import main
+def help_of(words):
+    with contextlib.redirect_stdout(io.StringIO()) as shown:
+        try:
+            code = main([*words, "--help"])
+        except SystemExit as end:
+            code = end.code
+    assert code in (0, None), (words, code)
+    assert shown.getvalue().startswith("usage: "), words
+help_of([])
+argparse.ArgumentParser.parse_known_args = remember
+print(len(found))
+for words in found:
+    help_of(words)
+"""
 
 
 @pytest.mark.parametrize(
-    ("module", "command"),
+    ("module", "own"),
     [
-        ("xethru_protocol.cli", ""),
-        *(
-            ("xethru_protocol.cli", command)
-            for command in ("stream", "doctor", "record", "dump", "convert")
-        ),
-        ("emulator.cli", ""),
-        ("emulator.cli", "serve"),
-        ("emulator.cli", "play"),
-        ("slam.app.cli", ""),
-        *(
-            ("slam.app.cli", command)
-            for command in (
-                *("demo", "run", "replay", "view", "report", "evaluate", "repair", "convert"),
-                *("calibrate", "sweep", "experiment"),
-            )
-        ),
+        ("xethru_protocol.cli", {"xethru_protocol"}),
+        ("emulator.cli", {"emulator", "xethru_protocol"}),
+        ("slam.app.cli", {"slam", "xethru_protocol"}),
     ],
 )
-def test_help_of_every_command_loads_no_heavy_library(module: str, command: str) -> None:
-    arguments = [command, "--help"] if command else ["--help"]
-    code = (
-        f"from {module} import main\n"
-        "try:\n"
-        f"    main({arguments!r})\n"
-        "except SystemExit as exit:\n"
-        "    assert exit.code in (0, None), exit.code"
-    )
-    assert loaded_heavy_modules("-c", code) == set()
+def test_help_of_every_command_loads_no_heavy_library(module: str, own: set[str]) -> None:
+    others = {"emulator", "slam", "xethru_protocol"} - own
+    assert not loaded(EVERY_HELP.replace("{module}", module)) & (HEAVY | others)

@@ -298,7 +298,6 @@ class _Counted:
 
 
 def report(outcome: Outcome) -> dict[str, object]:
-    """JSON-able form of an outcome."""
     return {
         "bytes": outcome.bytes,
         "damaged_bytes": outcome.damaged_bytes,
@@ -313,7 +312,6 @@ def report(outcome: Outcome) -> dict[str, object]:
 
 
 def main() -> None:
-    """Run one case and print what came out as JSON."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
     parser.add_argument("--megabytes", type=float, default=100)
     parser.add_argument("--rate", type=float, default=1e-3, help="share of bytes to damage")

@@ -23,7 +23,7 @@ from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.device import Device, radar_device
 from emulator.echo.echo import echo_source
 from emulator.module.memory import Identity
@@ -238,7 +238,6 @@ class World:
         self._server.turn(longest_wait_s=0)
 
     def close(self) -> None:
-        """Give the descriptors back."""
         self._server.close()
         for line in self.lines:
             line.close()
@@ -312,7 +311,6 @@ def memory() -> tuple[int, int]:
 
 
 def main() -> int:
-    """Run and print what came of it; return 0 if nothing was disturbed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=20.0, help="device time (default 20)")
     parser.add_argument("--seed", type=int, default=0)

@@ -24,7 +24,7 @@ from pathlib import Path
 from types import CodeType, FrameType, TracebackType
 from typing import Self
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport
@@ -47,7 +47,7 @@ from slam.app.rig.emulated import (
 )
 from slam.app.run.runner import run_slam
 from slam.app.session.log import SessionLog
-from slam.robust.pipeline import make_slam
+from slam.pipelines import make_slam
 from xethru_protocol.driver.radar import X4M300
 
 ROOT = REPOSITORY
@@ -84,7 +84,6 @@ class Trace:
         self._folders = tuple(f"{ROOT / package}/" for package in PRODUCT)
 
     def __enter__(self) -> Self:
-        """Begin to collect."""
         threading.setprofile(self._on_event)
         sys.setprofile(self._on_event)
         return self
@@ -95,12 +94,10 @@ class Trace:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Stop collecting, also after an error."""
         sys.setprofile(None)
         threading.setprofile(None)
 
     def files(self) -> list[str]:
-        """Return the files, sorted, relative to the repository."""
         paths = {Path(code.co_filename).relative_to(ROOT) for code in self._called}
         return sorted(path.as_posix() for path in paths)
 
@@ -213,7 +210,6 @@ def _loopback_driver() -> X4M300:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Print the number of files and the sorted list of every journey."""
     parser = argparse.ArgumentParser(description="count the product files of four journeys")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     arguments = parser.parse_args(argv)

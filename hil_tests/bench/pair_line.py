@@ -18,22 +18,18 @@ class PairLine:
             end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 16384)
 
     def fileno(self) -> int:
-        """Return the module's descriptor."""
         return self._end.fileno()
 
     def read(self) -> bytes:
-        """Return what the host wrote."""
         return self._end.recv(4096)
 
     def write(self, data: memoryview) -> int:
-        """Write to the host what fits."""
         try:
             return self._end.send(data)
         except BlockingIOError:
             return 0
 
     def host_fileno(self) -> int:
-        """Return the host's descriptor."""
         return self._host_end.fileno()
 
     def host_read(self) -> bytes:
@@ -49,6 +45,5 @@ class PairLine:
         return 0
 
     def close(self) -> None:
-        """Close both ends."""
         self._end.close()
         self._host_end.close()

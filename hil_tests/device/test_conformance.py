@@ -6,52 +6,51 @@
 
 from __future__ import annotations
 
+import datetime
 from pathlib import Path
 
 import pytest
 
-from hil_tests.paths import FIXTURES
-from hil_tests.plugin.bench import RadarAtPlace
-from hil_tests.plugin.cassette import Cassette, ask_all, differences, today
+from hil_tests.plugin.bench import RadarUnderTest
+from hil_tests.plugin.cassette import EMULATED, Cassette, ask_all, differences
 from hil_tests.plugin.choices import CHOICES
 from hil_tests.plugin.gate import leave_out
 from hil_tests.plugin.measurements import Measure
 from hil_tests.plugin.specs import parse_specs
 
-CASSETTES = FIXTURES / "cassettes"
 
-
-def emulator() -> RadarAtPlace:
-    radar = RadarAtPlace(parse_specs(["emu"])[0])
+def emulator() -> RadarUnderTest:
+    radar = RadarUnderTest(parse_specs(["emu"])[0])
     radar.begin_test()
     return radar
 
 
 @pytest.mark.requires("settings", "profiles", "files")
 def test_every_answer_is_the_emulators(
-    request: pytest.FixtureRequest, radar_place: RadarAtPlace, measure: Measure
+    request: pytest.FixtureRequest, radar_place: RadarUnderTest, measure: Measure
 ) -> None:
     choices = request.config.stash[CHOICES]
     if not choices.diff:
         leave_out(request, f"{radar_place.spec.name}: asked and compared only with --hil-diff")
-    answers = ask_all(radar_place.take_line(), radar_place.place.clock_ns)
+    questions = Cassette.read(EMULATED).exchanges
+    answers = ask_all(radar_place.take_line(), radar_place.place.clock_ns, questions)
     if choices.cassette is not None:
         recorded = {
             "identity": radar_place.identity,
             "reached": radar_place.place.description,
             "real_module": "hardware" in radar_place.place.capabilities,  # as the user says
-            "date": today(),
+            "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         }
         Cassette(recorded=recorded, exchanges=answers).write(choices.cassette)
     emulated = emulator()
-    expected = ask_all(emulated.take_line(), emulated.place.clock_ns)
+    expected = ask_all(emulated.take_line(), emulated.place.clock_ns, questions)
     found = differences(answers, expected)
     measure("answers_compared", len(answers))
     measure("answers_that_differ", len(found))
     assert not found, "\n".join(found)
 
 
-@pytest.mark.parametrize("path", sorted(CASSETTES.glob("*.json")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted(EMULATED.parent.glob("*.json")), ids=lambda path: path.stem)
 def test_the_emulator_answers_as_the_cassette(path: Path) -> None:
     """Offline: the answers of each cassette come again.
 
@@ -59,6 +58,6 @@ def test_the_emulator_answers_as_the_cassette(path: Path) -> None:
     """
     cassette = Cassette.read(path)
     emulated = emulator()
-    now = ask_all(emulated.take_line(), emulated.place.clock_ns, cassette.transactions)
+    now = ask_all(emulated.take_line(), emulated.place.clock_ns, cassette.exchanges)
     found = differences(cassette.exchanges, now)
     assert not found, "\n".join(found)

@@ -8,7 +8,7 @@ import itertools
 import numpy as np
 import pytest
 
-from hil_tests.plugin.bench import RadarAtPlace
+from hil_tests.plugin.bench import RadarUnderTest
 from hil_tests.plugin.measurements import Measure
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
@@ -67,7 +67,9 @@ def test_rates_read_back_as_the_timer_runs(radar: X4M300, rate_hz: int) -> None:
     radar.stop()
 
 
-def test_frames_keep_their_pace(radar: X4M300, radar_place: RadarAtPlace, measure: Measure) -> None:
+def test_frames_keep_their_pace(
+    radar: X4M300, radar_place: RadarUnderTest, measure: Measure
+) -> None:
     """Protocol reference 9.6: 17 is 17.049379 Hz, 58.653 ms; short frames, so any line carries it.
 
     Judged in virtual time; in real time, when 41 frames arrive says as much of a busy host as of
@@ -175,7 +177,7 @@ def test_init_ends_the_stream(radar: X4M300) -> None:
 
 
 def test_a_host_that_pauses_gets_whole_frames_afterwards(
-    radar: X4M300, radar_place: RadarAtPlace
+    radar: X4M300, radar_place: RadarUnderTest
 ) -> None:
     """What is read late is whole; what the firmware dropped meanwhile, the counters show (8.4)."""
     radar.configure_raw(RawConfig(frame_area_m=(0.4, 1.0)))

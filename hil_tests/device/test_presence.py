@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hil_tests.plugin.bench import RadarAtPlace
+from hil_tests.plugin.bench import RadarUnderTest
 from hil_tests.plugin.measurements import Measure
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m
@@ -93,7 +93,7 @@ def test_settings_are_refused_while_it_runs(radar: X4M300) -> None:
 
 @pytest.mark.writes_flash
 def test_it_reports_once_a_second_while_it_starts(
-    radar: X4M300, radar_place: RadarAtPlace, measure: Measure
+    radar: X4M300, radar_place: RadarUnderTest, measure: Measure
 ) -> None:
     """Protocol reference 7.3, 8.1: INITIALIZING for up to 20 s, at 1 Hz, judged in virtual time."""
     radar.presence.load()
@@ -145,7 +145,7 @@ def test_it_says_within_20_s_whether_somebody_is_there(radar: X4M300, measure: M
 
 @pytest.mark.writes_flash
 def test_baseband_frames_of_the_profile(
-    radar: X4M300, radar_place: RadarAtPlace, measure: Measure
+    radar: X4M300, radar_place: RadarUnderTest, measure: Measure
 ) -> None:
     """Protocol reference 7.1: 17 per second, bins of 5.14 cm, one more at both ends of the zone.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hil_tests.plugin.bench import RadarAtPlace
+from hil_tests.plugin.bench import RadarUnderTest
 from hil_tests.plugin.measurements import Measure
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
@@ -18,7 +18,7 @@ SHORT = RawConfig(frame_area_m=(0.4, 1.0))
 
 
 def test_it_is_ready_again_after_a_reset(
-    radar: X4M300, radar_place: RadarAtPlace, measure: Measure
+    radar: X4M300, radar_place: RadarUnderTest, measure: Measure
 ) -> None:
     """Protocol reference 8.1: ready again after 2 ... 9 s, X4 settings gone."""
     radar.configure_raw(RawConfig(iterations=8))
@@ -48,7 +48,7 @@ def test_frames_come_again_after_a_reset_in_a_stream(radar: X4M300, frame_rate_h
 
 @pytest.mark.requires("unplug")
 def test_the_driver_goes_on_after_an_unplug(
-    radar_place: RadarAtPlace, frame_rate_hz: float
+    radar_place: RadarUnderTest, frame_rate_hz: float
 ) -> None:
     """It finds the module by its own serial number and restores what was set."""
     radar = radar_place.open(reconnect_s=15.0)
@@ -65,7 +65,7 @@ def test_the_driver_goes_on_after_an_unplug(
 
 
 @pytest.mark.requires("unplug")
-def test_an_unplugged_module_is_said_to_be_gone(radar: X4M300, radar_place: RadarAtPlace) -> None:
+def test_an_unplugged_module_is_said_to_be_gone(radar: X4M300, radar_place: RadarUnderTest) -> None:
     radar.configure_raw(SHORT)
     radar.start(17.0)
     radar.read_frame()

@@ -59,12 +59,10 @@ def run_lap(scene: str, preset: str, seed: int) -> SweepRun:
 
 
 def stored_bands() -> tuple[Band, ...]:
-    """Return the bands of fixtures/baselines."""
     return tuple(Band(**row) for row in tomllib.loads(BANDS.read_text())["band"])
 
 
 def band_of(scene: str, preset: str) -> Band:
-    """Measure a band."""
     runs = [run_lap(scene, preset, seed) for seed in range(N_SEEDS)]
     errors_mm = [1e3 * run.ate_rmse_m for run in runs]
     maps = [run.landmarks for run in runs]

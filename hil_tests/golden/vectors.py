@@ -43,7 +43,6 @@ class Vector:
 
     @property
     def payload(self) -> bytes | None:
-        """The payload, where the vector lists it."""
         text = self.decoded.get("payload")
         return None if text is None else bytes.fromhex(text)
 
@@ -64,5 +63,4 @@ def load(file: str = "protocol_vectors.json") -> tuple[Vector, ...]:
 
 
 def load_hand_made() -> tuple[Vector, ...]:
-    """Vectors assembled by hand from the layouts of the reference."""
     return load("hand_vectors.json")

@@ -1,11 +1,10 @@
-"""The radars of one test session: opened when first needed, brought to a known state per test."""
+"""The radars of one test session: opened when first needed, reset to a known state per test."""
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
 import hashlib
-import math
 import os
 import re
 import tempfile
@@ -15,8 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.plugin.places import Place, PlaceError, WireTap, place_of, scene_radars
+from hil_tests.plugin.radar_targets import RadarTarget, TargetError, scene_radars, target_of
 from hil_tests.plugin.specs import Kind, RadarSpec
+from hil_tests.plugin.wire_tap import WireTap
 from xethru_protocol.driver.link import BAUD_RATES, POWER_UP_BAUD
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.transport import Transport, set_rate
@@ -30,29 +30,24 @@ from xethru_protocol.wire.errors import (
     XeThruError,
 )
 
-_ANYBODY = 0o666
+_ALL_USERS = 0o666
 _LONGEST_NAME = 200  # file systems take 255
 
 
 class PortBusyError(Exception):
-    """Another test session has the radar; the message says which process."""
+    """Another test session uses the radar; the message names its process."""
 
 
 class PortLock:
-    """The right to talk to a radar, until released or until this process ends.
+    """An exclusive lock on a radar, until released or until this process ends.
 
-    Keyed on the device behind links, so ``/dev/serial/by-id/...`` and ``/dev/ttyACM0`` are the same
-    radar. The file stays behind; the lock does not.
-
-    Parameters
-    ----------
-    target
-        A path of a port, or any other name of a radar, such as an address.
+    The target is a port or another name of a radar, such as an address. Links are resolved, so
+    ``/dev/serial/by-id/...`` and ``/dev/ttyACM0`` are the same radar. The lock file remains.
 
     Raises
     ------
     PortBusyError
-        If somebody else has it.
+        If another session has the lock.
     OSError
         If the lock file cannot be opened, or is a link.
     """
@@ -86,51 +81,30 @@ class PortLock:
             os.write(self._descriptor, f"{os.getpid()}\n".encode())
 
     def release(self) -> None:
-        """Let others have it; calling it again does nothing."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1
 
 
 def _open(path: Path) -> int:
-    """Return a descriptor of a lock file that anybody may open.
+    """Return a descriptor of a lock file that every user may open.
 
-    Never of what a link leads to: where anybody may write, it could lead to a file of ours.
+    Links are refused: in a folder that every user may write, one could point to a private file.
     """
     flags = os.O_CLOEXEC | os.O_NOFOLLOW
     try:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | flags, _ANYBODY)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | flags, _ALL_USERS)
     except PermissionError:
         return os.open(path, os.O_RDONLY | flags)  # enough for flock
     with contextlib.suppress(OSError):
-        os.fchmod(descriptor, _ANYBODY)  # whatever the umask
+        os.fchmod(descriptor, _ALL_USERS)  # whatever the umask
     return descriptor
-
-
-RF_FRAME_BYTES = 5747  # 1431 bins (Protocol reference 9.5)
-_SHARE = 0.8  # of a UART; the rest is for answers
-
-
-def carried_rate_hz(wanted_hz: float, bytes_per_s: float) -> float:
-    """Return the frame rate that a test asks for, or what a UART carries of 1431 bins, whole Hz.
-
-    >>> carried_rate_hz(17.0, math.inf), carried_rate_hz(17.0, 11520.0)
-    (17.0, 1.0)
-    """
-    if math.isinf(bytes_per_s):
-        return wanted_hz
-    return min(wanted_hz, float(max(math.floor(bytes_per_s * _SHARE / RF_FRAME_BYTES), 1)))
 
 
 def matched(path: Path, drivers: Mapping[str, X4M300]) -> Mapping[str, X4M300]:
     """Return the drivers under the names of a rig file; the test fails if they are not its modules.
 
-    Parameters
-    ----------
-    path
-        Rig file of `uwb-slam calibrate --rig`: one ``[[radars]]`` table with name and serial each.
-    drivers
-        The radars there are, by the names of their specs.
+    The rig file is that of `uwb-slam calibrate --rig`; ``drivers`` has the names of the specs.
     """
     from slam.app.errors import AppError
     from slam.app.rig.files import load_rig
@@ -157,20 +131,20 @@ _LATE_READS = 10_000
 
 
 class BrokenRadarError(Exception):
-    """A radar that did not answer, in an earlier test: this one has not even tried."""
+    """The radar did not answer in an earlier test; this test did not try again."""
 
 
-class RadarAtPlace:
+class RadarUnderTest:
     """One radar of the session.
 
     Attributes
     ----------
     place
-        Where it is.
+        How it is reached.
     identity
-        What it says of itself; empty before it was first opened.
+        Order code, serial number and firmware; empty before it was first opened.
     broken
-        Why nothing more is tried with it; None: it works.
+        Why later tests do not try it again; None: it works.
     tap
         What passed over its line in the running test.
     drivers
@@ -178,7 +152,7 @@ class RadarAtPlace:
     """
 
     def __init__(self, spec: RadarSpec) -> None:
-        place = place_of(spec)
+        place = target_of(spec)
         lock = place.lock_target
         self._lock = None if lock is None else PortLock(lock)
         try:
@@ -187,7 +161,7 @@ class RadarAtPlace:
             if self._lock is not None:
                 self._lock.release()
             raise
-        self.place: Place = place
+        self.place: RadarTarget = place
         self.identity = ""
         self.broken: str | None = None
         self.tap = WireTap()
@@ -196,7 +170,6 @@ class RadarAtPlace:
 
     @property
     def spec(self) -> RadarSpec:
-        """What the user asked for."""
         return self.place.spec
 
     def begin_test(self) -> None:
@@ -205,7 +178,7 @@ class RadarAtPlace:
         Raises
         ------
         BrokenRadarError
-            If it failed here before.
+            If it failed to answer in an earlier test.
         PortUnavailable, Disconnected, ResponseTimeout
             If it does not answer.
         """
@@ -215,26 +188,25 @@ class RadarAtPlace:
         self.tap = WireTap(self.place.clock_ns)
         try:
             self._settle()
-        except (XeThruError, PlaceError) as error:
+        except (XeThruError, TargetError) as error:
             self.broken = f"{self.spec.name} did not answer in an earlier test: {error}"
             raise
 
     def open(self, *, reconnect_s: float = 0.0) -> X4M300:
         """Return a driver of the radar; it is closed at the end of the test."""
-        # the line that was settled, or the adapter might take us for a second client
+        # the line that was settled: an adapter might refuse a second client
         line, self._line = self._line or self.tap.around(self.place.open_line()), None
         radar = self.place.driver(line, self.tap, reconnect_s=reconnect_s)
         self.drivers.append(radar)
         return radar
 
     def take_line(self) -> Transport:
-        """Return the open line itself, for who speaks without a driver; closed with the test."""
+        """Return the open line, for tests without a driver; closed with the test."""
         if self._line is None:
             self._line = self.tap.around(self.place.open_line())
         return self._line
 
     def end_test(self) -> None:
-        """Close what the test opened."""
         while self.drivers:
             self.drivers.pop().close()
         if self._line is not None:
@@ -242,7 +214,6 @@ class RadarAtPlace:
             self._line = None
 
     def close(self) -> None:
-        """Release the radar."""
         self.place.close()
         if self._lock is not None:
             self._lock.release()
@@ -253,7 +224,7 @@ class RadarAtPlace:
             try:
                 line = self.tap.around(self.place.open_line())
             except PortUnavailable:
-                # of a module that was there, it may come back: an earlier test may have reset it
+                # an earlier test may have reset a module that was there
                 if not self.identity or self.place.clock_ns() > deadline_ns:
                     raise
                 self.place.sleep(_QUIET_S)
@@ -263,8 +234,8 @@ class RadarAtPlace:
                 self._wait_until_ready(radar, line, deadline_ns)
                 _stop(radar)
                 if not self.identity:
-                    self._ask_who_it_is(radar)
-            except Disconnected:  # an adapter that has not noticed yet that the last client left
+                    self._identify(radar)
+            except Disconnected:  # an adapter may still hold the last client
                 line.close()
                 if self.place.clock_ns() > deadline_ns:
                     raise
@@ -276,12 +247,12 @@ class RadarAtPlace:
                 self._line = line
                 return
 
-    def _ask_who_it_is(self, radar: X4M300) -> None:
+    def _identify(self, radar: X4M300) -> None:
         info = radar.info()
-        if info.order_code is None:  # the base firmware knows no product, and has no profiles
+        if info.order_code is None:  # base firmware, without profiles
             self.place.capabilities -= {"profiles"}
-        said = (info.order_code or "bare", info.serial_number, info.firmware_id, info.version)
-        self.identity = " ".join(part for part in said if part)
+        known = (info.order_code or "bare", info.serial_number, info.firmware_id, info.version)
+        self.identity = " ".join(part for part in known if part)
 
     def _wait_until_ready(self, radar: X4M300, line: Transport, deadline_ns: int) -> None:
         while True:
@@ -296,10 +267,10 @@ class RadarAtPlace:
             self.place.sleep(_QUIET_S)
 
     def _found_at_another_rate(self, line: Transport) -> bool:
-        """Whether the module was at another baud rate, where a test left it; it is back now."""
+        """Find a module that a test left at another baud rate and set it back; False if none."""
         for baudrate in reversed(BAUD_RATES):
             set_rate(line, baudrate)
-            stray = self.place.driver(line, self.tap)  # that what came at a wrong rate is forgotten
+            stray = self.place.driver(line, self.tap)  # forgets what came at a wrong rate
             with contextlib.suppress(ResponseTimeout):
                 stray.ping(0.3)
                 stray.set_baud_rate(POWER_UP_BAUD)
@@ -313,25 +284,25 @@ class Bench:
 
     def __init__(self, specs: Iterable[RadarSpec]) -> None:
         self.specs = {spec.name: spec for spec in specs}
-        self._radars: dict[str, RadarAtPlace] = {}
+        self._radars: dict[str, RadarUnderTest] = {}
         self._failed: dict[str, str] = {}
 
-    def radar(self, name: str) -> RadarAtPlace:
-        """Return a radar, made when first asked for.
+    def radar(self, name: str) -> RadarUnderTest:
+        """Return a radar, opened on first use.
 
         Raises
         ------
-        PlaceError, PortBusyError, PortUnavailable
-            If it cannot be had.
+        TargetError, PortBusyError, PortUnavailable
+            If it cannot be opened.
         BrokenRadarError
-            If it could not be had before.
+            If it could not be opened earlier.
         """
         if name in self._failed:
             raise BrokenRadarError(self._failed[name])
         if name not in self._radars:
             try:
-                self._radars[name] = RadarAtPlace(self.specs[name])
-            except (PlaceError, PortBusyError, XeThruError) as error:
+                self._radars[name] = RadarUnderTest(self.specs[name])
+            except (TargetError, PortBusyError, XeThruError) as error:
                 self._failed[name] = f"{name} could not be opened in an earlier test: {error}"
                 raise
         return self._radars[name]
@@ -343,8 +314,7 @@ class Bench:
         spec = self.specs[names[0]]
         if "radar" in spec.options:
             return tuple(names)
-        first, *others = scene_radars(spec)
-        del first  # what the spec itself stands for
+        _, *others = scene_radars(spec)  # the spec itself is the first
         for other in others:
             name = f"{spec.name}-{other}"
             self.specs.setdefault(
@@ -353,7 +323,6 @@ class Bench:
         return (spec.name, *(f"{spec.name}-{other}" for other in others))
 
     def close(self) -> None:
-        """Release all radars."""
         with contextlib.ExitStack() as stack:
             for radar in self._radars.values():
                 stack.callback(radar.close)
@@ -361,7 +330,7 @@ class Bench:
 
 
 def _stop(radar: X4M300) -> None:
-    """Stop frames and profile, and hear what was on its way."""
+    """Stop frames and profile, and read what was on its way."""
     for command in (
         m.X4DriverSet(setting=X4Setting.FPS, value=0.0),
         m.SetMode(mode=SensorMode.XTID_SM_STOP),

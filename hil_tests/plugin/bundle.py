@@ -1,8 +1,8 @@
-"""What is kept of a test that failed, one folder per test: wire, log, scene, seeds, view.
+"""The artefacts of a test that failed, one folder per test: wire, log, scene, seeds, view.
 
 | file | what |
 |---|---|
-| `log.txt` | every packet both ways, decoded, and what nobody can read; why it failed |
+| `log.txt` | every packet both ways, decoded, and bytes that are no packet; why the test failed |
 | `wire.mcap` | the bytes as they passed (`/radar/NAME/rx`, `/tx`), and the module's messages |
 | `about.json` | test, radar, identity, seeds, versions, link statistics, measurements |
 | `scene.toml` | the scene of an emulated radar, if it has one |
@@ -18,29 +18,31 @@ import importlib.metadata
 import json
 import platform
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hil_tests.plugin.bench import RadarAtPlace
+from hil_tests.plugin.bench import RadarUnderTest
 from hil_tests.plugin.measurements import Measurement
-from hil_tests.plugin.places import WireBytes, WireTap
+from hil_tests.plugin.wire_tap import WireTap, decoded
 from xethru_protocol.recordings.mcap import BYTE_ARRAY, SCHEMAS, pack_array
 from xethru_protocol.wire.codec import describe, encode
-from xethru_protocol.wire.connection import Connection, Role
-from xethru_protocol.wire.framing import NEED_DATA, FramingFault
+from xethru_protocol.wire.framing import FramingFault
 from xethru_protocol.wire.messages import BasebandIq, Command, DataFloat, Message
 
-__all__ = ["folder_name", "write_bundle"]
+if TYPE_CHECKING:
+    import rerun as rr
+    import rerun.blueprint as rrb
 
 _SHOWN_BYTES = 64
 _LONGEST_NAME = 150
+_MOST_FRAMES = 512  # the last ones of each radar
 
 
 def folder_name(nodeid: str) -> str:
-    """Return the folder of a test: its id without what file systems dislike.
+    """Return the folder name of a test: its id, with ``-`` for special characters.
 
     >>> folder_name("hil_tests/device/test_raw.py::test_frames[emu-lab]")
     'hil_tests-device-test_raw.py-test_frames-emu-lab'
@@ -50,13 +52,13 @@ def folder_name(nodeid: str) -> str:
 
 def write_bundle(
     folder: Path,
-    radars: Sequence[RadarAtPlace],
+    radars: Sequence[RadarUnderTest],
     *,
     about: Mapping[str, Any],
     failure: str,
     measurements: Sequence[Measurement],
 ) -> None:
-    """Write the folder of one test; what an earlier run left in it is replaced."""
+    """Write the folder of one test, replacing the files of an earlier run."""
     folder.mkdir(parents=True, exist_ok=True)
     for old in ("log.txt", "wire.mcap", "about.json", "scene.toml", "session.rrd"):
         (folder / old).unlink(missing_ok=True)
@@ -70,28 +72,10 @@ def write_bundle(
             (folder / "scene.toml").write_text(radar.place.scene_text, "utf-8")
     _write_wire(folder / "wire.mcap", taps)
     with contextlib.suppress(ImportError):  # the rest of the bundle does without
-        from hil_tests.plugin.rerun_bundle import write_rrd  # Rerun takes half a second to import
-
-        write_rrd(folder / "session.rrd", taps, measurements, failure)
+        _write_rrd(folder / "session.rrd", taps, measurements, failure)
 
 
-def decoded(tap: WireTap) -> Iterator[tuple[WireBytes, Sequence[Message | FramingFault]]]:
-    """Yield what passed with the messages and faults that each piece completed.
-
-    Commands are read as the module reads them, answers as the driver does.
-    """
-    ends = {"tx": Connection(Role.MODULE), "rx": Connection(Role.HOST)}
-    for passed in tap.passed:
-        end = ends[passed.way]
-        end.receive_data(passed.data)
-        events: list[Message | FramingFault] = []
-        while (event := end.next_event()) is not NEED_DATA:
-            if isinstance(event, Message | FramingFault):
-                events.append(event)
-        yield passed, events
-
-
-def _log(radars: Sequence[RadarAtPlace], failure: str) -> str:
+def _log(radars: Sequence[RadarUnderTest], failure: str) -> str:
     lines = []
     for radar in radars:
         tap = radar.tap
@@ -128,7 +112,7 @@ def _event_text(event: Message | FramingFault, who: str) -> str:
 
 
 def _about(
-    radars: Sequence[RadarAtPlace], about: Mapping[str, Any], measurements: Sequence[Measurement]
+    radars: Sequence[RadarUnderTest], about: Mapping[str, Any], measurements: Sequence[Measurement]
 ) -> dict[str, Any]:
     return {
         **about,
@@ -182,3 +166,73 @@ def _write_wire(path: Path, taps: Mapping[str, WireTap]) -> None:
                         data=pack_array(BYTE_ARRAY, np.frombuffer(data, np.uint8)),
                     )
         writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
+
+
+def _write_rrd(
+    path: Path, taps: Mapping[str, WireTap], measurements: Sequence[Measurement], failure: str
+) -> None:
+    """Write the view for Rerun; times are those of the driver's clock.
+
+    Imports Rerun here, which takes half a second.
+    """
+    import rerun as rr
+
+    recording = rr.RecordingStream("xethru_hil_test")
+    recording.set_log_time_enabled(False)
+    recording.save(path, default_blueprint=_blueprint(list(taps)))
+    with recording:  # what is logged behind the block would be lost
+        for name, tap in taps.items():
+            _log_wire(recording, name, tap)
+        for measurement in measurements:
+            recording.log(f"measurements/{measurement.name}", rr.Scalars([measurement.value]))
+            recording.log("log/measurements", rr.TextLog(f"{measurement.name}: {measurement.text}"))
+        recording.log("log/failure", rr.TextLog(failure, level=rr.TextLogLevel.ERROR))
+
+
+def _blueprint(names: Sequence[str]) -> rrb.Blueprint:
+    import rerun.blueprint as rrb
+
+    scans = [
+        rrb.TensorView(name=name, origin=f"/radar/{name}/bscan", view_fit="fill") for name in names
+    ]
+    return rrb.Blueprint(
+        rrb.Vertical(
+            rrb.Horizontal(*scans) if scans else rrb.TextLogView(origin="/log"),
+            rrb.TextLogView(name="messages", origin="/log"),
+        ),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="expanded", timeline="time"),
+        auto_views=False,
+    )
+
+
+def _log_wire(recording: rr.RecordingStream, name: str, tap: WireTap) -> None:
+    import rerun as rr
+
+    frames: list[DataFloat] = []
+    for passed, events in decoded(tap):
+        recording.set_time("time", duration=(passed.t_ns - tap.started_ns) * 1e-9)
+        for event in events:
+            if isinstance(event, DataFloat):
+                frames.append(event)
+            else:
+                _log_event(recording, f"log/{name}/{passed.way}", event)
+    if not frames:
+        return
+    shown = [frame.values for frame in frames if frame.values.size == frames[-1].values.size]
+    block = np.stack(shown[-_MOST_FRAMES:])
+    recording.log(
+        f"radar/{name}/bscan", rr.Tensor(block, dim_names=("frame", "value")), static=True
+    )
+
+
+def _log_event(recording: rr.RecordingStream, path: str, event: Message | FramingFault) -> None:
+    import rerun as rr
+
+    if isinstance(event, FramingFault):
+        text, level = f"{event.kind.value} at byte {event.offset}", rr.TextLogLevel.ERROR
+    else:
+        message, fields = describe(event)
+        text, level = f"{message} {json.dumps(fields)}"[:500], rr.TextLogLevel.INFO
+    recording.log(path, rr.TextLog(text, level=level))

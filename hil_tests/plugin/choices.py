@@ -1,4 +1,4 @@
-"""What the user chose: command line before environment before ini file."""
+"""The plugin's options; the command line wins over the environment, that over the ini file."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ import pytest
 
 from hil_tests.plugin.specs import Kind, RadarSpec, SpecError, parse_specs
 
-__all__ = ["CHOICES", "Choices", "add_options", "choose"]
-
 ENVIRONMENT = "XETHRU_RADARS"
 INI = "xethru_radars"
 WORKER_KEY = "xethru_radars"
@@ -23,32 +21,9 @@ RIG_ENVIRONMENT, RIG_INI = "XETHRU_RIG", "xethru_rig"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Choices:
-    """Options of the session.
+    """Options of the session; `add_options` documents them.
 
-    Attributes
-    ----------
-    specs
-        The radars, each test runs on all of them.
-    chosen
-        Whether somebody asked for these radars; they are `emu` otherwise.
-    rig
-        Rig file that names modules by serial number; None: none.
-    strict
-        Whether a missing capability fails a test in place of skipping it.
-    slow
-        Whether tests that take long on hardware run there.
-    flash, factory
-        Whether tests may write the flash and the factory settings of a real module.
-    diff
-        Whether the answers of each radar are compared with the emulator's.
-    cassette
-        Where those answers are written; None: nowhere.
-    keep
-        Of which tests artefacts are kept.
-    artifacts
-        In which folder.
-    json
-        Where to write what ran and what was measured; None: nowhere.
+    ``chosen`` is false if the radars are the default, one `emu`.
     """
 
     specs: tuple[RadarSpec, ...]
@@ -69,7 +44,6 @@ CHOICES: pytest.StashKey[Choices] = pytest.StashKey()
 
 
 def add_options(parser: pytest.Parser) -> None:
-    """Add the options and their equivalents in ini files."""
     group = parser.getgroup("xethru-hil", "radars under test (xethru-hil)")
     group.addoption(
         "--radar",
@@ -116,20 +90,20 @@ def add_options(parser: pytest.Parser) -> None:
 
 
 def choose(config: pytest.Config) -> Choices:
-    """Return what the user chose.
+    """Read and check the options.
 
     Raises
     ------
     pytest.UsageError
-        If it makes no sense; one line with the remedy.
+        If they make no sense; one line with the remedy.
     """
     rig = config.getoption("rig") or os.environ.get(RIG_ENVIRONMENT) or config.getini(RIG_INI)
     worker: dict[str, list[str]] = getattr(config, "workerinput", {})
     try:
         chosen = (
-            worker.get(WORKER_KEY)  # what the first process found
+            worker.get(WORKER_KEY)  # found by the first process
             or config.getoption("radar")
-            or _words(os.environ.get(ENVIRONMENT, ""))
+            or _split(os.environ.get(ENVIRONMENT, ""))
             or config.getini(INI)
             or (_modules_of(Path(rig)) if rig else [])
         )
@@ -143,7 +117,7 @@ def choose(config: pytest.Config) -> Choices:
     if cassette and not config.getoption("hil_diff"):
         raise pytest.UsageError("--hil-cassette needs --hil-diff")
     if report:
-        _check_place(Path(config.invocation_params.dir, report))
+        _check_report(Path(config.invocation_params.dir, report))
     return Choices(
         specs=specs,
         chosen=bool(chosen),
@@ -161,7 +135,7 @@ def choose(config: pytest.Config) -> Choices:
 
 
 def _modules_of(rig: Path) -> list[str]:
-    """Return specs of the modules of a rig file; what else is wrong with it, `radar_rig` tells."""
+    """Return specs of the modules of a rig file; `radar_rig` checks the rest of it."""
     try:
         radars = tomllib.loads(rig.read_text("utf-8"))["radars"]
         modules = [f"serial={radar['serial']}" for radar in radars]
@@ -169,19 +143,19 @@ def _modules_of(rig: Path) -> list[str]:
         raise SpecError(f"--rig {rig}: {error.strerror}") from None
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise SpecError(f"--rig {rig}: no rig file with serial numbers: {error!r}") from None
-    if not modules:  # the emulator in their place would pass
+    if not modules:  # tests of the emulator in their place would pass
         raise SpecError(f"--rig {rig}: no rig file with serial numbers: it names no radar")
     return modules
 
 
-def _check_place(report: Path) -> None:
-    """Refuse a place where no file can be, before tests run whose numbers would be lost."""
+def _check_report(report: Path) -> None:
+    """Reject a path where no file can be, before tests run whose numbers would be lost."""
     wrong = report if report.is_dir() else next((p for p in report.parents if p.is_file()), None)
     if wrong is not None:
         raise pytest.UsageError(f"--hil-json {report}: {wrong} is there already; name a new file")
 
 
-def _words(text: str) -> list[str]:
+def _split(text: str) -> list[str]:
     return re.split(r"\s+", text.strip()) if text.strip() else []
 
 
@@ -189,7 +163,7 @@ def _found(specs: tuple[RadarSpec, ...]) -> tuple[RadarSpec, ...]:
     """Replace `auto` by the ports where modules answer."""
     if not any(spec.kind is Kind.AUTO for spec in specs):
         return specs
-    from hil_tests.plugin.places import ports_that_answer
+    from hil_tests.plugin.radar_targets import ports_that_answer
 
     texts: list[str] = []
     for spec in specs:
@@ -205,7 +179,7 @@ def _found(specs: tuple[RadarSpec, ...]) -> tuple[RadarSpec, ...]:
 
 
 def _check_workers(config: pytest.Config, specs: tuple[RadarSpec, ...]) -> None:
-    """Refuse to let every worker test the same real radar."""
+    """Reject `--dist each` if all workers would test the same real radar."""
     if not config.pluginmanager.hasplugin("xdist"):
         return
     shared = next((spec for spec in specs if spec.shared), None)

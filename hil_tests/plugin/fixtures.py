@@ -1,32 +1,34 @@
-"""Fixtures for tests of radars; what opens radars is imported when a test asks for one."""
+"""Fixtures for tests of radars; modules that open radars are imported on first use."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import pytest
 
-from hil_tests.plugin.bench import carried_rate_hz
 from hil_tests.plugin.choices import CHOICES
-from hil_tests.plugin.gate import FINDINGS, gate, lacking
+from hil_tests.plugin.gate import findings_of, gate, lacking
 from hil_tests.plugin.measurements import Measure
 
 if TYPE_CHECKING:
-    from hil_tests.plugin.bench import Bench, RadarAtPlace
+    from hil_tests.plugin.bench import Bench, RadarUnderTest
     from xethru_protocol.driver.radar import X4M300
 
-__all__ = [
-    "frame_rate_hz",
-    "hil_bench",
-    "measure",
-    "radar",
-    "radar_name",
-    "radar_pair",
-    "radar_place",
-    "radar_rig",
-    "rig_name",
-]
+RF_FRAME_BYTES = 5747  # 1431 bins (Protocol reference 9.5)
+_SHARE = 0.8  # of a UART; the rest is for answers
+
+
+def carried_rate_hz(wanted_hz: float, bytes_per_s: float) -> float:
+    """Return the wanted frame rate, or less if a UART carries fewer frames of 1431 bins.
+
+    >>> carried_rate_hz(17.0, math.inf), carried_rate_hz(17.0, 11520.0)
+    (17.0, 1.0)
+    """
+    if math.isinf(bytes_per_s):
+        return wanted_hz
+    return min(wanted_hz, float(max(math.floor(bytes_per_s * _SHARE / RF_FRAME_BYTES), 1)))
 
 
 @pytest.fixture(scope="session")
@@ -49,11 +51,11 @@ def radar_name(request: pytest.FixtureRequest) -> str:
 @pytest.fixture
 def radar_place(
     request: pytest.FixtureRequest, radar_name: str, hil_bench: Bench
-) -> Iterator[RadarAtPlace]:
-    """Where the radar is, brought to a known state: stopped, no profile, nothing on the line.
+) -> Iterator[RadarUnderTest]:
+    """Return the radar in a known state: stopped, no profile, nothing on the line.
 
-    ``radar_place.open()`` gives drivers, ``radar_place.place.unplug(seconds)`` unplugs it, where
-    that can be done.
+    ``radar_place.open()`` returns drivers; ``radar_place.place.unplug(seconds)`` unplugs a radar
+    that has the capability ``unplug``.
     """
     found = gate(request, hil_bench, (radar_name,))
     yield found[0]
@@ -61,14 +63,14 @@ def radar_place(
 
 
 @pytest.fixture
-def radar(radar_place: RadarAtPlace) -> X4M300:
+def radar(radar_place: RadarUnderTest) -> X4M300:
     """Return a driver of the radar, in its known state."""
     return radar_place.open()
 
 
 @pytest.fixture
-def frame_rate_hz(radar_place: RadarAtPlace) -> float:
-    """Rate at which the line carries whole RF frames: the spec's, or less on a UART."""
+def frame_rate_hz(radar_place: RadarUnderTest) -> float:
+    """Frame rate to ask for: the spec's, or what a UART carries of whole RF frames [Hz]."""
     return carried_rate_hz(radar_place.spec.fps, radar_place.place.bytes_per_s)
 
 
@@ -117,11 +119,11 @@ def radar_rig(
 
 @pytest.fixture
 def measure(request: pytest.FixtureRequest) -> Measure:
-    """Take numbers with units and limits; they go into JUnit, JSON and the artefacts.
+    """Record numbers with units and limits in JUnit, JSON and the artefacts.
 
     ``measure("frame_interval_p99", 61.2, unit="ms", limit=(None, 70))`` fails beyond its limit.
     """
     node: pytest.Item = request.node
     taker = Measure(node.user_properties)
-    FINDINGS.of(node).measure = taker
+    findings_of(node).measure = taker
     return taker

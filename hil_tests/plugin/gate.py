@@ -13,32 +13,18 @@ from hil_tests.plugin.choices import CHOICES
 from hil_tests.plugin.measurements import Measure
 
 if TYPE_CHECKING:
-    from hil_tests.plugin.bench import Bench, RadarAtPlace
-
-__all__ = ["FINDINGS", "Findings", "gate", "lacking", "leave_out"]
+    from hil_tests.plugin.bench import Bench, RadarUnderTest
 
 
 @dataclass(slots=True, kw_only=True)
 class Findings:
     """What the plugin knows of one test.
 
-    Attributes
-    ----------
-    radars
-        The radars it runs on, in the order of its names.
-    names
-        Their names, also where they could not be had.
-    measure
-        What it measures with, if it does.
-    reason
-        Why it was not run; None: it was.
-    bundle
-        Folder of its artefacts, if they were kept.
-    failures
-        What went wrong, in order: setup, call, teardown.
+    ``names`` also holds radars that could not be opened. ``reason`` says why the test was not run
+    (None: it was); ``bundle`` is the folder of its artefacts, if they were kept.
     """
 
-    radars: Sequence[RadarAtPlace] = ()
+    radars: Sequence[RadarUnderTest] = ()
     names: Sequence[str] = ()
     measure: Measure | None = None
     reason: str | None = None
@@ -46,7 +32,7 @@ class Findings:
     failures: list[str] = field(default_factory=list)
 
     def as_json(self) -> Mapping[str, Any]:
-        """Return what the report of the test carries, from workers too."""
+        """Return what the report of the test carries, also from a worker."""
         return {
             "radars": [
                 {
@@ -65,41 +51,31 @@ class Findings:
         }
 
 
-class _FindingsOfTests:
-    """Keeps findings in the tests themselves."""
-
-    def __init__(self) -> None:
-        self._key: pytest.StashKey[Findings] = pytest.StashKey()
-
-    def of(self, item: pytest.Item) -> Findings:
-        """Return the findings of a test, empty at first."""
-        return item.stash.setdefault(self._key, Findings())
-
-    def known(self, item: pytest.Item) -> Findings | None:
-        """Return them if there are any."""
-        return item.stash.get(self._key, None)
+FINDINGS: pytest.StashKey[Findings] = pytest.StashKey()
 
 
-FINDINGS = _FindingsOfTests()
+def findings_of(item: pytest.Item) -> Findings:
+    """Return the findings of a test, empty at first."""
+    return item.stash.setdefault(FINDINGS, Findings())
 
 
 def gate(
     request: pytest.FixtureRequest, bench: Bench, names: Sequence[str]
-) -> tuple[RadarAtPlace, ...]:
+) -> tuple[RadarUnderTest, ...]:
     """Return the radars, each in its known state, or end the test with the reason.
 
-    A test is skipped where a radar lacks what it requires, and fails so under ``--hil-strict``. It
-    fails where a radar does not answer; tests after that are skipped, or fail, without trying. A
-    test that ends here leaves no line open.
+    A test is skipped if a radar lacks what it requires, and fails then under ``--hil-strict``. It
+    fails if a radar does not answer; later tests are skipped, or fail, without trying again. A test
+    that ends here leaves no line open.
     """
     from hil_tests.plugin.bench import BrokenRadarError, PortBusyError
-    from hil_tests.plugin.places import PlaceError
+    from hil_tests.plugin.radar_targets import TargetError
     from xethru_protocol.wire.errors import XeThruError
 
     item: pytest.Item = request.node
-    findings = FINDINGS.of(item)
+    findings = findings_of(item)
     findings.names = names
-    found: list[RadarAtPlace] = []
+    found: list[RadarUnderTest] = []
     with contextlib.ExitStack() as begun:
         for name in names:
             _check_kind(request, bench, name)
@@ -113,19 +89,19 @@ def gate(
                 begun.callback(radar.end_test)
                 radar.begin_test()
                 _check_capabilities(request, radar)  # which firmware it has is known only now
-            except (BrokenRadarError, PlaceError, PortBusyError, XeThruError) as error:
+            except (BrokenRadarError, TargetError, PortBusyError, XeThruError) as error:
                 problem = error
             if isinstance(problem, BrokenRadarError):
                 lacking(request, names, str(problem))
             if problem is not None:
                 pytest.fail(f"{name}: {problem}", pytrace=False)
-        begun.pop_all()  # the fixture ends them, behind the test
+        begun.pop_all()  # the fixture ends them, after the test
     return tuple(found)
 
 
 def lacking(request: pytest.FixtureRequest, names: Sequence[str], reason: str) -> NoReturn:
-    """Skip a test for something that is not there; under ``--hil-strict`` fail it."""
-    findings = FINDINGS.of(request.node)
+    """Skip a test because something is missing; under ``--hil-strict`` fail it."""
+    findings = findings_of(request.node)
     findings.names, findings.reason = names, reason
     if request.config.stash[CHOICES].strict:
         pytest.fail(f"--hil-strict: {reason}", pytrace=False)
@@ -133,8 +109,8 @@ def lacking(request: pytest.FixtureRequest, names: Sequence[str], reason: str) -
 
 
 def leave_out(request: pytest.FixtureRequest, reason: str) -> NoReturn:
-    """Skip a test that nobody asked for here; nothing is missing, so never a failure."""
-    FINDINGS.of(request.node).reason = reason
+    """Skip a test that was not asked for; never a failure, since nothing is missing."""
+    findings_of(request.node).reason = reason
     pytest.skip(reason)
 
 
@@ -147,8 +123,8 @@ def _check_kind(request: pytest.FixtureRequest, bench: Bench, name: str) -> None
         leave_out(request, f"{name}: for real modules only; give --radar /dev/...")
 
 
-def _check_capabilities(request: pytest.FixtureRequest, radar: RadarAtPlace) -> None:
-    from hil_tests.plugin.places import CAPABILITIES
+def _check_capabilities(request: pytest.FixtureRequest, radar: RadarUnderTest) -> None:
+    from hil_tests.plugin.radar_targets import CAPABILITIES
 
     wanted = [name for mark in request.node.iter_markers("requires") for name in mark.args]
     for capability in wanted:
@@ -158,7 +134,7 @@ def _check_capabilities(request: pytest.FixtureRequest, radar: RadarAtPlace) -> 
             lacking(request, [name], f"{name}: needs {capability} ({why})")
 
 
-def _check_permissions(request: pytest.FixtureRequest, radar: RadarAtPlace) -> None:
+def _check_permissions(request: pytest.FixtureRequest, radar: RadarUnderTest) -> None:
     item: pytest.Item = request.node
     choices = request.config.stash[CHOICES]
     name = radar.spec.name

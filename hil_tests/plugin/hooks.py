@@ -1,4 +1,4 @@
-"""What pytest calls. Nothing heavy is imported here: every pytest of the machine loads it."""
+"""The plugin's hooks; imports nothing heavy, since every pytest of the machine loads it."""
 
 from __future__ import annotations
 
@@ -11,42 +11,26 @@ from typing import Any
 import pytest
 
 from hil_tests.plugin.choices import CHOICES, WORKER_KEY, add_options, choose
-from hil_tests.plugin.fixtures import (
-    frame_rate_hz,
-    hil_bench,
-    measure,
-    radar,
-    radar_name,
-    radar_pair,
-    radar_place,
-    radar_rig,
-    rig_name,
-)
 from hil_tests.plugin.gate import FINDINGS, Findings
 from hil_tests.plugin.specs import RadarSpec
+
+pytest_plugins = ["hil_tests.plugin.fixtures"]
 
 _OUTCOMES = ("passed", "failed", "skipped")
 
 
 class Summary:
-    """Collects the reports of all tests that used radars, also those of workers.
-
-    Attributes
-    ----------
-    trouble
-        Why the JSON could not be written; "" where nothing is wrong.
-    """
+    """Collects the reports of all tests that used radars, also those of workers."""
 
     def __init__(self) -> None:
-        self.trouble = ""
+        self.trouble = ""  # why the JSON could not be written
         self._counts: dict[str, Counter[str]] = defaultdict(Counter)
-        self._said: dict[str, str] = {}
+        self._identities: dict[str, str] = {}
         self._reasons: Counter[str] = Counter()
         self._tests: list[dict[str, Any]] = []
         self._pending: dict[str, str] = {}
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Take a report."""
         found: dict[str, Any] | None = getattr(report, "xethru_hil", None)
         if report.when != "teardown":
             if report.when == "call" or not report.passed:
@@ -59,16 +43,15 @@ class Summary:
         name = "+".join(found["names"])
         self._counts[name][outcome] += 1
         for one in found["radars"]:
-            if one["identity"] or one["name"] not in self._said:
+            if one["identity"] or one["name"] not in self._identities:
                 silent = "did not answer" if found["reason"] is None else "not asked"
                 who = one["identity"] or silent
-                self._said[one["name"]] = f"{who}; {one['reached']}"
+                self._identities[one["name"]] = f"{who}; {one['reached']}"
         if found["reason"] is not None:
             self._reasons[found["reason"]] += 1
         self._tests.append({"test": report.nodeid, "outcome": outcome, **found})
 
     def write_terminal(self, terminal: pytest.TerminalReporter) -> None:
-        """Print the table."""
         if not self._counts:
             return
         terminal.section("radars")
@@ -82,31 +65,19 @@ class Summary:
 
     def _what(self, name: str) -> str:
         together = name.count("+") + 1
-        unknown = "could not be had" if together == 1 else f"{together} radars together"
-        return self._said.get(name, unknown)
+        unknown = "could not be opened" if together == 1 else f"{together} radars together"
+        return self._identities.get(name, unknown)
 
     def write_json(self, path: Path) -> None:
         """Write every test with its radars, outcome and measurements."""
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(
-            json.dumps({"radars": self._said, "tests": self._tests}, indent=2) + "\n", "utf-8"
+            json.dumps({"radars": self._identities, "tests": self._tests}, indent=2) + "\n", "utf-8"
         )
 
 
 SUMMARY: pytest.StashKey[Summary] = pytest.StashKey()
 
-
-__all__ = [
-    "frame_rate_hz",
-    "hil_bench",
-    "measure",
-    "radar",
-    "radar_name",
-    "radar_pair",
-    "radar_place",
-    "radar_rig",
-    "rig_name",
-]
 
 MARKERS = (
     "requires(name, ...): capabilities of the radar that this test needs, else it is skipped",
@@ -119,7 +90,6 @@ MARKERS = (
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the plugin's options."""
     add_options(parser)
 
 
@@ -133,13 +103,13 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_configure_node(node: Any) -> None:  # noqa: ANN401 - xdist's, which need not be there
-    """Tell a worker which radars there are: it must not look for them itself."""
+def pytest_configure_node(node: Any) -> None:  # noqa: ANN401 - xdist may be missing
+    """Send a worker the list of radars: it must not search for them itself."""
     node.workerinput[WORKER_KEY] = [spec.text for spec in node.config.stash[CHOICES].specs]
 
 
 def pytest_report_header(config: pytest.Config) -> str | None:
-    """Say which radars are tested, where somebody chose some: not every pytest is about radars."""
+    """List the radars, if some were chosen: the plugin is loaded by every pytest."""
     choices = config.stash[CHOICES]
     if not choices.chosen:
         return None
@@ -182,9 +152,9 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object | Non
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Keep the artefacts of a test that failed, and let its report say what the plugin knows."""
+    """Keep the artefacts of a test that failed, and add its findings to the report."""
     report = yield
-    findings = FINDINGS.known(item)
+    findings = item.stash.get(FINDINGS, None)
     if findings is None:
         return report
     if report.failed:
@@ -195,7 +165,7 @@ def pytest_runtest_makereport(
         last = report.when == "call" or (report.failed and report.when in {"setup", "teardown"})
         if last and (keep == "all" or report.failed):
             _keep(item, findings, report)
-    report.xethru_hil = findings.as_json()  # type: ignore[attr-defined]  # reports carry what is added
+    report.xethru_hil = findings.as_json()  # type: ignore[attr-defined]  # reports carry added attributes
     return report
 
 
@@ -222,19 +192,18 @@ def _keep(item: pytest.Item, findings: Findings, report: pytest.TestReport) -> N
             failure="\n\n".join(findings.failures) or "none",
             measurements=findings.measure.taken if findings.measure else (),
         )
-    except Exception as error:  # whatever it is: the failure of the test must be told
-        report.sections.append(("radar artefacts", f"{folder}: not kept whole: {error!r}"))
+    except Exception as error:  # the failure of the test is reported in any case
+        report.sections.append(("radar artefacts", f"{folder}: incomplete: {error!r}"))
         return
     if findings.bundle is None:
         item.user_properties.append(("artefacts", str(folder)))
     findings.bundle = str(folder)
-    report.sections.append(("radar artefacts", f"{folder}: log.txt says what was on the wire"))
+    report.sections.append(("radar artefacts", f"{folder}: log.txt shows what was on the wire"))
 
 
 def pytest_terminal_summary(
     terminalreporter: pytest.TerminalReporter, config: pytest.Config
 ) -> None:
-    """Print what ran where."""
     summary = config.stash[SUMMARY]
     summary.write_terminal(terminalreporter)
     if summary.trouble:
@@ -242,7 +211,6 @@ def pytest_terminal_summary(
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Write the JSON report."""
     path = session.config.stash[CHOICES].json
     if path is not None and not hasattr(session.config, "workerinput"):
         summary = session.config.stash[SUMMARY]

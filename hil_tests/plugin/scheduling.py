@@ -1,7 +1,7 @@
 """Under xdist, all tests of real radars go to one worker, one after the other.
 
-Not by the mark ``xdist_group``: that needs ``--dist loadgroup``, and xdist 3.8 loses groups under
-pytest 9.2. Imported with xdist only.
+The mark ``xdist_group`` would need ``--dist loadgroup``, and xdist 3.8 loses groups under pytest
+9.2. A file of its own, since it imports xdist, which need not be installed.
 """
 
 from __future__ import annotations
@@ -13,14 +13,12 @@ import pytest
 from xdist.remote import Producer
 from xdist.scheduler import LoadScopeScheduling
 
-__all__ = ["RealRadarScheduling", "group_of"]
-
 _GROUP = "tests of real radars"
 _PARAMETERS = re.compile(r"\[(.*)\]", re.DOTALL)
 
 
 class RealRadarScheduling(LoadScopeScheduling):  # type: ignore[misc]  # xdist is not typed
-    """Sends tests to workers singly, but those of real radars to the same one."""
+    """Sends each test to any worker, but those of real radars to the same one."""
 
     def __init__(self, config: pytest.Config, log: Producer | None, radars: Iterable[str]) -> None:
         super().__init__(config, log)
@@ -31,7 +29,7 @@ class RealRadarScheduling(LoadScopeScheduling):  # type: ignore[misc]  # xdist i
 
 
 def group_of(nodeid: str, radars: Iterable[str]) -> str:
-    """Return what must stay on one worker with a test; its own id for what need not.
+    """Return the group that must stay on one worker; the test's id if it may go to any.
 
     >>> group_of("test_raw.py::test_frames[ttyACM0-1431]", ["ttyACM0"])
     'tests of real radars'

@@ -1,4 +1,4 @@
-"""What a user writes behind ``--radar``, and what it names. Standard library only.
+"""The values of ``--radar``. Standard library only.
 
 | spec | radar |
 |---|---|
@@ -7,13 +7,13 @@
 | `emu:?line=pty`, `uart`, `tcp` | an emulator in a process of its own behind such a line |
 | `emu:?firmware=xep` | in this process, with the bare base firmware |
 | `/dev/ttyACM0` | a module at a port; `?line=uart`: a UART that does not look like one |
-| `serial=202611210001` | a module by its own serial number, wherever it is plugged in |
+| `serial=202611210001` | a module by its serial number, at any port |
 | `auto` | every module that answers; at least one must |
 | `tcp://HOST:PORT` | a module behind a serial-to-network adapter, or `xethru-emulator --tcp` |
 | `replay:RECORDING?radar=NAME` | a recording at the port of an emulated module |
 
-Any of them takes ``?has=NAME,NAME``: capabilities that only the user knows of, such as a reflector
-on a stage, for tests that ask for them with ``@pytest.mark.requires``.
+Each takes ``?has=NAME,NAME``: further capabilities, such as a reflector on a stage, for tests
+marked with ``@pytest.mark.requires``.
 """
 
 from __future__ import annotations
@@ -26,11 +26,9 @@ from enum import Enum
 from pathlib import Path
 from typing import Literal
 
-__all__ = ["Kind", "RadarSpec", "SpecError", "parse_specs"]
-
 
 class SpecError(ValueError):
-    """A spec that names no radar; the message is one line with what is allowed."""
+    """A spec names no radar; the message is one line with what is allowed."""
 
 
 class Kind(Enum):
@@ -61,18 +59,9 @@ DEFAULT_FPS = 17.0
 class RadarSpec:
     """One radar to test.
 
-    Attributes
-    ----------
-    text
-        As the user wrote it.
-    kind
-        How it is reached.
-    target
-        Scene, port, serial number, ``host:port`` or recording; empty where there is none.
-    options
-        What stood behind the question mark.
-    name
-        What tests, reports and folders call it; unique within a run.
+    ``text`` is what the user wrote, ``target`` its scene, port, serial number, ``host:port`` or
+    recording, perhaps empty, ``options`` what followed the question mark. Tests, reports and
+    folders use ``name``, which is unique within a run.
     """
 
     text: str
@@ -83,7 +72,7 @@ class RadarSpec:
 
     @property
     def emulated(self) -> bool:
-        """Whether this program makes the radar itself."""
+        """Whether this program starts the radar itself."""
         return self.kind in {Kind.EMULATED, Kind.REPLAY}
 
     @property
@@ -93,17 +82,15 @@ class RadarSpec:
 
     @property
     def line(self) -> str:
-        """What leads to an emulated radar: memory, pty, uart or tcp."""
+        """How an emulated radar is connected: memory, pty, uart or tcp."""
         return self.options.get("line", "memory")
 
     @property
     def firmware(self) -> Literal["sensor", "xep"]:
-        """Firmware of an emulated radar."""
         return "xep" if self.options.get("firmware") == "xep" else "sensor"
 
     @property
     def seed(self) -> int:
-        """Seed of an emulated radar's noise."""
         return int(self.options.get("seed", "0"))
 
     @property
@@ -113,20 +100,12 @@ class RadarSpec:
 
     @property
     def has(self) -> frozenset[str]:
-        """Capabilities the user vouches for."""
         return frozenset(filter(None, self.options.get("has", "").split(",")))
 
 
 def parse_specs(texts: Iterable[str]) -> tuple[RadarSpec, ...]:
-    """Return the radars that specs name, each under a name of its own.
+    """Return the radars that specs name, with unique names; `SpecError` if one names no radar.
 
-    Raises
-    ------
-    SpecError
-        If one names no radar.
-
-    Examples
-    --------
     >>> [spec.name for spec in parse_specs(["emu", "emu:lab?seed=3", "/dev/ttyACM0"])]
     ['emu', 'emu-lab', 'ttyACM0']
     """

@@ -1,7 +1,5 @@
 """A scene short enough for tests that run everything: half a metre there and back, five rods."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 _SCENE = """\

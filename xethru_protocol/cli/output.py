@@ -1,5 +1,7 @@
 """What commands print: lines, progress, names for people."""
 
+from __future__ import annotations
+
 import json
 import math
 import os
@@ -7,12 +9,15 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
-from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.recordings import RecordingFault
+from xethru_protocol.system import flush_streams
 from xethru_protocol.wire.codes import ProfileId
 from xethru_protocol.wire.errors import Disconnected, XeThruError
+
+if TYPE_CHECKING:
+    from xethru_protocol.driver.radar import X4M300
+    from xethru_protocol.recordings import RecordingFault
 
 
 def profile_name(profile_id: int) -> str:
@@ -82,21 +87,7 @@ def show(text: str) -> None:
         sys.stderr.write(text)
         sys.stderr.flush()
     except OSError:
-        _mute(sys.stderr)
-
-
-def end_output() -> bool:
-    """Write out what waits on stdout; False if that cannot be done.
-
-    Python does the same at its exit, but complains with a traceback.
-    """
-    try:
-        if sys.stdout is not None:
-            sys.stdout.flush()
-    except OSError:
-        _mute(sys.stdout)
-        return False
-    return True
+        flush_streams()
 
 
 def is_terminal(stream: TextIO | None) -> bool:
@@ -107,11 +98,6 @@ def is_terminal(stream: TextIO | None) -> bool:
 def one_line(text: str) -> str:
     """Write control characters out: a file name may hold line ends."""
     return "".join(part if part.isprintable() else ascii(part)[1:-1] for part in text)
-
-
-def _mute(stream: TextIO) -> None:
-    """Send what is written from now on nowhere, and what is buffered too."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _printable(text: str, stream: TextIO) -> str:
@@ -232,6 +218,8 @@ def module_at(port: str, baudrate: int) -> Iterator[X4M300]:
     CommandFailed
         If the block failed, and then the module could not be stopped.
     """
+    from xethru_protocol.driver.radar import X4M300  # heavy, and --help needs this module
+
     radar = X4M300.open(port, baudrate=baudrate)
     losses = ""
     try:

@@ -4,16 +4,17 @@ Whatever ends it, the recording is closed and complete: a signal only asks for t
 none comes while a record is half written; a second one insists.
 """
 
-import signal
 import time
+from argparse import Namespace
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import TracebackType
 from typing import Any, Literal, Protocol, Self
 
+from xethru_protocol.cli.arguments import raw_config
 from xethru_protocol.cli.output import (
     CommandFailed,
     Progress,
@@ -29,6 +30,7 @@ from xethru_protocol.cli.output import (
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings import RecordingError, RecordingWriter, WireCapture
+from xethru_protocol.system import StopFlag
 from xethru_protocol.wire.codes import ProfileId
 from xethru_protocol.wire.errors import ResponseTimeout, XeThruError
 from xethru_protocol.wire.framing import LinkStatistics
@@ -229,13 +231,6 @@ class Listen:
 def _wait_for_frame(radar: X4M300, timeout_s: float) -> None:
     with suppress(ResponseTimeout):
         radar.read_frame(timeout_s)
-
-
-def recording_mode(profile: str, config: RawConfig, fps: float) -> RecordingMode:
-    """Mode by its name on the command line: raw, presence or none."""
-    if profile == "raw":
-        return RawFrames(config=config, fps=fps)
-    return Presence() if profile == "presence" else Listen()
 
 
 _ANSWERS = (
@@ -448,33 +443,41 @@ class Recorder:
 _GLANCE_S = 0.2  # how late a signal, or the end, may be noticed
 
 
-def record(
-    port: str,
-    baudrate: int,
-    mode: RecordingMode,
-    targets: Targets,
-    *,
-    count: int | None,
-    duration_s: float | None,
-    replace: bool,
-    as_json: bool,
-) -> int:
-    """Record until ``count`` messages, ``duration_s``, a signal, unplugging or a full disk."""
+def record(arguments: Namespace) -> int:
+    """Record until ``--count``, ``--duration``, a signal, unplugging or a full disk."""
+    config = raw_config(arguments)
+    if arguments.out is None and arguments.wire is None:
+        arguments.refuse("--out DIR is missing, or --wire FILE, or both")
+    if arguments.out == arguments.wire:
+        arguments.refuse("--out and --wire must not be the same")
+    mode: RecordingMode = Listen()
+    if arguments.profile == "raw":
+        mode = RawFrames(config=config, fps=arguments.fps)
+    elif arguments.profile == "presence":
+        mode = Presence()
+    targets = Targets(
+        directory=Path(arguments.out) if arguments.out else None,
+        wire=Path(arguments.wire) if arguments.wire else None,
+        session_id=arguments.session_id,
+        profile_id=mode.profile_id,
+        port=arguments.port,
+    )
+    replace = arguments.force
     targets.check(replace=replace)
-    signals: list[int] = []
-    with Recorder(targets, count) as recorder:
+    stop = StopFlag("previous")
+    with Recorder(targets, arguments.count) as recorder:
         try:
-            with module_at(port, baudrate) as radar:
+            with module_at(arguments.port, arguments.baudrate) as radar:
                 radar.raw_listener = recorder.take_bytes
                 mode.prepare(radar)
                 say_warnings(radar)
                 recorder.open(replace=replace)
-                with _noted(signals):
-                    _record_from(radar, recorder, mode, duration_s, signals)
+                with stop:
+                    _record_from(radar, recorder, mode, arguments.duration, stop)
         except XeThruError as error:
             recorder.fail(error)
-    if as_json:
-        print_json(recorder.summary() | {"ended_by": _end(recorder, signals)})
+    if arguments.json:
+        print_json(recorder.summary() | {"ended_by": _end(recorder, stop)})
     elif recorder.failure is None and recorder.messages:
         print_line(f"{targets.text}: {recorder.numbers()}")
     elif recorder.failure is None:
@@ -483,10 +486,10 @@ def record(
         text = str(recorder.failure)
         if recorder.messages:
             text += f"; kept {counted(recorder.messages, 'message')} in {targets.text}"
-        if not signals:
+        if stop.received is None:
             raise CommandFailed(text)
         warn(f"xethru record: {one_line(text)}")
-    return 128 + signals[0] if signals else 0
+    return 0 if stop.received is None else 128 + stop.received
 
 
 def _record_from(
@@ -494,14 +497,14 @@ def _record_from(
     recorder: Recorder,
     mode: RecordingMode,
     duration_s: float | None,
-    signals: list[int],
+    stop: StopFlag,
 ) -> None:
     progress = Progress("xethru record")
     recorder.listen_to(radar)
     try:
         silence_s = mode.start(radar)
         say_warnings(radar)
-        while not (signals or recorder.is_enough):
+        while not (stop.requested or recorder.is_enough):
             if duration_s is not None and recorder.elapsed_s >= duration_s:
                 if not recorder.messages:
                     raise ResponseTimeout(f"the module sent nothing to record in {duration_s:g} s")
@@ -519,29 +522,9 @@ def _record_from(
         progress.finish(recorder.numbers)
 
 
-def _end(recorder: Recorder, signals: list[int]) -> str:
+def _end(recorder: Recorder, stop: StopFlag) -> str:
     if recorder.failure is not None:
         return "failure"
-    if signals:
+    if stop.requested:
         return "signal"
     return "count" if recorder.is_enough else "duration"
-
-
-@contextmanager
-def _noted(signals: list[int]) -> Iterator[None]:
-    """Note the first signal to end; the second does what it did before."""
-
-    def note(number: int, frame: FrameType | None) -> None:
-        signals.append(number)
-        signal.signal(number, previous[signal.Signals(number)])
-
-    previous = {
-        number: signal.signal(number, note)
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-        if signal.getsignal(number) is not signal.SIG_IGN  # after nohup
-    }
-    try:
-        yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)

@@ -8,59 +8,57 @@
         async for frame in radar.frames():
             ...
 
-No threads: the port's descriptor is watched by the event loop while somebody waits for it.
+No threads: the port's descriptor is watched by the event loop while a task waits for it.
 
-Several tasks may use one driver, for example one that reads frames and one that asks: commands
-wait for each other, and whatever is read is sorted for everybody.
+Several tasks may use one driver, for example one that reads frames and one that sends commands:
+commands wait for each other, and what one task reads reaches the others.
 """
 
 import asyncio
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import Concatenate, Self
 
-from xethru_protocol.driver import link, raw_mode, reconnect
+from xethru_protocol.driver import raw_mode, reconnect
 from xethru_protocol.driver.conversation import Observer
-from xethru_protocol.driver.files import AsyncFiles, AsyncPresence
-from xethru_protocol.driver.frames import DEFAULT_FRAMES, Frame
+from xethru_protocol.driver.files import AsyncFiles
+from xethru_protocol.driver.frames import DEFAULT_FRAMES, Frame, FrameGeometry
 from xethru_protocol.driver.link import (
+    TIMEOUT_S,
     CloseLine,
+    Link,
+    ModuleInfo,
     OpenLine,
-    Procedure,
-    RadarCore,
+    P,
+    RawConfig,
     Read,
+    ReplyT,
     SetLineRate,
     Sleep,
     Step,
+    Steps,
+    T,
     Write,
 )
-from xethru_protocol.driver.radar import DriverFacts, known_ports
-from xethru_protocol.driver.reconnect import awaited, awaited_once
+from xethru_protocol.driver.profiles import AsyncPresence
+from xethru_protocol.driver.radar import RadarState, known_ports
 from xethru_protocol.transport import (
     AsyncSerialTransport,
     AsyncTransport,
     capacity_bytes_per_s,
     set_rate,
 )
+from xethru_protocol.wire.codes import PongCode, X4Setting
 from xethru_protocol.wire.errors import Disconnected, XeThruError
+from xethru_protocol.wire.messages import Command, X4Value
 
 _BAUD = 115200
 _LONGEST_WAIT_S = 86400.0
 
-T = TypeVar("T")
 
-
-class AsyncX4M300(DriverFacts):
-    """One module at the other end of a transport of asyncio; parameters as of `X4M300`.
-
-    Attributes
-    ----------
-    presence
-        Profiles: load, set up, run, hear.
-    files
-        Files in the module's flash, and its crash dump.
-    """
+class AsyncX4M300(RadarState):
+    """One module at the other end of a transport of asyncio; all members as of `X4M300`."""
 
     def __init__(
         self,
@@ -75,7 +73,7 @@ class AsyncX4M300(DriverFacts):
         sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
     ) -> None:
         super().__init__(
-            RadarCore(
+            Link(
                 transport.name,
                 clock=clock,
                 observer=observer,
@@ -84,14 +82,14 @@ class AsyncX4M300(DriverFacts):
                 candidates=candidates,
             )
         )
-        self._core.bytes_per_s = capacity_bytes_per_s(transport)
+        self._link.bytes_per_s = capacity_bytes_per_s(transport)
         self._transport = transport
         self._open_port = open_port
         self._sleep = sleep
         self._one_at_a_time = asyncio.Lock()
         self._reading: asyncio.Future[None] | None = None
-        self.presence = AsyncPresence(self._core, self._run, self._run_beside)
-        self.files = AsyncFiles(self._core, self._run)
+        self.presence = AsyncPresence(self._call, self._listen)
+        self.files = AsyncFiles(self._call, self._call_once)
 
     @classmethod
     def open(
@@ -120,11 +118,10 @@ class AsyncX4M300(DriverFacts):
         except BaseException:
             transport.close()
             raise
-        radar._core.baudrate = baudrate
+        radar._link.baudrate = baudrate
         return radar
 
     async def __aenter__(self) -> Self:
-        """Return self; `close` is called at the end."""
         return self
 
     async def __aexit__(
@@ -133,50 +130,73 @@ class AsyncX4M300(DriverFacts):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close, also after an error."""
         await self.close()
 
     async def close(self) -> None:
-        """Stop the radar if this driver configured it, and release the line.
-
-        A profile is left running, as the module itself would after power-up.
-        """
-        self._core.closed = True
+        """Stop the radar if this driver configured it, and release the line."""
+        self._link.closed = True
         try:
-            await self._run(raw_mode.leave(self._core))
+            await self._call_once(raw_mode.leave)
         except XeThruError as error:
-            self._core.warn(f"the module was not stopped: {error}")
+            self._link.warn(f"the module was not stopped: {error}")
         finally:
             self._transport.close()
 
     # --- any command ----------------------------------------------------------------------------
 
-    request = awaited(link.request)
-    ping = awaited(link.ping)
-    info = awaited(link.info)
-    x4_settings = awaited(link.x4_settings)
+    async def request(self, command: Command[ReplyT], timeout_s: float = TIMEOUT_S) -> ReplyT:
+        """Send a command and return its reply; see `X4M300.request`."""
+        return await self._call(Link.request, command, timeout_s)
+
+    async def ping(self, timeout_s: float = TIMEOUT_S) -> PongCode:
+        """Whether the module is ready, not ready, or in safe mode; see `X4M300.ping`."""
+        return await self._call(Link.ping, timeout_s)
+
+    async def info(self) -> ModuleInfo:
+        """Read what the module reports about itself; see `X4M300.info`."""
+        return await self._call(Link.info)
+
+    async def x4_settings(self) -> dict[X4Setting, X4Value | None]:
+        """Read every X4 setting that has a getter; see `X4M300.x4_settings`."""
+        return await self._call(Link.x4_settings)
 
     # --- the line -------------------------------------------------------------------------------
 
-    reset = awaited_once(reconnect.reset)
-    reconnect = awaited_once(reconnect.reconnect)
-    set_baud_rate = awaited_once(link.set_baud_rate)
+    async def reset(self, *, wait: bool = False, timeout_s: float = reconnect.RESTART_S) -> None:
+        """Restart the module; see `X4M300.reset`."""
+        await self._call_once(reconnect.reset, wait=wait, timeout_s=timeout_s)
+
+    async def reconnect(self, timeout_s: float = reconnect.RESTART_S) -> str:
+        """Find the module again and restore what was configured; see `X4M300.reconnect`."""
+        return await self._call_once(reconnect.reconnect, timeout_s)
+
+    async def set_baud_rate(self, baudrate: int, *, force: bool = False) -> None:
+        """Change the rate of a UART on both sides; see `X4M300.set_baud_rate`."""
+        await self._call_once(Link.set_baud_rate, baudrate, force=force)
 
     # --- raw radar mode -------------------------------------------------------------------------
 
-    configure_raw = awaited(raw_mode.configure_raw)
-    start = awaited(raw_mode.start)
-    stop = awaited(raw_mode.stop_frames)
+    async def configure_raw(self, config: RawConfig | None = None) -> FrameGeometry:
+        """Bring the module to raw radar mode, stopped; see `X4M300.configure_raw`."""
+        return await self._call(raw_mode.configure_raw, config)
 
-    async def read_frame(self, timeout_s: float = link.TIMEOUT_S) -> Frame:
+    async def start(self, fps: float) -> float:
+        """Start frames at ``fps`` [Hz]; see `X4M300.start`."""
+        return await self._call(raw_mode.start, fps)
+
+    async def stop(self) -> None:
+        """Stop frames; see `X4M300.stop`."""
+        await self._call(raw_mode.stop)
+
+    async def read_frame(self, timeout_s: float = TIMEOUT_S) -> Frame:
         """Next frame, in order of arrival; see `X4M300.read_frame`."""
-        frames = self._core.frames
+        frames = self._link.frames
         while not frames:  # another task may have been faster
-            await self._run_beside(lambda: link.wait_for_frame(self._core, timeout_s))
+            await self._listen(Link.wait_for_frame, timeout_s)
         return frames.pop()
 
     async def frames(
-        self, count: int | None = None, timeout_s: float = link.TIMEOUT_S
+        self, count: int | None = None, timeout_s: float = TIMEOUT_S
     ) -> AsyncIterator[Frame]:
         """Iterate over frames; ``count`` of them, or without end; see `X4M300.frames`."""
         while count is None or count > 0:
@@ -186,25 +206,51 @@ class AsyncX4M300(DriverFacts):
 
     # --- carrying out steps ---------------------------------------------------------------------
 
-    async def _run(self, procedure: Procedure[T]) -> T:
-        """Carry out a procedure that asks: no other may ask before it is done."""
+    async def _call(
+        self,
+        procedure: Callable[Concatenate[Link, P], Steps[T]],
+        /,
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> T:
+        """Carry out a procedure that sends commands; again after a reconnect, if that is on."""
+        link = self._link
+        return await self._run(reconnect.resilient(link, lambda: procedure(link, *args, **kwargs)))
+
+    async def _call_once(
+        self,
+        procedure: Callable[Concatenate[Link, P], Steps[T]],
+        /,
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> T:
+        return await self._run(procedure(self._link, *args, **kwargs))
+
+    async def _listen(
+        self,
+        procedure: Callable[Concatenate[Link, P], Steps[T]],
+        /,
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> T:
+        """Carry out a procedure that only receives, beside one that sends; also repeated."""
+        link = self._link
+        if link.reconnect_s > 0 and not link.identified:
+            await self._run(reconnect.identify_quietly(link))
+        for _ in range(reconnect.RECONNECTS_PER_CALL):
+            reconnects = link.reconnects
+            try:
+                return await self._carry(procedure(link, *args, **kwargs))
+            except Disconnected as error:
+                await self._run(reconnect.recover(link, reconnects, error))
+        return await self._carry(procedure(link, *args, **kwargs))
+
+    async def _run(self, procedure: Steps[T]) -> T:
+        """Carry out a procedure that sends commands: no other may send before it is done."""
         async with self._one_at_a_time:
             return await self._carry(procedure)
 
-    async def _run_beside(self, procedure: Callable[[], Procedure[T]]) -> T:
-        """Carry out a procedure that only hears, beside one that asks; again after a reconnect."""
-        core = self._core
-        if core.reconnect_s > 0 and core.identity is None:
-            await self._run(reconnect.identify_quietly(core))
-        for _ in range(reconnect.RECONNECTS_PER_CALL):
-            generation = core.generation
-            try:
-                return await self._carry(procedure())
-            except Disconnected as error:
-                await self._run(reconnect.recover(core, generation, error))
-        return await self._carry(procedure())
-
-    async def _carry(self, procedure: Procedure[T]) -> T:
+    async def _carry(self, procedure: Steps[T]) -> T:
         try:
             step = next(procedure)
             while True:
@@ -224,7 +270,7 @@ class AsyncX4M300(DriverFacts):
         match step:
             case Write(data):
                 if self.raw_listener is not None:
-                    self.raw_listener("tx", data, self._core.clock())
+                    self.raw_listener("tx", data, self._link.clock())
                 await self._transport.write(data)
             case Sleep(seconds):
                 await self._sleep(seconds)
@@ -232,10 +278,10 @@ class AsyncX4M300(DriverFacts):
                 self._transport.close()
             case OpenLine(path, baudrate):
                 self._transport = self._open_port(path, baudrate)
-                self._core.bytes_per_s = capacity_bytes_per_s(self._transport)
+                self._link.bytes_per_s = capacity_bytes_per_s(self._transport)
             case SetLineRate(baudrate):
                 set_rate(self._transport, baudrate)
-                self._core.bytes_per_s = capacity_bytes_per_s(self._transport)
+                self._link.bytes_per_s = capacity_bytes_per_s(self._transport)
         return False
 
     async def _pump(self, timeout_s: float) -> bool:
@@ -251,8 +297,8 @@ class AsyncX4M300(DriverFacts):
             self._reading = None
         if not data:
             return False
-        arrival_ns = self._core.clock()
+        arrival_ns = self._link.clock()
         if self.raw_listener is not None:
             self.raw_listener("rx", data, arrival_ns)
-        self._core.conversation.receive(data, arrival_ns)
+        self._link.conversation.receive(data, arrival_ns)
         return True

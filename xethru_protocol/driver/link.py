@@ -1,17 +1,15 @@
-"""One link to a module: what is known of it, and the steps that a procedure asks of it.
+"""The link to one module, without I/O: its state, and what the driver asks of the module.
 
-A procedure is a generator that yields steps and returns its result. `X4M300` carries steps out on
-a line that blocks, `AsyncX4M300` on one that does not; the procedures are the same.
-
-Each procedure is a generator that yields steps for the line and returns its result; the first
-argument is the driver's state. In the drivers it is a method of the same name.
+Whatever needs the line is a generator: it yields steps and returns its result. `X4M300` carries
+the steps out on a line that blocks, `AsyncX4M300` on one that is awaited. `raw_mode`, `profiles`,
+`files` and `reconnect` hold more such generators.
 """
 
 import math
 from collections import deque
-from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from typing import NamedTuple, TypeAlias, TypeVar
+from collections.abc import Awaitable, Callable, Generator, Sequence
+from dataclasses import dataclass, fields
+from typing import Concatenate, NamedTuple, ParamSpec, Protocol, TypeAlias, TypeVar
 
 from xethru_protocol.driver.conversation import FRAMES, Conversation, Observer
 from xethru_protocol.driver.frames import FrameQueue, Lattice
@@ -33,13 +31,12 @@ from xethru_protocol.wire.messages import (
     SetMode,
     SystemGetInfo,
     X4DriverGet,
-    X4DriverSet,
     X4Value,
 )
 
 
 class Read(NamedTuple):  # several per frame: twice as fast to make as a frozen dataclass
-    """Hear what comes, waiting up to ``timeout_s`` for its first byte; answered by whether any."""
+    """Receive, waiting up to ``timeout_s`` for the first byte; the answer is whether any came."""
 
     timeout_s: float
 
@@ -53,7 +50,7 @@ class Write:
 
 @dataclass(frozen=True, slots=True)
 class Sleep:
-    """Wait while there is no line to hear from."""
+    """Wait while there is no line."""
 
     seconds: float
 
@@ -80,12 +77,54 @@ class SetLineRate:
 
 Step: TypeAlias = Read | Write | Sleep | CloseLine | OpenLine | SetLineRate
 T = TypeVar("T")
-Procedure: TypeAlias = Generator[Step, bool, T]
+Steps: TypeAlias = Generator[Step, bool, T]
+ReplyT = TypeVar("ReplyT", bound=Response)
+
+
+TIMEOUT_S = 2.0
+SLOW_TIMEOUT_S = 10.0  # mode changes and chip restarts
+BAUD_RATES = (
+    *(9600, 19200, 38400, 115200, 230400, 460800, 500000, 576000, 921600),
+    *(1000000, 2000000, 3000000, 4000000),
+)
+
+_STALE_READS = 64  # more than any port buffers; a bound, since a fast module never pauses
+_BAUD_SETTLE_S = (0.1, 0.4)  # before and after the change, as the vendor's host waits
+POWER_UP_BAUD = 115200  # a UART module's rate after every restart (Protocol reference 10)
+_WARNINGS = 1000  # kept; a radar may run for months
+_MESSAGES = 4096  # of a profile that wait unread: pulse-Doppler sends one per range bin
+
+
+P = ParamSpec("P")
+
+
+class Call(Protocol):
+    """Carries a procedure of the link out and returns its result."""
+
+    def __call__(
+        self,
+        procedure: Callable[Concatenate["Link", P], Steps[T]],
+        /,
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> T: ...
+
+
+class AsyncCall(Protocol):
+    """Carries a procedure of the link out; its result is awaited."""
+
+    def __call__(
+        self,
+        procedure: Callable[Concatenate["Link", P], Steps[T]],
+        /,
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> Awaitable[T]: ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RawConfig:
-    """Settings of raw radar mode; the defaults are the vendor's working point.
+    """Settings of raw radar mode; the defaults are those of the vendor's example.
 
     ``frame_area_m`` and ``offset_m`` are module metres. ``dac_step`` 0 ... 3 means steps of
     1, 2, 4, 8 levels; ``prf_div`` divides the 243 MHz clock (16: the one regulators allow).
@@ -106,7 +145,7 @@ class RawConfig:
     tx_center_frequency: int = 3
 
     def __post_init__(self) -> None:
-        """Check what the module does not: it keeps the low bits of any number."""
+        # the module does not check: it keeps the low bits of any number
         for name, value, smallest, largest in (
             ("iterations", self.iterations, 1, 255),
             ("pulses_per_step", self.pulses_per_step, 1, 65535),
@@ -180,7 +219,7 @@ class RawConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModuleInfo:
-    """What a module tells about itself; None where it refuses to. Protocol reference 4.10."""
+    """Answers to SYSTEM GET_INFO and GETMODE; None where it refuses. Protocol reference 4.10."""
 
     item_number: str | None
     order_code: str | None
@@ -195,77 +234,42 @@ class ModuleInfo:
     mode: str | None
 
 
-POWER_UP_BAUD = 115200  # a UART module's rate after every restart (Protocol reference 10)
-_WARNINGS = 1000  # kept; a radar may run for months
-_MESSAGES = 4096  # of a profile that wait unread: pulse-Doppler sends one per range bin
+class Plan(Protocol):
+    """What the user configured."""
+
+    def restore(self, link: "Link") -> Steps[None]:
+        """Configure the module so again, after a reconnect."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RawPlan:
-    """Raw radar mode as the user wants it; ``fps`` None while stopped."""
-
-    config: RawConfig
-    fps: float | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ProfilePlan:
-    """A profile as the user wants it.
-
-    ``loaded`` is False if it was found running. ``settings`` holds the last command for each
-    setting, by what it sets; ``mode`` is None before the profile was run.
-    """
-
-    profile_id: int
-    loaded: bool
-    settings: Mapping[object, Command[Response]] = field(default_factory=dict)
-    mode: int | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Identity:
-    """How a module is told from others; ``serial_number`` None if it refuses to say."""
-
-    serial_number: str | None
-
-
-class RadarCore:
+class Link:
     """The state of one driver: the conversation, the frames, and what the module was set to.
 
     Parameters
     ----------
     path
         Of the line, as the user named it.
-    clock
-        Monotonic time [ns].
-    observer
-        Called with every command, answer, SYSTEM message, fault and warning; None: nobody.
-    queue_frames
-        Frames that may wait unread before the oldest is dropped.
-    reconnect_s
-        How long to look for a module that vanished; 0: not at all.
     candidates
         Finds the ports at which a module that vanished may have come back.
+    clock, observer, queue_frames, reconnect_s
+        As of `X4M300`.
 
     Attributes
     ----------
     warnings
-        What was asked of the module although it is likely to fail, and what went wrong quietly;
-        the last 1000.
+        What probably fails although the module accepts it, and what failed without an error; the
+        last 1000.
     messages
-        Messages of the running profile that were not taken yet; None: nobody wants them.
+        Messages of the running profile that were not taken yet; None: nobody reads them.
     home
         The path the user named; ``path`` is where the module is now.
     plan
         What to restore after a reconnect; None: nothing was configured.
-    identity
-        Which module this is; None: not asked yet.
+    serial_number
+        Of the module, None if it refuses to report it; known once ``identified``.
     baudrate
         Rate of a UART.
     bytes_per_s
         What the line carries at most; infinite if it has no known limit.
-    generation
-        Counts the lines: a changed number says that somebody reconnected.
     reconnects
         Times a module that vanished was found again.
     raw_mode
@@ -294,19 +298,14 @@ class RadarCore:
         self.frames = FrameQueue(queue_frames, self.statistics, self.warn)
         self.messages: deque[Response] | None = None
         self.messages_dropped = 0
-        self.plan: RawPlan | ProfilePlan | None = None
-        self.identity: Identity | None = None
+        self.plan: Plan | None = None
+        self.identified = False
+        self.serial_number: str | None = None
         self.baudrate = POWER_UP_BAUD
         self.bytes_per_s = math.inf
-        self.generation = 0
         self.reconnects = 0
         self.raw_mode = False
         self.closed = False
-
-    @property
-    def unlimited(self) -> bool:
-        """Whether the line has no rate of its own."""
-        return math.isinf(self.bytes_per_s)
 
     def _take(self, message: Response, arrival_ns: int) -> None:
         if isinstance(message, FRAMES):
@@ -319,8 +318,12 @@ class RadarCore:
                 self.messages_dropped += 1
             self.messages.append(message)
 
+    @property
+    def name(self) -> str:
+        """What messages call the line."""
+        return self.conversation.name
+
     def warn(self, text: str) -> None:
-        """Note what the user should know although nothing failed."""
         if len(self.warnings) >= _WARNINGS:
             del self.warnings[0]
         self.warnings.append(text)
@@ -330,266 +333,158 @@ class RadarCore:
         """Time until a deadline [s], negative when it is over."""
         return (deadline_ns - self.clock()) * 1e-9
 
+    # --- commands ---------------------------------------------------------------------------------
 
-TIMEOUT_S = 2.0
-SLOW_TIMEOUT_S = 10.0  # mode changes and chip restarts
-BAUD_RATES = (
-    *(9600, 19200, 38400, 115200, 230400, 460800, 500000, 576000, 921600),
-    *(1000000, 2000000, 3000000, 4000000),
-)
+    def request(self, command: Command[ReplyT], timeout_s: float = TIMEOUT_S) -> Steps[ReplyT]:
+        if self.conversation.out_of_step and not isinstance(command, Ping):
+            # the answer to an abandoned request may still come: all before this PONG is dropped
+            yield from self._exchange(Ping(), timeout_s)
+        reply = yield from self._exchange(command, timeout_s)
+        # the conversation checked it: the row's replies are what ReplyT stands for
+        return reply  # type: ignore[return-value]
 
-_STALE_READS = 64  # more than any port buffers; a bound, since a fast module never pauses
-_BAUD_SETTLE_S = (0.1, 0.4)  # before and after the change, as the vendor's host waits
+    def _exchange(self, command: Command[Response], timeout_s: float) -> Steps[Response]:
+        yield from self.take_stale_input()
+        conversation = self.conversation
+        try:
+            yield Write(conversation.ask(command, timeout_s))
+            while (answer := conversation.answer()) is None:
+                yield Read(conversation.wait_s())
+        finally:  # also after a cancellation or an interrupt
+            conversation.give_up()
+        return answer
 
-ReplyT = TypeVar("ReplyT", bound=Response)
+    def take_stale_input(self) -> Steps[None]:
+        for _ in range(_STALE_READS):
+            if not (yield Read(0.0)):
+                return
 
+    def listen(self, done: Callable[[], bool], timeout_s: float) -> Steps[bool]:
+        """Receive until ``done()``; False if that did not happen in time.
 
-# --- commands -----------------------------------------------------------------------------------
+        What has come already is received whatever the timeout.
+        """
+        deadline_ns = self.conversation.deadline_ns(timeout_s)
+        left_s = timeout_s
+        while not done():
+            yield Read(left_s)
+            left_s = self.left_s(deadline_ns)
+            if left_s <= 0:
+                return done()
+        return True
 
+    def ping(self, timeout_s: float = TIMEOUT_S) -> Steps[PongCode]:
+        value = (yield from self.request(Ping(), timeout_s)).value
+        try:
+            return PongCode(value)
+        except ValueError:
+            raise RemoteProtocolError(
+                f"{self.name} answered PING with 0x{value:08X}; no XeThru module does that"
+            ) from None
 
-def request(
-    core: RadarCore, command: Command[ReplyT], timeout_s: float = TIMEOUT_S
-) -> Procedure[ReplyT]:
-    """Send a command and return the reply that its row in the message table names.
+    def wait_until_ready(self, timeout_s: float = SLOW_TIMEOUT_S) -> Steps[PongCode]:
+        """Wait until the module is ready or in safe mode; returns which.
 
-    After a request that was given up its answer may still come; a PING is sent first then, and
-    all before its PONG dropped.
+        Raises
+        ------
+        ResponseTimeout
+            If it is still not ready then, or does not answer.
+        """
+        deadline_ns = self.conversation.deadline_ns(timeout_s)
+        while (state := (yield from self.ping())) is PongCode.XTS_SPRP_NOTREADY:
+            if self.left_s(deadline_ns) <= 0:
+                raise ResponseTimeout(
+                    f"{self.name} has not been ready for {timeout_s:g} s; reset the module"
+                )
+            yield Read(0.1)
+        return state
 
-    Parameters
-    ----------
-    command
-        Any command of the table.
-    timeout_s
-        How long to wait for the reply.
+    def info(self) -> Steps[ModuleInfo]:
+        texts = []
+        for item in InfoItem:
+            texts.append((yield from self.info_text(item)))  # noqa: PERF401 - comprehensions cannot yield
+        try:
+            values = (yield from self.request(GetMode())).values
+            mode = next((m.label for m in SensorMode if values and m == values[0]), values.hex())
+        except DeviceError:  # bare XEP firmware has no modes
+            mode = None
+        names = [field.name for field in fields(ModuleInfo)]
+        return ModuleInfo(**dict(zip(names, [*texts, mode], strict=True)))
 
-    Raises
-    ------
-    DeviceError
-        If the module refuses.
-    ResponseTimeout
-        If no fitting reply comes in time.
-    Disconnected
-        If the line is gone.
-    """
-    if core.conversation.out_of_step and not isinstance(command, Ping):
-        yield from _exchange(core, Ping(), timeout_s)
-    reply = yield from _exchange(core, command, timeout_s)
-    # the conversation checked it: the row's replies are what ReplyT stands for
-    return reply  # type: ignore[return-value]
+    def info_text(self, item: InfoItem) -> Steps[str | None]:
+        try:
+            return (yield from self.request(SystemGetInfo(item=item))).text
+        except DeviceError:
+            return None
 
+    def x4_settings(self) -> Steps[dict[X4Setting, X4Value | None]]:
+        without_getter = {
+            X4Setting.ENABLE,
+            X4Setting.SPIREGISTER,
+            X4Setting.PIFREGISTER,
+            X4Setting.XIFREGISTER,
+        }
+        values: dict[X4Setting, X4Value | None] = {}
+        for setting in X4Setting:
+            if setting not in without_getter:
+                try:
+                    values[setting] = yield from self.x4_get(setting)
+                except DeviceError:
+                    values[setting] = None
+        return values
 
-def _exchange(core: RadarCore, command: Command[Response], timeout_s: float) -> Procedure[Response]:
-    yield from take_stale_input()
-    conversation = core.conversation
-    try:
-        yield Write(conversation.ask(command, timeout_s))
-        while (answer := conversation.answer()) is None:
-            yield Read(conversation.wait_s())
-    finally:  # also after a cancellation or an interrupt
-        conversation.give_up()
-    return answer
+    def x4_get(self, setting: X4Setting) -> Steps[X4Value]:
+        """Read one X4 setting: a number, or the two ends of the frame area."""
+        reply = yield from self.request(X4DriverGet(setting=setting))
+        values = reply.values
+        if not values:
+            raise RemoteProtocolError(f"{self.name} reads back {setting.name} as nothing")
+        if len(values) == 2 and isinstance(reply, ReplyFloat):
+            return reply.values[0], reply.values[1]
+        return values[0]
 
+    def set_mode_if_known(self, mode: SensorMode) -> Steps[None]:
+        """Change the mode; firmware without modes is always as in MANUAL."""
+        try:
+            yield from self.request(SetMode(mode=mode), SLOW_TIMEOUT_S)
+        except DeviceError:
+            self.conversation.tell("warning", f"the module does not know mode {mode.label}")
 
-def take_stale_input() -> Procedure[None]:
-    """Hear what arrived before a request."""
-    for _ in range(_STALE_READS):
-        if not (yield Read(0.0)):
-            return
-
-
-def listen(core: RadarCore, done: Callable[[], bool], timeout_s: float) -> Procedure[bool]:
-    """Hear what comes until ``done()``; False if that did not happen in time.
-
-    What has come already is heard whatever the timeout.
-    """
-    deadline_ns = core.conversation.deadline_ns(timeout_s)
-    left_s = timeout_s
-    while not done():
-        yield Read(left_s)
-        left_s = core.left_s(deadline_ns)
-        if left_s <= 0:
-            return done()
-    return True
-
-
-def ping(core: RadarCore, timeout_s: float = TIMEOUT_S) -> Procedure[PongCode]:
-    """Whether the module is ready, not ready, or in safe mode.
-
-    Raises
-    ------
-    ResponseTimeout
-        If nothing answers: probably no radar.
-    RemoteProtocolError
-        If the answer is none a XeThru module gives.
-    """
-    value = (yield from request(core, Ping(), timeout_s)).value
-    try:
-        return PongCode(value)
-    except ValueError:
-        raise RemoteProtocolError(
-            f"{core.conversation.name} answered PING with 0x{value:08X}; no XeThru module does that"
-        ) from None
-
-
-def wait_until_ready(core: RadarCore, timeout_s: float = SLOW_TIMEOUT_S) -> Procedure[PongCode]:
-    """Wait while the module says that it is not ready; return what it says then.
-
-    Raises
-    ------
-    ResponseTimeout
-        If it does not get ready in time, or says nothing.
-    """
-    deadline_ns = core.conversation.deadline_ns(timeout_s)
-    while (state := (yield from ping(core))) is PongCode.XTS_SPRP_NOTREADY:
-        if core.left_s(deadline_ns) <= 0:
+    def set_baud_rate(self, baudrate: int, *, force: bool = False) -> Steps[None]:
+        if baudrate not in BAUD_RATES and not force:
+            raise LocalProtocolError(
+                f"{baudrate} baud is no rate of a module; it has {', '.join(map(str, BAUD_RATES))}"
+            )
+        yield from self.request(SetBaudRate(baudrate=baudrate))
+        before_s, after_s = _BAUD_SETTLE_S
+        yield from self.listen(lambda: False, before_s)
+        yield SetLineRate(baudrate)
+        yield from self.listen(lambda: False, after_s)
+        try:
+            yield from self.ping()
+        except ResponseTimeout:
+            yield SetLineRate(self.baudrate)
             raise ResponseTimeout(
-                f"{core.conversation.name} says it is not ready for {timeout_s:g} s; "
-                "reset the module"
-            )
-        yield Read(0.1)
-    return state
+                f"{self.name} does not answer at {baudrate} baud; "
+                f"this side is back at {self.baudrate}"
+            ) from None
+        self.baudrate = baudrate
 
+    # --- frames -----------------------------------------------------------------------------------
 
-def info(core: RadarCore) -> Procedure[ModuleInfo]:
-    """Ask for everything the module tells about itself."""
-    texts = []
-    for item in InfoItem:
-        texts.append((yield from info_text(core, item)))  # noqa: PERF401 - comprehensions cannot yield
-    try:
-        values = (yield from request(core, GetMode())).values
-        mode = next((m.label for m in SensorMode if values and m == values[0]), values.hex())
-    except DeviceError:  # bare XEP firmware has no modes
-        mode = None
-    names = [field.name for field in fields(ModuleInfo)]
-    return ModuleInfo(**dict(zip(names, [*texts, mode], strict=True)))
-
-
-def info_text(core: RadarCore, item: InfoItem) -> Procedure[str | None]:
-    """Ask for one item about the module; None if it refuses."""
-    try:
-        return (yield from request(core, SystemGetInfo(item=item))).text
-    except DeviceError:
-        return None
-
-
-def x4_settings(core: RadarCore) -> Procedure[dict[X4Setting, X4Value | None]]:
-    """Read every X4 setting that has a getter; None where the module refuses."""
-    without_getter = {
-        X4Setting.ENABLE,
-        X4Setting.SPIREGISTER,
-        X4Setting.PIFREGISTER,
-        X4Setting.XIFREGISTER,
-    }
-    values: dict[X4Setting, X4Value | None] = {}
-    for setting in X4Setting:
-        if setting not in without_getter:
-            try:
-                values[setting] = yield from x4_get(core, setting)
-            except DeviceError:
-                values[setting] = None
-    return values
-
-
-def x4_get(core: RadarCore, setting: X4Setting) -> Procedure[X4Value]:
-    """Read one X4 setting: a number, or the two ends of the frame area."""
-    reply = yield from request(core, X4DriverGet(setting=setting))
-    values = reply.values
-    if not values:
-        raise RemoteProtocolError(f"{core.conversation.name} reads back {setting.name} as nothing")
-    if len(values) == 2 and isinstance(reply, ReplyFloat):
-        return reply.values[0], reply.values[1]
-    return values[0]
-
-
-def set_mode_if_known(core: RadarCore, mode: SensorMode) -> Procedure[None]:
-    """Change the mode; firmware without modes is always as in MANUAL."""
-    try:
-        yield from request(core, SetMode(mode=mode), SLOW_TIMEOUT_S)
-    except DeviceError:
-        core.conversation.tell("warning", f"the module does not know mode {mode.label}")
-
-
-def set_baud_rate(core: RadarCore, baudrate: int, *, force: bool = False) -> Procedure[None]:
-    """Change the rate of a UART on both sides; lines without a rate take it and change nothing.
-
-    The module answers at the old rate and forgets the new one at a restart.
-
-    Parameters
-    ----------
-    baudrate
-        One of `BAUD_RATES`; any other only with ``force``, since a module acknowledges rates
-        that it does not have.
-
-    Raises
-    ------
-    LocalProtocolError
-        If the module does not list the rate.
-    ResponseTimeout
-        If the module is silent at the new rate; this side is back at the old one then.
-
-    Notes
-    -----
-    Protocol reference 4.10, 10, 16.
-    """
-    if baudrate not in BAUD_RATES and not force:
-        raise LocalProtocolError(
-            f"{baudrate} baud is no rate of a module; it has {', '.join(map(str, BAUD_RATES))}"
-        )
-    yield from request(core, SetBaudRate(baudrate=baudrate))
-    before_s, after_s = _BAUD_SETTLE_S
-    yield from listen(core, lambda: False, before_s)
-    yield SetLineRate(baudrate)
-    yield from listen(core, lambda: False, after_s)
-    try:
-        yield from ping(core)
-    except ResponseTimeout:
-        yield SetLineRate(core.baudrate)
-        raise ResponseTimeout(
-            f"{core.conversation.name} does not answer at {baudrate} baud; "
-            f"this side is back at {core.baudrate}"
-        ) from None
-    core.baudrate = baudrate
-
-
-# --- frames -------------------------------------------------------------------------------------
-
-
-def wait_for_frame(core: RadarCore, timeout_s: float) -> Procedure[None]:
-    """Wait until a frame can be taken from the queue.
-
-    Raises
-    ------
-    ResponseTimeout
-        If none comes in time.
-    """
-    frames = core.frames
-    conversation = core.conversation
-    deadline_ns = conversation.deadline_ns(timeout_s)
-    left_s = timeout_s
-    while not frames:
-        yield Read(left_s)
-        left_s = core.left_s(deadline_ns)
-        if left_s <= 0 and not frames:
-            if frames.last_counter is None:
-                raise conversation.silence("frame", timeout_s)
-            raise conversation.silence(
-                f"frame after frame {frames.last_counter}",
-                timeout_s,
-                "did the module stop, or its recording end?",
-            )
-
-
-def stop(core: RadarCore) -> Procedure[None]:
-    """Stop frames. One that was already on its way may still come."""
-    yield from request(core, X4DriverSet(setting=X4Setting.FPS, value=0.0))
-
-
-def real_rate(core: RadarCore, fps: float) -> Procedure[float]:
-    """Start frames and return the rate the chip really runs at [Hz]."""
-    yield from request(core, X4DriverSet(setting=X4Setting.FPS, value=fps))
-    rate = yield from x4_get(core, X4Setting.FPS)
-    if not isinstance(rate, float) or not 0 < rate < math.inf:
-        raise RemoteProtocolError(
-            f"{core.conversation.name} reads back frame rate {rate} after {fps:g} was set"
-        )
-    return x4.real_frame_rate(rate)
+    def wait_for_frame(self, timeout_s: float) -> Steps[None]:
+        frames = self.frames
+        conversation = self.conversation
+        deadline_ns = conversation.deadline_ns(timeout_s)
+        left_s = timeout_s
+        while not frames:
+            yield Read(left_s)
+            left_s = self.left_s(deadline_ns)
+            if left_s <= 0 and not frames:
+                if frames.last_counter is None:
+                    raise conversation.silence("frame", timeout_s)
+                raise conversation.silence(
+                    f"frame after frame {frames.last_counter}",
+                    timeout_s,
+                    "did the module stop, or its recording end?",
+                )

@@ -1,19 +1,26 @@
-"""Profiles of a module: load, set up, run, receive."""
+"""Profiles of a module: load, set up, run, receive; as part of a driver, ``radar.presence``.
+
+::
+
+    with X4M300.open(port) as radar:
+        radar.presence.load()
+        zone_m = radar.presence.set_zone(0.4, 5.0)
+        radar.presence.set_output(OutputFeature.PRESENCE_SINGLE)
+        radar.presence.run()
+        radar.presence.wait_until_initialized()
+        for message in radar.presence.messages():
+            ...
+"""
 
 from collections import deque
-from dataclasses import dataclass, replace
+from collections.abc import AsyncIterator, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
-from xethru_protocol.driver.link import (
-    SLOW_TIMEOUT_S,
-    Procedure,
-    ProfilePlan,
-    RadarCore,
-    listen,
-    request,
-    wait_until_ready,
-)
+from xethru_protocol.driver.link import SLOW_TIMEOUT_S, AsyncCall, Call, Link, Steps
+from xethru_protocol.driver.reconnect import await_restart
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import (
+    ErrorCode,
     LedMode,
     NoiseMapControl,
     OutputFeature,
@@ -46,63 +53,60 @@ class ZoneLimits:
     step_m: float
 
 
-def load(core: RadarCore, profile_id: int = ProfileId.XTS_ID_APP_PRESENCE_2) -> Procedure[None]:
-    """Stop whatever runs and load a profile, not running yet, with its own last settings.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProfilePlan:
+    """A profile as the user wants it.
 
-    Raises
-    ------
-    DeviceError
-        If the module does not have it.
+    ``loaded`` is False if it was found running. ``settings`` holds the last command for each
+    setting, by what it sets; ``mode`` is None before the profile was run.
     """
-    yield from wait_until_ready(core)
-    yield from _load(core, profile_id)
-    core.plan = ProfilePlan(profile_id=profile_id, loaded=True)
-    hear_messages(core).clear()  # those that wait are of what ran before
+
+    profile_id: int
+    loaded: bool
+    settings: Mapping[object, m.Command[m.Response]] = field(default_factory=dict)
+    mode: int | None = None
+
+    def restore(self, link: Link) -> Steps[None]:
+        """Load, set up and run again."""
+        if self.loaded:
+            yield from _load(link, self.profile_id)
+        for command in self.settings.values():
+            yield from link.request(command)
+        if self.mode is not None:
+            yield from link.request(m.SetMode(mode=self.mode), SLOW_TIMEOUT_S)
 
 
-def _load(core: RadarCore, profile_id: int) -> Procedure[None]:
-    yield from request(core, m.SetMode(mode=SensorMode.XTID_SM_STOP), SLOW_TIMEOUT_S)
-    yield from request(core, m.LoadApp(profile_id=profile_id), SLOW_TIMEOUT_S)
-    core.raw_mode = False
+def load(link: Link, profile_id: int = ProfileId.XTS_ID_APP_PRESENCE_2) -> Steps[None]:
+    yield from link.wait_until_ready()
+    yield from _load(link, profile_id)
+    link.plan = ProfilePlan(profile_id=profile_id, loaded=True)
+    hear_messages(link).clear()  # those that wait are of what ran before
 
 
-def profile_id(core: RadarCore) -> Procedure[int]:
-    """Ask which profile is loaded; 0 if none."""
-    values = (yield from request(core, m.GetProfileId())).values
-    return _first(core, values, "profile") & 0xFFFFFFFF
+def _load(link: Link, profile_id: int) -> Steps[None]:
+    yield from link.request(m.SetMode(mode=SensorMode.XTID_SM_STOP), SLOW_TIMEOUT_S)
+    yield from link.request(m.LoadApp(profile_id=profile_id), SLOW_TIMEOUT_S)
+    link.raw_mode = False
 
 
-def apply_plan(core: RadarCore, plan: ProfilePlan) -> Procedure[None]:
-    """Load, set up and run as planned."""
-    if plan.loaded:
-        yield from _load(core, plan.profile_id)
-    for command in plan.settings.values():
-        yield from request(core, command)
-    if plan.mode is not None:
-        yield from request(core, m.SetMode(mode=plan.mode), SLOW_TIMEOUT_S)
+def profile_id(link: Link) -> Steps[int]:
+    values = (yield from link.request(m.GetProfileId())).values
+    return _first(link, values, "profile") & 0xFFFFFFFF
 
 
 # --- settings: after `load`, before `run` -------------------------------------------------------
 
 
-def zone_limits(core: RadarCore) -> Procedure[ZoneLimits]:
-    """Ask within which limits a detection zone may lie."""
-    yield from _need_profile(core)
-    values = (yield from request(core, m.GetDetectionZoneLimits())).values
+def zone_limits(link: Link) -> Steps[ZoneLimits]:
+    yield from _need_profile(link)
+    values = (yield from link.request(m.GetDetectionZoneLimits())).values
     if len(values) != 3:
-        raise RemoteProtocolError(f"{core.path} tells zone limits {values}, not three numbers")
+        raise RemoteProtocolError(f"{link.path} tells zone limits {values}, not three numbers")
     return ZoneLimits(min_m=values[0], max_m=values[1], step_m=values[2])
 
 
-def set_zone(core: RadarCore, start_m: float, end_m: float) -> Procedure[tuple[float, float]]:
-    """Choose the detection zone; returns the one the module snapped it to [m].
-
-    Raises
-    ------
-    LocalProtocolError
-        If it leaves the limits the module tells, or is smaller than 0.20 m.
-    """
-    limits = yield from zone_limits(core)
+def set_zone(link: Link, start_m: float, end_m: float) -> Steps[tuple[float, float]]:
+    limits = yield from zone_limits(link)
     if not limits.min_m - _SLACK_M <= start_m < end_m <= limits.max_m + _SLACK_M:
         raise LocalProtocolError(
             f"detection zone {start_m:g} ... {end_m:g} m does not lie within "
@@ -112,195 +116,155 @@ def set_zone(core: RadarCore, start_m: float, end_m: float) -> Procedure[tuple[f
         raise LocalProtocolError(
             f"detection zone {start_m:g} ... {end_m:g} m is smaller than {_SMALLEST_ZONE_M} m"
         )
-    yield from _set(core, m.SetDetectionZone(start_m=start_m, end_m=end_m))
-    return (yield from zone(core))
+    yield from _set(link, m.SetDetectionZone(start_m=start_m, end_m=end_m))
+    return (yield from zone(link))
 
 
-def zone(core: RadarCore) -> Procedure[tuple[float, float]]:
-    """Ask for the actual detection zone [m]."""
-    yield from _need_profile(core)
-    values = (yield from request(core, m.GetDetectionZone())).values
+def zone(link: Link) -> Steps[tuple[float, float]]:
+    yield from _need_profile(link)
+    values = (yield from link.request(m.GetDetectionZone())).values
     if len(values) != 2:
-        raise RemoteProtocolError(f"{core.path} tells detection zone {values}, not two numbers")
+        raise RemoteProtocolError(f"{link.path} tells detection zone {values}, not two numbers")
     return values[0], values[1]
 
 
-def set_sensitivity(core: RadarCore, sensitivity: int) -> Procedure[None]:
-    """Choose how little is enough to detect, 0 ... 9."""
+def set_sensitivity(link: Link, sensitivity: int) -> Steps[None]:
     if not 0 <= sensitivity <= _MAX_SENSITIVITY:
         raise LocalProtocolError(f"sensitivity must be 0 ... {_MAX_SENSITIVITY}, not {sensitivity}")
-    yield from _set(core, m.SetSensitivity(sensitivity=sensitivity))
+    yield from _set(link, m.SetSensitivity(sensitivity=sensitivity))
 
 
-def sensitivity(core: RadarCore) -> Procedure[int]:
-    """Ask for the sensitivity."""
-    yield from _need_profile(core)
-    return _first(core, (yield from request(core, m.GetSensitivity())).values, "sensitivity")
+def sensitivity(link: Link) -> Steps[int]:
+    yield from _need_profile(link)
+    return _first(link, (yield from link.request(m.GetSensitivity())).values, "sensitivity")
 
 
-def set_band(core: RadarCore, tx_center_frequency: int) -> Procedure[None]:
-    """Choose the band: 3 is 7.29 GHz (low), 4 is 8.748 GHz (high)."""
+def set_band(link: Link, tx_center_frequency: int) -> Steps[None]:
     if tx_center_frequency not in {3, 4}:
         raise LocalProtocolError(f"band must be 3 (low) or 4 (high), not {tx_center_frequency}")
-    yield from _set(core, m.SetTxCenterFrequency(tx_center_frequency=tx_center_frequency))
+    yield from _set(link, m.SetTxCenterFrequency(tx_center_frequency=tx_center_frequency))
 
 
-def band(core: RadarCore) -> Procedure[int]:
-    """Ask for the band, 3 or 4."""
-    yield from _need_profile(core)
-    return _first(core, (yield from request(core, m.GetTxCenterFrequency())).values, "band")
+def band(link: Link) -> Steps[int]:
+    yield from _need_profile(link)
+    return _first(link, (yield from link.request(m.GetTxCenterFrequency())).values, "band")
 
 
-def set_led(core: RadarCore, mode: LedMode, intensity: int = 0) -> Procedure[None]:
-    """Choose what the LED shows; released firmware ignores ``intensity`` 0 ... 100."""
-    yield from _set(core, m.AppSetLedControl(mode=mode, intensity=intensity))
+def set_led(link: Link, mode: LedMode, intensity: int = 0) -> Steps[None]:
+    yield from _set(link, m.AppSetLedControl(mode=mode, intensity=intensity))
 
 
-def led(core: RadarCore) -> Procedure[LedMode]:
-    """Ask what the LED shows."""
-    yield from _need_profile(core)
-    value = _first(core, (yield from request(core, m.AppGetLedControl())).values, "LED mode")
+def led(link: Link) -> Steps[LedMode]:
+    yield from _need_profile(link)
+    value = _first(link, (yield from link.request(m.AppGetLedControl())).values, "LED mode")
     try:
         return LedMode(value)
     except ValueError:
-        raise RemoteProtocolError(f"{core.path} tells LED mode {value}; there is none") from None
+        raise RemoteProtocolError(f"{link.path} tells LED mode {value}; there is none") from None
 
 
-def set_noise_map(core: RadarCore, control: NoiseMapControl) -> Procedure[None]:
-    """Choose where the noise map comes from when the profile starts."""
-    yield from _set(core, m.NoiseMapSetControl(control=control))
+def set_noise_map(link: Link, control: NoiseMapControl) -> Steps[None]:
+    yield from _set(link, m.NoiseMapSetControl(control=control))
 
 
-def noise_map(core: RadarCore) -> Procedure[NoiseMapControl]:
-    """Ask where the noise map comes from."""
-    yield from _need_profile(core)
-    values = (yield from request(core, m.NoiseMapGetControl())).values
-    return NoiseMapControl(_first(core, values, "noise map control"))
+def noise_map(link: Link) -> Steps[NoiseMapControl]:
+    yield from _need_profile(link)
+    values = (yield from link.request(m.NoiseMapGetControl())).values
+    return NoiseMapControl(_first(link, values, "noise map control"))
 
 
-def store_noise_map(core: RadarCore) -> Procedure[None]:
-    """Store the noise map for later starts."""
-    yield from request(core, m.StoreNoiseMap(), SLOW_TIMEOUT_S)
+def store_noise_map(link: Link) -> Steps[None]:
+    yield from link.request(m.StoreNoiseMap(), SLOW_TIMEOUT_S)
 
 
-def load_noise_map(core: RadarCore) -> Procedure[None]:
-    """Load the stored noise map; without effect in released firmware."""
-    yield from request(core, m.LoadNoiseMap(), SLOW_TIMEOUT_S)
+def load_noise_map(link: Link) -> Steps[None]:
+    yield from link.request(m.LoadNoiseMap(), SLOW_TIMEOUT_S)
 
 
-def delete_noise_map(core: RadarCore) -> Procedure[None]:
-    """Delete the stored noise map."""
-    yield from request(core, m.DeleteNoiseMap(), SLOW_TIMEOUT_S)
+def delete_noise_map(link: Link) -> Steps[None]:
+    yield from link.request(m.DeleteNoiseMap(), SLOW_TIMEOUT_S)
 
 
-def factory_preset(core: RadarCore) -> Procedure[None]:
-    """Set the profile back to its factory settings."""
-    yield from request(core, m.FactoryPreset(), SLOW_TIMEOUT_S)
-    if isinstance(core.plan, ProfilePlan):
-        core.plan = replace(core.plan, settings={})
+def factory_preset(link: Link) -> Steps[None]:
+    yield from link.request(m.FactoryPreset(), SLOW_TIMEOUT_S)
+    if isinstance(link.plan, ProfilePlan):
+        link.plan = replace(link.plan, settings={})
 
 
-def set_output(core: RadarCore, feature: OutputFeature, control: int = 1) -> Procedure[None]:
-    """Switch a message on or off.
-
-    Parameters
-    ----------
-    feature
-        BASEBAND_IQ messages come as frames, all others as messages. IQ and AMPLITUDE_PHASE
-        exclude each other, so do FLOAT and BYTE of one matrix.
-    control
-        0 or 1; for pulse-Doppler and noise maps `MatrixControl` bits.
-    """
-    yield from _set(core, m.OutputSetControl(feature=feature, control=control))
+def set_output(link: Link, feature: OutputFeature, control: int = 1) -> Steps[None]:
+    yield from _set(link, m.OutputSetControl(feature=feature, control=control))
 
 
-def output(core: RadarCore, feature: OutputFeature) -> Procedure[int]:
-    """Ask whether a message is on: its control bits."""
-    values = (yield from request(core, m.OutputGetControl(feature=feature))).values
-    return _first(core, values, f"the control of output {feature:#x}") & 0xFFFFFFFF
+def output(link: Link, feature: OutputFeature) -> Steps[int]:
+    values = (yield from link.request(m.OutputGetControl(feature=feature))).values
+    return _first(link, values, f"the control of output {feature:#x}") & 0xFFFFFFFF
 
 
 # --- running ------------------------------------------------------------------------------------
 
 
-def run(core: RadarCore) -> Procedure[None]:
-    """Run the loaded profile; its settings are saved in the module by that."""
-    yield from _set_mode(core, SensorMode.XTID_SM_RUN)
+def run(link: Link) -> Steps[None]:
+    readies = link.conversation.readies
+    try:
+        yield from _set_mode(link, SensorMode.XTID_SM_RUN)
+    except DeviceError as error:
+        plan = link.plan
+        if error.code != ErrorCode.XTS_SPRE_RESTARTING or not isinstance(plan, ProfilePlan):
+            raise
+        link.warn("the module restarts to change its profile")
+        yield from await_restart(link, readies)
+        plan = link.plan = replace(plan, mode=SensorMode.XTID_SM_RUN)
+        yield from plan.restore(link)
 
 
-def idle(core: RadarCore) -> Procedure[None]:
-    """Pause the profile; `run` resumes it."""
-    yield from _set_mode(core, SensorMode.XTID_SM_IDLE)
+def idle(link: Link) -> Steps[None]:
+    yield from _set_mode(link, SensorMode.XTID_SM_IDLE)
 
 
-def stop(core: RadarCore) -> Procedure[None]:
-    """Stop and unload the profile."""
-    yield from request(core, m.SetMode(mode=SensorMode.XTID_SM_STOP), SLOW_TIMEOUT_S)
-    core.plan = None
+def stop(link: Link) -> Steps[None]:
+    yield from link.request(m.SetMode(mode=SensorMode.XTID_SM_STOP), SLOW_TIMEOUT_S)
+    link.plan = None
 
 
-def wait_for_message(core: RadarCore, timeout_s: float) -> Procedure[m.Response]:
-    """Take the next message of the profile.
-
-    Raises
-    ------
-    ResponseTimeout
-        If none comes in time.
-    """
-    waiting = hear_messages(core)
-    if not waiting and not (yield from listen(core, lambda: bool(waiting), timeout_s)):
-        raise _no_message(core, timeout_s)
+def wait_for_message(link: Link, timeout_s: float) -> Steps[m.Response]:
+    waiting = hear_messages(link)
+    if not waiting and not (yield from link.listen(lambda: bool(waiting), timeout_s)):
+        raise _no_message(link, timeout_s)
     return waiting.popleft()
 
 
-def wait_until_initialized(
-    core: RadarCore, timeout_s: float | None = None
-) -> Procedure[m.Response]:
-    """Wait until the profile says more than that it is starting; returns that first message.
-
-    Messages of other kinds that come meanwhile are dropped.
-
-    Parameters
-    ----------
-    timeout_s
-        None: as long as this start may take, 20 s, or 120 s if a noise map must be made.
-
-    Raises
-    ------
-    ResponseTimeout
-        If it is still starting then, or says nothing for seconds.
-    """
-    limit_s = _starting_time_s(core) if timeout_s is None else timeout_s
-    deadline_ns = core.conversation.deadline_ns(limit_s)
-    waiting = hear_messages(core)
-    while (left_s := core.left_s(deadline_ns)) > 0:
+def wait_until_initialized(link: Link, timeout_s: float | None = None) -> Steps[m.Response]:
+    limit_s = _starting_time_s(link) if timeout_s is None else timeout_s
+    deadline_ns = link.conversation.deadline_ns(limit_s)
+    waiting = hear_messages(link)
+    while (left_s := link.left_s(deadline_ns)) > 0:
         wait_s = min(left_s, MESSAGE_TIMEOUT_S)
-        if not waiting and not (yield from listen(core, lambda: bool(waiting), wait_s)):
+        if not waiting and not (yield from link.listen(lambda: bool(waiting), wait_s)):
             if wait_s == MESSAGE_TIMEOUT_S:
-                raise _no_message(core, wait_s)
+                raise _no_message(link, wait_s)
             break
         message = waiting.popleft()
         if isinstance(message, m.PresenceSingle | m.PresenceMovingList) and (
             message.state != PresenceState.INITIALIZING
         ):
             return message
-    raise core.conversation.silence(
+    raise link.conversation.silence(
         "end of the profile's start", limit_s, "does the room keep it from settling?"
     )
 
 
-def hear_messages(core: RadarCore) -> deque[m.Response]:
+def hear_messages(link: Link) -> deque[m.Response]:
     """From now on keep what the profile says, and return where."""
-    if core.messages is None:
-        core.messages = deque()
-    return core.messages
+    if link.messages is None:
+        link.messages = deque()
+    return link.messages
 
 
 # --- inside -------------------------------------------------------------------------------------
 
 
-def _starting_time_s(core: RadarCore) -> float:
-    plan = core.plan
+def _starting_time_s(link: Link) -> float:
+    plan = link.plan
     chosen = plan.settings.get(m.NoiseMapSetControl) if isinstance(plan, ProfilePlan) else None
     makes_map = not isinstance(chosen, m.NoiseMapSetControl) or bool(
         chosen.control & NoiseMapControl.NO_DEFAULT
@@ -308,46 +272,281 @@ def _starting_time_s(core: RadarCore) -> float:
     return (_NEW_MAP_S if makes_map else _START_S) + _RESERVE_S
 
 
-def _no_message(core: RadarCore, timeout_s: float) -> ResponseTimeout:
-    return core.conversation.silence(
+def _no_message(link: Link, timeout_s: float) -> ResponseTimeout:
+    return link.conversation.silence(
         "message of the profile", timeout_s, "does it run, and is an output switched on?"
     )
 
 
-def _set_mode(core: RadarCore, mode: SensorMode) -> Procedure[None]:
-    yield from _need_profile(core)
-    yield from request(core, m.SetMode(mode=mode), SLOW_TIMEOUT_S)
-    if isinstance(core.plan, ProfilePlan):
-        core.plan = replace(core.plan, mode=mode)
+def _set_mode(link: Link, mode: SensorMode) -> Steps[None]:
+    yield from _need_profile(link)
+    yield from link.request(m.SetMode(mode=mode), SLOW_TIMEOUT_S)
+    if isinstance(link.plan, ProfilePlan):
+        link.plan = replace(link.plan, mode=mode)
 
 
-def _set(core: RadarCore, command: m.Command[m.Ack]) -> Procedure[None]:
+def _set(link: Link, command: m.Command[m.Ack]) -> Steps[None]:
     """Send a setting and remember it; the last of each kind counts."""
-    yield from _need_profile(core)
-    yield from request(core, command)
-    plan = core.plan
+    yield from _need_profile(link)
+    yield from link.request(command)
+    plan = link.plan
     if isinstance(plan, ProfilePlan):
         kind: object = type(command)
         if isinstance(command, m.OutputSetControl):
             kind = (m.OutputSetControl, command.feature)
         kept = {key: value for key, value in plan.settings.items() if key != kind}
-        core.plan = replace(plan, settings={**kept, kind: command})
+        link.plan = replace(plan, settings={**kept, kind: command})
 
 
-def _need_profile(core: RadarCore) -> Procedure[None]:
+def _need_profile(link: Link) -> Steps[None]:
     """Check that a profile is loaded: without one, some questions get no answer at all."""
-    if isinstance(core.plan, ProfilePlan):
+    if isinstance(link.plan, ProfilePlan):
         return
     try:
-        found = yield from profile_id(core)
+        found = yield from profile_id(link)
     except DeviceError as error:
         raise LocalProtocolError(f"this module has no profiles: {error}") from error
     if found == ProfileId.XTS_ID_APP_NONE:
         raise LocalProtocolError("no profile is loaded; load() one first")
-    core.plan = ProfilePlan(profile_id=found, loaded=False)
+    link.plan = ProfilePlan(profile_id=found, loaded=False)
 
 
-def _first(core: RadarCore, values: bytes | tuple[int, ...], what: str) -> int:
+def _first(link: Link, values: bytes | tuple[int, ...], what: str) -> int:
     if not values:
-        raise RemoteProtocolError(f"{core.path} tells its {what} as nothing")
+        raise RemoteProtocolError(f"{link.path} tells its {what} as nothing")
     return values[0]
+
+
+class Presence:
+    """The profile of a module behind an `X4M300`."""
+
+    def __init__(self, call: Call) -> None:
+        self._call = call
+
+    def load(self, profile_id: int = ProfileId.XTS_ID_APP_PRESENCE_2) -> None:
+        """Stop whatever runs and load a profile, not running yet, with its own last settings.
+
+        Raises
+        ------
+        DeviceError
+            If the module does not have it.
+        """
+        self._call(load, profile_id)
+
+    def profile_id(self) -> int:
+        """Ask which profile is loaded; 0 if none."""
+        return self._call(profile_id)
+
+    # --- settings: after `load`, before `run` ---
+
+    def zone_limits(self) -> ZoneLimits:
+        """Ask within which limits a detection zone may lie."""
+        return self._call(zone_limits)
+
+    def set_zone(self, start_m: float, end_m: float) -> tuple[float, float]:
+        """Choose the detection zone; returns the one the module snapped it to [m].
+
+        Raises
+        ------
+        LocalProtocolError
+            If it leaves the limits the module tells, or is smaller than 0.20 m.
+        """
+        return self._call(set_zone, start_m, end_m)
+
+    def zone(self) -> tuple[float, float]:
+        """Ask for the actual detection zone [m]."""
+        return self._call(zone)
+
+    def set_sensitivity(self, sensitivity: int) -> None:
+        """Choose how little is enough to detect, 0 ... 9."""
+        self._call(set_sensitivity, sensitivity)
+
+    def sensitivity(self) -> int:
+        return self._call(sensitivity)
+
+    def set_band(self, tx_center_frequency: int) -> None:
+        """Choose the band: 3 is 7.29 GHz (low), 4 is 8.748 GHz (high)."""
+        self._call(set_band, tx_center_frequency)
+
+    def band(self) -> int:
+        """Ask for the band, 3 or 4."""
+        return self._call(band)
+
+    def set_led(self, mode: LedMode, intensity: int = 0) -> None:
+        """Choose what the LED shows; released firmware ignores ``intensity`` 0 ... 100."""
+        self._call(set_led, mode, intensity)
+
+    def led(self) -> LedMode:
+        return self._call(led)
+
+    def set_noise_map(self, control: NoiseMapControl) -> None:
+        """Choose where the noise map comes from when the profile starts."""
+        self._call(set_noise_map, control)
+
+    def noise_map(self) -> NoiseMapControl:
+        return self._call(noise_map)
+
+    def store_noise_map(self) -> None:
+        """Store the noise map for later starts."""
+        self._call(store_noise_map)
+
+    def load_noise_map(self) -> None:
+        """Load the stored noise map; without effect in released firmware."""
+        self._call(load_noise_map)
+
+    def delete_noise_map(self) -> None:
+        self._call(delete_noise_map)
+
+    def factory_preset(self) -> None:
+        """Set the profile back to its factory settings."""
+        self._call(factory_preset)
+
+    def set_output(self, feature: OutputFeature, control: int = 1) -> None:
+        """Switch a message on or off.
+
+        Parameters
+        ----------
+        feature
+            BASEBAND_IQ messages come as frames, all others as messages. IQ and AMPLITUDE_PHASE
+            exclude each other, so do FLOAT and BYTE of one matrix.
+        control
+            0 or 1; for pulse-Doppler and noise maps `MatrixControl` bits.
+        """
+        self._call(set_output, feature, control)
+
+    def output(self, feature: OutputFeature) -> int:
+        """Ask whether a message is on: its control bits."""
+        return self._call(output, feature)
+
+    # --- running ---
+
+    def run(self) -> None:
+        """Run the loaded profile; the module saves its settings.
+
+        A module that must restart to change its profile is waited for and set up again.
+        """
+        self._call(run)
+
+    def idle(self) -> None:
+        """Pause the profile; `run` resumes it."""
+        self._call(idle)
+
+    def stop(self) -> None:
+        """Stop and unload the profile."""
+        self._call(stop)
+
+    def wait_until_initialized(self, timeout_s: float | None = None) -> m.Response:
+        """Wait until the profile says more than that it is starting; returns that first message.
+
+        Messages of other kinds that come meanwhile are dropped.
+
+        Parameters
+        ----------
+        timeout_s
+            None: as long as this start may take, 20 s, or 120 s if a noise map must be made.
+
+        Raises
+        ------
+        ResponseTimeout
+            If it is still starting then, or says nothing for seconds.
+        """
+        return self._call(wait_until_initialized, timeout_s)
+
+    def messages(
+        self, count: int | None = None, timeout_s: float = MESSAGE_TIMEOUT_S
+    ) -> Iterator[m.Response]:
+        """Iterate over what the profile sends, except frames; raises `ResponseTimeout`."""
+        while count is None or count > 0:
+            yield self._call(wait_for_message, timeout_s)
+            if count is not None:
+                count -= 1
+
+
+class AsyncPresence:
+    """The profile of a module behind an `AsyncX4M300`; methods as of `Presence`."""
+
+    def __init__(self, call: AsyncCall, listen: AsyncCall) -> None:
+        self._call = call
+        self._listen = listen
+
+    async def load(self, profile_id: int = ProfileId.XTS_ID_APP_PRESENCE_2) -> None:
+        await self._call(load, profile_id)
+
+    async def profile_id(self) -> int:
+        return await self._call(profile_id)
+
+    # --- settings: after `load`, before `run` ---
+
+    async def zone_limits(self) -> ZoneLimits:
+        return await self._call(zone_limits)
+
+    async def set_zone(self, start_m: float, end_m: float) -> tuple[float, float]:
+        return await self._call(set_zone, start_m, end_m)
+
+    async def zone(self) -> tuple[float, float]:
+        return await self._call(zone)
+
+    async def set_sensitivity(self, sensitivity: int) -> None:
+        await self._call(set_sensitivity, sensitivity)
+
+    async def sensitivity(self) -> int:
+        return await self._call(sensitivity)
+
+    async def set_band(self, tx_center_frequency: int) -> None:
+        await self._call(set_band, tx_center_frequency)
+
+    async def band(self) -> int:
+        return await self._call(band)
+
+    async def set_led(self, mode: LedMode, intensity: int = 0) -> None:
+        await self._call(set_led, mode, intensity)
+
+    async def led(self) -> LedMode:
+        return await self._call(led)
+
+    async def set_noise_map(self, control: NoiseMapControl) -> None:
+        await self._call(set_noise_map, control)
+
+    async def noise_map(self) -> NoiseMapControl:
+        return await self._call(noise_map)
+
+    async def store_noise_map(self) -> None:
+        await self._call(store_noise_map)
+
+    async def load_noise_map(self) -> None:
+        await self._call(load_noise_map)
+
+    async def delete_noise_map(self) -> None:
+        await self._call(delete_noise_map)
+
+    async def factory_preset(self) -> None:
+        await self._call(factory_preset)
+
+    async def set_output(self, feature: OutputFeature, control: int = 1) -> None:
+        await self._call(set_output, feature, control)
+
+    async def output(self, feature: OutputFeature) -> int:
+        return await self._call(output, feature)
+
+    # --- running ---
+
+    async def run(self) -> None:
+        await self._call(run)
+
+    async def idle(self) -> None:
+        await self._call(idle)
+
+    async def stop(self) -> None:
+        await self._call(stop)
+
+    async def wait_until_initialized(self, timeout_s: float | None = None) -> m.Response:
+        """See `Presence.wait_until_initialized`; other tasks may send commands meanwhile."""
+        return await self._listen(wait_until_initialized, timeout_s)
+
+    async def messages(
+        self, count: int | None = None, timeout_s: float = MESSAGE_TIMEOUT_S
+    ) -> AsyncIterator[m.Response]:
+        while count is None or count > 0:
+            yield await self._listen(wait_for_message, timeout_s)
+            if count is not None:
+                count -= 1

@@ -1,29 +1,35 @@
 """Driver of one X4M300: raw radar mode, profiles, files. Pull-driven, no threads.
 
-What it can do is written once, as procedures; `AsyncX4M300` has the same methods as coroutines.
+`AsyncX4M300` has the same methods as coroutines.
 """
 
 import time
 from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import Concatenate, Self
 
-from xethru_protocol.driver import link, raw_mode, reconnect
+from xethru_protocol.driver import raw_mode, reconnect
 from xethru_protocol.driver.conversation import Listener, Observer, RawListener
-from xethru_protocol.driver.files import Files, Presence
+from xethru_protocol.driver.files import Files
 from xethru_protocol.driver.frames import DEFAULT_FRAMES, Frame, FrameGeometry
 from xethru_protocol.driver.link import (
+    TIMEOUT_S,
     CloseLine,
+    Link,
+    ModuleInfo,
     OpenLine,
-    Procedure,
-    RadarCore,
+    P,
+    RawConfig,
     Read,
+    ReplyT,
     SetLineRate,
     Sleep,
     Step,
+    Steps,
+    T,
     Write,
 )
-from xethru_protocol.driver.reconnect import blocking, blocking_once
+from xethru_protocol.driver.profiles import Presence
 from xethru_protocol.transport import (
     SerialTransport,
     Transport,
@@ -31,12 +37,14 @@ from xethru_protocol.transport import (
     find_ports,
     set_rate,
 )
+from xethru_protocol.wire.codes import PongCode, X4Setting
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.framing import LinkStatistics
+from xethru_protocol.wire.messages import Command, X4Value
 
 
-class DriverFacts:
-    """Counters and settings of one driver.
+class RadarState:
+    """Counters and settings of a driver, blocking or not.
 
     Attributes
     ----------
@@ -45,90 +53,88 @@ class DriverFacts:
         time [ns]; None: nobody.
     """
 
-    def __init__(self, core: RadarCore) -> None:
+    def __init__(self, link: Link) -> None:
         self.raw_listener: RawListener | None = None
-        self._core = core
+        self._link = link
 
     @property
     def port(self) -> str:
         """Where the module is; after a reconnect perhaps not where it was."""
-        return self._core.path
+        return self._link.path
 
     @property
     def warnings(self) -> list[str]:
-        """What was asked of the module although it is likely to fail, or went wrong quietly.
+        """What probably fails although the module accepts it, and what failed without an error.
 
-        The last 1000, oldest first; whoever has shown them may clear the list.
+        The last 1000, oldest first; a caller that has shown them may clear the list.
         """
-        return self._core.warnings
+        return self._link.warnings
 
     @property
     def listener(self) -> Listener | None:
         """Called with every message from the module, frames included, and its arrival [ns]."""
-        return self._core.conversation.listener
+        return self._link.conversation.listener
 
     @listener.setter
     def listener(self, listener: Listener | None) -> None:
-        self._core.conversation.listener = listener
+        self._link.conversation.listener = listener
 
     @property
     def geometry(self) -> FrameGeometry | None:
         """Where the bins of the radar frames lie; None before `configure_raw`."""
-        return self._core.frames.geometry
+        return self._link.frames.geometry
 
     @geometry.setter
     def geometry(self, geometry: FrameGeometry | None) -> None:
-        self._core.frames.geometry = geometry
+        self._link.frames.geometry = geometry
 
     @property
     def statistics(self) -> LinkStatistics:
         """What came over the line and what was wrong with it, since the driver was opened."""
-        return self._core.statistics
+        return self._link.statistics
 
     @property
     def frames_lost(self) -> int:
         """Frames missing by the counters of those that came."""
-        return self._core.statistics.frames_lost
+        return self._link.statistics.frames_lost
 
     @property
     def frames_dropped(self) -> int:
         """Frames that came, but left a full queue unread."""
-        return self._core.frames.dropped
+        return self._link.frames.dropped
 
     @property
     def frames_discarded(self) -> int:
         """Data that are no frame of the geometry, such as frames of older settings."""
-        return self._core.frames.discarded
+        return self._link.frames.discarded
 
     @property
     def messages_dropped(self) -> int:
         """Profile messages that came, but left a full queue unread."""
-        return self._core.messages_dropped
+        return self._link.messages_dropped
 
     @property
     def fault_count(self) -> int:
         """Damaged places seen on the line."""
-        return self._core.conversation.fault_count
+        return self._link.conversation.fault_count
 
     @property
     def stray_count(self) -> int:
         """Answers seen that belong to no request."""
-        return self._core.conversation.stray_count
+        return self._link.conversation.stray_count
 
     @property
     def reboots(self) -> int:
         """SYSTEM BOOTING messages seen."""
-        return self._core.conversation.reboots
+        return self._link.conversation.reboots
 
     @property
     def reconnects(self) -> int:
         """Times the module vanished and was found again."""
-        return self._core.reconnects
+        return self._link.reconnects
 
 
 _BAUD = 115200
-
-T = TypeVar("T")
 
 
 def known_ports() -> Sequence[str]:
@@ -136,7 +142,7 @@ def known_ports() -> Sequence[str]:
     return [port.path for port in find_ports()]
 
 
-class X4M300(DriverFacts):
+class X4M300(RadarState):
     """One module at the other end of a transport.
 
     Parameters
@@ -162,7 +168,7 @@ class X4M300(DriverFacts):
     Attributes
     ----------
     presence
-        Profiles: load, set up, run, hear.
+        Profiles: load, set up, run, receive.
     files
         Files in the module's flash, and its crash dump.
     """
@@ -180,7 +186,7 @@ class X4M300(DriverFacts):
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         super().__init__(
-            RadarCore(
+            Link(
                 transport.name,
                 clock=clock,
                 observer=observer,
@@ -189,12 +195,12 @@ class X4M300(DriverFacts):
                 candidates=candidates,
             )
         )
-        self._core.bytes_per_s = capacity_bytes_per_s(transport)
+        self._link.bytes_per_s = capacity_bytes_per_s(transport)
         self._transport = transport
         self._open_port = open_port
         self._sleep = sleep
-        self.presence = Presence(self._core, self._run)
-        self.files = Files(self._core, self._run)
+        self.presence = Presence(self._call)
+        self.files = Files(self._call, self._call_once)
 
     @classmethod
     def open(
@@ -223,11 +229,10 @@ class X4M300(DriverFacts):
         except BaseException:
             transport.close()
             raise
-        radar._core.baudrate = baudrate
+        radar._link.baudrate = baudrate
         return radar
 
     def __enter__(self) -> Self:
-        """Return self; `close` is called at the end."""
         return self
 
     def __exit__(
@@ -236,7 +241,6 @@ class X4M300(DriverFacts):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close, also after an error."""
         self.close()
 
     def close(self) -> None:
@@ -244,35 +248,161 @@ class X4M300(DriverFacts):
 
         A profile is left running, as the module itself would after power-up.
         """
-        self._core.closed = True
+        self._link.closed = True
         try:
-            self._run(raw_mode.leave(self._core))
+            self._call_once(raw_mode.leave)
         except XeThruError as error:
-            self._core.warn(f"the module was not stopped: {error}")
+            self._link.warn(f"the module was not stopped: {error}")
         finally:
             self._transport.close()
 
     # --- any command ----------------------------------------------------------------------------
 
-    request = blocking(link.request)
-    ping = blocking(link.ping)
-    info = blocking(link.info)
-    x4_settings = blocking(link.x4_settings)
+    def request(self, command: Command[ReplyT], timeout_s: float = TIMEOUT_S) -> ReplyT:
+        """Send a command and return the reply that its row in the message table names.
+
+        Parameters
+        ----------
+        command
+            Any command of the table.
+        timeout_s
+            How long to wait for the reply.
+
+        Raises
+        ------
+        DeviceError
+            If the module refuses.
+        ResponseTimeout
+            If no fitting reply comes in time.
+        Disconnected
+            If the line is gone.
+        """
+        return self._call(Link.request, command, timeout_s)
+
+    def ping(self, timeout_s: float = TIMEOUT_S) -> PongCode:
+        """Whether the module is ready, not ready, or in safe mode.
+
+        Raises
+        ------
+        ResponseTimeout
+            If nothing answers: probably no radar.
+        RemoteProtocolError
+            If no XeThru module gives this answer.
+        """
+        return self._call(Link.ping, timeout_s)
+
+    def info(self) -> ModuleInfo:
+        """Read what the module reports about itself."""
+        return self._call(Link.info)
+
+    def x4_settings(self) -> dict[X4Setting, X4Value | None]:
+        """Read every X4 setting that has a getter; None where the module refuses."""
+        return self._call(Link.x4_settings)
 
     # --- the line -------------------------------------------------------------------------------
 
-    reset = blocking_once(reconnect.reset)
-    reconnect = blocking_once(reconnect.reconnect)
-    set_baud_rate = blocking_once(link.set_baud_rate)
+    def reset(self, *, wait: bool = False, timeout_s: float = reconnect.RESTART_S) -> None:
+        """Restart the module; what was configured is gone.
+
+        Parameters
+        ----------
+        wait
+            False: return at its ACK; a USB port vanishes 0.5 s later. True: return when it is
+            ready again, on a port of the same or another name.
+        timeout_s
+            How long to wait.
+
+        Raises
+        ------
+        ResponseTimeout
+            If it keeps its port and does not get ready in time.
+        Disconnected
+            If its port vanishes and it does not come back in time.
+
+        Notes
+        -----
+        Protocol reference 8.1.
+        """
+        self._call_once(reconnect.reset, wait=wait, timeout_s=timeout_s)
+
+    def reconnect(self, timeout_s: float = reconnect.RESTART_S) -> str:
+        """Find the module again at the same port or another, and restore what was configured.
+
+        Frames that were read before it vanished stay in the queue; none is counted lost for the
+        time it was away. Returns the port it was found at.
+
+        Raises
+        ------
+        Disconnected
+            If it does not come back in time.
+        DeviceError
+            If it came back and refuses its settings.
+        """
+        return self._call_once(reconnect.reconnect, timeout_s)
+
+    def set_baud_rate(self, baudrate: int, *, force: bool = False) -> None:
+        """Change the rate of a UART on both sides; lines without a rate accept it without effect.
+
+        The module answers at the old rate and forgets the new one at a restart.
+
+        Parameters
+        ----------
+        baudrate
+            One of `BAUD_RATES`; any other only with ``force``, since a module acknowledges rates
+            that it does not have.
+
+        Raises
+        ------
+        LocalProtocolError
+            If the module does not list the rate.
+        ResponseTimeout
+            If the module is silent at the new rate; this side is back at the old one then.
+
+        Notes
+        -----
+        Protocol reference 4.10, 10, 16.
+        """
+        self._call_once(Link.set_baud_rate, baudrate, force=force)
 
     # --- raw radar mode -------------------------------------------------------------------------
 
-    configure_raw = blocking(raw_mode.configure_raw)
-    start = blocking(raw_mode.start)
-    stop = blocking(raw_mode.stop_frames)
-    _wait_for_frame = blocking(link.wait_for_frame)
+    def configure_raw(self, config: RawConfig | None = None) -> FrameGeometry:
+        """Bring the module from any state to raw radar mode, stopped.
 
-    def read_frame(self, timeout_s: float = link.TIMEOUT_S) -> Frame:
+        Every setting is read back. Returns the geometry as the module quantised it.
+
+        Raises
+        ------
+        LocalProtocolError
+            If the settings make no sense.
+        DeviceError
+            If the module refuses one.
+        RemoteProtocolError
+            If it reads back another value than was set; names the setting.
+        ResponseTimeout
+            If the port is no radar.
+
+        Notes
+        -----
+        Protocol reference 13.
+        """
+        return self._call(raw_mode.configure_raw, config)
+
+    def start(self, fps: float) -> float:
+        """Start frames at ``fps`` [Hz]; returns the rate at which the chip really runs.
+
+        Frames of an earlier stream that were not read yet are dropped.
+
+        A rate above what the settings allow or the line carries is tried, with a warning: the
+        firmware does not refuse it (Protocol reference 9.6, 10).
+        """
+        return self._call(raw_mode.start, fps)
+
+    def stop(self) -> None:
+        """Stop frames. One that was already on its way may still come."""
+        self._call(raw_mode.stop)
+
+    def read_frame(self, timeout_s: float = TIMEOUT_S) -> Frame:
         """Next frame, in order of arrival.
 
         Raises
@@ -282,14 +412,12 @@ class X4M300(DriverFacts):
         Disconnected
             If the line is gone.
         """
-        frames = self._core.frames
+        frames = self._link.frames
         if not frames:
-            self._wait_for_frame(timeout_s)
+            self._call(Link.wait_for_frame, timeout_s)
         return frames.pop()
 
-    def frames(
-        self, count: int | None = None, timeout_s: float = link.TIMEOUT_S
-    ) -> Iterator[Frame]:
+    def frames(self, count: int | None = None, timeout_s: float = TIMEOUT_S) -> Iterator[Frame]:
         """Iterate over frames; ``count`` of them, or without end.
 
         The line is read only when no frame waits, so a slow reader holds a lossless line back.
@@ -301,7 +429,30 @@ class X4M300(DriverFacts):
 
     # --- carrying out steps ---------------------------------------------------------------------
 
-    def _run(self, procedure: Procedure[T]) -> T:
+    def _call(
+        self,
+        procedure: Callable[Concatenate[Link, P], Steps[T]],
+        /,
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> T:
+        """Carry a procedure out; again after a reconnect, if that is on."""
+        link = self._link
+        if link.reconnect_s > 0:
+            return self._run(reconnect.resilient(link, lambda: procedure(link, *args, **kwargs)))
+        return self._run(procedure(link, *args, **kwargs))
+
+    def _call_once(
+        self,
+        procedure: Callable[Concatenate[Link, P], Steps[T]],
+        /,
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> T:
+        """Carry a procedure out; a broken line raises `Disconnected`."""
+        return self._run(procedure(self._link, *args, **kwargs))
+
+    def _run(self, procedure: Steps[T]) -> T:
         try:
             step = next(procedure)
             while True:
@@ -321,7 +472,7 @@ class X4M300(DriverFacts):
         match step:
             case Write(data):
                 if self.raw_listener is not None:
-                    self.raw_listener("tx", data, self._core.clock())
+                    self.raw_listener("tx", data, self._link.clock())
                 self._transport.write(data)
             case Sleep(seconds):
                 self._sleep(seconds)
@@ -329,10 +480,10 @@ class X4M300(DriverFacts):
                 self._transport.close()
             case OpenLine(path, baudrate):
                 self._transport = self._open_port(path, baudrate)
-                self._core.bytes_per_s = capacity_bytes_per_s(self._transport)
+                self._link.bytes_per_s = capacity_bytes_per_s(self._transport)
             case SetLineRate(baudrate):
                 set_rate(self._transport, baudrate)
-                self._core.bytes_per_s = capacity_bytes_per_s(self._transport)
+                self._link.bytes_per_s = capacity_bytes_per_s(self._transport)
         return False
 
     def _pump(self, timeout_s: float) -> bool:
@@ -340,8 +491,8 @@ class X4M300(DriverFacts):
         data = self._transport.read(timeout_s)
         if not data:
             return False
-        arrival_ns = self._core.clock()
+        arrival_ns = self._link.clock()
         if self.raw_listener is not None:
             self.raw_listener("rx", data, arrival_ns)
-        self._core.conversation.receive(data, arrival_ns)
+        self._link.conversation.receive(data, arrival_ns)
         return True

@@ -1,14 +1,25 @@
-"""Recordings as MCAP, which ROS 2, Foxglove and PlotJuggler open; the only user of mcap here.
+"""MCAP, which ROS 2, Foxglove and PlotJuggler open: reader, writer, and recordings in such files.
 
-Little-endian, each number aligned to its size counted from behind the four header bytes.
+The only file here that loads mcap. It has four parts:
 
-Topics, as in the sessions of this project: ``/radar/<name>/frame`` holds radar frames (DATA FLOAT
-of content 0) as Float32MultiArray with the counter in the record's sequence number,
-``/radar/<name>/info`` once what is known of them, where the recorded module answered for its
-settings. Every other message is on
-``/radar/<name>/payload``, its payload as UInt8MultiArray, and for reading, if it is a short one, on
-``/radar/<name>/message`` as JSON. Messages without a time have one of 0 and a channel that says so.
-A cut file loses its last chunk of at most 256 KiB.
+CDR
+    How messages of ROS 2 are stored: little-endian, each number aligned to its size counted from
+    behind the four header bytes.
+Reader
+    Finds every whole record before the end of a file; of a chunk that the end cuts through it
+    decompresses what is there. Where a record makes no sense or the checksum of a chunk is wrong,
+    that place is reported, and reading goes on behind it, at the next sound chunk if need be.
+Writer
+    Messages of ROS 2 in chunks compressed by zstd.
+Recordings
+    Topics as in the sessions of this project: ``/radar/<name>/frame`` holds radar frames (DATA
+    FLOAT of content 0) as Float32MultiArray with the counter in the record's sequence number,
+    ``/radar/<name>/info`` once what is known of them, where the recorded module answered for its
+    settings. Every other message is on ``/radar/<name>/payload``, its payload as UInt8MultiArray,
+    and for reading, if it is a short one, on ``/radar/<name>/message`` as JSON. Messages without a
+    time have time 0, and their channel is marked.
+
+Specification of the format: https://mcap.dev/spec
 """
 
 import json
@@ -16,16 +27,19 @@ import math
 import os
 import re
 import struct
-from collections.abc import Iterable, Iterator
+import zlib
+from collections.abc import Generator, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeAlias
 
+import lz4.frame
 import numpy as np
 import numpy.typing as npt
 import zstandard
 from mcap.exceptions import McapError
-from mcap.records import Channel, Message, Metadata
-from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.reader import make_reader
+from mcap.records import Statistics
 from mcap.writer import CompressionType, Writer
 
 from xethru_protocol.driver.frames import FrameGeometry
@@ -55,12 +69,19 @@ from xethru_protocol.wire.table import ROWS, Response, UnknownMessage
 from xethru_protocol.wire.x4 import RF_BIN_M
 
 FLOAT_ARRAY = "std_msgs/msg/Float32MultiArray"
+DOUBLE_ARRAY = "std_msgs/msg/Float64MultiArray"
 BYTE_ARRAY = "std_msgs/msg/UInt8MultiArray"
 STRING = "std_msgs/msg/String"
 
 _LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 _U32 = struct.Struct("<I")
+_DTYPE: Mapping[str, np.dtype[Any]] = {
+    FLOAT_ARRAY: np.dtype("<f4"),
+    DOUBLE_ARRAY: np.dtype("<f8"),
+    BYTE_ARRAY: np.dtype("u1"),
+}
 _LABEL = {FLOAT_ARRAY: "range_bin", BYTE_ARRAY: "byte"}
+_CDR_PADDING = 3  # most bytes that may follow the last value
 _RULE = "=" * 80
 _ARRAY_PARTS = f"""\
 {_RULE}
@@ -81,38 +102,37 @@ SCHEMAS = {
 """Definition of each message with all it refers to, as ``ros2msg`` text."""
 
 
-def _text(text: str) -> bytes:
+def pack_string(text: str) -> bytes:
+    return _LITTLE_ENDIAN + _counted(text)
+
+
+def pack_array(message_type: str, values: npt.NDArray[Any], label: str = "") -> bytes:
+    """Return the bytes of an array message of one dimension, values of shape (n,).
+
+    The dimension is called ``label``, by default "range_bin" for float32 and "byte" for bytes.
+    """
+    dtype = _DTYPE[message_type]
+    count = _U32.pack(len(values))
+    text = _counted(label or _LABEL[message_type])
+    head = _U32.pack(1) + text + bytes(-len(text) % 4) + count + count + _U32.pack(0) + count
+    padding = bytes(-len(head) % dtype.itemsize) if len(values) else b""
+    return _LITTLE_ENDIAN + head + padding + np.ascontiguousarray(values, dtype).tobytes()
+
+
+def _counted(text: str) -> bytes:
     data = text.encode() + b"\0"
     return _U32.pack(len(data)) + data
 
 
-def _aligned(data: bytes) -> bytes:
-    return data + bytes(-len(data) % 4)
-
-
-def pack_string(text: str) -> bytes:
-    """Bytes of a String."""
-    return _LITTLE_ENDIAN + _text(text)
-
-
-def pack_array(message_type: str, values: npt.NDArray[Any]) -> bytes:
-    """Bytes of a one-dimensional array, shape (n,), float32 or uint8 as ``message_type`` says."""
-    count = _U32.pack(len(values))
-    dimension = _aligned(_U32.pack(1) + _text(_LABEL[message_type])) + count + count
-    return _LITTLE_ENDIAN + dimension + _U32.pack(0) + count + values.tobytes()
-
-
-def unpack_array(data: bytes, dtype: str) -> npt.NDArray[Any]:
-    """Values of an array message, shape (n,), read-only.
+def unpack_array(message_type: str, data: bytes) -> npt.NDArray[Any]:
+    """Return the values of an array message, shape (n,), read-only.
 
     Raises
     ------
     ValueError, struct.error
-        If the bytes are none.
+        If the bytes are not such a message.
     """
-    if data[:4] != _LITTLE_ENDIAN:
-        raise ValueError("the array is not little-endian CDR")
-    body = data[4:]
+    body, dtype = _body(data), _DTYPE[message_type]
     (dimensions,) = _U32.unpack_from(body, 0)
     position = 4
     for _ in range(dimensions):
@@ -120,58 +140,485 @@ def unpack_array(data: bytes, dtype: str) -> npt.NDArray[Any]:
         position += 4 + length
         position += -position % 4 + 8
     (count,) = _U32.unpack_from(body, position + 4)
-    return np.frombuffer(body, dtype, count, position + 8)
+    position += 8
+    if count:
+        position += -position % dtype.itemsize
+    if len(body) - position - count * dtype.itemsize > _CDR_PADDING:
+        raise ValueError(f"{len(body)} bytes are too many for an array of {count} numbers")
+    return np.frombuffer(body, dtype, count, position)
 
 
 def unpack_string(data: bytes) -> str:
-    """Text of a String message.
+    """Return the text of a String message.
 
     Raises
     ------
     ValueError, struct.error
-        If the bytes are none.
+        If the bytes are not such a message.
     """
+    body = _body(data)
+    (length,) = _U32.unpack_from(body)
+    return body[4 : 4 + length].rstrip(b"\0").decode()
+
+
+def _body(data: bytes) -> bytes:
     if data[:4] != _LITTLE_ENDIAN:
-        raise ValueError("the text is not little-endian CDR")
-    (length,) = _U32.unpack_from(data, 4)
-    return data[8 : 8 + length].rstrip(b"\0").decode()
+        raise ValueError("the message is not little-endian CDR")
+    return data[4:]
+
+
+MAGIC = b"\x89MCAP0\r\n"
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
+MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END = 7, 9, 12, 15
+_OF_SUMMARY = (8, 10, 11, 13, 14)  # indexes and statistics, behind the data
+_LAST_CODE = 15  # private ones, from 128 on, are taken for damage
+
+_HEAD = struct.Struct("<BQ")
+_CHUNK = struct.Struct("<QQQI")
+MESSAGE_HEAD = struct.Struct("<HIQQ")
+"""Channel, sequence, time [ns], time of publication [ns]."""
+# A recorder writes chunks of 256 KiB; beyond this a length is damage, not data.
+_MOST_BYTES = 1 << 28
+# How a chunk names its compression, at a fixed place of its head.
+_NAMES = (b"\x04\0\0\0zstd", b"\x03\0\0\0lz4")
+_NAME_AT = _HEAD.size + _CHUNK.size
+_PIECE_BYTES = 1 << 20
+_FOOTER_BYTES, _DATA_END_BYTES = 20, 4
+
+DAMAGES = (struct.error, ValueError, RuntimeError, KeyError, zstandard.ZstdError)
+"""What taking a damaged record apart may raise."""
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """One record; ``at`` is where in the file it begins, or the chunk that it is in."""
+
+    at: int
+    code: int
+    body: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Cut:
+    """The file ends too early: in the record that begins at ``at``, or right before one."""
+
+    at: int
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """The bytes between two places are not what was written."""
+
+    at: int
+    until: int
+    reason: str
+
+
+Found: TypeAlias = Record | Cut | Damage
+
+
+class RecordReader:
+    """Walks through a file once.
+
+    Parameters
+    ----------
+    stream
+        The file; its first bytes are known to be `MAGIC`.
+    size
+        Of the file in bytes; what a recorder adds meanwhile is not looked at.
+    """
+
+    def __init__(self, stream: BinaryIO, size: int) -> None:
+        self._stream, self._size = stream, size
+        self._is_data_over = False
+
+    def _read(self, n_bytes: int | None = None) -> bytes:
+        left = max(self._size - self._stream.tell(), 0)
+        return self._stream.read(left if n_bytes is None else min(n_bytes, left))
+
+    def read(self) -> Iterator[Found]:
+        """Yield the records, those in chunks one by one, to the footer or as far as it goes."""
+        at: int | None = len(MAGIC)
+        while at is not None:
+            self._stream.seek(at)
+            head = self._read(_HEAD.size)
+            if len(head) < _HEAD.size or (not any(head) and self._is_zero_from(at)):
+                yield Cut(at)
+                return
+            code, length = _HEAD.unpack(head)
+            end = at + _HEAD.size + length
+            if not self._is_record(code, length) or end > self._size:
+                # A length that is damaged looks like a cut, but then a sound chunk follows.
+                at = yield from self._last_or_damaged(at, code, length)
+                continue
+            body = self._read(length)
+            try:
+                if code == CHUNK:
+                    yield from _records_in(at, _content(body))
+                else:
+                    self._check(at, code, body)
+                    yield Record(at, code, body)
+            except DAMAGES as error:
+                sound = self._is_head(end)
+                at = yield from self._damaged(at, str(error), end if sound else None)
+                continue
+            self._is_data_over |= code == DATA_END
+            at = None if code == FOOTER else end
+
+    def _check(self, at: int, code: int, body: bytes) -> None:
+        """Raise ValueError where a record does not fit its opcode.
+
+        One flipped bit there would hide a chunk, or end the file.
+        """
+        end = at + _HEAD.size + len(body)
+        if code == HEADER:
+            fits = at == len(MAGIC)
+        elif code == FOOTER:
+            fits = len(body) == _FOOTER_BYTES and end + len(MAGIC) >= self._size
+        elif code == DATA_END:
+            fits = len(body) == _DATA_END_BYTES
+        elif code == MESSAGE_INDEX:
+            fits = len(body) >= 6 and struct.unpack_from("<I", body, 2)[0] == len(body) - 6
+        elif code == ATTACHMENT:
+            at_media = text_at(body, 16)[1]
+            at_data = text_at(body, at_media)[1]
+            (size,) = struct.unpack_from("<Q", body, at_data)
+            fits = len(body) == at_data + 8 + size + 4
+        elif code in _OF_SUMMARY:
+            fits = self._is_data_over
+        else:
+            fits = True
+        if not fits:
+            raise ValueError("the record there is not what it says")
+
+    def _last_or_damaged(
+        self, at: int, code: int, length: int
+    ) -> Generator[Found, None, int | None]:
+        following = self._next_chunk(at + 1)
+        if following is None and self._is_record(code, length):
+            if code == CHUNK:
+                self._stream.seek(at + _HEAD.size)
+                yield from _records_in(at, _content_before_cut(self._read()))
+            yield Cut(at)
+            return None
+        yield Damage(at, self._size if following is None else following, "no record stands there")
+        return following
+
+    def _damaged(
+        self, at: int, reason: str, resume: int | None
+    ) -> Generator[Found, None, int | None]:
+        resume = self._next_chunk(at + 1) if resume is None else resume
+        yield Damage(at, self._size if resume is None else resume, reason)
+        return resume
+
+    def _is_record(self, code: int, length: int) -> bool:
+        return _is_code(code) and min(length, self._size) <= _MOST_BYTES
+
+    def _is_head(self, at: int) -> bool:
+        """Whether a record of a known kind may begin at a place, or the file ends there."""
+        self._stream.seek(at)
+        head = self._read(_HEAD.size)
+        if len(head) < _HEAD.size:
+            return True
+        code, length = _HEAD.unpack(head)
+        return _is_code(code) and at + _HEAD.size + int(length) <= self._size
+
+    def _is_zero_from(self, at: int) -> bool:
+        """Whether nothing but zeros follows, as after a loss of power."""
+        self._stream.seek(at)
+        while piece := self._read(_PIECE_BYTES):
+            if any(piece):
+                return False
+        return True
+
+    def _next_chunk(self, at: int) -> int | None:
+        """Return where the next chunk begins whose checksum is right."""
+        overlap = max(map(len, _NAMES)) - 1
+        place = at + _NAME_AT  # of a name, at the earliest
+        while place < self._size:
+            self._stream.seek(place)
+            piece = self._read(_PIECE_BYTES + overlap)
+            for found in _all_in(piece):
+                chunk_at = place + found - _NAME_AT
+                if self._is_sound(chunk_at):
+                    return chunk_at
+            place += _PIECE_BYTES
+        return None
+
+    def _is_sound(self, at: int) -> bool:
+        self._stream.seek(at)
+        code, length = _HEAD.unpack(self._read(_HEAD.size))
+        if code != CHUNK or length > min(self._size - at - _HEAD.size, _MOST_BYTES):
+            return False
+        try:
+            _content(self._read(length))
+        except DAMAGES:
+            return False
+        return True
+
+
+def _is_code(code: int) -> bool:
+    return 1 <= code <= _LAST_CODE
+
+
+def text_at(body: bytes, at: int) -> tuple[str, int]:
+    """Return a text with its length before it, and the position after it."""
+    data, end = bytes_at(body, at)
+    return data.decode(), end
+
+
+def bytes_at(body: bytes, at: int) -> tuple[bytes, int]:
+    """Return bytes with their 32-bit length before them, and the position after them."""
+    (length,) = struct.unpack_from("<I", body, at)
+    start = at + 4
+    if start + length > len(body):
+        raise ValueError("a text reaches beyond its record")
+    return body[start : start + length], start + length
+
+
+def table_at(body: bytes, at: int) -> tuple[dict[str, str], int]:
+    """Return a table of texts with its length in bytes before it, and the position after it."""
+    (length,) = struct.unpack_from("<I", body, at)
+    at, end = at + 4, at + 4 + length
+    table = {}
+    while at < end:
+        key, at = text_at(body, at)
+        table[key], at = text_at(body, at)
+    return table, end
+
+
+def _all_in(piece: bytes) -> list[int]:
+    places = []
+    for name in _NAMES:
+        found = piece.find(name)
+        while found >= 0:
+            places.append(found)
+            found = piece.find(name, found + 1)
+    return sorted(places)
+
+
+def _content(body: bytes) -> bytes:
+    """Decompress a whole chunk; raises one of `DAMAGES`."""
+    _start, _end, size, checksum = _CHUNK.unpack_from(body)
+    name, at = text_at(body, _CHUNK.size)
+    (packed_size,) = struct.unpack_from("<Q", body, at)
+    packed = body[at + 8 :]
+    if len(packed) != packed_size or size > _MOST_BYTES:
+        raise ValueError("the chunk's lengths do not fit together")
+    content = _unpacked(name, packed, size)
+    if len(content) != size or (checksum != 0 and zlib.crc32(content) != checksum):
+        raise ValueError("the chunk's checksum is wrong")
+    return content
+
+
+def _content_before_cut(body: bytes) -> bytes:
+    """Decompress what there is of a cut chunk, possibly nothing."""
+    try:
+        size = _CHUNK.unpack_from(body)[2]
+        name, at = text_at(body, _CHUNK.size)
+        return _unpacked(name, body[at + 8 :], min(size, _MOST_BYTES))
+    except DAMAGES:
+        return b""
+
+
+def _unpacked(name: str, packed: bytes, size: int) -> bytes:
+    """Decompress, one byte more than ``size`` at most."""
+    if name == "zstd":
+        return zstandard.ZstdDecompressor().stream_reader(packed).read(size + 1)
+    if name == "lz4":
+        unpacked: bytes = lz4.frame.LZ4FrameDecompressor().decompress(packed, size + 1)
+        return unpacked
+    if name == "":
+        return packed
+    raise ValueError(f"chunks compressed with {name!r} are not read here")
+
+
+def _records_in(at: int, content: bytes) -> Iterator[Record]:
+    """Yield the whole records of a chunk that begins at a place."""
+    here = 0
+    while here + _HEAD.size <= len(content):
+        code, length = _HEAD.unpack_from(content, here)
+        here += _HEAD.size
+        if here + length > len(content):
+            return  # the chunk was cut here
+        yield Record(at, code, content[here : here + length])
+        here += length
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Metadata:
+    """A named table of the file."""
+
+    name: str
+    values: dict[str, str]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Channel:
+    """A topic; `message_type` is the name of its schema."""
+
+    topic: str
+    message_type: str
+    metadata: dict[str, str]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Message:
+    """A message as stored; times in ns."""
+
+    channel: Channel
+    sequence: int
+    t_ns: int
+    publish_ns: int
+    data: bytes
+
+    @property
+    def topic(self) -> str:
+        return self.channel.topic
+
+
+Entry: TypeAlias = Metadata | Channel | Message
+
+
+def read_entries(stream: BinaryIO, size: int) -> Iterator[Entry | Cut | Damage]:
+    """Yield what a file holds, to the end of its data, and where it is cut or damaged.
+
+    One chunk at a time is in memory. ``stream`` and ``size`` are those of `RecordReader`.
+    """
+    schemas: dict[int, str] = {}
+    channels: dict[int, Channel] = {}
+    for found in RecordReader(stream, size).read():
+        if not isinstance(found, Record):
+            yield found
+            continue
+        if found.code == DATA_END:
+            return
+        try:
+            entry = _entry(found, schemas, channels)
+        except DAMAGES as error:
+            yield Damage(found.at, found.at, str(error))
+            continue
+        if entry is not None:
+            yield entry
+
+
+def _entry(record: Record, schemas: dict[int, str], channels: dict[int, Channel]) -> Entry | None:
+    body = record.body
+    if record.code == MESSAGE:
+        number, sequence, t_ns, publish_ns = MESSAGE_HEAD.unpack_from(body)
+        return Message(
+            channel=channels[number],
+            sequence=sequence,
+            t_ns=t_ns,
+            publish_ns=publish_ns,
+            data=body[MESSAGE_HEAD.size :],
+        )
+    if record.code == SCHEMA:
+        (number,) = struct.unpack_from("<H", body)
+        schemas[number] = text_at(body, 2)[0]
+    elif record.code == CHANNEL:
+        number, schema = struct.unpack_from("<HH", body)
+        topic, at = text_at(body, 4)
+        at = text_at(body, at)[1]  # behind the encoding of its messages
+        channels[number] = Channel(
+            topic=topic, message_type=schemas.get(schema, ""), metadata=table_at(body, at)[0]
+        )
+        return channels[number]
+    elif record.code == METADATA:
+        name, at = text_at(body, 0)
+        return Metadata(name=name, values=table_at(body, at)[0])
+    return None
+
+
+CHUNK_BYTES = 256 * 1024
+
+
+class McapWriter(Writer):
+    """Writes a file of chunks compressed by zstd, by default of messages of ROS 2.
+
+    Parameters
+    ----------
+    stream
+        The new file; stays open.
+    chunk_bytes
+        Size at which a chunk ends.
+    profile, library
+        For the file's header.
+    """
+
+    def __init__(
+        self,
+        stream: BinaryIO,
+        *,
+        chunk_bytes: int = CHUNK_BYTES,
+        profile: str = "ros2",
+        library: str = "xethru-hil",
+    ) -> None:
+        super().__init__(stream, chunk_size=chunk_bytes, compression=CompressionType.ZSTD)
+        self._schema_ids: dict[str, int] = {}
+        self.start(profile=profile, library=library)
+
+    def add_channel(
+        self, topic: str, message_type: str, schema: bytes, metadata: Mapping[str, str]
+    ) -> int:
+        """Return the number of a new channel of CDR messages; ``schema`` is its ros2msg text."""
+        if message_type not in self._schema_ids:
+            self._schema_ids[message_type] = self.register_schema(message_type, "ros2msg", schema)
+        return self.register_channel(topic, "cdr", self._schema_ids[message_type], dict(metadata))
+
+    def end_chunk(self) -> None:
+        """End the chunk here, whatever its size."""
+        # A private method: mcap's writer closes a chunk by size only and offers no public way
+        # to close it by time. pyproject pins the minor version of mcap for this line; before
+        # that is raised, see that the method is still there and still writes the pending
+        # chunk. The tests of chunks cut by time and of files never finished fail if not.
+        self._Writer__finalize_chunk()  # type: ignore[attr-defined]  # see above
+
+    def finish(self) -> None:
+        super().finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
+
+
+def statistics_of(path: Path) -> Statistics:
+    """Return the statistics in the index of a finished file, read by mcap's own reader.
+
+    Raises
+    ------
+    ValueError
+        The file cannot be read, or has no index.
+    """
+    try:
+        with path.open("rb") as stream:
+            summary = make_reader(stream, validate_crcs=True).get_summary()
+    except McapError as error:
+        raise ValueError(str(error)) from None
+    if summary is None or summary.statistics is None:
+        raise ValueError("it has no index")
+    return summary.statistics
 
 
 _FACTS = "xethru-hil recording"
 _LENGTH_UNIT = "module metres, c = 3.0e8 m/s"
-_CHUNK_BYTES = 256 * 1024
+_CONTENT = frozenset({"frame", "payload"})
+"""Topics of messages."""
 _UNTIMED = {"xethru-hil": "time unknown"}
-_DAMAGED = (
-    McapError,
-    CRCValidationError,
-    EOFError,
-    struct.error,
-    ValueError,
-    OverflowError,
-    zstandard.ZstdError,
-    MemoryError,  # a damaged size
-)
 
 
-class _McapWriter:
+class _RecordingWriter:
     """The channels of one radar in a file being written."""
 
     def __init__(self, stream: BinaryIO, radar: str, facts: RecordingFacts) -> None:
         self._radar = radar
-        self._writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
-        self._writer.start(profile="ros2", library="xethru-hil")
+        self._writer = McapWriter(stream)
         self._writer.add_metadata(_FACTS, {"facts": json.dumps(facts.as_json())})
-        self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[str, bool], int] = {}
         self._others = 0
         self._has_info = False
         self._settings: dict[str, X4Value] = {}  # as the recorded module read them back
 
     def write(self, message: Response, t_ns: int | None) -> None:
-        """Add a message."""
         if isinstance(message, DataFloat) and message.content_id == 0:
             self._info(message, t_ns)
-            data = pack_array(FLOAT_ARRAY, np.ascontiguousarray(message.values, "<f4"))
+            data = pack_array(FLOAT_ARRAY, message.values)
             self._add("frame", FLOAT_ARRAY, data, t_ns, message.info)
             return
         if isinstance(message, ReplyInt | ReplyFloat):
@@ -188,11 +635,10 @@ class _McapWriter:
         self._others = (self._others + 1) & 0xFFFFFFFF
 
     def finish(self) -> None:
-        """Write the index."""
-        self._writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
+        self._writer.finish()
 
     def _info(self, frame: DataFloat | BasebandIq | BasebandAp, t_ns: int | None) -> None:
-        """Say once what is known of the frames; what is not is null."""
+        """Write once what is known of the frames; null is unknown."""
         if self._has_info:
             return
         self._has_info = True
@@ -215,7 +661,7 @@ class _McapWriter:
         self._add("info", STRING, pack_string(json.dumps(info)), t_ns, 0)
 
     def _geometry(self, frame: DataFloat | BasebandIq | BasebandAp) -> FrameGeometry | None:
-        """Where the bins lie: as the message says, or as the module answered before it."""
+        """Where the bins lie, from the message or from earlier answers of the module."""
         if not isinstance(frame, DataFloat):
             return FrameGeometry(
                 range_start_m=frame.range_offset_m,
@@ -259,13 +705,10 @@ class _McapWriter:
     def _channel(self, topic: str, schema: str, *, timed: bool) -> int:
         key = topic, timed
         if key not in self._channels:
-            if schema not in self._schemas:
-                text = SCHEMAS[schema].encode()
-                self._schemas[schema] = self._writer.register_schema(schema, "ros2msg", text)
-            self._channels[key] = self._writer.register_channel(
+            self._channels[key] = self._writer.add_channel(
                 f"/radar/{self._radar}/{topic}",
-                "cdr",
-                self._schemas[schema],
+                schema,
+                SCHEMAS[schema].encode(),
                 {} if timed else _UNTIMED,
             )
         return self._channels[key]
@@ -283,7 +726,7 @@ def write_mcap(
     """
     try:
         with path.open("xb") as stream:
-            writer = _McapWriter(stream, radar, facts)
+            writer = _RecordingWriter(stream, radar, facts)
             for message, t_ns in messages:
                 writer.write(message, t_ns)
             writer.finish()
@@ -301,7 +744,6 @@ def read_mcap(path: Path, on_fault: FaultHandler | None, radar: str | None = Non
     RecordingError
         If it holds no radar, or several and none is named, or is damaged and ``on_fault`` is None.
     """
-    topics: dict[int, tuple[str, bool]] = {}
     radars: set[str] = set()
     faults: list[RecordingFault] = []
 
@@ -309,24 +751,25 @@ def read_mcap(path: Path, on_fault: FaultHandler | None, radar: str | None = Non
         faults.append(fault)
         report(fault, on_fault)
 
-    for record in _records(path, note):
-        if isinstance(record, Channel):
-            name, topic = _radar_topic(record.topic)
-            if name and topic in {"frame", "payload"} and radar in {None, name}:
-                topics[record.id] = topic, record.metadata.get("xethru-hil") is None
-                radars.add(name)
-                if len(radars) > 1:
-                    raise RecordingError(
-                        f"{path} holds several radars ({_names(path)}), not one; "
-                        "choose one: --radar NAME, in Python radar="
-                    )
-        elif isinstance(record, Message) and record.channel_id in topics:
-            topic, timed = topics[record.channel_id]
-            try:
-                message = _message(topic, record)
-            except (ValueError, struct.error) as error:
-                raise RecordingError(f"{path}: a message is damaged: {error}") from None
-            yield message, record.log_time if timed else None
+    for entry in _entries_of(path, note):
+        if isinstance(entry, Metadata):
+            continue
+        name, part = _radar_topic(entry.topic)
+        if part not in _CONTENT or radar not in {None, name}:
+            continue
+        if isinstance(entry, Channel):
+            radars.add(name)
+            if len(radars) > 1:
+                raise RecordingError(
+                    f"{path} holds several radars ({_names(path)}), not one; "
+                    "choose one: --radar NAME, in Python radar="
+                )
+            continue
+        try:
+            message = _message(part, entry)
+        except (ValueError, struct.error) as error:
+            raise RecordingError(f"{path}: a message is damaged: {error}") from None
+        yield message, None if "xethru-hil" in entry.channel.metadata else entry.t_ns
     if not radars and radar is not None and (names := _names(path)):
         raise RecordingError(f"{path} holds no radar {radar!r}; it holds {names}")
     if not radars and not faults:
@@ -334,21 +777,18 @@ def read_mcap(path: Path, on_fault: FaultHandler | None, radar: str | None = Non
 
 
 def mcap_radars(path: Path) -> tuple[RadarFacts, ...]:
-    """Return the radars of a file in the order in which their topics begin; damage passes."""
+    """Return the radars of a file in the order of their first topics; damage is ignored."""
     names: dict[str, None] = {}  # a set in order
-    channels: dict[int, str] = {}
-    said: dict[str, RadarFacts] = {}
-    for record in _records(path, lambda fault: None):
-        if isinstance(record, Channel):
-            name, topic = _radar_topic(record.topic)
-            if name and topic in {"frame", "payload"}:
-                names[name] = None
-            elif name and topic == "info":
-                channels[record.id] = name
-        elif isinstance(record, Message) and record.channel_id in channels:
-            name = channels[record.channel_id]
-            said[name] = _radar_facts(name, record.data)
-    return tuple(said.get(name, RadarFacts(name=name)) for name in names)
+    facts: dict[str, RadarFacts] = {}
+    for entry in _entries_of(path, lambda fault: None):
+        if isinstance(entry, Metadata):
+            continue
+        name, part = _radar_topic(entry.topic)
+        if isinstance(entry, Channel) and part in _CONTENT:
+            names[name] = None
+        elif isinstance(entry, Message) and part == "info":
+            facts[name] = _radar_facts(name, entry.data)
+    return tuple(facts.get(name, RadarFacts(name=name)) for name in names)
 
 
 def _names(path: Path) -> str:
@@ -356,7 +796,7 @@ def _names(path: Path) -> str:
 
 
 def _radar_facts(name: str, data: bytes) -> RadarFacts:
-    """Read what a latched info says of a radar; nothing where it makes no sense."""
+    """Read a latched info; facts without content if it is invalid."""
     try:
         info = json.loads(unpack_string(data))
         start_m, bin_m = float(info["range_start_m"]), float(info["bin_length_m"])
@@ -374,22 +814,23 @@ def _radar_facts(name: str, data: bytes) -> RadarFacts:
 
 
 def mcap_facts(path: Path) -> RecordingFacts:
-    """Return what a file says about itself; defaults where it says nothing."""
-    for record in _records(path, lambda fault: None):
-        if isinstance(record, Metadata) and record.name == _FACTS:
+    """Return what a file holds about itself, or defaults."""
+    for entry in _entries_of(path, lambda fault: None):
+        if isinstance(entry, Metadata) and entry.name == _FACTS:
             try:
-                return RecordingFacts.from_json(json.loads(record.metadata["facts"]))
+                return RecordingFacts.from_json(json.loads(entry.values["facts"]))
             except (KeyError, ValueError, TypeError, RecursionError) as error:
                 raise RecordingError(f"{path}: what it says about itself: {error}") from None
-        if isinstance(record, Message):
+        if isinstance(entry, Message):
             break
     return RecordingFacts()
 
 
-def _message(topic: str, record: Message) -> Response:
-    if topic == "frame":
-        return DataFloat(info=record.sequence, values=unpack_array(record.data, "<f4"))
-    return decode_response(unpack_array(record.data, "u1").tobytes())
+def _message(part: str, message: Message) -> Response:
+    if part == "frame":
+        values = unpack_array(FLOAT_ARRAY, message.data)
+        return DataFloat(info=message.sequence, values=values)
+    return decode_response(unpack_array(BYTE_ARRAY, message.data).tobytes())
 
 
 def _radar_topic(topic: str) -> tuple[str, str]:
@@ -397,16 +838,22 @@ def _radar_topic(topic: str) -> tuple[str, str]:
     return (found[1], found[2]) if found else ("", "")
 
 
-def _records(path: Path, on_fault: FaultHandler | None) -> Iterator[object]:
+def _entries_of(path: Path, on_fault: FaultHandler | None) -> Iterator[Entry]:
+    """Yield what a file holds before it is cut or damaged, which is reported."""
     try:
         with path.open("rb") as stream:
-            try:
-                size = os.fstat(stream.fileno()).st_size  # no record is larger, whatever it claims
-                reader = StreamReader(stream, validate_crcs=True, record_size_limit=size)
-                yield from reader.records
-            except _DAMAGED as error:
-                reason = f"it is cut or damaged: {str(error) or type(error).__name__}"
-                fault = RecordingFault(file=path.name, offset=stream.tell(), reason=reason)
-                report(fault, on_fault)
+            fault: Cut | Damage | None = None
+            if stream.read(len(MAGIC)) != MAGIC:
+                fault = Damage(0, 0, "it does not begin as an MCAP file")
+            else:
+                for found in read_entries(stream, os.fstat(stream.fileno()).st_size):
+                    if isinstance(found, Cut | Damage):
+                        fault = found
+                        break
+                    yield found
     except OSError as error:
         raise unreadable(path, error) from None
+    if fault is not None:
+        reason = "it ends too early" if isinstance(fault, Cut) else fault.reason
+        reason = f"it is cut or damaged: {reason}"
+        report(RecordingFault(file=path.name, offset=fault.at, reason=reason), on_fault)

@@ -20,6 +20,7 @@ from xethru_protocol.wire.table import (
     ROWS,
     Command,
     Message,
+    Prefixes,
     Response,
     Row,
     UnknownMessage,
@@ -63,13 +64,22 @@ def encode(message: Message, *, bulk: bool | None = None) -> bytes:
     return b"".join(parts)
 
 
+def message_type(prefixes: Prefixes, payload: bytes) -> type[Message] | None:
+    """Type whose prefix is the longest that fits a payload; None if there is none."""
+    for length in prefixes.lengths.get(payload[0], ()) if payload else ():
+        cls = prefixes.types.get(payload[:length])
+        if cls is not None:
+            return cls
+    return None
+
+
 def decode_command(payload: bytes) -> Command[Response]:
     """Message of a host-to-module payload.
 
     >>> decode_command(bytes.fromhex("50 10 10 00 00 00 00 00 A0 41"))
     X4DriverSet(setting=<X4Setting.FPS: 16>, value_width=None, value=20.0)
     """
-    cls = COMMANDS.find(payload)
+    cls = message_type(COMMANDS, payload)
     return _unknown(payload) if cls is None else cast(Command[Response], _build(cls, payload))
 
 
@@ -79,7 +89,7 @@ def decode_response(payload: bytes) -> Response:
     >>> decode_response(bytes.fromhex("20 01 00 00 00"))
     Error(code=1)
     """
-    cls = RESPONSES.find(payload)
+    cls = message_type(RESPONSES, payload)
     return _unknown(payload) if cls is None else cast(Response, _build(cls, payload))
 
 

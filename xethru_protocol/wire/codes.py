@@ -1,18 +1,12 @@
 """Numbers of the wire under the vendor's own names.
 
-Source: Protocol reference 2, 4, 5, 7, 16. Vendor's prefixes: ``XTS_SPC_*`` command, ``XTS_SPCA_*``
+First the numbers that tell messages apart, then the values of their fields, then error codes.
+
+Source: Protocol reference 2, 4 to 7, 16. Vendor's prefixes: ``XTS_SPC_*`` command, ``XTS_SPCA_*``
 profile sub-command, ``XTS_SPCX_*`` X4 driver sub-command, ``XTS_SDC_*`` system command,
-``XTS_SPR_*`` response, ``XTS_SPRD_*`` element type, ``XTS_ID_*`` content. Members without prefix
-bear the reference's own words where it gives no vendor's name.
-
-Source: Protocol reference 4 to 7. Vendor's prefixes: ``XTID_SM_*`` mode, ``XTS_ID_APP_*`` profile,
-``XTID_SSIC_*`` info item, ``XTS_SPRS_*`` system state, ``XTS_SPRP_*`` PONG. Members without prefix
-bear the reference's own words where it gives no vendor's name.
-
-Source: Protocol reference 5.1.
-
-What a message is stands in ``codes_wire``, what its fields carry in ``codes_values``, what an
-ERROR means in ``codes_errors``.
+``XTS_SPR_*`` response, ``XTS_SPRD_*`` element type, ``XTS_ID_*`` content, ``XTID_SM_*`` mode,
+``XTS_ID_APP_*`` profile, ``XTID_SSIC_*`` info item, ``XTS_SPRS_*`` system state, ``XTS_SPRP_*``
+PONG. Members without prefix have the reference's own words where it gives no vendor's name.
 """
 
 from enum import Enum, IntEnum, IntFlag

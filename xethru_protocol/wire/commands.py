@@ -1,21 +1,11 @@
 """Rows of the message table: every command a host sends.
 
 Names in dumps are those of the golden vectors. Section numbers refer to the Protocol reference.
-
-Names in dumps are those of the golden vectors. Section numbers refer to the Protocol reference.
-
-Names in dumps are those of the golden vectors. Section numbers refer to the Protocol reference.
-
-Names in dumps are those of the golden vectors. ``file_type`` is a `FileType` or any user-defined
-one from 80000000h on; identifiers, offsets and lengths are 0 ... 2**32 - 1.
-
-Names in dumps are those of the golden vectors. Section numbers refer to the Protocol reference.
-
-Names in dumps are those of the golden vectors. Section numbers refer to the Protocol reference.
+``file_type`` is a `FileType` or any user-defined one from 80000000h on; identifiers, offsets and
+lengths of files are 0 ... 2**32 - 1.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 from xethru_protocol.wire import fields
@@ -50,7 +40,6 @@ from xethru_protocol.wire.table import Command, Response, command, id32
 
 
 @command(CommandCode.XTS_SPC_PING, name="PING")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Ping(Command[Pong]):
     """Ask for a sign of life; the firmware does not check the seed. 4.1."""
 
@@ -58,7 +47,6 @@ class Ping(Command[Pong]):
 
 
 @command(CommandCode.XTS_SPC_START_BOOTLOADER, name="START_BOOTLOADER")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class StartBootloader(Command[Ack]):
     """Restart into the bootloader about 500 ms after the ACK; ``key`` as `BootloaderKey`. 4.1."""
 
@@ -66,7 +54,6 @@ class StartBootloader(Command[Ack]):
 
 
 @command(CommandCode.XTS_SPC_MOD_RESET, name="MOD_RESET")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ModReset(Command[Ack]):
     """Restart the module about 500 ms after its ACK; a USB port vanishes meanwhile. 4.1."""
 
@@ -80,7 +67,6 @@ class ModReset(Command[Ack]):
         )
     },
 )
-@dataclass(frozen=True, slots=True, kw_only=True)
 class SetMode(Command[Ack]):
     """Switch to a `SensorMode`; a host leaves ``param`` out for all but NORMAL and REG. 4.2."""
 
@@ -89,13 +75,11 @@ class SetMode(Command[Ack]):
 
 
 @command(CommandCode.XTS_SPC_MOD_GETMODE, name="GETMODE")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class GetMode(Command[ReplyByte]):
     """Ask for the `SensorMode`. 4.2."""
 
 
 @command(CommandCode.XTS_SPC_MOD_LOADAPP, name="MOD_LOADAPP")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class LoadApp(Command[Ack]):
     """Load a profile (`ProfileId`) without running it. 4.3."""
 
@@ -103,13 +87,11 @@ class LoadApp(Command[Ack]):
 
 
 @command(CommandCode.XTS_SPC_DIR_COMMAND, DirCode.XTS_SDC_GET_PROFILEID, name="DIR GET_PROFILEID")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class GetProfileId(Command[ReplyInt]):
     """Ask for the loaded profile; 0 if none. 4.3."""
 
 
 @command(CommandCode.XTS_SPC_MOD_SETLEDCONTROL, name="SETLEDCONTROL")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class SetLedControl(Command[Ack]):
     """Choose what the LED shows (`LedMode`); an intensity, 0 ... 100, is not implemented. 4.5."""
 
@@ -118,7 +100,6 @@ class SetLedControl(Command[Ack]):
 
 
 @command(CommandCode.XTS_SPC_DEBUG_LEVEL, name="DEBUG_LEVEL")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class DebugLevel(Command[Ack]):
     """Choose how much trace output comes as DATA STRING: a `TraceLevel`, up to 9. 4.5."""
 
@@ -126,7 +107,6 @@ class DebugLevel(Command[Ack]):
 
 
 @command(CommandCode.XTS_SPC_MOD_SETCOM, name="MOD_SETCOM")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class SetCom(Command[Ack]):
     """A command that is defined but handled by no firmware: ERROR 1. 2."""
 
@@ -134,7 +114,6 @@ class SetCom(Command[Ack]):
 
 
 @command(CommandCode.XTS_SPC_HIL, name="HIL")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Hil(Command[Ack]):
     """A command that every firmware answers with ERROR 1; its content has no known layout. 2."""
 
@@ -151,7 +130,6 @@ def _get(target: AppObject) -> tuple[int, ...]:
 
 
 @command(*_set(AppObject.DETECTION_ZONE), name="APP_SET DETECTION_ZONE")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class SetDetectionZone(Command[Ack]):
     """Choose the zone [m] in which a profile detects; the module snaps it outward. 4.4."""
 
@@ -160,19 +138,16 @@ class SetDetectionZone(Command[Ack]):
 
 
 @command(*_get(AppObject.DETECTION_ZONE), name="APP_GET DETECTION_ZONE")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class GetDetectionZone(Command[ReplyFloat]):
     """Ask for the actual zone: start and end [m]. 4.4."""
 
 
 @command(*_get(AppObject.DETECTION_ZONE_LIMITS), name="APP_GET DETECTION_ZONE_LIMITS")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class GetDetectionZoneLimits(Command[ReplyFloat]):
     """Ask for the smallest start, the largest end and the step of zones [m]. 4.4."""
 
 
 @command(*_set(AppObject.SENSITIVITY), name="APP_SET SENSITIVITY")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class SetSensitivity(Command[Ack]):
     """Choose the profile's sensitivity, 0 ... 9. 4.4."""
 
@@ -180,13 +155,11 @@ class SetSensitivity(Command[Ack]):
 
 
 @command(*_get(AppObject.SENSITIVITY), name="APP_GET SENSITIVITY")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class GetSensitivity(Command[ReplyInt]):
     """Ask for the profile's sensitivity. 4.4."""
 
 
 @command(*_set(AppObject.TX_CENTER_FREQ), name="APP_SET TX_CENTER_FREQ")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class SetTxCenterFrequency(Command[Ack]):
     """Choose the profile's band, a `TxCenterFrequency`. 4.4, 9.2."""
 
@@ -194,13 +167,11 @@ class SetTxCenterFrequency(Command[Ack]):
 
 
 @command(*_get(AppObject.TX_CENTER_FREQ), name="APP_GET TX_CENTER_FREQ")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class GetTxCenterFrequency(Command[ReplyInt]):
     """Ask for the profile's band. 4.4."""
 
 
 @command(*_set(AppObject.LED_CONTROL), name="APP_SET LED_CONTROL")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class AppSetLedControl(Command[Ack]):
     """Choose what the LED shows; as `SetLedControl`, but kept with the profile. 4.4."""
 
@@ -209,13 +180,11 @@ class AppSetLedControl(Command[Ack]):
 
 
 @command(*_get(AppObject.LED_CONTROL), name="APP_GET LED_CONTROL")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class AppGetLedControl(Command[ReplyByte]):
     """Ask for the `LedMode`. 4.4."""
 
 
 @command(*_set(AppObject.PROFILE_PARAMETERFILE), name="APP_SET PROFILE_PARAMETERFILE")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class SetParameterFile(Command[Ack]):
     """Give a profile its parameter file; the terminating NULs are added here. 4.4."""
 
@@ -226,7 +195,6 @@ class SetParameterFile(Command[Ack]):
 
 
 @command(*_get(AppObject.PROFILE_PARAMETERFILE), name="APP_GET PROFILE_PARAMETERFILE")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class GetParameterFile(Command[ReplyString | ParameterFile | ReplyByte]):
     """Ask for a profile's parameter file; modules answer in one of three ways. 4.4, 16."""
 
@@ -235,25 +203,21 @@ class GetParameterFile(Command[ReplyString | ParameterFile | ReplyByte]):
 
 
 @command(_APP, AppCommandCode.XTS_SPCA_FACTORY_PRESET, name="APP_FACTORY_PRESET")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class FactoryPreset(Command[Ack]):
     """Set the profile back to its factory settings. 4.4."""
 
 
 @command(_APP, AppCommandCode.XTS_SPCA_STORE_NOISEMAP, name="APP_STORE_NOISEMAP")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class StoreNoiseMap(Command[Ack]):
     """Store the profile's noise map; an error if a store is under way. 4.4."""
 
 
 @command(_APP, AppCommandCode.XTS_SPCA_LOAD_NOISEMAP, name="APP_LOAD_NOISEMAP")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class LoadNoiseMap(Command[Ack]):
     """Load the stored noise map; without effect in released firmware. 4.4."""
 
 
 @command(_APP, name="APP_DELETE_NOISEMAP")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class DeleteNoiseMap(Command[Ack]):
     """Delete the stored noise map; ``sub_code`` 15h is the document's form of it. 4.4, 11."""
 
@@ -270,7 +234,6 @@ class DeleteNoiseMap(Command[Ack]):
 
 
 @command(_APP, AppCommandCode.XTS_SPCA_POLL, name="APP_POLL")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class AppPoll(Command[Ack]):
     """A command that is defined but never parsed: ERROR 1. 4.4."""
 
@@ -284,7 +247,6 @@ _IOPIN = CommandCode.XTS_SPC_IOPIN
 
 
 @command(_NOISEMAP, NoiseMapCode.XTS_SPCN_SETCONTROL, name="NOISEMAP_SETCONTROL")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class NoiseMapSetControl(Command[Ack]):
     """Choose where a profile's noise map comes from: `NoiseMapControl` bits. 4.6."""
 
@@ -292,13 +254,11 @@ class NoiseMapSetControl(Command[Ack]):
 
 
 @command(_NOISEMAP, NoiseMapCode.XTS_SPCN_GETCONTROL, name="NOISEMAP_GETCONTROL")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class NoiseMapGetControl(Command[ReplyInt]):
     """Ask for the noise map's `NoiseMapControl` bits. 4.6."""
 
 
 @command(_NOISEMAP, NoiseMapCode.SET_PERIODIC_STORE, name="NOISEMAP_SET_PERIODIC_STORE")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class NoiseMapSetPeriodicStore(Command[Ack]):
     """Store the noise map every ``interval_min`` minutes; ``padding`` is sent as 0. 16."""
 
@@ -307,13 +267,11 @@ class NoiseMapSetPeriodicStore(Command[Ack]):
 
 
 @command(_NOISEMAP, NoiseMapCode.GET_PERIODIC_STORE, name="NOISEMAP_GET_PERIODIC_STORE")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class NoiseMapGetPeriodicStore(Command[ReplyInt]):
     """Ask for the interval [min] at which the noise map is stored; two integers. 16."""
 
 
 @command(_OUTPUT, OutputCode.XTS_SPCO_SETCONTROL, name="OUTPUT_SETCONTROL")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class OutputSetControl(Command[Ack]):
     """Switch a profile's message (`OutputFeature`) on or off. 4.7.
 
@@ -325,7 +283,6 @@ class OutputSetControl(Command[Ack]):
 
 
 @command(_OUTPUT, OutputCode.XTS_SPCO_GETCONTROL, name="OUTPUT_GETCONTROL")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class OutputGetControl(Command[ReplyInt]):
     """Ask for the control bits of an `OutputFeature`. 4.7."""
 
@@ -333,7 +290,6 @@ class OutputGetControl(Command[ReplyInt]):
 
 
 @command(_DEBUG_OUTPUT, OutputCode.XTS_SPCO_SETCONTROL, name="DEBUG_OUTPUT_SETCONTROL")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class DebugOutputSetControl(Command[Ack]):
     """Switch a message on or off on the debug line; fields as in `OutputSetControl`. 4.7, 16."""
 
@@ -342,7 +298,6 @@ class DebugOutputSetControl(Command[Ack]):
 
 
 @command(_DEBUG_OUTPUT, OutputCode.XTS_SPCO_GETCONTROL, name="DEBUG_OUTPUT_GETCONTROL")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class DebugOutputGetControl(Command[ReplyInt]):
     """Ask for a message's control bits on the debug line. 4.7, 16."""
 
@@ -355,7 +310,6 @@ class DebugOutputGetControl(Command[ReplyInt]):
     name="IOPIN_SETCONTROL",
     errors=ErrorSpace.IO_PINS,
 )
-@dataclass(frozen=True, slots=True, kw_only=True)
 class IoPinSetControl(Command[Ack]):
     """Say what a pin does: `IoPinSetup` bits and an `IoPinFeature`. 4.8.
 
@@ -373,7 +327,6 @@ class IoPinSetControl(Command[Ack]):
     name="IOPIN_GETCONTROL",
     errors=ErrorSpace.IO_PINS,
 )
-@dataclass(frozen=True, slots=True, kw_only=True)
 class IoPinGetControl(Command[ReplyInt]):
     """Ask for a pin's setup bits and feature: two integers. 4.8."""
 
@@ -381,7 +334,6 @@ class IoPinGetControl(Command[ReplyInt]):
 
 
 @command(_IOPIN, IoPinCode.XTS_SPCIOP_SETVALUE, name="IOPIN_SETVALUE", errors=ErrorSpace.IO_PINS)
-@dataclass(frozen=True, slots=True, kw_only=True)
 class IoPinSetValue(Command[Ack]):
     """Drive an output pin high (1) or low (0). 4.8."""
 
@@ -390,7 +342,6 @@ class IoPinSetValue(Command[Ack]):
 
 
 @command(_IOPIN, IoPinCode.XTS_SPCIOP_GETVALUE, name="IOPIN_GETVALUE", errors=ErrorSpace.IO_PINS)
-@dataclass(frozen=True, slots=True, kw_only=True)
 class IoPinGetValue(Command[ReplyInt]):
     """Ask whether a pin is high (1) or low (0). 4.8."""
 
@@ -403,7 +354,6 @@ _TYPE = fields.Number("I", "type", shown=fields.hexadecimal)
 
 
 @command(_DIR, DirCode.XTS_SDC_SEARCH_FILE_TYPE, name="DIR SEARCH_FILE_TYPE", errors=_ERRORS)
-@dataclass(frozen=True, slots=True, kw_only=True)
 class SearchFileType(Command[ReplyInt]):
     """Ask for the identifiers of all files of a type. 4.11."""
 
@@ -411,13 +361,11 @@ class SearchFileType(Command[ReplyInt]):
 
 
 @command(_DIR, DirCode.XTS_SDC_FIND_ALL_FILES, name="DIR FIND_ALL_FILES", errors=_ERRORS)
-@dataclass(frozen=True, slots=True, kw_only=True)
 class FindAllFiles(Command[ReplyInt]):
     """Ask for all files: n types, then n identifiers. 4.11."""
 
 
 @command(_DIR, DirCode.XTS_SDC_CREATE_NEW_FILE, name="DIR CREATE_NEW_FILE", errors=_ERRORS)
-@dataclass(frozen=True, slots=True, kw_only=True)
 class CreateFile(Command[Ack]):
     """Create a file of ``length`` bytes; it is open and erased then. 4.11."""
 
@@ -427,7 +375,6 @@ class CreateFile(Command[Ack]):
 
 
 @command(_DIR, DirCode.XTS_SDC_OPEN_FILE, name="DIR OPEN_FILE", errors=_ERRORS)
-@dataclass(frozen=True, slots=True, kw_only=True)
 class OpenFile(Command[Ack]):
     """Open a file; at most 10 may be open. 4.11."""
 
@@ -436,7 +383,6 @@ class OpenFile(Command[Ack]):
 
 
 @command(_DIR, DirCode.XTS_SDC_SET_FILE_DATA, name="DIR SET_FILE_DATA", errors=_ERRORS)
-@dataclass(frozen=True, slots=True, kw_only=True)
 class SetFileData(Command[Ack]):
     """Write ``data``, at most 1024 bytes, into an open file. 4.11."""
 
@@ -448,7 +394,6 @@ class SetFileData(Command[Ack]):
 
 
 @command(_DIR, DirCode.XTS_SDC_CLOSE_FILE, name="DIR CLOSE_FILE", errors=_ERRORS)
-@dataclass(frozen=True, slots=True, kw_only=True)
 class CloseFile(Command[Ack]):
     """Close a file; the firmware ignores ``commit``. 4.11."""
 
@@ -458,7 +403,6 @@ class CloseFile(Command[Ack]):
 
 
 @command(_DIR, DirCode.XTS_SDC_GET_FILE_LENGTH, name="DIR GET_FILE_LENGTH", errors=_ERRORS)
-@dataclass(frozen=True, slots=True, kw_only=True)
 class GetFileLength(Command[ReplyInt]):
     """Ask for a file's size [bytes]; it need not be open. 4.11."""
 
@@ -467,7 +411,6 @@ class GetFileLength(Command[ReplyInt]):
 
 
 @command(_DIR, DirCode.XTS_SDC_GET_FILE_DATA, name="DIR GET_FILE_DATA", errors=_ERRORS)
-@dataclass(frozen=True, slots=True, kw_only=True)
 class GetFileData(Command[ReplyByte]):
     """Read ``length`` bytes, at most 1024, of an open file. 4.11."""
 
@@ -478,7 +421,6 @@ class GetFileData(Command[ReplyByte]):
 
 
 @command(_DIR, DirCode.XTS_SDC_DELETE_FILE, name="DIR DELETE_FILE", errors=_ERRORS)
-@dataclass(frozen=True, slots=True, kw_only=True)
 class DeleteFile(Command[Ack]):
     """Delete a closed file; takes about 100 ms. 4.11."""
 
@@ -487,7 +429,6 @@ class DeleteFile(Command[Ack]):
 
 
 @command(_DIR, DirCode.XTS_SDC_FORMAT_FILESYSTEM, name="DIR FORMAT_FILESYSTEM", errors=_ERRORS)
-@dataclass(frozen=True, slots=True, kw_only=True)
 class FormatFilesystem(Command[Ack]):
     """Delete all files; ``key`` must be `FORMAT_KEY`. 4.11."""
 
@@ -495,7 +436,6 @@ class FormatFilesystem(Command[Ack]):
 
 
 @command(_DIR, DirCode.XTS_SDC_SYSTEM_TEST, name="DIR SYSTEM_TEST")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class SystemTest(Command[ReplyByte | Ack]):
     """Run a `TestCode`; 256 bytes, of which the first says if it passed, or an ACK. 4.10."""
 
@@ -508,7 +448,6 @@ class SystemTest(Command[ReplyByte | Ack]):
     name="DIR SYSTEM_GET_INFO",
     reply_content_id=lambda message: DirCode.XTS_SDC_SYSTEM_GET_INFO,
 )
-@dataclass(frozen=True, slots=True, kw_only=True)
 class SystemGetInfo(Command[ReplyString]):
     """Ask for an `InfoItem`. 4.10."""
 
@@ -516,7 +455,6 @@ class SystemGetInfo(Command[ReplyString]):
 
 
 @command(_DIR, DirCode.XTS_SDC_SYSTEM_GET_DEBUG_DATA, name="DIR SYSTEM_GET_DEBUG_DATA")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class SystemGetDebugData(Command[Response]):
     """A command that is not implemented: an emulator answers ERROR 1. 4.10."""
 
@@ -524,19 +462,16 @@ class SystemGetDebugData(Command[Response]):
 
 
 @command(_DIR, DirCode.XTS_SDC_GET_CRASH_DUMP_LENGTH, name="DIR GET_CRASH_DUMP_LENGTH")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class GetCrashDumpLength(Command[ReplyInt]):
     """Ask for the size of the crash dump [bytes]; 0 if there is none. 4.10."""
 
 
 @command(_DIR, DirCode.XTS_SDC_CLEAR_CRASH_DUMP, name="DIR CLEAR_CRASH_DUMP")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ClearCrashDump(Command[Ack]):
     """Delete the crash dump. 4.10."""
 
 
 @command(_DIR, DirCode.XTS_SDC_GET_CRASH_DUMP, name="DIR GET_CRASH_DUMP")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class GetCrashDump(Command[ReplyByte]):
     """Read ``length`` bytes of the crash dump from ``offset``. 4.10."""
 
@@ -545,7 +480,6 @@ class GetCrashDump(Command[ReplyByte]):
 
 
 @command(_DIR, DirCode.XTS_SDC_PREPARE_INJECT_FRAME, name="DIR PREPARE_INJECT_FRAME")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class PrepareInjectFrame(Command[Ack]):
     """Announce frames that replace the chip's: how many, of how many bins, `InjectMode`. 4.10."""
 
@@ -555,7 +489,6 @@ class PrepareInjectFrame(Command[Ack]):
 
 
 @command(_DIR, DirCode.XTS_SDC_INJECT_FRAME, name="DIR INJECT_FRAME")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class InjectFrame(Command[Ack]):
     """Give one frame in the chip's place: ``values`` are two float32 per bin. 4.10."""
 
@@ -565,7 +498,6 @@ class InjectFrame(Command[Ack]):
 
 
 @command(_DIR, DirCode.XTS_SDC_COMM_SETBAUDRATE, name="DIR SETBAUDRATE")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class SetBaudRate(Command[Ack]):
     """Change the UART rate after the ACK; no effect on USB. 4.10."""
 
@@ -573,13 +505,11 @@ class SetBaudRate(Command[Ack]):
 
 
 @command(_DIR, DirCode.XTS_SDC_SYSTEM_GET_VERSION, name="DIR SYSTEM_GET_VERSION (legacy)")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class LegacyGetVersion(Command[Response]):
     """An X2 command; an X4 answers ERROR 1. 4.10."""
 
 
 @command(_DIR, DirCode.XTS_SDC_RADLIB_GETVARINT, name="DIR RADLIB_GETVARINT (legacy)")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class LegacyGetVarInt(Command[Response]):
     """An X2 command; an X4 answers ERROR 1. 4.10."""
 
@@ -587,7 +517,6 @@ class LegacyGetVarInt(Command[Response]):
 
 
 @command(_DIR, name="DIR (legacy)")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class LegacyDirCommand(Command[Response]):
     """Any other X2 command, kept whole; an X4 answers ERROR 1. 4.10."""
 
@@ -599,13 +528,11 @@ _BOOTLOADER = CommandCode.XTS_SPC_BOOTLOADER
 
 
 @command(_BOOTLOADER, BootloaderCode.GET_DEVICE_INFO, name="BOOTLOADER_GET_DEVICE_INFO")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class BootloaderGetDeviceInfo(Command[Response]):
     """Ask the bootloader about the device; the form of its answer is not known. 4.12."""
 
 
 @command(_BOOTLOADER, BootloaderCode.WRITE_PAGE, name="BOOTLOADER_WRITE_PAGE")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class BootloaderWritePage(Command[Response]):
     """Write a page of 512 bytes, the last one padded with FF; answered by one byte. 4.12."""
 
@@ -615,7 +542,6 @@ class BootloaderWritePage(Command[Response]):
 
 
 @command(_BOOTLOADER, BootloaderCode.START_APP, name="BOOTLOADER_START_APP")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class BootloaderStartApp(Command[Response]):
     """Leave the bootloader for the application. 4.12."""
 
@@ -651,13 +577,11 @@ _SHORT = frozenset({X4Setting.PULSESPERSTEP, X4Setting.DACSTEP})
 
 
 @command(_X4, X4DriverCode.XTS_SPCX_INIT, name="X4DRIVER_INIT", errors=_X4_ERRORS)
-@dataclass(frozen=True, slots=True, kw_only=True)
 class X4DriverInit(Command[Ack]):
     """Restart the radar chip with default settings; takes up to a second. 4.9."""
 
 
 @command(_X4, X4DriverCode.XTS_SPCX_SET, name="X4DRIVER_SET", errors=_X4_ERRORS)
-@dataclass(frozen=True, slots=True, kw_only=True)
 class X4DriverSet(Command[Ack]):
     """Set one X4 setting. 4.9.
 
@@ -680,7 +604,6 @@ class X4DriverSet(Command[Ack]):
     reply_content_id=lambda message: message.setting,
     errors=_X4_ERRORS,
 )
-@dataclass(frozen=True, slots=True, kw_only=True)
 class X4DriverGet(Command[ReplyByte | ReplyInt | ReplyFloat]):
     """Read one X4 setting; a register needs its ``address``. 4.9."""
 
@@ -692,7 +615,6 @@ class X4DriverGet(Command[ReplyByte | ReplyInt | ReplyFloat]):
 
 
 @command(_X4, X4DriverCode.XTS_SPCX_WRITE, name="X4DRIVER_WRITE", errors=_X4_ERRORS)
-@dataclass(frozen=True, slots=True, kw_only=True)
 class X4DriverWrite(Command[Ack]):
     """Write bytes to consecutive registers from ``address``. 4.9."""
 
@@ -708,7 +630,6 @@ class X4DriverWrite(Command[Ack]):
     reply_content_id=lambda message: message.setting,
     errors=_X4_ERRORS,
 )
-@dataclass(frozen=True, slots=True, kw_only=True)
 class X4DriverRead(Command[ReplyByte]):
     """Read ``length`` bytes of registers from ``address``. 4.9."""
 
@@ -724,7 +645,6 @@ class X4DriverRead(Command[ReplyByte]):
     name="X4DRIVER_WRITE_I2C",
     errors=_X4_ERRORS,
 )
-@dataclass(frozen=True, slots=True, kw_only=True)
 class X4DriverWriteI2c(Command[Ack]):
     """Write bytes to the I2C device at ``address``; newer sensor firmware. 16."""
 
@@ -739,7 +659,6 @@ class X4DriverWriteI2c(Command[Ack]):
     name="X4DRIVER_READ_I2C",
     errors=_X4_ERRORS,
 )
-@dataclass(frozen=True, slots=True, kw_only=True)
 class X4DriverReadI2c(Command[ReplyByte]):
     """Read ``length`` bytes from the I2C device; newer sensor firmware. 16."""
 
@@ -759,7 +678,6 @@ POSTPROCESSING_LAYOUTS: Mapping[int, tuple[str, tuple[str, ...]]] = {
 
 
 @command(_POSTPROCESSING, FramePostprocessingCode.SET, name="FRAME_POSTPROCESSING_SET")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class FramePostprocessingSet(Command[Ack]):
     """Choose one step between chip and host; newer sensor firmware. 16.
 
@@ -771,7 +689,6 @@ class FramePostprocessingSet(Command[Ack]):
 
 
 @command(_POSTPROCESSING, FramePostprocessingCode.GET, name="FRAME_POSTPROCESSING_GET")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class FramePostprocessingGet(Command[ReplyByte | ReplyFloat | ReplyInt]):
     """Ask for one setting between chip and host. 16."""
 

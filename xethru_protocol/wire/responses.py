@@ -1,10 +1,6 @@
 """Rows of the message table: everything a module sends.
 
 Names in dumps are those of the golden vectors. Section numbers refer to the Protocol reference.
-
-Names in dumps are those of the golden vectors. Section numbers refer to the Protocol reference.
-
-Names in dumps are those of the golden vectors. Section numbers refer to the Protocol reference.
 """
 
 from collections.abc import Callable, Mapping
@@ -22,7 +18,6 @@ FloatArray = npt.NDArray[np.float32]
 
 
 @response(ResponseCode.XTS_SPR_ACK, name="ACK")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Ack(Response):
     """The command was carried out. 5."""
 
@@ -32,7 +27,6 @@ class Ack(Response):
     name="ERROR",
     derived={"code_name": lambda message: error_name(message.code) or None},
 )
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Error(Response):
     """The command was refused; ``code`` is 0 ... 2**32 - 1. 5.1."""
 
@@ -40,7 +34,6 @@ class Error(Response):
 
 
 @response(ResponseCode.XTS_SPR_PONG, name="PONG")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Pong(Response):
     """Answer to Ping: a `PongCode`. 5."""
 
@@ -57,7 +50,6 @@ class Pong(Response):
         )
     },
 )
-@dataclass(frozen=True, slots=True, kw_only=True)
 class System(Response):
     """The module tells its state unasked: a `SystemCode`. 5."""
 
@@ -70,7 +62,6 @@ _CONTENT_ID = fields.Number("I", shown=fields.short_hexadecimal)
 
 
 @response(_REPLY, ElementType.XTS_SPRD_NONE, name="REPLY NONE")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ReplyNone(Response):
     """Answer without elements; no firmware is known to send it. 5.2."""
 
@@ -80,7 +71,6 @@ class ReplyNone(Response):
 
 
 @response(_REPLY, ElementType.XTS_SPRD_BYTE, name="REPLY BYTE")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ReplyByte(Response):
     """Answer of bytes. 5.2."""
 
@@ -90,7 +80,6 @@ class ReplyByte(Response):
 
 
 @response(_REPLY, ElementType.XTS_SPRD_INT, name="REPLY INT")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ReplyInt(Response):
     """Answer of signed 32-bit integers; the only REPLY without trailer. 5.2."""
 
@@ -100,7 +89,6 @@ class ReplyInt(Response):
 
 
 @response(_REPLY, ElementType.XTS_SPRD_FLOAT, name="REPLY FLOAT")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ReplyFloat(Response):
     """Answer of float32 values, as exact Python floats. 5.2."""
 
@@ -112,7 +100,6 @@ class ReplyFloat(Response):
 
 
 @response(_REPLY, ElementType.XTS_SPRD_STRING, name="REPLY STRING")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ReplyString(Response):
     """Answer of text, one character per byte. 5.2."""
 
@@ -122,7 +109,6 @@ class ReplyString(Response):
 
 
 @response(_REPLY, ElementType.XTS_SPRD_USER, name="REPLY USER")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ReplyUser(Response):
     """Answer of a user structure, as bytes. 5.2."""
 
@@ -131,8 +117,7 @@ class ReplyUser(Response):
     values: Annotated[bytes, fields.Elements("c", 1, "values", trailer=1, trailer_shown=True)]
 
 
-@response(_DATA, ElementType.XTS_SPRD_FLOAT, name="DATA FLOAT", bulk=True)
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@response(_DATA, ElementType.XTS_SPRD_FLOAT, name="DATA FLOAT", bulk=True, eq=False)
 class DataFloat(Response):
     """A radar frame. 6.1.
 
@@ -161,7 +146,6 @@ class DataFloat(Response):
 
 
 @response(_DATA, ElementType.XTS_SPRD_BYTE, name="DATA BYTE", bulk=True)
-@dataclass(frozen=True, slots=True, kw_only=True)
 class DataByte(Response):
     """Generic bytes. 6.2."""
 
@@ -171,7 +155,6 @@ class DataByte(Response):
 
 
 @response(_DATA, ElementType.XTS_SPRD_STRING, name="DATA STRING")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class DataString(Response):
     """Debug text, one character per byte. 6.2."""
 
@@ -181,7 +164,6 @@ class DataString(Response):
 
 
 @response(_DATA, ElementType.XTS_SPRD_USER, name="DATA USER")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class DataUser(Response):
     """A user structure. 6.2."""
 
@@ -196,7 +178,6 @@ def _type_name(code: int) -> str:
 
 
 @response(ResponseCode.XTS_SPR_HIL, name="HIL")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class HilReply(Response):
     """Hardware-in-the-loop traffic, not used by an X4M300: a `HilCommand` and elements. 5.4.
 
@@ -257,8 +238,7 @@ _FREQUENCY_STEP = fields.Number("f", "frequency_step")
 _RANGE = fields.Number("f", "range")
 
 
-@response(*appdata(AppDataId.XTS_ID_BASEBAND_IQ), name="BASEBAND_IQ", bulk=True)
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@response(*appdata(AppDataId.XTS_ID_BASEBAND_IQ), name="BASEBAND_IQ", bulk=True, eq=False)
 class BasebandIq(_Bulk):
     """Complex baseband of the running profile. 7.1.
 
@@ -276,8 +256,9 @@ class BasebandIq(_Bulk):
     q: Annotated[FloatArray, fields.Bins("num_bins")]
 
 
-@response(*appdata(AppDataId.XTS_ID_BASEBAND_AMPLITUDE_PHASE), name="BASEBAND_AP", bulk=True)
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@response(
+    *appdata(AppDataId.XTS_ID_BASEBAND_AMPLITUDE_PHASE), name="BASEBAND_AP", bulk=True, eq=False
+)
 class BasebandAp(_Bulk):
     """Baseband as amplitude and phase [rad]. 7.1; fields as in `BasebandIq`."""
 
@@ -337,8 +318,9 @@ class _MatrixByte(_Bulk):
             return np.asarray(10.0 ** (decibels / 10.0), dtype=np.float64)
 
 
-@response(*appdata(AppDataId.XTS_ID_PULSEDOPPLER_FLOAT), name="PULSEDOPPLER_FLOAT", bulk=True)
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@response(
+    *appdata(AppDataId.XTS_ID_PULSEDOPPLER_FLOAT), name="PULSEDOPPLER_FLOAT", bulk=True, eq=False
+)
 class PulseDopplerFloat(_MatrixFloat):
     """Power spectrum of one range bin. 7.2.
 
@@ -349,8 +331,7 @@ class PulseDopplerFloat(_MatrixFloat):
     """
 
 
-@response(*appdata(AppDataId.XTS_ID_NOISEMAP_FLOAT), name="NOISEMAP_FLOAT", bulk=True)
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@response(*appdata(AppDataId.XTS_ID_NOISEMAP_FLOAT), name="NOISEMAP_FLOAT", bulk=True, eq=False)
 class NoiseMapFloat(_MatrixFloat):
     """Noise power spectrum of one range bin; fields as in `PulseDopplerFloat`. 7.2."""
 
@@ -365,8 +346,8 @@ _DECOMPRESSED: Mapping[str, Callable[[Any], Any]] = {
     name="PULSEDOPPLER_BYTE",
     bulk=True,
     derived=_DECOMPRESSED,
+    eq=False,
 )
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PulseDopplerByte(_MatrixByte):
     """Power spectrum of one range bin on a logarithmic scale. 7.2.
 
@@ -380,8 +361,8 @@ class PulseDopplerByte(_MatrixByte):
     name="NOISEMAP_BYTE",
     bulk=True,
     derived=_DECOMPRESSED,
+    eq=False,
 )
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class NoiseMapByte(_MatrixByte):
     """Noise power spectrum of one range bin; fields as in `PulseDopplerByte`. 7.2."""
 
@@ -391,7 +372,6 @@ _Floats = tuple[float, ...]
 
 
 @response(*appdata(AppDataId.XTS_ID_PRESENCE_SINGLE), name="PRESENCE_SINGLE")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class PresenceSingle(Response):
     """One person, once a second: `PresenceState`, `PresenceDirection`, quality 0 ... 10. 7.3."""
 
@@ -403,7 +383,6 @@ class PresenceSingle(Response):
 
 
 @response(*appdata(AppDataId.XTS_ID_PRESENCE_MOVINGLIST), name="PRESENCE_MOVINGLIST")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class PresenceMovingList(Response):
     """Movement by range and detections, once a second. 7.3.
 
@@ -433,7 +412,6 @@ class PresenceMovingList(Response):
 
 
 @response(*appdata(AppDataId.XTS_ID_RESP_STATUS), name="RESP_STATUS")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class RespStatus(Response):
     """Breathing: `RespirationState`, breaths per minute, movement [mm], quality. 7.4."""
 
@@ -446,7 +424,6 @@ class RespStatus(Response):
 
 
 @response(*appdata(AppDataId.XTS_ID_SLEEP_STATUS), name="SLEEP_STATUS")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class SleepStatus(Response):
     """Sleep: `RespirationState`, breaths per minute, quality, slow and fast movement. 7.4."""
 
@@ -460,7 +437,6 @@ class SleepStatus(Response):
 
 
 @response(*appdata(AppDataId.XTS_ID_VITAL_SIGNS), name="VITAL_SIGNS")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class VitalSigns(Response):
     """Rates of breath and heartbeat, with distances [m] and confidences. 7.4."""
 
@@ -479,7 +455,6 @@ class VitalSigns(Response):
 
 
 @response(*appdata(AppDataId.XTS_ID_SLEEPSTAGE), name="SLEEPSTAGE")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class SleepStage(Response):
     """Stage of sleep. 7.4."""
 
@@ -488,7 +463,6 @@ class SleepStage(Response):
 
 
 @response(*appdata(AppDataId.XTS_ID_RESPIRATION_MOVINGLIST), name="RESPIRATION_MOVINGLIST")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class RespirationMovingList(Response):
     """Movement by range, slow and fast; the two lists are equally long. 7.4."""
 
@@ -501,7 +475,6 @@ class RespirationMovingList(Response):
 
 
 @response(*appdata(AppDataId.XTS_ID_RESPIRATION_DETECTIONLIST), name="RESPIRATION_DETECTIONLIST")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class RespirationDetectionList(Response):
     """Detections: distances [m], cross sections, velocities; equally long lists. 7.4."""
 
@@ -523,7 +496,6 @@ class RespirationDetectionList(Response):
     *appdata(AppDataId.XTS_ID_RESPIRATION_NORMALIZEDMOVEMENTLIST),
     name="RESPIRATION_NORMALIZEDMOVEMENTLIST",
 )
-@dataclass(frozen=True, slots=True, kw_only=True)
 class RespirationNormalizedMovementList(Response):
     """Normalised movement per bin from ``start_m`` on, slow and fast, equally long. 7.4."""
 
@@ -536,7 +508,6 @@ class RespirationNormalizedMovementList(Response):
 
 
 @response(*appdata(AppDataId.XTS_ID_PROFILE_PARAMETERFILE), name="PROFILE_PARAMETERFILE")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ParameterFile(Response):
     """A profile's parameter file; the terminating NULs are taken off. 7.6."""
 
@@ -554,42 +525,35 @@ class _Opaque(Response):
 
 
 @response(*appdata(AppDataId.XTS_ID_RESP_STATUS_EXT), name="RESP_STATUS_EXT")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class RespStatusExt(_Opaque):
     """Extended breathing state; layout unknown. 7.4."""
 
 
 @response(*appdata(AppDataId.XTS_ID_RADAR_RF), name="RADAR_RF")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class RadarRf(_Opaque):
     """RF frame of newer firmware; order of its fields on the wire unproven. 7.5."""
 
 
 @response(*appdata(AppDataId.XTS_ID_RADAR_RF_NORMALIZED), name="RADAR_RF_NORMALIZED")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class RadarRfNormalized(_Opaque):
     """RF frame of newer firmware, as float; layout unproven. 7.5."""
 
 
 @response(*appdata(AppDataId.XTS_ID_RADAR_BASEBAND_FLOAT), name="RADAR_BASEBAND_FLOAT")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class RadarBasebandFloat(_Opaque):
     """Baseband frame of newer firmware, as float; layout unproven. 7.5."""
 
 
 @response(*appdata(AppDataId.XTS_ID_RADAR_BASEBAND_Q15), name="RADAR_BASEBAND_Q15")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class RadarBasebandQ15(_Opaque):
     """Baseband frame of newer firmware, as Q15; layout unproven. 7.5."""
 
 
 @response(*appdata(AppDataId.XTS_ID_PRESENCE_STATUS), name="PRESENCE_STATUS")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class PresenceStatus(_Opaque):
     """Legacy message; layout unknown. 7.5."""
 
 
 @response(*appdata(AppDataId.XTS_ID_DECIM_STATUS), name="DECIM_STATUS")
-@dataclass(frozen=True, slots=True, kw_only=True)
 class DecimStatus(_Opaque):
     """Legacy message; layout unknown. 7.5."""

@@ -1,16 +1,25 @@
 """The message table: what a row is, and the decorators that enter one.
 
-A row is a frozen dataclass under a decorator that names the bytes its payload begins with;
-``Annotated`` fields say how they lie on the wire. Encoder, decoder, CLI dump and test strategy
-follow from the row. A field under ``ClassVar`` lies on the wire only: a count that follows from
-the lists it counts. A command's row names its reply by its base, ``Command[Reply]``; that is what
-`X4M300.request` returns. The rows stand in the modules ``responses*`` and ``commands*``.
+A row is a class under a decorator that names the bytes its payload begins with and makes it a
+frozen dataclass; ``Annotated`` fields give their place on the wire. Encoder, decoder, CLI dump and
+test strategy follow from the row. A field under ``ClassVar`` exists on the wire only: a count that
+follows from the lists it counts. A command's row names its reply by its base, ``Command[Reply]``;
+that is what `X4M300.request` returns. The rows are in ``responses`` and ``commands``.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import UnionType
-from typing import Any, ClassVar, Generic, TypeVar, get_args, get_origin, get_type_hints
+from typing import (
+    Any,
+    ClassVar,
+    Generic,
+    TypeVar,
+    dataclass_transform,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from xethru_protocol.wire import fields
 from xethru_protocol.wire.codes import ErrorSpace
@@ -65,27 +74,22 @@ class Row:
 
 
 class Prefixes:
-    """Which message type a payload is of, told by the bytes it begins with."""
+    """Message types by the bytes their payloads begin with.
+
+    ``lengths`` holds those of the prefixes with one first byte, the longest first.
+    """
 
     def __init__(self) -> None:
         self.types: dict[bytes, type[Message]] = {}
-        self._lengths: dict[int, tuple[int, ...]] = {}  # by first byte, the longest first
+        self.lengths: dict[int, tuple[int, ...]] = {}
 
     def enter(self, prefix: bytes, cls: type[Message]) -> None:
         """Add a message type; ``ValueError`` if the prefix is another's."""
         if prefix in self.types:
             raise ValueError(f"{prefix.hex(' ')} is {self.types[prefix].__name__} already")
         self.types[prefix] = cls
-        lengths = {len(prefix), *self._lengths.get(prefix[0], ())}
-        self._lengths[prefix[0]] = tuple(sorted(lengths, reverse=True))
-
-    def find(self, payload: bytes) -> type[Message] | None:
-        """Type with the longest fitting prefix; None if there is none."""
-        for length in self._lengths.get(payload[0], ()) if payload else ():
-            cls = self.types.get(payload[:length])
-            if cls is not None:
-                return cls
-        return None
+        lengths = {len(prefix), *self.lengths.get(prefix[0], ())}
+        self.lengths[prefix[0]] = tuple(sorted(lengths, reverse=True))
 
 
 ROWS: dict[type[Message], Row] = {}
@@ -94,6 +98,7 @@ RESPONSES = Prefixes()
 MessageT = TypeVar("MessageT", bound=Message)
 
 
+@dataclass_transform(kw_only_default=True, frozen_default=True)
 def command(
     *prefix: int,
     name: str,
@@ -106,22 +111,29 @@ def command(
     def enter(cls: type[MessageT]) -> type[MessageT]:
         (answer,) = get_args(cls.__orig_bases__[0])  # type: ignore[attr-defined] # set for every generic base
         replies = get_args(answer) if isinstance(answer, UnionType) else (answer,)
-        row = _row(cls, bytes(prefix), name, derived, replies, reply_content_id, errors)
-        return _enter(COMMANDS, cls, row)
+        whole = _as_dataclass(cls, eq=True)
+        row = _row(whole, bytes(prefix), name, derived, replies, reply_content_id, errors)
+        return _enter(COMMANDS, whole, row)
 
     return enter
 
 
+@dataclass_transform(kw_only_default=True, frozen_default=True)
 def response(
     *prefix: int,
     name: str,
     bulk: bool = False,
+    eq: bool = True,
     derived: Mapping[str, Callable[[Any], Any]] | None = None,
 ) -> Callable[[type[MessageT]], type[MessageT]]:
-    """Enter a response into the table; ``bulk`` ones travel in NoEscape framing (1.3)."""
+    """Enter a response into the table; ``bulk`` ones travel in NoEscape framing (1.3).
+
+    ``eq`` is False for a class that compares itself.
+    """
 
     def enter(cls: type[MessageT]) -> type[MessageT]:
-        return _enter(RESPONSES, cls, _row(cls, bytes(prefix), name, derived, bulk=bulk))
+        whole = _as_dataclass(cls, eq=eq)
+        return _enter(RESPONSES, whole, _row(whole, bytes(prefix), name, derived, bulk=bulk))
 
     return enter
 
@@ -129,6 +141,10 @@ def response(
 def id32(number: int) -> tuple[int, ...]:
     """Prefix bytes of a 32-bit id."""
     return tuple(number.to_bytes(4, "little"))
+
+
+def _as_dataclass(cls: type[MessageT], *, eq: bool) -> type[MessageT]:
+    return dataclass(frozen=True, slots=True, kw_only=True, eq=eq)(cls)
 
 
 def _row(  # noqa: PLR0917 - the two decorators above are its only callers

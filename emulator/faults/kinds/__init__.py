@@ -1,1 +1,18 @@
 """Every kind of fault, one file per layer that it hits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from emulator.faults.kind import ENTERED, Kind, Layer
+
+# each enters its kinds
+from emulator.faults.kinds import bytes as _bytes  # noqa: F401
+from emulator.faults.kinds import commands, device, frames, stream  # noqa: F401
+
+_LAYERS = list(Layer)
+KINDS: Mapping[str, Kind] = MappingProxyType(
+    {kind.name: kind for kind in sorted(ENTERED, key=lambda kind: _LAYERS.index(kind.layer))}
+)
+"""The catalogue, in the order of its layers."""

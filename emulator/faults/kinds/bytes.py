@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Annotated
 
 from pydantic import Field
 
-from emulator.faults.kind import Context, Kind, Layer, Parameters, Piece, Target
+from emulator.faults.kind import Context, Layer, Parameters, Piece, Pieces, Target, kind
 from emulator.module.settings import what_is_heard
 from emulator.scene.philox import Dice
 from xethru_protocol.wire.framing import ESCAPE, START
-
-__all__ = ["KINDS"]
 
 _FLOW_CONTROL = b"\x11\x13"
 _CALM = bytes(code for code in range(256) if code not in b"\x7c\x7d\x7e\x7f")
@@ -24,7 +21,6 @@ class _At(Parameters):
     ] = None
 
     def place(self, data: bytes, dice: Dice) -> int:
-        """Return an index into the data, which is not empty."""
         return dice.below(len(data)) if self.at is None else min(self.at, len(data) - 1)
 
 
@@ -59,20 +55,34 @@ class _Baud(Parameters):
     )
 
 
-def _drop(data: bytes, wanted: _Several, dice: Dice, context: Context) -> Sequence[Piece]:
-    del context
+def _cut(data: bytes, size: int, gap_us: float) -> Pieces:
+    return [
+        Piece(data[at : at + size], delay_ns=round(at // size * gap_us * 1000))
+        for at in range(0, len(data), size)
+    ]
+
+
+_DAMAGE = "one damaged place, of the kind that the byte's role makes it"
+_SAME_BYTES = "The bytes are the same; a receiver that depended on how they are cut would be wrong."
+
+
+@kind(Layer.BYTE, Target.PACKET, _DAMAGE, _Several)
+def drop_bytes(data: bytes, wanted: _Several, dice: Dice, context: Context) -> Pieces:
+    """Bytes of a packet are lost."""
     at = wanted.place(data, dice)
     return [Piece(data[:at] + data[at + wanted.bytes :])]
 
 
-def _duplicate(data: bytes, wanted: _Several, dice: Dice, context: Context) -> Sequence[Piece]:
-    del context
+@kind(Layer.BYTE, Target.PACKET, _DAMAGE, _Several)
+def duplicate_bytes(data: bytes, wanted: _Several, dice: Dice, context: Context) -> Pieces:
+    """Bytes of a packet come twice."""
     end = wanted.place(data, dice) + 1
     return [Piece(data[:end] + data[max(end - wanted.bytes, 0) : end] + data[end:])]
 
 
-def _flip(data: bytes, wanted: _Flip, dice: Dice, context: Context) -> Sequence[Piece]:
-    del context
+@kind(Layer.BYTE, Target.PACKET, f"{_DAMAGE}; in a frame's samples off_lattice_samples", _Flip)
+def flip_bits(data: bytes, wanted: _Flip, dice: Dice, context: Context) -> Pieces:
+    """Bits of a packet are inverted."""
     flipped = bytearray(data)
     first = 0 if wanted.at is None else wanted.place(data, dice)
     room = 8 * (1 if wanted.at is not None and wanted.bits <= 8 else len(data) - first)
@@ -84,20 +94,23 @@ def _flip(data: bytes, wanted: _Flip, dice: Dice, context: Context) -> Sequence[
     return [Piece(bytes(flipped))]
 
 
-def _insert(data: bytes, wanted: _Several, dice: Dice, context: Context) -> Sequence[Piece]:
-    del context
+@kind(Layer.BYTE, Target.PACKET, _DAMAGE, _Several)
+def insert_bytes(data: bytes, wanted: _Several, dice: Dice, context: Context) -> Pieces:
+    """Random bytes appear inside a packet."""
     at = wanted.place(data, dice)
     return [Piece(data[:at] + dice.data(wanted.bytes) + data[at:])]
 
 
-def _noise_between(data: bytes, wanted: _Several, dice: Dice, context: Context) -> Sequence[Piece]:
-    del context
+@kind(Layer.BYTE, Target.PACKET, "1 fault 'bytes between packets' and junk_bytes = bytes", _Several)
+def noise_between(data: bytes, wanted: _Several, dice: Dice, context: Context) -> Pieces:
+    """Random bytes without a start appear before a packet."""
     noise = bytes(_CALM[dice.below(len(_CALM))] for _ in range(wanted.bytes))
     return [Piece(noise + data)]
 
 
-def _burst(data: bytes, wanted: _Burst, dice: Dice, context: Context) -> Sequence[Piece] | None:
-    del context
+@kind(Layer.BYTE, Target.PACKET, f"{_DAMAGE}; in a frame's samples off_lattice_samples", _Burst)
+def burst_errors(data: bytes, wanted: _Burst, dice: Dice, context: Context) -> Pieces:
+    """Bursts of bit errors after Gilbert and Elliott."""
     bad = False
     damaged = bytearray(data)
     for index in range(len(damaged)):
@@ -107,10 +120,9 @@ def _burst(data: bytes, wanted: _Burst, dice: Dice, context: Context) -> Sequenc
     return None if damaged == data else [Piece(bytes(damaged))]
 
 
-def _escape_lost(
-    data: bytes, wanted: Parameters, dice: Dice, context: Context
-) -> Sequence[Piece] | None:
-    del wanted, context
+@kind(Layer.BYTE, Target.PACKET, "1 fault; 2 where the byte behind it was 7D, which is a start now")
+def escape_lost(data: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+    """An escape byte of a Normal packet is lost."""
     if data[:1] != bytes((START,)):
         return None
     places, index = [], 1
@@ -125,155 +137,35 @@ def _escape_lost(
     return [Piece(data[:at] + data[at + 1 :])]
 
 
-def _flow_control(
-    data: bytes, wanted: Parameters, dice: Dice, context: Context
-) -> Sequence[Piece] | None:
-    del wanted, dice, context
+@kind(Layer.BYTE, Target.PACKET, _DAMAGE)
+def flow_control_swallowed(data: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+    """A line with XON/XOFF swallows bytes 11 and 13."""
     left = data.translate(None, _FLOW_CONTROL)
     return None if left == data else [Piece(left)]
 
 
-def _seven_bits(
-    data: bytes, wanted: Parameters, dice: Dice, context: Context
-) -> Sequence[Piece] | None:
-    del wanted, dice, context
+@kind(Layer.BYTE, Target.PACKET, _DAMAGE)
+def seven_bits(data: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+    """A line of seven bits clears the highest bit of every byte."""
     left = bytes(byte & 0x7F for byte in data)
     return None if left == data else [Piece(left)]
 
 
-def _split(data: bytes, wanted: _Split, dice: Dice, context: Context) -> Sequence[Piece]:
-    del dice, context
+@kind(Layer.BYTE, Target.PACKET, "nothing", _Split, hidden=_SAME_BYTES)
+def split_writes(data: bytes, wanted: _Split, dice: Dice, context: Context) -> Pieces:
+    """A packet comes in several writes."""
     return _cut(data, wanted.bytes, wanted.gap_us)
 
 
-def _one_byte(data: bytes, wanted: _Gap, dice: Dice, context: Context) -> Sequence[Piece]:
-    del dice, context
+@kind(Layer.BYTE, Target.PACKET, "nothing", _Gap, hidden=_SAME_BYTES)
+def one_byte_writes(data: bytes, wanted: _Gap, dice: Dice, context: Context) -> Pieces:
+    """A packet comes byte by byte."""
     return _cut(data, 1, wanted.gap_us)
 
 
-def _cut(data: bytes, size: int, gap_us: float) -> Sequence[Piece]:
-    return [
-        Piece(data[at : at + size], delay_ns=round(at // size * gap_us * 1000))
-        for at in range(0, len(data), size)
-    ]
-
-
-def _wrong_baud(data: bytes, wanted: _Baud, dice: Dice, context: Context) -> Sequence[Piece] | None:
-    del dice, context
+@kind(Layer.BYTE, Target.PACKET, "the packet is missing; what is heard of it counts as junk", _Baud)
+def wrong_baud(data: bytes, wanted: _Baud, dice: Dice, context: Context) -> Pieces:
+    """Sender and host disagree on the UART's rate; computed from the bits on the line."""
     if wanted.sent == wanted.heard:
         return None
     return [Piece(what_is_heard(data, wanted.sent, wanted.heard))]
-
-
-_DAMAGE = "one damaged place, of the kind that the byte's role makes it"
-_SAME_BYTES = "The bytes are the same; a receiver that depended on how they are cut would be wrong."
-
-KINDS = (
-    Kind(
-        name="drop_bytes",
-        layer=Layer.BYTE,
-        target=Target.PACKET,
-        summary="Bytes of a packet are lost.",
-        counted=_DAMAGE,
-        effect=_drop,
-        parameters=_Several,
-    ),
-    Kind(
-        name="duplicate_bytes",
-        layer=Layer.BYTE,
-        target=Target.PACKET,
-        summary="Bytes of a packet come twice.",
-        counted=_DAMAGE,
-        effect=_duplicate,
-        parameters=_Several,
-    ),
-    Kind(
-        name="flip_bits",
-        layer=Layer.BYTE,
-        target=Target.PACKET,
-        summary="Bits of a packet are inverted.",
-        counted=f"{_DAMAGE}; in a frame's samples off_lattice_samples",
-        effect=_flip,
-        parameters=_Flip,
-    ),
-    Kind(
-        name="insert_bytes",
-        layer=Layer.BYTE,
-        target=Target.PACKET,
-        summary="Random bytes appear inside a packet.",
-        counted=_DAMAGE,
-        effect=_insert,
-        parameters=_Several,
-    ),
-    Kind(
-        name="noise_between",
-        layer=Layer.BYTE,
-        target=Target.PACKET,
-        summary="Random bytes without a start appear before a packet.",
-        counted="1 fault 'bytes between packets' and junk_bytes = bytes",
-        effect=_noise_between,
-        parameters=_Several,
-    ),
-    Kind(
-        name="burst_errors",
-        layer=Layer.BYTE,
-        target=Target.PACKET,
-        summary="Bursts of bit errors after Gilbert and Elliott.",
-        counted=f"{_DAMAGE}; in a frame's samples off_lattice_samples",
-        effect=_burst,
-        parameters=_Burst,
-    ),
-    Kind(
-        name="escape_lost",
-        layer=Layer.BYTE,
-        target=Target.PACKET,
-        summary="An escape byte of a Normal packet is lost.",
-        counted="1 fault; 2 where the byte behind it was 7D, which is a start now",
-        effect=_escape_lost,
-    ),
-    Kind(
-        name="flow_control_swallowed",
-        layer=Layer.BYTE,
-        target=Target.PACKET,
-        summary="A line with XON/XOFF swallows bytes 11 and 13.",
-        counted=_DAMAGE,
-        effect=_flow_control,
-    ),
-    Kind(
-        name="seven_bits",
-        layer=Layer.BYTE,
-        target=Target.PACKET,
-        summary="A line of seven bits clears the highest bit of every byte.",
-        counted=_DAMAGE,
-        effect=_seven_bits,
-    ),
-    Kind(
-        name="split_writes",
-        layer=Layer.BYTE,
-        target=Target.PACKET,
-        summary="A packet comes in several writes.",
-        counted="nothing",
-        effect=_split,
-        parameters=_Split,
-        hidden=_SAME_BYTES,
-    ),
-    Kind(
-        name="one_byte_writes",
-        layer=Layer.BYTE,
-        target=Target.PACKET,
-        summary="A packet comes byte by byte.",
-        counted="nothing",
-        effect=_one_byte,
-        parameters=_Gap,
-        hidden=_SAME_BYTES,
-    ),
-    Kind(
-        name="wrong_baud",
-        layer=Layer.BYTE,
-        target=Target.PACKET,
-        summary="Sender and host disagree on the UART's rate; computed from the bits on the line.",
-        counted="the packet is missing; what is heard of it counts as junk",
-        effect=_wrong_baud,
-        parameters=_Baud,
-    ),
-)

@@ -74,7 +74,7 @@ def test_blocking_driver(benchmark: Any, port: str, checked: bool) -> None:  # n
     """Bar: 20 000 frames/s."""
     radar = X4M300.open(port)
     radar.geometry = GEOMETRY
-    radar._core.frames.lattice = RawConfig().lattice if checked else None
+    radar._link.frames.lattice = RawConfig().lattice if checked else None
     radar.read_frame(timeout_s=10.0)
     assert benchmark(lambda: sum(1 for _ in radar.frames(FRAMES))) == FRAMES
     assert radar.statistics.off_lattice_samples == 0
@@ -88,7 +88,7 @@ def test_asynchronous_driver(benchmark: Any, port: str) -> None:  # noqa: ANN401
         async def begin() -> AsyncX4M300:
             radar = AsyncX4M300.open(port)
             radar.geometry = GEOMETRY
-            radar._core.frames.lattice = RawConfig().lattice
+            radar._link.frames.lattice = RawConfig().lattice
             await radar.read_frame(timeout_s=10.0)
             return radar
 

@@ -13,7 +13,7 @@ from emulator.echo.echo import echo_source
 from emulator.scene.philox import frame_noise_units
 from emulator.scene.scene import load_scene
 from emulator.scene.wheels import scene_odometry
-from hil_tests.captures import PAPER
+from hil_tests.unit.emulator.rooms import PAPER
 
 FAST = replace(PAPER, pulses_per_step=10)  # the settings of 400 frames/s
 BLOCK = 32

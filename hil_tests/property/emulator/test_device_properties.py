@@ -1,14 +1,12 @@
 """Whatever a host sends, the module never raises, never blocks, and never grows."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.device import Device, radar_device
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource, ramp_device
 from xethru_protocol.wire import messages as m

@@ -1,7 +1,5 @@
 """Laws of the echo in any scene: shifts, blocks, linearity, radar order, independence."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 
@@ -13,9 +11,9 @@ from numpy.typing import NDArray
 
 from emulator.chip.chip import CaptureSettings
 from emulator.echo.echo import SceneEcho, echo_source
-from emulator.echo.pulse import sum_of_pulses
+from emulator.echo.reflections import sum_of_pulses
 from emulator.scene.scene import ClutterSpec, LeakageSpec, Scene, load_scene
-from hil_tests.captures import PAPER
+from hil_tests.unit.emulator.rooms import PAPER
 
 CAPTURE = replace(PAPER, n_samples=400)
 LAB = load_scene("lab")

@@ -1,7 +1,5 @@
 """What holds for every fault: no plan changes nothing, one seed gives the same bytes."""
 
-from __future__ import annotations
-
 from typing import Any, cast
 
 import numpy as np
@@ -9,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.faults.faulty_device import wrap
@@ -24,7 +22,8 @@ from emulator.faults.kind import (
     classify,
     frame_packet,
 )
-from emulator.faults.plan import KINDS, FaultPlan, TruthLog, fault_spec
+from emulator.faults.kinds import KINDS
+from emulator.faults.plan import FaultPlan, TruthLog, fault_spec
 from emulator.module.memory import Identity
 from emulator.scene.philox import Dice
 from emulator.scene.scene import empty_room

@@ -4,8 +4,6 @@ The model is independent: it moves in steps of device time small enough to see e
 and holds the recording's position as an exact fraction.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from fractions import Fraction
 

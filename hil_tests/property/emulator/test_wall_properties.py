@@ -1,7 +1,5 @@
 """Laws of paths in rooms: rigid motions, reversal of walls, reciprocity, energy, shadows."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from contextlib import nullcontext

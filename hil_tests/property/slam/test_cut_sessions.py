@@ -1,7 +1,5 @@
 """A session cut or damaged anywhere: what is left is a prefix, and `repair` makes it whole."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 from contextlib import suppress
@@ -19,12 +17,13 @@ from rosbags.highlevel import AnyReader
 from hil_tests.unit.slam.app.sessions import FRAME_NS, session_info, snapshot
 from slam.app.errors import AppError
 from slam.app.records import Scan
-from slam.app.session import messages as ros
 from slam.app.session.log import SessionLog
-from slam.app.session.mcap import CHUNK, RawMessage, read_entries
+from slam.app.session.mcap import read_entries
 from slam.app.session.reader import open_session
 from slam.app.session.repair import KEPT_SUFFIX, repair
 from slam.frames import RadarFrame
+from xethru_protocol.recordings.mcap import CHUNK, FLOAT_ARRAY
+from xethru_protocol.recordings.mcap import Message as StoredMessage
 
 N_BINS = 32
 N_SCANS = 16
@@ -82,7 +81,7 @@ def messages(path: Path) -> list[Message]:
     return [
         (entry.topic, entry.sequence, entry.t_ns, entry.publish_ns, entry.data)
         for entry in read_entries(path, lambda _: None)
-        if isinstance(entry, RawMessage)
+        if isinstance(entry, StoredMessage)
     ]
 
 
@@ -113,9 +112,10 @@ def test_a_cut_at_any_byte_leaves_a_prefix(whole: Content, tmp_path: Path) -> No
     path.write_bytes(whole)
     everything = messages(path)
     assert len(everything) == 2 + 1 + 1 + N_SCANS * (3 + 5)
-    longest = 0
+    longest, whole_until_ns = 0, -1
     # every record's first bytes, all of a chunk's head, and a comb through the rest
     starts = list(top_level_places(whole))
+    before = starts[0]
     places = {at + k for at in starts for k in (-1, 0, 1, 9)}
     places |= {at + k for at in starts if whole[at] == CHUNK for k in range(0, 60, 3)}
     places |= set(range(8, len(whole), 101))
@@ -125,6 +125,10 @@ def test_a_cut_at_any_byte_leaves_a_prefix(whole: Content, tmp_path: Path) -> No
         assert found == everything[: len(found)], cut
         assert len(found) >= longest, cut  # more bytes never give less
         longest = len(found)
+        if cut in starts and whole[before] == CHUNK:  # and no whole chunk is lost
+            whole_until_ns = struct.unpack_from("<Q", whole, before + 17)[0]
+        assert whole_until_ns < 0 or found[-1][2] >= whole_until_ns, cut
+        before = cut if cut in starts else before
     assert longest == len(everything)
 
 
@@ -250,7 +254,7 @@ def test_ros_types_survive(whole: Content, tmp_path: Path) -> None:
         connection = next(c for c in reader.connections if c.topic == "/radar/radar1/frame")
         _, t_ns, raw = next(reader.messages([connection]))
         message = reader.deserialize(raw, connection.msgtype)
-    assert connection.msgtype == ros.FLOAT_ARRAY
+    assert connection.msgtype == FLOAT_ARRAY
     assert (t_ns, len(message.data)) == (0, N_BINS)  # type: ignore[attr-defined]  # made at run time
 
 

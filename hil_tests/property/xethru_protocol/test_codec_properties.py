@@ -1,4 +1,4 @@
-"""Every row of the message table, both ways, and any bytes."""
+"""Laws of the codec and the connection."""
 
 import json
 from collections.abc import Callable
@@ -19,6 +19,8 @@ from xethru_protocol.wire.codec import (
     encode,
 )
 from xethru_protocol.wire.codes import X4Setting
+from xethru_protocol.wire.connection import Connection, Role
+from xethru_protocol.wire.framing import NEED_DATA
 from xethru_protocol.wire.messages import X4DriverSet
 from xethru_protocol.wire.table import (
     COMMANDS,
@@ -130,3 +132,28 @@ def test_every_command_names_its_reply() -> None:
         if issubclass(cls, Command):
             assert row.replies, cls
             assert all(issubclass(reply, Message) for reply in row.replies)
+
+
+def events(connection: Connection) -> list[Any]:
+    found = []
+    while (event := connection.next_event()) is not NEED_DATA:
+        found.append(event)
+    return found
+
+
+@given(st.lists(messages(Response), max_size=5), st.integers(1, 40))
+def test_a_host_hears_what_a_module_says(sent: list[Any], chunk: int) -> None:
+    module, host = Connection(Role.MODULE), Connection(Role.HOST)
+    line = b"".join(map(module.send, sent))
+    heard = []
+    for begin in range(0, len(line), chunk):
+        host.receive_data(line[begin : begin + chunk])
+        heard += events(host)
+    assert heard == sent
+
+
+@given(st.lists(messages(Command), max_size=5))
+def test_a_module_hears_what_a_host_says(sent: list[Any]) -> None:
+    host, module = Connection(Role.HOST), Connection(Role.MODULE)
+    module.receive_data(b"".join(map(host.send, sent)))
+    assert events(module) == sent

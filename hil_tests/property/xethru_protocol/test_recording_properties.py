@@ -1,7 +1,5 @@
 """What is written is read, in every format; a cut anywhere leaves a prefix and one fault."""
 
-from __future__ import annotations
-
 import tempfile
 from datetime import UTC
 from functools import cache

@@ -1,7 +1,5 @@
 """The authors' data set as we can make it: bags of their layout through convert and replay."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

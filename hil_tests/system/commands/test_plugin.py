@@ -1,7 +1,5 @@
 """The plugin as a user runs it: pytest in an empty folder, radars of another process."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -29,7 +27,7 @@ def test_my_reflector_is_there(radar, measure):
 
 # A driver that forgets to escape 7F, and only that.
 PLANTED = """
-from xethru_protocol import connection
+from xethru_protocol.wire import connection
 
 def wrong(payload):
     checksum = 0x7D
@@ -198,8 +196,9 @@ def test_workers_share_emulated_radars_and_leave_real_ones_to_one_of_them(
     assert done.returncode == 0, done.stdout
     ran = [line for line in done.stdout.splitlines() if line.startswith("[gw")]
     assert len(ran) == 22
-    assert len({line[:5] for line in ran if "[radar_1" in line}) == 1
-    assert {line[:5] for line in ran if "[emu" in line} == {"[gw0]", "[gw1]"}
+    (of_the_real_one,) = {line[:5] for line in ran if "[radar_1" in line}
+    # how many of the others go to the same worker depends on the load
+    assert {line[:5] for line in ran if "[emu" in line} - {of_the_real_one}
     assert refused.returncode == 4
     assert "all workers want this radar at once" in refused.stderr
 

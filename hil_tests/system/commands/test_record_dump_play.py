@@ -3,8 +3,6 @@
 The messages are the same everywhere, byte for byte.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,11 +1,14 @@
-"""`uwb-slam sweep`: same numbers on one process or two, groups that follow from the runs."""
+"""The command uwb-slam sweep: the same numbers on one process, two, or a Dask cluster."""
 
 import contextlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +17,6 @@ import pytest
 
 from hil_tests.patience import seconds, wait_until
 from hil_tests.system.short_scene import write_short_scene
-from slam.app.cli import main
 from slam.app.rig.emulated import end_counter
 from slam.app.sweep.run import make_case, run_case
 
@@ -99,17 +101,6 @@ def test_ctrl_c_while_workers_start(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [script]
 
 
-def test_an_out_that_cannot_be_written_fails_before_the_first_run(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "file").touch()
-    for out, said in ((tmp_path, "is a folder"), (tmp_path / "file" / "o", "file")):
-        assert main(["sweep", "--seeds", "1000", "--json", str(out)]) == 1
-        text = capsys.readouterr()
-        assert said in text.err
-        assert (text.out, text.err.count("\n")) == ("", 1)
-
-
 def test_a_stressed_run_loses_frames_and_has_a_bound_on_what_is_left(tmp_path: Path) -> None:
     pytest.importorskip("gtsam")
     case = make_case(str(write_short_scene(tmp_path)), "paper", 0, stress="all", bound=True)
@@ -122,3 +113,55 @@ def test_a_stressed_run_loses_frames_and_has_a_bound_on_what_is_left(tmp_path: P
     # true associations beat wheels, and who knows the whole run beats who knows the past
     assert run.bound.smoothed_ate_rmse_m < run.bound.filtered_ate_rmse_m
     assert run.bound.filtered_ate_rmse_m < run.odometry_ate_rmse_m
+
+
+QUIET = ("--no-dashboard", "--host", "127.0.0.1")
+
+
+@contextmanager
+def dask(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """Run `dask ...` until the block ends."""
+    command = [sys.executable, "-m", "dask", *arguments]
+    with subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    ) as (process):
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def scheduler_address(scheduler: subprocess.Popen[str]) -> str:
+    assert scheduler.stderr is not None
+    for line in scheduler.stderr:
+        if said := re.search(r"Scheduler at: *(tcp://\S+)", line):
+            return said[1]
+    raise AssertionError("the scheduler ended without a word")
+
+
+def sweep_on(scene: Path, out: Path, where: Sequence[str]) -> dict[str, Any]:
+    command = [sys.executable, "-m", "slam.app.cli", "sweep", "--scene", str(scene)]
+    command += ["--preset", "paper"]
+    command += ["--seeds", "1", "--stress", "dropped", "--json", str(out), *where]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    assert run.stderr.count(" elapsed, ") == run.stderr.count("\n") == 2
+    result: dict[str, Any] = json.loads(out.read_text())
+    for row in (*result["runs"], *result["groups"]):
+        del row["realtime_factor"]  # of the wall clock
+    return result
+
+
+def test_a_cluster_gives_what_one_machine_gives(tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    scene = write_short_scene(tmp_path)
+    with ExitStack() as stack:
+        scheduler = stack.enter_context(dask("scheduler", *QUIET, "--port", "0"))
+        address = scheduler_address(scheduler)
+        worker = ("worker", address, *QUIET, "--no-nanny", "--nthreads", "2")
+        for name in ("a", "b"):
+            folder = str(tmp_path / name)
+            stack.enter_context(dask(*worker, "--name", name, "--local-directory", folder))
+        clustered = sweep_on(scene, tmp_path / "cluster.json", ["--dask", address])
+    assert clustered == sweep_on(scene, tmp_path / "alone.json", ["--jobs", "1"])
+    assert [run["stress"] for run in clustered["runs"]] == ["clean", "dropped"]

@@ -1,13 +1,11 @@
 """Through pseudo-terminals and in process: the same frames, bit for bit."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 
 import pytest
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport

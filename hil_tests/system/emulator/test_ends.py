@@ -1,7 +1,5 @@
 """How serve and play start and end, whatever happens around them."""
 
-from __future__ import annotations
-
 import json
 import os
 import select

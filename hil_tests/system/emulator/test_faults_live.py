@@ -1,7 +1,5 @@
 """`serve --faults`, its truth log, and `ctl` on the running emulator, from outside."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

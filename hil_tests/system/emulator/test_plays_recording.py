@@ -1,7 +1,5 @@
 """A recording made on real hardware goes through an emulated module's port, byte for byte."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path

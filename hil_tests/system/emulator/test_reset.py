@@ -4,8 +4,6 @@ How long it took is told on the module's clock: a frame's counter is scene time,
 says when scene time 0 was.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from pathlib import Path

@@ -28,6 +28,7 @@ from slam.app.run.results import evaluate
 from slam.app.session import messages as ros
 from slam.app.sweep.run import run_in_process, run_one
 from slam.app.view.rerun_recording import count_rows
+from xethru_protocol.recordings.mcap import FLOAT_ARRAY, unpack_array
 
 pytestmark = pytest.mark.slow
 
@@ -158,7 +159,7 @@ def test_frames_through_ports_and_in_process_are_bit_identical(demo: Finished) -
         for frame in scan.frames:
             t_ns, data = recorded[f"/radar/{RADARS[frame.radar]}/frame", frame.counter]
             assert t_ns == frame.t_ns
-            samples = ros.deserialise(data, ros.FLOAT_ARRAY).data
+            samples = unpack_array(FLOAT_ARRAY, data)
             assert samples.tobytes() == frame.samples.tobytes()
             n_compared += 1
     assert n_compared == len(recorded)

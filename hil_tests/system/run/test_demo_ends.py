@@ -16,7 +16,7 @@ from hil_tests.patience import catches, seconds, wait_until
 from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.sessions import surviving_counters
 from slam.app.cli import main
-from slam.app.commands import demo as demo_module
+from slam.app.run import results
 from slam.app.view.rerun_recording import count_rows
 
 pytestmark = [
@@ -134,7 +134,7 @@ def test_a_file_that_may_not_grow_is_one_line(tmp_path: Path) -> None:
     [
         pytest.param("summarise", marks=pytest.mark.thorough),
         "write_trajectories",
-        pytest.param("print_table", marks=pytest.mark.thorough),
+        pytest.param("print_result", marks=pytest.mark.thorough),
     ],
 )
 def test_a_signal_after_the_last_scan(
@@ -143,13 +143,13 @@ def test_a_signal_after_the_last_scan(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    real = getattr(demo_module, step)
+    real = getattr(results, step)
 
     def interrupted(*arguments: object, **options: object) -> object:
         os.kill(os.getpid(), signal.SIGTERM)
         return real(*arguments, **options)
 
-    monkeypatch.setattr(demo_module, step, interrupted)
+    monkeypatch.setattr(results, step, interrupted)
     out = tmp_path / "out"
     command = [
         "demo",
@@ -162,7 +162,7 @@ def test_a_signal_after_the_last_scan(
     ]
     assert main(command) == 143
     assert capsys.readouterr().err.splitlines()[-1].startswith("uwb-slam: stopped by SIGTERM")
-    assert (out / "map.png").exists() == (step == "print_table")
+    assert (out / "map.png").exists() == (step == "print_result")
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """`uwb-slam run` as a user runs it: an emulator in real time, four ports, odometry beside them."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """``xethru-emulator play`` of a session of four radars: each at its own port, byte for byte."""
 
-from __future__ import annotations
-
 import os
 import select
 import time

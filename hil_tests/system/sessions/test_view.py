@@ -26,12 +26,14 @@ from hil_tests.system.recorded_session import (
 from slam.app.cli import main
 from slam.app.commands.view import is_finished, session_file
 from slam.app.errors import AppError
-from slam.app.run.replay import replay_session
+from slam.app.run.replay import recorded_source
+from slam.app.run.runner import execute
 from slam.app.session.reader import open_session
 from slam.app.view import rerun_recording
 from slam.app.view.rerun_recording import count_rows
 from slam.app.view.rerun_sdk import RrdReader, rr
 from slam.app.view.viewer import LiveView, executable
+from xethru_protocol.system import StopFlag
 
 pytestmark = pytest.mark.slow
 
@@ -159,7 +161,7 @@ def test_a_run_goes_on_when_its_viewer_is_killed(
     viewed: Viewed, capsys: pytest.CaptureFixture[str]
 ) -> None:
     session = open_session(viewed.session)
-    with LiveView("serve-web", lambda: None) as live:
+    with LiveView("serve-web", StopFlag()) as live:
         watcher = live.observer(session.info)
         for number, (scan, _) in enumerate(session.scans()):
             if number == 20:
@@ -175,7 +177,7 @@ def test_an_address_where_nobody_listens_is_named(capsys: pytest.CaptureFixture[
         probe.bind(("127.0.0.1", 0))  # bound and not listening: nobody else gets it meanwhile
         url = f"rerun+http://127.0.0.1:{probe.getsockname()[1]}/proxy"
         with pytest.raises(AppError, match=f"^{re.escape(url)}: no viewer listens there"):
-            LiveView(url, lambda: None).__enter__()
+            LiveView(url, StopFlag()).__enter__()
     with pytest.raises(SystemExit) as usage:
         main(["demo", "--rerun", "http://127.0.0.1:9876"])
     assert usage.value.code == 2
@@ -202,10 +204,8 @@ def test_a_viewer_gets_every_row_that_a_file_gets(
     expected = without_pictures(viewed.rrd)
     with saving_viewer(saved := tmp_path / "saved.rrd") as url:
         session = open_session(viewed.session)
-        with LiveView(url, lambda: None, is_replay=True) as live:
-            view = live.observer(session.info)
-            replay_session(session, [view], lambda: None)
-            view.close()
+        with LiveView(url, StopFlag(), is_replay=True) as live:
+            execute(recorded_source(session, StopFlag()), [live.observer(session.info)])
         wait_until(lambda: without_pictures(saved) == expected)
     assert without_pictures(saved) == expected
     assert sum(expected.values()) > 1000
@@ -269,18 +269,6 @@ def kill_viewer() -> None:
     os.waitid(os.P_PID, viewer, os.WEXITED | os.WNOWAIT)
 
 
-def test_what_is_left_of_a_cut_session_is_shown(
-    viewed: Viewed, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    whole = viewed.session.read_bytes()
-    (cut := tmp_path / "cut.mcap").write_bytes(whole[: len(whole) // 2])
-    assert main(["view", str(cut), "--out", str(tmp_path / "v.rrd")]) == 0
-    assert f"{cut} was cut at byte" in capsys.readouterr().err
-    rows, all_rows = count_rows(tmp_path / "v.rrd"), count_rows(viewed.rrd)
-    share = rows["/radar/front_left/frame"] / all_rows["/radar/front_left/frame"]
-    assert 0.3 < share < 0.6
-
-
 def test_of_a_killed_run_the_session_is_shown_not_its_unfinished_view(
     viewed: Viewed, tmp_path: Path
 ) -> None:
@@ -296,23 +284,6 @@ def test_of_a_killed_run_the_session_is_shown_not_its_unfinished_view(
     assert is_finished(viewed.rrd)
 
 
-def test_a_result_never_takes_the_place_of_the_session(
-    viewed: Viewed, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    session = tmp_path / "session.mcap"
-    shutil.copy(viewed.session, session)
-    before = session.read_bytes()
-    (link := tmp_path / "link.rrd").symlink_to(session)
-    for arguments in (
-        ["view", str(session), "--out", str(link)],
-        ["view", str(session), "--screenshot", str(session)],
-        ["report", str(session), "--out", str(session)],
-    ):
-        assert main(arguments) == 2
-        assert "is the session itself; write to another file" in capsys.readouterr().err
-    assert session.read_bytes() == before
-
-
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full (Linux)")
 @pytest.mark.parametrize("command", ["view", "report"])
 def test_a_full_disk_is_one_line(
@@ -321,38 +292,3 @@ def test_a_full_disk_is_one_line(
     assert main([command, str(viewed.session), "--out", "/dev/full"]) == 1
     last = capsys.readouterr().err.splitlines()[-1]
     assert last.startswith("uwb-slam: /dev/full: cannot be written: No space left on device")
-
-
-def test_what_cannot_be_shown_is_one_line(
-    viewed: Viewed,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    (foreign := tmp_path / "notes.rrd").write_text("a list of things to buy")
-    head = viewed.rrd.read_bytes()[:4]
-    (future := tmp_path / "future.rrd").write_bytes(head + bytes((1, 2, 0, 0)) + b"\0" * 100)
-    (old := tmp_path / "old.rrd").write_bytes(head + bytes((0, 20, 0, 0)) + b"\0" * 100)
-    (killed := tmp_path / "killed.rrd").write_bytes(viewed.rrd.read_bytes()[:-1000])
-    (cut := tmp_path / "cut.mcap").write_bytes(viewed.session.read_bytes()[:100])
-    out = str(tmp_path / "out.rrd")
-    for arguments, code, expected in (
-        ([str(viewed.rrd)], 1, "no display for the viewer's window; let a browser"),
-        ([str(tmp_path / "none.mcap")], 1, "no such file"),
-        ([str(tmp_path)], 1, "holds no session.rrd nor session.mcap"),
-        ([str(foreign)], 1, "is no Rerun recording"),
-        ([str(future)], 1, "written by Rerun 1.2, newer than the 0.41 here can open"),
-        ([str(killed)], 1, "was never closed, its program was killed; make it again"),
-        ([str(old)], 1, "written by Rerun 0.20, older than"),
-        ([str(cut), "--out", out], 1, str(cut)),
-        ([str(viewed.rrd), "--out", out], 2, "is an .rrd already"),
-        ([str(viewed.session), "--out", str(tmp_path / "no" / "v.rrd")], 1, "cannot be written"),
-        ([str(viewed.session), "--at", "3"], 2, "--at: says when a --screenshot is taken"),
-    ):
-        assert main(["view", *arguments]) == code, arguments
-        said = capsys.readouterr().err
-        assert said.startswith("uwb-slam: ")
-        assert expected in said
-        assert said.count("\n") == 1, said

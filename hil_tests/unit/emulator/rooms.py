@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.chip.chip import CaptureSettings
 from emulator.echo.echo import ScenePaths
 from emulator.scene.scene import (
     MIRROR_AMPLITUDE_1M,
@@ -98,3 +99,17 @@ def heard(radar: RadarSpec, *, t_ns: int = 0, **parts: Any) -> Heard:  # noqa: A
         amplitude=paths.amplitude[0, there],
         phase_rad=phase_rad[0, there],
     )
+
+
+PAPER = CaptureSettings(
+    first_sample_m=0.19929,
+    n_samples=1431,
+    iterations=16,
+    pulses_per_step=300,
+    dac_min=949,
+    dac_max=1100,
+    dac_step=0,
+    tx_power=2,
+    tx_center_frequency=3,
+)
+"""The paper's raw capture."""

@@ -2,49 +2,27 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport
 from emulator.scene.scene import load_scene
 from hil_tests.unit.emulator.doubles import IDENTITY, ramp_device
-from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire.codes import PongCode
 from xethru_protocol.wire.errors import Disconnected, ResponseTimeout
-
-
-@pytest.mark.parametrize(("downconversion", "bins"), [(False, 1431), (True, 181)])
-def test_the_driver_gets_frames_of_the_documented_length(downconversion: bool, bins: int) -> None:
-    transport = LoopbackTransport(ramp_device())
-    with X4M300(transport, clock=transport.clock_ns) as radar:
-        geometry = radar.configure_raw(RawConfig(downconversion=downconversion))
-        rate = radar.start(17.0)
-        frames = list(radar.frames(50))
-        assert geometry.n_bins == bins
-        assert rate == pytest.approx(17.049379, abs=1e-6)
-        assert [frame.counter for frame in frames] == list(range(50))
-        assert {frame.samples.shape for frame in frames} == {(bins,)}
-        assert {frame.samples.dtype for frame in frames} == {
-            np.dtype(np.complex64 if downconversion else np.float32)
-        }
-        assert (radar.frames_lost, radar.frames_discarded, radar.fault_count) == (0, 0, 0)
 
 
 def test_virtual_time_makes_a_silent_module_time_out_at_once() -> None:
     transport = LoopbackTransport(ramp_device())
     with X4M300(transport, clock=transport.clock_ns) as radar:
         radar.configure_raw()  # ends the profile
-        began = time.monotonic()
         with pytest.raises(ResponseTimeout):
             radar.read_frame(timeout_s=3600.0)
         assert transport.clock_ns() >= 3600 * 10**9
-        assert time.monotonic() - began < 5
 
 
 def test_a_reset_takes_no_wall_time() -> None:

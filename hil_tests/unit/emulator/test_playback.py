@@ -19,7 +19,6 @@ from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings import (
     RecordingError,
-    RecordingFault,
     RecordingWriter,
     WireCapture,
     convert,
@@ -27,7 +26,6 @@ from xethru_protocol.recordings import (
 )
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import X4Setting
-from xethru_protocol.wire.errors import ResponseTimeout
 
 IDENTITY = Identity(serial="123456789012")
 RECORDINGS = FIXTURES / "recordings"
@@ -55,30 +53,6 @@ def wire_bytes(device: Device) -> bytes:
 
 def copy_of_the_vendors_recording(folder: Path) -> Path:
     return Path(shutil.copytree(RECORDINGS / "iq", folder / "recording"))
-
-
-def counters_played(recording: Path, faults: list[RecordingFault]) -> list[int]:
-    options = PlayOptions(rate=0, loop=False)
-    (played,) = played_radars(recording, options, identity=IDENTITY, on_fault=faults.append)
-    line = LoopbackTransport(played.device)
-    counters = []
-    with X4M300(line, clock=line.clock_ns) as radar:
-        while True:
-            try:
-                counters.append(radar.read_frame(timeout_s=5).counter)
-            except ResponseTimeout:
-                return counters
-
-
-def test_a_cut_last_record_costs_that_record_only(tmp_path: Path) -> None:
-    recording = copy_of_the_vendors_recording(tmp_path)
-    faults: list[RecordingFault] = []
-    whole = counters_played(recording, faults)
-    assert faults == []
-    data = next(recording.glob("*baseband_iq*.dat"))
-    data.write_bytes(data.read_bytes()[:-1])
-    assert counters_played(recording, faults) == whole[:-1]
-    assert [Path(fault.file).name for fault in faults] == [data.name]
 
 
 def test_a_recording_of_nothing_is_refused(tmp_path: Path) -> None:

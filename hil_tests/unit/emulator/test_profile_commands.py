@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.device import Device, radar_device
 from emulator.module.settings import DeviceOptions
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource
@@ -31,8 +31,7 @@ def device(options: DeviceOptions | None = None) -> Device:
 
 def loaded(options: DeviceOptions | None = None) -> BareHost:
     host = BareHost(device(options))
-    assert host.ask(STOP) == m.Ack()
-    assert host.ask(LOAD) == m.Ack()
+    host.command(STOP, LOAD)
     return host
 
 
@@ -151,25 +150,6 @@ def test_values_out_of_range_are_refused(command: m.Command[m.Ack]) -> None:
     assert loaded().ask(command) == m.Error(code=0x21)
 
 
-# 8.3: a profile setting in each state
-PLACES = [
-    ([], 0x21),
-    ([m.SetMode(mode=0x11)], 0x21),
-    ([STOP], 1),
-    ([STOP, m.SetMode(mode=0x12)], 0x21),
-]
-
-
-@pytest.mark.parametrize(("way", "code"), PLACES)
-def test_settings_are_taken_only_from_a_stopped_profile(
-    way: list[m.Command[m.Ack]], code: int
-) -> None:
-    host = BareHost(device())
-    for command in way:
-        assert host.ask(command) == m.Ack()
-    assert host.ask(m.SetSensitivity(sensitivity=1)) == m.Error(code=code)
-
-
 def test_gets_without_a_profile() -> None:
     """4.4: sensitivity and band ERROR 1, several others no reply at all."""
     for silence in ("silence", "error"):
@@ -244,8 +224,7 @@ def test_noise_maps_are_files() -> None:
         assert host.ask(m.StoreNoiseMap()) == m.Ack()
         assert host.ask(m.StoreNoiseMap()) == m.Error(code=3), "one is under way"
         assert host.ask(m.FindAllFiles()) == found
-        assert host.ask(m.LoadNoiseMap()) == m.Ack()
-        assert host.ask(m.DeleteNoiseMap(sub_code=sub_code)) == m.Ack()
+        host.command(m.LoadNoiseMap(), m.DeleteNoiseMap(sub_code=sub_code))
         assert host.ask(m.FindAllFiles()) == m.ReplyInt(values=())
         host.now_ns += SECOND
     assert host.ask(m.DeleteNoiseMap()) == m.Ack(), "also if there is none"
@@ -276,8 +255,7 @@ TWO_PROFILES = frozenset({ProfileId.XTS_ID_APP_PRESENCE_2, ProfileId.XTS_ID_APP_
 
 def test_each_profile_has_its_own_settings() -> None:
     host = loaded(DeviceOptions(profiles=TWO_PROFILES))
-    assert host.ask(m.SetSensitivity(sensitivity=8)) == m.Ack()
-    assert host.ask(m.LoadApp(profile_id=PRESENCE_3)) == m.Ack()
+    host.command(m.SetSensitivity(sensitivity=8), m.LoadApp(profile_id=PRESENCE_3))
     assert host.ask(m.GetSensitivity()) == m.ReplyInt(content_id=0x10A5112B, values=(5,))
     assert host.ask(LOAD) == m.Ack()
     assert host.ask(m.GetSensitivity()) == m.ReplyInt(content_id=0x10A5112B, values=(8,))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from hil_tests.plugin.bench import Bench
-from hil_tests.plugin.gate import FINDINGS, gate
-from hil_tests.plugin.places import TappedTransport
+from hil_tests.plugin.gate import findings_of, gate
 from hil_tests.plugin.specs import parse_specs
+from hil_tests.plugin.wire_tap import TappedTransport
 
 
 @pytest.mark.requires("profiles")
@@ -26,5 +26,5 @@ def test_a_line_is_closed_where_the_firmware_turns_out_to_lack_something(
     with pytest.raises((pytest.skip.Exception, pytest.fail.Exception), match="needs profiles"):
         gate(request, bench, tuple(bench.specs))
     assert len(closed) == 1
-    findings = FINDINGS.of(request.node)
+    findings = findings_of(request.node)
     findings.names, findings.radars, findings.reason = (), (), None  # not a test of that radar

@@ -5,42 +5,20 @@ noise, and a wheel odometry with per-run biases. No product code takes part: geo
 out again here, so the pipeline is judged by an independent world.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hil_tests.unit.slam.robust.range_world import STEP_M, TURN_STEPS, Room
 from slam.frames import Detection
 from slam.geometry import Rig
 
 Array = NDArray[np.float64]
 
 FRAME_NS = 200_000_000
-STEP_M = 0.01
-TURN_STEPS = 16
 HALF_VIEW_RAD = math.radians(32.5)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Room:
-    """What differs between the two experiments."""
-
-    side_m: float
-    n_landmarks: int
-    min_spacing_m: float
-    scale_sigma: float
-    curvature_sigma: float
-
-
-LAB = Room(
-    side_m=2.0, n_landmarks=14, min_spacing_m=0.35, scale_sigma=0.007, curvature_sigma=0.0042
-)
-CLASSROOM = Room(
-    side_m=3.0, n_landmarks=10, min_spacing_m=1.0, scale_sigma=0.023, curvature_sigma=0.0139
-)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

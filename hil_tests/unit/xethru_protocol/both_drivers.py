@@ -19,20 +19,16 @@ class AsyncScripted:
         self.name = line.name
 
     async def read(self, timeout_s: float) -> bytes:
-        """See `ScriptedTransport.read`."""
         await asyncio.sleep(0)
         return self.line.read(timeout_s)
 
     async def write(self, data: bytes) -> None:
-        """See `ScriptedTransport.write`."""
         self.line.write(data)
 
     def close(self) -> None:
-        """See `ScriptedTransport.close`."""
         self.line.close()
 
     def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - what only some lines have
-        """Whatever else the line knows, such as its rate."""
         if name == "line":
             raise AttributeError(name)
         return getattr(self.line, name)
@@ -56,11 +52,9 @@ class Blocking:
         return value
 
     def __setattr__(self, name: str, value: object) -> None:
-        """Pass it on."""
         setattr(self.target, name, value)
 
     def __enter__(self) -> Self:
-        """Enter the target."""
         self.runner.run(self.target.__aenter__())
         return self
 
@@ -70,7 +64,6 @@ class Blocking:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Leave the target."""
         self.runner.run(self.target.__aexit__(kind, error, trace))
 
     def _iterate(self, items: Any) -> Iterator[Any]:  # noqa: ANN401 - an asynchronous generator
@@ -86,8 +79,6 @@ class Blocking:
 
 
 class DriverOn(Protocol):
-    """Makes a driver and the scripted line it is on."""
-
     def __call__(
         self,
         answer: Answer | None = None,
@@ -100,8 +91,6 @@ class DriverOn(Protocol):
 
 
 def driver_factory(kind: str, runner: asyncio.Runner) -> DriverOn:
-    """Return the maker of one kind of driver."""
-
     def driver_on(
         answer: Answer | None = None,
         *,

@@ -10,6 +10,5 @@ from hil_tests.unit.xethru_protocol.both_drivers import DriverOn, driver_factory
 
 @pytest.fixture(params=["sync", "async"])
 def driver_on(request: pytest.FixtureRequest) -> Iterator[DriverOn]:
-    """Maker of drivers on scripted lines."""
     with asyncio.Runner() as runner:
         yield driver_factory(request.param, runner)

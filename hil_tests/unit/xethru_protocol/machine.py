@@ -24,20 +24,16 @@ class Machine:
         self._first: ScriptedTransport | None = None
 
     def plug(self, path: str, module: Answer, from_s: float = 0.0) -> None:
-        """Put a module behind a port."""
         self._behind[path] = (module, round(from_s * 1e9))
 
     def runs_on(self, first: ScriptedTransport) -> None:
-        """Take the time from this line."""
         self._first = first
 
     @property
     def ports(self) -> dict[str, Callable[[int], ScriptedTransport]]:
-        """How to open each port at a baud rate."""
         return {path: partial(self._open, path) for path in self._paths}
 
     def asked(self, path: str) -> list[object]:
-        """Everything the module behind a port was asked."""
         return [command for line in self.lines if line.name == path for command in line.received]
 
     def _open(self, path: str, baudrate: int) -> ScriptedTransport:
@@ -61,7 +57,6 @@ class UartModule(PlainModule):
         self._line_rate = 115200
 
     def connect(self, line: ScriptedTransport, baudrate: int) -> None:
-        """Be at the other end of a line."""
         self._line_rate = baudrate
         line.bytes_per_s = 11520.0
         line.set_baudrate = self._set_line_rate
@@ -70,7 +65,6 @@ class UartModule(PlainModule):
         self._line_rate = baudrate
 
     def __call__(self, command: m.Message) -> Sequence[m.Message | bytes]:
-        """Answer, if the rates are the same."""
         if self._line_rate != self.baudrate:
             return []
         answer = super().__call__(command)
@@ -90,7 +84,6 @@ class _SameClock(ScriptedTransport):
 
     @property
     def now_ns(self) -> int:
-        """Time of the first line."""
         return self._first.now_ns
 
     @now_ns.setter

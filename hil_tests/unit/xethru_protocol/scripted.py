@@ -36,20 +36,16 @@ class ScriptedTransport:
         self._module = Connection(Role.MODULE)
 
     def clock(self) -> int:
-        """Virtual time."""
         return self.now_ns
 
     def say(self, *said: m.Message | bytes) -> None:
-        """Put something on the line, as one read each."""
         self.pending += [self._bytes(item) for item in said]
 
     def say_later(self, delay_s: float, *said: m.Message | bytes) -> None:
-        """Put something on the line when the time has come."""
         due_ns = self.now_ns + round(delay_s * 1e9)
         self.timed = sorted([*self.timed, *((due_ns, self._bytes(item)) for item in said)])
 
     def vanish_later(self, delay_s: float) -> None:
-        """Unplug the module when the time has come."""
         self.vanishes_ns = self.now_ns + round(delay_s * 1e9)
 
     def _bytes(self, item: m.Message | bytes) -> bytes:
@@ -74,7 +70,6 @@ class ScriptedTransport:
         return b""
 
     def write(self, data: bytes) -> None:
-        """Take a command."""
         self._check_open()
         self._module.receive_data(data)
         while (event := self._module.next_event()) is not NEED_DATA:
@@ -83,7 +78,6 @@ class ScriptedTransport:
             self.say(*self._answer(event))
 
     def close(self) -> None:
-        """Note it."""
         self.closed = True
 
     def _check_open(self) -> None:
@@ -125,7 +119,6 @@ class PlainModule:
     def __call__(  # noqa: PLR0911 - one return per command
         self, command: m.Message
     ) -> Sequence[m.Message | bytes]:
-        """Answer a command."""
         match command:
             case m.Ping():
                 return [READY]

@@ -4,7 +4,7 @@ Their bags hold, per radar, `/UWBradar<k>/readings` (in earlier ones `/UWBradar<
 per message as std_msgs/Float32MultiArray, which has neither stamp nor counter; `/odom` as
 nav_msgs/Odometry; and a pose by laser as truth: Hector SLAM's `/slam_out_pose`, a
 geometry_msgs/PoseStamped. Radars 2 and 4 look to the left, 1 and 3 to the right, as their public
-launch file pairs them; each data set says so in a file of its own, so a rig file can say otherwise.
+launch file pairs them; each data set has a file of its own for that, so a rig file can change it.
 
 What this program writes has two more kinds of topic, std_msgs/String with JSON, so that nothing is
 lost on the way back: `/UWBradar<k>/info` and `/session`.
@@ -15,7 +15,6 @@ truth keep the stamps of their headers where these are of the bag's clock.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 import re
@@ -25,7 +24,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +34,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from slam.app.errors import AppError, OdometryError, StopRequestedError
+from slam.app.errors import AppError, OdometryError
 from slam.app.odometry.track import OdometryTrack
 from slam.app.odometry.tum import NS_PER_S, TumSample
 from slam.app.records import RadarInfo, Scan, SessionInfo
@@ -54,6 +53,8 @@ from slam.app.session.messages import (
 from slam.app.session.reader import RecordedSession, ScanEnd
 from slam.frames import RadarFrame
 from slam.geometry import Mount, Rig
+from xethru_protocol.recordings.mcap import FLOAT_ARRAY, STRING, pack_array, pack_string
+from xethru_protocol.system import StopRequestedError
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.x4 import frame_area
 
@@ -85,7 +86,6 @@ def frames_topic(radar: int) -> str:
 
 
 def info_topic(radar: int) -> str:
-    """Return the topic that says what a radar is."""
     return f"/UWBradar{radar + 1}/info"
 
 
@@ -100,7 +100,6 @@ def radar_of_frames(topic: str) -> str | None:
 
 
 def radar_of_info(topic: str) -> str | None:
-    """Return the radar that a topic tells of, None for other topics."""
     found = _INFO.fullmatch(topic)
     return found[1] if found else None
 
@@ -118,12 +117,12 @@ _PAPER_BINS, _PAPER_AREA_M = 1431, (0.2, 9.4)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BagOptions:
-    """What a bag does not say itself.
+    """What a bag does not contain.
 
     Attributes
     ----------
     rig
-        Mounts under the names of the topics (UWBradar1, ...); ignored where the bag tells.
+        Mounts under the names of the topics (UWBradar1, ...); ignored if the bag has them.
     area_m
         Frame area that the modules were asked for, module metres; None: the paper's.
     truth_topic
@@ -163,7 +162,7 @@ class _Contents:
 def convert_bag(
     bag: Path, out: Path, options: BagOptions, check: Callable[[], None]
 ) -> tuple[str, list[str]]:
-    """Write a bag as a session; return what was written, in words, and what was odd about it.
+    """Write a bag as a session; return a line about it, and warnings.
 
     Raises
     ------
@@ -249,9 +248,9 @@ def _look_through(bag: Path, truth_topic: str, check: Callable[[], None]) -> _Co
 
 def _check_type(bag: Path, topic: str, message_type: str, truth_topic: str) -> None:
     if radar_of_frames(topic) is not None:
-        allowed: tuple[str, ...] = (ros.FLOAT_ARRAY,)
+        allowed: tuple[str, ...] = (FLOAT_ARRAY,)
     elif radar_of_info(topic) is not None or topic == SESSION_TOPIC:
-        allowed = (ros.STRING,)
+        allowed = (STRING,)
     elif topic == ODOMETRY_TOPIC:
         allowed = (ros.ODOMETRY,)
     elif topic == truth_topic:
@@ -276,7 +275,7 @@ def _open(bag: Path) -> Iterator[Any]:
         raise AppError(f"{bag}: no bag is there") from None
     except OSError as error:
         raise AppError(f"{bag}: cannot read: {error.strerror or error}") from None
-    except Exception as error:  # rosbags does not say what it may raise of a damaged bag
+    except Exception as error:  # rosbags documents no exceptions for damaged bags
         words = " ".join(str(error).split()) or type(error).__name__
         raise AppError(
             f"{bag}: no bag of ROS 1 or 2, or a damaged one: {words}; `rosbag reindex` or "
@@ -405,73 +404,41 @@ def _scan(number: int, held: dict[int, RadarFrame]) -> Scan:
     return Scan(counter=number, t_ns=min(frame.t_ns for frame in frames), frames=frames)
 
 
-class _Bag(Protocol):
-    """What both kinds of bag take."""
+class _Bag:
+    """A bag being written: of ROS 1 if the path ends in .bag, else of ROS 2."""
 
-    def write(self, topic: str, t_ns: int, message: ros.Message) -> None:
-        """Write a message; the topic appears with its first one."""
-
-    def close(self) -> None:
-        """Write the index."""
-
-
-class _Ros1Bag:
     def __init__(self, path: Path) -> None:
-        self._store: Any = get_typestore(Stores.ROS1_NOETIC)
-        self._writer: Any = Rosbag1Writer(path)
+        self._is_ros1 = path.suffix == ".bag"
+        self._ros2_store: Any = get_typestore(Stores.ROS2_HUMBLE)
+        self._store: Any
+        self._writer: Any
+        if self._is_ros1:
+            self._store = get_typestore(Stores.ROS1_NOETIC)
+            self._writer = Rosbag1Writer(path)
+        else:
+            self._store = self._ros2_store
+            # 8 is the older of two versions: older releases of ROS 2 read it, too
+            self._writer = Rosbag2Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3)
         self._writer.open()
         self._connections: dict[str, Any] = {}
 
-    def write(self, topic: str, t_ns: int, message: ros.Message) -> None:
-        name = message.__msgtype__
+    def write(self, topic: str, t_ns: int, message_type: str, data: bytes | memoryview) -> None:
+        """Write a message in CDR; the topic appears with its first one."""
         if topic not in self._connections:
+            latching = {"latching": 1 if message_type == STRING else None} if self._is_ros1 else {}
             self._connections[topic] = self._writer.add_connection(
-                topic, name, typestore=self._store, latching=1 if name == ros.STRING else None
+                topic, message_type, typestore=self._store, **latching
             )
-        data = self._store.serialize_ros1(self._as_ros1(message), name)
+        if self._is_ros1:
+            data = self._ros2_store.cdr_to_ros1(data, message_type)
         self._writer.write(self._connections[topic], t_ns, data)
-
-    def close(self) -> None:
-        self._writer.close()
-
-    def _as_ros1(self, value: object) -> object:
-        """Rebuild a message with the classes of ROS 1, whose header has a number more."""
-        if isinstance(value, list):
-            return [self._as_ros1(item) for item in value]
-        name = getattr(value, "__msgtype__", None)
-        if name is None or not dataclasses.is_dataclass(value):
-            return value
-        parts = {
-            field.name: self._as_ros1(getattr(value, field.name))
-            for field in dataclasses.fields(value)
-            if field.name != "__msgtype__"
-        }
-        if name == "std_msgs/msg/Header":
-            parts["seq"] = 0
-        return self._store.types[name](**parts)
-
-
-class _Ros2Bag:
-    def __init__(self, path: Path) -> None:
-        self._store: Any = get_typestore(Stores.ROS2_HUMBLE)
-        # 8 is the older of the two that can be written; older releases of ROS 2 read it, too
-        self._writer: Any = Rosbag2Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3)
-        self._writer.open()
-        self._connections: dict[str, Any] = {}
-
-    def write(self, topic: str, t_ns: int, message: ros.Message) -> None:
-        if topic not in self._connections:
-            self._connections[topic] = self._writer.add_connection(
-                topic, message.__msgtype__, typestore=self._store
-            )
-        self._writer.write(self._connections[topic], t_ns, ros.serialise(message))
 
     def close(self) -> None:
         self._writer.close()
 
 
 def write_bag(session: RecordedSession, out: Path, check: Callable[[], None]) -> str:
-    """Write frames, odometry and truth of a session; return what was written, in words.
+    """Write frames, odometry and truth of a session; return a line about it.
 
     Parameters
     ----------
@@ -490,7 +457,7 @@ def write_bag(session: RecordedSession, out: Path, check: Callable[[], None]) ->
     if out.exists():
         raise AppError(f"{out}: exists; choose another name")
     try:
-        bag: _Bag = _Ros1Bag(out) if out.suffix == ".bag" else _Ros2Bag(out)
+        bag = _Bag(out)
         try:
             counts = _fill(bag, session, check)
         finally:
@@ -499,7 +466,7 @@ def write_bag(session: RecordedSession, out: Path, check: Callable[[], None]) ->
         _remove(out)
         if isinstance(
             error, OSError | sqlite3.Error
-        ):  # SQLite has words of its own for a full disk
+        ):  # SQLite has an error of its own for a full disk
             reason = getattr(error, "strerror", None) or error
             raise AppError(f"{out}: cannot be written: {reason}") from None
         raise
@@ -518,14 +485,15 @@ def _fill(bag: _Bag, session: RecordedSession, check: Callable[[], None]) -> tup
             _write_head(bag, session, record.t_ns)
         if isinstance(record, RadarFrame):
             topic = frames_topic(record.radar)
-            bag.write(topic, record.t_ns, ros.float_array(record.samples))
+            bag.write(topic, record.t_ns, FLOAT_ARRAY, pack_array(FLOAT_ARRAY, record.samples))
             frames += 1
         elif isinstance(record, TumSample):
-            bag.write(ODOMETRY_TOPIC, record.t_ns, ros.odometry(record))
+            data = ros.serialise(ros.odometry(record))
+            bag.write(ODOMETRY_TOPIC, record.t_ns, ros.ODOMETRY, data)
             poses += 1
         elif isinstance(record, ScanEnd) and record.truth is not None:
-            message = ros.pose_stamped(record.t_ns, "world", record.truth)
-            bag.write(TRUTH_TOPIC, record.t_ns, message)
+            data = ros.serialise(ros.pose_stamped(record.t_ns, "world", record.truth))
+            bag.write(TRUTH_TOPIC, record.t_ns, ros.POSE, data)
             truths += 1
     if not frames:
         raise AppError(f"{session.path}: holds no frame")
@@ -534,9 +502,9 @@ def _fill(bag: _Bag, session: RecordedSession, check: Callable[[], None]) -> tup
 
 def _write_head(bag: _Bag, session: RecordedSession, t_ns: int) -> None:
     table = json.dumps(session_table(session.info))
-    bag.write(SESSION_TOPIC, t_ns, ros.string(table))
+    bag.write(SESSION_TOPIC, t_ns, STRING, pack_string(table))
     for index, radar in enumerate(session.info.radars):
-        bag.write(info_topic(index), t_ns, ros.string(radar_text(radar)))
+        bag.write(info_topic(index), t_ns, STRING, pack_string(radar_text(radar)))
 
 
 def _remove(out: Path) -> None:

@@ -1,44 +1,34 @@
-"""Whether SLAM is as sure as it may be: mean NEES and NIS over seeds at ten times of the run.
-
-Light, so that ``--help`` is; the drawing is in ``consistency_picture``.
-"""
+"""Whether SLAM is as sure as it may be: mean NEES and NIS over seeds at ten times of the run."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from slam.app.errors import StopFlag
-from slam.app.experiments.stress import add_sweep_argument, read_groups
-from slam.app.run.pictures import ESTIMATE, GRID, INK, LANDMARK, ODOMETRY, TRUTH, label, picture
+from slam.app.experiments import Result
+from slam.app.experiments.stress import clean_groups
+from slam.app.run.pictures import ESTIMATE, GRID, LANDMARK, ODOMETRY, TRUTH, label
+from slam.app.sweep.statistics import group_name, in_band, nis_in_band
+from xethru_protocol.system import StopFlag
 
 _COLOURS = (ESTIMATE, ODOMETRY, LANDMARK, "#2b8a3e", "#7048b8")
 
 
-def draw_consistency(path: Path, groups: Sequence[dict[str, Any]]) -> None:
-    """Draw ANEES above NIS, a column per scene and a line per preset and setting; a PNG file."""
-    scenes = list(dict.fromkeys(group["scene"] for group in groups))
-    with picture(path, width_in=1.2 + 4.6 * len(scenes), height_in=7.2) as figure:
-        figure.suptitle(
-            "Mean over seeds against the 95 % band of an honest filter (simulated)",
-            fontsize=11,
-            color=INK,
-            x=0.01,
-            ha="left",
-        )
-        panels = figure.subplots(2, len(scenes), squeeze=False, sharex="col", sharey="row")
-        for column, scene in zip(panels.T, scenes, strict=True):
-            of_scene = [group for group in groups if group["scene"] == scene]
-            _draw_anees(column[0], of_scene)
-            _draw_nis(column[1], of_scene)
-            seeds = "/".join(str(n) for n in dict.fromkeys(group["runs"] for group in of_scene))
-            label(column[0], f"{scene}, {seeds} seeds: NEES of the pose, 3 dof", "", "ANEES")
-            label(column[1], "NIS of true associations, per dof", "time [s]", "mean NIS / dof")
-            column[0].legend(frameon=False, fontsize=8)
+def _draw(figure: Figure, groups: Sequence[dict[str, Any]], scenes: Sequence[str]) -> None:
+    """Draw ANEES above NIS, a column per scene and a line per preset and setting."""
+    panels = figure.subplots(2, len(scenes), squeeze=False, sharex="col", sharey="row")
+    for column, scene in zip(panels.T, scenes, strict=True):
+        of_scene = [group for group in groups if group["scene"] == scene]
+        _draw_anees(column[0], of_scene)
+        _draw_nis(column[1], of_scene)
+        seeds = "/".join(str(n) for n in dict.fromkeys(group["runs"] for group in of_scene))
+        label(column[0], f"{scene}, {seeds} seeds: NEES of the pose, 3 dof", "", "ANEES")
+        label(column[1], "NIS of true associations, per dof", "time [s]", "mean NIS / dof")
+        column[0].legend(frameon=False, fontsize=8)
 
 
 def _draw_anees(axes: Axes, groups: Sequence[dict[str, Any]]) -> None:
@@ -76,25 +66,10 @@ def _name(group: dict[str, Any]) -> str:
     return f"preset {group['preset']}{settings}"
 
 
-NAME = "consistency"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the sweep to look at."""
-    add_sweep_argument(parser, "out/sweep.json", "`uwb-slam sweep`, like `make sweep`")
-
-
-def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
-    """Draw the clean groups of a sweep against their bands, and count the times inside."""
-    # heavy, see module text
-    from slam.app.run.output import print_table, write_json
-    from slam.app.sweep.statistics import group_name, in_band, nis_in_band
-    from slam.app.sweep.stress import CLEAN
-
-    result = arguments.out / f"{NAME}.json"
-    groups = [group for group in read_groups(arguments.sweep, result) if group["stress"] == CLEAN]
+def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
+    groups = clean_groups(arguments.sweep, arguments.out / "consistency.json")
     stop.check()
-    draw_consistency(arguments.out / f"{NAME}.png", groups)
+    scenes = list(dict.fromkeys(group["scene"] for group in groups))
     rows = []
     for group in groups:
         bound = group["bound"]
@@ -108,15 +83,23 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
                 "nis_mean": group["nis_mean"],
             }
         )
-    write_json(result, {"simulated": True, "groups": rows})
-    print_table(
-        "times of ten in their 95 % band: simulated numbers",
-        ("group", "seeds", "ANEES", "known association", "NIS", "NIS mean"),
-        [
+    cells = [
+        (
+            row["name"],
+            *("-" if row[key] is None else f"{row[key]:.4g}" for key in list(row)[1:]),
+        )
+        for row in rows
+    ]
+    return Result(
+        numbers={"simulated": True, "groups": rows},
+        title="Mean over seeds against the 95 % band of an honest filter (simulated)",
+        size_in=(1.2 + 4.6 * len(scenes), 7.2),
+        draw=lambda figure: _draw(figure, groups, scenes),
+        tables=[
             (
-                row["name"],
-                *("-" if row[key] is None else f"{row[key]:.4g}" for key in list(row)[1:]),
+                "times of ten in their 95 % band: simulated numbers",
+                ("group", "seeds", "ANEES", "known association", "NIS", "NIS mean"),
+                cells,
             )
-            for row in rows
         ],
     )

@@ -1,7 +1,4 @@
-"""The paper's figure of raw observations: a frame from raw to peaks, and a target that moves away.
-
-Light, so that ``--help`` is; the work is in ``range_steps`` and ``figure7_picture``.
-"""
+"""The paper's figure of raw observations: a frame from raw to peaks, a target that moves away."""
 
 from __future__ import annotations
 
@@ -9,21 +6,22 @@ import argparse
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from emulator.scene.scene import PathSpec, RadarSpec, Scene, TargetSpec, load_scene
-from slam.app.commands.options import count, seed
-from slam.app.errors import StopFlag
+from slam.app.experiments import Result
 from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, open_loopback
-from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label, picture
+from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label
 from slam.config import DetectionConfig, FrontEnd, SlamConfig, load_preset
 from slam.frames import Detection, RadarFrame
-from slam.front_end.paper import PaperDetector, make_detector
+from slam.front_end import make_detector
+from slam.front_end.paper import PaperDetector
+from xethru_protocol.system import StopFlag
 
 Array = NDArray[np.float64]
 
@@ -68,7 +66,6 @@ class RangeErrors:
 
     @property
     def found(self) -> float:
-        """Return the share of frames in which the rod was found."""
         return float(np.isfinite(self.residuals_m).mean())
 
     @property
@@ -79,12 +76,10 @@ class RangeErrors:
 
     @property
     def bias_m(self) -> float:
-        """Return the mean residual; NaN where the rod was never found."""
         return float(np.nanmean(self.residuals_m)) if self.found else math.nan
 
     @property
     def std_m(self) -> float:
-        """Return the standard deviation of all residuals."""
         return float(np.nanstd(self.residuals_m)) if self.found else math.nan
 
     @property
@@ -104,11 +99,9 @@ class RangeErrors:
 
     @property
     def worst_position_m(self) -> float:
-        """Return the largest mean residual of a position, by amount."""
         return float(np.nanmax(np.abs(self.position_means_m))) if self.found else math.nan
 
     def numbers(self) -> dict[str, object]:
-        """Return what goes into the JSON file."""
         return {
             "found": self.found,
             "others_per_frame": self.others_per_frame,
@@ -226,27 +219,16 @@ _MILLI = 1e3
 _WATER = LinearSegmentedColormap.from_list("water", ["#ffffff", "#9cc0ea", "#12408a"], N=20)
 
 
-def draw_figure7(path: Path, steps: Steps, errors: Mapping[str, RangeErrors], *, seed: int) -> None:
-    """Draw raw frame, smoothed frame, frames of all positions, residuals; into a PNG file."""
+def _draw(figure: Figure, steps: Steps, errors: Mapping[str, RangeErrors]) -> None:
     config = load_preset("paper").detection
     middle = len(steps.ranges_m) // 2
-    paper = errors[str(FrontEnd.PAPER)]
-    with picture(path, width_in=9.8, height_in=7.4) as figure:
-        figure.suptitle(
-            "From raw frame to range: the paper's figure of raw observations, repeated on an "
-            f"emulated X4M300 (simulated, seed {seed})",
-            fontsize=11,
-            color=INK,
-            x=0.01,
-            ha="left",
-        )
-        panels = figure.subplots(2, 2)
-        true_m = float(steps.ranges_m[middle])
-        frame = steps.frames[middle][0]
-        _draw_raw(panels[0, 0], frame, true_m)
-        _draw_smoothed(panels[0, 1], frame, true_m, config)
-        _draw_positions(panels[1, 0], steps, paper, config)
-        _draw_residuals(panels[1, 1], steps, errors)
+    panels = figure.subplots(2, 2)
+    true_m = float(steps.ranges_m[middle])
+    frame = steps.frames[middle][0]
+    _draw_raw(panels[0, 0], frame, true_m)
+    _draw_smoothed(panels[0, 1], frame, true_m, config)
+    _draw_positions(panels[1, 0], steps, errors[str(FrontEnd.PAPER)], config)
+    _draw_residuals(panels[1, 1], steps, errors)
 
 
 def _ranges_m(frame: RadarFrame) -> NDArray[np.float64]:
@@ -395,54 +377,37 @@ def _draw_residuals(axes: Axes, steps: Steps, errors: Mapping[str, RangeErrors])
     )
 
 
-NAME = "figure7"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the seed and how many frames are taken of each position."""
-    parser.add_argument(
-        "--seed", type=seed, default=0, help="seed of the receiver noise (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--frames",
-        type=count,
-        default=20,
-        help="frames taken at each position of the target (default: %(default)s)",
-    )
-
-
-def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
-    """Move a rod from 0.5 to 1.4 m in 1 cm steps past one radar of the lab."""
-    # heavy, see module text
-    from slam.app.run.output import print_table, write_json
-
+def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
     steps = measure_steps(seed=arguments.seed, frames_per_step=arguments.frames, check=stop.check)
     errors = range_errors(steps, check=stop.check)
-    write_json(
-        arguments.out / f"{NAME}.json",
-        {
+    title = (
+        f"a rod moved away in {len(steps.ranges_m)} steps of 1 cm, {arguments.frames} frames each, "
+        f"seed {arguments.seed}: simulated numbers"
+    )
+    header = ("front end", "found", "others/frame", "bias", "std", "of it noise", "worst position")
+    rows = [
+        (
+            name,
+            f"{error.found:.3f}",
+            f"{error.others_per_frame:.3f}",
+            f"{_MILLI * error.bias_m:.2f} mm",
+            f"{_MILLI * error.std_m:.2f} mm",
+            f"{_MILLI * error.noise_std_m:.2f} mm",
+            f"{_MILLI * error.worst_position_m:.2f} mm",
+        )
+        for name, error in errors.items()
+    ]
+    return Result(
+        numbers={
             "simulated": True,
             "seed": arguments.seed,
             "frames_per_step": arguments.frames,
             "true_ranges_m": steps.ranges_m.tolist(),
             "front_ends": {name: error.numbers() for name, error in errors.items()},
         },
-    )
-    draw_figure7(arguments.out / f"{NAME}.png", steps, errors, seed=arguments.seed)
-    print_table(
-        f"a rod moved away in {len(steps.ranges_m)} steps of 1 cm, {arguments.frames} frames each, "
-        f"seed {arguments.seed}: simulated numbers",
-        ("front end", "found", "others/frame", "bias", "std", "of it noise", "worst position"),
-        [
-            (
-                name,
-                f"{error.found:.3f}",
-                f"{error.others_per_frame:.3f}",
-                f"{1e3 * error.bias_m:.2f} mm",
-                f"{1e3 * error.std_m:.2f} mm",
-                f"{1e3 * error.noise_std_m:.2f} mm",
-                f"{1e3 * error.worst_position_m:.2f} mm",
-            )
-            for name, error in errors.items()
-        ],
+        title="From raw frame to range: the paper's figure of raw observations, repeated on an "
+        f"emulated X4M300 (simulated, seed {arguments.seed})",
+        size_in=(9.8, 7.4),
+        draw=lambda figure: _draw(figure, steps, errors),
+        tables=[(title, header, rows)],
     )

@@ -3,8 +3,6 @@
 A fix is made of two ranges. It is *true* if one landmark explains both, a *ghost* if each range is
 explained, but by different landmarks, and *clutter* otherwise: noise, walls, echoes that came by
 way of walls. Explained means within ``EXPLAINED_M`` of the true distance from the radar.
-
-Light, so that ``--help`` is; the work is in ``filter_study`` and ``filter_picture``.
 """
 
 from __future__ import annotations
@@ -13,34 +11,25 @@ import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from enum import Enum
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from emulator.scene.scene import Scene
-from emulator.scene.wheels import scene_odometry
-from slam.app.commands.options import seed
-from slam.app.errors import StopFlag
-from slam.app.odometry.track import OdometryTrack
+from slam.app.experiments import Result
 from slam.app.odometry.tum import NS_PER_S
-from slam.app.rig.emulated import (
-    FRAME_RATE_HZ,
-    RAW_CONFIG,
-    end_counter,
-    open_loopback,
-    rig_of,
-    scene_and_config,
-    true_landmarks_m,
-)
-from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label, picture
-from slam.app.run.runner import run_slam
+from slam.app.rig.emulated import rig_of, scene_and_config, true_landmarks_m
+from slam.app.run.output import share_text
+from slam.app.run.pictures import ESTIMATE, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label
+from slam.app.sweep.run import drive_in_process
 from slam.config import ClusteringConfig, SlamConfig, load_preset
 from slam.geometry import Rig, transform
 from slam.paper.clustering import CollectedState, filter_window
 from slam.paper.pipeline import UwbRadarSlam
-from slam.paper.trilateration import Fix
+from slam.results import Fix
+from xethru_protocol.system import StopFlag
 
 Array = NDArray[np.float64]
 
@@ -51,7 +40,7 @@ WRONG_M = 0.15
 
 
 class Origin(Enum):
-    """What a fix is of."""
+    """What a fix is of, see the module."""
 
     TRUE = "true"
     GHOST = "ghost"
@@ -67,7 +56,6 @@ class Setting:
     search_rad_m: float
 
     def __str__(self) -> str:
-        """Return the three numbers as a row of a table has them."""
         return f"{self.window_size}, {self.min_opc}, {1e2 * self.search_rad_m:g} cm"
 
 
@@ -112,32 +100,15 @@ class Seen:
     landmarks_m: Array
 
     def count(self, origin: Origin) -> int:
-        """Return how many fixes are of this origin."""
         return sum(each is origin for of_state in self.origins for each in of_state)
 
-    @property
-    def n_true(self) -> int:
-        """Return the number of true fixes."""
-        return self.count(Origin.TRUE)
-
-    @property
-    def n_ghosts(self) -> int:
-        """Return the number of ghosts."""
-        return self.count(Origin.GHOST)
-
-    @property
-    def n_clutter(self) -> int:
-        """Return the number of the other fixes."""
-        return self.count(Origin.CLUTTER)
-
     def numbers(self) -> dict[str, object]:
-        """Return what goes into the JSON file."""
         return {
             "scene": self.scene,
             "states": len(self.states),
-            "true_fixes": self.n_true,
-            "ghosts": self.n_ghosts,
-            "clutter": self.n_clutter,
+            "true_fixes": self.count(Origin.TRUE),
+            "ghosts": self.count(Origin.GHOST),
+            "clutter": self.count(Origin.CLUTTER),
         }
 
 
@@ -164,10 +135,6 @@ class Outcome:
     wrong_observations: float | None
     latency_s: float
 
-    def numbers(self) -> dict[str, object]:
-        """Return what goes into the JSON file."""
-        return asdict(self)
-
 
 def drive(scene: str, *, seed: int, check: Callable[[], None] = lambda: None) -> Seen:
     """Drive the first lap of a scene and return every state with all its fixes.
@@ -180,15 +147,10 @@ def drive(scene: str, *, seed: int, check: Callable[[], None] = lambda: None) ->
     loaded, config = scene_and_config(scene, "paper")
     path = loaded.path.model_copy(update={"laps": loaded.path.laps[:1]})
     lap = loaded.model_copy(update={"path": path})
-    trajectory = lap.trajectory()
-    odometry = OdometryTrack.from_lines(scene_odometry(lap, seed))
+    rig = rig_of(lap)
     # With a window of one state each comes out as it is collected.
     alone = config.model_copy(update={"window": config.window.model_copy(update={"size": 1})})
-    with open_loopback(lap, seed) as source:
-        source.start(RAW_CONFIG, FRAME_RATE_HZ)
-        scans = source.scans(end_counter(trajectory.duration_ns), check)
-        record = run_slam(scans, odometry, UwbRadarSlam(alone, rig_of(lap)), trajectory.poses)
-    rig = rig_of(lap)
+    record = drive_in_process(lap, UwbRadarSlam(alone, rig), seed, check=check)
     return Seen(
         scene=lap.name,
         states=tuple(
@@ -293,30 +255,18 @@ _PARAMETERS: tuple[tuple[str, str, _Value], ...] = (
 )
 
 
-def draw_filter(
-    path: Path, studies: Sequence[tuple[Seen, Sequence[Outcome]]], *, seed: int
-) -> None:
-    """Draw the shares kept over each of the three parameters, a row per scene; a PNG file."""
-    with picture(path, width_in=10.4, height_in=1.3 + 3.1 * len(studies)) as figure:
-        figure.suptitle(
-            "The paper's DBSCAN filter, one parameter varied at a time; dashed: Table I "
-            f"(one lap, simulated, seed {seed})",
-            fontsize=11,
-            color=INK,
-            x=0.01,
-            ha="left",
-        )
-        panels = figure.subplots(len(studies), len(_PARAMETERS), squeeze=False, sharey=True)
-        for row, (seen, outcomes) in zip(panels, studies, strict=True):
-            for axes, (name, x_label, value) in zip(row, _PARAMETERS, strict=True):
-                _draw(axes, name, value, outcomes)
-                label(axes, f"{seen.scene}: {name}", x_label, "share [%]")
-        figure.legend(
-            *panels[0, 0].get_legend_handles_labels(),
-            loc="outside lower center",
-            ncols=4,
-            frameon=False,
-        )
+def _draw_studies(figure: Figure, studies: Sequence[tuple[Seen, Sequence[Outcome]]]) -> None:
+    panels = figure.subplots(len(studies), len(_PARAMETERS), squeeze=False, sharey=True)
+    for row, (seen, outcomes) in zip(panels, studies, strict=True):
+        for axes, (name, x_label, value) in zip(row, _PARAMETERS, strict=True):
+            _draw(axes, name, value, outcomes)
+            label(axes, f"{seen.scene}: {name}", x_label, "share [%]")
+    figure.legend(
+        *panels[0, 0].get_legend_handles_labels(),
+        loc="outside lower center",
+        ncols=4,
+        frameon=False,
+    )
 
 
 def _draw(axes: Axes, name: str, value: _Value, outcomes: Sequence[Outcome]) -> None:
@@ -342,72 +292,56 @@ def _differs_only_in(value: _Value, setting: Setting) -> bool:
     return all(other(setting) == other(TABLE_I) for other in others)
 
 
-NAME = "filter"
+_HEADER = (
+    "window, min_opc, search_rad",
+    "true kept",
+    "ghosts kept",
+    "others kept",
+    "observations",
+    "wrong",
+    "latency",
+)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add seed and scenes."""
-    parser.add_argument(
-        "--seed",
-        type=seed,
-        default=0,
-        help="seed of receiver noise and odometry drift (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--scene",
-        nargs="+",
-        default=["lab"],
-        help="names or files of scenes (default: lab); in two_rooms walls make most of the fixes",
-    )
-
-
-def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
-    """Drive one lap per scene and filter what was seen with every setting."""
-    # heavy, see module text
-    from slam.app.rig.emulated import scene_and_config
-    from slam.app.run.output import print_table, share_text, write_json
-
+def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
     for scene in arguments.scene:
         scene_and_config(scene, "paper")  # a bad one is refused before the first is driven
     studies = []
     for scene in arguments.scene:
-        run_seen = drive(scene, seed=arguments.seed, check=stop.check)
-        studies.append((run_seen, outcomes(run_seen, check=stop.check)))
-    write_json(
-        arguments.out / f"{NAME}.json",
-        {
+        seen = drive(scene, seed=arguments.seed, check=stop.check)
+        studies.append((seen, outcomes(seen, check=stop.check)))
+    return Result(
+        numbers={
             "simulated": True,
             "seed": arguments.seed,
             "scenes": [
-                seen.numbers() | {"settings": [row.numbers() for row in rows]}
+                seen.numbers() | {"settings": [asdict(row) for row in rows]}
                 for seen, rows in studies
             ],
         },
-    )
-    draw_filter(arguments.out / f"{NAME}.png", studies, seed=arguments.seed)
-    for seen, rows in studies:
-        print_table(
-            f"{seen.scene}, one lap, seed {arguments.seed}: {seen.n_true} true fixes, "
-            f"{seen.n_ghosts} ghosts, {seen.n_clutter} others: simulated numbers",
+        title="The paper's DBSCAN filter, one parameter varied at a time; dashed: Table I "
+        f"(one lap, simulated, seed {arguments.seed})",
+        size_in=(10.4, 1.3 + 3.1 * len(studies)),
+        draw=lambda figure: _draw_studies(figure, studies),
+        tables=[
             (
-                "window, min_opc, search_rad",
-                "true kept",
-                "ghosts kept",
-                "others kept",
-                "observations",
-                "wrong",
-                "latency",
-            ),
-            [
-                (
-                    str(row.setting),
-                    share_text(row.true_kept),
-                    share_text(row.ghosts_kept),
-                    share_text(row.clutter_kept),
-                    str(row.n_observations),
-                    share_text(row.wrong_observations),
-                    f"{row.latency_s:.1f} s",
-                )
-                for row in rows
-            ],
-        )
+                f"{seen.scene}, one lap, seed {arguments.seed}: {seen.count(Origin.TRUE)} true "
+                f"fixes, {seen.count(Origin.GHOST)} ghosts, {seen.count(Origin.CLUTTER)} others: "
+                "simulated numbers",
+                _HEADER,
+                [
+                    (
+                        str(row.setting),
+                        share_text(row.true_kept),
+                        share_text(row.ghosts_kept),
+                        share_text(row.clutter_kept),
+                        str(row.n_observations),
+                        share_text(row.wrong_observations),
+                        f"{row.latency_s:.1f} s",
+                    )
+                    for row in rows
+                ],
+            )
+            for seen, rows in studies
+        ],
+    )

@@ -34,14 +34,15 @@ from numpy.typing import NDArray
 from scipy.stats import ncx2
 
 from emulator.chip.chip import CaptureSettings
-from emulator.echo.pulse import sum_of_pulses
 from emulator.echo.receiver import Receiver
+from emulator.echo.reflections import sum_of_pulses
 from emulator.scene.scene import LeakageSpec, NoiseSpec, RadarSpec, Scene
 from slam.app.rig.sources import sampler_limits
-from slam.config import FrontEnd, SlamConfig, override
+from slam.config import FrontEnd, MatchedFilterConfig, SlamConfig, override
 from slam.frames import Detector, RadarFrame
+from slam.front_end import make_detector
+from slam.front_end.matched_filter import threshold_sigmas
 from slam.front_end.overlapping import KnownPulse, SplitTest, split_threshold
-from slam.front_end.paper import make_detector
 from slam.front_end.pulse import PulseModel
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.wire.x4 import Normalisation
@@ -161,7 +162,6 @@ class Echoes:
         return (self.range_m - RANGE_START_M) / BIN_LENGTH_M
 
     def beside(self, other: Echoes) -> Echoes:
-        """Return frames with the echoes of both."""
         return Echoes(
             range_m=np.hstack([self.range_m, other.range_m]),
             amplitude=np.hstack([self.amplitude, other.amplitude]),
@@ -435,6 +435,9 @@ DAC_WINDOW = 0.07421875
 SATURATIONS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
 LEAKAGES = tuple((amplitude, at_m) for amplitude in (0.06, 0.5) for at_m in (0.05, 0.15))
 _NEAREST_M, _FARTHEST_M = 0.5, 1.3
+DETECTION_SNRS_DB = (0, 2, 3, 4, 5, 6, 7, 8, 10, 12, 16, 20, 22, 23, 24, 25, 26, 28)
+FALSE_ALARMS = (1e-3, 1e-2, 1e-1)
+_WHOLE_FRAME: Mapping[str, object] = {"detection.min_range_m": 0.0, "detection.max_range_m": 100.0}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -491,7 +494,6 @@ def front_end(name: str, settings: Mapping[str, object] | None = None) -> Detect
 
 
 def ranges_of(detector: Detector, frames: Sequence[RadarFrame]) -> list[Array]:
-    """Return the detected ranges of each frame, ascending."""
     found = detector.detect_many(frames, [0.0] * len(frames))
     return [np.array([d.range_m for d in each]) for each in found]
 
@@ -552,6 +554,17 @@ def resolution(found: Sequence[Array], true_m: Array) -> Resolution:
     )
 
 
+def _of_each_front_end(
+    frames: Sequence[RadarFrame], echoes: Echoes, check: Callable[[], None]
+) -> dict[str, object]:
+    """Return the fields of `Ranging` by front end, judged by the first echo of each frame."""
+    cells: dict[str, object] = {}
+    for name in FRONT_ENDS:
+        check()
+        cells[name] = asdict(ranging(ranges_of(front_end(name), frames), echoes.range_m[:, 0]))
+    return cells
+
+
 def ranging_against_snr(
     trials: int, seed: int, check: Callable[[], None]
 ) -> list[dict[str, object]]:
@@ -567,10 +580,8 @@ def ranging_against_snr(
         }
         for source, make in (("chip", chip_frames), ("closed_form", closed_form_frames)):
             frames = make(echoes, noise_sigma=AMPLITUDE / snr, seed=seed + snr_db)
-            for name in FRONT_ENDS:
-                check()
-                found = ranges_of(front_end(name), frames)
-                row[f"{source}.{name}"] = asdict(ranging(found, echoes.range_m[:, 0]))
+            for name, cell in _of_each_front_end(frames, echoes, check).items():
+                row[f"{source}.{name}"] = cell
         rows.append(row)
     return rows
 
@@ -580,7 +591,7 @@ def resolution_against_separation(
 ) -> list[dict[str, object]]:
     """Return one row per separation of two equal echoes: the bound, and each method.
 
-    The methods of `echo_separators` get the window of each frame that holds the two echoes, 3.5
+    The methods of `SEPARATORS` get the window of each frame that holds the two echoes, 3.5
     envelope sigmas either side; the front ends get the frame.
     """
     rows: list[dict[str, object]] = []
@@ -637,6 +648,72 @@ def windows_of(frames: Sequence[RadarFrame], echoes: Echoes) -> tuple[Array, NDA
     return np.stack(windows), first
 
 
+def detection_against_snr(
+    trials: int, seed: int, check: Callable[[], None]
+) -> list[dict[str, object]]:
+    """Return one row per SNR: the share of echoes found, and Marcum's at the same threshold.
+
+    Noise stays as it is, the echo changes: the paper's thresholds are absolute. ``told`` is the
+    matched filter that is given sigma, for which Marcum's Q holds at the echo's own place; a
+    detector takes the highest place nearby and so finds a little more.
+    """
+    told = {"matched_filter.noise_sigma": NOISE_SIGMA}
+    detectors = {
+        "paper": front_end("paper"),
+        "matched_filter": front_end("matched_filter"),
+        "told": front_end("matched_filter", told),
+    }
+    sigma = known_pulse(BIN_LENGTH_M).envelope_sigma_bins
+    threshold = threshold_sigmas(
+        N_BINS / sigma, MatchedFilterConfig().false_alarms_per_frame, noise_is_told=True
+    )
+    rows: list[dict[str, object]] = []
+    for snr_db in DETECTION_SNRS_DB:
+        snr = 10 ** (snr_db / 20)
+        rng = np.random.default_rng([seed, 5, snr_db])
+        echoes = single_echoes(trials, snr * NOISE_SIGMA, rng)
+        frames = chip_frames(echoes, noise_sigma=NOISE_SIGMA, seed=seed + 100 + snr_db)
+        row: dict[str, object] = {
+            "snr_db": snr_db,
+            "trials": trials,
+            "marcum": float(detection_probability(np.array(snr), threshold, sigma)),
+        }
+        for name, detector in detectors.items():
+            check()
+            row[name] = ranging(ranges_of(detector, frames), echoes.range_m[:, 0]).found
+        rows.append(row)
+    return rows
+
+
+def false_alarms(trials: int, seed: int, check: Callable[[], None]) -> list[dict[str, object]]:
+    """Return one row per configured rate: peaks per frame of noise alone, the whole frame."""
+    nothing = single_echoes(trials, 0.0, np.random.default_rng([seed, 6]))
+    frames = chip_frames(nothing, noise_sigma=NOISE_SIGMA, seed=seed + 4)
+
+    def per_frame(name: str, settings: Mapping[str, object]) -> float:
+        check()
+        found = ranges_of(front_end(name, {**_WHOLE_FRAME, **settings}), frames)
+        return sum(map(len, found)) / trials
+
+    paper = per_frame("paper", {})
+    rows: list[dict[str, object]] = []
+    for rate in FALSE_ALARMS:
+        settings: dict[str, object] = {"matched_filter.false_alarms_per_frame": rate}
+        told = settings | {"matched_filter.noise_sigma": NOISE_SIGMA}
+        rows.append(
+            {
+                "configured_per_frame": rate,
+                "trials": trials,
+                "standard_error": float(np.sqrt(rate / trials)),
+                "paper": paper,
+                "matched_filter": per_frame("matched_filter", settings),
+                "told": per_frame("matched_filter", told),
+                "joint": per_frame("joint", settings),
+            }
+        )
+    return rows
+
+
 def leakage(trials: int, seed: int, check: Callable[[], None]) -> list[dict[str, object]]:
     """Return one row per leakage and DAC window: each front end's view of one echo beside it."""
     rows: list[dict[str, object]] = []
@@ -657,11 +734,7 @@ def leakage(trials: int, seed: int, check: Callable[[], None]) -> list[dict[str,
                 "leakage_amplitude": amplitude,
                 "leakage_m": at_m,
             }
-            for name in FRONT_ENDS:
-                check()
-                found = ranges_of(front_end(name), frames)
-                row[name] = asdict(ranging(found, echoes.range_m[:, 0]))
-            rows.append(row)
+            rows.append(row | _of_each_front_end(frames, echoes, check))
     return rows
 
 
@@ -679,9 +752,5 @@ def saturation(trials: int, seed: int, check: Callable[[], None]) -> list[dict[s
             * BIN_LENGTH_M
             * PulseModel().position_bound_bins(snr, BIN_LENGTH_M),
         }
-        for name in FRONT_ENDS:
-            check()
-            found = ranges_of(front_end(name), frames)
-            row[name] = asdict(ranging(found, echoes.range_m[:, 0]))
-        rows.append(row)
+        rows.append(row | _of_each_front_end(frames, echoes, check))
     return rows

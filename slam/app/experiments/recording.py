@@ -9,18 +9,15 @@ of its ten farthest bins, 1.4e-4 per component with an autocorrelation of 0.98 a
 2.1e-5 are new with every frame; of its strongest reflector, a phase that wanders by 0.032 rad, of
 which 0.0056 rad are new with every frame.
 
-What one recording cannot tell:
+What one recording does not show:
 
 * The working point. 17 frames/s and 54 bins fit the vendor's example settings, 16 iterations x 300
   pulses per step, which are assumed here; the samples lie on no lattice that would show it.
 * What is the module and what is the room. In its quietest 7 s the floor of all bins from the 18th
-  on is 6e-6, three times below the anchor, and the phase wanders by 0.0014 rad; later somebody
+  on is 6e-6, three times below the anchor, and the phase wanders by 0.0014 rad; later a person
   moves close by. The anchors are what the whole recording shows: upper bounds on the module.
 * Whether the phase is common to all echoes, as a jitter's is: the strongest echo's fluctuation is
-  nearly as large in amplitude as in phase, which says that a part of it is other echoes.
-
-Light, so that ``--help`` is; the work is in ``slow_time``, ``recorded_room`` and
-``recording_picture``.
+  nearly as large in amplitude as in phase, so a part of it is other echoes.
 """
 
 from __future__ import annotations
@@ -32,23 +29,25 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.signal import welch
 
+from emulator.chip import Pace
 from emulator.chip.downconversion import CHANNELS, LEAD_SAMPLES, TAP_COUNT
-from emulator.chip.pace import Pace
 from emulator.device import radar_device
 from emulator.echo.echo import SPEED_OF_LIGHT_MPS, echo_source
-from emulator.echo.pulse import CARRIER_CYCLES_PER_SAMPLE, SIGMA_S
+from emulator.echo.reflections import CARRIER_CYCLES_PER_SAMPLE, SIGMA_S
 from emulator.loopback import LoopbackTransport
 from emulator.module.memory import Identity
 from emulator.scene.scene import ClutterSpec, JitterSpec, NoiseSpec, RadarSpec, Scene, TargetSpec
-from slam.app.commands.options import count, seed
-from slam.app.errors import AppError, StopFlag
-from slam.app.run.pictures import ESTIMATE, INK, ODOMETRY, TRUTH, label, picture
+from slam.app.errors import AppError
+from slam.app.experiments import Result
+from slam.app.run.pictures import ESTIMATE, INK, ODOMETRY, TRUTH, label
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings import RecordingError, read_recording
+from xethru_protocol.system import StopFlag
 from xethru_protocol.wire.messages import BasebandIq
 from xethru_protocol.wire.x4 import MODULE_SPEED_MPS, SAMPLING_RATE_HZ, real_frame_rate
 
@@ -89,7 +88,6 @@ class SlowTime:
 
     @property
     def strongest(self) -> int:
-        """Return the bin of the largest mean amplitude."""
         return int(np.argmax(self.amplitude))
 
     @property
@@ -196,7 +194,6 @@ def _neighbours(values: NDArray[np.complex128]) -> float:
 
 
 def spread_of(values: Sequence[float]) -> tuple[float, float, float]:
-    """Return the 10th percentile, the median and the 90th percentile."""
     low, middle, high = np.percentile(values, (10, 50, 90))
     return float(low), float(middle), float(high)
 
@@ -329,34 +326,25 @@ _LAGS = 24
 _MRAD_TICKS = (1, 2, 5, 10, 20, 50, 100)
 
 
-def draw_recording(path: Path, recorded: SlowTime, emulated: Sequence[SlowTime]) -> None:
-    """Draw amplitudes, spectra, autocorrelation and phase of both; into a PNG file.
+def _draw(figure: Figure, recorded: SlowTime, emulated: Sequence[SlowTime]) -> None:
+    """Draw amplitudes, spectra, autocorrelation and phase of both.
 
     Lines of the emulation are medians over its runs, bands reach from 10 to 90 %.
     """
     quiet = recorded.quietest()
     near, far = slice(recorded.strongest, recorded.strongest + 1), slice(-FAR_BINS, None)
-    with picture(path, width_in=12.6, height_in=7.6) as figure:
-        figure.suptitle(
-            f"A real X4 ({len(recorded.iq)} frames at {recorded.rate_hz:.1f} Hz) and the emulated "
-            f"one before a single static reflector ({len(emulated)} runs: median, 10-90 %)",
-            fontsize=11,
-            color=INK,
-            x=0.01,
-            ha="left",
-        )
-        panels = figure.subplots(2, 3)
-        _draw_amplitudes(panels[0, 0], recorded, emulated)
-        for axes, bins, title in (
-            (panels[0, 1], near, "(b) spectrum of the strongest bin"),
-            (panels[0, 2], far, f"(c) spectrum of the {FAR_BINS} farthest bins"),
-        ):
-            _draw_spectra(axes, recorded, emulated, quiet, bins)
-            label(axes, title, "frequency over slow time [Hz]", "amplitude per component [1/√Hz]")
-        _draw_autocorrelation(panels[1, 0], recorded, emulated)
-        _draw_phase(panels[1, 1], recorded, emulated[0])
-        _draw_increments(panels[1, 2], recorded, emulated, quiet)
-        panels[0, 2].legend(frameon=False, fontsize=8.5)
+    panels = figure.subplots(2, 3)
+    _draw_amplitudes(panels[0, 0], recorded, emulated)
+    for axes, bins, title in (
+        (panels[0, 1], near, "(b) spectrum of the strongest bin"),
+        (panels[0, 2], far, f"(c) spectrum of the {FAR_BINS} farthest bins"),
+    ):
+        _draw_spectra(axes, recorded, emulated, quiet, bins)
+        label(axes, title, "frequency over slow time [Hz]", "amplitude per component [1/√Hz]")
+    _draw_autocorrelation(panels[1, 0], recorded, emulated)
+    _draw_phase(panels[1, 1], recorded, emulated[0])
+    _draw_increments(panels[1, 2], recorded, emulated, quiet)
+    panels[0, 2].legend(frameon=False, fontsize=8.5)
 
 
 def _draw_band(axes: Axes, x: Array, runs: Sequence[Array]) -> None:
@@ -437,35 +425,8 @@ def _draw_increments(
     label(axes, "(f) change of that phase over a lag", "lag [s]", "std [mrad]")
 
 
-NAME = "recording"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the recording, the first seed and the number of emulated runs."""
-    parser.add_argument(
-        "--recording",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help="recording of a standing module's baseband frames, in any format `xethru dump` reads",
-    )
-    parser.add_argument("--radar", metavar="NAME", help="which radar of a recording of several")
-    parser.add_argument(
-        "--seed", type=seed, default=0, help="seed of the run drawn in full (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--runs",
-        type=count,
-        default=20,
-        help="emulated runs, with seeds from there on (default: %(default)s)",
-    )
-
-
-def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
+def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
     """Emulate the recording's scene through a module and its driver, and compare the spectra."""
-    # heavy, see module text
-    from slam.app.run.output import print_table, write_json
-
     recorded = read_slow_time(arguments.recording, arguments.radar)
     scene = equivalent_scene(recorded)
     emulated = []
@@ -475,9 +436,18 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
     figures = recorded.numbers()
     quiet = recorded.quietest().numbers()
     spread = {name: spread_of([run.numbers()[name] for run in emulated]) for name in TITLES}
-    write_json(
-        arguments.out / f"{NAME}.json",
-        {
+    rows = [
+        (
+            title,
+            _three_digits(figures[name]),
+            _three_digits(spread[name][1]),
+            f"{_three_digits(spread[name][0])} ... {_three_digits(spread[name][2])}",
+            _three_digits(quiet[name]),
+        )
+        for name, title in TITLES.items()
+    ]
+    return Result(
+        numbers={
             "recording": str(arguments.recording),
             "frames": len(recorded.iq),
             "rate_hz": recorded.rate_hz,
@@ -490,21 +460,17 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
                 for name, (low, middle, high) in spread.items()
             },
         },
-    )
-    draw_recording(arguments.out / f"{NAME}.png", recorded, emulated)
-    print_table(
-        f"{len(recorded.iq)} recorded frames at {recorded.rate_hz:.2f} Hz, and {arguments.runs} "
-        f"emulated runs of as many, seeds from {arguments.seed}",
-        ("", "recorded", "emulated: median", "10 ... 90 %", "recorded, quietest 128"),
-        [
+        title=f"A real X4 ({len(recorded.iq)} frames at {recorded.rate_hz:.1f} Hz) and the "
+        f"emulated one before a single static reflector ({len(emulated)} runs: median, 10-90 %)",
+        size_in=(12.6, 7.6),
+        draw=lambda figure: _draw(figure, recorded, emulated),
+        tables=[
             (
-                title,
-                _three_digits(figures[name]),
-                _three_digits(spread[name][1]),
-                f"{_three_digits(spread[name][0])} ... {_three_digits(spread[name][2])}",
-                _three_digits(quiet[name]),
+                f"{len(recorded.iq)} recorded frames at {recorded.rate_hz:.2f} Hz, and "
+                f"{arguments.runs} emulated runs of as many, seeds from {arguments.seed}",
+                ("", "recorded", "emulated: median", "10 ... 90 %", "recorded, quietest 128"),
+                rows,
             )
-            for name, title in TITLES.items()
         ],
     )
 

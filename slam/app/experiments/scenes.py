@@ -1,44 +1,30 @@
-"""How a preset does in many scenes, those it was chosen on among them: errors, map, consistency.
-
-Light, so that ``--help`` is; the drawing is in ``scenes_picture``.
-"""
+"""How a preset does in many scenes, those it was chosen on among them: errors, map, consistency."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
-from slam.app.errors import StopFlag
-from slam.app.experiments.stress import (
-    add_sweep_argument,
-    draw_consistency,
-    legend_below,
-    read_groups,
-)
-from slam.app.run.pictures import ESTIMATE, GRID, INK, LANDMARK, ODOMETRY, label, picture
-from slam.app.sweep.statistics import group_name
+from slam.app.experiments import Result
+from slam.app.experiments.stress import clean_groups, draw_consistency, legend_below
+from slam.app.run.evaluation import ratio
+from slam.app.run.output import mm_text, share_text
+from slam.app.run.pictures import ESTIMATE, GRID, LANDMARK, ODOMETRY, label
+from slam.app.sweep.statistics import group_name, in_band
+from xethru_protocol.system import StopFlag
 
 
-def draw_scenes(path: Path, groups: Sequence[dict[str, Any]]) -> None:
-    """Draw the errors of wheels and SLAM beside the consistency, a row per group; a PNG."""
-    names = [group_name(group) for group in groups]
-    with picture(path, width_in=10.4, height_in=1.6 + 0.34 * len(groups)) as figure:
-        figure.suptitle(
-            "Clean runs, a row per scene and preset (simulated)",
-            fontsize=11,
-            color=INK,
-            x=0.01,
-            ha="left",
-        )
-        errors, consistency = figure.subplots(1, 2)
-        _draw_errors(errors, groups, names)
-        draw_consistency(consistency, groups, [""] * len(groups))
-        legend_below(figure, errors, consistency)
+def _draw(figure: Figure, groups: Sequence[dict[str, Any]]) -> None:
+    errors, consistency = figure.subplots(1, 2)
+    _draw_errors(errors, groups, [group_name(group) for group in groups])
+    draw_consistency(consistency, groups, [""] * len(groups))
+    legend_below(figure, errors, consistency)
 
 
 def _draw_errors(axes: Axes, groups: Sequence[dict[str, Any]], names: Sequence[str]) -> None:
@@ -66,28 +52,9 @@ def _draw_errors(axes: Axes, groups: Sequence[dict[str, Any]], names: Sequence[s
     axes.set_ylim(len(groups) - 0.5, -0.5)
 
 
-NAME = "scenes"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the sweep to look at."""
-    add_sweep_argument(parser, "out/scenes.json", "`uwb-slam sweep --scene ...`")
-
-
-def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
-    """Draw and print the clean groups of a sweep, a row per scene."""
-    # heavy, see module text
-    from statistics import fmean
-
-    from slam.app.run.evaluation import ratio
-    from slam.app.run.output import mm_text, print_table, share_text, write_json
-    from slam.app.sweep.statistics import group_name, in_band
-    from slam.app.sweep.stress import CLEAN
-
-    result = arguments.out / f"{NAME}.json"
-    groups = [group for group in read_groups(arguments.sweep, result) if group["stress"] == CLEAN]
+def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
+    groups = clean_groups(arguments.sweep, arguments.out / "scenes.json")
     stop.check()
-    draw_scenes(arguments.out / f"{NAME}.png", groups)
     rows = [
         {
             "name": group_name(group),
@@ -106,42 +73,52 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
         }
         for group in groups
     ]
-    write_json(result, {"simulated": True, "groups": rows})
-    print_table(
-        "clean runs by scene and preset; errors, precision, recall: medians over seeds; simulated",
+    header = (
+        "group",
+        "seeds",
+        "wheels",
+        "SLAM",
+        "SLAM p90",
+        "of wheels",
+        "beat wheels",
+        "ANEES",
+        "in band",
+        "NIS",
+        "precision",
+        "recall",
+        "no duplicate",
+        "confident false",
+    )
+    cells = [
         (
-            "group",
-            "seeds",
-            "wheels",
-            "SLAM",
-            "SLAM p90",
-            "of wheels",
-            "beat wheels",
-            "ANEES",
-            "in band",
-            "NIS",
-            "precision",
-            "recall",
-            "no duplicate",
-            "confident false",
-        ),
-        [
+            row["name"],
+            str(row["runs"]),
+            mm_text(row["odometry_ate_rmse_m"]["median"]),
+            mm_text(row["ate_rmse_m"]["median"]),
+            mm_text(row["ate_rmse_m"]["p90"]),
+            f"{row['ratio']:.3f}",
+            f"{row['runs_below_odometry']} of {row['runs']}",
+            f"{row['anees_mean']:.1f}",
+            f"{row['anees_in_band']} of {row['times']}",
+            "-" if row["nis_mean"] is None else f"{row['nis_mean']:.2f}",
+            share_text(row["landmark_medians"]["precision"]),
+            share_text(row["landmark_medians"]["recall"]),
+            f"{row['without_duplicates']:.0%}",
+            str(row["confident_false"]),
+        )
+        for row in rows
+    ]
+    return Result(
+        numbers={"simulated": True, "groups": rows},
+        title="Clean runs, a row per scene and preset (simulated)",
+        size_in=(10.4, 1.6 + 0.34 * len(groups)),
+        draw=lambda figure: _draw(figure, groups),
+        tables=[
             (
-                row["name"],
-                str(row["runs"]),
-                mm_text(row["odometry_ate_rmse_m"]["median"]),
-                mm_text(row["ate_rmse_m"]["median"]),
-                mm_text(row["ate_rmse_m"]["p90"]),
-                f"{row['ratio']:.3f}",
-                f"{row['runs_below_odometry']} of {row['runs']}",
-                f"{row['anees_mean']:.1f}",
-                f"{row['anees_in_band']} of {row['times']}",
-                "-" if row["nis_mean"] is None else f"{row['nis_mean']:.2f}",
-                share_text(row["landmark_medians"]["precision"]),
-                share_text(row["landmark_medians"]["recall"]),
-                f"{row['without_duplicates']:.0%}",
-                str(row["confident_false"]),
+                "clean runs by scene and preset; errors, precision, recall: medians over seeds; "
+                "simulated",
+                header,
+                cells,
             )
-            for row in rows
         ],
     )

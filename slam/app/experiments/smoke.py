@@ -10,8 +10,6 @@ because the last factor cannot exceed 1/2 for a permittivity whose real part is 
 in smoke weaken every echo by this bound at the largest range SLAM uses. Chains of soot can absorb
 more than spheres; ten times more would change nothing here. What it does to light: 8.7 m2 of
 extinction per gram of smoke from flames (Mulholland and Croarkin 2000, Fire and Materials 24).
-
-Light, so that ``--help`` is; the work is in ``smoke_runs`` and ``smoke_picture``.
 """
 
 from __future__ import annotations
@@ -20,34 +18,23 @@ import argparse
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from emulator.scene.scene import Scene
-from emulator.scene.wheels import scene_odometry
-from slam.app.commands.options import seed
-from slam.app.errors import StopFlag
-from slam.app.odometry.track import OdometryTrack
-from slam.app.rig.emulated import (
-    FRAME_RATE_HZ,
-    RAW_CONFIG,
-    end_counter,
-    open_loopback,
-    rig_of,
-    scene_and_config,
-    true_landmarks_m,
-)
+from slam.app.experiments import Result
+from slam.app.rig.emulated import rig_of, scene_and_config, true_landmarks_m
 from slam.app.run.output import mm_text
-from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, TRUTH, label, picture
-from slam.app.run.runner import RunRecord, run_slam
-from slam.config import SlamConfig
+from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, TRUTH, label
+from slam.app.run.runner import RunRecord
+from slam.app.sweep.run import drive_in_process
 from slam.geometry import transform
-from slam.paper.clustering import Observation
-from slam.paper.pipeline import StepResult, UwbRadarSlam
-from slam.paper.trilateration import Fix
+from slam.paper.pipeline import UwbRadarSlam
+from slam.results import Fix, Observation, StepResult
+from xethru_protocol.system import StopFlag
 
 Array = NDArray[np.float64]
 
@@ -109,7 +96,6 @@ class ObservedRun:
     landmarks_m: Array
 
     def numbers(self) -> dict[str, object]:
-        """Return what goes into the JSON file."""
         return {
             "name": self.name,
             "detections": self.n_detections,
@@ -130,7 +116,7 @@ def drive_in_clear_air_and_smoke(
     """Return the runs: clear air, smoke, smoke under other receiver noise, and the lab.
 
     The first two share receiver noise and odometry, so what differs is the smoke's doing; the
-    third tells how much another noise of the receivers does. The lab, in clear air, is there for
+    third shows the effect of other receiver noise. The lab, in clear air, is there for
     its ghosts: with one landmark there are none.
 
     Parameters
@@ -154,7 +140,8 @@ def drive_in_clear_air_and_smoke(
     )
     runs: list[ObservedRun] = []
     for name, scene, settings, noise_seed in cells:
-        record = _drive(scene, settings, seed=seed, noise_seed=noise_seed, check=check)
+        slam = UwbRadarSlam(settings, rig_of(scene))
+        record = drive_in_process(scene, slam, seed, noise_seed=noise_seed, check=check)
         if not runs:
             reference = record
         runs.append(_observed(name, scene, record, reference if scene is not lab else None))
@@ -177,18 +164,6 @@ def in_smoke(scene: Scene) -> Scene:
 def _laps(scene: Scene, laps: int | None) -> Scene:
     path = scene.path.model_copy(update={"laps": scene.path.laps[:laps]})
     return scene.model_copy(update={"path": path})
-
-
-def _drive(
-    scene: Scene, config: SlamConfig, *, seed: int, noise_seed: int, check: Callable[[], None]
-) -> RunRecord:
-    trajectory = scene.trajectory()
-    odometry = OdometryTrack.from_lines(scene_odometry(scene, seed))
-    with open_loopback(scene, noise_seed) as source:
-        source.start(RAW_CONFIG, FRAME_RATE_HZ)
-        scans = source.scans(end_counter(trajectory.duration_ns), check)
-        slam = UwbRadarSlam(config, rig_of(scene))
-        return run_slam(scans, odometry, slam, trajectory.poses)
 
 
 def _observed(
@@ -246,42 +221,32 @@ def _rms_m(points: Array, landmarks_m: Array) -> float | None:
 _SHOWN = ("clear air", "smoke", "lab, clear air")
 
 
-def draw_smoke(path: Path, runs: Sequence[ObservedRun], *, seed: int) -> None:
-    """Draw raw observations above filtered ones, run by run, on odometry poses; a PNG file."""
+def _draw_runs(figure: Figure, runs: Sequence[ObservedRun]) -> None:
     shown = [run for run in runs if run.name in _SHOWN]
-    with picture(path, width_in=10.4, height_in=7.4) as figure:
-        figure.suptitle(
-            "Observations on wheel-odometry poses, before and after the paper's DBSCAN filter "
-            f"(simulated, seed {seed})",
-            fontsize=11,
-            color=INK,
-            x=0.01,
-            ha="left",
-        )
-        panels = figure.subplots(2, len(shown), sharex="col", sharey="col")
-        for column, run in zip(panels.T, shown, strict=True):
-            for axes, points, colour, what, error_m in (
-                (column[0], run.raw_m, ESTIMATE, "raw", run.raw_rms_m),
-                (column[1], run.filtered_m, LANDMARK, "filtered", run.filtered_rms_m),
-            ):
-                _draw(axes, run, points, colour)
-                label(
-                    axes,
-                    f"{run.name}: {len(points)} {what}, {mm_text(error_m)} off",
-                    "x [m]" if axes is column[1] else "",
-                    "y [m]" if run is shown[0] else "",
-                )
-        handles = [*panels[0, 0].get_legend_handles_labels()[0]]
-        handles.append(panels[1, 0].get_lines()[-1])
-        figure.legend(
-            handles,
-            ["wheel odometry", "true path", "true landmark", "raw fix", "filtered observation"],
-            loc="outside lower center",
-            ncols=5,
-            frameon=False,
-            title="off: root mean square distance to the nearest landmark, seen from the true pose",
-            title_fontsize=9,
-        )
+    panels = figure.subplots(2, len(shown), sharex="col", sharey="col")
+    for column, run in zip(panels.T, shown, strict=True):
+        for axes, points, colour, what, error_m in (
+            (column[0], run.raw_m, ESTIMATE, "raw", run.raw_rms_m),
+            (column[1], run.filtered_m, LANDMARK, "filtered", run.filtered_rms_m),
+        ):
+            _draw(axes, run, points, colour)
+            label(
+                axes,
+                f"{run.name}: {len(points)} {what}, {mm_text(error_m)} off",
+                "x [m]" if axes is column[1] else "",
+                "y [m]" if run is shown[0] else "",
+            )
+    handles = [*panels[0, 0].get_legend_handles_labels()[0]]
+    handles.append(panels[1, 0].get_lines()[-1])
+    figure.legend(
+        handles,
+        ["wheel odometry", "true path", "true landmark", "raw fix", "filtered observation"],
+        loc="outside lower center",
+        ncols=5,
+        frameon=False,
+        title="off: root mean square distance to the nearest landmark, seen from the true pose",
+        title_fontsize=9,
+    )
 
 
 def _draw(axes: Axes, run: ObservedRun, points: NDArray[np.float64], colour: str) -> None:
@@ -309,59 +274,46 @@ def _draw(axes: Axes, run: ObservedRun, points: NDArray[np.float64], colour: str
     )
 
 
-NAME = "smoke"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the seed."""
-    parser.add_argument(
-        "--seed",
-        type=seed,
-        default=0,
-        help="seed of receiver noise and odometry drift (default: %(default)s)",
-    )
-
-
-def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
-    """Drive round one point feature in clear air and in smoke; filter what was observed."""
-    # heavy, see module text
-    from slam.app.run.output import mm_text, print_table, write_json
-
+def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
     runs = drive_in_clear_air_and_smoke(seed=arguments.seed, check=stop.check)
-    radar_db, light_db = smoke_attenuation_db(1.5), light_attenuation_db(1.5)
-    write_json(
-        arguments.out / f"{NAME}.json",
-        {
+    radar_db = smoke_attenuation_db(_LARGEST_RANGE_M)
+    light_db = light_attenuation_db(_LARGEST_RANGE_M)
+    title = (
+        f"seed {arguments.seed}: simulated numbers. Smoke of {SMOKE_G_PER_M3:g} g/m3 takes at most "
+        f"{radar_db:.4f} dB from a radar's echo 1.5 m away, and {light_db:.0f} dB from a lidar's"
+    )
+    header = (
+        "run",
+        "detections",
+        "states as in clear air",
+        "raw fixes",
+        "filtered",
+        "raw error",
+        "filtered error",
+    )
+    rows = [
+        (
+            row.name,
+            str(row.n_detections),
+            "-" if row.same_detections is None else f"{row.same_detections:.4f}",
+            str(len(row.raw_m)),
+            str(len(row.filtered_m)),
+            mm_text(row.raw_rms_m),
+            mm_text(row.filtered_rms_m),
+        )
+        for row in runs
+    ]
+    return Result(
+        numbers={
             "simulated": True,
             "seed": arguments.seed,
             "smoke_g_per_m3": SMOKE_G_PER_M3,
             "attenuation_to_1_5_m_and_back_db": {"radar_at_most": radar_db, "light": light_db},
             "runs": [row.numbers() for row in runs],
         },
-    )
-    draw_smoke(arguments.out / f"{NAME}.png", runs, seed=arguments.seed)
-    print_table(
-        f"seed {arguments.seed}: simulated numbers. Smoke of {SMOKE_G_PER_M3:g} g/m3 takes at most "
-        f"{radar_db:.4f} dB from a radar's echo 1.5 m away, and {light_db:.0f} dB from a lidar's",
-        (
-            "run",
-            "detections",
-            "states as in clear air",
-            "raw fixes",
-            "filtered",
-            "raw error",
-            "filtered error",
-        ),
-        [
-            (
-                row.name,
-                str(row.n_detections),
-                "-" if row.same_detections is None else f"{row.same_detections:.4f}",
-                str(len(row.raw_m)),
-                str(len(row.filtered_m)),
-                mm_text(row.raw_rms_m),
-                mm_text(row.filtered_rms_m),
-            )
-            for row in runs
-        ],
+        title="Observations on wheel-odometry poses, before and after the paper's DBSCAN filter "
+        f"(simulated, seed {arguments.seed})",
+        size_in=(10.4, 7.4),
+        draw=lambda figure: _draw_runs(figure, runs),
+        tables=[(title, header, rows)],
     )

@@ -3,8 +3,6 @@
 Time is CPU time of this thread with one BLAS thread, so that a loaded machine changes little but
 the caches. Every step of a cycle is timed again and again and its least counts; the mean over the
 cycle is the cost of a step, the passes over the covariance that many steps share among them.
-
-Light, so that ``--help`` is; the work is in ``step_cost_study`` and ``step_cost_picture``.
 """
 
 from __future__ import annotations
@@ -15,21 +13,23 @@ import platform
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 import numpy as np
 import scipy
+from matplotlib.figure import Figure
 from scipy.linalg.blas import dsyr2, dsyrk
 from threadpoolctl import threadpool_limits
 
-from slam.app.commands.options import count
-from slam.app.errors import StopFlag, UsageError
-from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label, picture
+from slam.app.errors import UsageError
+from slam.app.experiments import Result
+from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label
+from slam.config import WheelNoise
 from slam.geometry import paper_rig
 from slam.robust.matching import sure_landmarks
-from slam.robust.parameters import ContinuationRule, RangeNoise, WheelNoise
+from slam.robust.parameters import ContinuationRule, RangeNoise
 from slam.robust.ranges import antennas_of, rows_of, sides_of, view
 from slam.robust.state import Motion, State, SymmetricMatrix, calibrated_motion, predict
+from xethru_protocol.system import StopFlag
 
 N_UPDATES = 4
 BAR_MS, BAR_LANDMARKS = 4.0, 1000
@@ -42,7 +42,7 @@ _DENSITY_PER_M2 = 1.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reference:
-    """A number somebody else's code takes at 1000 landmarks, as quoted: low and high [ms]."""
+    """What other code takes at 1000 landmarks, as quoted: low and high [ms]."""
 
     name: str
     low_ms: float
@@ -170,7 +170,6 @@ def slope_of(costs: Sequence[StepCost]) -> float | None:
 
 
 def numbers_of(costs: Sequence[StepCost], *, repetitions: int) -> dict[str, object]:
-    """Return what goes into the JSON file."""
     return {
         "measured": "CPU time of one thread, one BLAS thread, the least of the repetitions of "
         "every step; mean and slowest over a cycle of steps",
@@ -234,105 +233,71 @@ def _at_rest() -> Motion:
     return Motion(step_m=np.zeros(2), turn_rad=0.0, covariance=np.zeros((3, 3)), walk_variance=0.0)
 
 
-def draw_step_cost(path: Path, costs: Sequence[StepCost]) -> None:
-    """Draw the cost of a step over the number of landmarks, both logarithmic; a PNG file."""
+def _draw(figure: Figure, costs: Sequence[StepCost]) -> None:
     n = np.array([cost.n_landmarks for cost in costs])
     slope = slope_of(costs)
     fitted = "" if slope is None else f", slope {slope:.2f} from n = {SLOPE_FROM} on"
-    with picture(path, width_in=8.6, height_in=6.2) as figure:
-        figure.suptitle(
-            "One step of the robust filter against the size of the map (CPU time, one BLAS thread)",
-            fontsize=11,
-            color=INK,
-            x=0.01,
-            ha="left",
-        )
-        axes = figure.subplots()
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        series = (
-            ("step_ms", ESTIMATE, "o-", f"measured: predict, view, gate, 4 updates{fitted}"),
-            (
-                "slowest_ms",
-                LANDMARK,
-                "v:",
-                "measured: slowest step, which carries out what others put off",
-            ),
-            ("at_once_ms", ODOMETRY, "s--", "measured: dsyr2 + dsyrk, if nothing were put off"),
-            ("triangle_ms", TRUTH, "-", "measured: triangle of P read and written once"),
-        )
-        for name, colour, style, what in series:
-            ms = [getattr(cost, name) for cost in costs]
-            axes.plot(n, ms, style, color=colour, linewidth=1.4, markersize=4, label=what)
-        left = float(n.min())
-        for reference in REFERENCES:
-            for quoted in {reference.low_ms, reference.high_ms}:
-                axes.axhline(quoted, color=PALE_INK, linewidth=0.9, linestyle=(0, (6, 3)))
-            text = f"{reference.low_ms:g}"
-            if reference.high_ms > reference.low_ms:
-                text += f" - {reference.high_ms:g}"
-            axes.annotate(
-                f"{reference.name}, n = {BAR_LANDMARKS}: {text} ms (quoted)",
-                (left, reference.low_ms),
-                xytext=(0, -4),
-                textcoords="offset points",
-                va="top",
-                fontsize=8,
-                color=PALE_INK,
-            )
-        axes.plot(
-            [BAR_LANDMARKS], [BAR_MS], marker="_", markersize=26, markeredgewidth=2.2, color=INK
-        )
+    axes = figure.subplots()
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    series = (
+        ("step_ms", ESTIMATE, "o-", f"measured: predict, view, gate, 4 updates{fitted}"),
+        (
+            "slowest_ms",
+            LANDMARK,
+            "v:",
+            "measured: slowest step, which carries out what others put off",
+        ),
+        ("at_once_ms", ODOMETRY, "s--", "measured: dsyr2 + dsyrk, if nothing were put off"),
+        ("triangle_ms", TRUTH, "-", "measured: triangle of P read and written once"),
+    )
+    for name, colour, style, what in series:
+        ms = [getattr(cost, name) for cost in costs]
+        axes.plot(n, ms, style, color=colour, linewidth=1.4, markersize=4, label=what)
+    left = float(n.min())
+    for reference in REFERENCES:
+        for quoted in {reference.low_ms, reference.high_ms}:
+            axes.axhline(quoted, color=PALE_INK, linewidth=0.9, linestyle=(0, (6, 3)))
+        text = f"{reference.low_ms:g}"
+        if reference.high_ms > reference.low_ms:
+            text += f" - {reference.high_ms:g}"
         axes.annotate(
-            f"bar: {BAR_MS:g} ms",
-            (BAR_LANDMARKS, BAR_MS),
-            xytext=(16, 0),
+            f"{reference.name}, n = {BAR_LANDMARKS}: {text} ms (quoted)",
+            (left, reference.low_ms),
+            xytext=(0, -4),
             textcoords="offset points",
-            va="center",
+            va="top",
             fontsize=8,
-            color=INK,
+            color=PALE_INK,
         )
-        ticks = [10, 20, 50, 100, 200, 500, 1000, 2000]
-        axes.set_xticks(ticks, [str(tick) for tick in ticks])
-        axes.minorticks_off()
-        label(axes, "", "landmarks n", "time [ms]")
-        figure.legend(loc="outside lower center", ncols=1, frameon=False, fontsize=9)
+    axes.plot([BAR_LANDMARKS], [BAR_MS], marker="_", markersize=26, markeredgewidth=2.2, color=INK)
+    axes.annotate(
+        f"bar: {BAR_MS:g} ms",
+        (BAR_LANDMARKS, BAR_MS),
+        xytext=(16, 0),
+        textcoords="offset points",
+        va="center",
+        fontsize=8,
+        color=INK,
+    )
+    ticks = [10, 20, 50, 100, 200, 500, 1000, 2000]
+    axes.set_xticks(ticks, [str(tick) for tick in ticks])
+    axes.minorticks_off()
+    label(axes, "", "landmarks n", "time [ms]")
+    figure.legend(loc="outside lower center", ncols=1, frameon=False, fontsize=9)
 
 
-NAME = "step-cost"
 _FEWEST = 2
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add sizes and repetitions."""
-    parser.add_argument(
-        "--landmarks",
-        nargs="+",
-        type=count,
-        default=[10, 20, 50, 100, 200, 500, 1000, 2000],
-        metavar="N",
-        help="sizes of the map (default: 10 20 50 100 200 500 1000 2000)",
-    )
-    parser.add_argument(
-        "--repetitions",
-        type=count,
-        default=7,
-        metavar="N",
-        help="how often every step is timed; the least counts (default: %(default)s)",
-    )
-
-
-def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
-    """Time a step at every size, write, draw and print.
+def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
+    """Time a step at every size.
 
     Raises
     ------
     UsageError
         A map of one landmark was asked for: each side of the robot needs its own.
     """
-    # heavy, see module text
-    from slam.app.run.output import print_table, write_json
-
     if min(arguments.landmarks) < _FEWEST:
         raise UsageError(
             f"--landmarks {min(arguments.landmarks)}: a step sees one landmark on each side, "
@@ -341,21 +306,32 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
     costs = study(
         sorted(set(arguments.landmarks)), repetitions=arguments.repetitions, check=stop.check
     )
-    numbers = numbers_of(costs, repetitions=arguments.repetitions)
-    write_json(arguments.out / f"{NAME}.json", numbers)
-    draw_step_cost(arguments.out / f"{NAME}.png", costs)
-    print_table(
+    title = (
         "One step of the robust filter: predict, view, gate, 4 range updates; CPU time, one BLAS "
-        f"thread, least of {arguments.repetitions}",
-        ("landmarks", "step", "slowest step", "every change at once", "triangle read and written"),
-        [
-            (
-                str(cost.n_landmarks),
-                f"{cost.step_ms:.3f} ms",
-                f"{cost.slowest_ms:.3f} ms",
-                f"{cost.at_once_ms:.3f} ms",
-                f"{cost.triangle_ms:.3f} ms",
-            )
-            for cost in costs
-        ],
+        f"thread, least of {arguments.repetitions}"
+    )
+    header = (
+        "landmarks",
+        "step",
+        "slowest step",
+        "every change at once",
+        "triangle read and written",
+    )
+    rows = [
+        (
+            str(cost.n_landmarks),
+            f"{cost.step_ms:.3f} ms",
+            f"{cost.slowest_ms:.3f} ms",
+            f"{cost.at_once_ms:.3f} ms",
+            f"{cost.triangle_ms:.3f} ms",
+        )
+        for cost in costs
+    ]
+    return Result(
+        numbers=numbers_of(costs, repetitions=arguments.repetitions),
+        title="One step of the robust filter against the size of the map (CPU time, one BLAS "
+        "thread)",
+        size_in=(8.6, 6.2),
+        draw=lambda figure: _draw(figure, costs),
+        tables=[(title, header, rows)],
     )

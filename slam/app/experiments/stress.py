@@ -1,7 +1,4 @@
-"""How much worse each hardship of the stress table makes a run, on equal seeds.
-
-Light, so that ``--help`` is; the drawing is in ``stress_picture``.
-"""
+"""How much worse each hardship of the stress table makes a run, on equal seeds."""
 
 from __future__ import annotations
 
@@ -15,24 +12,21 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
-from slam.app.errors import AppError, StopFlag
-from slam.app.run.pictures import ESTIMATE, GRID, INK, LANDMARK, PALE_INK, label, picture
-from slam.app.sweep.statistics import group_name, times_clean
-from xethru_protocol.system import read_bounded
+from slam.app.errors import AppError
+from slam.app.experiments import Result
+from slam.app.run.pictures import ESTIMATE, GRID, LANDMARK, PALE_INK, label
+from slam.app.sweep.statistics import (
+    group_name,
+    in_band,
+    stress_table,
+    stress_tables,
+    times_clean,
+)
+from slam.app.sweep.stress import CLEAN
+from xethru_protocol.system import StopFlag, read_bounded
 
 _MOST_BYTES = 1 << 28
 _NEEDED = {"scene", "preset", "settings", "stress", "ate_rmse_m", "anees_pose", "nis_times"}
-
-
-def add_sweep_argument(parser: argparse.ArgumentParser, default: str, made_by: str) -> None:
-    """Add `--sweep`, the result file to look at."""
-    parser.add_argument(
-        "--sweep",
-        type=Path,
-        default=Path(default),
-        metavar="JSON",
-        help=f"result of {made_by} (default: %(default)s)",
-    )
 
 
 def read_groups(path: Path, result: Path) -> list[dict[str, Any]]:
@@ -60,6 +54,11 @@ def read_groups(path: Path, result: Path) -> list[dict[str, Any]]:
     return groups
 
 
+def clean_groups(path: Path, result: Path) -> list[dict[str, Any]]:
+    """Return the groups without stress, see `read_groups`."""
+    return [group for group in read_groups(path, result) if group["stress"] == CLEAN]
+
+
 TARGETS = {
     **dict.fromkeys(("outliers", "dropped", "skew", "walk", "silent"), 1.5),
     "all": 2.5,
@@ -72,25 +71,15 @@ _MOST_NEES = 100.0
 """What is above is an arrow at the edge."""
 
 
-def draw_stress(
-    path: Path, tables: Sequence[tuple[dict[str, Any], Sequence[dict[str, Any]]]]
-) -> None:
-    """Draw the error in units of the clean one beside the consistency, a row per table; a PNG."""
-    rows = max(len(groups) for _, groups in tables)
-    height_in = 0.9 + (1.1 + 0.3 * rows) * len(tables)
-    with picture(path, width_in=10.4, height_in=height_in) as figure:
-        figure.suptitle(
-            "What each hardship costs, on equal seeds (simulated)",
-            fontsize=11,
-            color=INK,
-            x=0.01,
-            ha="left",
-        )
-        panels = figure.subplots(len(tables), 2, squeeze=False, sharex="col")
-        for (errors, consistency), (clean, groups) in zip(panels, tables, strict=True):
-            _draw_errors(errors, clean, groups)
-            draw_consistency(consistency, groups, [group["stress"] for group in groups])
-        legend_below(figure, panels[0, 0], panels[0, 1])
+_Tables = Sequence[tuple[dict[str, Any], Sequence[dict[str, Any]]]]
+
+
+def _draw(figure: Figure, tables: _Tables) -> None:
+    panels = figure.subplots(len(tables), 2, squeeze=False, sharex="col")
+    for (errors, consistency), (clean, groups) in zip(panels, tables, strict=True):
+        _draw_errors(errors, clean, groups)
+        draw_consistency(consistency, groups, [group["stress"] for group in groups])
+    legend_below(figure, panels[0, 0], panels[0, 1])
 
 
 def _draw_errors(axes: Axes, clean: dict[str, Any], groups: Sequence[dict[str, Any]]) -> None:
@@ -172,34 +161,11 @@ def legend_below(figure: Figure, *panels: Axes) -> None:
     figure.legend(handles, names, loc="outside lower center", ncols=5, frameon=False)
 
 
-NAME = "stress"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the sweep to look at."""
-    add_sweep_argument(parser, "out/stress.json", "`uwb-slam sweep --stress ...`")
-
-
-def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
-    """Draw and print the stress tables of a sweep."""
-    # heavy, see module text
-    from slam.app.errors import AppError
-    from slam.app.run.output import write_json
-    from slam.app.sweep.statistics import (
-        group_name,
-        in_band,
-        print_stress_tables,
-        stress_tables,
-        times_clean,
-    )
-
-    result = arguments.out / f"{NAME}.json"
-    groups = read_groups(arguments.sweep, result)
-    tables = stress_tables(groups)
+def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
+    tables = stress_tables(read_groups(arguments.sweep, arguments.out / "stress.json"))
     if not tables:
         raise AppError(f"{arguments.sweep}: has no stressed runs; `uwb-slam sweep --stress` does")
     stop.check()
-    draw_stress(arguments.out / f"{NAME}.png", tables)
     numbers = [
         {
             "name": group_name(group),
@@ -214,5 +180,11 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
         for clean, rows in tables
         for group in rows
     ]
-    write_json(result, {"simulated": True, "groups": numbers})
-    print_stress_tables(groups)
+    most_rows = max(len(groups) for _, groups in tables)
+    return Result(
+        numbers={"simulated": True, "groups": numbers},
+        title="What each hardship costs, on equal seeds (simulated)",
+        size_in=(10.4, 0.9 + (1.1 + 0.3 * most_rows) * len(tables)),
+        draw=lambda figure: _draw(figure, tables),
+        tables=[stress_table(clean, rows) for clean, rows in tables],
+    )

@@ -8,15 +8,13 @@ The file has one line per odometry step and one per tree seen::
 in metres and radians, body frame of the earlier pose, with covariances (upper triangles). Poses
 and landmarks share one sequence of ids, so poses are numbered anew here. There is no ground
 truth. Source: the data of Guivant and Nebot, University of Sydney, in iSAM's format.
-
-Light, so that ``--help`` is; the work is in ``slam.app.experiments.victoria_park`` and
-``victoria_park_picture``.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -26,18 +24,22 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from slam.app.commands.options import count
-from slam.app.errors import AppError, StopFlag
-from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, TRUTH, label, picture
+from slam.app.errors import AppError
+from slam.app.experiments import Result
+from slam.app.run.output import share_text
+from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, TRUTH, label
 from slam.app.sweep.bound import load_gtsam
+from slam.config import WheelNoise
 from slam.evaluation import ate_rmse_m
 from slam.geometry import Rig, compose, wrap_angle
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import RangeBearing
-from slam.robust.parameters import BackEndParameters, RelinearisationRule, WheelNoise
+from slam.robust.parameters import BackEndParameters, RelinearisationRule
 from slam.robust.state import CALIBRATION
+from xethru_protocol.system import StopFlag
 
 Array = NDArray[np.float64]
 
@@ -62,18 +64,15 @@ class Drive:
 
     @property
     def n_observations(self) -> int:
-        """Return how often a landmark was seen."""
         return sum(len(points) for points in self.seen)
 
     @property
     def labels(self) -> frozenset[int]:
-        """Return the ids of all landmarks."""
         return frozenset(
             point.label for points in self.seen for point in points if point.label is not None
         )
 
     def first(self, n_steps: int) -> Drive:
-        """Return the drive up to a pose."""
         return Drive(
             increments=self.increments[:n_steps],
             covariances=self.covariances[:n_steps],
@@ -104,7 +103,7 @@ def read_drive(path: Path) -> Drive:
     Raises
     ------
     AppError
-        It cannot be read, or a line is not as the module's text says; file and line are named.
+        It cannot be read, or a line is not in the format above; file and line are named.
     """
     increments: list[list[float]] = []
     covariances: list[Array] = []
@@ -220,7 +219,7 @@ def drive_back_end(
     drive
         The data; the noise of each step is in it.
     with_ids
-        Whether the back end is told which tree each observation is of.
+        Whether the back end gets the id of the tree of each observation.
     wheels
         Standard deviations of the wheels' calibration errors; the reference's model has none.
     check
@@ -236,8 +235,8 @@ def drive_back_end(
         check()
         if step > 0:
             back_end.predict(drive.increments[step - 1], drive.covariances[step - 1])
-        told = points if with_ids else [replace(point, label=None) for point in points]
-        ids = back_end.update_points(told)
+        given_points = points if with_ids else [replace(point, label=None) for point in points]
+        ids = back_end.update_points(given_points)
         given += [
             (point.label, id_)
             for point, id_ in zip(points, ids, strict=True)
@@ -352,7 +351,7 @@ def batch_reference(drive: Drive, check: Callable[[], None] = lambda: None) -> R
     )
 
 
-def _vector(pose: Any) -> Array:  # noqa: ANN401 - GTSAM's own types, see gtsam_door
+def _vector(pose: Any) -> Array:  # noqa: ANN401 - GTSAM's own types
     return np.array([pose.x(), pose.y(), wrap_angle(pose.theta())])
 
 
@@ -370,7 +369,7 @@ class PathScore:
         Landmarks in the map.
     right_share
         Share of the observations taken in whose landmark is the one that its tree is mostly
-        called, and is mostly called so for its tree; None where the ids were told.
+        called, and is mostly called so for its tree; None where the ids were given.
     left_out
         Observations that were in doubt and not taken in.
     seconds
@@ -386,26 +385,21 @@ class PathScore:
     left_out: int | None = None
     seconds: float | None = None
 
-    def numbers(self) -> dict[str, object]:
-        """Return the fields for a JSON file."""
-        return asdict(self)
-
 
 def scores(drive: Drive, reference: Reference, runs: Mapping[str, ParkRun]) -> list[PathScore]:
-    """Return the scores of odometry, of ISAM2's causal path, and of our runs."""
     rows = [
         _score("odometry", odometry_path(drive), reference),
         _score("ISAM2, true ids", reference.causal, reference),
     ]
     for name, run in runs.items():
-        told = name.startswith("true ids")
+        has_ids = name.startswith("true ids")
         rows.append(
             _score(
                 f"robust, {name}",
                 run.poses,
                 reference,
                 n_landmarks=len(run.landmarks_m),
-                right_share=None if told else right_share(run.given),
+                right_share=None if has_ids else right_share(run.given),
                 left_out=sum(given is None for _, given in run.given),
                 seconds=run.seconds,
             )
@@ -464,60 +458,50 @@ _ISAM = "#2f9e44"
 _MAPS = ("true ids", "unknown ids")
 
 
-def draw_park(
-    path: Path,
-    drive: Drive,
+def _draw(
+    figure: Figure,
+    odometry: Array,
     reference: Reference,
     runs: Mapping[str, ParkRun],
     rows: Sequence[PathScore],
 ) -> None:
-    """Draw one map per run beside the batch solution, and distances to it below; a PNG file."""
-    odometry = odometry_path(drive)
+    """Draw one map per run beside the batch solution, and distances to it below."""
     ate = {row.name: row.ate_m for row in rows}
-    with picture(path, width_in=11.0, height_in=9.2) as figure:
-        figure.suptitle(
-            "Victoria Park (real data): causal paths of the robust back end "
-            "against GTSAM's batch solution",
-            fontsize=11,
-            color=INK,
-            x=0.01,
-            ha="left",
-        )
-        grid = figure.add_gridspec(2, 2, height_ratios=(2.4, 1.0))
-        for column, name in enumerate(_MAPS):
-            run = runs[name]
-            axes = figure.add_subplot(grid[0, column])
-            _map(axes, odometry, reference, run)
-            label(
-                axes,
-                f"{name}: {len(run.landmarks_m)} landmarks for {len(reference.labels)} trees, "
-                f"ATE {ate[f'robust, {name}']:.2f} m",
-                "x [m]",
-                "y [m]",
-            )
-            if column == 0:
-                axes.legend(loc="lower left", fontsize=8, frameon=False)
-        axes = figure.add_subplot(grid[1, :])
-        gone_m = np.concatenate(
-            [[0.0], np.cumsum(np.hypot(*np.diff(reference.poses[:, :2], axis=0).T))]
-        )
-        paths = {"ISAM2, true ids": reference.causal} | {
-            f"robust, {name}": runs[name].poses for name in _MAPS
-        }
-        for (name, poses), colour in zip(paths.items(), (_ISAM, ESTIMATE, LANDMARK), strict=True):
-            away = np.hypot(*(poses - reference.poses)[:, :2].T)
-            axes.semilogy(gone_m, np.maximum(away, 1e-3), color=colour, linewidth=0.9, label=name)
-        axes.set_ylim(1e-2, None)
-        axes.legend(loc="lower right", fontsize=8, frameon=False, ncols=3)
+    grid = figure.add_gridspec(2, 2, height_ratios=(2.4, 1.0))
+    for column, name in enumerate(_MAPS):
+        run = runs[name]
+        axes = figure.add_subplot(grid[0, column])
+        _map(axes, odometry, reference, run)
         label(
             axes,
-            "distance to the batch solution, not aligned (batch also knows what came later)",
-            "distance driven [m]",
-            "distance [m]",
+            f"{name}: {len(run.landmarks_m)} landmarks for {len(reference.labels)} trees, "
+            f"ATE {ate[f'robust, {name}']:.2f} m",
+            "x [m]",
+            "y [m]",
         )
+        if column == 0:
+            axes.legend(loc="lower left", fontsize=8, frameon=False)
+    axes = figure.add_subplot(grid[1, :])
+    gone_m = np.concatenate(
+        [[0.0], np.cumsum(np.hypot(*np.diff(reference.poses[:, :2], axis=0).T))]
+    )
+    paths = {"ISAM2, true ids": reference.causal} | {
+        f"robust, {name}": runs[name].poses for name in _MAPS
+    }
+    for (name, poses), colour in zip(paths.items(), (_ISAM, ESTIMATE, LANDMARK), strict=True):
+        away = np.hypot(*(poses - reference.poses)[:, :2].T)
+        axes.semilogy(gone_m, np.maximum(away, 1e-3), color=colour, linewidth=0.9, label=name)
+    axes.set_ylim(1e-2, None)
+    axes.legend(loc="lower right", fontsize=8, frameon=False, ncols=3)
+    label(
+        axes,
+        "distance to the batch solution, not aligned (batch also knows what came later)",
+        "distance driven [m]",
+        "distance [m]",
+    )
 
 
-def _map(axes: Axes, odometry: np.ndarray, reference: Reference, run: ParkRun) -> None:
+def _map(axes: Axes, odometry: Array, reference: Reference, run: ParkRun) -> None:
     axes.set_aspect("equal", adjustable="datalim")
     axes.plot(*odometry[:, :2].T, color=ODOMETRY, linewidth=0.6, alpha=0.8, label="odometry")
     axes.plot(
@@ -544,33 +528,11 @@ def _map(axes: Axes, odometry: np.ndarray, reference: Reference, run: ParkRun) -
     )
 
 
-NAME = "victoria-park"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add how much of the drive to take."""
-    parser.add_argument(
-        "--steps",
-        type=count,
-        default=None,
-        help="take the first steps of the drive only (default: all 6968)",
-    )
-
-
-def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
-    """Drive through the park with and without ids; compare with GTSAM on the same data."""
-    # heavy, see module text
-    import sys
-
-    from slam.app.run.output import print_table, share_text, write_json
-
-    def tell(what: str) -> None:
-        sys.stderr.write(f"{what}\n")
-
+def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
     drive = read_drive(shipped_file())
     if arguments.steps is not None:
         drive = drive.first(arguments.steps)
-    tell("GTSAM: every step with ISAM2, then all of it in a batch")
+    sys.stderr.write("GTSAM: every step with ISAM2, then all of it in a batch\n")
     reference = batch_reference(drive, stop.check)
     runs = {}
     for name, with_ids, wheels in (
@@ -578,12 +540,30 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
         ("true ids", True, UNKNOWN_WHEELS),
         ("unknown ids", False, UNKNOWN_WHEELS),
     ):
-        tell(f"robust back end, {name}")
+        sys.stderr.write(f"robust back end, {name}\n")
         runs[name] = drive_back_end(drive, with_ids=with_ids, wheels=wheels, check=stop.check)
     rows = scores(drive, reference, runs)
-    write_json(
-        arguments.out / f"{NAME}.json",
-        {
+    title = (
+        f"Victoria Park, {len(drive.increments)} steps, {len(drive.labels)} trees seen "
+        f"{drive.n_observations} times: causal paths against GTSAM's batch solution (real data, "
+        "no ground truth)"
+    )
+    header = ("path", "ATE", "unaligned", "most", "landmarks", "right", "left out", "CPU time")
+    cells = [
+        (
+            row.name,
+            f"{row.ate_m:.2f} m",
+            f"{row.rmse_m:.2f} m",
+            f"{row.max_m:.2f} m",
+            "-" if row.n_landmarks is None else str(row.n_landmarks),
+            share_text(row.right_share),
+            "-" if row.left_out is None else str(row.left_out),
+            "-" if row.seconds is None else f"{row.seconds:.1f} s",
+        )
+        for row in rows
+    ]
+    return Result(
+        numbers={
             "simulated": False,
             "data": "Victoria Park as in the wheel of gtsam; no ground truth",
             "reference": "GTSAM, batch, true ids",
@@ -593,30 +573,15 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> None:
             "reference_chi_square": reference.chi_square,
             "reference_dof": reference.dof,
             "reference_seconds": reference.seconds,
-            "paths": [row.numbers() for row in rows],
+            "paths": [asdict(row) for row in rows],
             "wheel_errors": {
                 name: {"mean": run.calibration.tolist(), "sigma": run.calibration_sigmas.tolist()}
                 for name, run in runs.items()
             },
         },
-    )
-    draw_park(arguments.out / f"{NAME}.png", drive, reference, runs, rows)
-    print_table(
-        f"Victoria Park, {len(drive.increments)} steps, {len(drive.labels)} trees seen "
-        f"{drive.n_observations} times: causal paths against GTSAM's batch solution (real data, "
-        "no ground truth)",
-        ("path", "ATE", "unaligned", "most", "landmarks", "right", "left out", "CPU time"),
-        [
-            (
-                row.name,
-                f"{row.ate_m:.2f} m",
-                f"{row.rmse_m:.2f} m",
-                f"{row.max_m:.2f} m",
-                "-" if row.n_landmarks is None else str(row.n_landmarks),
-                share_text(row.right_share),
-                "-" if row.left_out is None else str(row.left_out),
-                "-" if row.seconds is None else f"{row.seconds:.1f} s",
-            )
-            for row in rows
-        ],
+        title="Victoria Park (real data): causal paths of the robust back end against GTSAM's "
+        "batch solution",
+        size_in=(11.0, 9.2),
+        draw=lambda figure: _draw(figure, odometry_path(drive), reference, runs, rows),
+        tables=[(title, header, cells)],
     )

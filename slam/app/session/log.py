@@ -21,6 +21,14 @@ from slam.app.session import messages as ros
 from slam.app.session.mcap import SessionFile
 from slam.app.session.messages import METADATA_NAME, radar_text, session_table, state_row
 from slam.geometry import between, compose
+from xethru_protocol.recordings.mcap import (
+    BYTE_ARRAY,
+    DOUBLE_ARRAY,
+    FLOAT_ARRAY,
+    STRING,
+    pack_array,
+    pack_string,
+)
 
 _ORIGIN = np.zeros(3)
 
@@ -35,7 +43,7 @@ class SessionLog(SessionObserver):
     latched `/radar/<name>/info` (JSON); `/scan` after the frames of each scan, with their counters
     and the true pose where it is known, or `/scan_unused`; `/odom`, `/truth`, `/estimate`,
     `/landmarks`, `/tf`, `/tf_static`, `/log`; `/slam/state`, the same states to the last bit
-    (`session_states`); where there are such, raw bytes in `/radar/<name>/rx` and `tx`, and ranges
+    (`state_row`); where there are such, raw bytes in `/radar/<name>/rx` and `tx`, and ranges
     that another program found in `/radar/<name>/detections`. A metadata record names scene, preset,
     seed, settings, versions.
 
@@ -48,7 +56,7 @@ class SessionLog(SessionObserver):
     odometry
         The whole track where it is known before the run; None where `on_odometry` brings it.
     truth_at
-        The robot's true pose; None where nobody knows.
+        The robot's true pose; None if unknown.
     start_ns
         Session time [ns] at which the file begins.
     clock_ns
@@ -81,13 +89,13 @@ class SessionLog(SessionObserver):
         self._file.add_metadata(METADATA_NAME, session_table(info))
         for radar in info.radars:
             self._frame_channels.append(
-                self._file.channel(f"/radar/{radar.name}/frame", ros.FLOAT_ARRAY)
+                self._file.channel(f"/radar/{radar.name}/frame", FLOAT_ARRAY)
             )
-            channel = self._file.channel(f"/radar/{radar.name}/info", ros.STRING, latched=True)
-            self._file.write(channel, start_ns, ros.string(radar_text(radar)))
-        self._scans = self._file.channel("/scan", ros.DOUBLE_ARRAY)
-        self._unused_scans = self._file.channel("/scan_unused", ros.DOUBLE_ARRAY)
-        self._states = self._file.channel("/slam/state", ros.DOUBLE_ARRAY)
+            channel = self._file.channel(f"/radar/{radar.name}/info", STRING, latched=True)
+            self._file.write(channel, start_ns, pack_string(radar_text(radar)))
+        self._scans = self._file.channel("/scan", DOUBLE_ARRAY)
+        self._unused_scans = self._file.channel("/scan_unused", DOUBLE_ARRAY)
+        self._states = self._file.channel("/slam/state", DOUBLE_ARRAY)
         self._odometry = self._file.channel("/odom", ros.ODOMETRY)
         self._truth = self._file.channel("/truth", ros.POSE)
         self._estimate = self._file.channel("/estimate", ros.POSE)
@@ -100,9 +108,8 @@ class SessionLog(SessionObserver):
             ("base_link", f"radar_{radar.name}"): np.array([radar.x_m, radar.y_m, radar.yaw_rad])
             for radar in info.radars
         }
-        self._file.write(
-            self._static_transforms, start_ns, ros.transforms(start_ns, self._placements)
-        )
+        static = ros.transforms(start_ns, self._placements)
+        self._write(self._static_transforms, start_ns, static)
         self._file.cut_chunk()
 
     def on_scan(self, scan: Scan) -> None:
@@ -116,7 +123,7 @@ class SessionLog(SessionObserver):
             self._file.write(
                 self._frame_channels[frame.radar],
                 frame.t_ns,
-                ros.float_array(frame.samples),
+                pack_array(FLOAT_ARRAY, frame.samples),
                 sequence=frame.counter,
                 publish_ns=host_ns,
             )
@@ -125,18 +132,17 @@ class SessionLog(SessionObserver):
         # which frames they are, so that a reader of a damaged file knows what is missing
         members = [number for frame in scan.frames for number in (frame.radar, frame.counter)]
         row = np.array([len(scan.frames), *members, *known], dtype=np.float64)
-        mark = ros.double_array("n_frames_radars_counters_truth", row)
+        mark = pack_array(DOUBLE_ARRAY, row, "n_frames_radars_counters_truth")
         topic = self._scans if scan.used else self._unused_scans
         self._file.write(topic, scan.t_ns, mark, sequence=scan.counter)
 
     def on_detections(self, radar: int, t_ns: int, ranges_m: NDArray[np.float64]) -> None:
         """Write ranges of the scan that comes next, shape (n,) [m], of a radar by its index."""
-        channel = self._lazily(radar, "detections", ros.DOUBLE_ARRAY)
-        self._file.write(channel, t_ns, ros.double_array("range_m", ranges_m))
+        channel = self._lazily(radar, "detections", DOUBLE_ARRAY)
+        self._file.write(channel, t_ns, pack_array(DOUBLE_ARRAY, ranges_m, "range_m"))
 
     def on_odometry(self, sample: TumSample) -> None:
-        """Write a pose of the wheels as it comes."""
-        self._file.write(self._odometry, sample.t_ns, ros.odometry(sample))
+        self._write(self._odometry, sample.t_ns, ros.odometry(sample))
         self._odometry_ns = sample.t_ns
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
@@ -145,23 +151,22 @@ class SessionLog(SessionObserver):
         if ("world", "map") not in self._placements:
             self._placements["world", "map"] = snapshot.world_from_map
             static = ros.transforms(t_ns, self._placements)
-            self._file.write(self._static_transforms, t_ns, static)
+            self._write(self._static_transforms, t_ns, static)
         if np.all(np.isfinite(snapshot.truth)):
-            self._file.write(self._truth, t_ns, ros.pose_stamped(t_ns, "world", snapshot.truth))
-        self._file.write(self._estimate, t_ns, ros.pose_stamped(t_ns, "map", snapshot.estimate))
-        self._file.write(self._landmarks, t_ns, ros.landmark_cloud(snapshot))
+            self._write(self._truth, t_ns, ros.pose_stamped(t_ns, "world", snapshot.truth))
+        self._write(self._estimate, t_ns, ros.pose_stamped(t_ns, "map", snapshot.estimate))
+        self._write(self._landmarks, t_ns, ros.landmark_cloud(snapshot))
         links = {
             ("map", "odom"): compose(snapshot.estimate, between(snapshot.odometry, _ORIGIN)),
             ("odom", "base_link"): snapshot.odometry,
         }
-        self._file.write(self._transforms, t_ns, ros.transforms(t_ns, links))
-        row = ros.double_array("state", state_row(snapshot))
+        self._write(self._transforms, t_ns, ros.transforms(t_ns, links))
+        row = pack_array(DOUBLE_ARRAY, state_row(snapshot), "state")
         self._file.write(self._states, t_ns, row, sequence=snapshot.counter)
 
     def on_log(self, line: LogLine) -> None:
-        """Write a line about the link."""
         message = ros.log_line(line.t_ns, line.radar, line.text, warning=line.warning)
-        self._file.write(self._log, line.t_ns, message)
+        self._write(self._log, line.t_ns, message)
 
     def on_wire(self, radar: str, way: Literal["rx", "tx"], data: bytes, host_ns: int) -> None:
         """Write bytes as a radar's port gave (rx) or took (tx) them, at a host time [ns].
@@ -170,9 +175,12 @@ class SessionLog(SessionObserver):
         """
         if not data:
             return
-        channel = self._lazily(radar, way, ros.BYTE_ARRAY)
-        message = ros.byte_array("byte", data)
+        channel = self._lazily(radar, way, BYTE_ARRAY)
+        message = pack_array(BYTE_ARRAY, np.frombuffer(data, np.uint8))
         self._file.write(channel, self._t_ns, message, publish_ns=host_ns)
+
+    def _write(self, channel: int, t_ns: int, message: ros.Message) -> None:
+        self._file.write(channel, t_ns, ros.serialise(message))
 
     def _lazily(self, radar: int | str, part: str, message_type: str) -> int:
         """Return the channel of a part that few sessions have, made when it is first needed."""
@@ -183,5 +191,4 @@ class SessionLog(SessionObserver):
         return self._rare[topic]
 
     def close(self) -> None:
-        """Write index and footer, and close the file; doing so again does nothing."""
         self._file.close()

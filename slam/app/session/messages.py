@@ -1,6 +1,6 @@
-"""What a session of somebody else's recording says about itself.
+"""What is in a session: messages of ROS 2, the table of the run, the description of a radar.
 
-The row::
+The row of a state, float64, in /slam/state::
 
     n_landmarks, n_nis,
     truth (3), odometry (3), estimate (3), world_from_map (3),
@@ -10,8 +10,7 @@ The row::
 
 in the units and frames of `Snapshot`; an unknown truth is NaN.
 
-Types and serialisation are those of the rosbags library; the arrays of a frame are copied once,
-into the serialised bytes.
+Composite messages are made and serialised by the rosbags library.
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ def snapshot_of(counter: int, t_ns: int, row: NDArray[np.float64]) -> Snapshot:
     Raises
     ------
     ValueError
-        The row's length is not what its first two numbers say.
+        The row's length does not fit its first two numbers.
     """
     n_landmarks, n_nis = (int(value) for value in row[:_COUNTS])
     ends = np.cumsum([_COUNTS, 3, 3, 3, 3, 9, _PER_LANDMARK * n_landmarks, n_nis])
@@ -92,10 +91,6 @@ def snapshot_of(counter: int, t_ns: int, row: NDArray[np.float64]) -> Snapshot:
     )
 
 
-FLOAT_ARRAY = "std_msgs/msg/Float32MultiArray"
-DOUBLE_ARRAY = "std_msgs/msg/Float64MultiArray"
-BYTE_ARRAY = "std_msgs/msg/UInt8MultiArray"
-STRING = "std_msgs/msg/String"
 ODOMETRY = "nav_msgs/msg/Odometry"
 POSE = "geometry_msgs/msg/PoseStamped"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
@@ -139,7 +134,6 @@ def schema_text(message_type: str) -> bytes:
 
 
 def serialise(message: Message) -> memoryview:
-    """Serialise any of the messages of this module to CDR."""
     data: memoryview = _typestore().serialize_cdr(message, message.__msgtype__)
     return data
 
@@ -147,26 +141,6 @@ def serialise(message: Message) -> memoryview:
 def deserialise(data: bytes, message_type: str) -> Message:
     """Read CDR bytes back; arrays come as numpy arrays."""
     return _typestore().deserialize_cdr(data, message_type)
-
-
-def float_array(samples: NDArray[np.float32]) -> Message:
-    """Wrap one frame, shape (n_bins,), as an array with the dimension `range_bin`."""
-    return _array(FLOAT_ARRAY, "range_bin", samples)
-
-
-def double_array(label: str, values: NDArray[np.float64]) -> Message:
-    """Wrap numbers, shape (n,), as an array with one labelled dimension."""
-    return _array(DOUBLE_ARRAY, label, values)
-
-
-def byte_array(label: str, data: bytes) -> Message:
-    """Wrap bytes as an array with one labelled dimension."""
-    return _array(BYTE_ARRAY, label, np.frombuffer(data, dtype=np.uint8))
-
-
-def string(text: str) -> Message:
-    """Wrap text."""
-    return _type(STRING)(data=text)
 
 
 def odometry(sample: TumSample) -> Message:
@@ -191,7 +165,6 @@ def odometry(sample: TumSample) -> Message:
 
 
 def odometry_sample(message: Message) -> TumSample:
-    """Read an odometry message back."""
     pose = message.pose.pose
     stamp = message.header.stamp
     return TumSample(
@@ -275,14 +248,6 @@ def _landmark_fields() -> list[Message]:
     ]
 
 
-def _array(message_type: str, label: str, values: NDArray[Any]) -> Message:
-    size = len(values)
-    dimension = _type("std_msgs/msg/MultiArrayDimension")(label=label, size=size, stride=size)
-    layout = _type("std_msgs/msg/MultiArrayLayout")(dim=[dimension], data_offset=0)
-    # a row of an array in Fortran order is none that can be written as it lies
-    return _type(message_type)(layout=layout, data=np.ascontiguousarray(values))
-
-
 def _time(t_ns: int) -> Message:
     seconds, rest = divmod(int(t_ns), NS_PER_S)
     return _type("builtin_interfaces/msg/Time")(sec=seconds, nanosec=rest)
@@ -347,7 +312,6 @@ def settings_text(config: SlamConfig) -> str:
 
 
 def radar_text(radar: RadarInfo) -> str:
-    """Return what a session says of a radar."""
     return json.dumps(asdict(radar) | {"length_unit": LENGTH_UNIT})
 
 
@@ -371,7 +335,7 @@ def check_format(path: Path, table: Mapping[str, str]) -> None:
 def read_session_table(
     path: Path, table: Mapping[str, str], radars: tuple[RadarInfo, ...]
 ) -> SessionInfo:
-    """Read the table of a run back; what older files did not say has its default.
+    """Read the table of a run back; keys that older files lack have their defaults.
 
     Raises
     ------
@@ -405,7 +369,7 @@ def read_session_table(
 
 
 def read_radar_text(path: Path, topic: str, text: str) -> RadarInfo:
-    """Read what a session says of a radar.
+    """Read the description of a radar in a session.
 
     Raises
     ------
@@ -436,7 +400,7 @@ def read_radar_text(path: Path, topic: str, text: str) -> RadarInfo:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlamSettings:
-    """How SLAM is to be set; see the fields of `SessionInfo` of these names."""
+    """Settings of SLAM; see the fields of `SessionInfo` of these names."""
 
     preset: str = "robust"
     config_json: str = ""
@@ -470,7 +434,7 @@ def imported_info(
 def imported_radar(
     mount: Mount, *, range_start_m: float, bin_length_m: float, n_bins: int, rate_hz: float
 ) -> RadarInfo:
-    """Return a radar of whose serial number, port and settings nobody told; module metres."""
+    """Return a radar with unknown serial number, port and settings; module metres."""
     return RadarInfo(
         name=mount.name,
         serial="",

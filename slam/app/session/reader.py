@@ -24,7 +24,7 @@ from slam.app.odometry.tum import TumSample
 from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, Snapshot
 from slam.app.rig.sources import TRUE_PER_MODULE_METRE, sampler_limits
 from slam.app.session import messages as ros
-from slam.app.session.mcap import Metadata, RawMessage, read_entries
+from slam.app.session.mcap import read_entries
 from slam.app.session.messages import (
     METADATA_NAME,
     check_format,
@@ -35,6 +35,15 @@ from slam.app.session.messages import (
 from slam.frames import Detection, RadarFrame
 from slam.geometry import Mount, Rig
 from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.recordings.mcap import (
+    BYTE_ARRAY,
+    DOUBLE_ARRAY,
+    FLOAT_ARRAY,
+    Message,
+    Metadata,
+    unpack_array,
+    unpack_string,
+)
 
 _LOG_WARN = 30
 
@@ -49,7 +58,7 @@ class TruthPose:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReceivedFrame:
-    """A frame and when it arrived at the host, nanoseconds since 1970; None where nobody noted."""
+    """A frame and when it arrived at the host, nanoseconds since 1970; None if not recorded."""
 
     frame: RadarFrame
     host_ns: int | None
@@ -60,7 +69,7 @@ class ScanEnd:
     """The frames before it made a scan; see `Scan`.
 
     ``members`` are their radars and counters, so that a scan is known to be whole.
-    ``truth`` has shape (3,), [x m, y m, heading rad], world frame; None where nobody knew.
+    ``truth`` has shape (3,), [x m, y m, heading rad], world frame; None if unknown.
     """
 
     counter: int
@@ -71,14 +80,14 @@ class ScanEnd:
 
 
 Recorded: TypeAlias = ReceivedFrame | TumSample | TruthPose | LogLine | ScanEnd | Snapshot
-"""What the messages of a session say; a TumSample is odometry."""
+"""What is in a session; a TumSample is odometry."""
 
 FrameTopics: TypeAlias = Mapping[str, tuple[int, RadarInfo, tuple[float, float] | None]]
 """By topic: index and description of a radar, and the limits of its sampler."""
 
 
-def read_record(message: RawMessage, frame_of: FrameTopics) -> Recorded | None:
-    """Return what a message says; None for those that say nothing new."""
+def read_record(message: Message, frame_of: FrameTopics) -> Recorded | None:
+    """Return the content of a message; None for messages that repeat others."""
     found = frame_of.get(message.topic)
     if found is not None:
         host_ns = None if message.publish_ns == message.t_ns else message.publish_ns
@@ -88,9 +97,9 @@ def read_record(message: RawMessage, frame_of: FrameTopics) -> Recorded | None:
 
 
 def _frame(
-    message: RawMessage, index: int, radar: RadarInfo, limits: tuple[float, float] | None
+    message: Message, index: int, radar: RadarInfo, limits: tuple[float, float] | None
 ) -> RadarFrame:
-    samples = np.asarray(ros.deserialise(message.data, ros.FLOAT_ARRAY).data, dtype=np.float32)
+    samples = unpack_array(FLOAT_ARRAY, message.data)
     if len(samples) != radar.n_bins:
         raise ValueError(f"{len(samples)} samples, but the radar was set to {radar.n_bins}")
     return RadarFrame(
@@ -112,8 +121,8 @@ def limits_of(radar: RadarInfo) -> tuple[float, float] | None:
     return sampler_limits(RawConfig(**dict(radar.settings)))  # type: ignore[arg-type]  # from JSON
 
 
-def _scan_end(message: RawMessage) -> ScanEnd:
-    values = ros.deserialise(message.data, ros.DOUBLE_ARRAY).data
+def _scan_end(message: Message) -> ScanEnd:
+    values = unpack_array(DOUBLE_ARRAY, message.data)
     n_frames = int(values[0]) if len(values) else -1
     members, truth = np.split(values[1:], [2 * n_frames])
     if n_frames < 0 or len(members) != 2 * n_frames or len(truth) not in (0, 3):
@@ -127,16 +136,16 @@ def _scan_end(message: RawMessage) -> ScanEnd:
     )
 
 
-def _state(message: RawMessage) -> Snapshot:
-    row = ros.deserialise(message.data, ros.DOUBLE_ARRAY).data
+def _state(message: Message) -> Snapshot:
+    row = unpack_array(DOUBLE_ARRAY, message.data)
     return snapshot_of(message.sequence, message.t_ns, row)
 
 
-def _odometry(message: RawMessage) -> TumSample:
+def _odometry(message: Message) -> TumSample:
     return ros.odometry_sample(ros.deserialise(message.data, ros.ODOMETRY))
 
 
-def _truth(message: RawMessage) -> TruthPose:
+def _truth(message: Message) -> TruthPose:
     pose = ros.deserialise(message.data, ros.POSE).pose
     heading_rad = 2.0 * math.atan2(pose.orientation.z, pose.orientation.w)
     return TruthPose(
@@ -144,14 +153,14 @@ def _truth(message: RawMessage) -> TruthPose:
     )
 
 
-def _log_line(message: RawMessage) -> LogLine:
+def _log_line(message: Message) -> LogLine:
     line = ros.deserialise(message.data, ros.LOG)
     return LogLine(
         t_ns=message.t_ns, radar=line.name, warning=line.level >= _LOG_WARN, text=line.msg
     )
 
 
-_READERS: Mapping[str, Callable[[RawMessage], Recorded]] = {
+_READERS: Mapping[str, Callable[[Message], Recorded]] = {
     "/scan": _scan_end,
     "/scan_unused": _scan_end,
     "/slam/state": _state,
@@ -200,7 +209,6 @@ class RecordedSession:
 
     @property
     def rig(self) -> Rig:
-        """Return the mounts as the run knew them."""
         return Rig(
             mounts=tuple(
                 Mount(
@@ -262,11 +270,11 @@ class RecordedSession:
         of_scan: dict[int, tuple[Detection, ...]] = {}
         held: list[Detection] = []
         for entry in read_entries(self.path, self._on_cut, self._size):
-            if not isinstance(entry, RawMessage):
+            if not isinstance(entry, Message):
                 continue
             if entry.topic in index_of:
                 with self._naming(entry):
-                    ranges_m = ros.deserialise(entry.data, ros.DOUBLE_ARRAY).data.tolist()
+                    ranges_m = unpack_array(DOUBLE_ARRAY, entry.data).tolist()
                 radar, t_ns = index_of[entry.topic], entry.t_ns
                 held += [
                     Detection(radar=radar, t_ns=t_ns, range_m=range_m, amplitude=math.nan)
@@ -284,9 +292,9 @@ class RecordedSession:
             ways[f"/radar/{radar.name}/rx"] = (radar.name, "rx")
             ways[f"/radar/{radar.name}/tx"] = (radar.name, "tx")
         for entry in read_entries(self.path, self._on_cut, self._size):
-            if isinstance(entry, RawMessage) and (found := ways.get(entry.topic)):
+            if isinstance(entry, Message) and (found := ways.get(entry.topic)):
                 with self._naming(entry):
-                    data = ros.deserialise(entry.data, ros.BYTE_ARRAY).data.tobytes()
+                    data = unpack_array(BYTE_ARRAY, entry.data).tobytes()
                 yield WireBytes(
                     radar=found[0],
                     way=found[1],
@@ -315,7 +323,7 @@ class RecordedSession:
             for index, radar in enumerate(self.info.radars)
         }
         for entry in read_entries(self.path, self._on_cut, self._size):
-            if not isinstance(entry, RawMessage):
+            if not isinstance(entry, Message):
                 continue
             with self._naming(entry):
                 record = read_record(entry, frame_of)
@@ -323,7 +331,7 @@ class RecordedSession:
                 yield record
 
     @contextmanager
-    def _naming(self, entry: RawMessage) -> Iterator[None]:
+    def _naming(self, entry: Message) -> Iterator[None]:
         try:
             yield
         except (ValueError, TypeError, AssertionError, IndexError, struct.error) as error:
@@ -350,7 +358,7 @@ def open_session(path: Path) -> RecordedSession:
     try:
         size = path.stat().st_size
     except OSError:
-        size = None  # what is wrong with it is told below
+        size = None  # reading it reports what is wrong
     for entry in read_entries(path, cut.append, size):
         if isinstance(entry, Metadata):
             if entry.name == METADATA_NAME:
@@ -373,9 +381,9 @@ def open_session(path: Path) -> RecordedSession:
     return RecordedSession(path, read_session_table(path, head, tuple(radars)), size=size)
 
 
-def _radar_info(path: Path, message: RawMessage) -> RadarInfo:
+def _radar_info(path: Path, message: Message) -> RadarInfo:
     try:
-        text = str(ros.deserialise(message.data, ros.STRING).data)
+        text = unpack_string(message.data)
     except (ValueError, TypeError, AssertionError, IndexError, struct.error) as error:
         raise AppError(f"{path}: {message.topic} cannot be read: {error!r}") from None
     return read_radar_text(path, message.topic, text)

@@ -14,20 +14,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
-from mcap.writer import CompressionType, Writer
-
 from slam.app.errors import AppError
-from slam.app.session import mcap
 from slam.app.session.mcap import open_mcap
-from xethru_protocol.system import PathInUseError, locked
+from xethru_protocol.recordings import mcap
+from xethru_protocol.system import PathInUseError, StopFlag, locked
 
 KEPT_SUFFIX = ".unrepaired"
 """Of the name under which the file is kept as it was."""
 
-_CHUNK_BYTES = 256 * 1024
-_MESSAGE = struct.Struct("<HIQQ")
 _ATTACHMENT = struct.Struct("<QQ")
 _FOOTER = struct.Struct("<QQI")
 _FOOTER_HEAD_BYTES = 9  # code and length
@@ -36,8 +30,6 @@ _CHECKED_FOOTER_BYTES = 16  # of its body, that its checksum covers
 
 @dataclass(slots=True, kw_only=True)
 class _Survey:
-    """What one look at the whole file finds."""
-
     cut_at: int | None = None
     damages: list[mcap.Damage] = field(default_factory=list)
     has_index: bool = False
@@ -53,7 +45,6 @@ class _Survey:
 
     @property
     def is_whole(self) -> bool:
-        """Whether there is nothing to do."""
         return self.cut_at is None and not self.damages and self.has_index
 
 
@@ -87,7 +78,6 @@ class Repair:
     kept: Path | None
 
     def __str__(self) -> str:
-        """Say so to a person."""
         span = f"{self.n_messages} messages, {(self.last_ns - self.first_ns) / 1e9:.1f} s"
         if self.was_whole:
             return f"{self.path}: whole, nothing to repair: {span}"
@@ -102,6 +92,11 @@ class Repair:
         if self.kept is not None:
             lines.append(f"  as it was: {self.kept}")
         return "\n".join(lines)
+
+
+def run_repair(stop: StopFlag, *, session: Path, out: Path | None) -> None:
+    """Repair a recording and print the outcome; see `repair`."""
+    print(repair(session, out, stop.check))  # noqa: T201 - the result
 
 
 def repair(path: Path, out: Path | None, check: Callable[[], None]) -> Repair:
@@ -178,8 +173,8 @@ def _held(path: Path) -> Iterator[None]:
 
 def _survey(path: Path, check: Callable[[], None]) -> _Survey:
     survey = _Survey()
-    with open_mcap(path) as reader:
-        for found in reader.read():
+    with open_mcap(path) as opened:
+        for found in mcap.RecordReader(*opened).read():
             if isinstance(found, mcap.Cut):
                 survey.cut_at = found.at
             elif isinstance(found, mcap.Damage):
@@ -225,9 +220,8 @@ def _is_index_right(path: Path, footer: mcap.Record) -> bool:
 
 
 def _write(path: Path, fresh: Path, survey: _Survey, check: Callable[[], None]) -> None:
-    with fresh.open("wb") as stream, open_mcap(path) as reader:
-        writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
-        writer.start(profile=survey.profile, library=survey.library)
+    with fresh.open("wb") as stream, open_mcap(path) as opened:
+        writer = mcap.McapWriter(stream, profile=survey.profile, library=survey.library)
         schemas = {0: 0} | {
             number: writer.register_schema(*row) for number, row in survey.schemas.items()
         }
@@ -235,7 +229,7 @@ def _write(path: Path, fresh: Path, survey: _Survey, check: Callable[[], None]) 
             number: writer.register_channel(topic, encoding, schemas.get(schema, 0), table)
             for number, (schema, topic, encoding, table) in survey.channels.items()
         }
-        for found in reader.read():
+        for found in mcap.RecordReader(*opened).read():
             check()
             if not isinstance(found, mcap.Record):
                 continue
@@ -243,21 +237,21 @@ def _write(path: Path, fresh: Path, survey: _Survey, check: Callable[[], None]) 
                 _copy(writer, channels, found)
             except mcap.DAMAGES as error:
                 survey.lose(found, error)
-        writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
+        writer.finish()
         stream.flush()
         os.fsync(stream.fileno())
 
 
-def _copy(writer: Writer, channels: dict[int, int], record: mcap.Record) -> None:
+def _copy(writer: mcap.McapWriter, channels: dict[int, int], record: mcap.Record) -> None:
     body = record.body
     if record.code == mcap.MESSAGE:
-        channel, sequence, t_ns, publish_ns = _MESSAGE.unpack_from(body)
+        channel, sequence, t_ns, publish_ns = mcap.MESSAGE_HEAD.unpack_from(body)
         writer.add_message(
             channel_id=channels[channel],
             log_time=t_ns,
             publish_time=publish_ns,
             sequence=sequence,
-            data=body[_MESSAGE.size :],
+            data=body[mcap.MESSAGE_HEAD.size :],
         )
     elif record.code == mcap.METADATA:
         name, at = mcap.text_at(body, 0)
@@ -273,18 +267,15 @@ def _copy(writer: Writer, channels: dict[int, int], record: mcap.Record) -> None
 def _result(readable: Path, target: Path, survey: _Survey, kept: Path | None) -> Repair:
     """Read the finished file's own index, as every other program will."""
     try:
-        with readable.open("rb") as stream:
-            summary = make_reader(stream, validate_crcs=True).get_summary()
-    except McapError as error:
+        statistics = mcap.statistics_of(readable)
+    except ValueError as error:
         raise AppError(f"{target}: cannot be made whole: {error}") from None
-    if summary is None or summary.statistics is None:
-        raise AppError(f"{target}: cannot be made whole: it has no index")
     return Repair(
         path=target,
         was_whole=survey.is_whole,
-        n_messages=summary.statistics.message_count,
-        first_ns=summary.statistics.message_start_time,
-        last_ns=summary.statistics.message_end_time,
+        n_messages=statistics.message_count,
+        first_ns=statistics.message_start_time,
+        last_ns=statistics.message_end_time,
         cut_at=survey.cut_at,
         damages=tuple(survey.damages),
         kept=kept,

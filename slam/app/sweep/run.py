@@ -30,6 +30,7 @@ from slam.app.rig.emulated import (
     RAW_CONFIG,
     end_counter,
     open_loopback,
+    outlines_m,
     rig_of,
     scene_and_config,
     true_landmarks_m,
@@ -37,17 +38,16 @@ from slam.app.rig.emulated import (
     wheels_of,
 )
 from slam.app.run.evaluation import Summary, summarise
-from slam.app.run.pictures import outlines_m
 from slam.app.run.runner import RunRecord, run_slam
 from slam.app.sweep.bound import BoundSummary, bound_of
 from slam.app.sweep.stress import CLEAN, STRESSES, Stress
 from slam.config import ConfigError, SlamConfig, override
 from slam.evaluation import LANDMARK_MATCH_M
 from slam.frames import Detection, Detector, RadarFrame
-from slam.front_end.paper import make_detector
+from slam.front_end import make_detector
 from slam.geometry import transform
-from slam.paper.pipeline import Slam
-from slam.robust.pipeline import make_slam
+from slam.pipelines import make_slam
+from slam.results import Slam
 
 # Streams of their own beside the radars' (serial numbers and purposes, below 2**51) and the
 # odometry's, 2**63.
@@ -264,7 +264,6 @@ class Case:
 
     @property
     def key(self) -> Key:
-        """Return what tells the run from all others of its sweep."""
         return (self.scene.name, self.preset, self.settings, self.stress, self.seed)
 
 
@@ -293,7 +292,6 @@ class SweepRun(Summary):
 
     @property
     def key(self) -> Key:
-        """Return what tells the run from all others of its sweep."""
         return (self.scene, self.preset, tuple(self.settings.items()), self.stress, self.seed)
 
 
@@ -361,22 +359,35 @@ def run_one(scene: str, preset: str, seed: int, *, check: Callable[[], None] = n
     return _summary(case, record_of(case, check=check))
 
 
-def record_of(case: Case, *, check: Callable[[], None] = never) -> RunRecord:
-    """Drive the robot through a case; SLAM is told the scene's own rig and wheels, no stress."""
-    stress = STRESSES[case.stress]
-    scene = stressed_scene(case.scene, stress, case.seed)
+def drive_in_process(
+    scene: Scene,
+    slam: Slam,
+    seed: int,
+    *,
+    noise_seed: int | None = None,
+    stress: Stress = STRESSES[CLEAN],
+    check: Callable[[], None] = never,
+) -> RunRecord:
+    """Drive the emulated robot through a scene in this process; ``noise_seed`` is ``seed`` if None.
+
+    ``seed`` is that of the odometry and of the stress, ``noise_seed`` that of the receivers.
+    """
     trajectory = scene.trajectory()
     duration_ns = trajectory.duration_ns
-    odometry = OdometryTrack.from_lines(scene_odometry(scene, case.seed))
-    with open_loopback(scene, case.seed) as source:
+    odometry = OdometryTrack.from_lines(scene_odometry(scene, seed))
+    with open_loopback(scene, seed if noise_seed is None else noise_seed) as source:
         source.start(RAW_CONFIG, FRAME_RATE_HZ)
-        scans = source.scans(end_counter(duration_ns), check)
-        return run_slam(
-            stressed_scans(scans, stress, case.seed, duration_ns),
-            odometry,
-            _slam(case, stress),
-            trajectory.poses,
+        scans = stressed_scans(
+            source.scans(end_counter(duration_ns), check), stress, seed, duration_ns
         )
+        return run_slam(scans, odometry, slam, trajectory.poses)
+
+
+def record_of(case: Case, *, check: Callable[[], None] = never) -> RunRecord:
+    """Drive the robot through a case; SLAM gets the scene's own rig and wheels, no stress."""
+    stress = STRESSES[case.stress]
+    scene = stressed_scene(case.scene, stress, case.seed)
+    return drive_in_process(scene, _slam(case, stress), case.seed, stress=stress, check=check)
 
 
 def run_case(
@@ -389,7 +400,7 @@ def run_case(
     case
         What to run.
     program
-        `program_version` of whoever asks, if that may be another machine.
+        `program_version` of the caller, if that may be another machine.
     check
         Called once per scan; may raise to stop.
 

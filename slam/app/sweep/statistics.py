@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from slam.app.run.evaluation import ratio
-from slam.app.run.output import mm_text, print_table, share_text
+from slam.app.run.output import mm_text, share_text
 from slam.app.sweep.run import SweepRun
 from slam.app.sweep.stress import CLEAN
 
@@ -132,7 +132,6 @@ def _bound(runs: Sequence[SweepRun]) -> dict[str, Any] | None:
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:
-    """Return median and 90th percentile."""
     return {"median": float(np.median(values)), "p90": float(np.quantile(values, 0.9))}
 
 
@@ -197,14 +196,12 @@ def nis_in_band(group: dict[str, Any]) -> int:
     return sum(low <= mean <= high for _, mean, low, high in known)
 
 
-def print_stress_tables(groups: Sequence[dict[str, Any]]) -> None:
-    """Write a table for each scene and preset that has stressed runs; to stdout."""
-    for clean, rows in stress_tables(groups):
-        print_table(
-            f"{group_name(clean)}, {clean['runs']} seeds, the same in every row: simulated",
-            _HEADER,
-            [_row(group, clean) for group in rows],
-        )
+def stress_table(
+    clean: dict[str, Any], rows: Sequence[dict[str, Any]]
+) -> tuple[str, Sequence[str], list[tuple[str, ...]]]:
+    """Return title, header and rows of a table of `stress_tables`, for `print_table`."""
+    title = f"{group_name(clean)}, {clean['runs']} seeds, the same in every row: simulated"
+    return title, _HEADER, [_row(group, clean) for group in rows]
 
 
 def _row(group: dict[str, Any], clean: dict[str, Any]) -> tuple[str, ...]:

@@ -40,47 +40,10 @@ class OneEchoSource(RampSource):
         return ramp
 
 
-# Protocol reference 9.3, column "After INIT/boot".
-DEFAULTS: list[tuple[X4Setting, X4Value]] = [
-    (X4Setting.FPS, 0.0),
-    (X4Setting.PULSESPERSTEP, 10),
-    (X4Setting.ITERATIONS, 8),
-    (X4Setting.DOWNCONVERSION, 0),
-    (X4Setting.DACMIN, 0),
-    (X4Setting.DACMAX, 2047),
-    (X4Setting.DACSTEP, 0),
-    (X4Setting.TXPOWER, 2),
-    (X4Setting.TXCENTERFREQUENCY, 3),
-    (X4Setting.PRFDIV, 16),
-    (X4Setting.FRAMEBINCOUNT, 1467),
-]
-
-
-@pytest.mark.parametrize(("setting", "value"), DEFAULTS)
-def test_init_restores_every_default(setting: X4Setting, value: X4Value) -> None:
-    chip = Chip(RampSource())
-    working_point(chip)
-    chip.set(X4Setting.FPS, 17.0)
-    chip.init()
-    assert chip.get(setting) == value
-
-
-def test_default_area_reads_back_as_documented() -> None:
-    start_m, end_m = Chip(RampSource()).area.start_m, Chip(RampSource()).area.end_m
-    assert (start_m, end_m) == pytest.approx((-0.0000411, 9.4328289), abs=5e-8)
-
-
-# Protocol reference 4.9, column "Range / check (error)".
+# Protocol reference 4.9, column "Range / check (error)"; others are in hil_tests/device.
 REFUSED: list[tuple[X4Setting, X4Value, int]] = [
-    (X4Setting.FRAMEAREA, (5.0, 0.4), 17),
     (X4Setting.FRAMEAREA, (math.nan, 1.0), 17),
-    (X4Setting.DACSTEP, 4, 12),
-    (X4Setting.DACMIN, 2048, 1),
-    (X4Setting.DACMAX, 2048, 1),
     (X4Setting.TXCENTERFREQUENCY, 2, 20),
-    (X4Setting.TXCENTERFREQUENCY, 5, 20),
-    (X4Setting.TXPOWER, 4, 21),
-    (X4Setting.PRFDIV, 3, 18),
     (X4Setting.FRAMEBINCOUNT, 7, 1),
 ]
 

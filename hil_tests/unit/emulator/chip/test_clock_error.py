@@ -9,9 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from emulator.chip.chip import CaptureSettings, EchoSource
-from emulator.chip.clock import ModuleClock
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
+from emulator.chip.chip import CaptureSettings, EchoSource, ModuleClock
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport

@@ -11,11 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulator.chip.clock import ModuleClock
+from emulator.chip.chip import ModuleClock
 from emulator.echo.echo import SceneEcho
 from emulator.scene.scene import LeakageSpec, NoiseSpec, PathSpec, RadarSpec, Scene
-from hil_tests.captures import PAPER
-from hil_tests.unit.emulator.rooms import radar_at, room, target
+from hil_tests.unit.emulator.rooms import PAPER, radar_at, room, target
 
 DAY_NS = 86_400_000_000_000
 CAPTURE = replace(PAPER, first_sample_m=0.0, n_samples=1400, dac_min=0, dac_max=2047)

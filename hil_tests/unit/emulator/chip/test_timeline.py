@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulator.chip.clock import Timeline
+from emulator.chip.chip import Timeline
 
 
 def test_a_rate_change_continues_at_the_next_counter() -> None:

@@ -14,7 +14,7 @@ from emulator.chip.chip import CaptureSettings
 from emulator.chip.downconversion import CHANNELS, TAP_COUNT, downconvert
 from emulator.echo.receiver import GRIDS, ClutterField
 from emulator.scene.scene import ClutterSpec
-from hil_tests.captures import PAPER
+from hil_tests.unit.emulator.rooms import PAPER
 from xethru_protocol.wire.x4 import BASEBAND_DECIMATION, CARRIER_HZ, RF_BIN_M, SAMPLING_RATE_HZ
 
 CAPTURE = PAPER

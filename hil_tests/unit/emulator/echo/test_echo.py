@@ -29,7 +29,7 @@ from emulator.scene.scene import (
     empty_room,
     load_scene,
 )
-from hil_tests.captures import PAPER
+from hil_tests.unit.emulator.rooms import PAPER
 
 BIN_M = 1.5e8 / 23.328e9
 C_MPS = 299_792_458.0

@@ -8,7 +8,7 @@ import pytest
 from emulator.chip.chip import CaptureSettings
 from emulator.chip.downconversion import CHANNELS, TAP_COUNT, downconvert
 from emulator.echo.echo import echo_source
-from emulator.echo.noise import CarrierJitter
+from emulator.echo.receiver import CarrierJitter
 from emulator.scene.scene import JitterSpec, LeakageSpec, NoiseSpec, RadarSpec, Scene, TargetSpec
 
 SERIAL = 202305070101

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from emulator.echo.pulse import (
+from emulator.echo.reflections import (
     BANDWIDTH_HZ,
     CARRIER_CYCLES_PER_SAMPLE,
     HALF_WINDOW,

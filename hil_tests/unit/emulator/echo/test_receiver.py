@@ -10,7 +10,7 @@ import pytest
 from emulator.chip.chip import CaptureSettings
 from emulator.echo.receiver import Receiver, one_count
 from emulator.scene.scene import ClutterSpec, NoiseSpec, RadarSpec, Scene
-from hil_tests.captures import PAPER
+from hil_tests.unit.emulator.rooms import PAPER
 
 CAPTURE = replace(PAPER, dac_min=0, dac_max=2047)
 RADAR = RadarSpec(name="radar", serial="202305070101", x_m=0.0, y_m=0.0, yaw_deg=0.0)

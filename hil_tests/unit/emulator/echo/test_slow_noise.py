@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from emulator.echo.noise import SPACINGS_PER_E_FOLD, KnotGrid, SlowNoise
+from emulator.echo.receiver import SPACINGS_PER_E_FOLD, KnotGrid, SlowNoise
 from emulator.scene.philox import Purpose
 
 SPACING_NS = 1_000_000_000

@@ -12,8 +12,8 @@ from emulator.echo.echo import SceneEcho
 from emulator.echo.reflections import BEAM_EXPONENT
 from emulator.echo.walls import edge_wave, faces_of, passing, past_edge
 from emulator.scene.scene import MIRROR_AMPLITUDE_1M
-from hil_tests.captures import PAPER
 from hil_tests.unit.emulator.rooms import (
+    PAPER,
     WAVELENGTH_M,
     WAVENUMBER,
     box,

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from emulator.faults.faulty_device import fault
-from emulator.faults.plan import KINDS
+from emulator.faults.kinds import KINDS
 from hil_tests.faulty import SERIAL, FaultyLine, faulty_line
 from hil_tests.unit.emulator.faults.witnesses import FPS, WITNESSES
 from xethru_protocol.driver.radar import X4M300

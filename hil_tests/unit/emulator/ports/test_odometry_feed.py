@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.ports.odometry import MOST_CLIENTS, OdometryFeed, stamp_ns
 from emulator.ports.pty import LinkError
 

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
 from emulator.device import Device
 from emulator.module.settings import what_is_heard
 from emulator.ports.lines import Line, UartLine, UsbLine

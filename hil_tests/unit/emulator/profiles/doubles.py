@@ -6,11 +6,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, cast
 
-from emulator.chip.clock import ModuleClock
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
+from emulator.chip.chip import ModuleClock
 from emulator.echo.echo import SceneEcho
 from emulator.module.memory import FileSystem
 from emulator.module.modes import ModeMachine
+from emulator.module.module import Module
 from emulator.module.settings import DeviceOptions, ProfileSettings
 from emulator.profiles.run import ProfileStream
 from emulator.scene.motion import PersonSpec
@@ -77,7 +78,9 @@ def profile(
         module.profile.outputs = outputs
     source = SceneEcho(scene, scene.radars[0], seed=1)
     clock = ModuleClock()
-    stream = ProfileStream(module, source, pace=pace, clock=clock, scene_time_zero_ns=zero_ns)
+    stream = ProfileStream(
+        cast(Module, module), source, pace=pace, clock=clock, scene_time_zero_ns=zero_ns
+    )
     return stream, module
 
 

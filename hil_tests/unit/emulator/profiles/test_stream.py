@@ -7,9 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from emulator.chip.chip import Chip
-from emulator.chip.clock import ModuleClock
-from emulator.chip.pace import Pace
+from emulator.chip import Pace
+from emulator.chip.chip import Chip, ModuleClock
 from emulator.device import ChipStream, CombinedStream
 from emulator.module.module import Module
 from emulator.module.settings import ProfileSettings

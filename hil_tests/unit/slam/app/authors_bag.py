@@ -1,7 +1,5 @@
 """Bags as the paper's authors recorded them, made by nothing but the rosbags library."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any
@@ -17,6 +15,11 @@ from slam.app.session.messages import Message
 
 Pose = tuple[float, float, float]
 """x [m], y [m], heading [rad]."""
+
+N_SCANS = 12
+N_BINS = 1431
+START_NS = 1_690_000_000_000_000_000
+STEP_NS = 200_000_000
 
 
 class AuthorsBag:
@@ -106,3 +109,40 @@ class AuthorsBag:
                 w=math.cos(heading / 2),
             ),
         )
+
+
+def jittered_ns(radar: int, number: int) -> int:
+    """When a laptop would have recorded a frame of a radar that is not synchronised."""
+    late_ns = int(np.random.default_rng((radar, number)).integers(0, 20_000_000))
+    return START_NS + number * STEP_NS + radar * 30_000_000 + late_ns
+
+
+def samples(radar: int, number: int, n_bins: int = N_BINS) -> NDArray[np.float32]:
+    rng = np.random.default_rng((radar, number))
+    return rng.normal(0, 1e-3, n_bins).astype(np.float32)
+
+
+def authors_bag(
+    path: Path,
+    *,
+    topics: str = "/UWBradar{}/readings",
+    n_bins: int = N_BINS,
+    odometry: bool = True,
+    jump_back: bool = False,
+    truth: bool = True,
+    storage: StoragePlugin = StoragePlugin.SQLITE3,
+) -> Path:
+    """Write a bag of noise and a straight drive as the authors' recorder would have."""
+    bag = AuthorsBag(path, topics, storage)
+    for number in range(N_SCANS):
+        for radar in range(4):
+            bag.add_frame(jittered_ns(radar, number), radar + 1, samples(radar, number, n_bins))
+    for k in range(6 * N_SCANS):
+        t_ns = START_NS - 300_000_000 + k * STEP_NS // 5
+        stamp_ns = t_ns - 300_000_000 if jump_back and k == 20 else t_ns
+        if odometry:
+            bag.add_odometry(t_ns + 3_000_000, stamp_ns, (0.01 * k, -0.5, 0.2))
+        if truth:
+            bag.add_truth(t_ns + 9_000_000, t_ns, (0.01 * k + 2.0, -0.5, 0.2))
+    bag.write()
+    return path

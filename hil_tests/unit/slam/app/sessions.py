@@ -1,7 +1,5 @@
 """A made-up session for the tests of logs and viewers: known frames, poses and landmarks."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

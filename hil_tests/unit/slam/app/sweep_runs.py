@@ -1,7 +1,5 @@
 """Made-up results of a sweep, for tests of what becomes of them."""
 
-from __future__ import annotations
-
 from slam.app.run.evaluation import LandmarkSummary
 from slam.app.sweep.bound import BoundSummary
 from slam.app.sweep.run import Case, SweepRun

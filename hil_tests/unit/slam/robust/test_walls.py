@@ -1,4 +1,4 @@
-"""Walls in the robust filter and smoother: derivatives, invariance, birth, and a bare room."""
+"""Walls, corners and round objects in the robust filter: derivatives, birth, ends."""
 
 import math
 from dataclasses import replace
@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 
 from hil_tests.unit.slam.robust.range_world import LAB, odometry_path, reported, true_path
+from slam.config import WheelNoise
 from slam.evaluation import nees_pose
 from slam.geometry import paper_rig
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.parameters import BackEndParameters, RangeNoise, WallRule, WheelNoise
+from slam.robust.initialisation import Slot, UnassignedRange
+from slam.robust.map import Law, Sightings, compare
+from slam.robust.parameters import BackEndParameters, RangeNoise, WallRule
 from slam.robust.ranges import Antennas, RangeScan, antennas_of, rows_of, view
 from slam.robust.run_log import Estimate, RunLog, start_prior
 from slam.robust.smoother import measurement_residuals, prior_about, prior_cost, prior_terms
@@ -18,7 +21,9 @@ from slam.robust.state import Array, State, SymmetricMatrix, calibrated_motion, 
 from slam.robust.walls import (
     BodyWall,
     WallCells,
-    give_birth_to_wall,
+    WallTracker,
+    WallTracklet,
+    initialise_wall,
     is_unresolved,
     match_wall,
     update_with_wall,
@@ -124,7 +129,7 @@ def test_birth_of_a_wall_is_the_limit_of_an_unknown_wall_seen() -> None:
     born, seen = state_with_map(), seen_wall()
     born.remove(3)
     other = copy_of(born)
-    wall_id = give_birth_to_wall(born, seen)
+    wall_id = initialise_wall(born, seen)
     assert born.feature_ids[-1] == wall_id
     other.augment_wall(born.walls[-1], np.zeros((other.P.size, 2)), 1e6 * np.eye(2))
     update_with_wall(other, 1, seen)
@@ -150,7 +155,7 @@ def test_a_landmark_born_later_goes_before_the_walls() -> None:
 
 def test_walls_match_only_where_they_were_seen() -> None:
     state, seen, cells, rule = state_with_map(), seen_wall(), WallCells(0.1), WallRule()
-    wall_id = give_birth_to_wall(state, seen)
+    wall_id = initialise_wall(state, seen)
     row = state.wall_ids.index(wall_id)
     along = seen.in_map(state) @ np.array([-math.sin(1.9), math.cos(1.9)])
     cells.add(wall_id, along)
@@ -288,7 +293,7 @@ def test_four_bare_walls_hold_the_robot_and_become_no_points() -> None:
         back_end.update(scans)
     assert back_end.landmarks() == ()
     rough = dict.fromkeys(back_end.state.wall_ids, WallRule().roughness_m)
-    assert back_end.state.range_doubts_m == rough
+    assert back_end.state.shape_sigmas_m == rough
     true_d_m = {0: 3.0, 1: 3.0, 2: 1.0, 3: 1.0}
     for wall in back_end.walls():
         quarter = round(wall.phi_rad / (math.pi / 2))
@@ -304,3 +309,160 @@ def test_four_bare_walls_hold_the_robot_and_become_no_points() -> None:
     assert back_end.relinearise()
     assert back_end.pose == pytest.approx(before, abs=0.01)
     assert nees_pose(back_end.pose, back_end.pose_covariance, path[-1]) < 16.3
+
+
+STEP_M = 0.01
+WALL_Y_M, WALL_END_M = 1.1, 0.8
+OFFSET_M = 0.02
+
+
+def past_the_end_of_a_wall(n: int, rng: np.random.Generator) -> list[list[RangeScan]]:
+    """Return what the radars hear along y = 0: a wall on the left, then its edge."""
+    frames = []
+    for k in range(1, n + 1):
+        scans = []
+        for radar, mount in enumerate(paper_rig().mounts):
+            x, y = k * STEP_M + mount.x_m, mount.y_m
+            beyond = max(x - WALL_END_M, 0.0)
+            range_m = math.hypot(beyond, WALL_Y_M - y)
+            left = mount.yaw_rad > 0.0
+            heard = left and math.atan2(beyond, WALL_Y_M - y) < math.radians(32.5)
+            noisy = (range_m + SIGMA_M * float(rng.standard_normal()),) if heard else ()
+            scans.append(RangeScan(radar=radar, ranges_m=noisy))
+        frames.append(scans)
+    return frames
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_edge_of_a_wall_turns_neither_wall_nor_robot(seed: int) -> None:
+    noise = RangeNoise(sigma_m=SIGMA_M, detection_probability=0.98, clutter_per_m=0.02)
+    back_end = RobustBackEnd(paper_rig(), BackEndParameters(ranges=noise))
+    n = 140
+    for k, scans in enumerate(past_the_end_of_a_wall(n, np.random.default_rng(seed)), start=1):
+        back_end.predict(np.array([STEP_M, 0.0, 0.0]))
+        back_end.update(scans)
+        truth = np.array([k * STEP_M, 0.0, 0.0])
+        # Wheels without error are sigma 0 of their model: what is left is the radars' doing.
+        assert nees_pose(back_end.pose, back_end.pose_covariance, truth) < 3.0
+    (wall,) = back_end.walls()
+    assert wall.phi_rad == pytest.approx(math.pi / 2, abs=0.01)
+    assert wall.spans_m[:, :, 0].max() < WALL_END_M + 0.2
+
+
+def tracklet_of(shape: Array, offset_sigma_m: float) -> tuple[WallTracker, WallTracklet]:
+    """Return what a wall tracker makes of ranges that miss a wall by a shape, front and rear."""
+    parameters = BackEndParameters(ranges=RangeNoise(sigma_m=SIGMA_M, offset_sigma_m=0.02))
+    frames = []
+    for back, miss in enumerate(shape.tolist()):
+        slots = []
+        for radar, mount in enumerate(paper_rig().mounts[:2]):
+            range_m = WALL_Y_M - mount.y_m + OFFSET_M + miss
+            x = mount.x_m - back * STEP_M
+            heard = [UnassignedRange(range_m, None, SIGMA_M)]
+            slots.append(
+                Slot(back, radar, x, mount.y_m, mount.yaw_rad, 0.0, heard, (mount.x_m, mount.y_m))
+            )
+        frames.append(slots)
+    tracker = WallTracker(parameters, WallRule(), np.zeros(2), offset_sigma_m**2 * np.ones((2, 2)))
+    return tracker, tracker.follow(np.array([math.pi / 2, WALL_Y_M + OFFSET_M]), frames)
+
+
+def test_an_unknown_offset_is_one_number_and_no_noise_of_each_range() -> None:
+    """A wall is found under an offset of 20 mm; ranges that scatter by half as much are none."""
+    rng = np.random.default_rng(1)
+    tracker, wall = tracklet_of(SIGMA_M * rng.standard_normal(40), OFFSET_M)
+    assert tracker.is_wall(wall)
+    assert wall.wall == pytest.approx([math.pi / 2, WALL_Y_M + OFFSET_M], abs=2e-3)
+    # d is right for the offsets of the state, zero; as they are corrected, so is d.
+    assert wall.by_offsets[1].sum() == pytest.approx(-1.0, abs=1e-3)
+    assert wall.covariance[1, 1] < SIGMA_M**2
+    tracker, none = tracklet_of(5 * SIGMA_M * rng.standard_normal(40), OFFSET_M)
+    assert len(none.members) > 60
+    assert not tracker.is_wall(none)
+
+
+SHARP_SIGMA_M = 1e-3
+REACH_M = 0.15
+DISTANCE_M = 1.0
+
+
+def places(n: int = 301, reach_m: float = REACH_M) -> Array:
+    """Return places along x, the reflector's side being +y."""
+    return np.column_stack([np.linspace(-reach_m, reach_m, n), np.zeros(n)])
+
+
+def sightings(antennas: Array, ranges: Array, radars: Array | None = None) -> Sightings:
+    return Sightings(
+        antennas_m=antennas,
+        ranges_m=ranges,
+        variances=np.full(len(ranges), SHARP_SIGMA_M**2),
+        radars=np.zeros(len(ranges), dtype=np.intp) if radars is None else radars,
+        offset_covariance=None if radars is None else 0.02**2 * np.eye(2),
+    )
+
+
+def bulge() -> float:
+    """Return the chi-square that x^2 / 2 D leaves when a straight line is fitted to it.
+
+    A point at D is at D + x^2 / 2 D, to second order; a straight line takes up the mean. With x
+    uniform in +-a the rest has the variance (a^4 / 5 - a^4 / 9) / 4 D^2.
+    """
+    a = REACH_M
+    return len(places()) * (a**4 / 5 - a**4 / 9) / (4 * DISTANCE_M**2 * SHARP_SIGMA_M**2)
+
+
+def test_ranges_of_a_point_leave_the_bulge_of_a_hyperbola_under_the_law_of_a_wall() -> None:
+    antennas = places()
+    ranges = np.hypot(antennas[:, 0], DISTANCE_M)
+    verdict = compare(sightings(antennas, ranges), math.pi / 2)
+    assert verdict.point == pytest.approx(0.0, abs=1e-6)
+    assert verdict.wall == pytest.approx(bulge(), rel=0.03)
+
+
+def test_ranges_of_a_wall_leave_the_same_bulge_under_the_law_of_a_point() -> None:
+    antennas = places()
+    verdict = compare(sightings(antennas, np.full(len(antennas), DISTANCE_M)), math.pi / 2)
+    assert verdict.wall == pytest.approx(0.0, abs=1e-6)
+    assert verdict.point == pytest.approx(bulge(), rel=0.03)
+
+
+def test_a_wall_aslant_is_a_wall() -> None:
+    antennas = places()
+    antennas[:, 1] = 0.3 + 2.0 * antennas[:, 0] ** 2
+    n = np.array([math.cos(1.9), math.sin(1.9)])
+    verdict = compare(sightings(antennas, 1.1 - antennas @ n), 1.7)
+    assert verdict.wall == pytest.approx(0.0, abs=1e-6)
+    assert verdict.law(30.0) is Law.WALL
+
+
+def test_little_displacement_decides_nothing() -> None:
+    """The bulge goes with the fourth power of the displacement."""
+    antennas = places(reach_m=REACH_M / 10)
+    verdict = compare(sightings(antennas, np.hypot(antennas[:, 0], DISTANCE_M)), math.pi / 2)
+    assert verdict.law(1.0) is Law.UNDECIDED
+    assert verdict.wall == pytest.approx(bulge() / 1e4, rel=0.03)
+
+
+def test_unknown_offsets_of_two_radars_turn_a_wall_but_make_no_point_of_it() -> None:
+    along = places()
+    antennas = np.vstack([np.subtract(along, [0.1, 0.0]), np.add(along, [0.1, 0.0])])
+    radars = np.repeat([0, 1], len(along))
+    offsets = np.array([0.015, -0.02])[radars]
+    verdict = compare(
+        sightings(antennas, np.full(len(antennas), DISTANCE_M) + offsets, radars), math.pi / 2
+    )
+    assert verdict.wall < 2.0  # what the prior of the offsets asks for 15 and 20 of 20 mm
+    assert verdict.law(30.0) is Law.WALL
+
+
+def test_a_corner_is_a_point_at_its_apex() -> None:
+    """By way of both walls the antenna's image is the antenna turned about the apex."""
+    apex = np.array([0.3, 0.9])
+    antennas = places()
+    first = np.column_stack([antennas[:, 0], 2 * apex[1] - antennas[:, 1]])
+    image = np.column_stack([2 * apex[0] - first[:, 0], first[:, 1]])
+    ranges = np.hypot(*(image - antennas).T) / 2
+    toward = math.atan2(apex[1], apex[0])
+    verdict = compare(sightings(antennas, ranges), toward)
+    assert verdict.point == pytest.approx(0.0, abs=1e-6)
+    assert verdict.law(30.0) is Law.POINT

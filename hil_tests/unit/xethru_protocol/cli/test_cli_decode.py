@@ -12,7 +12,6 @@ import pytest
 from hil_tests.golden.test_protocol_vectors import KNOWN
 from hil_tests.golden.vectors import ABOUT, Vector, load
 from xethru_protocol.cli import main
-from xethru_protocol.recordings import WireCapture
 
 VECTORS = load()
 PING = "7D 01 AE EA AA EE 7C 7E"
@@ -55,29 +54,6 @@ def test_every_known_vector_in_both_directions(
             assert list(found) == ["framing", "payload_hex", "message", "fields"]
             if vector.payload is not None:
                 assert bytes.fromhex(found["payload_hex"]) == vector.payload
-
-
-def test_all_other_vectors_give_packets_or_faults(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    for vector in VECTORS:
-        sender = "host" if vector.from_host else "module"
-        found = decoded(capsys, tmp_path, [vector.wire.hex()], "--from", sender)
-        packets = [item for item in found if "fault" not in item]
-        assert all(
-            list(item) == ["framing", "payload_hex", "message", "fields"] for item in packets
-        )
-        assert all(list(item) == ["fault", "offset"] for item in found if "fault" in item)
-        if vector.decoded["framing"] == "stream":
-            # a packet without its start is dropped, as the reference recommends (1.2)
-            dropped = vector.name == "stream_missing_start_accepted"
-            expected = vector.decoded["packets"][: -1 if dropped else None]
-            assert [item["payload_hex"] for item in packets] == expected, vector.name
-        elif vector.name == "doc_escaping_example":  # its printed checksum is wrong
-            assert [item.get("fault") for item in found] == ["wrong checksum"]
-        else:
-            payloads = [bytes.fromhex(item["payload_hex"]) for item in found]
-            assert payloads == [vector.payload or payloads[0]], vector.name
 
 
 def test_corrupted_packet_is_a_fault(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -145,30 +121,6 @@ def test_lines_are_streams_of_their_own(capsys: pytest.CaptureFixture[str], tmp_
     ]
 
 
-def test_bad_hexadecimal_is_one_line_naming_file_and_line(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    file = tmp_path / "capture.txt"
-    file.write_text(f"{PING}\n7D 1\n")
-    assert main(["decode", "--hex", str(file)]) == 1
-    out, err = capsys.readouterr()
-    assert json.loads(out)["message"] == "PING"
-    assert err == (
-        f"xethru decode: {file} line 2 is not hexadecimal bytes: '7D 1'; "
-        "write them like 7D 10 6D 7E\n"
-    )
-
-
-@pytest.mark.parametrize("name", ["missing.bin", "."])
-def test_file_that_cannot_be_read_is_one_line(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, name: str
-) -> None:
-    assert main(["decode", str(tmp_path / name)]) == 1
-    err = capsys.readouterr().err
-    assert "cannot be read" in err
-    assert err.count("\n") == 1
-
-
 def test_bytes_from_standard_input(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -195,10 +147,3 @@ def test_packets_are_printed_as_they_come() -> None:
         assert json.loads(process.stdout.readline())["message"] == "ACK"  # input is still open
         process.stdin.close()
         assert process.wait() == 0
-
-
-def test_a_wire_capture_belongs_to_dump(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    with WireCapture(tmp_path / "line.xtwire") as capture:
-        capture.write("rx", ACK, 0)
-    assert main(["decode", str(tmp_path / "line.xtwire")]) == 1
-    assert "use xethru dump" in capsys.readouterr().err

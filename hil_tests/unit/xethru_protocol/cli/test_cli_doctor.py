@@ -13,19 +13,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil_tests.unit.xethru_protocol.sick_module import (
+from hil_tests.unit.xethru_protocol.pty_module import (
     IDLE,
     MANUAL,
     NOT_READY,
     SAFE_MODE,
     STOP,
+    PtyModule,
     Said,
-    SickModule,
     silent,
     stock,
 )
-from xethru_protocol.cli import main
-from xethru_protocol.cli import port_probe as patient
+from xethru_protocol.cli import main, port_probe
 from xethru_protocol.cli.doctor import MACHINE_CHECKS, PORT_CHECKS
 from xethru_protocol.cli.port_probe import PortUser, port_users
 from xethru_protocol.transport import SerialTransport
@@ -44,8 +43,8 @@ def only_own_emulators(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 @pytest.fixture
 def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait less for modules that never answer, and longer at a rate at which one may."""
-    monkeypatch.setattr(patient, "_PATIENCE_S", 0.3)
-    monkeypatch.setattr(patient, "_GLANCE_S", 1.0)
+    monkeypatch.setattr(port_probe, "_PATIENCE_S", 0.3)
+    monkeypatch.setattr(port_probe, "_GLANCE_S", 1.0)
 
 
 def examined(capsys: Capture, *arguments: str) -> tuple[int, list[dict[str, Any]]]:
@@ -69,7 +68,7 @@ def only_finding(capsys: Capture, path: str) -> tuple[int, dict[str, str]]:
 
 
 def test_a_module_as_it_comes_from_the_factory_is_well(capsys: Capture) -> None:
-    with SickModule(stock()) as module:
+    with PtyModule(stock()) as module:
         code, (report,) = examined(capsys, "--port", module.path)
     assert (code, not_well(report)) == (0, [])
     assert [check["check"] for check in report["checks"]] == [row.name for row in PORT_CHECKS]
@@ -94,33 +93,33 @@ def only_bootloader(command: m.Message) -> Sequence[Said]:
 
 
 SILENT_MODULES = [
-    ("not in the bootloader", lambda: SickModule(only_bootloader), "fault", "bootloader"),
-    ("speaks XeThru", lambda: SickModule(silent, unasked=UNCHECKED), "fault", "no XeThru packets"),
-    ("listens", lambda: SickModule(silent, unasked=FRAME), "fault", "does not answer"),
-    ("answers", lambda: SickModule(silent), "fault", "nothing answers"),
+    ("not in the bootloader", lambda: PtyModule(only_bootloader), "fault", "bootloader"),
+    ("speaks XeThru", lambda: PtyModule(silent, unasked=UNCHECKED), "fault", "no XeThru packets"),
+    ("listens", lambda: PtyModule(silent, unasked=FRAME), "fault", "does not answer"),
+    ("answers", lambda: PtyModule(silent), "fault", "nothing answers"),
 ]
 ANSWERING_MODULES = [
-    ("stays connected", lambda: SickModule(gone), "fault", "went away"),
-    ("no echo", lambda: SickModule(silent, echoes=True), "fault", "sends back"),
-    ("is a module", lambda: SickModule(stock(pong=0x12345678)), "fault", "0x12345678"),
-    ("ready", lambda: SickModule(stock(pong=NOT_READY)), "fault", "not ready"),
-    ("not in safe mode", lambda: SickModule(stock(pong=SAFE_MODE)), "fault", "safe mode"),
+    ("stays connected", lambda: PtyModule(gone), "fault", "went away"),
+    ("no echo", lambda: PtyModule(silent, echoes=True), "fault", "sends back"),
+    ("is a module", lambda: PtyModule(stock(pong=0x12345678)), "fault", "0x12345678"),
+    ("ready", lambda: PtyModule(stock(pong=NOT_READY)), "fault", "not ready"),
+    ("not in safe mode", lambda: PtyModule(stock(pong=SAFE_MODE)), "fault", "safe mode"),
     (
         "has profiles",
-        lambda: SickModule(stock(order_code=None, firmware_id="XEP", mode=None, profile=None)),
+        lambda: PtyModule(stock(order_code=None, firmware_id="XEP", mode=None, profile=None)),
         "note",
         "bare XEP firmware",
     ),
-    ("is an X4M300", lambda: SickModule(stock(order_code="X4M200")), "note", "X4M200"),
-    ("firmware", lambda: SickModule(stock(version="1.6.7")), "fault", "1.6.7"),
-    ("right profile", lambda: SickModule(stock(profile=0x064E57AD)), "fault", "RESPIRATION_2"),
-    ("profile loaded", lambda: SickModule(stock(mode=STOP, profile=0)), "note", "mode STOP"),
-    ("radar runs", lambda: SickModule(stock(mode=IDLE)), "note", "mode IDLE"),
-    ("transmitter on", lambda: SickModule(stock(mode=MANUAL, tx_power=0)), "fault", "off"),
+    ("is an X4M300", lambda: PtyModule(stock(order_code="X4M200")), "note", "X4M200"),
+    ("firmware", lambda: PtyModule(stock(version="1.6.7")), "fault", "1.6.7"),
+    ("right profile", lambda: PtyModule(stock(profile=0x064E57AD)), "fault", "RESPIRATION_2"),
+    ("profile loaded", lambda: PtyModule(stock(mode=STOP, profile=0)), "note", "mode STOP"),
+    ("radar runs", lambda: PtyModule(stock(mode=IDLE)), "note", "mode IDLE"),
+    ("transmitter on", lambda: PtyModule(stock(mode=MANUAL, tx_power=0)), "fault", "off"),
 ]
 
 
-Make = Callable[[], SickModule]
+Make = Callable[[], PtyModule]
 
 
 @pytest.mark.parametrize(
@@ -148,15 +147,15 @@ def test_what_is_wrong_with_a_module_that_does_not_answer(
 
 @pytest.mark.parametrize("version", ["1.6.8", "1.6.10", "1.10.0", "2.0.0", "new"])
 def test_firmware_that_is_not_stale(version: str, capsys: Capture) -> None:
-    with SickModule(stock(version=version)) as module:
+    with PtyModule(stock(version=version)) as module:
         code, (report,) = examined(capsys, "--port", module.path)
     assert (code, not_well(report)) == (0, [])
 
 
 @pytest.mark.usefixtures("hurried")
 def test_a_module_at_another_baud_rate(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(patient, "ignores_baudrate", lambda path: False)
-    with SickModule(stock(), baudrate=termios.B460800) as module:
+    monkeypatch.setattr(port_probe, "ignores_baudrate", lambda path: False)
+    with PtyModule(stock(), baudrate=termios.B460800) as module:
         code, finding = only_finding(capsys, module.path)
     assert (code, finding["check"]) == (1, "usual baud rate")
     assert finding["found"] == "it answers at 460800 baud, not at 115200"
@@ -174,7 +173,7 @@ def test_a_module_at_another_baud_rate(capsys: Capture, monkeypatch: pytest.Monk
     ],
 )
 def test_only_real_uarts_are_tried_at_other_rates(path: str, ignores: bool) -> None:
-    assert patient.ignores_baudrate(path) is ignores
+    assert port_probe.ignores_baudrate(path) is ignores
 
 
 def test_a_module_that_stops_answering_half_way(capsys: Capture) -> None:
@@ -183,7 +182,7 @@ def test_a_module_that_stops_answering_half_way(capsys: Capture) -> None:
     def answer(command: m.Message) -> Sequence[Said]:
         return [b""] if isinstance(command, m.GetProfileId) else healthy(command)
 
-    with SickModule(answer) as module:
+    with PtyModule(answer) as module:
         code, finding = only_finding(capsys, module.path)
     assert (code, finding["check"]) == (1, "right profile")
     assert "disconnected" in finding["found"]
@@ -211,7 +210,7 @@ def test_names_in_remedies_can_be_given_to_a_shell(tmp_path: Path, capsys: Captu
 def test_a_port_that_vanishes_while_it_is_examined(
     capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(patient.Patient, "exists", True)
+    monkeypatch.setattr(port_probe.PortProbe, "exists", True)
     _, finding = only_finding(capsys, "/dev/none")
     assert finding["check"] == "is a serial port"
     assert finding["found"] == "this could not be found out: No such file or directory"
@@ -235,12 +234,12 @@ def test_what_is_no_serial_port(path: str, capsys: Capture) -> None:
 def test_no_rights(
     mode: int, check: str, remedy: str, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with SickModule(stock()) as module:
+    with PtyModule(stock()) as module:
         os.chmod(module.path, mode)
         # root may open everything, and tests may run as root
         monkeypatch.setattr("os.access", lambda path, wanted: False)
         code, finding = only_finding(capsys, module.path)
-        group = patient.Patient(module.path).group
+        group = port_probe.PortProbe(module.path).group
     assert (code, finding["check"]) == (1, check)
     assert f"group {group}" in finding["found"]
     assert remedy in finding["remedy"]
@@ -268,8 +267,8 @@ def test_a_port_that_another_program_has_open_is_left_alone(
     capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened: list[str] = []
-    monkeypatch.setattr(patient, "SerialTransport", opened.append)
-    with SickModule(stock()) as module, reader(module.path) as pid:
+    monkeypatch.setattr(port_probe, "SerialTransport", opened.append)
+    with PtyModule(stock()) as module, reader(module.path) as pid:
         code, finding = only_finding(capsys, module.path)
     assert (code, finding["check"]) == (1, "nobody else has it open")
     assert f"(pid {pid}) has it open" in finding["found"]
@@ -279,7 +278,7 @@ def test_a_port_that_another_program_has_open_is_left_alone(
 @needs_proc
 def test_two_programs_that_split_the_stream(capsys: Capture) -> None:
     with ExitStack() as stack:
-        module = stack.enter_context(SickModule(stock()))
+        module = stack.enter_context(PtyModule(stock()))
         pids = [stack.enter_context(reader(module.path)) for _ in range(2)]
         code, finding = only_finding(capsys, module.path)
     assert (code, finding["check"]) == (1, "no two readers")
@@ -289,7 +288,7 @@ def test_two_programs_that_split_the_stream(capsys: Capture) -> None:
 
 @needs_proc
 def test_whoever_serves_a_port_is_no_user_of_it() -> None:
-    with SickModule(stock()) as module:
+    with PtyModule(stock()) as module:
         assert port_users(module.path) == ()
         with reader(module.path) as pid:
             (user,) = port_users(module.path)
@@ -302,8 +301,8 @@ def test_whoever_serves_a_port_is_no_user_of_it() -> None:
 def test_a_port_locked_by_a_program_that_cannot_be_seen(
     capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(patient, "port_users", lambda path: ())
-    with SickModule(stock()) as module:
+    monkeypatch.setattr(port_probe, "port_users", lambda path: ())
+    with PtyModule(stock()) as module:
         other = SerialTransport(module.path)
         code, finding = only_finding(capsys, module.path)
         other.close()
@@ -314,8 +313,8 @@ def test_a_port_locked_by_a_program_that_cannot_be_seen(
 
 def test_many_readers_are_not_all_named(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     users = tuple(PortUser(pid=number, name="reader") for number in range(10, 20))
-    monkeypatch.setattr(patient, "port_users", lambda path: users)
-    with SickModule(stock()) as module:
+    monkeypatch.setattr(port_probe, "port_users", lambda path: users)
+    with PtyModule(stock()) as module:
         _, finding = only_finding(capsys, module.path)
     assert "(pid 13) and 6 more have it open" in finding["found"]
 
@@ -353,7 +352,7 @@ def test_all_found_ports_are_examined(
     tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "xethru").mkdir()
-    with SickModule(stock()) as module:
+    with PtyModule(stock()) as module:
         device = {"path": module.path, "name": "left", "serial": "1", "tcp": None}
         word = json.dumps({"pid": os.getpid(), "ready": True, "devices": [device]})
         (tmp_path / "xethru" / f"{os.getpid()}.json").write_text(word)
@@ -368,7 +367,7 @@ def test_all_found_ports_are_examined(
 
 def test_the_report_for_people(capsys: Capture, tmp_path: Path) -> None:
     missing = str(tmp_path / "radar")
-    with SickModule(stock(pong=SAFE_MODE)) as module:
+    with PtyModule(stock(pong=SAFE_MODE)) as module:
         assert main(["doctor", "--port", module.path, "--port", missing]) == 1
     assert capsys.readouterr().out == (
         f"{module.path}\n"

@@ -8,7 +8,8 @@ import pytest
 from hil_tests.unit.xethru_protocol.both_drivers import DriverOn
 from hil_tests.unit.xethru_protocol.scripted import PlainModule, frame
 from xethru_protocol.driver.async_radar import AsyncX4M300
-from xethru_protocol.driver.files import AsyncFiles, AsyncPresence, Files, Presence
+from xethru_protocol.driver.files import AsyncFiles, Files
+from xethru_protocol.driver.profiles import AsyncPresence, Presence
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import PongCode
@@ -74,7 +75,7 @@ def test_answers_to_nothing_are_counted_and_not_kept(driver_on: DriverOn) -> Non
     line.say(*[m.Ack()] * 1000, frame(1))
     radar.read_frame()
     assert radar.stray_count == 1000
-    assert not radar._core.conversation._answers
+    assert not radar._link.conversation._answers
 
 
 def test_warnings_are_kept_up_to_a_thousand(driver_on: DriverOn) -> None:
@@ -96,4 +97,4 @@ def test_methods_are_documented_as_they_are_called(radar: type) -> None:
         members += inspect.getmembers(cls, inspect.isfunction)
     for name, method in members:
         parameters = inspect.signature(method).parameters
-        assert "core" not in parameters or name == "__init__", name
+        assert "link" not in parameters or name == "__init__", name

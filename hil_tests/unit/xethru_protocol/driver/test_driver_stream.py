@@ -152,7 +152,7 @@ def test_frame_area_is_quantised_and_only_a_strange_one_is_a_warning(driver_on: 
     radar.configure_raw(RawConfig(frame_area_m=(0.4, 5.0)))  # the script answers 0.2 ... 9.4
     assert radar.warnings == [
         "the module made 1431 bins over 0.1993 ... 9.4007 m of the frame area, where 716 over "
-        "0.3986 ... 5.0025 m were expected; its own numbers count"
+        "0.3986 ... 5.0025 m were expected; its own values are used"
     ]
 
 
@@ -170,7 +170,7 @@ def test_step_and_divider_count_for_the_highest_rate() -> None:
 
 def test_rate_beyond_a_uart_is_a_warning(driver_on: DriverOn) -> None:
     radar, line = driver_on()
-    radar._core.bytes_per_s = 11520.0  # 115200 baud; the table of Protocol reference 10 says 2.0
+    radar._link.bytes_per_s = 11520.0  # 115200 baud; the table of Protocol reference 10 says 2.0
     radar.configure_raw()
     radar.start(2.0)
     assert radar.warnings == []

@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 from hil_tests.paths import FIXTURES
+from hil_tests.unit.xethru_protocol.recordings.messages import frame, presence, read_with_faults
 from xethru_protocol.recordings import (
     RecordingError,
-    RecordingFault,
     RecordingWriter,
     convert,
     read_recording,
@@ -29,15 +29,8 @@ from xethru_protocol.wire import messages as m
 
 RECORDINGS = FIXTURES / "recordings"
 META = "xethru_recording_meta.dat"
+PARAMETERS = "xethru_parameter_file.par"
 MS = 1_000_000
-
-
-def frame(counter: int, n_bins: int = 3) -> m.DataFloat:
-    return m.DataFloat(info=counter, values=np.arange(n_bins, dtype=np.float32) + counter)
-
-
-def presence(counter: int) -> m.PresenceSingle:
-    return m.PresenceSingle(counter=counter, state=1, distance_m=1.5, direction=2, signal_quality=7)
 
 
 def copy_of(name: str, tmp_path: Path) -> Path:
@@ -45,13 +38,6 @@ def copy_of(name: str, tmp_path: Path) -> Path:
     for path in (copy, *copy.iterdir()):
         path.chmod(0o755)
     return copy
-
-
-def read_with_faults(
-    path: Path,
-) -> tuple[list[tuple[m.Response, int | None]], list[RecordingFault]]:
-    faults: list[RecordingFault] = []
-    return list(read_recording(path, faults.append)), faults
 
 
 def test_the_meta_file_names_the_recording(tmp_path: Path) -> None:
@@ -95,14 +81,25 @@ def test_text_files_have_times_of_their_own(tmp_path: Path) -> None:
     assert found[-1][1] == 1795221366688 * MS
 
 
-@pytest.mark.parametrize("cut", [1, 10, 46])
-def test_a_cut_line_is_reported_after_all_whole_ones(tmp_path: Path, cut: int) -> None:
-    copy = copy_of("single", tmp_path)
-    file = next(copy.glob("*.csv"))
+@pytest.mark.parametrize(
+    ("name", "cut", "offset"),
+    [
+        *(("single", cut, 1909 - 47) for cut in (1, 10, 46)),
+        *(("iq", cut, 39 * 104) for cut in (1, 50, 103)),
+    ],
+)
+def test_a_cut_record_is_reported_after_all_whole_ones(
+    name: str, cut: int, offset: int, tmp_path: Path
+) -> None:
+    """Cuts at every byte of every format are in hil_tests/property."""
+    copy = copy_of(name, tmp_path)
+    (file,) = (path for path in copy.iterdir() if path.name not in {META, PARAMETERS})
     file.write_bytes(file.read_bytes()[:-cut])
     found, faults = read_with_faults(copy)
     assert len(found) == 39
-    assert [(fault.file, fault.offset) for fault in faults] == [(file.name, 1909 - 47)]
+    assert [(fault.file, fault.offset) for fault in faults] == [(file.name, offset)]
+    with pytest.raises(RecordingError):
+        list(read_recording(copy))
 
 
 def test_a_line_that_makes_no_sense_costs_itself_only(tmp_path: Path) -> None:
@@ -388,5 +385,5 @@ def test_a_damaged_archive_gives_no_message(tmp_path: Path) -> None:
 def test_a_record_of_mcap_that_claims_more_than_the_file_is_not_waited_for(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(b"\x89MCAP0\r\n\x06" + struct.pack("<Q", 3_000_000_000))
-    with pytest.raises(RecordingError, match="exceeds limit 17"):
+    with pytest.raises(RecordingError, match="ends too early"):
         list(read_recording(path))

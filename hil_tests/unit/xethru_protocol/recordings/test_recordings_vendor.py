@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from hil_tests.paths import FIXTURES, REPOSITORY
+from hil_tests.unit.xethru_protocol.recordings.messages import frame, presence
 from xethru_protocol.recordings import (
     RecordingError,
     RecordingWriter,
@@ -25,17 +26,10 @@ from xethru_protocol.wire import messages as m
 
 RECORDINGS = FIXTURES / "recordings"
 SHARED = Path(os.environ.get("XETHRU_SHARED_DATA", REPOSITORY.parent / "shared" / "data"))
+REAL = SHARED / "x4_baseband_iq_2017"
 MANIFEST = SHARED / "recordings" / "manifest.json"
 META = "xethru_recording_meta.dat"
 MS = 1_000_000
-
-
-def frame(counter: int, n_bins: int = 3) -> m.DataFloat:
-    return m.DataFloat(info=counter, values=np.arange(n_bins, dtype=np.float32) + counter)
-
-
-def presence(counter: int) -> m.PresenceSingle:
-    return m.PresenceSingle(counter=counter, state=1, distance_m=1.5, direction=2, signal_quality=7)
 
 
 def write_again(source: Path, target: Path) -> None:
@@ -80,15 +74,14 @@ def test_what_the_vendor_wrote_is_written_again_byte_for_byte(name: str, tmp_pat
 
 
 def test_the_real_meta_file_of_2017_is_written_again_byte_for_byte(tmp_path: Path) -> None:
-    source = SHARED / "x4_baseband_iq_2017"
-    if not source.is_dir():
-        pytest.skip(f"no recording {source}: set XETHRU_SHARED_DATA to the folder that holds it")
-    facts = recording_facts(source)
+    if not REAL.is_dir():
+        pytest.skip(f"no recording {REAL}: set XETHRU_SHARED_DATA to the folder that holds it")
+    facts = recording_facts(REAL)
     assert facts.session_id == "baseband_recording"
     # its file name has the local time of Oslo in summer, 15:04 where UTC had 13:04
-    write_again(source, tmp_path / "again")
+    write_again(REAL, tmp_path / "again")
     ours = contents(tmp_path / "again")
-    theirs = contents(source)
+    theirs = contents(REAL)
     name = "xethru_baseband_iq_20170913_"
     assert ours[META].replace(name.encode() + b"130437", name.encode() + b"150437") == theirs[META]
     assert ours[name + "130437.dat"] == theirs[name + "150437.dat"]
@@ -274,3 +267,43 @@ def test_a_closed_recording_takes_nothing_more(tmp_path: Path) -> None:
     writer.close()
     with pytest.raises(RecordingError, match="is closed"):
         writer.write(frame(2), 0)
+
+
+def test_records_have_the_values_and_times_that_were_written() -> None:
+    """The vendor's library wrote the recording from messages with these values."""
+    records = list(read_recording(RECORDINGS / "iq"))
+    assert [t_ns for _, t_ns in records[:4]] == [
+        1795221357000 * MS + ms * MS for ms in (928, 1085, 1086, 1086)
+    ]
+    for counter, (message, _) in enumerate(records, start=44):
+        assert isinstance(message, m.BasebandIq)
+        assert message.counter == counter
+        np.testing.assert_allclose(message.i, np.arange(1, 11) * counter * 1e-3, rtol=1e-6)
+        np.testing.assert_allclose(message.q, np.arange(1, 11) * counter * -2e-3, rtol=1e-6)
+        assert message.range_offset_m == np.float32(0.4)
+        assert message.carrier_frequency_hz == np.float32(7.29e9)
+
+
+def test_a_data_file_alone_has_no_times(tmp_path: Path) -> None:
+    (file,) = (RECORDINGS / "iq").glob("*_iq_*.dat")
+    shutil.copy(file, tmp_path)
+    assert [t_ns for _, t_ns in read_recording(tmp_path / file.name)] == [None] * 40
+
+
+def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
+    for path in (tmp_path / "nothing", tmp_path):
+        with pytest.raises(RecordingError):
+            list(read_recording(path))
+
+
+@pytest.mark.skipif(
+    not REAL.is_dir(), reason="real recording not found; name its folder in XETHRU_SHARED_DATA"
+)
+def test_the_real_recording_is_read_whole() -> None:
+    records = [message for message, _ in read_recording(REAL) if isinstance(message, m.BasebandIq)]
+    assert len(records) == 514
+    assert {message.num_bins for message in records} == {54}
+    assert {message.range_offset_m for message in records} == {np.float32(0.3343209922)}
+    strength = np.mean([np.abs(message.i + 1j * message.q) for message in records], axis=0)
+    assert int(np.argmax(strength)) == 0
+    assert strength[0] == pytest.approx(0.0294, abs=1e-4)

@@ -1,6 +1,5 @@
 """What a row of the message table can say, and how wrong messages and codes are named."""
 
-from dataclasses import dataclass
 from typing import Annotated
 
 import pytest
@@ -9,7 +8,13 @@ from hil_tests.golden.test_protocol_vectors import KNOWN
 from hil_tests.golden.vectors import Vector
 from xethru_protocol.wire import fields
 from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.codec import decode_command, decode_response, describe, encode
+from xethru_protocol.wire.codec import (
+    decode_command,
+    decode_response,
+    describe,
+    encode,
+    message_type,
+)
 from xethru_protocol.wire.codes import ErrorSpace, MatrixControl, error_name
 from xethru_protocol.wire.errors import LocalProtocolError
 from xethru_protocol.wire.table import ROWS, Command, Prefixes, command
@@ -166,7 +171,6 @@ def test_no_two_rows_share_a_prefix() -> None:
     with pytest.raises(ValueError, match="22 is ModReset already"):
 
         @command(0x22, name="ANOTHER_RESET")
-        @dataclass(frozen=True, slots=True, kw_only=True)
         class _AnotherReset(Command[m.Ack]):
             seed: Annotated[int, fields.U8]
 
@@ -176,7 +180,10 @@ def test_the_longest_prefix_wins() -> None:
     prefixes.enter(b"\x10", m.Ack)
     prefixes.enter(b"\x10\x01\x02", m.Pong)
     prefixes.enter(b"\x10\x01", m.System)
-    found = [prefixes.find(data) for data in (b"\x10\x01\x02\x03", b"\x10\x01", b"\x10\x02", b"")]
+    found = [
+        message_type(prefixes, data)
+        for data in (b"\x10\x01\x02\x03", b"\x10\x01", b"\x10\x02", b"")
+    ]
     assert found == [m.Pong, m.System, m.Ack, None]
 
 

@@ -1,7 +1,5 @@
 """Bags of ROS 1 and ROS 2: sessions there and back, and the authors' layout as we generate it."""
 
-from __future__ import annotations
-
 import math
 import signal
 import sqlite3
@@ -11,26 +9,27 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import StoragePlugin
 
-from hil_tests.unit.slam.app.authors_bag import AuthorsBag
+from hil_tests.unit.slam.app.authors_bag import (
+    N_SCANS,
+    START_NS,
+    AuthorsBag,
+    authors_bag,
+    jittered_ns,
+    samples,
+)
 from hil_tests.unit.slam.app.sessions import FRAME_NS, feed, scan, session_info, snapshot
 from slam.app.cli import main
 from slam.app.convert.rosbag import BagOptions, convert_bag, write_bag
-from slam.app.errors import StopRequestedError
 from slam.app.odometry.track import OdometryTrack
 from slam.app.odometry.tum import format_tum_line
 from slam.app.records import Scan
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import SlamSettings
 from slam.app.session.reader import RecordedSession, open_session
+from xethru_protocol.system import StopRequestedError
 
-N_SCANS = 12
-N_BINS = 1431
-START_NS = 1_690_000_000_000_000_000
-STEP_NS = 200_000_000
 KINDS = ("bag.bag", "bag")
 
 
@@ -108,43 +107,6 @@ def test_the_bag_has_the_topics_and_types_of_the_data_set(
     np.testing.assert_array_equal(message.data, scan(3).frames[1].samples)
 
 
-def jittered_ns(radar: int, number: int) -> int:
-    """When a laptop would have recorded a frame of a radar that is not synchronised."""
-    late_ns = int(np.random.default_rng((radar, number)).integers(0, 20_000_000))
-    return START_NS + number * STEP_NS + radar * 30_000_000 + late_ns
-
-
-def samples(radar: int, number: int, n_bins: int = N_BINS) -> NDArray[np.float32]:
-    rng = np.random.default_rng((radar, number))
-    return rng.normal(0, 1e-3, n_bins).astype(np.float32)
-
-
-def authors_bag(
-    path: Path,
-    *,
-    topics: str = "/UWBradar{}/readings",
-    n_bins: int = N_BINS,
-    odometry: bool = True,
-    jump_back: bool = False,
-    truth: bool = True,
-    storage: StoragePlugin = StoragePlugin.SQLITE3,
-) -> Path:
-    """Write a bag of noise and a straight drive as the authors' recorder would have."""
-    bag = AuthorsBag(path, topics, storage)
-    for number in range(N_SCANS):
-        for radar in range(4):
-            bag.add_frame(jittered_ns(radar, number), radar + 1, samples(radar, number, n_bins))
-    for k in range(6 * N_SCANS):
-        t_ns = START_NS - 300_000_000 + k * STEP_NS // 5
-        stamp_ns = t_ns - 300_000_000 if jump_back and k == 20 else t_ns
-        if odometry:
-            bag.add_odometry(t_ns + 3_000_000, stamp_ns, (0.01 * k, -0.5, 0.2))
-        if truth:
-            bag.add_truth(t_ns + 9_000_000, t_ns, (0.01 * k + 2.0, -0.5, 0.2))
-    bag.write()
-    return path
-
-
 @pytest.mark.parametrize("topics", ["/UWBradar{}/readings", "/UWBradar{}"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_authors_layout_becomes_a_session(
@@ -188,20 +150,6 @@ def problem(capsys: pytest.CaptureFixture[str], bag: Path, *options: object, cod
     assert len(err.splitlines()) == 1
     assert not out.exists()
     return err
-
-
-def test_what_a_bag_lacks_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    blind = authors_bag(tmp_path / "blind.bag", odometry=False)
-    assert "holds no pose on /odom, nav_msgs/Odometry" in problem(capsys, blind)
-    other = authors_bag(tmp_path / "other.bag", topics="/radar{}")
-    assert "holds no frames; they are looked for on /UWBradar1/readings" in problem(capsys, other)
-    five = authors_bag(tmp_path / "five.bag", topics="/UWBradar{}0")
-    assert "radar UWBradar10 is not in the rig (UWBradar1, UWBradar2" in problem(capsys, five)
-    short = authors_bag(tmp_path / "short.bag", n_bins=500)
-    assert "frames of 500 bins, not the paper's 1431; say --frame-area" in problem(capsys, short)
-    wrong = problem(capsys, short, "--frame-area", 0.2, 9.4)
-    assert "but a frame area of 0.2 to 9.4 m has 1431; say another" in wrong
-    assert "unknown preset 'mine'" in problem(capsys, short, "--preset", "mine", code=2)
 
 
 def test_another_frame_area(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -255,34 +203,6 @@ def test_a_cut_bag_is_one_line(
     for share in (0.0, 0.01, 0.5, 0.98):
         file.write_bytes(content[: round(share * len(content))])
         assert f"uwb-slam: {bag}: no bag of ROS 1 or 2, or a damaged one" in problem(capsys, bag)
-
-
-def test_wrong_names_are_one_line(
-    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert "none.bag: no bag is there" in problem(capsys, tmp_path / "none.bag")
-    (tmp_path / "text.bag").write_text("hello\n" * 99)
-    assert "no bag of ROS 1 or 2" in problem(capsys, tmp_path / "text.bag")
-    empty = tmp_path / "empty"
-    empty.mkdir()
-    assert "empty: no bag is there" in problem(capsys, empty)
-    code, _, err = run(capsys, recorded, empty)
-    assert (code, err) == (1, f"uwb-slam: {empty}: exists; choose another name\n")
-    bag = authors_bag(tmp_path / "a.bag")
-    code, _, err = run(capsys, bag, tmp_path / "b.bag")
-    assert code == 2
-    assert "of a bag or MATLAB file a session is made; give a name that ends in .mcap" in err
-    assert not (tmp_path / "b.bag").exists()
-
-
-def test_a_session_without_frames_leaves_no_bag(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    SessionLog(tmp_path / "s.mcap", session_info()).close()
-    code, _, err = run(capsys, tmp_path / "s.mcap", tmp_path / "bag")
-    assert code == 1
-    assert "holds no frame" in err
-    assert not (tmp_path / "bag").exists()
 
 
 def test_a_topic_of_another_type_is_named(

@@ -1,22 +1,40 @@
-"""Experiments `figure7`, `smoke` and `filter`: what they measure, and how the command ends."""
+"""Experiments: what they measure, the pictures and tables they leave, and how the command ends."""
 
-from __future__ import annotations
-
+import json
 import math
+import os
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from emulator.scene.scene import Scene, load_scene
-from hil_tests.paths import FIXTURES
+from hil_tests.paths import FIXTURES, REPOSITORY
+from hil_tests.unit.slam.app.sweep_runs import run_of
 from slam.app.cli import main
-from slam.app.experiments import EXPERIMENTS
 from slam.app.experiments.figure7 import measure_steps, range_errors
 from slam.app.experiments.filter import Origin, Seen, Setting, drive, outcomes
+from slam.app.experiments.recording import (
+    FAR_BINS,
+    SlowTime,
+    emulate,
+    equivalent_scene,
+    read_slow_time,
+    spread_of,
+)
 from slam.app.experiments.smoke import in_smoke, light_attenuation_db, smoke_attenuation_db
+from slam.app.experiments.step_cost import StepCost, mapped_state, slope_of, stepper
 from slam.app.run.pictures import picture
-from slam.geometry import transform
+from slam.app.sweep.run import SweepRun, make_case
+from slam.app.sweep.statistics import summarise_groups
+from slam.geometry import paper_rig, transform
+from slam.robust.matching import sure_landmarks
+from slam.robust.parameters import ContinuationRule, RangeNoise
+from slam.robust.ranges import antennas_of, sides_of, view
+from slam.robust.state import Motion
 
 RANGES_M = (0.6, 0.61, 0.62, 0.9, 0.91, 0.92)
 
@@ -76,7 +94,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Seen:
 
 
 def test_a_true_fix_lies_where_a_landmark_is(seen: Seen) -> None:
-    assert seen.n_true > 50
+    assert seen.count(Origin.TRUE) > 50
     gaps = [
         np.linalg.norm(transform(pose, np.array([[fix.x_m, fix.y_m]])) - seen.landmarks_m, axis=1)
         for state, pose, origins in zip(seen.states, seen.truth, seen.origins, strict=True)
@@ -106,30 +124,6 @@ def test_a_filter_that_asks_for_more_keeps_less(seen: Seen) -> None:
     assert lax.n_observations >= table_i.n_observations > strict.n_observations
 
 
-def test_an_unknown_experiment_is_wrong_usage_and_lists_the_known(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    with pytest.raises(SystemExit) as end:
-        main(["experiment", "figure8"])
-    assert end.value.code == 2
-    error = capsys.readouterr().err
-    assert all(name in error for name in EXPERIMENTS)
-    assert "Traceback" not in error
-
-
-@pytest.mark.parametrize("name", [name for name in EXPERIMENTS if name != "recording"])
-def test_a_folder_that_cannot_be_written_is_one_line_before_anything_is_measured(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = tmp_path / "file"
-    file.write_text("not a folder")
-    assert main(["experiment", name, "--out", str(file)]) == 1
-    captured = capsys.readouterr()
-    assert captured.err.startswith(f"uwb-slam: {file}: ")
-    assert captured.err.count("\n") == 1
-    assert captured.out == ""
-
-
 def test_a_picture_is_the_same_file_each_time(tmp_path: Path) -> None:
     for name in ("one.png", "two.png"):
         with picture(tmp_path / name, width_in=2, height_in=2) as figure:
@@ -137,15 +131,286 @@ def test_a_picture_is_the_same_file_each_time(tmp_path: Path) -> None:
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
 
 
-def test_a_scene_that_is_not_there_is_told_before_the_first_is_driven(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def never(*_: object, **__: object) -> Seen:
-        raise AssertionError("driven")
+def test_a_step_predicts_and_learns_from_a_landmark_on_each_side() -> None:
+    """The covariance is that of a dense filter: every landmark is surer after what two told."""
+    state = mapped_state(40)
+    before = state.P.full()
+    assert np.count_nonzero(before) == before.size, "the covariance is dense"
+    step = stepper(state)
+    step()
+    assert state.position_m[0] == pytest.approx(0.01, abs=1e-4)
+    after = state.P.full()
+    seen = slice(state.offsets.stop, state.offsets.stop + 4)
+    assert (np.diag(after)[seen] < np.diag(before)[seen]).any()
+    step()
+    assert np.abs(state.position_m).max() < 1e-3, "to and fro"
 
-    monkeypatch.setattr("slam.app.experiments.filter.drive", never)
-    command = ["experiment", "filter", "--out", str(tmp_path), "--scene", "lab", "nowhere"]
-    assert main(command) == 2
-    error = capsys.readouterr().err
-    assert "nowhere: no such scene" in error
-    assert error.count("\n") == 1
+
+def test_the_gate_of_a_step_has_something_to_weigh() -> None:
+    state, rig = mapped_state(40), paper_rig()
+    still = Motion(step_m=np.zeros(2), turn_rad=0.0, covariance=np.zeros((3, 3)), walk_variance=0.0)
+    seen = view(state, antennas_of(rig, (), still))
+    for side in sides_of(rig):
+        sure = sure_landmarks(state, seen, side, RangeNoise(), ContinuationRule())
+        assert sure is not None
+        assert {0, 1} & set(sure.landmarks.tolist())
+
+
+def test_the_slope_is_that_of_a_power_law() -> None:
+    costs = [
+        StepCost(
+            n_landmarks=n,
+            size=10 + 2 * n,
+            step_ms=3e-6 * n**1.7 if n >= 200 else 5.0,
+            slowest_ms=1.0,
+            at_once_ms=1.0,
+            triangle_ms=1.0,
+            triangle_gb_per_s=1.0,
+        )
+        for n in (10, 200, 600, 2000)
+    ]
+    assert slope_of(costs) == pytest.approx(1.7)
+    assert slope_of(costs[:2]) is None
+
+
+def test_the_experiment_tells_measured_from_quoted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--landmarks", "30", "5", "--repetitions", "1"]
+    assert main(["experiment", "step-cost", "--out", str(tmp_path), *arguments]) == 0
+    numbers = json.loads((tmp_path / "step-cost.json").read_text())
+    assert [row["n_landmarks"] for row in numbers["steps"]] == [5, 30]
+    for row in numbers["steps"]:
+        assert 0.0 < row["step_ms"] <= row["slowest_ms"]
+    assert {row["low_ms"] for row in numbers["quoted"]} == {1604.0, 29.0, 0.4}
+    assert numbers["slope"] is None
+    assert (tmp_path / "step-cost.png").read_bytes().startswith(b"\x89PNG")
+    assert "slowest step" in capsys.readouterr().out
+
+
+SIGMA = 3e-5
+SEEDS = range(6)
+
+
+def shared_recording() -> Path:
+    named = os.environ.get("XETHRU_SHARED_DATA")
+    shared = Path(named) if named else REPOSITORY.parent / "shared" / "data"
+    path = shared / "x4_baseband_iq_2017"
+    if not path.is_dir():
+        pytest.skip(f"no recording {path}: set XETHRU_SHARED_DATA to the folder that holds it")
+    return path
+
+
+def frames_of(iq: NDArray[Any]) -> SlowTime:
+    return SlowTime(iq=iq.astype(np.complex128), rate_hz=17.0, first_bin_m=0.3, bin_length_m=0.05)
+
+
+@pytest.fixture(scope="module")
+def white() -> SlowTime:
+    rng = np.random.default_rng(11)
+    iq = SIGMA * (rng.normal(size=(4000, 40)) + 1j * rng.normal(size=(4000, 40)))
+    iq[:, 4] += 0.02
+    return frames_of(iq)
+
+
+def test_white_noise_is_its_own_floor_and_all_new_with_every_frame(white: SlowTime) -> None:
+    numbers = white.numbers()
+    for name in ("far_sigma", "far_white", "far_floor"):
+        assert numbers[name] == pytest.approx(SIGMA, rel=0.03), name
+    assert abs(numbers["far_lag_1"]) < 0.02
+    assert numbers["far_neighbours"] < 0.04
+    assert white.strongest == 4
+    # small noise beside a strong echo: its quadrature part over the amplitude
+    assert numbers["phase_rad"] == pytest.approx(SIGMA / 0.02, rel=0.05)
+    assert numbers["phase_white_rad"] == pytest.approx(SIGMA / 0.02, rel=0.05)
+
+
+def test_a_line_of_known_frequency_stands_in_its_place() -> None:
+    time_s = np.arange(1024) / 17.0
+    iq = np.zeros((1024, 40), dtype=np.complex128)
+    iq[:, 30:] = 1e-3 * np.cos(2 * np.pi * 3.0 * time_s)[:, np.newaxis]
+    frequency, density = frames_of(iq).spectrum(slice(-FAR_BINS, None))
+    assert frequency[np.argmax(density)] == pytest.approx(3.0, abs=17 / 128)
+    # power: (1e-3)^2 / 2 in I and none in Q, so half of it per component
+    power = float((density**2).sum() * (frequency[1] - frequency[0]))
+    assert power == pytest.approx(1e-6 / 4, rel=0.03)
+
+
+def test_first_order_process_has_its_autocorrelation() -> None:
+    rng = np.random.default_rng(2)
+    steps = rng.normal(size=(6000, 40)) + 1j * rng.normal(size=(6000, 40))
+    iq = np.zeros_like(steps)
+    for frame in range(1, 6000):
+        iq[frame] = 0.9 * iq[frame - 1] + steps[frame]
+    np.testing.assert_allclose(
+        frames_of(iq[100:]).autocorrelation(6), 0.9 ** np.arange(6), atol=0.02
+    )
+
+
+def test_the_quietest_stretch_is_found(white: SlowTime) -> None:
+    loud = white.iq.copy()
+    loud[:1000] *= 5
+    loud[1128:] *= 3
+    quiet = frames_of(loud).quietest()
+    assert quiet.iq.shape == (128, 40)
+    assert quiet.numbers()["far_white"] == pytest.approx(SIGMA, rel=0.1)
+
+
+def test_emulated_frames_have_the_statistics_of_the_recording() -> None:
+    """Spreads over seeds are those of 30 s of slow processes; what is fast is held tightly."""
+    recorded = read_slow_time(shared_recording())
+    assert recorded.rate_hz == pytest.approx(17.05, abs=0.01)
+    scene = equivalent_scene(recorded)
+    runs = [emulate(scene, recorded, seed).numbers() for seed in SEEDS]
+    real = recorded.numbers()
+    # the figures that the recording's description gives
+    assert real["far_sigma"] == pytest.approx(1.4e-4, rel=0.01)
+    assert real["far_lag_1"] == pytest.approx(0.98, abs=0.005)
+    assert real["far_white"] == pytest.approx(2.1e-5, rel=0.02)
+    assert real["phase_rad"] == pytest.approx(0.032, rel=0.02)
+    assert real["phase_white_rad"] == pytest.approx(0.0056, rel=0.02)
+    for name, within in (
+        ("amplitude", 0.01),
+        ("far_sigma", 0.15),
+        ("far_lag_1", 0.006),
+        ("far_white", 0.10),
+        ("far_floor", 0.08),
+        ("far_neighbours", 0.08),
+        ("phase_white_rad", 0.08),
+        ("phase_rad", 0.40),
+    ):
+        _, median, _ = spread_of([run[name] for run in runs])
+        assert median == pytest.approx(real[name], rel=within), name
+
+
+def test_white_noise_of_neighbouring_bins_is_as_alike_as_in_the_real_filter() -> None:
+    """In the quietest stretch the fast part is the receiver's: it went through the real taps."""
+    recorded = read_slow_time(shared_recording())
+    real = recorded.quietest().numbers()["far_neighbours_fast"]
+    emulated = emulate(equivalent_scene(recorded), recorded, 0).numbers()["far_neighbours_fast"]
+    assert emulated == pytest.approx(real, abs=0.06)
+
+
+def test_the_experiment_leaves_picture_numbers_and_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = shared_recording()
+    options = ["--recording", str(recording), "--runs", "2", "--out", str(tmp_path)]
+    assert main(["experiment", "recording", *options]) == 0
+    numbers = json.loads((tmp_path / "recording.json").read_text())
+    assert numbers["frames"] == 514
+    assert numbers["recorded"]["far_sigma"] == pytest.approx(1.4e-4, rel=0.01)
+    assert (tmp_path / "recording.png").read_bytes().startswith(b"\x89PNG")
+    assert "ten farthest bins" in capsys.readouterr().out
+
+
+TIMES_S = tuple(float(second) for second in range(1, 11))
+
+
+def made_up(preset: str, stress: str, seed: int, nees: tuple[float, ...], ate_m: float) -> SweepRun:
+    """Return a run with these ten NEES; NIS 2.0 of 2 dof, but 20.0 at the first time."""
+    run = run_of(make_case("lab", preset, seed, stress=stress))
+    return replace(
+        run,
+        ate_rmse_m=ate_m,
+        nees_pose=tuple(zip(TIMES_S, nees, strict=True)),
+        nis_times=tuple((t_s, 20.0 if t_s == 1.0 else 2.0, 2) for t_s in TIMES_S),
+        bound=None,
+    )
+
+
+def written(folder: Path, runs: list[SweepRun]) -> str:
+    path = folder / "sweep.json"
+    result = {"runs": [asdict(run) for run in runs], "groups": summarise_groups(runs)}
+    path.write_text(json.dumps(result))
+    return str(path)
+
+
+# For 4 seeds the band is [1.10, 5.83] (chi-square of 12 dof: 4.404 and 23.337).
+HONEST = (3.0,) * 10
+TWICE_OUT = (9.0, 0.5, *(3.0,) * 8)
+
+
+def runs() -> list[SweepRun]:
+    rows = (
+        ("paper", "clean", TWICE_OUT, 0.010),
+        ("paper", "skew", TWICE_OUT, 0.030),
+        ("robust", "clean", HONEST, 0.002),
+        ("robust", "skew", HONEST, 0.003),
+    )
+    return [
+        made_up(preset, stress, seed, nees, ate_m)
+        for preset, stress, nees, ate_m in rows
+        for seed in range(4)
+    ]
+
+
+def test_consistency_counts_the_times_in_their_bands(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["experiment", "consistency", "--sweep", written(tmp_path, runs())]
+    assert main([*command, "--out", str(tmp_path / "out")]) == 0
+    numbers = json.loads((tmp_path / "out" / "consistency.json").read_text())
+    assert numbers["simulated"] is True
+    # the stressed runs are not in it
+    assert [
+        (row["name"], row["runs"], row["anees_in_band"], row["nis_in_band"])
+        for row in numbers["groups"]
+    ] == [("lab, preset paper", 4, 8, 9), ("lab, preset robust", 4, 10, 9)]
+    assert (tmp_path / "out" / "consistency.png").read_bytes().startswith(b"\x89PNG")
+    assert "lab, preset robust" in capsys.readouterr().out
+
+
+def test_stress_compares_with_clean_runs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["experiment", "stress", "--sweep", written(tmp_path, runs())]
+    assert main([*command, "--out", str(tmp_path / "out")]) == 0
+    numbers = json.loads((tmp_path / "out" / "stress.json").read_text())
+    times = {row["name"]: row["times_clean"]["median"] for row in numbers["groups"]}
+    assert times == {
+        "lab, preset paper": 1.0,
+        "lab, preset paper, stress skew": pytest.approx(3.0),
+        "lab, preset robust": 1.0,
+        "lab, preset robust, stress skew": pytest.approx(1.5),
+    }
+    assert (tmp_path / "out" / "stress.png").read_bytes().startswith(b"\x89PNG")
+    assert capsys.readouterr().out.count("x clean") == 4
+
+
+def test_scenes_has_a_row_per_clean_group(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["experiment", "scenes", "--sweep", written(tmp_path, runs())]
+    assert main([*command, "--out", str(tmp_path / "out")]) == 0
+    numbers = json.loads((tmp_path / "out" / "scenes.json").read_text())
+    # 10 and 2 mm, where the wheels have 40
+    assert [
+        (row["name"], row["ratio"], row["anees_mean"], row["anees_in_band"])
+        for row in numbers["groups"]
+    ] == [
+        ("lab, preset paper", pytest.approx(0.25), pytest.approx(3.35), 8),
+        ("lab, preset robust", pytest.approx(0.05), pytest.approx(3.0), 10),
+    ]
+    assert (tmp_path / "out" / "scenes.png").read_bytes().startswith(b"\x89PNG")
+    assert "0.250" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["consistency", "stress", "scenes"])
+def test_a_result_never_replaces_its_sweep(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / f"{name}.json"
+    Path(written(tmp_path, runs())).rename(path)
+    before = path.read_bytes()
+    assert main(["experiment", name, "--sweep", str(path), "--out", str(tmp_path)]) == 1
+    assert "choose another --out" in capsys.readouterr().err
+    assert path.read_bytes() == before
+
+
+def test_a_sweep_without_stresses_has_no_stress_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = written(tmp_path, [run for run in runs() if run.stress == "clean"])
+    assert main(["experiment", "stress", "--sweep", path, "--out", str(tmp_path / "out")]) == 1
+    assert "has no stressed runs" in capsys.readouterr().err

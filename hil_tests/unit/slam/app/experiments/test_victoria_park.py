@@ -1,7 +1,5 @@
 """Victoria Park: the reader, the conversion to range and bearing, and both back ends on it."""
 
-from __future__ import annotations
-
 import json
 import math
 import sys

@@ -1,7 +1,5 @@
 """Time base `arrival`: the line below the points, drift found through jitter, restarts."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

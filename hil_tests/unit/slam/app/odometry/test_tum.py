@@ -84,39 +84,6 @@ def test_files_round_trip_and_skip_comments(tmp_path: Path) -> None:
     np.testing.assert_allclose(back.poses[:, 2], poses[:, 2], atol=1e-15)
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("", "holds no pose"),
-        ("1 2 3\n", "line 1: expected 8 numbers"),
-        ("0 0 0 0 0 0 0 1\nx 0 0 0 0 0 0 1\n", "line 2: not a number"),
-        ("0 nan 0 0 0 0 0 1\n", "line 1: not a finite number"),
-        ("0 0 0 0 0 0 0 1\n1732155000123456789 0 0 0 0 0 0 1\n", "line 2: stamps must be seconds"),
-        ("1e9999999 0 0 0 0 0 0 1\n", "line 1: stamps must be seconds"),
-        ("inf 0 0 0 0 0 0 1\n", "line 1: not a finite number"),
-        ("0 0 0 0 0 0 0 0\n", "line 1: quaternion without a heading"),
-        ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "line 2: its time is not after"),
-    ],
-)
-def test_a_bad_file_is_one_line_with_file_and_line_number(
-    tmp_path: Path, text: str, said: str
-) -> None:
-    path = tmp_path / "bad.tum"
-    path.write_text(text)
-    with pytest.raises(TumError, match=said) as caught:
-        read_tum(path)
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-def test_a_missing_file_and_a_binary_file_are_named(tmp_path: Path) -> None:
-    with pytest.raises(TumError, match=r"nowhere\.tum: cannot read: No such file"):
-        read_tum(tmp_path / "nowhere.tum")
-    (tmp_path / "b.tum").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(TumError, match="not a text file"):
-        read_tum(tmp_path / "b.tum")
-
-
 def test_endless_input_is_no_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("slam.app.odometry.tum._MAX_BYTES", 1000)
     with pytest.raises(TumError, match="it is no trajectory"):

@@ -1,17 +1,22 @@
-"""Numbers of a run whose errors are known: perfect, offset, and without any landmark."""
+"""Numbers of runs whose errors are known in closed form, and the fields of summary.json."""
 
 import cmath
+import dataclasses
+import json
+import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from slam.app.run.evaluation import NEES_AT, Summary, summarise
+from slam.app.cli import main
+from slam.app.odometry.tum import Trajectory, write_tum
+from slam.app.run.evaluation import NEES_AT, LandmarkSummary, Summary, summarise
+from slam.app.run.output import summary_rows, table_text
+from slam.app.run.results import evaluate
 from slam.app.run.runner import RunRecord
 from slam.geometry import Mount, Rig
-from slam.paper.association import Association
-from slam.paper.clustering import Observation
-from slam.paper.ekf import Belief
-from slam.paper.pipeline import StepResult
+from slam.results import Association, Belief, Observation, StepResult
 
 N = 201
 PERIOD_NS = 200_000_000
@@ -44,10 +49,6 @@ def run(offset_m: float, drift: float, variance: float) -> Summary:
                     next_id=2,
                 ),
                 detections=(),
-                fixes=(),
-                observations=(),
-                associations=(),
-                rejected=(),
             )
         )
     record = RunRecord(
@@ -150,10 +151,8 @@ def turned() -> Summary:
                     next_id=0,
                 ),
                 detections=(),
-                fixes=(),
                 observations=tuple(observation for observation, _ in observed),
                 associations=tuple(association for _, association in observed),
-                rejected=(),
             )
         )
     record = RunRecord(
@@ -215,3 +214,144 @@ def test_a_run_without_a_state_has_no_summary() -> None:
         true_landmarks_m=LANDMARKS,
     )
     assert nothing is None
+
+
+N_POSES = 200
+STAMPS = np.arange(N_POSES, dtype=np.int64) * 199_261_498
+
+
+def square_path() -> np.ndarray:
+    angle = np.linspace(0, 2 * np.pi, N_POSES, endpoint=False)
+    return np.stack([np.cos(angle), np.sin(angle), angle], axis=1)
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> tuple[Path, Path]:
+    reference = square_path()
+    # radial error +-10 mm, alternating: mean zero and uncorrelated with position, so no alignment
+    # can remove any of it; then moved rigidly, which alignment must remove wholly
+    radial = 0.01 * np.where(np.arange(N_POSES) % 2, 1.0, -1.0)
+    bent = reference[:, :2] * (1 + radial)[:, None]
+    cosine, sine = math.cos(0.7), math.sin(0.7)
+    moved = bent @ np.array([[cosine, sine], [-sine, cosine]]) + [3.0, -2.0]
+    estimate = np.column_stack([moved, reference[:, 2] + 0.7])
+    write_tum(tmp_path / "ref.tum", Trajectory(stamps_ns=STAMPS, poses=reference))
+    write_tum(tmp_path / "est.tum", Trajectory(stamps_ns=STAMPS[3:] + 900_000, poses=estimate[3:]))
+    return tmp_path / "est.tum", tmp_path / "ref.tum"
+
+
+def test_a_rigid_motion_costs_nothing_and_noise_counts(
+    files: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["evaluate", *map(str, files), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["ate_rmse_m"] == pytest.approx(0.01, rel=0.01)
+    assert (result["pairs"], result["reference_poses"]) == (N_POSES - 3, N_POSES)
+
+
+def test_the_line_states_the_alignment(
+    files: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["evaluate", *map(str, files)]) == 0
+    assert capsys.readouterr().out == "ATE 10.0 mm (RMS, SE(2), no scale, 197 of 197 poses)\n"
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_stamps_belong_together_within_10_ms(tmp_path: Path, sign: int) -> None:
+    reference, estimate = tmp_path / "ref.tum", tmp_path / "est.tum"
+    write_tum(reference, Trajectory(stamps_ns=STAMPS, poses=square_path()))
+    # 9 ms and 11 ms apart, in turns
+    apart_ns = np.where(np.arange(N_POSES) % 2, 11_000_000, 9_000_000)
+    write_tum(estimate, Trajectory(stamps_ns=STAMPS + sign * apart_ns, poses=square_path()))
+    assert evaluate(estimate, reference)["pairs"] == N_POSES // 2
+
+
+@pytest.mark.parametrize("huge", [1e160, 1e308])
+def test_an_error_beyond_all_floats_is_null(
+    files: tuple[Path, Path], tmp_path: Path, huge: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    far = square_path()
+    far[::2, 0] = huge
+    write_tum(tmp_path / "far.tum", Trajectory(stamps_ns=STAMPS, poses=far))
+    assert main(["evaluate", str(tmp_path / "far.tum"), str(files[1]), "--json"]) == 0
+    text = capsys.readouterr()
+    assert json.loads(text.out, parse_constant=pytest.fail)["ate_rmse_m"] is None
+    assert text.err == ""
+    assert main(["evaluate", str(tmp_path / "far.tum"), str(files[1])]) == 0
+    assert capsys.readouterr().out.startswith("ATE beyond floating point (RMS, ")
+
+
+SUMMARY = Summary(
+    scene="lab",
+    preset="paper",
+    seed=3,
+    frames=13876,
+    duration_s=691.2,
+    realtime_factor=70.0,
+    ate_rmse_m=0.0141,
+    ate_icp_rmse_m=0.0089,
+    odometry_ate_rmse_m=0.0564,
+    final_error_m=0.02,
+    landmarks=LandmarkSummary(
+        true=14, estimated=15, precision=14 / 15, recall=1.0, duplicates=1, rmse_m=0.012
+    ),
+    nees_pose=((69.12, 2.5), (691.2, 3.25)),
+    nis_mean=1.1,
+)
+
+
+def test_the_fields_are_those_of_the_contract() -> None:
+    data = json.loads(SUMMARY.to_json())
+    assert list(data) == [
+        "scene",
+        "preset",
+        "seed",
+        "frames",
+        "duration_s",
+        "realtime_factor",
+        "ate_rmse_m",
+        "ate_icp_rmse_m",
+        "odometry_ate_rmse_m",
+        "final_error_m",
+        "landmarks",
+        "nees_pose",
+        "nis_mean",
+    ]
+    assert list(data["landmarks"]) == [
+        "true",
+        "estimated",
+        "precision",
+        "recall",
+        "duplicates",
+        "rmse_m",
+    ]
+    assert data["nees_pose"] == [[69.12, 2.5], [691.2, 3.25]]
+
+
+def test_nan_is_refused() -> None:
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        dataclasses.replace(SUMMARY, ate_rmse_m=float("nan")).to_json()
+
+
+def test_the_table_gives_the_ratio() -> None:
+    rows = summary_rows(SUMMARY, lag_states=14, wall_s=9.9, lost_frames=0)
+    text = table_text("title", None, rows)
+    assert "14.1 mm" in text
+    assert "0.25 of odometry's, SE(2)-aligned, filtered, 14 states late" in text
+    # 8.9 / 56.4
+    assert "0.16 of odometry's ATE" in text
+    assert "70 x real time" in text
+    assert "0 lost" in text
+    assert max(map(len, text.splitlines())) <= 100
+
+
+def test_a_map_without_a_match_has_dashes() -> None:
+    nothing = LandmarkSummary(
+        true=14, estimated=0, precision=None, recall=0.0, duplicates=0, rmse_m=None
+    )
+    rows = summary_rows(
+        dataclasses.replace(SUMMARY, landmarks=nothing), lag_states=0, wall_s=1.0, lost_frames=2
+    )
+    text = table_text("title", None, rows)
+    assert "SE(2)-aligned, causal" in text
+    assert "precision -, recall 0.00, 0 duplicates, rmse -" in text

@@ -1,5 +1,6 @@
-"""The runner hands every state on with its own counter, its truth and the place of the map."""
+"""The runner: each state with its counter, truth and place; link states; progress lines."""
 
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,14 +9,15 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from hil_tests.unit.slam.app.sessions import FRAME_NS, scan
+from hil_tests.unit.slam.app.sessions import FRAME_NS, scan, session_info, snapshot
 from slam.app.odometry.track import OdometryTrack
 from slam.app.odometry.tum import TumSample
-from slam.app.records import Scan, SessionObserver, Snapshot
-from slam.app.run.runner import nobody_knows, run_slam
+from slam.app.records import LogLine, Scan, SessionObserver, Snapshot
+from slam.app.run.output import Progress
+from slam.app.run.runner import LinkStates, run_slam, unknown_truth
 from slam.frames import RadarFrame
-from slam.paper.ekf import Belief
-from slam.paper.pipeline import PoseAt, StepResult, UwbRadarSlam
+from slam.paper.pipeline import UwbRadarSlam
+from slam.results import Belief, PoseAt, StepResult
 
 COUNTERS = (5, 6, 8, 11, 12)
 LAG = 2
@@ -38,10 +40,6 @@ class LateSlam:
                 odometry_pose=odometry_pose,
                 belief=belief,
                 detections=(),
-                fixes=(),
-                observations=(),
-                associations=(),
-                rejected=(),
             )
         )
         return (self.waiting.pop(0),) if len(self.waiting) > LAG else ()
@@ -87,12 +85,12 @@ def test_every_state_comes_with_its_own_counter_truth_and_place() -> None:
     assert tuple(snapshot.counter for snapshot in listener.snapshots) == COUNTERS
     assert len(record.results) == len(COUNTERS)
     np.testing.assert_allclose(record.world_from_map, [5.0, 95.0, 0.5])
-    for counter, snapshot, truth in zip(COUNTERS, listener.snapshots, record.truth, strict=True):
-        assert snapshot.t_ns == counter * FRAME_NS
-        np.testing.assert_allclose(snapshot.truth, [counter, 100 - counter, 0.1 * counter])
-        np.testing.assert_allclose(snapshot.estimate, [2.0 * counter, 0.0, 0.0])
-        np.testing.assert_array_equal(snapshot.world_from_map, record.world_from_map)
-        np.testing.assert_array_equal(truth, snapshot.truth)
+    for counter, taken, truth in zip(COUNTERS, listener.snapshots, record.truth, strict=True):
+        assert taken.t_ns == counter * FRAME_NS
+        np.testing.assert_allclose(taken.truth, [counter, 100 - counter, 0.1 * counter])
+        np.testing.assert_allclose(taken.estimate, [2.0 * counter, 0.0, 0.0])
+        np.testing.assert_array_equal(taken.world_from_map, record.world_from_map)
+        np.testing.assert_array_equal(truth, taken.truth)
     assert record.n_frames == 2 * len(COUNTERS)
     assert record.start_ns == COUNTERS[0] * FRAME_NS
     assert record.start_ns + record.duration_ns == COUNTERS[-1] * FRAME_NS
@@ -104,7 +102,7 @@ def test_an_unused_scan_is_told_and_not_stepped() -> None:
     listener = Listener()
     scans = [replace(scan(counter), used=counter not in (5, 8)) for counter in COUNTERS]
     slam = cast(UwbRadarSlam, LateSlam())
-    record = run_slam(scans, OdometryTrack(ends), slam, nobody_knows, [listener])
+    record = run_slam(scans, OdometryTrack(ends), slam, unknown_truth, [listener])
     assert tuple(listener.scans) == COUNTERS
     assert [snapshot.counter for snapshot in listener.snapshots] == [6, 11, 12]
     assert record.n_frames == 2 * 3
@@ -133,7 +131,7 @@ def test_slam_hears_radars_less_their_gains_and_observers_as_they_are() -> None:
         [made],
         OdometryTrack(ends),
         cast(UwbRadarSlam, Hearing()),
-        nobody_knows,
+        unknown_truth,
         gains_db=[0.0, 20.0 * math.log10(2.0)],
     )
     as_it_was, halved = heard
@@ -141,3 +139,113 @@ def test_slam_hears_radars_less_their_gains_and_observers_as_they_are() -> None:
     np.testing.assert_allclose(halved.samples, made.frames[1].samples / 2.0, rtol=1e-6)
     assert halved.samples.dtype == np.float32
     assert halved.limits == (float(halved.samples.min()), float(halved.samples.max()))
+
+
+def line(text: str, *, warning: bool = False, radar: str = "radar0") -> LogLine:
+    return LogLine(t_ns=0, radar=radar, warning=warning, text=text)
+
+
+def test_a_gap_in_the_counters_is_a_loss_until_the_next_frame() -> None:
+    links = LinkStates(session_info(1).radars)
+    changes = [
+        (change.t_ns // FRAME_NS, str(change.state))
+        for counter in (5, 6, 9, 10)
+        for change in links.on_scan(scan(counter, 1))
+    ]
+    assert changes == [(5, "streaming"), (9, "frames lost"), (10, "streaming")]
+    count = links.counts["radar0"]
+    assert (count.frames, count.lost, count.longest_gap) == (4, 2, 2)
+
+
+def test_a_radar_without_a_frame_in_a_tick_is_silent_and_others_go_on() -> None:
+    links = LinkStates(session_info(2).radars)
+    list(links.on_scan(scan(0)))
+    both = scan(1)
+    (change,) = links.on_scan(replace(both, frames=both.frames[:1]))
+    assert (change.radar, str(change.state), change.t_ns) == ("radar1", "silent", FRAME_NS)
+    changes = {change.radar: str(change.state) for change in links.on_scan(scan(2))}
+    assert changes == {"radar1": "frames lost"}
+
+
+def test_late_frames_that_slam_did_not_use_make_no_other_radar_silent() -> None:
+    links = LinkStates(session_info(2).radars)
+    list(links.on_scan(scan(0)))
+    late = scan(1)
+    assert list(links.on_scan(replace(late, frames=late.frames[:1], used=False))) == []
+
+
+def test_a_module_is_set_up_streams_fails_and_streams_again() -> None:
+    links = LinkStates(session_info(1).radars)
+    states = [
+        str(change.state)
+        for changes in (
+            links.on_log(line("tx SetMode")),
+            links.on_log(line("rx Ack")),
+            links.on_scan(scan(0, 1)),
+            links.on_log(line("tx Ping")),
+            links.on_log(line("fault CRC", warning=True)),
+            links.on_scan(scan(1, 1)),
+            links.end(2 * FRAME_NS),
+        )
+        for change in changes
+    ]
+    assert states == ["setting up", "streaming", "fault", "streaming", "ended"]
+    assert links.counts["radar0"].faults == 1
+
+
+def test_a_line_about_something_else_changes_no_lane() -> None:
+    links = LinkStates(session_info(1).radars)
+    assert list(links.on_log(line("stopped", warning=True, radar="odometry"))) == []
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_the_line_has_time_rate_error_landmarks_and_losses() -> None:
+    now = [0.0]
+    progress = Progress(
+        session_info(), 100 * FRAME_NS, lambda: 3, stream=io.StringIO(), clock=lambda: now[0]
+    )
+    for counter in range(51):
+        progress.on_scan(scan(counter))
+    progress.on_snapshot(snapshot(50))
+    now[0] = 0.5
+    # 51 frames of each radar in half a second; the made-up estimate is 10 mm off
+    assert progress.line() == (
+        "scene time   10.0 of 19.9 s    102 frames/s per radar"
+        "  pose error   10.0 mm  2 landmarks  3 frames lost"
+    )
+
+
+def test_plain_lines_come_every_ten_seconds() -> None:
+    now, stream = [0.0], io.StringIO()
+    progress = Progress(session_info(), FRAME_NS, lambda: 0, stream=stream, clock=lambda: now[0])
+    for counter in range(31):
+        now[0] = float(counter)
+        progress.on_scan(scan(counter))
+    assert len(stream.getvalue().splitlines()) == 3
+    progress.close()
+    assert len(stream.getvalue().splitlines()) == 4
+    assert "\r" not in stream.getvalue()
+
+
+def test_a_terminal_gets_one_line_rewritten() -> None:
+    now, stream = [0.0], Terminal()
+    progress = Progress(session_info(), FRAME_NS, lambda: 0, stream=stream, clock=lambda: now[0])
+    for counter in range(20):
+        now[0] = counter / 8
+        progress.on_scan(scan(counter))
+    progress.close()
+    assert stream.getvalue().count("\n") == 1
+    # every second scan is a quarter of a second after the last line, and one at the end
+    assert stream.getvalue().count("\r\x1b[K") == 10
+
+
+def test_a_warning_about_a_link_is_shown_at_once() -> None:
+    stream = io.StringIO()
+    progress = Progress(session_info(), FRAME_NS, lambda: 0, stream=stream)
+    progress.on_log(LogLine(t_ns=0, radar="left", warning=False, text="Ping"))
+    progress.on_log(LogLine(t_ns=0, radar="left", warning=True, text="checksum"))
+    assert stream.getvalue() == "warning: radar left: checksum\n"

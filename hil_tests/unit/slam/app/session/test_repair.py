@@ -1,9 +1,6 @@
 """What `uwb-slam repair` says and refuses; what it keeps is tested in property/."""
 
-from __future__ import annotations
-
 import errno
-import os
 import signal
 from pathlib import Path
 
@@ -11,11 +8,10 @@ import pytest
 
 from hil_tests.unit.slam.app.sessions import feed, session_info
 from slam.app.cli import main
-from slam.app.errors import StopRequestedError
 from slam.app.session.log import SessionLog
 from slam.app.session.reader import open_session
 from slam.app.session.repair import repair
-from xethru_protocol.system import locked
+from xethru_protocol.system import StopRequestedError, locked
 
 
 @pytest.fixture
@@ -86,74 +82,6 @@ def test_a_signal_leaves_everything_as_it_was(cut: Path, tmp_path: Path) -> None
         repair(cut, None, check)
     assert list(tmp_path.iterdir()) == [cut]
     assert cut.read_bytes() == before
-
-
-FOREIGN = {
-    "view.rrd": (b"RRF2\x00\x57\x00\x00rest", "is a Rerun recording (.rrd), a view that other"),
-    "old.bag": (b"#ROSBAG V2.0\n", "is a bag of ROS 1; `uwb-slam convert`"),
-    "a.db3": (b"SQLite format 3\0", "give that folder to `uwb-slam convert`"),
-    "port.xtwire": (b"\x89XTWIRE\n", "is a wire capture of one port"),
-    "found.mat": (b"MATLAB 5.0 MAT-file, Platform", "is a MATLAB file"),
-    "packed.gz": (b"\x1f\x8b\x08", "is a gzip file; unpack it first"),
-    "notes.txt": (b"hello", "give the session.mcap of a run"),
-    "empty": (b"", "is no MCAP file, it is empty; whatever"),
-}
-
-
-@pytest.mark.parametrize("name", FOREIGN)
-def test_a_foreign_file_is_called_what_it_is(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    content, expected = FOREIGN[name]
-    path = tmp_path / name
-    path.write_bytes(content)
-    code, out, err = run(capsys, path)
-    assert (code, out) == (1, "")
-    assert len(err.splitlines()) == 1
-    assert err.startswith(f"uwb-slam: {path}: is no MCAP file")
-    assert expected in err
-    assert path.read_bytes() == content
-
-
-def test_missing_files_and_folders_are_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for path, expected in (
-        (tmp_path / "none.mcap", "cannot read: No such file"),
-        (tmp_path / "no" / "where.mcap", "No such file"),
-        (tmp_path, "is a directory; give the session.mcap in it"),
-    ):
-        code, out, err = run(capsys, path)
-        assert (code, out) == (1, "")
-        assert len(err.splitlines()) == 1
-        assert expected in err
-
-
-def test_a_file_with_nothing_in_it_stays_as_it_is(
-    cut: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    cut.write_bytes(cut.read_bytes()[:100])
-    code, _, err = run(capsys, cut)
-    assert code == 1
-    assert "nothing in it can be kept" in err
-    assert list(tmp_path.iterdir()) == [cut]
-
-
-def test_a_link_to_itself_and_a_pipe_are_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (loop := tmp_path / "loop.mcap").symlink_to("loop.mcap")
-    assert run(capsys, loop) == (
-        1,
-        "",
-        f"uwb-slam: {loop}: cannot read: Too many levels of symbolic links\n",
-    )
-    os.mkfifo(pipe := tmp_path / "pipe.mcap")
-    assert run(capsys, pipe) == (
-        1,
-        "",
-        f"uwb-slam: {pipe}: is a pipe; give a file, the session.mcap of a run\n",
-    )
 
 
 @pytest.mark.parametrize("has_second_names", [True, False], ids=["hard links", "none, as on FAT"])

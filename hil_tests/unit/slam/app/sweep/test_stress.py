@@ -1,7 +1,5 @@
 """The stress table does what its rows say, as hard as they say, and the same every time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields

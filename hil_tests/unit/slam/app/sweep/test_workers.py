@@ -1,17 +1,20 @@
-"""Worker processes: deaf to the signals of their group from the start, gone with their parent."""
-
-from __future__ import annotations
+"""Worker processes and clusters: what they do with signals, and how they fail."""
 
 import signal
+import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import pytest
 
 from hil_tests.patience import seconds
+from slam.app.cli import main
+from slam.app.errors import AppError
+from slam.app.sweep import workers as sweep_dask
+from slam.app.sweep.run import make_case, run_case
 from slam.app.sweep.workers import _throw_away
 
 LIMIT_S = seconds(15)
@@ -47,6 +50,13 @@ def started(tmp_path: Path, body: str) -> subprocess.Popen[str]:
     )
 
 
+def ended(tmp_path: Path, body: str) -> tuple[int, str, str]:
+    """Return exit code, output and errors of a fresh interpreter."""
+    with started(tmp_path, body) as process:
+        output, errors = process.communicate(timeout=LIMIT_S)
+    return process.returncode, output, errors
+
+
 def test_every_worker_begins_with_the_groups_signals_blocked(tmp_path: Path) -> None:
     body = (
         "with worker_results(work, [('mask',)] * 4, 2) as masks:\n"
@@ -54,9 +64,8 @@ def test_every_worker_begins_with_the_groups_signals_blocked(tmp_path: Path) -> 
         "        print(*(int(number) for number in mask))\n"
         "print(*(int(one) for one in signal.pthread_sigmask(signal.SIG_BLOCK, ())))\n"
     )
-    with started(tmp_path, body) as process:
-        output, errors = process.communicate(timeout=LIMIT_S)
-    assert (process.returncode, errors) == (0, "")
+    code, output, errors = ended(tmp_path, body)
+    assert (code, errors) == (0, "")
     blocked = sorted((signal.SIGINT, signal.SIGTERM, signal.SIGHUP))
     *workers, parent = output.split("\n")[:-1]
     assert workers == [" ".join(str(int(number)) for number in blocked)] * 4
@@ -85,9 +94,7 @@ def test_work_that_is_thrown_away_ends_at_once_and_without_a_word(tmp_path: Path
         "with worker_results(work, [('pid',)] + [('sleep',)] * 20, 2) as results:\n"
         "    next(results)\n"
     )
-    with started(tmp_path, body) as process:
-        output, errors = process.communicate(timeout=LIMIT_S)
-    assert (process.returncode, output, errors) == (0, "", "")
+    assert ended(tmp_path, body) == (0, "", "")
 
 
 def test_what_killed_workers_leave_is_removed_without_a_word(tmp_path: Path) -> None:
@@ -98,9 +105,7 @@ def test_what_killed_workers_leave_is_removed_without_a_word(tmp_path: Path) -> 
         "resource_tracker.register('/gone', 'semlock')\n"
         "print('PYTHONWARNINGS' in os.environ)\n"
     )
-    with started(tmp_path, body) as process:
-        output, errors = process.communicate(timeout=LIMIT_S)
-    assert (process.returncode, output, errors) == (0, "False\n", "")
+    assert ended(tmp_path, body) == (0, "False\n", "")
 
 
 def test_a_worker_that_dies_breaks_the_results(tmp_path: Path) -> None:
@@ -112,9 +117,7 @@ def test_a_worker_that_dies_breaks_the_results(tmp_path: Path) -> None:
         "except BrokenExecutor:\n"
         "    print('broken')\n"
     )
-    with started(tmp_path, body) as process:
-        output, errors = process.communicate(timeout=LIMIT_S)
-    assert (process.returncode, output, errors) == (0, "broken\n", "")
+    assert ended(tmp_path, body) == (0, "broken\n", "")
 
 
 @pytest.mark.parametrize(
@@ -147,3 +150,72 @@ def test_only_the_managers_search_for_lost_work_is_silent(
     _throw_away(begun)
     assert bool(told) == is_told
     assert threading.excepthook == told.append
+
+
+@pytest.fixture
+def port() -> Iterator[int]:
+    """Give a port that nobody listens on."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        yield taken.getsockname()[1]
+
+
+def test_without_dask_the_remedy_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    out = tmp_path / "o.json"
+    assert main(["sweep", "--dask", "tcp://127.0.0.1:8786", "--json", str(out)]) == 2
+    text = capsys.readouterr()
+    assert text.err == "uwb-slam: --dask: Dask is missing; pip install 'xethru-hil[dask]'\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("address", "code"), [("nowhere", 2), ("here://x:1", 2), ("", 2)])
+def test_an_address_that_is_none_is_2(
+    address: str, code: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("distributed")
+    assert main(["sweep", "--dask", address, "--json", str(tmp_path / "o.json")]) == code
+    text = capsys.readouterr()
+    assert "write it as tcp://HOST:PORT" in text.err
+    assert text.err.count("\n") == 1
+
+
+def test_a_scheduler_that_does_not_answer_is_1_in_bounded_time(
+    port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(sweep_dask, "PATIENCE_S", 0.5)
+    address = f"tcp://127.0.0.1:{port}"
+    assert main(["sweep", "--dask", address, "--json", str(tmp_path / "o.json")]) == 1
+    text = capsys.readouterr()
+    assert "no Dask scheduler answers there; start one with `dask scheduler`" in text.err
+    assert text.err.count("\n") == 1
+
+
+def test_somebody_else_at_the_port_is_1(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(sweep_dask, "PATIENCE_S", 2.0)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer() -> None:
+            client, _ = server.accept()
+            with client:
+                client.sendall(b"HTTP/1.0 400 Bad Request\r\n\r\n" * 4)
+
+        thread = threading.Thread(target=answer, daemon=True)
+        thread.start()
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        assert main(["sweep", "--dask", address, "--json", str(tmp_path / "o.json")]) == 1
+    thread.join(timeout=seconds(5))
+    text = capsys.readouterr()
+    assert "no Dask scheduler answers there" in text.err
+    assert text.err.count("\n") == 1
+
+
+def test_a_worker_of_another_version_refuses() -> None:
+    with pytest.raises(AppError, match="another version of xethru-hil"):
+        run_case(make_case("lab", "paper", 0), "of yesterday")

@@ -1,0 +1,419 @@
+"""Radar targets: each opens lines to one radar under test and lists what that radar can do."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import select
+import socket
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hil_tests.device.serving import Served, emulator
+from hil_tests.paths import FIXTURES
+from hil_tests.plugin.specs import Kind, RadarSpec
+from hil_tests.plugin.wire_tap import WireTap
+from xethru_protocol.driver.radar import X4M300, known_ports
+from xethru_protocol.transport import SerialTransport, Transport, find_ports
+from xethru_protocol.wire.errors import Disconnected, PortUnavailable, XeThruError
+
+if TYPE_CHECKING:
+    from emulator.scene.scene import Scene
+
+_CONNECT_S = 5.0
+_WRITE_S = 5.0
+_CHUNK_BYTES = 65536
+
+
+class TcpTransport:
+    """A `Transport` to ``host:port`` or ``tcp://host:port``; may raise `PortUnavailable`."""
+
+    def __init__(self, address: str) -> None:
+        self.name = address if address.startswith("tcp://") else f"tcp://{address}"
+        host, _, port = self.name.removeprefix("tcp://").rpartition(":")
+        try:
+            self._socket = socket.create_connection((host.strip("[]"), int(port)), _CONNECT_S)
+        except (OSError, UnicodeError) as error:  # UnicodeError: not a host name
+            reason = getattr(error, "strerror", None) or error
+            raise PortUnavailable(
+                f"{self.name} cannot be reached: {reason}; does the adapter, or "
+                "'xethru-emulator serve --tcp', run there?"
+            ) from None
+        self._socket.setblocking(False)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def read(self, timeout_s: float) -> bytes:
+        try:
+            ready, _, _ = select.select([self._socket], [], [], max(timeout_s, 0.0))
+            if not ready:
+                return b""
+            data = self._socket.recv(_CHUNK_BYTES)
+        except (OSError, ValueError) as error:  # ValueError: closed
+            raise Disconnected(self._lost()) from error
+        if not data:
+            raise Disconnected(self._lost())
+        return data
+
+    def write(self, data: bytes) -> None:
+        rest = memoryview(data)
+        deadline_s = time.monotonic() + _WRITE_S
+        while rest:
+            left_s = deadline_s - time.monotonic()
+            if left_s <= 0:
+                raise Disconnected(f"{self.name} takes no data any more; is the module hanging?")
+            try:
+                _, ready, _ = select.select([], [self._socket], [], left_s)
+                if ready:
+                    rest = rest[self._socket.send(rest) :]
+            except BlockingIOError:
+                continue
+            except (OSError, ValueError) as error:
+                raise Disconnected(self._lost()) from error
+
+    def close(self) -> None:
+        self._socket.close()
+
+    def _lost(self) -> str:
+        return (
+            f"{self.name} hung up; is the module gone, or has another program taken it? "
+            "(an adapter has one client at a time)"
+        )
+
+
+CAPABILITIES: Mapping[str, str] = {
+    "settings": "a recording that is played takes none",
+    "profiles": "bare XEP firmware has none",
+    "files": "a file system that answers",
+    "unplug": "only emulated ones can be unplugged by a program",
+    "uart": "USB, TCP and pseudo-terminals have no baud rate",
+    "virtual_time": "waiting must cost nothing",
+}
+"""What a test may require of a radar, and why one may lack it; ``?has=`` adds others."""
+
+_CONTROL_S = 5.0
+_BAUD = 115200
+_UART_BYTES_PER_S = _BAUD / 10
+_EMPTY_ROOM_RADARS = 4
+
+
+class TargetError(Exception):
+    """A radar that is not available; the message is one line with the remedy."""
+
+
+class RadarTarget(ABC):
+    """How one radar under test is reached, and its capabilities.
+
+    ``bytes_per_s`` is the capacity of the line: infinite but on a UART.
+    """
+
+    def __init__(self, spec: RadarSpec, capabilities: frozenset[str], description: str) -> None:
+        self.spec = spec
+        self.capabilities = capabilities | spec.has
+        self.description = description
+        self.bytes_per_s = math.inf
+        self.clock_ns: Callable[[], int] = time.monotonic_ns
+        self.sleep: Callable[[float], None] = time.sleep
+
+    @property
+    def virtual(self) -> bool:
+        """Whether time passes only while a driver waits for the module."""
+        return "virtual_time" in self.capabilities
+
+    @property
+    def lock_target(self) -> str | None:
+        """Name to lock against other sessions; None: no other process can reach the radar."""
+        return None
+
+    @property
+    def scene_text(self) -> str | None:
+        """The scene file of an emulated radar; None without one."""
+        return None
+
+    def explore(self) -> None:  # noqa: B027 - most targets know it without asking
+        """Complete the capabilities; called once, after locking."""
+
+    def begin_test(self) -> None:  # noqa: B027 - an optional hook
+        """Prepare the radar; called before each test."""
+
+    @abstractmethod
+    def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
+        """Return an open line; ``path`` is where a driver looks for a module that vanished."""
+
+    def candidates(self) -> Sequence[str]:
+        """Where a module that vanished may come back."""
+        return ()
+
+    def driver(self, line: Transport, tap: WireTap, *, reconnect_s: float = 0.0) -> X4M300:
+        """Return a driver on an open line, with the target's clock; new lines are tapped."""
+        return X4M300(
+            line,
+            clock=self.clock_ns,
+            reconnect_s=reconnect_s,
+            open_port=lambda path, baudrate: tap.around(self.open_line(path, baudrate)),
+            candidates=self.candidates,
+            sleep=self.sleep,
+        )
+
+    def unplug(self, seconds: float) -> None:
+        """Take the port away and bring it back after ``seconds``; the module restarts."""
+        raise TargetError(f"{self.spec.name} cannot be unplugged by a program")
+
+    def close(self) -> None:  # noqa: B027 - an optional hook
+        """Release processes and ports."""
+
+
+class InProcessTarget(RadarTarget):
+    """A module in this process, in virtual time; a fresh one for every test."""
+
+    def __init__(self, spec: RadarSpec) -> None:
+        super().__init__(
+            spec,
+            frozenset(CAPABILITIES) - {"uart"},
+            f"emulated in this process, virtual time, {spec.target or 'an empty room'}",
+        )
+        self._scene = _scene(spec)
+        names = [radar.name for radar in self._scene.radars]
+        self._index = _index_of(spec, names)
+        self.begin_test()
+
+    @property
+    def scene_text(self) -> str | None:
+        return _scene_text(self.spec)
+
+    def begin_test(self) -> None:
+        """Make a new module, so that no test sees what an earlier one left."""
+        from emulator.chip import Pace
+        from emulator.device import radar_device
+        from emulator.echo.echo import echo_source
+        from emulator.module.memory import Identity
+        from emulator.module.settings import DeviceOptions
+        from hil_tests.faulty import FaultyLine
+
+        radar = self._scene.radars[self._index]
+        device = radar_device(
+            Identity(serial=radar.serial),
+            echo_source(self._scene, self._index, self.spec.seed),
+            Pace.REALTIME,
+            options=DeviceOptions(firmware=self.spec.firmware),
+        )
+        self._line = FaultyLine(device)
+        self.clock_ns = self._line.clock_ns
+        self.sleep = self._line.sleep
+
+    def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
+        from hil_tests.faulty import PATH
+
+        return self._line.open(path or PATH, baudrate)
+
+    def candidates(self) -> Sequence[str]:
+        return self._line.ports()
+
+    def unplug(self, seconds: float) -> None:
+        self._line.device.unplug(self._line.clock_ns(), round(seconds * 1e9))
+
+
+class ProcessTarget(RadarTarget):
+    """A module of an emulator that runs in a process of its own, or a recording played there."""
+
+    def __init__(self, spec: RadarSpec) -> None:
+        played = spec.kind is Kind.REPLAY
+        able = {"settings", "profiles", "files", "unplug"}
+        if spec.line == "uart":
+            able.add("uart")
+        super().__init__(
+            spec,
+            frozenset() if played else frozenset(able),
+            f"recording {spec.target}, played at a pseudo-terminal"
+            if played
+            else f"emulated in its own process, {spec.line}, {spec.target or 'an empty room'}",
+        )
+        if spec.line == "uart":
+            self.bytes_per_s = _UART_BYTES_PER_S
+        self._cleanup = contextlib.ExitStack()
+        arguments = ["play", spec.target] if played else _serve_arguments(spec)
+        try:
+            self._served: Served = self._cleanup.enter_context(emulator(*arguments))
+            self._index = _index_of(spec, self._served.names)
+        except AssertionError as error:
+            raise TargetError(f"--radar {spec.text}: the emulator did not start: {error}") from None
+        except TargetError:
+            self._cleanup.close()
+            raise
+
+    @property
+    def scene_text(self) -> str | None:
+        return None if self.spec.kind is Kind.REPLAY else _scene_text(self.spec)
+
+    def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
+        if self.spec.line == "tcp":
+            return TcpTransport(f"127.0.0.1:{self._served.tcp_ports[self._index]}")
+        return SerialTransport(path or self._served.paths[self._index], baudrate)
+
+    def unplug(self, seconds: float) -> None:
+        assert self._served.control is not None
+        name = self._served.names[self._index]
+        _ask(self._served.control, {"verb": "unplug", "radar": name, "seconds": seconds})
+
+    def close(self) -> None:
+        self._served.end()
+        self._cleanup.close()
+
+
+class PortTarget(RadarTarget):
+    """A module at a port of this machine, named or found by its serial number."""
+
+    def __init__(self, spec: RadarSpec) -> None:
+        path = spec.target
+        if spec.kind is Kind.SERIAL_NUMBER:
+            path = _port_of(spec.target)
+        super().__init__(spec, frozenset({"settings", "profiles", "files"}), f"module at {path}")
+        self._path = path
+
+    @property
+    def lock_target(self) -> str | None:
+        return os.path.realpath(self._path)
+
+    def explore(self) -> None:
+        """Find out whether the port is a UART."""
+        line = SerialTransport(self._path)
+        self.bytes_per_s = _UART_BYTES_PER_S if self.spec.line == "uart" else line.bytes_per_s
+        line.close()
+        if not math.isinf(self.bytes_per_s):
+            self.capabilities |= {"uart"}
+
+    def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
+        return SerialTransport(path or self._path, baudrate)
+
+    def candidates(self) -> Sequence[str]:
+        return known_ports()
+
+
+class TcpTarget(RadarTarget):
+    """A module behind a TCP port, perhaps of another machine."""
+
+    def __init__(self, spec: RadarSpec) -> None:
+        super().__init__(
+            spec, frozenset({"settings", "profiles", "files"}), f"module at tcp://{spec.target}"
+        )
+
+    @property
+    def lock_target(self) -> str | None:
+        return self.spec.target
+
+    def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
+        del path, baudrate
+        return TcpTransport(self.spec.target)
+
+
+def target_of(spec: RadarSpec) -> RadarTarget:
+    """Return the target that a spec names.
+
+    Raises
+    ------
+    TargetError, PortUnavailable
+        If there is no such radar; one line with the remedy.
+    """
+    match spec.kind:
+        case Kind.EMULATED if spec.line == "memory":
+            return InProcessTarget(spec)
+        case Kind.EMULATED | Kind.REPLAY:
+            return ProcessTarget(spec)
+        case Kind.TCP:
+            return TcpTarget(spec)
+        case _:
+            return PortTarget(spec)
+
+
+def ports_that_answer() -> tuple[tuple[str, str], ...]:
+    """Return path and serial number of every port where a module answers.
+
+    A port that another program has open is skipped: opening it would take bytes from that program.
+    """
+    from xethru_protocol.cli.port_probe import port_users
+
+    found = []
+    for port in find_ports():
+        if port_users(port.path):
+            continue
+        with contextlib.suppress(PortUnavailable), X4M300.open(port.path) as radar:
+            serial = _serial_number(radar)
+            if serial is not None:
+                found.append((port.path, serial))
+    return tuple(found)
+
+
+def _port_of(serial: str) -> str:
+    for port in find_ports():
+        if port.kind == "emulated" and port.serial == serial:
+            return port.path  # its emulator publishes the number
+    found = ports_that_answer()
+    for path, number in found:
+        if number == serial:
+            return path
+    there = ", ".join(f"{number} at {path}" for path, number in found) or "none"
+    raise TargetError(f"no module with serial number {serial} answers; those that do: {there}")
+
+
+def _serial_number(radar: X4M300) -> str | None:
+    try:
+        radar.ping(0.5)
+        return radar.info().serial_number
+    except XeThruError:
+        return None
+
+
+def _index_of(spec: RadarSpec, names: Sequence[str]) -> int:
+    wanted = spec.options.get("radar")
+    if wanted is None:
+        return 0
+    if wanted not in names:
+        raise TargetError(
+            f"--radar {spec.text}: no radar is called {wanted!r}; there are {', '.join(names)}"
+        )
+    return names.index(wanted)
+
+
+def scene_radars(spec: RadarSpec) -> tuple[str, ...]:
+    """Return the names of the radars of an emulated spec's scene; an empty room has four."""
+    return tuple(radar.name for radar in _scene(spec).radars)
+
+
+def _scene(spec: RadarSpec) -> Scene:
+    from emulator.scene.scene import SceneError, empty_room, load_scene
+
+    try:
+        return load_scene(spec.target) if spec.target else empty_room(_EMPTY_ROOM_RADARS)
+    except SceneError as error:
+        raise TargetError(f"--radar {spec.text}: {error}") from None
+
+
+def _serve_arguments(spec: RadarSpec) -> list[str]:
+    scene = [spec.target] if spec.target else ["--bare", "--count", str(_EMPTY_ROOM_RADARS)]
+    line = {"uart": ["--link", "uart"], "tcp": ["--tcp", "0"]}.get(spec.line, [])
+    return ["serve", *scene, "--seed", str(spec.seed), *line]
+
+
+def _scene_text(spec: RadarSpec) -> str | None:
+    if not spec.target:
+        return None
+    path = Path(spec.target)
+    if path.suffix != ".toml":
+        path = FIXTURES / "scenes" / f"{spec.target}.toml"
+    return path.read_text("utf-8")
+
+
+def _ask(control: str, request: Mapping[str, object]) -> None:
+    """Send a request to a running emulator; `TargetError` if it refuses."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+        connection.settimeout(_CONTROL_S)
+        connection.connect(control)
+        connection.sendall(json.dumps(request).encode() + b"\n")
+        with connection.makefile() as answers:
+            answer = json.loads(answers.readline())
+    if not answer["ok"]:
+        raise TargetError(str(answer["error"]))

@@ -1,0 +1,142 @@
+"""The command uwb-slam run: its arguments, and its session wherever the disk ends."""
+
+import subprocess
+import time
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil_tests.unit.slam.app.sessions import scan, session_info
+from slam.app.cli import CSV_TO_TUM, main
+from slam.app.commands.run import parse_clock
+from slam.app.errors import UsageError
+from slam.app.odometry.live import parse_source
+from slam.app.odometry.tum import TumSample, parse_tum_line
+from slam.app.records import LogLine, SessionObserver
+from slam.app.run.live_source import LiveLog
+from slam.app.session import messages as ros
+from slam.app.session.log import SessionLog
+from slam.app.session.mcap import CannotWriteError
+from slam.app.session.reader import open_session
+
+
+class Heard(SessionObserver):
+    """Keeps the lines that a user would see."""
+
+    def __init__(self) -> None:
+        self.lines: list[LogLine] = []
+
+    def on_log(self, line: LogLine) -> None:
+        """Keep it."""
+        self.lines.append(line)
+
+
+def pose(number: int) -> TumSample:
+    return TumSample(t_ns=number, x_m=float(number), y_m=0.0, qz=0.0, qw=1.0)
+
+
+def refuse(*_: object) -> None:
+    raise CannotWriteError("session.mcap: cannot be written: No space left on device")
+
+
+def test_odometry_from_before_the_log_is_in_it_once_and_in_order(tmp_path: Path) -> None:
+    listener = LiveLog()
+    listener.on_odometry(pose(1))
+    listener.on_odometry(pose(2))
+    listener.begin(SessionLog(tmp_path / "session.mcap", session_info()))
+    listener.on_odometry(pose(3))
+    listener.close()
+    recorded = open_session(tmp_path / "session.mcap").records()
+    assert [row.t_ns for row in recorded if isinstance(row, TumSample)] == [1, 2, 3]
+    assert not listener.failure
+
+
+@pytest.mark.parametrize("refused", ["on_odometry", "on_scan"])
+def test_a_disk_that_fills_up_is_said_once_and_the_run_goes_on(
+    refused: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where it is full as soon as what was kept for the log is written."""
+    listener, heard = LiveLog(), Heard()
+    listener.on_odometry(pose(1))
+    listener.on_odometry(pose(2))
+    log = SessionLog(tmp_path / "session.mcap", session_info())
+    monkeypatch.setattr(log, refused, refuse)
+    listener.begin(log)
+    listener.attach(heard)
+    for number in range(3):
+        listener.on_odometry(pose(3 + number))
+        listener.on_scan(scan(number))
+    listener.close()
+    log.close()
+    (line,) = heard.lines
+    assert line.warning
+    assert line.text.endswith("No space left on device; the run goes on and is not recorded")
+    assert listener.failure.endswith("No space left on device")
+
+
+def test_a_last_chunk_that_does_not_fit_is_told_and_nothing_raised(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listener = LiveLog()
+    log = SessionLog(tmp_path / "session.mcap", session_info())
+    listener.begin(log)
+    with monkeypatch.context() as full:
+        full.setattr(log, "close", refuse)
+        listener.close()
+    assert listener.failure.endswith("No space left on device")
+    log.close()
+
+
+def csv_of(message: object) -> str:
+    """Write a message as `ros2 topic echo --csv` does: all fields in order, arrays spread."""
+
+    def values(part: object) -> Iterator[str]:
+        if isinstance(part, np.ndarray):
+            yield from map(str, part.tolist())
+        elif is_dataclass(part):
+            for field in fields(part):
+                if field.name != "__msgtype__":
+                    yield from values(getattr(part, field.name))
+        else:
+            yield str(part)
+
+    return ",".join(values(message))
+
+
+def test_lines_of_ros2_topic_echo_become_tum_lines_with_the_same_floats() -> None:
+    samples = [
+        TumSample(t_ns=1_700_000_000_000_000_005, x_m=1 / 3, y_m=-2e-17, qz=-0.6, qw=0.8),
+        TumSample(t_ns=1_700_000_001_234_567_890, x_m=-1.5, y_m=0.0, qz=0.0, qw=1.0),
+    ]
+    csv = "".join(f"{csv_of(ros.odometry(sample))}\n" for sample in samples)
+    assert csv.startswith("1700000000,5,odom,base_link,0.3333333333333333,-2e-17,0.0,0.0,0.0,-0.6,")
+    done = subprocess.run(
+        ["sed", "-uE", CSV_TO_TUM], input=csv, capture_output=True, text=True, check=True
+    )
+    assert [parse_tum_line(line) for line in done.stdout.splitlines()] == samples
+
+
+def test_the_help_shows_that_very_recipe(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["run", "--help"])
+    said = capsys.readouterr().out
+    assert f"sed -uE '{CSV_TO_TUM}'" in said
+    assert "--odometry-clock unix" in said
+
+
+@pytest.mark.parametrize("text", ["9" * 5000, "9" * 19, "²", "-5", ""])
+def test_a_clock_that_is_none_is_wrong_usage(text: str) -> None:
+    with pytest.raises(UsageError, match="must be arrival, unix, monotonic"):
+        parse_clock(text, parse_source("-"))
+
+
+def test_a_unix_clock_shows_the_seconds_since_1970(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The host was started 100 s ago, 1 700 000 000 s after 1970."""
+    monkeypatch.setattr(time, "monotonic_ns", lambda: 100_000_000_000)
+    monkeypatch.setattr(time, "time_ns", lambda: 1_700_000_100_000_000_007)
+    clock = parse_clock("unix", parse_source("-"))
+    assert clock is not None
+    assert clock.session_ns(105_000_000_000) == 1_700_000_105_000_000_007

@@ -1,0 +1,145 @@
+"""Odometry input: the same floats on every path, interpolation the short way round."""
+
+import math
+import socket
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from slam.app.errors import OdometryError
+from slam.app.odometry.track import OdometryTrack, read_odometry_socket
+from slam.app.odometry.tum import TumSample, format_tum_line
+from slam.geometry import wrap_angle
+
+
+def lines_of(rows: list[tuple[int, float, float, float]]) -> list[str]:
+    return [format_tum_line(t_ns, np.array(pose)) for t_ns, *pose in rows]
+
+
+def test_at_a_samples_own_time_the_pose_is_the_sample() -> None:
+    track = OdometryTrack.from_lines(lines_of([(0, 0.1, 0.2, 0.3), (10**9, 1 / 3, -2.0, 0.5)]))
+    assert track.pose_at(10**9)[:2].tolist() == [1 / 3, -2.0]
+    assert track.pose_at(0)[:2].tolist() == [0.1, 0.2]
+
+
+def test_between_two_samples_it_is_linear() -> None:
+    track = OdometryTrack.from_lines(lines_of([(0, 0.0, 0.0, 0.0), (10**9, 4.0, -8.0, 1.0)]))
+    np.testing.assert_allclose(track.pose_at(250_000_000), [1.0, -2.0, 0.25])
+
+
+@given(st.floats(-0.4, 0.4), st.floats(0.001, 0.1))
+def test_on_an_arc_it_is_off_by_no_more_than_the_arcs_height(turn_rad: float, arc_m: float) -> None:
+    """Chord / 2 tan(turn / 4), 0.12 mm for a centimetre and 5.6 degrees; the heading is exact."""
+
+    def on_arc(part: float) -> tuple[float, float, float]:
+        turned = part * turn_rad
+        chord_m = part * arc_m * float(np.sinc(turned / math.tau))
+        return chord_m * math.cos(turned / 2), chord_m * math.sin(turned / 2), turned
+
+    end = on_arc(1.0)
+    track = OdometryTrack.from_lines(lines_of([(0, 0.0, 0.0, 0.0), (1000, *end)]))
+    height_m = math.hypot(end[0], end[1]) / 2 * math.tan(abs(turn_rad) / 4)
+    for part in (0.1, 0.25, 0.5, 0.9):
+        x_m, y_m, heading_rad = track.pose_at(round(1000 * part))
+        assert heading_rad == pytest.approx(part * turn_rad, abs=1e-12)
+        assert math.dist((x_m, y_m), on_arc(part)[:2]) <= height_m + 1e-12
+    assert math.dist(track.pose_at(500)[:2], on_arc(0.5)[:2]) == pytest.approx(height_m, abs=1e-12)
+
+
+@pytest.mark.parametrize("turn_rad", [0.4, -0.4])
+def test_heading_crosses_half_a_turn_the_short_way(turn_rad: float) -> None:
+    start = math.copysign(math.pi - 0.1, turn_rad)
+    end = math.remainder(start + turn_rad, math.tau)
+    assert abs(end - start) > math.pi  # as the text has it, the short way is not the direct one
+    samples = [
+        TumSample(t_ns=t_ns, x_m=0, y_m=0, qz=math.sin(h / 2), qw=math.cos(h / 2))
+        for t_ns, h in ((0, start), (100, end))
+    ]
+    track = OdometryTrack(samples)
+    for part in (20, 50, 75):
+        expected = math.remainder(start + turn_rad * part / 100, math.tau)
+        heading_rad = float(track.pose_at(part)[2])
+        assert heading_rad == pytest.approx(expected)
+        assert -math.pi <= heading_rad < math.pi
+
+
+@given(st.lists(st.floats(-50, 50), min_size=2, max_size=20))
+def test_the_same_text_gives_the_same_floats(values: list[float]) -> None:
+    lines = lines_of([(k * 1000, value, -value, value) for k, value in enumerate(values)])
+    first, second = OdometryTrack.from_lines(lines), OdometryTrack.from_lines(list(lines))
+    for t_ns in range(0, 1000 * len(values), 333):
+        assert first.pose_at(t_ns).tobytes() == second.pose_at(t_ns).tobytes()
+
+
+def test_a_time_far_outside_is_refused() -> None:
+    track = OdometryTrack.from_lines(lines_of([(0, 0, 0, 0), (10**9, 1, 0, 0)]))
+    np.testing.assert_array_equal(track.pose_at(1_400_000_000), [1.0, 0.0, 0.0])
+    with pytest.raises(OdometryError, match=r"covers 0.00 .. 1.00 s, but a frame came at 1.60 s"):
+        track.pose_at(1_600_000_000)
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        [],
+        ["0 0 0 0 0 0 0 1", "oops"],
+        ["1 0 0 0 0 0 0 1", "0 0 0 0 0 0 0 1"],
+    ],
+)
+def test_bad_odometry_is_one_line(
+    lines: list[str],
+) -> None:
+    with pytest.raises(OdometryError):
+        OdometryTrack.from_lines(lines)
+
+
+def test_the_socket_gives_what_was_sent_however_it_was_cut(tmp_path: Path) -> None:
+    lines = lines_of([(k, k / 7, k / 11, k / 13) for k in range(200)])
+    data = "".join(f"{line}\n" for line in lines).encode()
+    path = str(tmp_path / "odom")
+    server = socket.socket(socket.AF_UNIX)
+    server.bind(path)
+    server.listen()
+
+    def serve() -> None:
+        client, _ = server.accept()
+        with client:
+            for start in range(0, len(data), 777):
+                client.sendall(data[start : start + 777])
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    track = read_odometry_socket(path)
+    thread.join()
+    server.close()
+    assert track.samples == OdometryTrack.from_lines(lines).samples
+
+
+def test_a_missing_or_silent_socket_is_named(tmp_path: Path) -> None:
+    with pytest.raises(OdometryError, match="nobody: No such file"):
+        read_odometry_socket(str(tmp_path / "nobody"))
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(tmp_path / "silent"))
+        server.listen()
+        with pytest.raises(OdometryError, match=r"silent for 0\.1 s"):
+            read_odometry_socket(str(tmp_path / "silent"), timeout_s=0.1)
+
+
+@given(st.lists(st.floats(-2 * math.pi, 2 * math.pi), min_size=2, max_size=30))
+def test_a_track_that_grows_unwraps_like_numpy_to_the_last_bit(headings: list[float]) -> None:
+    samples = [
+        TumSample(t_ns=t_ns, x_m=0.0, y_m=0.0, qz=math.sin(h / 2), qw=math.cos(h / 2))
+        for t_ns, h in enumerate(headings)
+    ]
+    track = OdometryTrack(samples[:1])
+    for sample in samples[1:]:
+        track.append(sample)
+    unwrapped = np.unwrap([sample.heading_rad for sample in samples])
+    for row, heading_rad in enumerate(unwrapped):
+        assert track.pose_at(row)[2] == wrap_angle(float(heading_rad))
+    with pytest.raises(OdometryError, match="not later"):
+        track.append(samples[-1])

@@ -1,0 +1,147 @@
+"""The emulator process, every way it can fail to start, and the bytes of its ports."""
+
+import os
+import stat
+import sys
+from pathlib import Path
+
+import pytest
+
+from hil_tests.patience import wait_until
+from hil_tests.system.short_scene import write_short_scene
+from hil_tests.unit.slam.app.sessions import session_info
+from slam.app.cli import main
+from slam.app.commands.demo import WireTap
+from slam.app.errors import EmulatorError
+from slam.app.records import Scan, SessionInfo
+from slam.app.rig import emulated as emulator_process
+from slam.app.rig.emulated import (
+    FRAME_RATE_HZ,
+    RAW_CONFIG,
+    EmulatorProcess,
+    open_loopback,
+    scene_and_config,
+)
+from slam.app.session.log import SessionLog
+from slam.app.session.reader import open_session
+from xethru_protocol.recordings import read_chunks, read_note, read_recording
+from xethru_protocol.wire.messages import DataFloat
+
+
+@pytest.fixture
+def fake_emulator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the file of a shell script that is started in the emulator's place."""
+    script = tmp_path / "fake"
+    script.touch(mode=stat.S_IRWXU)
+    monkeypatch.setattr(sys, "executable", str(script))
+    return script
+
+
+def never() -> None:
+    """Do not stop."""
+
+
+@pytest.mark.parametrize(
+    "does",
+    [
+        "echo 'xethru-emulator: no ptys left' >&2; exit 1",
+        "kill -9 $$",
+        "echo hello; sleep 5",
+        'echo "{}"; sleep 5',
+    ],
+)
+def test_a_bad_start_is_one_line(
+    fake_emulator: Path,
+    does: str,
+) -> None:
+    fake_emulator.write_text(f"#!/bin/sh\n{does}\n")
+    with EmulatorProcess("lab", 0) as emulator, pytest.raises(EmulatorError) as caught:
+        emulator.wait_until_ready(never)
+    assert "\n" not in str(caught.value)
+
+
+def test_no_ready_line_in_time(fake_emulator: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(emulator_process, "READY_LIMIT_S", 0.3)
+    fake_emulator.write_text("#!/bin/sh\nexec sleep 20\n")
+    with (
+        EmulatorProcess("lab", 0) as emulator,
+        pytest.raises(EmulatorError, match=r"not ready after 0\.3 s"),
+    ):
+        emulator.wait_until_ready(never)
+
+
+def test_one_that_ignores_sigterm_is_killed(
+    fake_emulator: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(emulator_process, "END_LIMIT_S", 0.3)
+    pid_file = tmp_path / "pid"
+    fake_emulator.write_text(
+        f"#!/bin/sh\ntrap '' TERM\necho $$ > {pid_file}.new; mv {pid_file}.new {pid_file}\n"
+        "while :; do sleep 0.05; done\n"
+    )
+    with EmulatorProcess("lab", 0):
+        wait_until(pid_file.exists)
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(pid_file.read_text()), 0)
+
+
+def test_the_arguments_are_those_of_the_emulators_command_line(
+    fake_emulator: Path, tmp_path: Path
+) -> None:
+    said = tmp_path / "arguments"
+    fake_emulator.write_text(f'#!/bin/sh\necho "$@" > {said}\n')
+    with EmulatorProcess("scene.toml", 42) as emulator, pytest.raises(EmulatorError):
+        emulator.wait_until_ready(never)
+    assert said.read_text() == "-P -m emulator.cli serve scene.toml --pace asap --seed 42\n"
+
+
+N_SCANS = 4
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Scan]]:
+    """Record a short drive in this process, raw bytes and all."""
+    folder = tmp_path_factory.mktemp("wire")
+    scene, _ = scene_and_config(str(write_short_scene(folder)), "paper")
+    path = folder / "session.mcap"
+    with open_loopback(scene, 3) as source:
+        tap = WireTap(source)
+        source.start(RAW_CONFIG, FRAME_RATE_HZ)
+        info = SessionInfo(
+            scene="short",
+            preset="paper",
+            seed=3,
+            radars=source.radars,
+            true_landmarks_m=session_info().true_landmarks_m,
+            versions={},
+        )
+        log = SessionLog(path, info)
+        tap.attach(log)
+        scans = []
+        for scan in source.scans(N_SCANS, lambda: None):
+            log.on_scan(scan)
+            scans.append(scan)
+    log.close()
+    return path, scans
+
+
+def test_the_bytes_of_every_port_hold_its_frames(
+    recorded: tuple[Path, list[Scan]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, scans = recorded
+    for index, radar in enumerate(open_session(path).info.radars):
+        out = tmp_path / f"{radar.name}.xtwire"
+        assert main(["convert", str(path), str(out), "--radar", radar.name]) == 0
+        said = capsys.readouterr().out
+        assert "bytes from the module" in said
+        frames = {
+            message.info: message.values.tobytes()
+            for message, _ in read_recording(out)
+            if isinstance(message, DataFloat) and message.content_id == 0
+        }
+        for scan in scans:
+            assert frames[scan.counter] == scan.frames[index].samples.tobytes()
+        ways = [chunk.way for chunk in read_chunks(out)]
+        # the host spoke first: what was said before the log began is there, too
+        assert ways[0] == "tx"
+        assert read_note(out)["radar"] == radar.name

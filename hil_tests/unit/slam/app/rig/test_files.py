@@ -1,0 +1,212 @@
+"""Rig files, and which radar is at which port: by serial numbers."""
+
+import math
+from pathlib import Path
+
+import pytest
+
+from emulator.chip import Pace
+from emulator.device import radar_device
+from emulator.echo.echo import echo_source
+from emulator.loopback import LoopbackTransport
+from emulator.module.memory import Identity
+from emulator.scene.scene import empty_room
+from slam.app.errors import AppError
+from slam.app.rig import files as rig_match
+from slam.app.rig.files import RigFile, RigRadar, RigWheels, load_rig, open_rig, write_rig
+from slam.app.rig.sources import RadarLink
+from slam.config import WheelNoise
+from xethru_protocol.driver.conversation import Observer, ProtocolRecord
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.wire.errors import Disconnected, PortUnavailable
+
+RADAR = """\
+[[radars]]
+name = "left"
+serial = "202305070101"
+x_m = 0.1
+y_m = 0
+yaw_deg = 90
+"""
+
+
+def test_a_rig_comes_back_with_the_same_floats(tmp_path: Path) -> None:
+    rig = RigFile(
+        radars=(
+            RigRadar(
+                name='a "b" \\ é',
+                serial="202305070101",
+                x_m=-1 / 3,
+                y_m=1e-17,
+                yaw_deg=90.0,
+                range_offset_m=0.1 + 0.2,
+                phase_offset_deg=100 / 3,
+                gain_db=-1.5,
+            ),
+        )
+    )
+    write_rig(tmp_path / "rig.toml", rig)
+    assert load_rig(tmp_path / "rig.toml") == rig
+
+
+def test_wheels_come_back_and_tell_slam_how_they_err(tmp_path: Path) -> None:
+    rig = RigFile(
+        radars=(RigRadar(name="a", serial="000000000001", x_m=0, y_m=0, yaw_deg=0),),
+        wheels=RigWheels(scale_sigma=0.02, curvature_sigma_rad_per_m=0.001),
+    )
+    write_rig(tmp_path / "rig.toml", rig)
+    assert load_rig(tmp_path / "rig.toml") == rig
+    noise = rig.wheels.noise
+    assert (noise.scale_sigma, noise.curvature_sigma_rad_per_m) == (0.02, 0.001)
+    assert noise.turn_scale_sigma == WheelNoise().turn_scale_sigma
+    (path := tmp_path / "plain.toml").write_text(RADAR)
+    assert load_rig(path).wheels.noise == WheelNoise()
+
+
+def test_a_rig_file_gives_mounts_in_radians(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text(RADAR + "range_offset_m = 0.02\nphase_offset_deg = -45\n")
+    (mount,) = load_rig(path).rig.mounts
+    assert mount.yaw_rad == pytest.approx(math.pi / 2)
+    assert mount.phase_offset_rad == pytest.approx(-math.pi / 4)
+    assert (mount.name, mount.x_m, mount.y_m, mount.range_offset_m) == ("left", 0.1, 0.0, 0.02)
+
+
+def test_a_missing_file_and_a_folder_that_does_not_exist_are_named(tmp_path: Path) -> None:
+    with pytest.raises(AppError, match="cannot read the rig file: No such file"):
+        load_rig(tmp_path / "none.toml")
+    radar = RigRadar(name="a", serial="202305070101", x_m=0.0, y_m=0.0, yaw_deg=0.0)
+    with pytest.raises(AppError, match="cannot be written"):
+        write_rig(tmp_path / "no" / "rig.toml", RigFile(radars=(radar,)))
+
+
+RIG = Path("robot.toml")
+LEFT, RIGHT, OTHER = "000000000001", "000000000002", "000000000009"
+
+
+class Bench:
+    """Ports with emulated modules behind them, in place of `X4M300.open`."""
+
+    def __init__(self) -> None:
+        self.serials: dict[str, str] = {}
+        self.lines: dict[str, LoopbackTransport] = {}
+        self.heard: list[tuple[str, str]] = []
+        self.notes: list[str] = []
+
+    def open(self, port: str, *, observer: Observer) -> X4M300:
+        if port not in self.serials:
+            raise PortUnavailable(f"there is no port {port}")
+        identity = Identity(serial=self.serials[port])
+        device = radar_device(identity, echo_source(empty_room(), 0, 0), Pace.ASAP)
+        line = self.lines[port] = LoopbackTransport(device, name=port)
+        return X4M300(line, clock=line.clock_ns, observer=observer)
+
+    def find(self, *ports: str, rig: RigFile | None = None) -> tuple[RadarLink, ...]:
+        return open_rig(rig or robot(), RIG, ports or None, self.hear, self.notes.append)
+
+    def hear(self, name: str, record: ProtocolRecord) -> None:
+        self.heard.append((name, record.summary))
+
+    def is_open(self, port: str) -> bool:
+        try:
+            self.lines[port].read(0.0)
+        except Disconnected:
+            return False
+        return True
+
+
+def robot() -> RigFile:
+    mounts = {"left": (LEFT, 0.2, 90.0), "right": (RIGHT, -0.2, -90.0)}
+    return RigFile(
+        radars=tuple(
+            RigRadar(
+                name=name,
+                serial=serial,
+                x_m=0.0,
+                y_m=y_m,
+                yaw_deg=yaw,
+                range_offset_m=0.01,
+                gain_db=1.5,
+            )
+            for name, (serial, y_m, yaw) in mounts.items()
+        )
+    )
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
+    made = Bench()
+    monkeypatch.setattr(X4M300, "open", made.open)
+    monkeypatch.setattr(rig_match, "known_ports", lambda: tuple(made.serials))
+    return made
+
+
+@pytest.mark.parametrize("ports", [("a", "b"), ("b", "a")])
+def test_mounts_follow_serial_numbers_whichever_cable_is_where(
+    ports: tuple[str, ...], bench: Bench
+) -> None:
+    bench.serials = {"a": RIGHT, "b": LEFT}
+    links = bench.find(*ports)
+    assert [(link.mount.name, link.port, link.serial) for link in links] == [
+        ("left", "b", LEFT),
+        ("right", "a", RIGHT),
+    ]
+    assert [link.mount.range_offset_m for link in links] == [0.01, 0.01]
+    assert [link.gain_db for link in links] == [1.5, 1.5]
+    assert "radar left: serial number 000000000001, at b" in bench.notes
+    asked = [(name, text) for name, text in bench.heard if "GET_INFO" in text]
+    assert [name for name, _ in asked] == ["left", "right"]
+    links[0].driver.ping()
+    assert bench.heard[-1][0] == "left"
+    for link in links:
+        link.driver.close()
+
+
+def test_a_missing_module_is_named_and_the_others_are_let_go(bench: Bench) -> None:
+    bench.serials = {"a": LEFT}
+    with pytest.raises(AppError) as refused:
+        bench.find("a")
+    assert str(refused.value) == (
+        "robot.toml: radar right (serial number 000000000002) not found; "
+        "there are 000000000001 at a: is it plugged in?"
+    )
+    assert not bench.is_open("a")
+
+
+def test_a_module_in_place_of_another_is_named(bench: Bench) -> None:
+    bench.serials = {"a": LEFT, "b": OTHER}
+    with pytest.raises(AppError, match=r"radar right .* instead there is 000000000009 at b: if a"):
+        bench.find("a", "b")
+    assert not bench.is_open("b")
+
+
+def test_a_foreign_module_is_refused_where_it_was_named_and_passed_over_elsewhere(
+    bench: Bench,
+) -> None:
+    bench.serials = {"a": LEFT, "b": RIGHT, "c": OTHER}
+    with pytest.raises(AppError, match="the module at c has serial number 000000000009, which"):
+        bench.find("a", "b", "c")
+    links = bench.find()
+    assert [link.port for link in links] == ["a", "b"]
+    assert not bench.is_open("c")
+    assert any(note.startswith("passed over: the module at c") for note in bench.notes)
+    for link in links:
+        link.driver.close()
+
+
+def test_two_modules_of_one_serial_number_are_refused(bench: Bench) -> None:
+    bench.serials = {"a": LEFT, "b": LEFT, "c": RIGHT}
+    with pytest.raises(AppError, match="two modules have the serial number 000000000001, at a and"):
+        bench.find("a", "b", "c")
+
+
+def test_a_port_that_is_none_is_refused_where_it_was_named(bench: Bench) -> None:
+    bench.serials = {"a": LEFT}
+    with pytest.raises(AppError, match="nowhere: there is no port nowhere"):
+        bench.find("a", "nowhere")
+    assert not bench.is_open("a")
+
+
+def test_a_machine_without_modules_says_so(bench: Bench) -> None:
+    with pytest.raises(AppError, match="no modules and no running emulators on this machine"):
+        bench.find()

@@ -1,0 +1,304 @@
+"""A recorded session comes back as it was; damaged and foreign files are one line."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+from hil_tests.unit.slam.app.sessions import FRAME_NS, feed, scan, session_info, snapshot
+from slam.app.errors import AppError
+from slam.app.odometry.track import OdometryTrack
+from slam.app.odometry.tum import TumSample, format_tum_line
+from slam.app.records import LogLine, Scan, Snapshot
+from slam.app.session.log import SessionLog
+from slam.app.session.messages import (
+    settings_text,
+    snapshot_of,
+    state_row,
+)
+from slam.app.session.reader import TruthPose, open_session
+from slam.config import SlamConfig, load_preset
+from slam.frames import RadarFrame
+
+N_SCANS = 60
+LIGHT_OVER_MODULE = 299_792_458.0 / 3.0e8
+
+
+def odometry() -> OdometryTrack:
+    poses = [np.array([k / 3, k / 7, k / 11]) for k in range(80)]
+    return OdometryTrack.from_lines(
+        [format_tum_line(k * 200_000_000 + k, pose) for k, pose in enumerate(poses)]
+    )
+
+
+@pytest.fixture(scope="module")
+def session_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("session") / "session.mcap"
+    log = SessionLog(path, session_info(), odometry())
+    feed(log, N_SCANS)
+    log.close()
+    return path
+
+
+def test_head_and_rig_are_those_of_the_run(session_file: Path) -> None:
+    session = open_session(session_file)
+    expected = session_info()
+    assert session.info.radars == expected.radars
+    assert (session.info.scene, session.info.seed) == ("made_up", 7)
+    np.testing.assert_array_equal(session.info.true_landmarks_m, expected.true_landmarks_m)
+    assert [(m.name, m.x_m, m.y_m) for m in session.rig.mounts] == [
+        ("radar0", 0.1, 0.2),
+        ("radar1", 0.1, 0.5),
+    ]
+
+
+def test_frames_come_back_in_true_metres_with_their_own_stamps(session_file: Path) -> None:
+    frames = [r for r in open_session(session_file).records() if isinstance(r, RadarFrame)]
+    assert len(frames) == 2 * N_SCANS
+    for index, frame in enumerate(frames):
+        sent = scan(index // 2).frames[index % 2]
+        assert (frame.radar, frame.counter, frame.t_ns) == (sent.radar, sent.counter, sent.t_ns)
+        assert frame.samples.tobytes() == sent.samples.tobytes()
+        assert frame.range_start_m == pytest.approx(0.2 * LIGHT_OVER_MODULE, rel=1e-12)
+        assert frame.bin_length_m == pytest.approx(0.0064 * LIGHT_OVER_MODULE, rel=1e-12)
+
+
+def test_odometry_truth_and_log_come_back(session_file: Path) -> None:
+    records = list(open_session(session_file).records())
+    samples = [r for r in records if isinstance(r, TumSample)]
+    assert tuple(samples) == odometry().samples[: len(samples)]
+    assert samples[-1].t_ns >= (N_SCANS - 1) * FRAME_NS
+    truths = [r for r in records if isinstance(r, TruthPose)]
+    assert len(truths) == N_SCANS
+    np.testing.assert_allclose(truths[7].pose, snapshot(7).truth, atol=1e-12)
+    lines = [r for r in records if isinstance(r, LogLine)]
+    assert [(line.radar, line.warning) for line in lines] == [("radar0", False), ("radar1", True)]
+
+
+def test_scans_group_by_tick_also_where_a_radar_started_whole_periods_late(tmp_path: Path) -> None:
+    info = session_info()
+    late = replace(info.radars[1], start_skew_ns=FRAME_NS + 50_000_000)
+    info = replace(info, radars=(info.radars[0], late))
+    path = tmp_path / "late.mcap"
+    log = SessionLog(path, info, odometry())
+    for tick in range(5):
+        first, second = scan(tick).frames
+        frames = (first,) if tick == 0 else (first, replace(second, counter=tick - 1))
+        log.on_scan(replace(scan(tick), frames=frames))
+    log.close()
+    grouped = [one for one, _ in open_session(path).scans()]
+    assert [(s.counter, [f.counter for f in s.frames]) for s in grouped] == [
+        (0, [0]),
+        *((tick, [tick, tick - 1]) for tick in range(1, 5)),
+    ]
+    assert [s.t_ns for s in grouped] == pytest.approx([tick * FRAME_NS for tick in range(5)])
+
+
+def facts(one: Scan) -> tuple[object, ...]:
+    frames = [(frame.radar, frame.counter, frame.t_ns) for frame in one.frames]
+    return one.counter, one.t_ns, one.host_ns, one.used, frames
+
+
+def test_scans_come_back_as_the_run_took_them(tmp_path: Path) -> None:
+    """Stamps of time base `arrival`, a tick without frames, a counter that begins anew."""
+    path = tmp_path / "s.mcap"
+    log = SessionLog(path, session_info(), truth_at=lambda t_ns: np.outer(t_ns, [1e-9, 1 / 3, 0.1]))
+    first, second = scan(7).frames
+    sent = (
+        replace(scan(7), t_ns=123, host_ns=(10**18, 10**18 + 5)),
+        replace(scan(8), t_ns=456, frames=()),
+        replace(scan(9), t_ns=789, frames=(replace(second, counter=0, t_ns=700),)),
+        replace(scan(10), t_ns=999, frames=(replace(first, counter=3, t_ns=999),), used=False),
+    )
+    for one in sent:
+        log.on_scan(one)
+    log.close()
+    taken = list(open_session(path).scans())
+    assert [facts(one) for one, _ in taken] == [facts(one) for one in sent]
+    for one, truth in taken:
+        assert truth is not None
+        assert truth.tolist() == (one.t_ns * np.array([1e-9, 1 / 3, 0.1])).tolist()
+
+
+def test_what_is_unknown_stays_unknown(tmp_path: Path) -> None:
+    path = tmp_path / "s.mcap"
+    unknown = np.full(3, np.nan)
+    info = replace(session_info(), seed=None, simulated=False, time_base="arrival")
+    log = SessionLog(path, info)
+    log.on_scan(scan(0))
+    log.on_snapshot(replace(snapshot(0), truth=unknown))
+    log.close()
+    session = open_session(path)
+    assert (session.info.seed, session.info.simulated) == (None, False)
+    assert session.info.time_base == "arrival"
+    assert [truth for _, truth in session.scans()] == [None]
+    records = list(session.records())
+    assert not [record for record in records if isinstance(record, TruthPose)]
+    (state,) = [record for record in records if isinstance(record, Snapshot)]
+    assert np.isnan(state.truth).all()
+
+
+def test_states_come_back_to_the_last_bit(session_file: Path) -> None:
+    states = [r for r in open_session(session_file).records() if isinstance(r, Snapshot)]
+    assert len(states) == N_SCANS
+    for counter in (0, 7):
+        sent, found = snapshot(counter), states[counter]
+        assert (found.counter, found.t_ns) == (sent.counter, sent.t_ns)
+        assert found.nis_per_dof == sent.nis_per_dof
+        assert found.landmark_ids.tolist() == sent.landmark_ids.tolist()
+        for name in (
+            "truth",
+            "odometry",
+            "estimate",
+            "world_from_map",
+            "pose_covariance",
+            "landmarks_m",
+            "landmark_covariances_m2",
+        ):
+            assert getattr(found, name).tolist() == getattr(sent, name).tolist(), name
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    numbers=st.lists(st.floats(allow_nan=False), min_size=21, max_size=21),
+    landmarks=st.lists(
+        st.tuples(st.integers(0, 2**31), *[st.floats(allow_nan=False)] * 6), max_size=5
+    ),
+    nis=st.lists(st.floats(allow_nan=False), max_size=4),
+)
+def test_a_state_as_a_row_of_doubles_and_back(
+    numbers: list[float], landmarks: list[tuple[float, ...]], nis: list[float]
+) -> None:
+    table = np.array(landmarks, dtype=np.float64).reshape(-1, 7)
+    row = np.concatenate([[len(table), len(nis)], numbers, table.ravel(), nis])
+    state = snapshot_of(4, 5, row)
+    assert (state.counter, state.t_ns) == (4, 5)
+    assert state_row(state).tolist() == row.tolist()
+    for wrong in (row[:-1], np.append(row, 0.0)):
+        with pytest.raises(ValueError, match="says it has"):
+            snapshot_of(4, 5, wrong)
+
+
+def test_settings_and_surroundings_come_back(tmp_path: Path) -> None:
+    sent = replace(
+        session_info(),
+        config_json='{"a": 0.1}',
+        wheels={"scale_sigma": 1 / 3},
+        outlines_m=(np.array([[0.1, 1 / 3], [2.0, 3.0]]), np.zeros((3, 2))),
+        started_unix_ns=1_790_000_000_123_456_789,
+    )
+    path = tmp_path / "s.mcap"
+    SessionLog(path, sent).close()
+    found = open_session(path).info
+    assert (found.config_json, found.wheels) == (sent.config_json, sent.wheels)
+    assert found.started_unix_ns == sent.started_unix_ns
+    assert [line.tolist() for line in found.outlines_m] == [
+        line.tolist() for line in sent.outlines_m
+    ]
+
+
+def test_wire_bytes_come_back_with_both_clocks(tmp_path: Path) -> None:
+    path = tmp_path / "s.mcap"
+    log = SessionLog(path, session_info())
+    log.on_wire("radar1", "tx", b"\x7d\x01", 77)
+    log.on_scan(scan(3))
+    log.on_wire("radar1", "rx", bytes(range(256)), 99)
+    log.on_wire("radar0", "rx", b"", 100)
+    log.close()
+    session = open_session(path)
+    assert [(w.radar, w.way, w.data, w.t_ns, w.host_ns) for w in session.wire()] == [
+        ("radar1", "tx", b"\x7d\x01", 0, 77),
+        ("radar1", "rx", bytes(range(256)), 3 * FRAME_NS, 99),
+    ]
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    types = {
+        c.topic: summary.schemas[c.schema_id].name
+        for c in summary.channels.values()
+        if c.topic.endswith("x")
+    }
+    assert types == {
+        "/radar/radar1/tx": "std_msgs/msg/UInt8MultiArray",
+        "/radar/radar1/rx": "std_msgs/msg/UInt8MultiArray",
+    }
+
+
+@pytest.mark.parametrize("preset", ["paper", "robust"])
+def test_settings_of_every_preset_come_back_the_same(preset: str) -> None:
+    config = load_preset(preset, "lab")
+    assert SlamConfig.model_validate_json(settings_text(config)) == config
+
+
+def test_a_whole_file_is_not_called_cut(session_file: Path) -> None:
+    session = open_session(session_file)
+    for _ in session.records():
+        pass
+    assert session.cut_at_byte is None
+
+
+def foreign(path: Path) -> None:
+    with path.open("wb") as stream:
+        writer = Writer(stream, compression=CompressionType.ZSTD)
+        writer.start(profile="", library="somebody")
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+        channel = writer.register_channel("/chatter", "cdr", schema)
+        writer.add_message(channel_id=channel, log_time=1, publish_time=1, data=b"\0\1\0\0")
+        writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
+
+
+def test_what_is_no_session_is_one_line(session_file: Path, tmp_path: Path) -> None:
+    content = session_file.read_bytes()
+    first_chunk = content.index(b"zstd")  # stands in the chunk's head
+    damaged = bytearray(content)
+    damaged[len(content) // 2] ^= 0xFF
+    cases: dict[str, bytes | None] = {
+        "missing": None,
+        "empty": b"",
+        "text": b"hello\n" * 100,
+        "magic only": content[:8],
+        "head only": content[:first_chunk],
+        "damaged": bytes(damaged),
+    }
+    expected = {
+        "missing": "cannot read",
+        "empty": "no MCAP file",
+        "text": "no MCAP file",
+        "magic only": "ends at byte 8, before it says",
+        "head only": "ends before any radar is named",
+        "damaged": "damaged at byte",
+    }
+    for name, data in cases.items():
+        path = tmp_path / f"{name}.mcap"
+        if data is not None:
+            path.write_bytes(data)
+        with pytest.raises(AppError, match=expected[name]) as caught:
+            for _ in open_session(path).records():
+                pass
+        assert str(path) in str(caught.value)
+        assert "\n" not in str(caught.value)
+    foreign(tmp_path / "foreign.mcap")
+    with pytest.raises(AppError, match="no session of"):
+        open_session(tmp_path / "foreign.mcap")
+    with pytest.raises(AppError, match="is a directory; give the session"):
+        open_session(tmp_path)
+
+
+def test_a_session_that_grows_reads_the_same_again(tmp_path: Path) -> None:
+    """What a run adds after it was opened would have scans without the odometry read before."""
+    log = SessionLog(path := tmp_path / "session.mcap", session_info())
+    feed(log, 60)
+    log.close()
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    session = open_session(path)
+    n_scans = sum(1 for _ in session.scans())
+    assert 0 < n_scans < 60
+    path.write_bytes(whole)
+    assert sum(1 for _ in session.scans()) == n_scans
+    assert sum(1 for _ in open_session(path).scans()) == 60

@@ -1,0 +1,225 @@
+"""What is counted of a sweep's runs: groups, bands, false landmarks."""
+
+import dataclasses
+import math
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+
+from emulator.scene.scene import ObjectSpec, Scene, TargetSpec, WallSpec, empty_room
+from hil_tests.unit.slam.app.sweep_runs import run_of
+from slam.app.run.evaluation import LandmarkSummary
+from slam.app.run.runner import RunRecord
+from slam.app.sweep.bound import BoundSummary
+from slam.app.sweep.run import SweepRun, distance_m, false_landmarks, make_case
+from slam.app.sweep.statistics import (
+    group_line,
+    in_band,
+    stress_table,
+    stress_tables,
+    summarise_groups,
+    times_clean,
+)
+from slam.results import Belief, StepResult
+
+RUN = dataclasses.replace(
+    run_of(make_case("lab", "paper", 0)),
+    scene="a",
+    ate_rmse_m=0.01,
+    landmarks=LandmarkSummary(
+        true=4, estimated=4, precision=1.0, recall=1.0, duplicates=0, rmse_m=0.01
+    ),
+    nis_mean=0.5,
+    nis_times=(),
+    false=0,
+    confident_false=0,
+    bound=None,
+)
+
+
+def other(seed: int, ate_m: float, nees: float, nis: float | None, recall: float) -> SweepRun:
+    return dataclasses.replace(
+        RUN,
+        seed=seed,
+        ate_rmse_m=ate_m,
+        nees_pose=((1.2, nees), (9.6, 4.0)),
+        nis_mean=nis,
+        landmarks=dataclasses.replace(RUN.landmarks, precision=None, recall=recall, rmse_m=None),
+    )
+
+
+def test_a_group_counts_averages_and_takes_medians() -> None:
+    # one of three is worse than odometry
+    runs = [RUN, other(1, 0.05, 3.0, 1.7, 0.5), other(2, 0.02, 7.0, None, 0.75)]
+    (group,) = summarise_groups(runs)
+    assert (group["scene"], group["preset"], group["runs"]) == ("a", "paper", 3)
+    assert group["runs_below_odometry"] == 2
+    assert group["ate_rmse_m"]["median"] == 0.02
+    # 80 % of the way from the second to the third of three
+    assert group["ate_rmse_m"]["p90"] == pytest.approx(0.044)
+    (first_s, first), (last_s, last) = group["anees_pose"]
+    assert (first_s, first) == (pytest.approx(3.4 / 3), pytest.approx(4.0))
+    assert (last_s, last) == (pytest.approx(29.1 / 3), pytest.approx(3.0))
+    assert group["nis_mean"] == pytest.approx(1.1)
+    assert group["landmark_medians"] == {"precision": 1.0, "recall": 0.75, "rmse_m": 0.01}
+
+
+def test_scenes_and_presets_are_groups_of_their_own_in_order() -> None:
+    runs = [
+        RUN,
+        dataclasses.replace(RUN, scene="b", nis_mean=None),
+        dataclasses.replace(RUN, preset="robust"),
+        dataclasses.replace(RUN, seed=1),
+    ]
+    groups = summarise_groups(runs)
+    names = [(group["scene"], group["preset"], group["runs"]) for group in groups]
+    assert names == [("a", "paper", 2), ("b", "paper", 1), ("a", "robust", 1)]
+    assert groups[1]["nis_mean"] is None
+
+
+def stressed(stress: str, seed: int, ate_m: float) -> SweepRun:
+    return dataclasses.replace(RUN, stress=stress, seed=seed, ate_rmse_m=ate_m)
+
+
+def test_settings_and_stresses_are_groups_named_by_them() -> None:
+    runs = [RUN, dataclasses.replace(RUN, settings={"a.b": "1"}), stressed("skew", 0, 0.02)]
+    lines = [group_line(group) for group in summarise_groups(runs)]
+    assert [line.partition(", 1 seeds")[0] for line in lines] == [
+        "a, preset paper",
+        "a, preset paper, a.b=1",
+        "a, preset paper, stress skew",
+    ]
+
+
+def test_a_group_says_how_good_its_maps_are() -> None:
+    twice = dataclasses.replace(RUN.landmarks, duplicates=2)
+    runs = [
+        dataclasses.replace(RUN, seed=1, landmarks=twice),
+        *(dataclasses.replace(RUN, seed=seed, false=seed, confident_false=1) for seed in (2, 3, 4)),
+    ]
+    (group,) = summarise_groups(runs)
+    assert group["without_duplicates"] == 0.75
+    assert (group["false_per_run"], group["confident_false"]) == (2.25, 3)
+
+
+def test_nis_is_averaged_over_seeds_by_degrees_of_freedom() -> None:
+    """Bands by hand: chi-square with 10 dof has 3.247 and 20.483 at 2.5 and 97.5 %."""
+    runs = [
+        dataclasses.replace(RUN, nis_times=((1.0, 2.0, 2), (2.0, 0.0, 0))),
+        dataclasses.replace(RUN, seed=1, nis_times=((3.0, 10.0, 8), (2.0, 0.0, 0))),
+        dataclasses.replace(RUN, seed=2, nis_times=()),
+    ]
+    (group,) = summarise_groups(runs)
+    first, second = group["nis_times"]
+    assert first == pytest.approx([2.0, 1.2, 0.3247, 2.0483], rel=1e-4)
+    assert second == [2.0, None, None, None]
+
+
+def test_the_bound_has_the_same_statistics() -> None:
+    bounds = [
+        BoundSummary(filtered_ate_rmse_m=f, smoothed_ate_rmse_m=s, nees_pose=((1.0, n),))
+        for f, s, n in ((0.01, 0.004, 2.0), (0.02, 0.006, 4.0), (0.03, 0.005, 6.0))
+    ]
+    runs = [dataclasses.replace(RUN, seed=i, bound=bound) for i, bound in enumerate(bounds)]
+    (group,) = summarise_groups(runs)
+    assert group["bound"]["filtered_ate_rmse_m"] == {
+        "median": 0.02,
+        "p90": pytest.approx(0.028),
+    }
+    assert group["bound"]["smoothed_ate_rmse_m"]["median"] == 0.005
+    assert group["bound"]["anees_pose"] == [[1.0, pytest.approx(4.0)]]
+    assert "known association: filtered median 20.0 mm, smoothed 5.0 mm" in group_line(group)
+    assert summarise_groups([RUN])[0]["bound"] is None
+
+
+def test_a_stress_table_compares_with_its_own_clean_group() -> None:
+    runs = [
+        RUN,
+        stressed("skew", 0, 0.015),
+        dataclasses.replace(RUN, preset="robust", ate_rmse_m=0.001),
+        dataclasses.replace(stressed("skew", 0, 0.004), preset="robust"),
+        dataclasses.replace(RUN, scene="b"),
+    ]
+    groups = summarise_groups(runs)
+    tables = stress_tables(groups)
+    assert [(clean["scene"], clean["preset"]) for clean, _ in tables] == [
+        ("a", "paper"),
+        ("a", "robust"),
+    ]
+    times = [[times_clean(row, clean, "median") for row in rows] for clean, rows in tables]
+    assert times == [[1.0, pytest.approx(1.5)], [1.0, pytest.approx(4.0)]]
+    # one run of 3 dof: 0.216 to 9.35, and both of its times lie within
+    assert in_band(groups[0]) == 2
+    printed = [stress_table(*table) for table in stress_tables(groups)]
+    assert [[row[0] for row in rows] for _, _, rows in printed] == [["clean", "skew"]] * 2
+    assert "a, preset robust, 1 seeds" in printed[1][0]
+
+
+ROOM: Scene = empty_room().model_copy(
+    update={
+        "targets": (
+            TargetSpec(name="rod", kind="rod", x_m=1.0, y_m=2.0),
+            TargetSpec(name="pillar", kind="cylinder", x_m=-3.0, y_m=0.0, radius_m=0.5),
+        ),
+        "walls": (WallSpec(name="wall", from_m=(5.0, -1.0), to_m=(5.0, 1.0)),),
+        "objects": (
+            ObjectSpec(name="box", x_m=0.0, y_m=-4.0, width_m=2.0, depth_m=1.0, yaw_deg=90.0),
+        ),
+    }
+)
+
+
+@pytest.mark.parametrize(
+    ("x_m", "y_m", "far_m"),
+    [
+        (1.0, 2.1, 0.1),
+        (-3.0, 0.3, 0.2),
+        (5.3, 0.9, 0.3),
+        (5.3, 1.4, 0.5),
+        # the box stands on end: 1 m wide along x, 2 m along y
+        (0.6, -4.0, 0.1),
+        (0.0, -2.7, 0.3),
+    ],
+)
+def test_distance_to_what_reflects(x_m: float, y_m: float, far_m: float) -> None:
+    assert distance_m(ROOM, np.array([x_m, y_m])) == pytest.approx(far_m)
+
+
+def test_nothing_is_infinitely_far_in_an_empty_room() -> None:
+    assert distance_m(empty_room(), np.zeros(2)) == math.inf
+
+
+def record(places: list[tuple[float, float]], sigmas: list[tuple[float, float]]) -> RunRecord:
+    mean = np.concatenate([np.zeros(3), np.ravel(places)])
+    variances = np.concatenate([np.zeros(3), np.ravel(sigmas)]) ** 2
+    ids = tuple(range(len(places)))
+    belief = Belief(mean=mean, covariance=np.diag(variances), landmark_ids=ids)
+    return RunRecord(
+        results=(cast(StepResult, SimpleNamespace(belief=belief)),),
+        truth=np.zeros((1, 3)),
+        world_from_map=np.array([1.0, 0.0, math.pi / 2]),
+        n_frames=1,
+        duration_ns=1,
+        wall_s=1.0,
+    )
+
+
+def test_false_ones_are_counted_in_the_world_and_by_their_worst_direction() -> None:
+    # map (2, 0) is world (1, 2), where the rod stands
+    places = [(2.1, 0.0), (2.2, 0.0), (2.2, 0.0), (-9.0, 9.0)]
+    sigmas = [(0.01, 0.01), (0.01, 0.04), (0.01, 0.06), (0.2, 0.2)]
+    assert false_landmarks(record(places, sigmas), ROOM) == (3, 1)
+
+
+def test_no_state_no_false_landmark() -> None:
+    empty = RunRecord(
+        results=(),
+        truth=np.zeros((0, 3)),
+        world_from_map=np.zeros(3),
+        n_frames=0,
+        duration_ns=0,
+        wall_s=1.0,
+    )
+    assert false_landmarks(empty, ROOM) == (0, 0)

@@ -1,0 +1,385 @@
+"""Views in Rerun: pictures, tables and recordings of sessions."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+from hil_tests.unit.slam.app.sessions import feed, scan, session_info, snapshot
+from slam.app.errors import AppError
+from slam.app.records import LogLine
+from slam.app.view.frames import bscan_picture
+from slam.app.view.panels import RerunView
+from slam.app.view.rerun_recording import count_rows
+from slam.frames import Detection
+from slam.geometry import compose, transform
+from slam.paper.ekf import start
+from slam.results import Fix, Observation, StepResult, UpdateReport
+
+N_SCANS = 150  # more than a block, and not a multiple of it
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("view") / "session.rrd"
+    view = RerunView(path, session_info())
+    feed(view, N_SCANS)
+    view.close()
+    return path
+
+
+def rows(path: Path, entity: str, component: str) -> Iterator[tuple[int | None, Any]]:
+    """Yield (frame counter, value) of one component of one entity."""
+    for chunk in RrdReader(path).stream():
+        if str(chunk.entity_path) != entity:
+            continue
+        batch = chunk.to_record_batch()
+        frames = batch["frame"].to_pylist() if "frame" in batch.schema.names else None
+        if component in batch.schema.names:
+            for index, value in enumerate(batch[component].to_pylist()):
+                yield (None if frames is None else frames[index]), value
+
+
+def test_every_frame_is_a_bar_chart_with_its_counter_and_samples(finished: Path) -> None:
+    charts = dict(rows(finished, "/radar/radar1/frame", "BarChart:values"))
+    assert sorted(charts) == list(range(N_SCANS))  # type: ignore[type-var]  # no None here
+    for counter in (0, 127, 128, N_SCANS - 1):
+        (tensor,) = charts[counter]
+        assert tensor["shape"] == [1431]
+        np.testing.assert_array_equal(
+            np.array(tensor["buffer"], dtype=np.float32), scan(counter).frames[1].samples
+        )
+
+
+def test_a_bscan_picture_per_block(finished: Path) -> None:
+    pictures = list(rows(finished, "/radar/radar0/bscan", "Tensor:data"))
+    assert [frame for frame, _ in pictures] == [0, 128]
+    shapes = [picture[0]["shape"] for _, picture in pictures]
+    assert [shape[0] for shape in shapes] == [128, 128]  # the last one holds the newest frames
+
+
+def test_y_points_down_on_the_screen(finished: Path) -> None:
+    frame, points = next(rows(finished, "/map/landmarks/estimated", "Points2D:positions"))
+    assert frame == 0
+    np.testing.assert_allclose(points, snapshot(0).landmarks_m * [1, -1], rtol=1e-6)
+    _, (turn,) = next(rows(finished, "/map/robot", "Transform3D:quaternion"))
+    # heading 0.4 rad to the left is upwards for us, so a turn to the right for Rerun
+    np.testing.assert_allclose(turn, [0.0, 0.0, -np.sin(0.2), np.cos(0.2)], atol=1e-6)
+    _, (place,) = next(rows(finished, "/map/robot", "Transform3D:translation"))
+    np.testing.assert_allclose(place, [0.0, -0.01, 0.0], atol=1e-6)
+
+
+def test_ellipses_are_rotated_polygons(finished: Path) -> None:
+    _, strips = next(rows(finished, "/map/landmarks/ellipses", "LineStrips2D:strips"))
+    assert [len(strip) for strip in strips] == [33, 33]
+    tilted = np.array(strips[1]) - snapshot(0).landmarks_m[1] * [1, -1]
+    # covariance [[2, 1], [1, 2]]: long axis at +45 degrees, so at -45 on a screen
+    longest = tilted[np.argmax(np.linalg.norm(tilted, axis=1))]
+    assert longest[0] * longest[1] < 0
+
+
+def test_scalars_and_log(finished: Path) -> None:
+    counted = count_rows(finished)
+    assert counted["/error/slam"] == counted["/landmarks/count"] == N_SCANS
+    assert counted["/consistency/nis/value"] == N_SCANS // 2
+    assert counted["/link/log/radar0"] == counted["/link/log/radar1"] == 1
+    errors = dict(rows(finished, "/error/slam", "Scalars:scalars"))
+    assert errors[0] == [pytest.approx(0.01)]
+    odometry = dict(rows(finished, "/error/odometry", "Scalars:scalars"))
+    assert odometry[0] == [pytest.approx(0.01)]  # it begins elsewhere, so is placed at SLAM's start
+
+
+def test_nees_is_told_with_its_band(finished: Path) -> None:
+    values = dict(rows(finished, "/consistency/nees/value", "Scalars:scalars"))
+    # 0.01 m in y with a deviation of 0.01 m, 0.3 rad with one of sqrt(1e-5): 1 + 9000 over 3
+    assert values[0] == [pytest.approx((1.0 + 0.3**2 / 1e-5) / 3.0)]
+    bounds = [
+        dict(rows(finished, f"/consistency/nees/{name}", "Scalars:scalars"))[0]
+        for name in ("low", "high")
+    ]
+    np.testing.assert_allclose(np.ravel(bounds), [0.0719, 3.1161], atol=1e-4)  # tables of chi2(3)
+
+
+def test_a_fault_is_a_marker_and_a_state_of_its_lane(finished: Path) -> None:
+    marks = [mark for _, mark in rows(finished, "/link/faults/radar1", "Scalars:scalars") if mark]
+    assert marks == [[1.0]]
+    states = [s[0] for _, s in rows(finished, "/link/state/radar1", "StateChange:state") if s]
+    assert states == ["streaming", "fault", "ended"]
+    states = [s[0] for _, s in rows(finished, "/link/state/radar0", "StateChange:state") if s]
+    assert states == ["setting up", "streaming", "ended"]
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_the_guide_speaks_of_truth_only_where_there_is_one(tmp_path: Path, is_known: bool) -> None:
+    info = session_info()
+    path = tmp_path / "s.rrd"
+    known = info if is_known else replace(info, true_landmarks_m=np.empty((0, 2)))
+    RerunView(path, known).close()
+    (_, (text,)) = next(rows(path, "/about", "TextDocument:text"))
+    assert ("*true* path" in text) is is_known
+    assert "2 short-range radars" in text
+
+
+def test_a_blueprint_is_embedded(finished: Path) -> None:
+    assert len(RrdReader(finished).blueprints()) == 1
+    (recording,) = RrdReader(finished).recordings()
+    assert recording.recording_id == "made_up-paper-7"
+
+
+def test_wall_clock_is_nowhere_in_the_data(finished: Path) -> None:
+    timelines = {
+        name
+        for chunk in RrdReader(finished).stream()
+        for name in chunk.to_record_batch().schema.names
+        if name in {"log_time", "log_tick"}
+    }
+    assert timelines == set()
+
+
+def test_one_missing_row_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    view = RerunView(tmp_path / "s.rrd", session_info())
+    feed(view, 3)
+
+    def one_less(path: Path) -> dict[str, int]:
+        rows = count_rows(path)
+        rows["/radar/radar1/frame"] -= 1
+        return rows
+
+    monkeypatch.setattr("slam.app.view.rerun_recording.count_rows", one_less)
+    with pytest.raises(AppError, match=r"s\.rrd: holds 2 of 3 rows of /radar/radar1/frame"):
+        view.close()
+
+
+def test_a_followed_view_sends_what_waited_too_long(tmp_path: Path) -> None:
+    now_s = 0.0
+    view = RerunView(tmp_path / "s.rrd", session_info(), flush_s=0.5, clock_s=lambda: now_s)
+    for counter in range(10):
+        now_s = 0.1 * counter
+        view.on_scan(scan(counter))
+    view.close()
+    pictures = list(rows(tmp_path / "s.rrd", "/radar/radar0/bscan", "Tensor:data"))
+    # sent at 0.5 s with six frames, and at the end with all ten, each from its own first frame
+    assert [(frame, picture[0]["shape"][0]) for frame, picture in pictures] == [(0, 6), (6, 10)]
+
+
+def test_a_followed_view_waits_for_the_next_block_of_a_fast_radar(tmp_path: Path) -> None:
+    now_s = 0.0
+    view = RerunView(tmp_path / "s.rrd", session_info(), flush_s=0.5, clock_s=lambda: now_s)
+    for counter in range(300):
+        now_s = 0.0025 * counter
+        one = scan(counter)
+        frames = tuple(replace(f, t_ns=round(1e9 * now_s)) for f in one.frames)
+        view.on_scan(replace(one, t_ns=round(1e9 * now_s), frames=frames))
+    view.close()
+    pictures = rows(tmp_path / "s.rrd", "/radar/radar0/bscan", "Tensor:data")
+    assert [frame for frame, _ in pictures] == [0, 128, 256]  # full blocks, though 0.5 s passed
+
+
+def arrivals(path: Path, entity: str) -> list[int]:
+    """Return an entity's stamps on `host_time`, nanoseconds since 1970."""
+    return [
+        stamp.value
+        for chunk in RrdReader(path).stream()
+        if str(chunk.entity_path) == entity
+        for batch in [chunk.to_record_batch()]
+        if "host_time" in batch.schema.names
+        for stamp in batch["host_time"]
+    ]
+
+
+def test_host_time_is_a_timeline_where_arrival_is_known(tmp_path: Path) -> None:
+    view = RerunView(tmp_path / "s.rrd", session_info())
+    day_ns = 1_790_000_000_000_000_000
+    for counter in range(3):
+        view.on_scan(replace(scan(counter), host_ns=(day_ns + counter, day_ns + 10 + counter)))
+    view.close()
+    stamps = arrivals(tmp_path / "s.rrd", "/radar/radar1/frame")
+    assert stamps == [day_ns + 10, day_ns + 11, day_ns + 12]
+
+
+def test_a_live_view_notes_arrival_itself(tmp_path: Path) -> None:
+    day_ns = iter(range(1_790_000_000_000_000_000, 2_000_000_000_000_000_000))
+    view = RerunView(tmp_path / "s.rrd", session_info(), time_of_day_ns=lambda: next(day_ns))
+    for counter in range(2):
+        view.on_scan(scan(counter))
+    view.close()
+    for name in ("radar0", "radar1"):  # one arrival per scan
+        assert arrivals(tmp_path / "s.rrd", f"/radar/{name}/frame") == [
+            1_790_000_000_000_000_000,
+            1_790_000_000_000_000_001,
+        ]
+
+
+@pytest.mark.parametrize("day_ns", [1_790_000_000_000_000_000, 37_310_000_000_000])
+def test_time_is_counted_from_the_first_scan(tmp_path: Path, day_ns: int) -> None:
+    view = RerunView(tmp_path / "s.rrd", session_info())
+    view.on_log(LogLine(t_ns=0, radar="radar0", warning=False, text="tx Ping"))  # before any scan
+    for counter in range(3):
+        view.on_scan(replace(scan(counter), t_ns=day_ns + counter))
+        view.on_snapshot(replace(snapshot(counter), t_ns=day_ns + counter))
+    view.close()
+    for entity, expected in (("/error/slam", [0, 1, 2]), ("/link/log/radar0", [0])):
+        stamps = [
+            stamp.value
+            for chunk in RrdReader(tmp_path / "s.rrd").stream()
+            if str(chunk.entity_path) == entity
+            for batch in [chunk.to_record_batch()]
+            if "device_time" in batch.schema.names
+            for stamp in batch["device_time"]
+        ]
+        assert stamps == expected
+
+
+def test_without_truth_there_is_no_error_to_show(tmp_path: Path) -> None:
+    view = RerunView(tmp_path / "s.rrd", session_info())
+    for counter in range(3):
+        view.on_scan(scan(counter))
+        view.on_snapshot(replace(snapshot(counter), truth=np.full(3, np.nan)))
+    view.close()
+    counted = count_rows(tmp_path / "s.rrd")
+    assert {"/error/slam", "/consistency/nees/value", "/map/truth/path"}.isdisjoint(counted)
+    assert counted["/map/estimate/path"] == 2  # first state, and last
+
+
+def test_odometry_that_began_with_slam_is_shown_as_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "s.rrd"
+    view = RerunView(path, session_info())
+    state = snapshot(0)
+    view.on_snapshot(replace(state, odometry=state.estimate + np.array([0.03, 0.0, 0.01])))
+    view.close()
+    (_, (error_m,)) = next(rows(path, "/error/odometry", "Scalars:scalars"))
+    assert error_m == pytest.approx(np.hypot(0.03, 0.01))  # the estimate itself is 0.01 m off
+
+
+def test_odometry_that_began_elsewhere_begins_where_slam_does(tmp_path: Path) -> None:
+    path = tmp_path / "s.rrd"
+    view = RerunView(path, session_info())
+    elsewhere = np.array([40.0, -7.0, 2.0])
+    for counter in range(3):
+        state = snapshot(counter)
+        driven = np.array([0.1 * counter, 0.0, 0.0])
+        view.on_snapshot(replace(state, odometry=compose(elsewhere, driven)))
+    view.close()
+    (strip,) = [s for _, s in rows(path, "/map/odometry/path", "LineStrips2D:strips")][-1]
+    start = snapshot(0).estimate
+    expected = transform(start, np.array([[0.0, 0.0], [0.2, 0.0]])) * [1, -1]
+    np.testing.assert_allclose(strip, expected, atol=1e-5)
+
+
+def test_names_may_hold_any_character(tmp_path: Path) -> None:
+    # closing compares the rows of every entity by its name
+    path = tmp_path / "s.rrd"
+    name = "left/rear 1.ä"
+    info = session_info()
+    radars = (replace(info.radars[0], name=name), info.radars[1])
+    view = RerunView(path, replace(info, radars=radars))
+    view.on_log(LogLine(t_ns=0, radar=name, warning=True, text="fault CRC"))
+    view.on_log(LogLine(t_ns=0, radar="tcp://127.0.0.1:3000", warning=False, text="tx Ping"))
+    for counter in range(3):
+        view.on_scan(scan(counter))
+        view.on_snapshot(replace(snapshot(counter), step=step(robust=True)))
+    view.close()
+    counted = count_rows(path)
+    assert counted["/radar/left\\/rear\\ 1.ä/frame"] == 3
+    assert counted["/link/faults/left\\/rear\\ 1.ä"] == 1
+    assert counted["/link/log/tcp\\:\\/\\/127.0.0.1\\:3000"] == 1
+
+
+def step(*, robust: bool) -> StepResult:
+    """Return a state with two detections of radar 0, the second of which counted."""
+    seen = tuple(
+        Detection(radar=0, t_ns=0, range_m=range_m, amplitude=0.01, sigma_m=0.001)
+        for range_m in (0.5, 1.0)
+    )
+    fix = Fix(pair=0, t_ns=0, x_m=0.3, y_m=0.9, detections=(seen[1], seen[1]))
+    stray = Fix(pair=0, t_ns=0, x_m=0.1, y_m=0.4, detections=(seen[0], seen[0]))
+    observation = Observation(x_m=0.3, y_m=0.9, n_fixes=5, n_poses=5, fixes=(fix,))
+    report = UpdateReport(
+        continued=((0, 0, 7),),  # the first of those given: the other one was unfit
+        initialised=(),
+        seen_again=(),
+        merged=(),
+        deleted=(),
+        nis=1.0,
+        dof=1,
+        relinearised=False,
+    )
+    return StepResult(
+        t_ns=0,
+        odometry_pose=np.zeros(3),
+        belief=start(),
+        detections=seen,
+        fixes=() if robust else (fix, stray),
+        observations=() if robust else (observation,),
+        rejected=() if robust else (stray,),
+        report=report if robust else None,
+        range_sigmas_m=(np.inf, 0.001) if robust else (),
+    )
+
+
+@pytest.mark.parametrize("robust", [True, False])
+def test_echoes_are_arcs_of_the_body_and_bars_of_the_frame(tmp_path: Path, robust: bool) -> None:
+    path = tmp_path / "s.rrd"
+    view = RerunView(path, session_info())
+    view.on_scan(scan(0))
+    view.on_snapshot(replace(snapshot(0), step=step(robust=robust)))
+    view.close()
+    antenna = np.array([0.1, -0.2])  # of radar0, on the screen
+    for name, range_m in (("arcs_used", 1.0), ("arcs_unused", 0.5)):
+        found = rows(path, f"/map/robot/radar0/{name}", "LineStrips2D:strips")
+        ((arc,),) = [strips for _, strips in found if strips]
+        np.testing.assert_allclose(np.linalg.norm(arc - antenna, axis=1), range_m, rtol=1e-6)
+        middle = (arc[8] - antenna) / range_m
+        np.testing.assert_allclose(middle, [np.cos(1.57), -np.sin(1.57)], atol=1e-6)
+    ((bars,),) = [v for _, v in rows(path, "/radar/radar0/detections", "BarChart:abscissa") if v]
+    assert bars["buffer"] == [0.5, 1.0]
+    ((none,),) = [v for _, v in rows(path, "/radar/radar1/detections", "BarChart:values") if v]
+    assert none["buffer"] == [0.0]
+
+
+def test_fixes_and_clusters_lie_where_the_robot_saw_them(tmp_path: Path) -> None:
+    path = tmp_path / "s.rrd"
+    view = RerunView(path, session_info())
+    for counter in range(50):
+        view.on_snapshot(replace(snapshot(counter), step=step(robust=False)))
+    view.close()
+    for name, places in (
+        ("fixes/found", [(0.3, 0.9), (0.1, 0.4)]),
+        ("fixes/rejected", [(0.1, 0.4)]),
+        ("clusters/kept", [(0.3, 0.9)]),
+    ):
+        shown = [p for _, p in rows(path, f"/map/{name}", "Points2D:positions") if p]
+        assert [len(points) // len(places) for points in shown] == [*range(1, 40), *[40] * 11]
+        poses = [snapshot(counter).estimate for counter in range(10, 50)]
+        expected = np.concatenate([transform(pose, np.array(places)) for pose in poses])
+        np.testing.assert_allclose(shown[-1], expected * [1, -1], rtol=1e-5, atol=1e-6)
+
+
+BIN_M = 0.0064255
+
+
+def moving_tone(amplitude: float) -> np.ndarray:
+    """Return a carrier in every second frame, so that its mean is half of it."""
+    phase = 2 * np.pi * 7.29e9 * 2 * BIN_M * np.arange(400) / 299_792_458.0
+    return np.array([amplitude * (row % 2) * np.cos(phase) for row in range(10)], dtype=np.float32)
+
+
+def test_the_envelope_of_a_tone_is_flat_and_in_decibels() -> None:
+    picture = bscan_picture(moving_tone(0.02), 0.2, BIN_M)
+    # half of 0.02 is left after the mean is removed: -40 dB, so 22 of 32 dB of 255 levels
+    np.testing.assert_allclose(picture, 255 * 22 / 32, atol=2)
+
+
+@pytest.mark.parametrize(("amplitude", "level"), [(1.0, 255), (0.0, 0)])
+def test_levels_are_clipped(amplitude: float, level: int) -> None:
+    assert set(bscan_picture(moving_tone(amplitude), 0.2, BIN_M).ravel()) == {level}
+
+
+def test_it_shows_three_metres_at_most() -> None:
+    frames = np.zeros((4, 1431), dtype=np.float32)
+    assert bscan_picture(frames, 0.2, BIN_M).shape == (4, int((3.0 - 0.2) / BIN_M) - 2)
+    assert bscan_picture(frames[:, :20], 0.2, BIN_M).shape == (4, 18)

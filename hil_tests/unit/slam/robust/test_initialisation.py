@@ -1,0 +1,241 @@
+"""What the back end believes: tracklets, births from one radar, merges, weights of ranges."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hil_tests.unit.slam.robust.range_world import (
+    LAB,
+    Stress,
+    parameters_for,
+    reported,
+    scans_of,
+    true_path,
+)
+from slam.config import WheelNoise
+from slam.geometry import paper_rig
+from slam.robust.back_end import RobustBackEnd, huber_weighted_sigmas_m
+from slam.robust.initialisation import (
+    BodyPoint,
+    Tracker,
+    Tracklet,
+    UnassignedRanges,
+    find_tracklets,
+    initialise_landmark,
+    pair_guesses,
+)
+from slam.robust.map import Existence, find_merge
+from slam.robust.parameters import MapRule, RangeNoise, TrackletRule
+from slam.robust.ranges import RangeScan, antennas_of
+from slam.robust.state import Array, State, SymmetricMatrix, calibrated_motion
+
+SIGMA_M = 5e-3
+NOISE = RangeNoise(sigma_m=SIGMA_M)
+RULE = TrackletRule()
+LEFT = (0, 1)
+
+
+def driven(targets: Array, offsets_m: Array, *, moving: bool = False) -> UnassignedRanges:
+    """Return 15 frames of 2 cm past targets on the left; moving ones go with the robot."""
+    rng = np.random.default_rng(1)
+    unassigned = UnassignedRanges(15, SIGMA_M, 0.005, 0.0015)
+    step = calibrated_motion(np.array([0.02, 0.0, 0.0]), np.zeros(3), WheelNoise())
+    mounts = np.array([(mount.x_m, mount.y_m) for mount in paper_rig().mounts])
+    for k in range(15):
+        unassigned.move(step)
+        body = targets - [0.0 if moving else 0.02 * k, 0.0]
+        scans = [
+            RangeScan(
+                radar=radar,
+                ranges_m=tuple(
+                    float(np.hypot(*(target - mounts[radar])))
+                    + float(offsets_m[radar])
+                    + SIGMA_M * rng.standard_normal()
+                    for target in body
+                ),
+            )
+            for radar in LEFT
+        ]
+        unassigned.keep(k, antennas_of(paper_rig(), scans, step), scans, set())
+    return unassigned
+
+
+def tracklets(unassigned: UnassignedRanges, offset_sigma_m: float = 0.0) -> list[Tracklet]:
+    frames = unassigned.slots(LEFT, 15)
+    tracker = Tracker(NOISE, RULE, np.zeros(4), offset_sigma_m**2 * np.eye(4))
+    return find_tracklets(tracker, pair_guesses(frames[0], NOISE, RULE), frames, 2, RULE)
+
+
+def test_a_tracklet_is_a_point_at_rest_and_uses_its_ranges_up() -> None:
+    target = np.array([[0.15, 0.9]])
+    unassigned = driven(target, np.zeros(4))
+    (found,) = tracklets(unassigned)
+    miss = found.point_m - (target[0] - [0.28, 0.0])
+    assert miss @ np.linalg.solve(found.covariance, miss) < 13.8
+    assert len(found.members) == 30
+    assert all(not slot.unused for slots in unassigned.slots(LEFT, 15) for slot in slots)
+    assert tracklets(unassigned) == []
+
+
+def test_what_goes_with_the_robot_is_no_tracklet() -> None:
+    fixed = np.array([[0.0, 0.9]])
+    assert tracklets(driven(fixed, np.zeros(4), moving=True)) == []
+    assert tracklets(driven(fixed, np.zeros(4), moving=True), 0.02) == []
+
+
+def test_of_two_points_four_fixes_and_two_tracklets() -> None:
+    targets = np.array([[0.1, 0.8], [0.25, 0.9]])
+    unassigned = driven(targets, np.zeros(4))
+    frames = unassigned.slots(LEFT, 15)
+    assert len(pair_guesses(frames[0], NOISE, RULE)) > 2
+    found = sorted(tracklets(unassigned), key=lambda tracklet: float(tracklet.point_m[1]))
+    assert len(found) == 2
+    for tracklet, target in zip(found, targets, strict=True):
+        assert tracklet.point_m == pytest.approx(target - [0.28, 0.0], abs=0.03)
+
+
+def test_offsets_that_are_told_to_be_doubtful_cost_no_tracklet() -> None:
+    """Both radars 30 mm off in opposite directions: no point at rest, unless that may be."""
+    target, offsets = np.array([[0.15, 0.6]]), np.array([0.03, -0.03, 0.0, 0.0])
+    assert tracklets(driven(target, offsets)) == []
+    (found,) = tracklets(driven(target, offsets), 0.02)
+    true = target[0] - [0.28, 0.0]
+    corrected = found.point_m + found.by_offsets @ offsets
+    assert np.hypot(*(corrected - true)) < 0.5 * np.hypot(*(found.point_m - true))
+
+
+@pytest.mark.parametrize("dead", [0, 1])
+def test_a_radar_alone_gives_birth_where_its_partner_is_dead(dead: int) -> None:
+    rng = np.random.default_rng(0)
+    poses = true_path(LAB)[:90]
+    target = np.array([[0.5, 0.8]])
+    back_end = RobustBackEnd(paper_rig(), parameters_for(LAB, SIGMA_M))
+    increments = reported(poses, LAB, rng, 0.0)
+    stress = Stress(dead=(dead, 2, 3))
+    scans = scans_of(poses, target, rng, SIGMA_M, stress, labelled=False)
+    for increment, seen in zip(increments, scans, strict=True):
+        back_end.predict(increment)
+        back_end.update(seen)
+    (mark,) = back_end.landmarks()
+    miss = mark.position_m - target[0]
+    assert np.hypot(*miss) < 0.06
+    assert miss @ np.linalg.solve(mark.covariance, miss) < 13.8
+
+
+def mapped(places: Array, sigma_m: float = 0.02) -> tuple[State, Existence]:
+    state, existence = State((0.0, 0.0, 0.0), (0.0,) * 4), Existence(MapRule())
+    for place in places:
+        point = BodyPoint(
+            point_m=place, covariance=sigma_m**2 * np.eye(2), by_offsets=np.zeros((2, 4))
+        )
+        existence.hit(initialise_landmark(state, point), 9)
+    return state, existence
+
+
+def test_a_merge_must_stand_out_from_its_rivals() -> None:
+    rule = MapRule()
+    state, existence = mapped(np.array([[0.0, 1.0], [0.03, 1.0], [2.0, 1.0]]))
+    merge = find_merge(state, existence, rule)
+    assert merge is not None
+    assert merge.pairs == ((0, 1),)
+    # A third one as near as the second: which are one cannot be told.
+    state, existence = mapped(np.array([[0.0, 1.0], [0.03, 1.0], [-0.03, 1.0]]))
+    assert find_merge(state, existence, rule) is None
+
+
+@pytest.mark.parametrize(
+    ("third_m", "sigma_m", "merges"),
+    [
+        (0.069, 0.02, False),
+        (0.070, 0.02, True),  # 12^0.5 sigma: 3 nats less likely, as each is unsure by sigma
+        (9.0, 0.284, False),
+        (9.0, 0.280, True),  # below (4 pi)^-0.5 m the density exceeds 1 per square metre
+    ],
+)
+def test_a_merge_is_made_from_the_likelihood_margin_and_the_density_on(
+    third_m: float, sigma_m: float, merges: bool
+) -> None:
+    state, existence = mapped(np.array([[0.0, 1.0], [0.0, 1.0], [third_m, 1.0]]), sigma_m)
+    merge = find_merge(state, existence, MapRule())
+    assert (merge is not None and merge.pairs == ((0, 1),)) == merges
+
+
+def test_what_was_seen_whole_together_is_never_merged() -> None:
+    state, existence = mapped(np.array([[0.0, 1.0], [0.03, 1.0]]))
+    for _ in range(MapRule().apart_frames):
+        existence.seen_whole([0, 1])
+    assert find_merge(state, existence, MapRule()) is None
+
+
+def test_two_merges_together_tell_what_each_alone_does_not() -> None:
+    """All landmarks shifted alike: each fits two, both together fit one way only."""
+    places = np.array([[0.0, 1.0], [0.6, 1.0], [0.3, 1.0], [0.9, 1.02]])
+    state, existence = mapped(places, 0.01)
+    # The later two were seen after a loop: 0.3 m of doubt common to both, along the wall.
+    P = state.P.full()
+    first = state.landmark_columns(np.array([2]))[0]
+    along = np.zeros(state.P.size)
+    along[[first, first + 2]] = 0.3
+    state.P = SymmetricMatrix(P + np.outer(along, along))
+    for pair in ((0, 1), (2, 3)):
+        for _ in range(3):
+            existence.seen_whole(pair)
+    merge = find_merge(state, existence, MapRule())
+    assert merge is not None
+    assert set(merge.pairs) == {(0, 2), (1, 3)}
+
+
+def test_walking_biases_are_as_uncertain_to_the_filter_as_to_the_smoother() -> None:
+    rng = np.random.default_rng(2)
+    poses = true_path(LAB)[:121]
+    landmarks = np.array([[0.2, 1.0], [0.7, 0.8], [1.1, 0.9], [0.3, -0.9], [0.9, -1.1]])
+    parameters = parameters_for(LAB, SIGMA_M, walk_per_sqrt_m=1.0)
+    back_end = RobustBackEnd(paper_rig(), parameters)
+    scans = scans_of(poses, landmarks, rng, SIGMA_M, Stress(), labelled=True)
+    for increment, seen in zip(reported(poses, LAB, rng, 1.0), scans, strict=True):
+        back_end.predict(increment)
+        back_end.update(seen)
+    at = np.arange(6)
+    mean, sigmas = back_end.state.calibration, np.sqrt(np.diag(back_end.state.P.block(at)))
+    assert back_end.relinearise()
+    again = np.sqrt(np.diag(back_end.state.P.block(at)))
+    assert again == pytest.approx(sigmas, rel=0.1)
+    assert (np.abs(back_end.state.calibration - mean) < 0.5 * sigmas[3:]).all()
+
+
+positive = st.floats(1e-4, 1e-1)
+
+
+@given(prior=positive, sigma=positive, sigmas_off=st.floats(0.0, 2.0))
+def test_near_its_prediction_a_range_counts_in_full(
+    prior: float, sigma: float, sigmas_off: float
+) -> None:
+    nu = np.array([sigmas_off * np.sqrt(prior**2 + sigma**2)]) * (1 - 1e-9)
+    weighed = huber_weighted_sigmas_m(nu, np.array([prior**2]), np.array([sigma]), 2.0)
+    np.testing.assert_array_equal(weighed, [sigma])
+
+
+@given(prior=positive, sigma=positive, sigmas_off=st.floats(2.0, 1e3))
+def test_far_from_it_a_range_moves_the_state_no_further_than_at_the_bound(
+    prior: float, sigma: float, sigmas_off: float
+) -> None:
+    """Closed form: a scalar state of variance p moves by nu p / S', which is 2 p / sqrt(S)."""
+    S = prior**2 + sigma**2
+    nu = sigmas_off * np.sqrt(S)
+    weighed = huber_weighted_sigmas_m(np.array([nu]), np.array([prior**2]), np.array([sigma]), 2.0)
+    moved = nu * prior**2 / (prior**2 + float(weighed[0]) ** 2)
+    assert moved == pytest.approx(2.0 * prior**2 / np.sqrt(S), rel=1e-9)
+
+
+def test_without_a_bound_every_range_counts_in_full() -> None:
+    weighed = huber_weighted_sigmas_m(np.array([5.0]), np.array([0.0]), np.array([1e-3]), np.inf)
+    np.testing.assert_array_equal(weighed, [1e-3])
+
+
+def test_a_doubt_is_added_to_what_the_front_end_tells_and_to_nothing_else() -> None:
+    told = RangeScan(radar=0, ranges_m=(1.0, 2.0), sigmas_m=(3e-3, 4e-3))
+    assert told.with_added_sigma(4e-3).sigmas_m == pytest.approx((5e-3, np.sqrt(32) * 1e-3))
+    assert told.with_added_sigma(0.0) is told
+    untold = RangeScan(radar=0, ranges_m=(1.0,))
+    assert untold.with_added_sigma(4e-3) is untold

@@ -1,0 +1,240 @@
+"""A robot that is carried away: noticed by what is missing, found again by what is there."""
+
+import math
+
+import numpy as np
+import pytest
+
+from hil_tests.unit.slam.robust.range_world import (
+    LAB,
+    Run,
+    Stress,
+    parameters_for,
+    reported,
+    scans_of,
+)
+from slam.config import WheelNoise
+from slam.evaluation import nees_pose
+from slam.geometry import between, compose, paper_rig, transform
+from slam.robust.back_end import RobustBackEnd
+from slam.robust.initialisation import BodyPoint, initialise_landmark
+from slam.robust.kidnapping import (
+    Evidence,
+    Localisation,
+    Surprise,
+    apply_join,
+    begin_submap,
+    find_join,
+)
+from slam.robust.map import Existence
+from slam.robust.parameters import BackEndParameters, MapRule, RelocationRule, SurpriseRule
+from slam.robust.run_log import RunLog
+from slam.robust.state import Array, State, calibrated_motion, predict
+
+SIGMA_M = 7.4e-3
+PLACES = np.array(
+    [[0.1, 0.9], [0.55, 0.7], [0.95, 1.1], [1.5, 0.8], [0.3, -0.8], [0.8, -1.0], [1.25, -0.7]]
+)
+MISSED, SEEN = 2.5, -2.5
+
+
+def mapped(places: Array) -> State:
+    """Return a state that has seen some places from its start, 5 mm well."""
+    state = State((0.007, 0.007, 0.0042), (0.0,) * 4)
+    see(state, places)
+    return state
+
+
+def see(state: State, places: Array) -> None:
+    """Give birth to places, in the body frame."""
+    for place in places:
+        initialise_landmark(
+            state,
+            BodyPoint(point_m=place, covariance=2.5e-5 * np.eye(2), by_offsets=np.zeros((2, 4))),
+        )
+
+
+def on_an_island(places: Array, seen: Array, pose: Array, apart: Array) -> State:
+    """Return a map of places, and an island begun at a pose that sees some, in truth ``apart``."""
+    state = mapped(places)
+    begin_submap(state, pose)
+    see(state, transform(between(apart, np.zeros(3)), seen))
+    return state
+
+
+def test_an_island_forgets_the_pose_and_nothing_else() -> None:
+    state = mapped(PLACES)
+    state.P.add_products(np.eye(state.P.size)[0], 0.01 * np.eye(state.P.size)[0])  # heading
+    before = [state.landmark_covariance(row) for row in range(len(PLACES))]
+    calibration = state.P.block(np.arange(3, 6))
+    begin_submap(state, np.array([3.0, 1.0, 2.0]))
+    assert np.abs(state.pose_covariance()).max() == 0.0
+    assert state.pose == pytest.approx([3.0, 1.0, 2.0])
+    assert np.array_equal(state.P.block(np.arange(3, 6)), calibration)
+    for row, covariance in enumerate(before):
+        assert state.landmark_covariance(row) == pytest.approx(covariance, abs=1e-12)
+
+
+def test_a_constellation_tells_where_the_robot_is() -> None:
+    truth = np.array([0.6, 0.1, 2.0])
+    state = on_an_island(PLACES, PLACES[[0, 1, 2, 5]], np.array([4.0, 4.0, -1.0]), truth)
+    old, new = range(7), range(7, 11)
+    join = find_join(state, new, old, MapRule(), RelocationRule())
+    assert join is not None
+    assert set(join.pairs) == {(0, 7), (1, 8), (2, 9), (5, 10)}
+    doubt = [np.trace(state.landmark_covariance(row)) for row in old]
+    apply_join(state, join, new, 1e-5)
+    assert state.pose == pytest.approx(truth, abs=1e-6)
+    assert state.landmarks_m == pytest.approx(PLACES, abs=1e-6)
+    assert len(state.landmark_ids) == 7
+    # What was seen twice is known better; the pose is as sure as landmarks of 5 mm make it.
+    for row in (0, 1, 2, 5):
+        assert np.trace(state.landmark_covariance(row)) < 0.8 * doubt[row]
+    sigmas = np.sqrt(np.diag(state.pose_covariance()))
+    assert (sigmas[:2] < 0.015).all()
+    assert (sigmas[:2] > 0.002).all()
+    assert sigmas[2] < 0.02
+    assert np.linalg.eigvalsh(state.P.full())[0] > -1e-12
+
+
+def test_a_constellation_that_fits_twice_tells_nothing() -> None:
+    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    state = on_an_island(square, square, np.zeros(3), np.zeros(3))
+    assert find_join(state, range(4, 8), range(4), MapRule(), RelocationRule()) is None
+
+
+def test_two_landmarks_or_a_strange_place_tell_nothing() -> None:
+    few = on_an_island(PLACES, PLACES[:2], np.zeros(3), np.zeros(3))
+    assert find_join(few, (7, 8), range(7), MapRule(), RelocationRule()) is None
+    strange = np.array([[0.0, 0.0], [0.61, 0.1], [0.2, 0.47], [1.3, 0.9]])
+    state = on_an_island(PLACES, strange, np.zeros(3), np.zeros(3))
+    assert find_join(state, range(7, 11), range(7), MapRule(), RelocationRule()) is None
+
+
+def looked(frames: int, missing: tuple[int, ...], seen: tuple[int, ...]) -> Surprise:
+    surprise = Surprise(SurpriseRule())
+    for pose in range(frames):
+        frame = [Evidence(id_, MISSED) for id_ in missing] + [Evidence(id_, SEEN) for id_ in seen]
+        surprise.look(frame, pose, (*missing, *seen))
+    return surprise
+
+
+def test_several_must_be_missing_and_nothing_speak_for_the_map() -> None:
+    assert not looked(500, (1,), ()).is_carried
+    assert not looked(500, (1, 2), ()).is_carried
+    assert looked(500, (1, 2, 3), ()).is_carried
+    assert not looked(500, (1, 2, 3), (4, 5)).is_carried
+    assert not looked(500, (1, 2, 3), (4, 5, 6, 7, 8)).is_suspicious
+
+
+def test_a_robot_carried_away_from_a_map_of_which_nothing_is_left_stays_lost() -> None:
+    """Else its pose, free of doubt on an island of its own, would pass for one on the map."""
+    where, log = Localisation(BackEndParameters()), RunLog(WheelNoise())
+    state, existence = mapped(PLACES[:2]), Existence(MapRule())
+    log.add_motion(np.array([0.1, 0.0, 0.0]), 1e-6 * np.eye(3), 0.0, np.zeros(3))
+    where.look([Evidence(7, MISSED)], state, log)
+    while state.landmark_ids:
+        state.remove(0)
+    where.begin_submap(state, existence, log)
+    assert np.abs(state.pose_covariance()).max() == 0.0
+    assert where.is_lost
+    assert where.lost_covariance[0, 0] >= 1.0
+    see(state, PLACES[:3])
+    where.look([Evidence(id_, MISSED) for id_ in state.landmark_ids], state, log)
+    for id_ in state.landmark_ids:
+        existence.hit(id_, 20)
+    assert where.find(state, existence, log) == ()
+    where.begin_submap(state, existence, log)
+    assert where.is_lost
+    assert where.old_map == frozenset()
+
+
+def test_what_was_mapped_after_the_robot_was_carried_is_no_witness() -> None:
+    surprise = looked(100, (), (1, 2, 3, 4))
+    for pose in range(100, 140):
+        frame = [Evidence(id_, MISSED) for id_ in (2, 3, 4)] + [
+            Evidence(id_, SEEN) for id_ in (8, 9)
+        ]
+        surprise.look(frame, pose, (1, 2, 3, 4) if pose < 115 else (1, 2, 3, 4, 8, 9))
+    assert surprise.is_carried
+    assert 100 <= surprise.first_pose <= 110
+    assert surprise.witnesses == {1, 2, 3, 4}
+
+
+def carried_run(seed: int) -> tuple[Run, int]:
+    """Return a drive past seven landmarks and back; the robot is turned by hand and goes on."""
+    rng = np.random.default_rng(seed)
+    x = np.arange(0.0, 1.5, 0.02)
+    there = np.column_stack([x, np.zeros((len(x), 2))])
+    elsewhere = np.column_stack([1.4 - x, np.full(len(x), 0.1), np.full(len(x), math.pi)])
+    there = np.vstack([there, there[::-1][:60]])
+    poses = np.vstack([there, elsewhere])
+    increments = reported(poses, LAB, rng, 0.0, unaware=len(there))
+    scans = scans_of(poses, PLACES, rng, SIGMA_M, Stress(), labelled=False)
+    return (
+        Run(poses=poses, landmarks=PLACES, increments=increments, scans=list(scans)),
+        len(there),
+    )
+
+
+def test_a_carried_robot_says_so_and_finds_itself_on_the_old_map() -> None:
+    run, cut = carried_run(0)
+    back_end = RobustBackEnd(paper_rig(), parameters_for(LAB, SIGMA_M))
+    events = []
+    for k, (increment, scans) in enumerate(zip(run.increments, run.scans, strict=True), start=1):
+        back_end.predict(increment)
+        report = back_end.update(scans)
+        events += [(k - cut, name) for name in ("carried", "relocated") if getattr(report, name)]
+        if report.lost:
+            assert math.sqrt(back_end.pose_covariance[0, 0]) > 1.0
+            assert all(mark.landmark_id < 100 for mark in back_end.landmarks())
+    assert [name for _, name in events] == ["carried", "relocated"]
+    assert 0 <= events[0][0] <= 80
+    assert np.hypot(*(back_end.pose - run.poses[-1])[:2]) < 0.03
+    assert nees_pose(back_end.pose, back_end.pose_covariance, run.poses[-1]) < 16.0
+    assert len(back_end.landmarks()) == len(PLACES)
+
+
+def test_nobody_is_carried_by_a_motion_the_wheels_report() -> None:
+    run, cut = carried_run(1)
+    back_end = RobustBackEnd(paper_rig(), BackEndParameters())
+    for increment, scans in list(zip(run.increments, run.scans, strict=True))[: cut - 1]:
+        back_end.predict(increment)
+        report = back_end.update(scans)
+        assert not report.carried
+        assert not report.lost
+
+
+def test_islands_turn_with_the_motion_that_joins_them() -> None:
+    """The pose relative to its island does not change by a join without noise."""
+    truth = np.array([-0.3, 0.4, -2.5])
+    state = on_an_island(PLACES, PLACES[:4], np.array([1.0, 2.0, 0.5]), truth)
+    seen = transform(between(state.pose, np.zeros(3)), state.landmarks_m[7:])
+    join = find_join(state, range(7, 11), range(7), MapRule(), RelocationRule())
+    assert join is not None
+    assert compose(join.motion, state.pose) == pytest.approx(truth, abs=1e-6)
+    apply_join(state, join, range(7, 11), 1e-5)
+    again = transform(between(state.pose, np.zeros(3)), state.landmarks_m[:4])
+    assert again == pytest.approx(seen, abs=1e-6)
+
+
+def test_where_the_island_was_begun_does_not_matter() -> None:
+    """Pose, map and their covariances after a join are the same for any place of the island."""
+    truth, wheels = np.array([0.2, -0.1, 0.7]), WheelNoise()
+    after = []
+    for begun in (np.zeros(3), np.array([3.0, -2.0, 2.5])):
+        state = mapped(PLACES)
+        begin_submap(state, begun)
+        for _ in range(5):
+            step = calibrated_motion(np.array([0.1, 0.0, 0.2]), state.calibration, wheels)
+            predict(state, step, wheels)
+        see(state, transform(between(truth, np.zeros(3)), PLACES[:4]))
+        join = find_join(state, range(7, 11), range(7), MapRule(), RelocationRule())
+        assert join is not None
+        apply_join(state, join, range(7, 11), 1e-5)
+        after.append(state)
+    one, other = after
+    assert one.pose == pytest.approx(truth, abs=1e-6)
+    assert other.pose == pytest.approx(truth, abs=1e-6)
+    scale = np.sqrt(np.outer(one.P.full().diagonal(), one.P.full().diagonal()))
+    assert (np.abs(one.P.full() - other.P.full()) <= 1e-3 * scale + 1e-12).all()

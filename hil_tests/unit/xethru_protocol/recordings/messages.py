@@ -1,0 +1,23 @@
+"""Small messages, and recordings read with their faults."""
+
+from pathlib import Path
+
+import numpy as np
+
+from xethru_protocol.recordings import RecordingFault, read_recording
+from xethru_protocol.wire import messages as m
+
+
+def frame(counter: int, n_bins: int = 3) -> m.DataFloat:
+    return m.DataFloat(info=counter, values=np.arange(n_bins, dtype=np.float32) + counter)
+
+
+def presence(counter: int) -> m.PresenceSingle:
+    return m.PresenceSingle(counter=counter, state=1, distance_m=1.5, direction=2, signal_quality=7)
+
+
+def read_with_faults(
+    path: Path,
+) -> tuple[list[tuple[m.Response, int | None]], list[RecordingFault]]:
+    faults: list[RecordingFault] = []
+    return list(read_recording(path, faults.append)), faults
