@@ -28,6 +28,7 @@ def test_the_state_diagram_is_that_of_the_emulated_module() -> None:
 @pytest.mark.parametrize("document", ["README.md", "CONTRIBUTING.md"])
 def test_every_path_in_a_document_exists(document: str) -> None:
     text = (REPOSITORY / document).read_text()
-    paths = re.findall(r"`((?:xethru_protocol|emulator|slam|hil_tests|fixtures|docs)/[\w./]+)`", text)
+    folders = "xethru_protocol|emulator|slam|hil_tests|fixtures|docs"
+    paths = re.findall(rf"`((?:{folders})/[\w./]+)`", text)
     assert len(paths) > 3
     assert [path for path in paths if not (REPOSITORY / path).exists()] == []
