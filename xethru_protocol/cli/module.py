@@ -145,7 +145,6 @@ class _Live:
         self._began_ns = 0  # arrival of the first
 
     def show(self, frame: Frame) -> None:
-        """Count a frame, and say so a few times a second."""
         if self._newest is None:
             self._began_ns = time.monotonic_ns()
         self._frames += 1
@@ -156,7 +155,6 @@ class _Live:
             self._write(frame, now_ns)
 
     def finish(self) -> None:
-        """Bring the line up to date and leave it."""
         if self._newest is not None:
             self._write(self._newest, time.monotonic_ns())
         warn("")

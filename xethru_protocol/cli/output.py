@@ -75,7 +75,6 @@ def print_text(text: str) -> None:
 
 
 def warn(text: str) -> None:
-    """Write a line for people."""
     show(text + "\n")
 
 
@@ -138,7 +137,6 @@ class Progress:
         self._is_open = False  # a line is there that ends in no line end
 
     def show(self, state: Callable[[], str]) -> None:
-        """Show ``state()`` if it is time to."""
         now_s = self._clock()
         if now_s - self._shown_s < (_REWRITE_S if self._rewrites else _LINE_S):
             return

@@ -174,15 +174,12 @@ class RawFrames:
     profile_id: int | None = None
 
     def prepare(self, radar: X4M300) -> None:
-        """Configure the chip."""
         radar.configure_raw(self.config)
 
     def start(self, radar: X4M300) -> float:
-        """Start frames."""
         return max(2.0, 3.0 / radar.start(self.fps))
 
     def wait(self, radar: X4M300, timeout_s: float) -> None:
-        """Take a frame."""
         _wait_for_frame(radar, timeout_s)
 
 
@@ -193,11 +190,9 @@ class Presence:
     profile_id: int | None = ProfileId.XTS_ID_APP_PRESENCE_2
 
     def prepare(self, radar: X4M300) -> None:
-        """Load the profile."""
         radar.presence.load()
 
     def start(self, radar: X4M300) -> float:
-        """Run it."""
         radar.presence.run()
         return 10.0
 
@@ -220,7 +215,6 @@ class Listen:
         """Send nothing."""
 
     def start(self, radar: X4M300) -> float:
-        """Wait for ever."""
         return float("inf")
 
     def wait(self, radar: X4M300, timeout_s: float) -> None:
@@ -265,7 +259,6 @@ class Targets:
 
     @property
     def text(self) -> str:
-        """Both names, for people."""
         return " and ".join(one_line(str(path)) for path in self.paths)
 
     @property
@@ -319,7 +312,6 @@ class Recorder:
         self._wire: WireCapture | None = None
 
     def __enter__(self) -> Self:
-        """Return the recorder itself."""
         return self
 
     def __exit__(
@@ -392,7 +384,6 @@ class Recorder:
             self.fail(error)
 
     def take_bytes(self, direction: Literal["rx", "tx"], data: bytes, t_ns: int) -> None:
-        """Write bytes of the line."""
         if self._early is not None and self._targets.wire is not None:
             self._early.append((direction, bytes(data), t_ns))
         if self._wire is None or self.failure is not None:
@@ -411,16 +402,13 @@ class Recorder:
 
     @property
     def elapsed_s(self) -> float:
-        """Time since the recording began."""
         return (time.monotonic_ns() - self._began_ns) * 1e-9
 
     @property
     def silent_s(self) -> float:
-        """Time since the newest message."""
         return (time.monotonic_ns() - self._newest_ns) * 1e-9
 
     def numbers(self) -> str:
-        """Say what was recorded so far, for people."""
         span_s = (self._newest_ns - self._began_ns) * 1e-9
         rate = f", {self.messages / span_s:.1f}/s" if span_s > 0 else ""
         return (
@@ -429,7 +417,6 @@ class Recorder:
         )
 
     def summary(self) -> dict[str, Any]:
-        """Say what was recorded, as JSON."""
         directory, wire = self._targets.directory, self._targets.wire
         return {
             "directory": None if directory is None else str(directory),

@@ -241,7 +241,6 @@ class Conversation:
     # --- hearing --------------------------------------------------------------------------------
 
     def receive(self, data: bytes, arrival_ns: int) -> None:
-        """Sort what came."""
         connection = self._connection
         try:
             connection.receive_data(data)
@@ -347,7 +346,6 @@ class Conversation:
         return ResponseTimeout(f"{missing}; {likely}")
 
     def tell(self, direction: Literal["tx", "rx", "fault", "warning"], text: str) -> None:
-        """Tell the observer."""
         if self._observer is not None:
             self._observer(ProtocolRecord(t_ns=self._clock(), direction=direction, summary=text))
 

@@ -324,11 +324,9 @@ class FrameQueue:
         self._baseband_geometry: FrameGeometry | None = None
 
     def __len__(self) -> int:
-        """Count the frames that wait."""
         return len(self._frames)
 
     def pop(self) -> Frame:
-        """Take the oldest frame."""
         frame = self._frames.popleft()
         if not self._frames:
             self._in_burst = False

@@ -94,7 +94,6 @@ class WireCapture:
         self._append(_HEAD.pack(MAGIC, VERSION, len(text)) + text)
 
     def __enter__(self) -> Self:
-        """Return the capture itself."""
         return self
 
     def __exit__(
@@ -103,7 +102,6 @@ class WireCapture:
         value: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Close the file."""
         self.close()
 
     def write(self, direction: Way, data: bytes, t_ns: int | None) -> None:

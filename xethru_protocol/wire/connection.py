@@ -60,7 +60,6 @@ class Connection:
         self._next_span = self._reader.next_span
 
     def receive_data(self, data: bytes) -> None:
-        """Take bytes from the peer, in chunks of any size."""
         self._reader.receive_data(data)
 
     def next_event(self) -> Event:

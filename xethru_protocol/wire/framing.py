@@ -299,7 +299,6 @@ class LinkStatistics:
 
     @property
     def clean(self) -> bool:
-        """Whether nothing was wrong so far."""
         return not (
             self.faults
             or self.junk_bytes
@@ -523,7 +522,6 @@ class PacketReader:
         return len(self._buffer) - self._pos + self._queued
 
     def next_packet(self) -> Packet | FramingFault | NeedData:
-        """Next packet or fault, or NEED_DATA."""
         span = self.next_span()
         if isinstance(span, tuple):
             framing, buffer, start, end, offset = span
@@ -614,7 +612,6 @@ class PacketReader:
         return FramingFault(kind=kind, offset=offset)
 
     def _skip_to(self, offset: int) -> None:
-        """Go on at ``offset``; the bytes before it belong to no packet."""
         self.statistics.junk_bytes += offset - self._base - self._pos
         self._pos = offset - self._base
 

@@ -214,13 +214,11 @@ class _Bulk(Response):
     __slots__ = ()
 
     def __eq__(self, other: object) -> bool:
-        """Equal if every bit of every field is."""
         if not isinstance(other, _Bulk) or type(other) is not type(self):
             return NotImplemented
         return self._identity() == other._identity()
 
     def __hash__(self) -> int:
-        """Hash of all bits."""
         return hash(self._identity())
 
     def _identity(self) -> tuple[bytes, ...]:

@@ -95,11 +95,9 @@ class Layout:
 
     @property
     def element_bytes(self) -> int:
-        """Bytes per element."""
         return self.columns * np.dtype(self.values).itemsize
 
     def record_size(self, header: bytes) -> int:
-        """Bytes of the record that begins with ``header``."""
         count = int(np.frombuffer(header, self.header, 1)[self.count][0])
         return self.header.itemsize + count * self.element_bytes
 
@@ -534,7 +532,6 @@ class Entry:
     end: int
 
     def pack(self) -> bytes:
-        """Bytes of the entry."""
         kind = _CLOSED if self.closed else _RECORD
         return _ENTRY.pack(
             self.since_start_ms, kind, self.data_type, self.size, self.file, self.begin, self.end
@@ -587,7 +584,6 @@ class MetaHead:
     session_id: bytes = b""
 
     def pack(self) -> bytes:
-        """Bytes of the head."""
         text = self.session_id + b"\0"
         return (
             _HEAD.pack(
@@ -664,7 +660,6 @@ def parse_meta(data: bytes) -> Meta:
 
 
 def _parse_entries(data: bytes, index: int, index_end: int) -> tuple[Index, int]:
-    """Return the entries from ``index`` on and where they end."""
     stop = min(index_end, len(data)) if index_end else len(data)
     count = max(stop - index, 0) // _ENTRY.size
     rows = np.frombuffer(data, _ROW, count, index) if count else np.empty(0, _ROW)

@@ -102,7 +102,6 @@ class DataFile:
             raise unreadable(path, error) from None
 
     def close(self) -> None:
-        """Close the file."""
         self._stream.close()
 
     def skip_user_header(self) -> None:
@@ -280,7 +279,6 @@ def vendor_facts(path: Path) -> RecordingFacts:
 
 
 def is_vendor_file(path: Path) -> bool:
-    """Whether a file's name is one that ModuleConnector gives."""
     return path.name == META_NAME or kind_of(path.name) is not None
 
 
