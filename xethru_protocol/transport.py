@@ -166,7 +166,7 @@ class SerialTransport:
 
 
 def capacity_bytes_per_s(line: object) -> float:
-    """Return what a line says that it carries at most; infinite if it says nothing."""
+    """Return the highest rate of a line; infinite if it has no known limit."""
     return float(getattr(line, "bytes_per_s", math.inf))
 
 
@@ -217,7 +217,7 @@ def _why(path: str, error: Exception) -> str:
     if number in reasons:
         return reasons[number]
     text = str(error)
-    if "exclusively lock" in text:  # pyserial tells this one by its text only
+    if "exclusively lock" in text:  # pyserial marks this one by its text only
         return reasons[errno.EAGAIN]
     if "Could not configure port" in text:
         return reasons[errno.ENOTTY]
@@ -361,7 +361,7 @@ def find_ports() -> tuple[PortInfo, ...]:
 
 
 def run_directory() -> Path:
-    """Folder in which running emulators leave word; it may not exist."""
+    """Folder in which running emulators are registered; it may not exist."""
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     if runtime and Path(runtime).is_dir():
         return Path(runtime) / "xethru"
@@ -387,7 +387,7 @@ def _emulated_ports(folder: Path) -> Iterator[PortInfo]:
                 (str(one["path"]), str(one["name"]), one["serial"]) for one in word["devices"]
             ]
         except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
-            continue  # not an emulator's word, or one that is just being written
+            continue  # not an emulator's entry, or one that is being written
         for path, name, serial_number in devices:
             if os.path.exists(path):  # False, too, for what can be no path
                 yield PortInfo(

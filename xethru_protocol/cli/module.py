@@ -16,8 +16,8 @@ from xethru_protocol.cli.output import (
     print_json,
     print_line,
     print_text,
+    print_warnings,
     rewriting,
-    say_warnings,
     warn,
 )
 from xethru_protocol.driver.frames import Frame
@@ -104,7 +104,7 @@ def stream(arguments: Namespace) -> int:
     with module_at(arguments.port, arguments.baudrate) as radar:
         radar.configure_raw(config)
         rate = radar.start(arguments.fps)
-        say_warnings(radar)
+        print_warnings(radar)
         as_json = arguments.json or arguments.samples or not is_terminal(sys.stdout)
         live = None if as_json else _Live(radar)
         try:

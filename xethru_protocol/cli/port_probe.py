@@ -308,7 +308,7 @@ class PortProbe:
 
     @property
     def is_serial_port(self) -> bool:
-        """Whether it is a device, and, where the system tells (Linux), one of a serial driver."""
+        """Whether it is a device, and of a serial driver where the system lists them (Linux)."""
         status = os.stat(self.path)
         if not stat.S_ISCHR(status.st_mode):
             return False
@@ -350,7 +350,7 @@ class PortProbe:
 
     @cached_property
     def opens(self) -> bool:
-        """Open the port; if that fails, `refusal` says why."""
+        """Open the port; if that fails, `refusal` holds the reason."""
         try:
             self._transport = SerialTransport(self.path)
         except PortUnavailable as error:

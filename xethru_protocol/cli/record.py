@@ -24,7 +24,7 @@ from xethru_protocol.cli.output import (
     one_line,
     print_json,
     print_line,
-    say_warnings,
+    print_warnings,
     warn,
 )
 from xethru_protocol.driver.link import RawConfig
@@ -153,7 +153,7 @@ class RecordingMode(Protocol):
 
     @property
     def profile_id(self) -> int | None:
-        """Profile that runs then; None if that is none, or not known."""
+        """Profile that runs then; None if there is none, or it is not known."""
 
     def prepare(self, radar: X4M300) -> None:
         """Bring the module to where it sends nothing yet; what comes meanwhile is old."""
@@ -276,12 +276,12 @@ class Targets:
 
 
 class Recorder:
-    """Writes down what a driver hears.
+    """Writes what a driver receives to files.
 
     Files are made, and older ones removed, only by `open`: a module that does not answer must
-    cost nobody an older recording. Bytes that come before that are kept until then.
+    not cost an older recording. Bytes that come before that are kept until then.
 
-    An error of a file is kept, not raised: whoever calls is in the middle of receiving.
+    An error of a file is kept, not raised: the caller is in the middle of receiving.
 
     Parameters
     ----------
@@ -352,8 +352,8 @@ class Recorder:
         if targets.wire is not None:
             self._wire = WireCapture(targets.wire, {"port": targets.port})
         early, self._early = self._early or [], None
-        for heard in early:
-            self.take_bytes(*heard)
+        for received in early:
+            self.take_bytes(*received)
 
     def listen_to(self, radar: X4M300) -> None:
         """Take the module's messages from now on; the time of the recording begins."""
@@ -362,7 +362,7 @@ class Recorder:
         radar.listener = self.take
 
     def stop_listening(self, radar: X4M300) -> None:
-        """Take nothing more; what the module says while it is stopped counts for nothing."""
+        """Take nothing more; what the module sends while it is stopped is not recorded."""
         radar.listener = None
         self._statistics = deepcopy(radar.statistics)
 
@@ -457,7 +457,7 @@ def record(arguments: Namespace) -> int:
             with module_at(arguments.port, arguments.baudrate) as radar:
                 radar.raw_listener = recorder.take_bytes
                 mode.prepare(radar)
-                say_warnings(radar)
+                print_warnings(radar)
                 recorder.open(replace=replace)
                 with stop:
                     _record_from(radar, recorder, mode, arguments.duration, stop)
@@ -490,7 +490,7 @@ def _record_from(
     recorder.listen_to(radar)
     try:
         silence_s = mode.start(radar)
-        say_warnings(radar)
+        print_warnings(radar)
         while not (stop.requested or recorder.is_enough):
             if duration_s is not None and recorder.elapsed_s >= duration_s:
                 if not recorder.messages:
@@ -502,7 +502,7 @@ def _record_from(
                     f"the module sent nothing to record for {silence_s:g} s; {likely}"
                 )
             left_s = _GLANCE_S if duration_s is None else duration_s - recorder.elapsed_s
-            mode.wait(radar, min(_GLANCE_S, left_s))  # the recorder hears what comes
+            mode.wait(radar, min(_GLANCE_S, left_s))  # the recorder gets what comes
             progress.show(recorder.numbers)
     finally:
         recorder.stop_listening(radar)

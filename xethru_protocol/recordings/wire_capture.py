@@ -75,7 +75,7 @@ class WireCapture:
     path
         A new file.
     note
-        What to say about the capture, as JSON-able values.
+        Note about the capture, as JSON-able values.
 
     Raises
     ------
@@ -177,7 +177,7 @@ def read_chunks(path: Path | str, on_fault: FaultHandler | None = None) -> Itera
 
 
 def read_note(path: Path | str) -> dict[str, Any]:
-    """Return the note of a wire capture; RecordingError if it is none."""
+    """Return the note of a wire capture; RecordingError if the file is not one."""
     path = Path(path)
     try:
         with path.open("rb") as stream:
@@ -187,11 +187,11 @@ def read_note(path: Path | str) -> dict[str, Any]:
 
 
 def wire_facts(path: Path) -> RecordingFacts:
-    """Return what the note says of the recording; defaults where it says nothing."""
+    """Return the facts in the note; defaults for those that it lacks."""
     try:
         return RecordingFacts.from_json(read_note(path).get("facts", {}))
     except (ValueError, TypeError, AttributeError) as error:
-        raise RecordingError(f"{path}: what it says about itself is damaged: {error}") from None
+        raise RecordingError(f"{path}: its description is damaged: {error}") from None
 
 
 def read_wire(path: Path, on_fault: FaultHandler | None) -> TimedMessages:

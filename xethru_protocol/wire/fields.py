@@ -1,8 +1,8 @@
-"""Kinds of wire fields: what ``Annotated[type, KIND]`` in a message may say.
+"""Kinds of wire fields: what ``KIND`` in ``Annotated[type, KIND]`` of a message may be.
 
 A kind knows how one field is packed, unpacked and shown. The codec walks a message's fields in
-order; the layouts themselves stand in the rows. All numbers are little-endian, unpadded
-(Protocol reference, head). Lists with a count of their own stand in ``wire_lists``. A kind raises
+order; the layouts themselves are in the rows. All numbers are little-endian, unpadded
+(Protocol reference, head). A kind raises
 ``struct.error`` or ``ValueError`` when the bytes do not fit; the codec turns that into
 `UnknownMessage`.
 
@@ -31,7 +31,7 @@ class Kind(Protocol):
     """One way to put a field on the wire."""
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
-        """Bytes of ``value``; ``bulk`` says that the packet travels in NoEscape framing."""
+        """Bytes of ``value``; ``bulk``: the packet travels in NoEscape framing."""
 
     def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
         """Value at ``start`` and the offset behind it."""
@@ -203,7 +203,7 @@ class ShortForm:
         return b""
 
     def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
-        """Tell the form by the bytes that are left."""
+        """Determine the form by the bytes that are left."""
         return (1 if fields[self.field] in self.short and len(data) - start == 1 else None), start
 
     def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
@@ -431,7 +431,7 @@ class Text:
 
 @dataclass(frozen=True, slots=True)
 class TypedElements:
-    """An element list whose type an earlier field tells."""
+    """An element list whose type an earlier field gives."""
 
     field: str
     types: Mapping[int, Elements]

@@ -469,7 +469,7 @@ class PacketReader:
     Parameters
     ----------
     direction
-        Who sends the bytes: it tells which NoEscape headers can be true.
+        Who sends the bytes: it decides which NoEscape headers are plausible.
     statistics
         Where to count; None: in new ones.
 
@@ -513,7 +513,7 @@ class PacketReader:
             self.statistics.bytes += len(data)
 
     def end_data(self) -> None:
-        """Tell that no more bytes will come: what is incomplete now will be a fault."""
+        """No more bytes will come: what is incomplete now becomes a fault."""
         self._ended = True
 
     @property
@@ -529,9 +529,9 @@ class PacketReader:
         return span
 
     def next_span(self) -> Span | FramingFault | NeedData:
-        """Like ``next_packet``, but tells where the payload lies instead of copying it."""
+        """Like ``next_packet``, but returns where the payload lies instead of copying it."""
         while True:
-            if self._missing and not self._refill():  # parsing would tell nothing new
+            if self._missing and not self._refill():  # parsing would give nothing new
                 if not self._ended or not self.buffered:
                     return NEED_DATA
                 fault = self._reject_last_start()

@@ -3,10 +3,10 @@
 A data file holds records without separators: a message's payload without its leading codes
 (Protocol reference 12). Data type bits: [OBS] seen in recordings of known content; [HDR] taken
 from the public header of the vendor's library, no sample at hand. File names: [FMT] Protocol
-reference 12, [OBS] seen. The kinds that are text stand in ``csv_kinds``.
+reference 12, [OBS] seen. The kinds that are text are in `CSV_KINDS`.
 
 A line is an ISO time stamp and the message's fields, separated by ``;``; the first line names the
-columns. Lists stand in square brackets, separated by commas. Known from a recording [OBS]:
+columns. Lists are in square brackets, separated by commas. Known from a recording [OBS]:
 PRESENCE_SINGLE with its header, bit and name. Bits [HDR] as in ``layouts``. Everything else is
 inferred [INF] from the message's fields in the same manner, or from what others report of such
 files; a line of another column count or order is reported, not guessed at.
@@ -43,7 +43,7 @@ Index, 33 bytes per entry::
 
 After the index: u32 duration, u8 3, u32 number of files; of each u32 length and name, with NUL.
 
-The file number and the two different origins of begin and end cannot be told from our samples,
+The file number and the two different origins of begin and end do not follow from our samples,
 which have one file each; they are what others report of split recordings in the same format.
 """
 
@@ -320,7 +320,7 @@ class CsvKind:
         Raises
         ------
         ValueError, OverflowError, LocalProtocolError
-            If the line is none of this kind.
+            If the line is of another kind.
         """
         cells = line.rstrip("\r\n").split(";")
         if len(cells) != len(self.columns) + 1:
@@ -348,7 +348,7 @@ def _stamp(time_ms: int, zone: tzinfo | None) -> str:
 def _time_ns(stamp: str) -> int:
     time = datetime.fromisoformat(stamp)
     if time.tzinfo is None:
-        time = time.astimezone()  # the zone it was written in is not told: this machine's
+        time = time.astimezone()  # the zone it was written in is not stored: this machine's
     time_ms = (time - _UNIX) // timedelta(milliseconds=1)
     if not EARLIEST_MS <= time_ms <= LATEST_MS:
         raise ValueError(f"{stamp} is beyond what 64 bits of nanoseconds hold")
@@ -607,7 +607,7 @@ class MetaHead:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Meta:
-    """A meta file as read; ``complete`` says that it was closed and nothing is missing."""
+    """A meta file as read; ``complete``: it was closed and nothing is missing."""
 
     head: MetaHead
     entries: Index
