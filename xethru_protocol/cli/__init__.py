@@ -5,6 +5,7 @@ Results go to stdout, everything else to stderr. Exit 0 done, 1 failed, 2 wrong 
 """
 
 from collections.abc import Sequence
+from importlib import import_module
 
 from xethru_protocol.system import (
     StopFlag,
@@ -36,7 +37,9 @@ def _run(argv: Sequence[str] | None) -> int:
     try:
         arguments = parse(argv)
         try:
-            code: int = arguments.run(arguments)
+            file, _, function = arguments.run.partition(":")
+            run = getattr(import_module(f"xethru_protocol.cli.{file}"), function)
+            code: int = run(arguments)
         except XeThruError as error:
             warn(f"xethru {arguments.command}: {one_line(str(error))}")
             return 1

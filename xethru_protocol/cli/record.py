@@ -5,6 +5,7 @@ none comes while a record is half written; a second one insists.
 """
 
 import time
+from argparse import Namespace
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from copy import deepcopy
@@ -13,6 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Protocol, Self
 
+from xethru_protocol.cli.arguments import raw_config
 from xethru_protocol.cli.output import (
     CommandFailed,
     Progress,
@@ -231,13 +233,6 @@ def _wait_for_frame(radar: X4M300, timeout_s: float) -> None:
         radar.read_frame(timeout_s)
 
 
-def recording_mode(profile: str, config: RawConfig, fps: float) -> RecordingMode:
-    """Mode by its name on the command line: raw, presence or none."""
-    if profile == "raw":
-        return RawFrames(config=config, fps=fps)
-    return Presence() if profile == "presence" else Listen()
-
-
 _ANSWERS = (
     *(Ack, Error, Pong, System),
     *(ReplyByte, ReplyFloat, ReplyInt, ReplyNone, ReplyString, ReplyUser),
@@ -448,32 +443,40 @@ class Recorder:
 _GLANCE_S = 0.2  # how late a signal, or the end, may be noticed
 
 
-def record(
-    port: str,
-    baudrate: int,
-    mode: RecordingMode,
-    targets: Targets,
-    *,
-    count: int | None,
-    duration_s: float | None,
-    replace: bool,
-    as_json: bool,
-) -> int:
-    """Record until ``count`` messages, ``duration_s``, a signal, unplugging or a full disk."""
+def record(arguments: Namespace) -> int:
+    """Record until ``--count``, ``--duration``, a signal, unplugging or a full disk."""
+    config = raw_config(arguments)
+    if arguments.out is None and arguments.wire is None:
+        arguments.refuse("--out DIR is missing, or --wire FILE, or both")
+    if arguments.out == arguments.wire:
+        arguments.refuse("--out and --wire must not be the same")
+    mode: RecordingMode = Listen()
+    if arguments.profile == "raw":
+        mode = RawFrames(config=config, fps=arguments.fps)
+    elif arguments.profile == "presence":
+        mode = Presence()
+    targets = Targets(
+        directory=Path(arguments.out) if arguments.out else None,
+        wire=Path(arguments.wire) if arguments.wire else None,
+        session_id=arguments.session_id,
+        profile_id=mode.profile_id,
+        port=arguments.port,
+    )
+    replace = arguments.force
     targets.check(replace=replace)
     stop = StopFlag("previous")
-    with Recorder(targets, count) as recorder:
+    with Recorder(targets, arguments.count) as recorder:
         try:
-            with module_at(port, baudrate) as radar:
+            with module_at(arguments.port, arguments.baudrate) as radar:
                 radar.raw_listener = recorder.take_bytes
                 mode.prepare(radar)
                 say_warnings(radar)
                 recorder.open(replace=replace)
                 with stop:
-                    _record_from(radar, recorder, mode, duration_s, stop)
+                    _record_from(radar, recorder, mode, arguments.duration, stop)
         except XeThruError as error:
             recorder.fail(error)
-    if as_json:
+    if arguments.json:
         print_json(recorder.summary() | {"ended_by": _end(recorder, stop)})
     elif recorder.failure is None and recorder.messages:
         print_line(f"{targets.text}: {recorder.numbers()}")

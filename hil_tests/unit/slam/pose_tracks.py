@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.paper.pipeline import PoseAt
+from slam.results import PoseAt
 
 Array = NDArray[np.float64]
 

@@ -24,9 +24,9 @@ from slam.app.experiments.limit_cells import (
 )
 from slam.config import SlamConfig, override
 from slam.frames import RadarFrame
+from slam.front_end import make_detector
 from slam.front_end.matched_filter import _MEDIAN_EFFICIENCY
 from slam.front_end.overlapping import SplitTest
-from slam.front_end.paper import make_detector
 
 Array = NDArray[np.float64]
 

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from slam.config import SampleTime, SlamConfig, TrilaterationConfig, WindowConfig
 from slam.frames import Detection
 from slam.geometry import Mount, Rig, mount_at, paper_rig
-from slam.paper.pipeline import StepResult, UwbRadarSlam
+from slam.paper.pipeline import UwbRadarSlam
 from slam.paper.trilateration import Trilaterator
+from slam.results import StepResult
 
 Array = NDArray[np.float64]
 

@@ -19,10 +19,10 @@ from hil_tests.property.robust_oracles import (
     turn,
     values,
 )
+from slam.config import WheelNoise
 from slam.geometry import paper_rig
-from slam.robust.initialisation import BodyPoint, give_birth, point_rows, update_with_point
+from slam.robust.initialisation import BodyPoint, initialise_landmark, point_rows, update_with_point
 from slam.robust.map import apply_merge
-from slam.robust.parameters import WheelNoise
 from slam.robust.ranges import Rows, antennas_of, rows_of, view
 from slam.robust.state import State, SymmetricMatrix, calibrated_motion, predict, quarter_turn
 
@@ -132,7 +132,7 @@ def test_no_landmark_becomes_surer_than_the_start(seed: int, n_steps: int) -> No
     state.P = SymmetricMatrix(P)
     truth = np.array([1.0, 0.5])
     point = BodyPoint(point_m=truth, covariance=1e-4 * np.eye(2), by_offsets=np.zeros((2, 4)))
-    give_birth(state, point)
+    initialise_landmark(state, point)
     for _ in range(n_steps):
         radar = int(rng.integers(N_RADARS))
         see(state, radar, 0, foreseen(state, radar, 0) + 0.01 * rng.normal())
@@ -232,7 +232,7 @@ Birth = Callable[[State, BodyPoint], int]
 
 def identity_birth(state: State, point: BodyPoint) -> int:
     """Give a new landmark P = I and no correlation with anything."""
-    give_birth(state, point)
+    initialise_landmark(state, point)
     P = state.P.full()
     P[-2:, :] = P[:, -2:] = 0.0
     P[-2:, -2:] = np.eye(2)
@@ -242,7 +242,7 @@ def identity_birth(state: State, point: BodyPoint) -> int:
 
 def uncorrelated_birth(state: State, point: BodyPoint) -> int:
     """Forget the covariance of a new landmark with the rest."""
-    give_birth(state, point)
+    initialise_landmark(state, point)
     P = state.P.full()
     P[-2:, :-2] = P[:-2, -2:] = 0.0
     state.P = SymmetricMatrix(P)
@@ -281,7 +281,7 @@ def check_birth(birth: Birth, law: settings) -> None:
 
 
 def test_new_landmark_is_the_limit_of_a_prior_of_1e12() -> None:
-    check_birth(give_birth, few)
+    check_birth(initialise_landmark, few)
 
 
 @pytest.mark.parametrize("mutant", [identity_birth, uncorrelated_birth])

@@ -25,15 +25,15 @@ from hil_tests.property.robust_oracles import (
     turn,
     values,
 )
+from slam.config import WheelNoise
 from slam.geometry import paper_rig
 from slam.robust.initialisation import (
     BodyPoint,
     RangeBearing,
-    give_birth,
+    initialise_landmark,
     point_rows,
     range_bearing_rows,
 )
-from slam.robust.parameters import WheelNoise
 from slam.robust.ranges import RangeScan, antennas_of, rows_of, view
 from slam.robust.run_log import Estimate, Problem, start_prior
 from slam.robust.smoother import measurement_residuals, motion_residuals
@@ -150,7 +150,7 @@ def test_a_new_landmark_is_correlated_as_its_formula_says(seed: int, heading: fl
     rng = np.random.default_rng(seed)
     b, D = rng.uniform(-1, 1, 2), rng.standard_normal((2, N_RADARS))
     C = 1e-4 * np.diag([1.0, 2.0])
-    give_birth(state, BodyPoint(point_m=b, covariance=C, by_offsets=D))
+    initialise_landmark(state, BodyPoint(point_m=b, covariance=C, by_offsets=D))
     mean = values(before).astype(np.complex128)
     born = mean[1:3] + turn(mean[0]) @ b
 

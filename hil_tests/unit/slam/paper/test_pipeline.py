@@ -28,7 +28,8 @@ from slam.evaluation import ate_rmse_m
 from slam.frames import Detection, RadarFrame
 from slam.geometry import Mount, Rig, paper_rig
 from slam.paper.ekf import motion_noise
-from slam.paper.pipeline import StepResult, UwbRadarSlam
+from slam.paper.pipeline import UwbRadarSlam
+from slam.results import StepResult
 
 Array = NDArray[np.float64]
 

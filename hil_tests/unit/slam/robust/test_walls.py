@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from hil_tests.unit.slam.robust.range_world import LAB, odometry_path, reported, true_path
+from slam.config import WheelNoise
 from slam.evaluation import nees_pose
 from slam.geometry import paper_rig
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.initialisation import Leftover, Slot
+from slam.robust.initialisation import Slot, UnassignedRange
 from slam.robust.map import Law, Sightings, compare
-from slam.robust.parameters import BackEndParameters, RangeNoise, WallRule, WheelNoise
+from slam.robust.parameters import BackEndParameters, RangeNoise, WallRule
 from slam.robust.ranges import Antennas, RangeScan, antennas_of, rows_of, view
 from slam.robust.run_log import Estimate, RunLog, start_prior
 from slam.robust.smoother import measurement_residuals, prior_about, prior_cost, prior_terms
@@ -23,7 +24,7 @@ from slam.robust.walls import (
     WallCells,
     WallTracker,
     WallTracklet,
-    give_birth_to_wall,
+    initialise_wall,
     is_unresolved,
     match_wall,
     update_with_wall,
@@ -119,7 +120,7 @@ def test_birth_of_a_wall_is_the_limit_of_an_unknown_wall_seen() -> None:
     born, seen = state_with_map(), seen_wall()
     born.remove(3)
     other = deepcopy(born)
-    wall_id = give_birth_to_wall(born, seen)
+    wall_id = initialise_wall(born, seen)
     assert born.feature_ids[-1] == wall_id
     other.augment_wall(born.walls[-1], np.zeros((other.P.size, 2)), 1e6 * np.eye(2))
     update_with_wall(other, 1, seen)
@@ -145,7 +146,7 @@ def test_a_landmark_born_later_goes_before_the_walls() -> None:
 
 def test_walls_match_only_where_they_were_seen() -> None:
     state, seen, cells, rule = state_with_map(), seen_wall(), WallCells(0.1), WallRule()
-    wall_id = give_birth_to_wall(state, seen)
+    wall_id = initialise_wall(state, seen)
     row = state.wall_ids.index(wall_id)
     along = seen.in_map(state) @ np.array([-math.sin(1.9), math.cos(1.9)])
     cells.add(wall_id, along)
@@ -283,7 +284,7 @@ def test_four_bare_walls_hold_the_robot_and_become_no_points() -> None:
         back_end.update(scans)
     assert back_end.landmarks() == ()
     rough = dict.fromkeys(back_end.state.wall_ids, WallRule().roughness_m)
-    assert back_end.state.range_doubts_m == rough
+    assert back_end.state.shape_sigmas_m == rough
     true_d_m = {0: 3.0, 1: 3.0, 2: 1.0, 3: 1.0}
     for wall in back_end.walls():
         quarter = round(wall.phi_rad / (math.pi / 2))
@@ -348,7 +349,7 @@ def tracklet_of(shape: Array, offset_sigma_m: float) -> tuple[WallTracker, WallT
         for radar, mount in enumerate(paper_rig().mounts[:2]):
             range_m = WALL_Y_M - mount.y_m + OFFSET_M + miss
             x = mount.x_m - back * STEP_M
-            heard = [Leftover(range_m, None, SIGMA_M)]
+            heard = [UnassignedRange(range_m, None, SIGMA_M)]
             slots.append(
                 Slot(back, radar, x, mount.y_m, mount.yaw_rad, 0.0, heard, (mount.x_m, mount.y_m))
             )

@@ -49,7 +49,7 @@ from slam.config import load_preset
 from slam.evaluation import ate_rmse_m
 from slam.frames import RadarFrame
 from slam.geometry import Mount
-from slam.robust.pipeline import make_slam
+from slam.pipelines import make_slam
 from xethru_protocol.driver.frames import Frame, FrameGeometry
 from xethru_protocol.system import StopFlag
 from xethru_protocol.wire.errors import Disconnected, ResponseTimeout
