@@ -53,7 +53,6 @@ def dense(rows: Rows, size: int) -> Array:
 
 
 def see(state: State, radar: int, landmark: int, range_m: float, sigma_m: float = SIGMA_M) -> float:
-    """Update with one range and return its NIS."""
     rows = rows_for(state, [radar], [landmark])
     residual = np.array([range_m]) - rows.predicted_m
     return state.update(rows.at, rows.H, residual, np.array([sigma_m**2]))[0]

@@ -8,9 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from hil_tests.property.ekf_oracles import complex_step, move, observe, place
-from hil_tests.unit.slam.pose_tracks import at_rest
 from hil_tests.unit.slam.robust.range_world import CLASSROOM, LAB, Room
-from hil_tests.unit.slam.simulation import FRAME_NS, World, simulate
+from hil_tests.unit.slam.simulation import FRAME_NS, World, at_rest, simulate
 from slam.config import (
     AssociationConfig,
     ClusteringConfig,
