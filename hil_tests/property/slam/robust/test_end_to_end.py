@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from hil_tests.property.slam.front_end.test_detection import N_BINS, frame, pulse
 from hil_tests.system.short_scene import write_short_scene
-from hil_tests.unit.slam.pose_tracks import at_rest
 from hil_tests.unit.slam.robust.range_world import LAB
-from hil_tests.unit.slam.simulation import FRAME_NS, World, integrate, simulate
+from hil_tests.unit.slam.simulation import FRAME_NS, World, at_rest, integrate, simulate
 from slam.app.run.runner import execute
 from slam.app.sweep.run import make_case, source_of
 from slam.config import WheelNoise, load_preset, override

@@ -387,8 +387,6 @@ class Drive:
 
 @dataclass
 class Heard(SessionObserver):
-    """What an observer of a run was told."""
-
     scans: list[Scan] = field(default_factory=list)
 
     def on_scan(self, scan: Scan) -> None:
