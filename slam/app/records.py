@@ -8,22 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import RadarFrame
-from slam.paper.pipeline import StepResult
+from slam.results import StepResult
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RadarInfo:
-    """One radar of a run: who it is, where it is mounted, how its samples lie in range and time.
+    """One radar of a run: its identity, mount, and the range and time of its samples.
 
     `range_start_m` and `bin_length_m` are module metres, as FRAMEAREA was read back; the same in
     true metres are in every RadarFrame. `start_skew_ns` is the session time of counter 0.
-    `gain_db` is how much louder it hears than the mean of the rig: SLAM is given its samples less
-    that, the session holds them as they came.
+    `gain_db` is its gain over the mean of the rig: SLAM gets samples without it, the session holds
+    them as received.
     """
 
     name: str
@@ -45,7 +47,7 @@ class RadarInfo:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SessionInfo:
-    """What a run is: enough to name it, to repeat it and to read its frames.
+    """Describes a run: enough to name it, to repeat it and to read its frames.
 
     Attributes
     ----------
@@ -54,23 +56,23 @@ class SessionInfo:
     radars
         In the order of the rig.
     true_landmarks_m
-        Shape (n, 2), world frame; (0, 2) where nobody knows.
+        Shape (n, 2), world frame; (0, 2) if unknown.
     versions
         Of what the numbers depend on.
     config_json
-        SLAM's settings, by `session_head.settings_text`; "" where they are not told.
+        SLAM's settings, by `slam.app.session.messages.settings_text`; "" if not recorded.
     wheels
-        Fields of `WheelNoise`: how SLAM was told the wheels err.
+        Fields of `WheelNoise`: the wheel errors that SLAM assumes.
     outlines_m
         Lines of walls and boxes for pictures, shape (k, 2) each, world frame.
     simulated
         Whether radars and world are emulated.
     time_base
-        What the frames' stamps come from: "counter" or "arrival".
+        Source of the frames' stamps: "counter" or "arrival".
     has_detections
         Whether ranges were recorded that SLAM takes instead of what it finds in frames.
     started_unix_ns
-        Time of day at session time 0; None where it means nothing.
+        Time of day at session time 0; None if it has no meaning.
     """
 
     scene: str
@@ -93,11 +95,10 @@ class Scan:
     """The frames of one tick, at most one per radar; a missing radar lost its frame.
 
     A tick is one frame period; `counter` numbers them from session time 0, and `t_ns` is when a
-    radar without start skew samples, whether there is one or not. Every frame has its own stamp,
-    in the period that begins with `t_ns`. The counters of the frames are that of the tick, less
-    the whole periods that their radar started late (none, unless it started more than one late).
-    `host_ns` holds for each frame when it arrived, nanoseconds since 1970; () where nobody noted.
-    One that is not `used` is recorded only: SLAM was not stepped with it, as odometry was missing.
+    radar without start skew samples. Every frame has its own stamp, in the period that begins with
+    `t_ns`. The counter of a frame is that of the tick, less the whole periods that its radar
+    started late. `host_ns` holds the arrival of each frame, nanoseconds since 1970; () if unknown.
+    A scan that is not `used` is recorded only: SLAM was not stepped with it.
     """
 
     counter: int
@@ -128,7 +129,7 @@ class Snapshot:
     nis_per_dof
         One value per observation that was associated with a landmark at this state.
     step
-        Everything that led to the state, for views; None where it came from a file.
+        Everything that led to the state, for views; None if it was read from a file.
     """
 
     counter: int
@@ -162,7 +163,7 @@ class SessionObserver:
     """
 
     def on_scan(self, scan: Scan) -> None:
-        """Take the frames of one counter."""
+        """Take the frames of one tick."""
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         """Take a state of SLAM."""
@@ -172,3 +173,14 @@ class SessionObserver:
 
     def close(self) -> None:
         """Finish; called once, also after a failure."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()

@@ -12,7 +12,7 @@ one flat array, cut by the sum of ``frame_bins`` (for pairs: all of the first, t
 
 Everything else is ragged: ``message_payload`` u1, cut at ``message_end``, with ``message_t_ns``,
 ``message_index``, ``message_name`` and ``message_fields``, the fields as JSON for reading (the
-payload decides). ``facts`` is what the recording says about itself, as JSON.
+payload decides). ``facts`` are those of the recording, as JSON.
 
 An archive that was cut cannot be read at all: it is for finished recordings. Samples are written
 and read a message at a time; only headers and what is no bulk message are held in memory.

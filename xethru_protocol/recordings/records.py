@@ -21,7 +21,7 @@ class RecordingError(XeThruError):
 class RecordingFault:
     """A damaged part: what could not be read of ``file`` at byte ``offset``, and why.
 
-    ``minor`` says that no message is lost, only its time or the order among several files.
+    ``minor``: no message is lost, only its time or the order among several files.
     """
 
     file: str
@@ -116,7 +116,7 @@ TimedMessages = Iterator[Timed]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RadarFacts:
-    """What a recording says of one of its radars besides the messages.
+    """Facts about one radar of a recording.
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ class RadarFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingFacts:
-    """What a recording says about itself besides its messages.
+    """Facts about a recording, beside its messages.
 
     Attributes
     ----------

@@ -73,7 +73,7 @@ class WireCapture:
     path
         A new file.
     note
-        What to say about the capture, as JSON-able values.
+        Note about the capture, as JSON-able values.
 
     Raises
     ------
@@ -166,11 +166,11 @@ def read_note(path: Path | str) -> dict[str, Any]:
 
 
 def wire_facts(path: Path) -> RecordingFacts:
-    """Return what the note says of the recording; defaults where it says nothing."""
+    """Return the facts in the note; defaults for those that it lacks."""
     try:
         return RecordingFacts.from_json(read_note(path).get("facts", {}))
     except (ValueError, TypeError, AttributeError) as error:
-        raise RecordingError(f"{path}: what it says about itself is damaged: {error}") from None
+        raise RecordingError(f"{path}: its description is damaged: {error}") from None
 
 
 def read_wire(path: Path, on_fault: FaultHandler | None) -> TimedMessages:

@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hil_tests.property.message_strategies import messages, of_type
-from hil_tests.property.wire_streams import STREAMS
 from xethru_protocol.wire import fields
 from xethru_protocol.wire.codec import (
     decode_command,
@@ -21,7 +20,7 @@ from xethru_protocol.wire.codec import (
 )
 from xethru_protocol.wire.codes import X4Setting
 from xethru_protocol.wire.connection import Connection, Role
-from xethru_protocol.wire.framing import NEED_DATA, FramingFault
+from xethru_protocol.wire.framing import NEED_DATA
 from xethru_protocol.wire.messages import X4DriverSet
 from xethru_protocol.wire.table import (
     COMMANDS,
@@ -158,11 +157,3 @@ def test_a_module_hears_what_a_host_says(sent: list[Any]) -> None:
     host, module = Connection(Role.HOST), Connection(Role.MODULE)
     module.receive_data(b"".join(map(host.send, sent)))
     assert events(module) == sent
-
-
-@given(STREAMS)
-def test_any_bytes_give_messages_and_faults_and_never_raise(stream: bytes) -> None:
-    for role in Role:
-        connection = Connection(role)
-        connection.receive_data(stream)
-        assert all(isinstance(event, Message | FramingFault) for event in events(connection))

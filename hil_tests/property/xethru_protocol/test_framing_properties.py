@@ -137,16 +137,6 @@ def test_garbage_without_start_bytes_hides_nothing(parts: list[tuple[bytes, byte
     assert [offset for offset, _ in packets_in(found)] == offsets
 
 
-@given(STREAMS)
-def test_after_the_end_nothing_is_left_over(stream: bytes) -> None:
-    reader = PacketReader()
-    reader.receive_data(stream)
-    reader.end_data()
-    while reader.next_packet() is not NEED_DATA:
-        pass
-    assert reader.buffered == 0
-
-
 @given(st.binary(min_size=1, max_size=200))
 def test_what_is_framed_is_read_back(payload: bytes) -> None:
     assert packets_in(read_all(encode_normal(payload), [])) == [(0, payload)]

@@ -141,7 +141,7 @@ def test_books_balance_for_any_bytes_in_any_chunks(stream: bytes, cuts: list[int
         )
 
 
-@given(NASTY | st.binary(max_size=200))
+@given(STREAMS | NASTY | st.binary(max_size=200))
 def test_messages_of_any_bytes_are_counted(stream: bytes) -> None:
     for role in Role:
         connection = Connection(role)

@@ -1,4 +1,4 @@
-"""A small ``python -m hil_tests.bench.hostile_client``, and the same at real ports."""
+"""Small runs of two benchmarks, hostile clients and corrupted traffic, and hosts at real ports."""
 
 import contextlib
 import os
@@ -9,6 +9,16 @@ from pathlib import Path
 import pytest
 
 from emulator.chip import Pace
+from hil_tests.bench.corrupted_traffic import (
+    SWALLOWED_BULK,
+    SWALLOWED_MERGED,
+    SWALLOWED_NORMAL,
+    Outcome,
+    run_command,
+)
+from hil_tests.bench.corrupted_traffic import (
+    run as run_traffic,
+)
 from hil_tests.bench.hostile_client import MOST_OBJECTS_GROWN, run
 from hil_tests.device.serving import Served, emulator
 from hil_tests.patience import seconds
@@ -129,3 +139,42 @@ def test_hostile_hosts_at_real_ports() -> None:
             assert ping_through_whatever(path), path
         os.close(watched.fd)
         assert served.end() == 0
+
+
+def check(outcome: Outcome) -> None:
+    """Every packet that no damage touched was found, or is known to be inside another."""
+    statistics = outcome.statistics
+    assert statistics.bytes == outcome.bytes
+    assert outcome.found + outcome.missed.total() == outcome.untouched
+    assert set(outcome.missed) <= {SWALLOWED_NORMAL, SWALLOWED_MERGED, SWALLOWED_BULK}
+    assert outcome.missed.total() <= 1e-3 * outcome.untouched + 1
+
+
+@pytest.mark.parametrize("rate", [1e-5, 1e-3])
+def test_mixed_traffic(rate: float) -> None:
+    outcome = run_traffic(1_000_000, rate, 1, short=False)
+    check(outcome)
+    assert outcome.untouched > (0.4 if rate == 1e-3 else 0.9) * outcome.packets
+    assert outcome.damaged_bytes > 0
+
+
+def test_short_packets_with_a_hundredth_of_all_bytes_damaged() -> None:
+    outcome = run_traffic(200_000, 1e-2, 1, short=True)
+    check(outcome)
+    assert outcome.untouched > 0.8 * outcome.packets
+    assert outcome.statistics.checksum_failures > 100
+
+
+def test_undamaged_traffic_is_found_whole() -> None:
+    outcome = run_traffic(1_000_000, 0.0, 1, short=False)
+    assert outcome.found == outcome.untouched == outcome.packets == outcome.statistics.packets
+    assert outcome.statistics.clean
+
+
+def test_the_command_finds_the_same() -> None:
+    outcome = run_traffic(300_000, 1e-3, 2, short=False)
+    command = run_command(300_000, 1e-3, 2, short=False)
+    assert command.exit_code == 0
+    assert command.statistics == outcome.statistics.summary()
+    assert command.faults == outcome.statistics.faults.total()
+    assert command.lines - command.faults == outcome.statistics.packets

@@ -116,7 +116,7 @@ def test_of_a_real_drive_it_tells_no_error(tmp_path: Path) -> None:
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "measured data" in page
     assert "simulated" not in page
-    assert "Nothing true is known of this drive" in page
+    assert "The truth of this drive is unknown" in page
     assert "begun 2026-09-21 14:13:20 UTC" in page
     assert "ATE" not in page
     assert "nearest truth" not in page

@@ -26,12 +26,14 @@ from hil_tests.system.recorded_session import (
 from slam.app.cli import main
 from slam.app.commands.view import is_finished, session_file
 from slam.app.errors import AppError
-from slam.app.run.replay import replay_session
+from slam.app.run.replay import recorded_source
+from slam.app.run.runner import execute
 from slam.app.session.reader import open_session
 from slam.app.view import rerun_recording
 from slam.app.view.rerun_recording import count_rows
 from slam.app.view.rerun_sdk import RrdReader, rr
 from slam.app.view.viewer import LiveView, executable
+from xethru_protocol.system import StopFlag
 
 pytestmark = pytest.mark.slow
 
@@ -159,7 +161,7 @@ def test_a_run_goes_on_when_its_viewer_is_killed(
     viewed: Viewed, capsys: pytest.CaptureFixture[str]
 ) -> None:
     session = open_session(viewed.session)
-    with LiveView("serve-web", lambda: None) as live:
+    with LiveView("serve-web", StopFlag()) as live:
         watcher = live.observer(session.info)
         for number, (scan, _) in enumerate(session.scans()):
             if number == 20:
@@ -175,7 +177,7 @@ def test_an_address_where_nobody_listens_is_named(capsys: pytest.CaptureFixture[
         probe.bind(("127.0.0.1", 0))  # bound and not listening: nobody else gets it meanwhile
         url = f"rerun+http://127.0.0.1:{probe.getsockname()[1]}/proxy"
         with pytest.raises(AppError, match=f"^{re.escape(url)}: no viewer listens there"):
-            LiveView(url, lambda: None).__enter__()
+            LiveView(url, StopFlag()).__enter__()
     with pytest.raises(SystemExit) as usage:
         main(["demo", "--rerun", "http://127.0.0.1:9876"])
     assert usage.value.code == 2
@@ -202,10 +204,8 @@ def test_a_viewer_gets_every_row_that_a_file_gets(
     expected = without_pictures(viewed.rrd)
     with saving_viewer(saved := tmp_path / "saved.rrd") as url:
         session = open_session(viewed.session)
-        with LiveView(url, lambda: None, is_replay=True) as live:
-            view = live.observer(session.info)
-            replay_session(session, [view], lambda: None)
-            view.close()
+        with LiveView(url, StopFlag(), is_replay=True) as live:
+            execute(recorded_source(session, StopFlag()), [live.observer(session.info)])
         wait_until(lambda: without_pictures(saved) == expected)
     assert without_pictures(saved) == expected
     assert sum(expected.values()) > 1000

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -11,9 +13,12 @@ from emulator.chip import Pace
 from emulator.chip.chip import CaptureSettings
 from emulator.device import BootTiming, Device, radar_device
 from emulator.module.memory import Identity
+from emulator.ports.server import Server
+from hil_tests.patience import seconds
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import SensorMode, X4Setting
 from xethru_protocol.wire.connection import Connection, Role
+from xethru_protocol.wire.framing import NeedData
 
 IDENTITY = Identity(serial="202611210001")
 
@@ -83,13 +88,17 @@ class BareHost:
         (reply,) = self.hear(1)
         return reply
 
+    def command(self, *commands: m.Command[m.Ack]) -> None:
+        """Send commands, each of which must be acknowledged."""
+        for one in commands:
+            assert self.ask(one) == m.Ack()
+
     def set(self, setting: X4Setting, value: m.X4Value) -> None:
         assert self.ask(m.X4DriverSet(setting=setting, value=value)) == m.Ack()
 
     def enter_manual(self) -> None:
-        for mode in (SensorMode.XTID_SM_STOP, SensorMode.XTID_SM_MANUAL):
-            assert self.ask(m.SetMode(mode=mode)) == m.Ack()
-        assert self.ask(m.X4DriverInit()) == m.Ack()
+        stop, manual = SensorMode.XTID_SM_STOP, SensorMode.XTID_SM_MANUAL
+        self.command(m.SetMode(mode=stop), m.SetMode(mode=manual), m.X4DriverInit())
 
     def frames(self, count: int) -> list[m.DataFloat]:
         heard = self.hear(count)
@@ -99,3 +108,47 @@ class BareHost:
 
 def ramp_device(pace: Pace = Pace.ASAP, source: RampSource | None = None) -> Device:
     return radar_device(IDENTITY, source or RampSource(), pace, boot=BootTiming())
+
+
+class PortHost:
+    """A host at the other end of a line, which turns the server as it waits."""
+
+    def __init__(self, fd: int, server: Server) -> None:
+        self.fd = fd
+        self.server = server
+        self.line = Connection(Role.HOST)
+
+    def send(self, command: m.Command[m.Response]) -> None:
+        os.write(self.fd, self.line.send(command))
+
+    def hear(self) -> m.Message:
+        give_up_s = time.monotonic() + seconds(60)  # only ends a test that has failed
+        while time.monotonic() < give_up_s:
+            event = self.line.next_event()
+            if isinstance(event, m.Message):
+                return event
+            assert isinstance(event, NeedData), event
+            try:
+                data = os.read(self.fd, 65536)
+                assert data, "hung up"
+                self.line.receive_data(data)
+            except BlockingIOError:
+                self.server.turn(longest_wait_s=0.01)
+        raise AssertionError("the device says nothing")
+
+    def ask(self, command: m.Command[m.Response]) -> m.Message:
+        self.send(command)
+        return self.hear()
+
+    def stream(self, fps: float = 17.0) -> None:
+        for command in (
+            m.SetMode(mode=SensorMode.XTID_SM_MANUAL),
+            m.X4DriverInit(),
+            m.X4DriverSet(setting=X4Setting.FPS, value=fps),
+        ):
+            assert self.ask(command) == m.Ack()
+
+    def close(self) -> None:
+        if self.fd >= 0:
+            os.close(self.fd)
+            self.fd = -1

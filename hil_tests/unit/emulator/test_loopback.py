@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 
@@ -22,11 +20,9 @@ def test_virtual_time_makes_a_silent_module_time_out_at_once() -> None:
     transport = LoopbackTransport(ramp_device())
     with X4M300(transport, clock=transport.clock_ns) as radar:
         radar.configure_raw()  # ends the profile
-        began = time.monotonic()
         with pytest.raises(ResponseTimeout):
             radar.read_frame(timeout_s=3600.0)
         assert transport.clock_ns() >= 3600 * 10**9
-        assert time.monotonic() - began < 5
 
 
 def test_a_reset_takes_no_wall_time() -> None:

@@ -31,8 +31,7 @@ def device(options: DeviceOptions | None = None) -> Device:
 
 def loaded(options: DeviceOptions | None = None) -> BareHost:
     host = BareHost(device(options))
-    assert host.ask(STOP) == m.Ack()
-    assert host.ask(LOAD) == m.Ack()
+    host.command(STOP, LOAD)
     return host
 
 
@@ -225,8 +224,7 @@ def test_noise_maps_are_files() -> None:
         assert host.ask(m.StoreNoiseMap()) == m.Ack()
         assert host.ask(m.StoreNoiseMap()) == m.Error(code=3), "one is under way"
         assert host.ask(m.FindAllFiles()) == found
-        assert host.ask(m.LoadNoiseMap()) == m.Ack()
-        assert host.ask(m.DeleteNoiseMap(sub_code=sub_code)) == m.Ack()
+        host.command(m.LoadNoiseMap(), m.DeleteNoiseMap(sub_code=sub_code))
         assert host.ask(m.FindAllFiles()) == m.ReplyInt(values=())
         host.now_ns += SECOND
     assert host.ask(m.DeleteNoiseMap()) == m.Ack(), "also if there is none"
@@ -257,8 +255,7 @@ TWO_PROFILES = frozenset({ProfileId.XTS_ID_APP_PRESENCE_2, ProfileId.XTS_ID_APP_
 
 def test_each_profile_has_its_own_settings() -> None:
     host = loaded(DeviceOptions(profiles=TWO_PROFILES))
-    assert host.ask(m.SetSensitivity(sensitivity=8)) == m.Ack()
-    assert host.ask(m.LoadApp(profile_id=PRESENCE_3)) == m.Ack()
+    host.command(m.SetSensitivity(sensitivity=8), m.LoadApp(profile_id=PRESENCE_3))
     assert host.ask(m.GetSensitivity()) == m.ReplyInt(content_id=0x10A5112B, values=(5,))
     assert host.ask(LOAD) == m.Ack()
     assert host.ask(m.GetSensitivity()) == m.ReplyInt(content_id=0x10A5112B, values=(8,))

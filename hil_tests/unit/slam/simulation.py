@@ -11,34 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hil_tests.unit.slam.robust.range_world import STEP_M, TURN_STEPS, Room
 from slam.frames import Detection
 from slam.geometry import Rig
+from slam.results import PoseAt
 
 Array = NDArray[np.float64]
 
 FRAME_NS = 200_000_000
-STEP_M = 0.01
-TURN_STEPS = 16
 HALF_VIEW_RAD = math.radians(32.5)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Room:
-    """What differs between the two experiments."""
-
-    side_m: float
-    n_landmarks: int
-    min_spacing_m: float
-    scale_sigma: float
-    curvature_sigma: float
-
-
-LAB = Room(
-    side_m=2.0, n_landmarks=14, min_spacing_m=0.35, scale_sigma=0.007, curvature_sigma=0.0042
-)
-CLASSROOM = Room(
-    side_m=3.0, n_landmarks=10, min_spacing_m=1.0, scale_sigma=0.023, curvature_sigma=0.0139
-)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -143,3 +124,8 @@ def _wheels(increments: Array, room: Room, rng: np.random.Generator, amount: flo
         increments[:, 2] * (1 + turn_scale) + curvature * distance + heading_sigma * noise[:, 2]
     )
     return measured
+
+
+def at_rest(pose: Array) -> PoseAt:
+    """Return odometry that gives one pose, whatever the time: all radars sample at once."""
+    return lambda t_ns: pose

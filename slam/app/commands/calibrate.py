@@ -6,7 +6,7 @@ import json
 import math
 import sys
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ from slam.calibration.observability import (
 from slam.calibration.tracks import UNASSIGNED, RangeSet
 from slam.config import FrontEnd, SlamConfig, override
 from slam.frames import Detection, RadarFrame
-from slam.front_end.paper import make_detector
+from slam.front_end import make_detector
 from slam.geometry import Rig
 from xethru_protocol.system import StopFlag, read_bounded
 
@@ -51,24 +51,13 @@ _FRONT_END = override(
     },
 )
 _FRAMES_AT_ONCE = 64
-_YAW_LIMIT_RAD = math.radians(2)
+_YAW_LIMIT_DEG = 2.0
 _GAIN_LIMIT_DB = 1.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CalibrateOptions:
-    """What the command line of `uwb-slam calibrate` says."""
-
-    session: Path
-    reflectors: str | None
-    truth: str | None
-    rig: Path | None
-    as_json: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CalibrationReport:
-    """Everything that is printed."""
+    """The results that are printed."""
 
     drive: Drive
     calibration: Calibration
@@ -77,7 +66,15 @@ class CalibrationReport:
     poor: tuple[str, ...]
 
 
-def run_calibrate(options: CalibrateOptions, stop: StopFlag) -> None:
+def run_calibrate(
+    stop: StopFlag,
+    *,
+    session: Path,
+    reflectors: str | None,
+    truth: str | None,
+    rig: Path | None,
+    as_json: bool,
+) -> None:
     """Calibrate from a session file and print the table; write the rig file if asked for.
 
     Raises
@@ -88,26 +85,26 @@ def run_calibrate(options: CalibrateOptions, stop: StopFlag) -> None:
     StopRequestedError
         A signal arrived.
     """
-    known = None if options.reflectors is None else read_reflectors(options.reflectors)
-    planted = None if options.truth is None else _scene(options.truth)
-    session = open_session(options.session)
-    # minutes of work: what can be refused is refused before
-    _planted(session.rig, planted)
-    if options.rig is not None:
-        _check_rig_place(options.rig, options.session)
-    report = report_of(drive_of(session, stop.check), known)
-    if session.cut_at_byte is not None:
-        sys.stderr.write(f"{session.path}: cut at byte {session.cut_at_byte}; read up to there\n")
-    if options.as_json:
-        facts = _facts(report, _planted(report.drive.rig, planted))
-        sys.stdout.write(json.dumps(facts, indent=2, allow_nan=False) + "\n")
+    known = None if reflectors is None else read_reflectors(reflectors)
+    scene = None if truth is None else _scene(truth)
+    recorded = open_session(session)
+    # before minutes of work: what can be refused already
+    _planted(recorded.rig, scene)
+    if rig is not None:
+        _check_rig_place(rig, session)
+    report = report_of(drive_of(recorded, stop), known)
+    if recorded.cut_at_byte is not None:
+        sys.stderr.write(f"{session}: cut at byte {recorded.cut_at_byte}; read up to there\n")
+    planted = _planted(report.drive.rig, scene)
+    if as_json:
+        sys.stdout.write(json.dumps(_facts(report, planted), indent=2, allow_nan=False) + "\n")
     else:
         sys.stdout.write("".join(f"{line}\n" for line in _lines(report, planted)))
-    if options.rig is not None:
-        write_rig(options.rig, rig_file(session.info, report))
+    if rig is not None:
+        write_rig(rig, rig_file(recorded.info, report))
 
 
-def drive_of(session: RecordedSession, check: Callable[[], None]) -> Drive:
+def drive_of(session: RecordedSession, stop: StopFlag) -> Drive:
     """Read a session once and detect its echoes.
 
     Raises
@@ -124,7 +121,7 @@ def drive_of(session: RecordedSession, check: Callable[[], None]) -> Drive:
         for found in detector.detect_many(frames, [0.0] * len(frames)):
             detections.extend(each for each in found if not each.saturated)
         frames.clear()
-        check()
+        stop.check()
 
     n_frames = 0
     for record in session.records():
@@ -155,7 +152,7 @@ def drive_from(rig: Rig, odometry: OdometryTrack, detections: Iterable[Detection
 
 
 def report_of(drive: Drive, known_m: Array | None) -> CalibrationReport:
-    """Calibrate, and find out what the drive does not tell."""
+    """Calibrate, and find out what the drive does not determine."""
     with threadpool_limits(limits=1):
         calibration = calibrate(drive, known_m=known_m)
         names = [mount.name for mount in drive.rig.mounts]
@@ -201,19 +198,19 @@ def read_reflectors(name: str) -> Array:
 
 
 def _is_number(value: object) -> bool:
-    """Tell a finite number from anything else that TOML holds, true and false included."""
+    """Return whether a TOML value is a finite number, not a boolean."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
     return math.isfinite(value)
 
 
 def rig_file(info: SessionInfo, report: CalibrationReport) -> RigFile:
-    """Return the calibrated rig as a file; what the drive did not tell stays nominal."""
-    told = report.calibration.offset_sigmas_m <= OFFSET_LIMIT_M
+    """Return the calibrated rig as a file; what the drive does not determine stays nominal."""
+    is_known = report.calibration.offset_sigmas_m <= OFFSET_LIMIT_M
     radars = []
     for index, radar in enumerate(info.radars):
-        shift = report.calibration.mount_shifts_m[index] if told[index] else np.zeros(2)
-        heard = report.gains.gain_sigmas_db[index] <= _GAIN_LIMIT_DB
+        shift = report.calibration.mount_shifts_m[index] if is_known[index] else np.zeros(2)
+        has_gain = report.gains.gain_sigmas_db[index] <= _GAIN_LIMIT_DB
         radars.append(
             RigRadar(
                 name=radar.name,
@@ -222,10 +219,10 @@ def rig_file(info: SessionInfo, report: CalibrationReport) -> RigFile:
                 y_m=radar.y_m + float(shift[1]),
                 yaw_deg=math.degrees(radar.yaw_rad),
                 range_offset_m=float(report.calibration.offsets_m[index])
-                if told[index]
+                if is_known[index]
                 else radar.range_offset_m,
                 phase_offset_deg=math.degrees(radar.phase_offset_rad),
-                gain_db=float(report.gains.gains_db[index]) if heard else 0.0,
+                gain_db=float(report.gains.gains_db[index]) if has_gain else 0.0,
             )
         )
     return RigFile(radars=tuple(radars))
@@ -307,9 +304,8 @@ def _used(report: CalibrationReport) -> int:
     return int(np.count_nonzero(report.calibration.landmark != UNASSIGNED))
 
 
-def _lines(report: CalibrationReport, scene: Scene | None) -> Iterable[str]:
+def _lines(report: CalibrationReport, planted: Mapping[str, tuple[float, float]]) -> Iterable[str]:
     calibration, gains = report.calibration, report.gains
-    planted = _planted(report.drive.rig, scene)
     fit = "" if math.isnan(calibration.sigma_m) else f", to {1e3 * calibration.sigma_m:.2f} mm rms"
     yield (
         f"{_used(report)} of {len(report.drive.ranges)} ranges fit to "
@@ -327,11 +323,12 @@ def _lines(report: CalibrationReport, scene: Scene | None) -> Iterable[str]:
         mark = "?" if sigma > 1e3 * OFFSET_LIMIT_M else " "
         line = f"{mount.name:<14}{f'{offset:+.2f} +- {sigma:.2f}{mark}':>16}"
         line += f"{f'{dx:+.1f} +- {sx:.1f}, {dy:+.1f} +- {sy:.1f}':>26}"
-        line += f"{_told(gains.gains_db[index], gains.gain_sigmas_db[index], _GAIN_LIMIT_DB):>16}"
-        yaw, spread = gains.yaws_rad[index], gains.yaw_sigmas_rad[index]
-        line += (
-            f"{_told(math.degrees(yaw), math.degrees(spread), math.degrees(_YAW_LIMIT_RAD)):>16}"
+        gain = _with_sigma(gains.gains_db[index], gains.gain_sigmas_db[index], _GAIN_LIMIT_DB)
+        turn_deg, spread_deg = (
+            math.degrees(gains.yaws_rad[index]),
+            math.degrees(gains.yaw_sigmas_rad[index]),
         )
+        line += f"{gain:>16}{_with_sigma(turn_deg, spread_deg, _YAW_LIMIT_DEG):>16}"
         if planted:
             truth_mm = 1e3 * planted[mount.name][0]
             line += f"{truth_mm:+12.2f}{offset - truth_mm:+10.2f}"
@@ -351,6 +348,6 @@ def _lines(report: CalibrationReport, scene: Scene | None) -> Iterable[str]:
             yield f"remedy: {remedy}"
 
 
-def _told(value: float, sigma: float, limit: float) -> str:
-    """Write a value with its deviation, or that the drive does not tell it."""
+def _with_sigma(value: float, sigma: float, limit: float) -> str:
+    """Return a value with its deviation, or "not seen" if that is above the limit."""
     return f"{value:+.2f} +- {sigma:.2f}" if sigma <= limit else "not seen"

@@ -7,11 +7,11 @@ import json
 import math
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from html import escape
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -30,23 +30,30 @@ from slam.app.run.evaluation import (
     nis_dof,
     pose_nees,
     position_errors_m,
-    summarise,
     world_from_odom,
 )
 from slam.app.run.output import Progress, run_rows, summary_rows
-from slam.app.run.pictures import ESTIMATE, LANDMARK, ODOMETRY, PALE_INK, label
-from slam.app.run.replay import LostFrames, replay_session, settings_of
-from slam.app.run.results import has_truth
-from slam.app.run.runner import LinkChange, LinkLanes, LinkState, RunRecord
+from slam.app.run.pictures import (
+    ESTIMATE,
+    LANDMARK,
+    ODOMETRY,
+    PALE_INK,
+    label,
+    map_figure,
+    svg_of,
+)
+from slam.app.run.replay import recorded_source
+from slam.app.run.results import summary_of
+from slam.app.run.runner import LinkChange, LinkState, LinkStates, RunRecord, RunSource, execute
 from slam.app.session.reader import RecordedSession, open_session
+from slam.evaluation import LANDMARK_MATCH_M
 from slam.geometry import transform
 from xethru_protocol.system import StopFlag
 
 _KEPT_WARNINGS = 200
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ReportSeries:
+class ReportSeries(NamedTuple):
     """Numbers over the states of a run, each of shape (n_states,); NaN where there is none.
 
     Attributes
@@ -73,11 +80,11 @@ class ReportSeries:
 
 
 class ReportData(SessionObserver):
-    """Observes a run, and keeps what its report shows.
+    """Collects what the report of a run shows.
 
     Attributes
     ----------
-    lanes, changes
+    links, changes
         The links, and every change of their states with its time since the first scan [s].
     warnings, n_warnings
         The first warnings of the log, and how many there were.
@@ -86,7 +93,7 @@ class ReportData(SessionObserver):
     """
 
     def __init__(self, info: SessionInfo) -> None:
-        self.lanes = LinkLanes(info.radars)
+        self.links = LinkStates(info.radars)
         self.changes: list[tuple[float, LinkChange]] = []
         self.warnings: list[LogLine] = []
         self.n_warnings = 0
@@ -97,7 +104,6 @@ class ReportData(SessionObserver):
 
     @property
     def duration_s(self) -> float:
-        """Time between first and last scan [s]."""
         return 0.0 if self.start_ns is None else (self.end_ns - self.start_ns) / NS_PER_S
 
     def seconds(self, t_ns: int) -> float:
@@ -105,14 +111,12 @@ class ReportData(SessionObserver):
         return 0.0 if self.start_ns is None else max(t_ns - self.start_ns, 0) / NS_PER_S
 
     def on_scan(self, scan: Scan) -> None:
-        """Follow the links."""
         if self.start_ns is None:
             self.start_ns = scan.t_ns
         self.end_ns = scan.t_ns
-        self._note(self.lanes.on_scan(scan))
+        self._note(self.links.on_scan(scan))
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
-        """Keep the numbers of a state."""
         if self._odom is None:
             self._odom = world_from_odom(snapshot)
         nis = float(np.mean(snapshot.nis_per_dof)) if snapshot.nis_per_dof else math.nan
@@ -128,29 +132,17 @@ class ReportData(SessionObserver):
         )
 
     def on_log(self, line: LogLine) -> None:
-        """Follow the links, keep warnings."""
-        self._note(self.lanes.on_log(line))
+        self._note(self.links.on_log(line))
         if line.warning:
             self.n_warnings += 1
             if len(self.warnings) < _KEPT_WARNINGS:
                 self.warnings.append(line)
 
     def close(self) -> None:
-        """End the lanes."""
-        self._note(self.lanes.end(self.end_ns))
+        self._note(self.links.end(self.end_ns))
 
     def series(self) -> ReportSeries:
-        """Return the numbers over time."""
-        table = np.array(self._rows, dtype=np.float64).reshape(-1, 7)
-        return ReportSeries(
-            t_s=table[:, 0],
-            slam_error_m=table[:, 1],
-            odometry_error_m=table[:, 2],
-            nis_per_dof=table[:, 3],
-            nis_dof=table[:, 4],
-            nees_per_dof=table[:, 5],
-            n_landmarks=table[:, 6],
-        )
+        return ReportSeries(*np.array(self._rows, dtype=np.float64).reshape(-1, 7).T)
 
     def _note(self, changes: Iterable[LinkChange]) -> None:
         self.changes += [(self.seconds(change.t_ns), change) for change in changes]
@@ -192,7 +184,6 @@ class Page:
     _parts: list[str] = field(default_factory=list)
 
     def heading(self, text: str) -> None:
-        """Begin a section."""
         self._parts.append(f"<h2>{escape(text)}</h2>")
 
     def note(self, text: str) -> None:
@@ -200,11 +191,11 @@ class Page:
         self._parts.append(f'<p class="note">{escape(text)}</p>')
 
     def origin(self, text: str) -> None:
-        """Say where all data come from, so that nobody misses it."""
+        """State where all data come from, prominently."""
         self._parts.append(f'<p class="origin">{escape(text)}</p>')
 
     def picture(self, svg: str, alt: str) -> None:
-        """Add a picture, as part of the page."""
+        """Add a picture, embedded in the page."""
         data = base64.b64encode(svg.encode()).decode()
         self._parts.append(
             f'<img alt="{escape(alt, quote=True)}" src="data:image/svg+xml;base64,{data}">'
@@ -234,11 +225,10 @@ class Page:
         )
 
     def settings(self, summary: str, values: Mapping[str, object]) -> None:
-        """Add settings, a line each, shown on demand; those inside others with a dotted name."""
+        """Add settings, a line each, shown on demand; nested ones have dotted names."""
         self.details(summary, "\n".join(f"{key} = {value}" for key, value in _flat("", values)))
 
     def text(self) -> str:
-        """Return the page."""
         title = escape(self.title)
         return (
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
@@ -266,8 +256,8 @@ _STATE_COLOURS = {
     LinkState.SILENT: "#8c5a2b",
     LinkState.FAULT: "#d03a3a",
 }
-_LANE = 0.7
-"""Height of a lane; 1 is the distance of two."""
+_BAR = 0.7
+"""Height of a link's bar; 1 is the distance of two."""
 _TIME = "time since the first scan [s]"
 
 
@@ -292,10 +282,10 @@ def draw_consistency(figure: Figure, series: ReportSeries) -> None:
     """Draw NIS and NEES over their degrees of freedom, with the 95 % band of each state."""
     has_truth = bool(np.isfinite(series.nees_per_dof).any())
     panels = figure.subplots(2 if has_truth else 1, 1, sharex=True, squeeze=False).ravel()
-    told = np.isfinite(series.nis_dof)
-    bands = np.array([band_95(int(dof)) for dof in series.nis_dof[told]]).reshape(-1, 2)
-    bands /= np.maximum(series.nis_dof[told], 1.0)[:, None]
-    _draw_band(panels[0], series.t_s[told], bands)
+    known = np.isfinite(series.nis_dof)
+    bands = np.array([band_95(int(dof)) for dof in series.nis_dof[known]]).reshape(-1, 2)
+    bands /= np.maximum(series.nis_dof[known], 1.0)[:, None]
+    _draw_band(panels[0], series.t_s[known], bands)
     panels[0].plot(
         series.t_s, series.nis_per_dof, linestyle="none", marker=".", markersize=2, color=ESTIMATE
     )
@@ -313,7 +303,7 @@ def draw_consistency(figure: Figure, series: ReportSeries) -> None:
 def draw_links(
     figure: Figure, names: Sequence[str], changes: Sequence[tuple[float, LinkChange]], end_s: float
 ) -> None:
-    """Draw a lane per radar, coloured by the state of its link."""
+    """Draw a bar per radar, coloured by the state of its link."""
     axes = figure.add_subplot()
     for row, name in enumerate(names):
         own = [(at_s, change.state) for at_s, change in changes if change.radar == name]
@@ -322,7 +312,7 @@ def draw_links(
             if state in _STATE_COLOURS:
                 # The shortest state, one lost frame, must stay visible.
                 width_s = max(stop_s - start_s, 0.002 * end_s)
-                place, height = [(start_s, width_s)], (row - _LANE / 2, _LANE)
+                place, height = [(start_s, width_s)], (row - _BAR / 2, _BAR)
                 axes.broken_barh(place, height, facecolors=_STATE_COLOURS[state])
     axes.set_yticks(range(len(names)), names)
     axes.set_ylim(len(names) - 0.5, -0.5)
@@ -342,7 +332,7 @@ def _draw_band(axes: Axes, t_s: NDArray[np.float64], bounds: NDArray[np.float64]
 
 
 def _scale(axes: Axes, values: NDArray[np.float64]) -> None:
-    """Show what is usual; single values far above would flatten everything else."""
+    """Limit the axis: single values far above would flatten everything else."""
     known = values[np.isfinite(values)]
     if len(known):
         axes.set_ylim(0.0, max(4.0, 1.2 * float(np.percentile(known, 99))))
@@ -350,20 +340,9 @@ def _scale(axes: Axes, values: NDArray[np.float64]) -> None:
 
 REPORT_NAME = "report.html"
 
-_MATCH_M = 0.15
-"""As far as a landmark may be from the truth that it is of; the metrics' own limit."""
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReportOptions:
-    """What the command line of `uwb-slam report` says; `out` is beside the session where None."""
-
-    session: Path
-    out: Path | None = None
-
-
-def run_report(options: ReportOptions, stop: StopFlag) -> None:
-    """Replay a session and write its report.
+def run_report(stop: StopFlag, *, session: Path, out: Path | None) -> None:
+    """Replay a session and write its report; beside the session if `out` is None.
 
     Raises
     ------
@@ -372,13 +351,13 @@ def run_report(options: ReportOptions, stop: StopFlag) -> None:
     StopRequestedError
         A signal arrived; nothing was written.
     """
-    session = open_session(session_file(options.session))
-    out = options.out or session.path.with_name(REPORT_NAME)
-    refuse_overwriting(session.path, out)
-    text = report_text(session, stop)
-    with naming(out):
-        out.write_text(text, encoding="utf-8")
-    sys.stdout.write(f"{out}\n")
+    recorded = open_session(session_file(session))
+    page = out or recorded.path.with_name(REPORT_NAME)
+    refuse_overwriting(recorded.path, page)
+    text = report_text(recorded, stop)
+    with naming(page):
+        page.write_text(text, encoding="utf-8")
+    sys.stdout.write(f"{page}\n")
 
 
 def report_text(session: RecordedSession, stop: StopFlag) -> str:
@@ -389,32 +368,18 @@ def report_text(session: RecordedSession, stop: StopFlag) -> str:
     AppError
         The session cannot be replayed, or no state was estimated in it.
     """
-    config = settings_of(session)
+    source = recorded_source(session, stop)
     data = ReportData(session.info)
-    losses = LostFrames(session.info.radars)
-    with ExitStack() as stack:
-        stack.callback(data.close)
-        progress = Progress(session.info, None, lambda: losses.count)
-        stack.callback(progress.close)
-        record = replay_session(session, [data, losses, progress], stop.check)
+    record = execute(source, [Progress(session.info, None, source.lost_frames), data])
     if not record.results:
         raise AppError(f"{session.path}: no state was estimated, the robot did not move")
     info = session.info
-    summary = None
-    if has_truth(record):
-        summary = summarise(
-            record,
-            scene=info.scene,
-            preset=info.preset,
-            seed=info.seed,
-            rig=session.rig,
-            true_landmarks_m=info.true_landmarks_m,
-        )
-    page = Page(f"{info.scene}, preset {info.preset}" + _seed_text(info))
+    summary = summary_of(source, record)
+    seed = "" if info.seed is None else f", seed {info.seed}"
+    page = Page(f"{info.scene}, preset {info.preset}{seed}")
     page.origin("simulated data" if info.simulated else "measured data")
     page.note(_what_it_is(session, data))
-    lag_states = config.window.size - 1
-    _write_numbers(page, info, record, summary, lost_frames=losses.count, lag_states=lag_states)
+    _write_numbers(page, source, record, summary)
     _write_figures(page, info, record, summary, data)
     _write_landmarks(page, info, record)
     _write_links(page, info, data)
@@ -423,20 +388,16 @@ def report_text(session: RecordedSession, stop: StopFlag) -> str:
 
 
 def _write_numbers(
-    page: Page,
-    info: SessionInfo,
-    record: RunRecord,
-    summary: Summary | None,
-    *,
-    lost_frames: int,
-    lag_states: int,
+    page: Page, source: RunSource, record: RunRecord, summary: Summary | None
 ) -> None:
     page.heading("Numbers")
-    driven = run_rows(info, record, lost_frames)
+    lost_frames = source.lost_frames()
+    driven = run_rows(source.info, record, lost_frames)
     if summary is None:
-        page.note("Nothing true is known of this drive, so no error can be told.")
+        page.note("The truth of this drive is unknown, so there are no errors.")
         page.numbers(driven)
         return
+    lag_states = source.slam.config.window.size - 1
     rows = summary_rows(
         summary, lag_states=lag_states, wall_s=record.wall_s, lost_frames=lost_frames
     )
@@ -451,20 +412,17 @@ def _write_numbers(
 def _write_figures(
     page: Page, info: SessionInfo, record: RunRecord, summary: Summary | None, data: ReportData
 ) -> None:
-    # Half a second of matplotlib, and only after a replay that may fail.
-    from slam.app.run.pictures import map_figure, svg_of
-
     series = data.series()
     page.heading("Map and trajectory")
     page.picture(
         svg_of(
-            lambda figure: map_figure(figure, info, record, summary, info.outlines_m),
+            lambda figure: map_figure(figure, info, record, summary),
             width_in=9.5,
             height_in=6.6,
         ),
         "map with paths and landmarks",
     )
-    page.heading("Errors over time" if has_truth(record) else "Over time")
+    page.heading("Errors over time" if record.has_truth else "Over time")
     page.picture(
         svg_of(lambda figure: draw_errors(figure, series), width_in=9.5, height_in=4.4),
         "position errors and number of landmarks over time",
@@ -494,7 +452,7 @@ def _write_landmarks(page: Page, info: SessionInfo, record: RunRecord) -> None:
         cells = [str(number), f"{point[0]:.4f}", f"{point[1]:.4f}", f"{1e3 * sigma_m:.1f}"]
         if len(info.true_landmarks_m):
             off_m = float(np.linalg.norm(info.true_landmarks_m - point, axis=1).min())
-            cells.append(f"{1e3 * off_m:.1f}" if off_m <= _MATCH_M else "none within 150")
+            cells.append(f"{1e3 * off_m:.1f}" if off_m <= LANDMARK_MATCH_M else "none within 150")
         rows.append(cells)
     frame = "world" if len(info.true_landmarks_m) else "map"
     names = ["id", f"x [m, {frame}]", f"y [m, {frame}]", "largest sigma [mm]"]
@@ -504,12 +462,10 @@ def _write_landmarks(page: Page, info: SessionInfo, record: RunRecord) -> None:
 
 
 def _write_links(page: Page, info: SessionInfo, data: ReportData) -> None:
-    from slam.app.run.pictures import svg_of
-
     page.heading("Links")
     rows = []
     for radar in info.radars:
-        count = data.lanes.counts[radar.name]
+        count = data.links.counts[radar.name]
         share = count.lost / max(count.frames + count.lost, 1)
         rows.append(
             [
@@ -581,7 +537,3 @@ def _what_it_is(session: RecordedSession, data: ReportData) -> str:
     if session.cut_at_byte is not None:
         words.append(f"cut at byte {session.cut_at_byte}: this is what is left of it")
     return "; ".join(words) + "."
-
-
-def _seed_text(info: SessionInfo) -> str:
-    return "" if info.seed is None else f", seed {info.seed}"

@@ -1,9 +1,8 @@
 """`uwb-slam view`: a recorded session in Rerun, in a window, a browser, a file or a picture.
 
-Rerun calls the way to steer a viewer experimental: it is used in this file only.
-
 A session is replayed into the view, so it shows what the run itself would have shown, whatever
-version of Rerun the run had. An .rrd is opened as it is.
+version of Rerun the run had. An .rrd is opened as it is. Rerun's API to control a viewer is
+experimental: it is used in this file only.
 """
 
 from __future__ import annotations
@@ -12,9 +11,6 @@ import io
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
@@ -23,7 +19,8 @@ from PIL import Image
 from slam.app.errors import AppError, UsageError, naming
 from slam.app.records import SessionObserver
 from slam.app.run.output import Progress
-from slam.app.run.replay import LostFrames, replay_session, settings_of
+from slam.app.run.replay import recorded_source
+from slam.app.run.runner import RunSource, execute
 from slam.app.session.reader import RecordedSession, open_session
 from slam.app.view import SERVE_WEB, SPAWN
 from slam.app.view.rerun_recording import DEVICE_TIME
@@ -40,13 +37,13 @@ _OLDEST = (0, 23)
 
 
 def require_readable(path: Path) -> None:
-    """See that the installed Rerun opens a recording.
+    """Require that the installed Rerun opens a recording.
 
     Raises
     ------
     AppError
-        It is no recording, one of a version that is too new or too old, or one that was never
-        closed; names the remedy.
+        It is no recording, has a version that is too new or too old, or was never closed; the
+        message names the remedy.
     """
     try:
         with path.open("rb") as stream:
@@ -65,7 +62,7 @@ def require_readable(path: Path) -> None:
             "here can open; make it again from its session: "
             f"uwb-slam view session.mcap --out {path.name}"
         )
-    if not is_finished(path):  # the viewer refuses it in many words, and only in its window
+    if not is_finished(path):  # the viewer would report it in its window only
         raise AppError(
             f"{path}: was never closed, its program was killed; make it again from its session: "
             f"uwb-slam view session.mcap --out {path.name}; or: rerun rrd merge {path.name} -o NEW"
@@ -73,7 +70,7 @@ def require_readable(path: Path) -> None:
 
 
 def is_finished(path: Path) -> bool:
-    """Return whether a recording was closed; of a killed program's the last rows are missing."""
+    """Return whether a recording was closed; that of a killed program lacks its last rows."""
     with path.open("rb") as stream:
         stream.seek(max(path.stat().st_size - len(_END) - 4, 0))
         return stream.read().startswith(_END)
@@ -86,7 +83,7 @@ _MENU_PIXELS = 36
 """The viewer's own bar on top, which says what machine drew it."""
 
 
-def take_screenshot(rrd: Path, out: Path, *, at_s: float | None, check: Callable[[], None]) -> None:
+def take_screenshot(rrd: Path, out: Path, *, at_s: float | None, stop: StopFlag) -> None:
     """Open a recording in a viewer that draws in memory, and write what it shows as PNG.
 
     Parameters
@@ -97,8 +94,8 @@ def take_screenshot(rrd: Path, out: Path, *, at_s: float | None, check: Callable
         The picture.
     at_s
         Where the cursor of `device_time` stands; None for the end.
-    check
-        Called again and again; may raise to stop.
+    stop
+        Checked again and again.
 
     Raises
     ------
@@ -107,12 +104,12 @@ def take_screenshot(rrd: Path, out: Path, *, at_s: float | None, check: Callable
         come to rest, or the picture cannot be written.
     """
     with ViewerProcess(ViewerKind.HEADLESS) as process:
-        process.wait_until_ready(check)
+        process.wait_until_ready(stop)
         try:
-            picture = _settled(process, rrd, at_s, check)
+            picture = _settled(process, rrd, at_s, stop)
         except (ConnectionError, RuntimeError, TimeoutError) as error:
-            said = str(error).strip() or type(error).__name__
-            raise AppError(f"{rrd}: the viewer gave no picture: {said.splitlines()[0]}") from None
+            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+            raise AppError(f"{rrd}: the viewer gave no picture: {reason}") from None
     with Image.open(io.BytesIO(picture)) as full:
         shown = full.convert("RGB").crop((0, _MENU_PIXELS, full.width, full.height))
         # An octree keeps colours that few points have, like landmarks; a median cut does not.
@@ -121,15 +118,13 @@ def take_screenshot(rrd: Path, out: Path, *, at_s: float | None, check: Callable
         few.save(out, format="png", optimize=True)
 
 
-def _settled(
-    process: ViewerProcess, rrd: Path, at_s: float | None, check: Callable[[], None]
-) -> bytes:
-    """Return the picture once it shows the same twice: all data are there and drawn."""
+def _settled(process: ViewerProcess, rrd: Path, at_s: float | None, stop: StopFlag) -> bytes:
+    """Return the picture once two in a row are the same: all data are loaded and drawn."""
     client = ViewerClient.connect(process.url)
     client.open(str(rrd.resolve()))
     give_up = time.monotonic() + _SETTLE_LIMIT_S
     while client.get_state().loading or not client.get_state().recordings:
-        _wait(check, give_up)
+        _wait(stop, give_up)
     lines = {line.name: line for line in client.get_state().recordings[0].timelines}
     if DEVICE_TIME not in lines:
         raise AppError(f"{rrd}: has no timeline {DEVICE_TIME}, so it is no view of a session")
@@ -140,12 +135,12 @@ def _settled(
     before = b""
     while (picture := client.take_screenshot()) != before:
         before = picture
-        _wait(check, give_up)
+        _wait(stop, give_up)
     return picture
 
 
-def _wait(check: Callable[[], None], give_up: float) -> None:
-    check()
+def _wait(stop: StopFlag, give_up: float) -> None:
+    stop.check()
     if time.monotonic() > give_up:
         raise TimeoutError(f"it was still busy after {_SETTLE_LIMIT_S:g} s")
     time.sleep(_PERIOD_S)
@@ -154,19 +149,16 @@ def _wait(check: Callable[[], None], give_up: float) -> None:
 SESSION_NAME, VIEW_NAME = "session.mcap", "session.rrd"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ViewOptions:
-    """What the command line of `uwb-slam view` says; at most one of the ways to show is given."""
-
-    session: Path
-    web: bool = False
-    out: Path | None = None
-    screenshot: Path | None = None
-    at_s: float | None = None
-
-
-def run_view(options: ViewOptions, stop: StopFlag) -> None:
-    """Show a session.
+def run_view(
+    stop: StopFlag,
+    *,
+    session: Path,
+    web: bool,
+    out: Path | None,
+    screenshot: Path | None,
+    at_s: float | None,
+) -> None:
+    """Show a session; at most one of `web`, `out` and `screenshot` is given.
 
     Raises
     ------
@@ -175,39 +167,47 @@ def run_view(options: ViewOptions, stop: StopFlag) -> None:
     StopRequestedError
         A signal arrived; also the way to end serving a browser.
     """
-    if options.at_s is not None and options.screenshot is None:
+    if at_s is not None and screenshot is None:
         raise UsageError("--at: says when a --screenshot is taken; name its file, too")
-    path = session_file(options.session, allow_view=options.out is None)
-    for written in (options.out, options.screenshot):
+    path = session_file(session, allow_view=out is None)
+    for written in (out, screenshot):
         refuse_overwriting(path, written)
+    where = SERVE_WEB if web else SPAWN
     if path.suffix == ".rrd":
-        if options.out is not None:
+        if out is not None:
             raise UsageError(f"{path}: is an .rrd already; --out makes one of a session.mcap")
         require_readable(path)
-        _show_file(path, options, stop)
+        if screenshot is not None:
+            _take_picture(path, screenshot, at_s, stop)
+            return
+        with LiveView(where, stop, path) as live:
+            live.keep_serving()
         return
-    session = open_session(path)
-    if options.out is not None:
-        write_view(session, options.out, stop)
-        sys.stdout.write(f"{options.out}\n")
-    elif options.screenshot is not None:
+    recorded = open_session(path)
+    if out is not None:
+        write_view(recorded, out, stop)
+        sys.stdout.write(f"{out}\n")
+    elif screenshot is not None:
         with tempfile.TemporaryDirectory(prefix="uwb-slam-view-") as folder:
             made = Path(folder) / VIEW_NAME
-            write_view(session, made, stop)
-            _take_picture(made, options.screenshot, options, stop)
+            write_view(recorded, made, stop)
+            _take_picture(made, screenshot, at_s, stop)
     else:
-        _show_replay(session, options, stop)
+        with LiveView(where, stop, is_replay=True) as live:
+            source = recorded_source(recorded, stop)
+            _replay(recorded, source, live.observer(recorded.info))
+            live.keep_serving()
 
 
 def session_file(given: Path, *, allow_view: bool = False) -> Path:
-    """Return the file that a user means by a file or by the folder of a run.
+    """Return a file as it is, or the session of a run's folder.
 
-    `allow_view` prefers the .rrd of a folder, which needs no replay, if its run lived to close it.
+    `allow_view` prefers the .rrd of a folder, which needs no replay, if it was closed.
 
     Raises
     ------
     AppError
-        There is none.
+        There is no such file.
     """
     if not given.is_dir():
         if not given.exists():
@@ -223,7 +223,7 @@ def session_file(given: Path, *, allow_view: bool = False) -> Path:
 
 
 def refuse_overwriting(recorded: Path, out: Path | None) -> None:
-    """See that a result does not take the place of what it is made of, or of another recording.
+    """Require that a result does not replace its own session or another recording.
 
     Raises
     ------
@@ -248,53 +248,23 @@ def write_view(session: RecordedSession, path: Path, stop: StopFlag) -> None:
     AppError
         It cannot be replayed, or the file not be written.
     """
-    from slam.app.view.panels import RerunView  # half a second, only where it is needed
+    from slam.app.view.panels import RerunView  # half a second, loaded only if needed
 
-    settings_of(session)  # before a file that is there already is given up for this one
+    source = recorded_source(session, stop)  # before an existing file is replaced
     with naming(path):
-        path.open("wb").close()  # Rerun's own words on this would not name the remedy
-    with ExitStack() as stack:
-        view = RerunView(path, session.info)
-        stack.callback(view.close)
-        _replay(session, view, stop, stack)
+        path.open("wb").close()  # Rerun's own message would not name the remedy
+    _replay(session, source, RerunView(path, session.info))
 
 
-def _show_replay(session: RecordedSession, options: ViewOptions, stop: StopFlag) -> None:
-    with LiveView(SERVE_WEB if options.web else SPAWN, stop.check, is_replay=True) as live:
-        with ExitStack() as stack:
-            view = live.observer(session.info)
-            stack.callback(view.close)
-            _replay(session, view, stop, stack)
-        live.keep_serving()
-
-
-def _replay(
-    session: RecordedSession, view: SessionObserver, stop: StopFlag, stack: ExitStack
-) -> None:
-    losses = LostFrames(session.info.radars)
-    progress = Progress(session.info, None, lambda: losses.count)
-    stack.callback(progress.close)
-    replay_session(session, [view, losses, progress], stop.check)
+def _replay(session: RecordedSession, source: RunSource, view: SessionObserver) -> None:
+    execute(source, [Progress(source.info, None, source.lost_frames), view])
     if session.cut_at_byte is not None:
-        stack.callback(_say_cut, session)
+        sys.stderr.write(
+            f"uwb-slam: {session.path} was cut at byte {session.cut_at_byte}; "
+            "the view shows what is left of it\n"
+        )
 
 
-def _say_cut(session: RecordedSession) -> None:
-    sys.stderr.write(
-        f"uwb-slam: {session.path} was cut at byte {session.cut_at_byte}; "
-        "the view shows what is left of it\n"
-    )
-
-
-def _show_file(path: Path, options: ViewOptions, stop: StopFlag) -> None:
-    if options.screenshot is not None:
-        _take_picture(path, options.screenshot, options, stop)
-        return
-    with LiveView(SERVE_WEB if options.web else SPAWN, stop.check, path) as live:
-        live.keep_serving()
-
-
-def _take_picture(rrd: Path, out: Path, options: ViewOptions, stop: StopFlag) -> None:
-
-    take_screenshot(rrd, out, at_s=options.at_s, check=stop.check)
+def _take_picture(rrd: Path, out: Path, at_s: float | None, stop: StopFlag) -> None:
+    take_screenshot(rrd, out, at_s=at_s, stop=stop)
     sys.stdout.write(f"{out}\n")

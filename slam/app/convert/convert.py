@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
-from slam.app.convert import rosbag as layout
-from slam.app.convert.matlab import MatOptions, convert_mat, write_detections
-from slam.app.convert.rosbag import BagOptions, convert_bag, write_bag
+from slam.app.convert.matlab import convert_mat, write_detections
+from slam.app.convert.rosbag import AUTHORS_RIG, convert_bag, write_bag
 from slam.app.errors import AppError, UsageError
 from slam.app.rig.files import load_rig
 from slam.app.run.replay import recorded_config
 from slam.app.session.messages import SlamSettings, settings_text
 from slam.app.session.reader import RecordedSession, open_session
-from slam.config import ConfigError, SlamConfig, load_preset
-from slam.robust.parameters import WheelNoise
+from slam.config import ConfigError, SlamConfig, WheelNoise, load_preset
 from xethru_protocol.recordings import RecordingError, WireCapture
+from xethru_protocol.system import StopFlag
 
 
-def write_wire(
-    session: RecordedSession, out: Path, radar: str | None, check: Callable[[], None]
-) -> str:
-    """Write the bytes of a radar's port, both ways; return in words what was written.
+def write_wire(session: RecordedSession, out: Path, radar: str | None, stop: StopFlag) -> str:
+    """Write the bytes of a radar's port, both ways; return a description of what was written.
 
     Their times are those of the host's own clock, whose zero means nothing.
 
@@ -45,7 +42,7 @@ def write_wire(
     try:
         with WireCapture(out, {"radar": chosen, "clock": "monotonic"}) as capture:
             for row in session.wire():
-                check()
+                stop.check()
                 if row.radar == chosen:
                     capture.write(row.way, row.data, row.host_ns)
                     sizes[row.way] += len(row.data)
@@ -62,21 +59,18 @@ _PRESET = "robust"
 _MAT_PRESET = "paper"  # whose front end such ranges are of: they scatter by a bin, 7 mm
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ConvertOptions:
-    """What the command line of `uwb-slam convert` says; None where it does not."""
-
-    source: Path
-    out: Path
-    rig: Path | None
-    area_m: tuple[float, float] | None
-    truth_topic: str
-    rate_hz: int
-    preset: str | None
-    radar: str | None
-
-
-def run_convert(options: ConvertOptions, check: Callable[[], None]) -> None:
+def run_convert(
+    stop: StopFlag,
+    *,
+    source: Path,
+    out: Path,
+    rig: Path | None,
+    area_m: Sequence[float] | None,
+    truth_topic: str,
+    rate_hz: int,
+    preset: str | None,
+    radar: str | None,
+) -> None:
     """Convert a session to a bag or MATLAB file, or such a file to a session; names say which.
 
     Raises
@@ -84,29 +78,46 @@ def run_convert(options: ConvertOptions, check: Callable[[], None]) -> None:
     AppError
         One line; what was begun is removed.
     """
-    if options.out.exists():
-        raise AppError(f"{options.out}: exists; choose another name")
-    out_is_session = options.out.suffix == SESSION_SUFFIX
-    if options.source.suffix == SESSION_SUFFIX and not out_is_session:
-        with _removing(options.out):
-            said = _from_session(open_session(options.source), options, check)
-        _say(said)
-        return
-    if not out_is_session:
+    if out.exists():
+        raise AppError(f"{out}: exists; choose another name")
+    warnings: list[str] = []
+    if source.suffix == SESSION_SUFFIX and out.suffix != SESSION_SUFFIX:
+        with _removing(out):
+            result = _from_session(open_session(source), out, preset, radar, stop)
+    elif out.suffix != SESSION_SUFFIX:
         raise UsageError(
-            f"{options.out}: of a bag or MATLAB file a session is made; give a name that ends in "
-            ".mcap"
+            f"{out}: of a bag or MATLAB file a session is made; give a name that ends in .mcap"
         )
-    if options.source.suffix == SESSION_SUFFIX and _is_session(options.source):
+    elif source.suffix == SESSION_SUFFIX and _is_session(source):
         raise UsageError(
-            f"{options.source}: is a session already; name an OUT that ends in .mat, .xtwire or "
-            ".bag, or a new folder for a bag of ROS 2"
+            f"{source}: is a session already; name an OUT that ends in .mat, .xtwire or .bag, or "
+            "a new folder for a bag of ROS 2"
         )
-    with _removing(options.out):
-        said, odd = _to_session(options, check)
-    for line in odd:
-        print(f"uwb-slam: {options.source}: {line}", file=sys.stderr)  # noqa: T201 - a warning
-    _say(said)
+    else:
+        is_mat = source.suffix == MAT_SUFFIX
+        name = preset or (_MAT_PRESET if is_mat else _PRESET)
+        settings = SlamSettings(
+            preset=name, config_json=settings_text(_config(name)), wheels=asdict(WheelNoise())
+        )
+        given_rig = None if rig is None else load_rig(rig).rig
+        with _removing(out):
+            if is_mat:
+                result = convert_mat(
+                    source, out, stop.check, settings=settings, rig=given_rig, rate_hz=rate_hz
+                )
+            else:
+                result, warnings = convert_bag(
+                    source,
+                    out,
+                    stop.check,
+                    settings=settings,
+                    rig=given_rig or AUTHORS_RIG,
+                    area_m=None if area_m is None else (area_m[0], area_m[1]),
+                    truth_topic=truth_topic,
+                )
+    for line in warnings:
+        print(f"uwb-slam: {source}: {line}", file=sys.stderr)  # noqa: T201 - a warning
+    print(result)  # noqa: T201 - the result
 
 
 def _is_session(path: Path) -> bool:
@@ -129,39 +140,17 @@ def _removing(out: Path) -> Iterator[None]:
 
 
 def _from_session(
-    session: RecordedSession, options: ConvertOptions, check: Callable[[], None]
+    session: RecordedSession, out: Path, preset: str | None, radar: str | None, stop: StopFlag
 ) -> str:
-    if options.out.suffix == WIRE_SUFFIX:
-        return write_wire(session, options.out, options.radar, check)
-    if options.out.suffix != MAT_SUFFIX:
-        return write_bag(session, options.out, check)
-    if options.preset is None and session.info.config_json:
+    if out.suffix == WIRE_SUFFIX:
+        return write_wire(session, out, radar, stop)
+    if out.suffix != MAT_SUFFIX:
+        return write_bag(session, out, stop.check)
+    if preset is None and session.info.config_json:
         config = recorded_config(session)
     else:
-        config = _config(options.preset or _PRESET)
-    return write_detections(session, options.out, config, check)
-
-
-def _to_session(options: ConvertOptions, check: Callable[[], None]) -> tuple[str, list[str]]:
-    is_mat = options.source.suffix == MAT_SUFFIX
-    preset = options.preset or (_MAT_PRESET if is_mat else _PRESET)
-    settings = SlamSettings(
-        preset=preset, config_json=settings_text(_config(preset)), wheels=asdict(WheelNoise())
-    )
-    if is_mat:
-        of_mat = MatOptions(
-            rig=None if options.rig is None else load_rig(options.rig).rig,
-            rate_hz=options.rate_hz,
-            settings=settings,
-        )
-        return convert_mat(options.source, options.out, of_mat, check), []
-    of_bag = BagOptions(
-        rig=layout.AUTHORS_RIG if options.rig is None else load_rig(options.rig).rig,
-        area_m=options.area_m,
-        truth_topic=options.truth_topic,
-        settings=settings,
-    )
-    return convert_bag(options.source, options.out, of_bag, check)
+        config = _config(preset or _PRESET)
+    return write_detections(session, out, config, stop.check)
 
 
 def _config(preset: str) -> SlamConfig:
@@ -169,7 +158,3 @@ def _config(preset: str) -> SlamConfig:
         return load_preset(preset)
     except ConfigError as error:
         raise UsageError(str(error)) from None
-
-
-def _say(line: str) -> None:
-    print(line)  # noqa: T201 - the result

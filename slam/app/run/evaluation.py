@@ -41,13 +41,13 @@ class LandmarkSummary:
     """Landmarks against the truth, matched within 0.15 m after the trajectory's alignment."""
 
     true: int | None
-    """None where nobody knows what stands there; so are precision, recall and rmse_m then."""
+    """None if unknown; so are precision, recall and rmse_m then."""
     estimated: int
     precision: float | None
     recall: float | None
     duplicates: int
     rmse_m: float | None
-    """These three are None where there is nothing to divide by."""
+    """These three are None if there is nothing to divide by."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,7 +82,7 @@ class Summary:
 
     @property
     def ate_ratio(self) -> float:
-        """SLAM's ATE in units of odometry's; below 1 is better than driving blind."""
+        """SLAM's ATE in units of odometry's."""
         return ratio(self.ate_rmse_m, self.odometry_ate_rmse_m)
 
     def to_json(self) -> str:
@@ -112,7 +112,7 @@ def band_95(dof: int) -> tuple[float, float]:
 
 
 def nis_dof(snapshot: Snapshot) -> int | None:
-    """Return over how many degrees of freedom the state's NIS is spread; None if nobody told."""
+    """Return the degrees of freedom of a state's NIS; None if unknown."""
     if not snapshot.nis_per_dof or snapshot.step is None:
         return None
     report = snapshot.step.report
@@ -122,8 +122,8 @@ def nis_dof(snapshot: Snapshot) -> int | None:
 def world_from_odom(first: Snapshot) -> NDArray[np.float64]:
     """Return where the odometry's frame lies in the world, shape (3,), from the first state.
 
-    That of a demo begins with the map frame. A robot's begins anywhere, as it runs before we
-    listen: it is placed so that both paths begin at one pose.
+    That of a demo begins with the map frame. A robot's odometry starts before the run: it is
+    placed so that both paths begin at one pose.
     """
     apart = between(first.estimate, first.odometry)
     if np.all(np.abs(apart) < _ONE_STEP):
@@ -135,7 +135,7 @@ def world_from_odom(first: Snapshot) -> NDArray[np.float64]:
 def position_errors_m(snapshot: Snapshot, odom: NDArray[np.float64]) -> tuple[float, float]:
     """Return how far estimate and odometry are from the truth, not aligned; NaN without truth.
 
-    ``odom`` is what `world_from_odom` said of the first state.
+    `odom` is the `world_from_odom` of the first state.
     """
     place, truth = snapshot.world_from_map, snapshot.truth[:2]
     return (
@@ -156,8 +156,7 @@ def pose_nees(snapshot: Snapshot) -> float:
 
 
 NEES_AT = (0.1, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.9, 1.0)
-"""Parts of the run at which consistency is judged; the quarters are the ends of four laps."""
-
+"""Parts of the run at which consistency is evaluated; the quarters are the ends of four laps."""
 
 Nis = tuple[float, int]
 """Summed NIS of one state's true associations, and its degrees of freedom."""
@@ -177,11 +176,11 @@ def summarise(
     Parameters
     ----------
     record
-        The run.
+        The run; its truth is known.
     scene, preset, seed
         Its names.
     rig
-        What SLAM was told of the mounts; decides which true landmarks count.
+        The mounts that SLAM uses; decides which true landmarks count.
     true_landmarks_m
         Shape (n, 2), world frame.
     """

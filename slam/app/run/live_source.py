@@ -1,15 +1,16 @@
-"""Scans of radars on real ports, as they come: arrivals to stamps, silence to words.
+"""Scans of radars on real ports in real time: threads, ticks, stamps, and the log of a live run.
 
-Each thread owns what it reads from and tells the main loop through one queue. A radar that falls
-silent or vanishes is looked for until it is back or the run ends.
+Each thread reads one radar or the odometry and puts events into one queue; the main loop reads
+that queue only. A radar that falls silent or vanishes is looked for until it is back or the run
+ends.
 
-Ticks are frame periods of session time. A tick is complete when every radar that is alive has
-sent a frame of it or a later one, and odometry has come past it; or when waiting longer would
-help nobody. No clock is read here: time is an argument, so all of it runs in virtual time, too.
+Ticks are frame periods of session time. A tick is complete when every radar that is not lost has
+sent a frame of it or a later one, and odometry has come past it; or when waiting longer would not
+make it more complete. `TickAssembler` reads no clock: time is an argument, so tests run it in
+virtual time.
 
 Time base `arrival`: every radar's counter is regressed on the host's clock, the odometry's stamps
-likewise, so a frame's session time is what the odometry's clock showed when it was taken. The
-main loop reads its inbox only; ports are read by the threads of `run_readers`.
+likewise, so a frame's session time is what the odometry's clock showed when it was taken.
 """
 
 from __future__ import annotations
@@ -27,18 +28,21 @@ from slam.app.errors import AppError, OdometryError
 from slam.app.odometry.arrival import ArrivalClock
 from slam.app.odometry.live import LineSource, LiveOdometry, read_lines
 from slam.app.odometry.tum import NS_PER_S, TumSample
-from slam.app.records import RadarInfo, Scan
+from slam.app.records import LogLine, RadarInfo, Scan, Snapshot
 from slam.app.rig.sources import RadarLink, radar_frame
+from slam.app.run.runner import LinkLog
+from slam.app.session.log import SessionLog
+from slam.app.session.mcap import CannotWriteError
 from slam.frames import RadarFrame
 from xethru_protocol.driver.conversation import ProtocolRecord
 from xethru_protocol.driver.frames import Frame
-from xethru_protocol.system import StopRequestedError
+from xethru_protocol.system import StopFlag, StopRequestedError
 from xethru_protocol.wire.errors import ResponseTimeout, XeThruError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FrameCame:
-    """A frame of a radar of the rig; it knows when it arrived."""
+class FrameArrived:
+    """A frame of a radar, by its index in the rig."""
 
     radar: int
     frame: Frame
@@ -46,7 +50,7 @@ class FrameCame:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RadarLost:
-    """A radar sends no more; `text` says why. It is looked for."""
+    """A radar sends no more; `text` is the reason."""
 
     radar: int
     text: str
@@ -61,7 +65,7 @@ class RadarBack:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LinkSaid:
+class LinkRecorded:
     """A line of the protocol log of a radar."""
 
     radar: str
@@ -69,7 +73,7 @@ class LinkSaid:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WireCame:
+class WireBytes:
     """Bytes as they went over a radar's port."""
 
     radar: str
@@ -80,7 +84,7 @@ class WireCame:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryLine:
-    """A line of the odometry's source, and the host's time when it came."""
+    """A line of the odometry's source, and the host's monotonic time of its arrival."""
 
     text: str
     arrival_ns: int
@@ -88,23 +92,23 @@ class OdometryLine:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryEnded:
-    """No more lines will come; `trouble` says why, "" where the source just ended."""
+    """No more lines will come; `trouble` is the reason, "" if the source just ended."""
 
     trouble: str
 
 
 Event: TypeAlias = (
-    FrameCame | RadarLost | RadarBack | LinkSaid | WireCame | OdometryLine | OdometryEnded
+    FrameArrived | RadarLost | RadarBack | LinkRecorded | WireBytes | OdometryLine | OdometryEnded
 )
 
 
 SILENCE_S = 3.0
-"""Many frame periods; a module that is silent for so long has stopped streaming."""
+"""Many frame periods; a module that sends nothing for so long has stopped streaming."""
 _POLL_S = 0.2
 _LOOK_S = 2.0
 _LOOK_AGAIN_S = 1.0
 _JOIN_S = 10.0
-"""More than a look for a module takes; whoever still reads then hangs in the system."""
+"""More than a look for a module takes; a thread that still reads then hangs in the system."""
 
 Inbox = SimpleQueue[Event]
 
@@ -144,7 +148,6 @@ class Readers:
         )
 
     def __enter__(self) -> Self:
-        """Start the threads."""
         for thread in self._threads:
             thread.start()
         return self
@@ -162,50 +165,39 @@ class Readers:
             thread.join(max(give_up - time.monotonic(), 0.0))
 
 
-def tap_wire(link: RadarLink, inbox: Inbox) -> None:
-    """Let every byte of a radar's port pass the inbox."""
-
-    def tell(way: Literal["rx", "tx"], data: bytes, host_ns: int) -> None:
-        inbox.put(WireCame(radar=link.mount.name, way=way, data=data, host_ns=host_ns))
-
-    link.driver.raw_listener = tell
-
-
 def _read_radar(radar: int, link: RadarLink, inbox: Inbox, stopped: threading.Event) -> None:
     try:
         _follow_radar(radar, link, inbox, stopped)
-    except Exception as error:  # a bug; the run must hear of it, not lose a radar without a word
+    except Exception as error:  # a bug: reported, so that no radar is lost silently
         inbox.put(RadarLost(radar=radar, text=f"its reader failed: {error!r}"))
         raise
 
 
 def _follow_radar(radar: int, link: RadarLink, inbox: Inbox, stopped: threading.Event) -> None:
-    heard = time.monotonic()
+    received_s = time.monotonic()
     while not stopped.is_set():
         trouble = ""
         try:
-            inbox.put(FrameCame(radar=radar, frame=link.driver.read_frame(_POLL_S)))
-            heard = time.monotonic()
+            inbox.put(FrameArrived(radar=radar, frame=link.driver.read_frame(_POLL_S)))
+            received_s = time.monotonic()
         except ResponseTimeout:
-            if time.monotonic() - heard > SILENCE_S:
+            if time.monotonic() - received_s > SILENCE_S:
                 trouble = f"no frame for {SILENCE_S:g} s"
         except XeThruError as error:
             trouble = str(error)
         if trouble:
             inbox.put(RadarLost(radar=radar, text=trouble))
-            if _found_again(link, stopped.is_set, stopped.wait):
+            if _found_again(link, stopped):
                 inbox.put(RadarBack(radar=radar, port=link.driver.port))
-            heard = time.monotonic()
+            received_s = time.monotonic()
 
 
-def _found_again(
-    link: RadarLink, is_stopped: Callable[[], bool], wait: Callable[[float], bool]
-) -> bool:
-    while not is_stopped():
+def _found_again(link: RadarLink, stopped: threading.Event) -> bool:
+    while not stopped.is_set():
         try:
             link.driver.reconnect(_LOOK_S)
         except XeThruError:
-            wait(_LOOK_AGAIN_S)
+            stopped.wait(_LOOK_AGAIN_S)
         else:
             return True
     return False
@@ -226,7 +218,7 @@ def _read_odometry(source: LineSource, inbox: Inbox, stopped: threading.Event) -
 
 GRACE_NS = NS_PER_S // 2
 """How long a tick waits for a radar that has not sent its frame yet."""
-ODOMETRY_PATIENCE_NS = NS_PER_S
+ODOMETRY_WAIT_NS = NS_PER_S
 """How long a tick waits for odometry; then its frames are recorded and not used."""
 MOST_LAG_NS = 10 * NS_PER_S
 """When SLAM is later than that, scans are recorded and not used until it has caught up."""
@@ -251,7 +243,7 @@ class TickAssembler:
     period_ns
         Of their frames.
     odometry
-        Asked how far it has come.
+        Limits which ticks are complete.
 
     Attributes
     ----------
@@ -281,30 +273,27 @@ class TickAssembler:
 
     @property
     def alive(self) -> frozenset[int]:
-        """Radars that are not lost."""
         return frozenset(self._alive)
 
     def begin(self, start_ns: int) -> None:
-        """Let tick 0 begin at a session time; frames before it are forgotten."""
+        """Let tick 0 begin at a session time; frames before it are dropped."""
         self.start_ns = start_ns
         for queue in self._waiting:
             while queue and queue[0].frame.t_ns < start_ns:
                 queue.popleft()
 
     def take(self, received: ReceivedFrame) -> None:
-        """Take a frame; those of one radar come in the order of time."""
+        """Take a frame; the frames of one radar come in the order of time."""
         self._waiting[received.frame.radar].append(received)
 
     def lost(self, radar: int) -> None:
-        """Wait for this radar no more."""
         self._alive.discard(radar)
 
     def back(self, radar: int) -> None:
-        """Wait for it again."""
         self._alive.add(radar)
 
     def next_scan(self, now_ns: int) -> Scan | None:
-        """Return the next scan that is complete at a session time, None if none is yet."""
+        """Return the next scan if it is complete at a session time, else None."""
         if self.start_ns is None:
             return None
         while True:
@@ -334,7 +323,7 @@ class TickAssembler:
     def _next_with_something(self, now_ns: int) -> int:
         """Return the tick of the oldest frame, or the first one that may still get some.
 
-        Those before it are empty; there are billions where odometry's clock was set from 1970.
+        Those before it are empty; there are billions if odometry's clock is set from 1970.
         """
         assert self.start_ns is not None
         heads_ns = [queue[0].frame.t_ns for queue in self._waiting if queue]
@@ -343,7 +332,7 @@ class TickAssembler:
     def _may_get_more(
         self, received: Sequence[ReceivedFrame], needed_ns: int, end_ns: int, now_ns: int
     ) -> bool:
-        """Return whether waiting makes a tick more complete: by a radar, or by odometry."""
+        """Return whether a tick may get more frames, or odometry for them."""
         missing = not self._alive or any(not self._waiting[radar] for radar in self._alive)
         if missing and now_ns < end_ns + GRACE_NS:
             return True
@@ -351,7 +340,7 @@ class TickAssembler:
             return now_ns < end_ns
         if self._odometry.covers(needed_ns) or self._odometry.ended:
             return False
-        return now_ns < needed_ns + ODOMETRY_PATIENCE_NS
+        return now_ns < needed_ns + ODOMETRY_WAIT_NS
 
     def _scan(self, received: Sequence[ReceivedFrame], t_ns: int, *, used: bool) -> Scan:
         self.n_unused += not used
@@ -366,9 +355,9 @@ class TickAssembler:
     def _late(self, begin_ns: int, end_ns: int) -> Sequence[ReceivedFrame]:
         """Take the oldest frame of every radar that is too old for a tick.
 
-        It is, if it is older than a whole period, or than a quarter of one where a newer one of
-        the tick is there: after a stall of a line, or once in hours where a module's clock is
-        fast. By less, jitter about a tick's bounds makes frames old; they count.
+        Too old is by more than a whole period, or by a quarter of one if a newer frame of the tick
+        is there: after a stall of a line, or once in hours if a module's clock is fast. Frames that
+        are late by less, from jitter about a tick's bounds, count.
         """
         late = []
         for queue in self._waiting:
@@ -391,7 +380,7 @@ class TickAssembler:
 
 
 SETTLE_S = 2.0
-"""For so long frames and odometry are listened to before the first scan: clocks are known then."""
+"""How long frames and odometry are read before the first scan, so that clocks are known."""
 START_LIMIT_S = 15.0
 SILENT_RIG_S = 10.0
 WARN_LAG_S = 2.0
@@ -402,7 +391,7 @@ _DRIFT_EVERY_S = 60.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ended:
-    """Why a run came to its end; `failed` where it should have gone on."""
+    """Why a run ended; `failed` if it should have gone on."""
 
     text: str
     failed: bool = False
@@ -410,31 +399,78 @@ class Ended:
 
 
 class EventQueue(Protocol):
-    """Where events wait; a `queue.SimpleQueue` is one."""
+    """A `queue.SimpleQueue`, or one in virtual time; both methods raise `queue.Empty`."""
 
-    def get(self, *, timeout: float) -> Event:
-        """Return the next event; raise `queue.Empty` if none comes in time."""
-        ...
+    def get(self, *, timeout: float) -> Event: ...
 
-    def get_nowait(self) -> Event:
-        """Return the next event; raise `queue.Empty` if none waits."""
-        ...
+    def get_nowait(self) -> Event: ...
 
 
-class RunListener(Protocol):
-    """Gets what a run learns beside scans."""
+class LiveLog(LinkLog):
+    """Writes what a live run learns into its session log; keeps odometry until there is one.
+
+    If the log cannot be written any more, this is reported once, and the run goes on without it.
+
+    Attributes
+    ----------
+    failure
+        Why the log is not whole; "" if it is.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.failure = ""
+        self._log: SessionLog | None = None
+        self._early: list[TumSample] | None = []
+
+    def begin(self, log: SessionLog) -> None:
+        """Write to a log, first the odometry so far."""
+        self._log = log
+        early, self._early = self._early or [], None
+        for sample in early:
+            self.on_odometry(sample)
 
     def on_odometry(self, sample: TumSample) -> None:
-        """Take a pose of the wheels."""
+        """Write a pose of the wheels."""
+        if self._early is None:
+            self._write(lambda log: log.on_odometry(sample))
+        else:
+            self._early.append(sample)
 
-    def on_wire(self, event: WireCame) -> None:
-        """Take raw bytes of a port."""
+    def on_wire(self, event: WireBytes) -> None:
+        """Write raw bytes of a port; those from before `begin` are dropped."""
+        self._write(lambda log: log.on_wire(event.radar, event.way, event.data, event.host_ns))
 
-    def on_link(self, event: LinkSaid) -> None:
-        """Take a line of a radar's protocol log."""
+    def on_scan(self, scan: Scan) -> None:
+        super().on_scan(scan)
+        self._write(lambda log: log.on_scan(scan))
 
-    def say(self, who: str, text: str, *, warning: bool) -> None:
-        """Take what the user should know; `who` is a radar, the odometry or the run."""
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        self._write(lambda log: log.on_snapshot(snapshot))
+
+    def pass_on(self, line: LogLine) -> None:
+        if self._sinks is not None:
+            self._write(lambda log: log.on_log(line))
+        super().pass_on(line)
+
+    def close(self) -> None:
+        """Close the log; results are not lost if its last chunk cannot be written."""
+        log, self._log = self._log, None
+        try:
+            if log is not None:
+                log.close()
+        except CannotWriteError as error:
+            self.failure = str(error)
+
+    def _write(self, write: Callable[[SessionLog], None]) -> None:
+        if self._log is None:
+            return
+        try:
+            write(self._log)
+        except CannotWriteError as error:
+            self._log = None
+            self.failure = str(error)
+            self.log("run", f"{error}; the run goes on and is not recorded", warning=True)
 
 
 class LiveSource:
@@ -450,12 +486,12 @@ class LiveSource:
         Takes the lines.
     inbox
         Where the threads' events are.
-    listener
-        Gets everything beside the scans, in this thread.
-    check
-        Called often; may raise StopRequestedError to stop.
+    log
+        Gets everything but the scans, in this thread.
+    stop
+        Checked often; ends the run.
     duration_s
-        When to end; None: never.
+        When to end; None if never.
     clock_ns
         The host's monotonic time, that of the drivers' arrivals.
 
@@ -479,24 +515,24 @@ class LiveSource:
         limits: tuple[float, float] | None,
         odometry: LiveOdometry,
         inbox: EventQueue,
-        listener: RunListener,
-        check: Callable[[], None],
+        log: LiveLog,
+        stop: StopFlag,
         *,
         duration_s: float | None = None,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._radars, self._limits = radars, limits
-        self._odometry, self._inbox, self._listener = odometry, inbox, listener
-        self._check, self._duration_s, self._clock_ns = check, duration_s, clock_ns
+        self._odometry, self._inbox, self._log = odometry, inbox, log
+        self._stop, self._duration_s, self._clock_ns = stop, duration_s, clock_ns
         self._unix_ns = time.time_ns() - time.monotonic_ns()
         self._assembler = TickAssembler(len(radars), round(NS_PER_S / radars[0].rate_hz), odometry)
         self._began_ns = clock_ns()
         self._all_lost_ns: int | None = None
         self._last_counters: list[int | None] = [None] * len(radars)
-        self._drift_told_ns = self._began_ns
-        self._lag_told_s = WARN_LAG_S
+        self._drift_logged_ns = self._began_ns
+        self._lag_warned_s = WARN_LAG_S
         self._unused_since_ns: int | None = None
-        self._unused_told = False
+        self._unused_warned = False
         self.clocks = tuple(ArrivalClock(radar.rate_hz) for radar in radars)
         self.ended: Ended | None = None
         self.worst_lag_s = self.busy_s = 0.0
@@ -509,7 +545,6 @@ class LiveSource:
 
     @property
     def n_unused(self) -> int:
-        """Scans recorded that SLAM did not use."""
         return self._assembler.n_unused
 
     @property
@@ -519,22 +554,22 @@ class LiveSource:
 
     @property
     def odometry_drift_ppm(self) -> float | None:
-        """How fast the odometry's clock is against the host's; None where it is told otherwise."""
+        """Rate of the odometry's clock against the host's; None if its clock was given."""
         return self._odometry.drift_ppm
 
     def settle(self) -> int:
-        """Listen until every clock is known a little; return the session time of the first scan.
+        """Read until every clock is roughly known; return the session time of the first scan.
 
         Raises
         ------
         AppError
-            A radar or the odometry says nothing.
+            A radar or the odometry sends nothing.
         StopRequestedError
-            As `check` raises it.
+            A signal arrived.
         """
         ready_ns: int | None = None
         while True:
-            self._check()
+            self._stop.check()
             self._drain(_SOURCE_POLL_S)
             now_ns = self._clock_ns()
             waited_s = (now_ns - self._began_ns) / NS_PER_S
@@ -569,10 +604,10 @@ class LiveSource:
             return start_ns
 
     def scans(self) -> Iterator[Scan]:
-        """Yield scans until the run ends; `ended` says why it did."""
+        """Yield scans until the run ends; `ended` is the reason then."""
         while self.ended is None:
             try:
-                self._check()
+                self._stop.check()
             except StopRequestedError as stopped:
                 self.ended = Ended(text=str(stopped), stopped=stopped)
                 break
@@ -582,8 +617,8 @@ class LiveSource:
                 yield scan
                 self.busy_s += (self._clock_ns() - started_ns) / NS_PER_S
                 self._drain(0.0)
-            self._judge()
-        self._tell_drifts()
+            self._end_if_over()
+        self._log_drifts()
 
     def _next_scan(self) -> Scan | None:
         if self.ended is not None:
@@ -601,7 +636,7 @@ class LiveSource:
         return scan
 
     def _drain(self, wait_s: float) -> None:
-        """Take all events there are; wait for the first one if there is none."""
+        """Take all events that wait; wait for the first one if there is none."""
         try:
             self._take(self._inbox.get(timeout=wait_s) if wait_s else self._inbox.get_nowait())
             while True:
@@ -611,23 +646,21 @@ class LiveSource:
 
     def _take(self, event: Event) -> None:
         match event:
-            case FrameCame():
+            case FrameArrived():
                 self._take_frame(event.radar, event.frame)
             case OdometryLine():
-                sample, words = self._odometry.take(event.text, event.arrival_ns)
-                if words:
-                    self._listener.say("odometry", words, warning=True)
+                sample, warning = self._odometry.take(event.text, event.arrival_ns)
+                if warning:
+                    self._log.log("odometry", warning, warning=True)
                 if sample is not None:
-                    self._listener.on_odometry(sample)
+                    self._log.on_odometry(sample)
             case OdometryEnded():
                 self._odometry.end(event.trouble)
-                self._listener.say(
-                    "odometry", event.trouble or "ended", warning=bool(event.trouble)
-                )
+                self._log.log("odometry", event.trouble or "ended", warning=bool(event.trouble))
             case RadarLost():
                 self._assembler.lost(event.radar)
                 left = len(self._assembler.alive)
-                self._listener.say(
+                self._log.log(
                     self._radars[event.radar].name,
                     f"{event.text}; the run goes on with {left} of {len(self._radars)} radars",
                     warning=True,
@@ -635,11 +668,11 @@ class LiveSource:
             case RadarBack():
                 self._assembler.back(event.radar)
                 text = f"is back, at {event.port}"
-                self._listener.say(self._radars[event.radar].name, text, warning=True)
-            case LinkSaid():
-                self._listener.on_link(event)
-            case WireCame():
-                self._listener.on_wire(event)
+                self._log.log(self._radars[event.radar].name, text, warning=True)
+            case LinkRecorded():
+                self._log.on_record(event.radar, event.record)
+            case WireBytes():
+                self._log.on_wire(event)
 
     def _take_frame(self, radar: int, frame: Frame) -> None:
         info = self._radars[radar]
@@ -649,7 +682,7 @@ class LiveSource:
         self._last_counters[radar] = frame.counter
         taken_ns = self.clocks[radar].stamp_ns(frame.counter, frame.arrival_ns)
         if not self._odometry.has_pose:
-            return  # nobody knows session time yet
+            return  # session time is unknown until then
         made = radar_frame(radar, frame, info.rate_hz, limits=self._limits)
         self._assembler.take(
             ReceivedFrame(
@@ -661,9 +694,9 @@ class LiveSource:
     def _note_lag(self) -> None:
         lag_s = self.lag_s
         self.worst_lag_s = max(self.worst_lag_s, lag_s)
-        if lag_s > self._lag_told_s:
-            self._lag_told_s = 2.0 * lag_s
-            self._listener.say(
+        if lag_s > self._lag_warned_s:
+            self._lag_warned_s = 2.0 * lag_s
+            self._log.log(
                 "run",
                 f"SLAM is {lag_s:.1f} s behind the radars: this machine is too slow, or busy with "
                 "something else; all frames are recorded",
@@ -671,26 +704,26 @@ class LiveSource:
             )
 
     def _note_unused(self, scan: Scan) -> None:
-        """Say it where SLAM has stood still for long: its clock may be another one by now."""
+        """Warn if SLAM has got no scan for long: a clock may have been set."""
         if scan.used:
             self._unused_since_ns = None
         elif self._unused_since_ns is None:
-            self._unused_since_ns, self._unused_told = scan.t_ns, False
-        elif scan.t_ns - self._unused_since_ns > UNUSED_S * NS_PER_S and not self._unused_told:
-            self._unused_told = True
-            self._listener.say(
+            self._unused_since_ns, self._unused_warned = scan.t_ns, False
+        elif scan.t_ns - self._unused_since_ns > UNUSED_S * NS_PER_S and not self._unused_warned:
+            self._unused_warned = True
+            self._log.log(
                 "run",
                 f"SLAM got no scan for {UNUSED_S:g} s, as odometry does not cover their time or "
                 "they came too late; they are recorded. Was a clock set?",
                 warning=True,
             )
 
-    def _judge(self) -> None:
-        """Say how clocks drift, and end a run that cannot go on."""
+    def _end_if_over(self) -> None:
+        """Log how clocks drift, and end a run that cannot go on."""
         now_ns = self._clock_ns()
-        if now_ns - self._drift_told_ns > _DRIFT_EVERY_S * NS_PER_S:
-            self._drift_told_ns = now_ns
-            self._tell_drifts()
+        if now_ns - self._drift_logged_ns > _DRIFT_EVERY_S * NS_PER_S:
+            self._drift_logged_ns = now_ns
+            self._log_drifts()
         if self.ended is not None:
             return
         if self._assembler.ended:
@@ -706,13 +739,13 @@ class LiveSource:
         elif now_ns - self._all_lost_ns > SILENT_RIG_S * NS_PER_S:
             self.ended = Ended(text=f"no radar for {SILENT_RIG_S:g} s", failed=True)
 
-    def _tell_drifts(self) -> None:
+    def _log_drifts(self) -> None:
         for info, clock in zip(self._radars, self.clocks, strict=True):
-            self._listener.say(info.name, drift_text(clock), warning=False)
+            self._log.log(info.name, drift_text(clock), warning=False)
 
 
 def drift_text(clock: ArrivalClock) -> str:
-    """Return a clock's drift against the host's, for people."""
+    """Return a clock's drift against the host's as text."""
     return (
         f"clock {clock.drift_ppm:+.2f} ppm against this machine's, "
         f"+-{clock.drift_sigma_ppm:.2f} over {clock.baseline_s:.0f} s"

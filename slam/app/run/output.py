@@ -1,4 +1,4 @@
-"""What a person reads during and after a run: progress and tables."""
+"""Progress lines, tables and JSON files."""
 
 from __future__ import annotations
 
@@ -16,32 +16,28 @@ from slam.app.errors import naming
 from slam.app.odometry.tum import NS_PER_S
 from slam.app.records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.run.evaluation import LandmarkSummary, Summary, ratio
-from slam.app.run.runner import RunRecord
+from slam.app.run.runner import RunRecord, RunSource
 from slam.geometry import transform
 
 _LIVE_PERIOD_S = 0.2
 _PLAIN_PERIOD_S = 10.0
 _NO_RADARS = frozenset({"odometry", "run"})
-"""Who else log lines are about."""
+"""Other subjects of log lines."""
 
 
 class Progress(SessionObserver):
-    """Shows scene time, frames per second and radar, pose error, landmarks and lost frames.
-
-    The pose error compares with the truth, which SLAM itself never sees.
+    """Shows session time, frames/s per radar, pose error against truth, landmarks, lost frames.
 
     Parameters
     ----------
     info
-        The run; its radars are counted.
+        Its radars are counted.
     duration_ns
-        Session time the run will cover; None where nobody knows.
-    lost_frames
-        Asked when a line is shown.
-    also
-        Asked for more words when a line is shown.
+        Session time the run will cover; None if unknown.
+    lost_frames, also
+        Called when a line is shown; `also` returns text to add.
     stream
-        Where lines go; a terminal gets one line that is rewritten.
+        A terminal gets one line that is rewritten.
     """
 
     def __init__(
@@ -65,7 +61,6 @@ class Progress(SessionObserver):
         self._snapshot: Snapshot | None = None
 
     def on_scan(self, scan: Scan) -> None:
-        """Count frames; show a line when it is time."""
         self._n_frames += len(scan.frames)
         if self._start_ns is None:  # in the real world session time begins anywhere
             self._start_ns = 0 if self._duration_ns is not None else scan.t_ns
@@ -74,7 +69,6 @@ class Progress(SessionObserver):
             self._show()
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
-        """Remember the newest state."""
         self._snapshot = snapshot
 
     def on_log(self, line: LogLine) -> None:
@@ -120,59 +114,68 @@ class Progress(SessionObserver):
 
 
 def write_json(path: Path, numbers: Mapping[str, object]) -> None:
-    """Write the numbers; NaN is refused, None stands for what there is not.
-
-    Raises
-    ------
-    AppError
-        The file cannot be written.
-    """
+    """Write numbers without NaN; raise AppError if the file cannot be written."""
     text = json.dumps(numbers, indent=2, allow_nan=False)
     with naming(path):
         path.write_text(text + "\n", encoding="ascii")
 
 
-def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Write a table to stdout: names to the left, everything else to the right."""
-    table = [header, *rows]
-    widths = [max(len(row[column]) for row in table) for column in range(len(header))]
-    rule = "-" * max(len(title), sum(widths) + 2 * (len(widths) - 1))
+Row = tuple[str, str, str]
+"""Name, value and note."""
+
+
+def print_table(title: str, header: Sequence[str] | None, rows: Sequence[Sequence[str]]) -> None:
+    """Write a table to stdout; see `table_text`."""
+    sys.stdout.write(table_text(title, header, rows))
+    sys.stdout.flush()
+
+
+def table_text(title: str, header: Sequence[str] | None, rows: Sequence[Sequence[str]]) -> str:
+    """Return a table: the first column to the left, others to the right.
+
+    Without a header, rows are a `Row` each, whose note is to the left, too.
+    """
+    left = {0, 2} if header is None else {0}
+    table = [*([] if header is None else [header]), *rows]
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     lines = [
         "  ".join(
-            cell.ljust(width) if column == 0 else cell.rjust(width)
+            cell.ljust(width) if column in left else cell.rjust(width)
             for column, (cell, width) in enumerate(zip(row, widths, strict=True))
         ).rstrip()
         for row in table
     ]
-    sys.stdout.write("\n".join([title, rule, lines[0], rule, *lines[1:], rule]) + "\n")
-
-
-def print_summary(
-    summary: Summary, *, lag_states: int, wall_s: float, lost_frames: int, stream: TextIO
-) -> None:
-    """Write the table of one simulated run."""
-    text = table_text(summary, lag_states=lag_states, wall_s=wall_s, lost_frames=lost_frames)
-    stream.write(text)
-    stream.flush()
-
-
-def table_text(summary: Summary, *, lag_states: int, wall_s: float, lost_frames: int) -> str:
-    """Return the table of `summary_rows` under its title."""
-    rows = summary_rows(summary, lag_states=lag_states, wall_s=wall_s, lost_frames=lost_frames)
-    title = f"{summary.scene}, preset {summary.preset}"
-    title += ": a drive" if summary.seed is None else f", seed {summary.seed}: simulated numbers"
-    widths = [max(len(row[column]) for row in rows) for column in (0, 1)]
-    rule = "-" * max(len(title), *(sum(widths) + 4 + len(row[2]) for row in rows))
-    lines = [f"{name:<{widths[0]}}  {value:>{widths[1]}}  {note}" for name, value, note in rows]
+    rule = "-" * max(map(len, [title, *lines]))
+    if header is not None:
+        lines.insert(1, rule)
     return "\n".join([title, rule, *lines, rule]) + "\n"
+
+
+def print_result(
+    source: RunSource, record: RunRecord, summary: Summary | None, also: Sequence[Row] = ()
+) -> None:
+    """Print the table of a run; without `summary` no truth is known. `also` are more rows."""
+    info, lost_frames = source.info, source.lost_frames()
+    if summary is None:
+        what = "emulated radars" if info.simulated else "a real drive"
+        title = f"{info.scene}, preset {info.preset}: {what}, with no truth to compare with"
+        rows = run_rows(info, record, lost_frames)
+    else:
+        kind = ": a drive" if summary.seed is None else f", seed {summary.seed}: simulated numbers"
+        title = f"{summary.scene}, preset {summary.preset}{kind}"
+        lag_states = source.slam.config.window.size - 1
+        rows = summary_rows(
+            summary, lag_states=lag_states, wall_s=record.wall_s, lost_frames=lost_frames
+        )
+    print_table(title, None, [*rows, *also])
 
 
 def summary_rows(
     summary: Summary, *, lag_states: int, wall_s: float, lost_frames: int
-) -> list[tuple[str, str, str]]:
-    """Return name, value and note: errors in mm with their ratio to odometry's, landmarks, speed.
+) -> list[Row]:
+    """Return errors in mm with their ratio to odometry's, landmarks and speed.
 
-    `lag_states` is how many newer states had been seen when a state was estimated.
+    `lag_states` is the number of newer states that a filtered state has seen.
     """
     lag = f"filtered, {lag_states} states late" if lag_states else "causal"
     icp_ratio = ratio(summary.ate_icp_rmse_m, summary.odometry_ate_rmse_m)
@@ -198,7 +201,7 @@ def summary_rows(
     ]
 
 
-def _landmark_row(landmarks: LandmarkSummary) -> tuple[str, str, str]:
+def _landmark_row(landmarks: LandmarkSummary) -> Row:
     if landmarks.true is None:
         return ("landmarks", str(landmarks.estimated), "nobody told what really stands there")
     return (
@@ -219,30 +222,8 @@ def share_text(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
-Row = tuple[str, str, str]
-
-
-def print_run_table(
-    info: SessionInfo,
-    record: RunRecord,
-    *,
-    lost_frames: int,
-    stream: TextIO,
-    also: Sequence[Row] = (),
-) -> None:
-    """Write what was driven, mapped and lost; `also` are more rows of name, value, note."""
-    rows = [*run_rows(info, record, lost_frames), *also]
-    what = "emulated radars" if info.simulated else "a real drive"
-    title = f"{info.scene}, preset {info.preset}: {what}, with no truth to compare with"
-    widths = [max(len(row[column]) for row in rows) for column in (0, 1)]
-    rule = "-" * max(len(title), *(sum(widths) + 4 + len(row[2]) for row in rows))
-    lines = [f"{name:<{widths[0]}}  {value:>{widths[1]}}  {note}" for name, value, note in rows]
-    stream.write("\n".join([title, rule, *(line.rstrip() for line in lines), rule]) + "\n")
-    stream.flush()
-
-
 def run_rows(info: SessionInfo, record: RunRecord, lost_frames: int) -> list[Row]:
-    """Return the rows of a run: name, value, note."""
+    """Return time, way driven, last pose and landmarks of a run."""
     duration_s = record.duration_ns / NS_PER_S
     speed = f"{record.n_frames} frames used, {lost_frames} lost between counters"
     rows = [("time", f"{duration_s:.1f} s", f"{speed}, {len(info.radars)} radars")]

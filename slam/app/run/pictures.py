@@ -20,13 +20,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
-from emulator.scene.scene import Scene
 from slam.app.errors import naming
 from slam.app.records import SessionInfo
 from slam.app.run.evaluation import Summary
 from slam.app.run.runner import RunRecord
 from slam.geometry import between, compose, transform
-from slam.paper.ekf import Belief
+from slam.results import Belief
 
 TRUTH, ODOMETRY, ESTIMATE, LANDMARK = "#8a8f98", "#e08a2c", "#1f6fd0", "#c2255c"
 INK, PALE_INK, GRID = "#20242a", "#6a707a", "#eceef1"
@@ -134,30 +133,15 @@ def rotate_covariances(
     return np.asarray(rotation @ covariances_m2 @ rotation.T)
 
 
-Array = NDArray[np.float64]
-
-
-def outlines_m(scene: Scene) -> tuple[Array, ...]:
-    """Return a line for each wall and a closed one for each box, shape (k, 2) [m], world frame."""
-    walls = [np.array([wall.from_m, wall.to_m]) for wall in scene.walls]
-    boxes = []
-    for box in scene.objects:
-        half = np.array([box.width_m, box.depth_m]) / 2
-        corners = half * np.array([(1, 1), (-1, 1), (-1, -1), (1, -1), (1, 1)])
-        boxes.append(transform(np.array([box.x_m, box.y_m, math.radians(box.yaw_deg)]), corners))
-    return (*walls, *boxes)
-
-
 def draw_map(
     path: Path,
     info: SessionInfo,
     record: RunRecord,
     summary: Summary | None,
-    outlines_m: Sequence[NDArray[np.float64]] = (),
 ) -> None:
     """Draw the map of a run into a PNG file; see `map_figure`."""
     with picture(path, width_in=9.0, height_in=6.6, dpi=150) as figure:
-        map_figure(figure, info, record, summary, outlines_m)
+        map_figure(figure, info, record, summary)
 
 
 def map_figure(
@@ -165,14 +149,11 @@ def map_figure(
     info: SessionInfo,
     record: RunRecord,
     summary: Summary | None,
-    outlines_m: Sequence[NDArray[np.float64]] = (),
 ) -> None:
-    """Draw the map of a run.
+    """Draw the map of a run; without `summary`, no truth is drawn.
 
-    Without `summary` nothing true is known, and nothing true is drawn: a drive in the real world.
-    `outlines_m` are lines of shape (k, 2), world frame: walls and boxes, where there are any.
     Estimate and odometry are drawn where they began, at the robot's first pose, without the
-    alignment that the ATE uses: drift is seen as it is.
+    alignment that the ATE uses: drift is shown unaligned.
     """
     place = record.world_from_map
     truth = record.truth
@@ -183,7 +164,7 @@ def map_figure(
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(color=GRID, linewidth=0.8)
     axes.set_axisbelow(True)
-    for number, line in enumerate(outlines_m):
+    for number, line in enumerate(info.outlines_m):
         name = "wall or box" if number == 0 else None
         axes.plot(*line.T, color=INK, linewidth=1.6, alpha=0.45, label=name)
     axes.plot(*odometry.T, color=ODOMETRY, linewidth=0.9, alpha=0.9, label="wheel odometry")

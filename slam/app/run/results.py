@@ -1,11 +1,11 @@
-"""`uwb-slam evaluate`: the error of one trajectory file against another."""
+"""The results of a run: summary, files and printed table; and `uwb-slam evaluate`."""
 
 from __future__ import annotations
 
 import json
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -17,62 +17,80 @@ from slam.app.errors import AppError, naming
 from slam.app.odometry.tum import NS_PER_S, Trajectory, read_tum, write_tum
 from slam.app.records import SessionInfo
 from slam.app.run.evaluation import Summary, summarise
-from slam.app.run.runner import RunRecord
+from slam.app.run.output import Row, print_result
+from slam.app.run.runner import RunRecord, RunSource
 from slam.evaluation import associate_times, ate_rmse_m
-from slam.geometry import Rig
-from xethru_protocol.system import PathInUseError, StopRequestedError, locked
+from xethru_protocol.system import PathInUseError, StopFlag, StopRequestedError, locked
 
 RESULTS = ("map.png", "summary.json", "estimate.tum", "truth.tum", "odometry.tum")
 
 
-def has_truth(record: RunRecord) -> bool:
-    """Return whether the true pose is known at every state, and there is a state."""
-    return len(record.truth) > 0 and bool(np.isfinite(record.truth).all())
+def finish(
+    out: Path, source: RunSource, record: RunRecord, stop: StopFlag, also: Sequence[Row] = ()
+) -> None:
+    """Write a run's results into an existing folder and print its table; `also` are more rows.
 
-
-def write_results(out: Path, info: SessionInfo, record: RunRecord, rig: Rig) -> Summary | None:
-    """Write trajectories, summary.json and map.png; return the numbers where truth is known.
-
-    Parameters
-    ----------
-    out
-        An existing folder.
-    info, record, rig
-        The run.
+    Raises
+    ------
+    AppError
+        A file cannot be written; the table is printed nevertheless.
+    StopRequestedError
+        A signal arrived between two files.
     """
-    summary = None
-    if has_truth(record):
-        summary = summarise(
-            record,
-            scene=info.scene,
-            preset=info.preset,
-            seed=info.seed,
-            rig=rig,
-            true_landmarks_m=info.true_landmarks_m,
-        )
-        if summary is not None and not info.simulated and not len(info.true_landmarks_m):
-            unknown = replace(summary.landmarks, true=None, precision=None, recall=None)
-            summary = replace(summary, landmarks=unknown)
+    stop.check()
+    summary = summary_of(source, record)
+    try:
+        _write(out, source.info, record, summary, stop)
+    except AppError:
+        print_result(source, record, summary, also)
+        raise
+    print_result(source, record, summary, also)
+
+
+def summary_of(source: RunSource, record: RunRecord) -> Summary | None:
+    """Return the numbers of a run; None if no state was estimated or the truth is unknown."""
+    info = source.info
+    if not record.has_truth:
+        return None
+    summary = summarise(
+        record,
+        scene=info.scene,
+        preset=info.preset,
+        seed=info.seed,
+        rig=source.rig,
+        true_landmarks_m=info.true_landmarks_m,
+    )
+    if summary is not None and not info.simulated and not len(info.true_landmarks_m):
+        unknown = replace(summary.landmarks, true=None, precision=None, recall=None)
+        summary = replace(summary, landmarks=unknown)
+    return summary
+
+
+def _write(
+    out: Path, info: SessionInfo, record: RunRecord, summary: Summary | None, stop: StopFlag
+) -> None:
+    stop.check()
     text = summary.to_json() if summary else _summary_without_truth(info, record)
     with naming(path := out / "summary.json"):
         path.write_text(text + "\n", encoding="ascii")
     write_trajectories(out, record)
+    stop.check()
     if record.results:
-        from slam.app.run.pictures import draw_map  # half a second; nobody waits for it before
+        from slam.app.run.pictures import draw_map  # loads matplotlib, half a second
 
         with naming(path := out / "map.png"):
-            draw_map(path, info, record, summary, info.outlines_m)
-    return summary
+            draw_map(path, info, record, summary)
+        stop.check()
 
 
 def write_trajectories(out: Path, record: RunRecord) -> None:
-    """Write estimate, odometry and, where it is known, truth at the stamps of SLAM's states."""
+    """Write estimate, odometry and, if known, truth at the stamps of SLAM's states."""
     stamps_ns = np.array([result.t_ns for result in record.results], dtype=np.int64)
     paths = {
         "estimate": np.array([result.belief.pose for result in record.results]),
         "odometry": np.array([result.odometry_pose for result in record.results]),
     }
-    if has_truth(record):
+    if record.has_truth:
         paths["truth"] = record.truth
     for name, poses in paths.items():
         with naming(path := out / f"{name}.tum"):
@@ -109,7 +127,7 @@ def _summary_without_truth(info: SessionInfo, record: RunRecord) -> str:
 
 
 def prepare_folder(out: Path, names: tuple[str, ...], held: ExitStack) -> None:
-    """Make the folder, hold it, and remove an earlier run's files so that no two runs mix.
+    """Make a folder, lock it, and remove an earlier run's files so that no two runs mix.
 
     Raises
     ------
@@ -130,21 +148,19 @@ def prepare_folder(out: Path, names: tuple[str, ...], held: ExitStack) -> None:
 
 @contextmanager
 def saying_what_is_left(kept: str) -> Iterator[None]:
-    """Let a stop by a signal say what was recorded until then."""
+    """Add to the message of a stop by a signal what was recorded until then."""
     try:
         yield
     except StopRequestedError as stopped:
         raise StopRequestedError(stopped.received, kept) from None
 
 
-Array = NDArray[np.float64]
-
 _TOLERANCE_NS = NS_PER_S // 100
-"""Stamps further apart than 10 ms do not belong together, as in evo."""
+"""Stamps further apart than 10 ms are not associated, as in evo."""
 
 
 def evaluate(estimate: Path, reference: Path) -> dict[str, float | int | str | None]:
-    """Return the ATE of one TUM file against another, with what it rests on.
+    """Return the ATE of one TUM file against another, with the numbers of poses.
 
     The ATE is None where positions are so large that it overflows.
 
@@ -169,7 +185,9 @@ def evaluate(estimate: Path, reference: Path) -> dict[str, float | int | str | N
     }
 
 
-def _finite_ate_m(estimate_xy: Array, reference_xy: Array) -> float | None:
+def _finite_ate_m(
+    estimate_xy: NDArray[np.float64], reference_xy: NDArray[np.float64]
+) -> float | None:
     try:
         with np.errstate(over="ignore", invalid="ignore"):
             ate_m = ate_rmse_m(estimate_xy, reference_xy)
@@ -178,7 +196,7 @@ def _finite_ate_m(estimate_xy: Array, reference_xy: Array) -> float | None:
     return ate_m if math.isfinite(ate_m) else None
 
 
-def run_evaluate(estimate: Path, reference: Path, *, as_json: bool) -> None:
+def run_evaluate(stop: StopFlag, *, estimate: Path, reference: Path, as_json: bool) -> None:
     """Print the ATE as a line, or as one JSON object."""
     result = evaluate(estimate, reference)
     if as_json:

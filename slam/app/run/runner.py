@@ -1,9 +1,13 @@
-"""What happens on the radars' links, as lines of a session."""
+"""The run loop of every command: scans of a source go through SLAM, and sinks get what comes out.
+
+Also what happens on the radars' links: log lines stamped with session time, and link states.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Protocol
@@ -12,39 +16,108 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from slam.app.records import LogLine, RadarInfo, Scan, SessionObserver, Snapshot
+from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.frames import RadarFrame
-from slam.paper.pipeline import Slam, StepResult
+from slam.geometry import Rig
+from slam.results import Slam, StepResult
 from xethru_protocol.driver.conversation import ProtocolRecord
 
 TruthAt = Callable[[NDArray[np.int64]], NDArray[np.float64]]
-"""True poses, shape (n, 3), world frame, at n session times [ns]; NaN where nobody knows."""
+"""True poses, shape (n, 3), world frame, at n session times [ns]; NaN if unknown."""
 
 
-def nobody_knows(stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+def unknown_truth(stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the truth of a run in the real world: NaN, shape (n, 3)."""
     return np.full((len(stamps_ns), 3), np.nan)
 
 
 class Odometry(Protocol):
-    """What tells the wheels' pose."""
+    """Gives the wheels' pose, shape (3,), odometry frame, at a session time."""
 
-    def pose_at(self, t_ns: int) -> NDArray[np.float64]:
-        """Return the pose at a session time, shape (3,), odometry frame."""
-        ...
+    def pose_at(self, t_ns: int) -> NDArray[np.float64]: ...
+
+
+class LinkLog(SessionObserver):
+    """Stamps what is logged with session time; lines wait until sinks are attached."""
+
+    def __init__(self) -> None:
+        self._t_ns = 0
+        self._waiting: list[LogLine] = []
+        self._sinks: tuple[SessionObserver, ...] | None = None
+
+    def attach(self, *sinks: SessionObserver) -> None:
+        """Pass on the lines that wait, and every later one."""
+        self._sinks = sinks
+        waiting, self._waiting = self._waiting, []
+        for line in waiting:
+            self.pass_on(line)
+
+    def on_record(self, radar: str, record: ProtocolRecord) -> None:
+        """Log one command, answer, SYSTEM message or fault of a radar's link."""
+        text = f"{record.direction} {record.summary}"
+        self.log(radar, text, warning=record.direction == "fault")
+
+    def log(self, subject: str, text: str, *, warning: bool) -> None:
+        """Log a line about a radar, "odometry" or "run"."""
+        self.pass_on(LogLine(t_ns=self._t_ns, radar=subject, warning=warning, text=text))
+
+    def pass_on(self, line: LogLine) -> None:
+        """Give a line that has its stamp to the sinks."""
+        if self._sinks is None:
+            self._waiting.append(line)
+            return
+        for sink in self._sinks:
+            sink.on_log(line)
+
+    def on_scan(self, scan: Scan) -> None:
+        """Take over session time."""
+        self._t_ns = scan.t_ns
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RunSource:
+    """The input of a run: an emulated rig, live modules or a recorded session, and its SLAM.
+
+    Attributes
+    ----------
+    info
+        Describes the run; SLAM gets the frames of its radars without their gains.
+    rig
+        The mounts that SLAM uses.
+    slam, scans, odometry
+        The pipeline and its input.
+    truth_at
+        For sinks and results only.
+    lost_frames
+        Returns the frames missing so far between counters, over all radars.
+    link_log
+        Gets the lines about links while scans are drawn.
+    close
+        Called before sinks are closed: what it logs is still recorded.
+    """
+
+    info: SessionInfo
+    rig: Rig
+    slam: Slam
+    scans: Iterable[Scan]
+    odometry: Odometry
+    truth_at: TruthAt = unknown_truth
+    lost_frames: Callable[[], int] = int
+    link_log: LinkLog = field(default_factory=LinkLog)
+    close: Callable[[], None] = lambda: None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RunRecord:
-    """What a run leaves behind for its reports.
+    """The outcome of a run.
 
     Attributes
     ----------
     results, truth
         States of SLAM in time order, and the true pose at each, shape (n_states, 3), world frame;
-        NaN where nobody knows.
+        NaN if unknown.
     world_from_map
-        Shape (3,): where the map frame lies in the world; zeros where nobody knows.
+        Shape (3,): where the map frame lies in the world; zeros if unknown.
     n_frames
         Radar frames used, over all radars.
     start_ns
@@ -64,6 +137,35 @@ class RunRecord:
     start_ns: int = 0
     wall_spans_m: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 2, 2)))
 
+    @property
+    def has_truth(self) -> bool:
+        """Whether the true pose is known at every state, and there is a state."""
+        return len(self.truth) > 0 and bool(np.isfinite(self.truth).all())
+
+
+def execute(source: RunSource, sinks: Sequence[SessionObserver] = ()) -> RunRecord:
+    """Run a source through SLAM into sinks, and close these in their order.
+
+    Raises
+    ------
+    OdometryError
+        Odometry does not cover the time of a scan.
+    """
+    observers = [*sinks, source.link_log]
+    with ExitStack() as closing:
+        for observer in reversed(observers):
+            closing.enter_context(observer)
+        closing.callback(source.close)
+        source.link_log.attach(*sinks)
+        return run_slam(
+            source.scans,
+            source.odometry,
+            source.slam,
+            source.truth_at,
+            [source.link_log, *sinks],
+            gains_db=[radar.gain_db for radar in source.info.radars],
+        )
+
 
 def run_slam(
     scans: Iterable[Scan],
@@ -74,11 +176,11 @@ def run_slam(
     *,
     gains_db: Sequence[float] = (),
 ) -> RunRecord:
-    """Feed scans to SLAM as they come and tell the observers about scans and states.
+    """Feed scans to SLAM as they come, and scans and states to the observers.
 
-    A scan that is not `used` is told, and not stepped. BLAS runs on one thread, here as in every
-    other path, so that results are the same bits. Truth goes to the observers only; they see
-    frames as they came, SLAM sees them less each radar's gain, where `gains_db` tells any.
+    A scan that is not `used` goes to the observers only. BLAS runs on one thread, as in every
+    other path, so that results are the same bits. Truth goes to the observers only; they get
+    frames as received, SLAM gets them without each radar's gain, if `gains_db` has any.
 
     Raises
     ------
@@ -131,7 +233,7 @@ def run_slam(
 
 
 def less_gain(frame: RadarFrame, gain_db: float) -> RadarFrame:
-    """Return a frame as a radar of no gain would have heard it, cut off where it was cut off."""
+    """Return a frame as a radar without gain would give it, with its limits scaled, too."""
     if gain_db == 0.0:
         return frame
     scale = np.float32(10.0 ** (-gain_db / 20.0))
@@ -170,7 +272,7 @@ def make_snapshot(
 
 
 class LinkState(StrEnum):
-    """One of the states a lane shows."""
+    """State of a radar's link."""
 
     SETTING_UP = "setting up"
     STREAMING = "streaming"
@@ -182,7 +284,7 @@ class LinkState(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkChange:
-    """From `t_ns` of session time on, a radar's link is in this state."""
+    """A radar's link is in this state from session time `t_ns` on."""
 
     t_ns: int
     radar: str
@@ -191,7 +293,7 @@ class LinkChange:
 
 @dataclass(slots=True, kw_only=True)
 class LinkCount:
-    """What came and what did not, of one radar.
+    """Frames received and lost of one radar.
 
     Attributes
     ----------
@@ -202,7 +304,7 @@ class LinkCount:
     longest_gap
         Most frames lost in a row.
     state
-        What its lane shows now; None before anything was heard.
+        Of the link now; None before anything was received.
     """
 
     frames: int = 0
@@ -215,7 +317,7 @@ class LinkCount:
 
 
 @dataclass(slots=True)
-class LinkLanes:
+class LinkStates:
     """Follows the links of all radars.
 
     Parameters
@@ -228,13 +330,12 @@ class LinkLanes:
     counts: dict[str, LinkCount] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Start with nothing heard."""
         self.counts = {radar.name: LinkCount() for radar in self.radars}
 
     def on_scan(self, scan: Scan) -> Iterator[LinkChange]:
-        """Yield the changes that one tick brings; a radar without a frame in it is silent.
+        """Yield the changes in one tick; a radar without a frame in it is silent.
 
-        What SLAM did not use holds late frames, too, and tells nothing of the radars not in it.
+        A scan that SLAM did not use may hold late frames only, so other radars are not silent then.
         """
         frames = {frame.radar: frame for frame in scan.frames}
         for index, radar in enumerate(self.radars):
@@ -254,7 +355,7 @@ class LinkLanes:
             yield from self._change(radar.name, frame.t_ns, state)
 
     def on_log(self, line: LogLine) -> Iterator[LinkChange]:
-        """Yield the change that a line of the log brings, if any."""
+        """Yield the change that follows from a line of the log, if any."""
         count = self.counts.get(line.radar)
         if count is None:
             return  # a line about something else than a radar
@@ -265,7 +366,7 @@ class LinkLanes:
             yield from self._change(line.radar, line.t_ns, LinkState.SETTING_UP)
 
     def end(self, t_ns: int) -> Iterator[LinkChange]:
-        """Yield the end of every lane."""
+        """Yield the end of every link."""
         for radar in self.radars:
             yield from self._change(radar.name, t_ns, LinkState.ENDED)
 
@@ -274,40 +375,3 @@ class LinkLanes:
         if count.state is not state:
             count.state = state
             yield LinkChange(t_ns=t_ns, radar=radar, state=state)
-
-
-class LinkLog(SessionObserver):
-    """Stamps what the drivers report with session time and passes it on, once someone listens."""
-
-    def __init__(self) -> None:
-        self._t_ns = 0
-        self._waiting: list[LogLine] = []
-        self._listeners: tuple[SessionObserver, ...] = ()
-
-    def attach(self, *listeners: SessionObserver) -> None:
-        """Pass on what was said so far, and everything from now on."""
-        self._listeners = listeners
-        waiting, self._waiting = self._waiting, []
-        for line in waiting:
-            self._tell(line)
-
-    def on_record(self, radar: str, record: ProtocolRecord) -> None:
-        """Take one command, answer, SYSTEM message or fault of a radar's link."""
-        text = f"{record.direction} {record.summary}"
-        self.say(radar, text, warning=record.direction == "fault")
-
-    def say(self, who: str, text: str, *, warning: bool) -> None:
-        """Pass on a line about a radar, the odometry or the run itself."""
-        line = LogLine(t_ns=self._t_ns, radar=who, warning=warning, text=text)
-        if self._listeners:
-            self._tell(line)
-        else:
-            self._waiting.append(line)
-
-    def on_scan(self, scan: Scan) -> None:
-        """Keep session time."""
-        self._t_ns = scan.t_ns
-
-    def _tell(self, line: LogLine) -> None:
-        for listener in self._listeners:
-            listener.on_log(line)

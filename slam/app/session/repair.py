@@ -17,7 +17,7 @@ from pathlib import Path
 from slam.app.errors import AppError
 from slam.app.session.mcap import open_mcap
 from xethru_protocol.recordings import mcap
-from xethru_protocol.system import PathInUseError, locked
+from xethru_protocol.system import PathInUseError, StopFlag, locked
 
 KEPT_SUFFIX = ".unrepaired"
 """Of the name under which the file is kept as it was."""
@@ -30,8 +30,6 @@ _CHECKED_FOOTER_BYTES = 16  # of its body, that its checksum covers
 
 @dataclass(slots=True, kw_only=True)
 class _Survey:
-    """What one look at the whole file finds."""
-
     cut_at: int | None = None
     damages: list[mcap.Damage] = field(default_factory=list)
     has_index: bool = False
@@ -47,7 +45,6 @@ class _Survey:
 
     @property
     def is_whole(self) -> bool:
-        """Whether there is nothing to do."""
         return self.cut_at is None and not self.damages and self.has_index
 
 
@@ -81,7 +78,6 @@ class Repair:
     kept: Path | None
 
     def __str__(self) -> str:
-        """Say so to a person."""
         span = f"{self.n_messages} messages, {(self.last_ns - self.first_ns) / 1e9:.1f} s"
         if self.was_whole:
             return f"{self.path}: whole, nothing to repair: {span}"
@@ -96,6 +92,11 @@ class Repair:
         if self.kept is not None:
             lines.append(f"  as it was: {self.kept}")
         return "\n".join(lines)
+
+
+def run_repair(stop: StopFlag, *, session: Path, out: Path | None) -> None:
+    """Repair a recording and print the outcome; see `repair`."""
+    print(repair(session, out, stop.check))  # noqa: T201 - the result
 
 
 def repair(path: Path, out: Path | None, check: Callable[[], None]) -> Repair:

@@ -11,13 +11,15 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 
+from joblib import cpu_count
 from pydantic import TypeAdapter, ValidationError
 
 from slam.app.errors import AppError, UsageError, naming
@@ -127,29 +129,39 @@ def _runs_of(path: Path, content: bytes, command: Mapping[str, str]) -> list[Swe
     return known.runs
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SweepOptions:
-    """What the command line of `uwb-slam sweep` says.
-
-    `settings` maps dotted keys of a preset to the values to try, `stresses` are rows beside the
-    clean runs, and `dask` is the address of a scheduler that takes the place of `jobs` processes.
-    """
-
-    scenes: tuple[str, ...]
-    presets: tuple[str, ...]
-    n_seeds: int
-    jobs: int
-    out: Path
-    settings: tuple[tuple[str, tuple[str, ...]], ...] = ()
-    stresses: tuple[str, ...] = ()
-    bound: bool = False
-    dask: str | None = None
-
-
-def run_sweep(options: SweepOptions, stop: StopFlag) -> None:
+def run_sweep(
+    stop: StopFlag,
+    *,
+    out: Path,
+    scenes: Sequence[str] | None = None,
+    presets: Sequence[str] | None = None,
+    n_seeds: int,
+    settings: Sequence[tuple[str, tuple[str, ...]]] = (),
+    stresses: Sequence[str] = (),
+    bound: bool = False,
+    jobs: int | None = None,
+    dask: str | None = None,
+) -> None:
     """Run all cells, write `{"runs": [...], "groups": [...]}`, print one line per group.
 
     OUT.part holds the runs done so far, and the same command goes on with it.
+
+    Parameters
+    ----------
+    stop
+        Checked between runs.
+    out
+        The result file.
+    scenes, presets, n_seeds
+        What is run; None is the lab, and preset robust.
+    settings
+        Dotted keys of a preset and the values to try.
+    stresses
+        Rows beside the clean runs.
+    bound
+        Whether to compute the known-association bound, too.
+    jobs, dask
+        The number of processes, None for one per core; or the address of a scheduler.
 
     Raises
     ------
@@ -159,15 +171,17 @@ def run_sweep(options: SweepOptions, stop: StopFlag) -> None:
     StopRequestedError
         A signal arrived; OUT.part stays if it holds a run.
     """
-    cases = _cases(options)  # a wrong name ends the command before any run
-    if options.bound:
+    presets = presets or ["robust"]
+    # a wrong name ends the command before any run
+    cases = _cases(scenes or ["lab"], presets, n_seeds, settings, stresses, bound=bound)
+    if bound:
         require_gtsam()
-    if options.out.is_dir():
-        raise AppError(f"{options.out}: is a folder, must be a file")
-    if options.out.exists() and not options.out.is_file():
+    if out.is_dir():
+        raise AppError(f"{out}: is a folder, must be a file")
+    if out.exists() and not out.is_file():
         # it would be replaced: as root, even a device for everybody
-        raise AppError(f"{options.out}: is no regular file, must be one")
-    path = options.out.with_name(f"{options.out.name}.part")
+        raise AppError(f"{out}: is no regular file, must be one")
+    path = out.with_name(f"{out.name}.part")
     with ExitStack() as held:
         with naming(path):  # what cannot be written ends the command before any run, too
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -178,44 +192,58 @@ def run_sweep(options: SweepOptions, stop: StopFlag) -> None:
                 raise AppError(
                     f"{path}: another sweep is writing there; choose another --json"
                 ) from None
-        part = PartFile(path, _command(options, cases))
-        _run(options, cases, part, stop)
+        part = PartFile(path, _command(cases, presets, n_seeds, settings, bound=bound))
+        results = partial(_results, jobs=jobs or cpu_count(), dask=dask, stop=stop)
+        _run(cases, part, out, results, stop)
 
 
-def _cases(options: SweepOptions) -> list[Case]:
+def _cases(
+    scenes: Sequence[str],
+    presets: Sequence[str],
+    n_seeds: int,
+    settings: Sequence[tuple[str, tuple[str, ...]]],
+    stresses: Sequence[str],
+    *,
+    bound: bool,
+) -> list[Case]:
     """Return the runs in their order: seeds innermost, so that groups are done one by one."""
-    values = [[(key, value) for value in of_key] for key, of_key in options.settings]
-    stresses = dict.fromkeys((CLEAN, *options.stresses))
+    values = [[(key, value) for value in of_key] for key, of_key in settings]
+    rows = dict.fromkeys((CLEAN, *stresses))
     cells = [
-        make_case(scene, preset, 0, settings=dict(settings), stress=stress, bound=options.bound)
-        for scene, preset, settings, stress in product(
-            options.scenes, options.presets, product(*values), stresses
-        )
+        make_case(scene, preset, 0, settings=dict(chosen), stress=stress, bound=bound)
+        for scene, preset, chosen, stress in product(scenes, presets, product(*values), rows)
     ]
     if len({cell.key for cell in cells}) < len(cells):
-        names = len({cell.scene.name for cell in cells}) < len(options.scenes)
+        names = len({cell.scene.name for cell in cells}) < len(scenes)
         raise UsageError(
             "--scene: two of the scenes have the same name; give each its own"
             if names
             else "--preset, --set: one of them is given twice; give each once"
         )
-    return [replace(cell, seed=seed) for cell in cells for seed in range(options.n_seeds)]
+    return [replace(cell, seed=seed) for cell in cells for seed in range(n_seeds)]
 
 
-def _command(options: SweepOptions, cases: Sequence[Case]) -> dict[str, str]:
+def _command(
+    cases: Sequence[Case],
+    presets: Sequence[str],
+    n_seeds: int,
+    settings: Sequence[tuple[str, tuple[str, ...]]],
+    *,
+    bound: bool,
+) -> dict[str, str]:
     """Return what the results depend on, by the name that an error message gives it."""
     command = {
         "scenes": " ".join(dict.fromkeys(case.scene.name for case in cases)),
-        "presets": " ".join(options.presets),
-        "seeds": str(options.n_seeds),
-        "settings": " ".join(f"{key}={','.join(values)}" for key, values in options.settings),
+        "presets": " ".join(presets),
+        "seeds": str(n_seeds),
+        "settings": " ".join(f"{key}={','.join(values)}" for key, values in settings),
         "stresses": " ".join(dict.fromkeys(case.stress for case in cases)),
-        "bound": str(options.bound),
+        "bound": str(bound),
     }
-    for case in cases[:: options.n_seeds]:
+    for case in cases[::n_seeds]:
         command[f"scene file {case.scene.name}"] = _digest(case.scene.model_dump_json())
         command[f"preset file {case.preset}"] = ""
-    for preset in options.presets:
+    for preset in presets:
         configs = [case.config.model_dump_json() for case in cases if case.preset == preset]
         command[f"preset file {preset}"] = _digest(*dict.fromkeys(configs))
     return command | {"version of the program": program_version()}
@@ -225,7 +253,13 @@ def _digest(*texts: str) -> str:
     return hashlib.sha256("\n".join(texts).encode()).hexdigest()
 
 
-def _run(options: SweepOptions, cases: Sequence[Case], part: PartFile, stop: StopFlag) -> None:
+def _run(
+    cases: Sequence[Case],
+    part: PartFile,
+    out: Path,
+    results: Callable[[Sequence[Case]], Iterator[SweepRun]],
+    stop: StopFlag,
+) -> None:
     done = {run.key for run in part.runs}
     missing = [case for case in cases if case.key not in done]
     if done:
@@ -236,7 +270,7 @@ def _run(options: SweepOptions, cases: Sequence[Case], part: PartFile, stop: Sto
 
     started = time.monotonic()
     try:
-        for run in _results(missing, options, stop):
+        for run in results(missing):
             part.add(run)
             elapsed_s = time.monotonic() - started
             to_do = len(cases) - len(part.runs)
@@ -255,10 +289,10 @@ def _run(options: SweepOptions, cases: Sequence[Case], part: PartFile, stop: Sto
     finally:
         if not part.runs:
             part.path.unlink()
-    _finish(options, cases, part)
+    _finish(cases, part, out)
 
 
-def _finish(options: SweepOptions, cases: Sequence[Case], part: PartFile) -> None:
+def _finish(cases: Sequence[Case], part: PartFile, out: Path) -> None:
     by_key = {run.key: run for run in part.runs}
     runs = [by_key[case.key] for case in cases]
     groups = summarise_groups(runs)
@@ -266,7 +300,7 @@ def _finish(options: SweepOptions, cases: Sequence[Case], part: PartFile) -> Non
     with naming(part.path):
         text = json.dumps(result, indent=2, allow_nan=False) + "\n"
         part.path.write_text(text, encoding="ascii")
-        part.path.replace(options.out)
+        part.path.replace(out)
     for group in groups:
         sys.stdout.write(f"{group_line(group)}\n")
     for clean, rows in stress_tables(groups):
@@ -293,15 +327,17 @@ def _clock(seconds: float) -> str:
     return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
 
 
-def _results(cases: Sequence[Case], options: SweepOptions, stop: StopFlag) -> Iterator[SweepRun]:
+def _results(
+    cases: Sequence[Case], *, jobs: int, dask: str | None, stop: StopFlag
+) -> Iterator[SweepRun]:
     """Run cases here, on worker processes or on a cluster; results in the order of the cases."""
     if not cases:
         return
-    if options.dask is None and options.jobs == 1:
+    if dask is None and jobs == 1:
         for case in cases:
             yield run_case(case, check=stop.check)
         return
-    with _workers(cases, options) as results:
+    with _workers(cases, jobs, dask) as results:
         while True:
             # Nothing is half-written while we wait, so a signal may end the waiting at once.
             with stop.at_once():
@@ -312,9 +348,9 @@ def _results(cases: Sequence[Case], options: SweepOptions, stop: StopFlag) -> It
 
 
 def _workers(
-    cases: Sequence[Case], options: SweepOptions
+    cases: Sequence[Case], jobs: int, dask: str | None
 ) -> AbstractContextManager[Iterator[SweepRun]]:
-    if options.dask is None:
-        return worker_results(run_case, [(case,) for case in cases], options.jobs)
+    if dask is None:
+        return worker_results(run_case, [(case,) for case in cases], jobs)
     tasks = [(case, program_version()) for case in cases]
-    return dask_results(run_case, tasks, options.dask)
+    return dask_results(run_case, tasks, dask)

@@ -13,10 +13,12 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.app.errors import AppError
 from slam.app.odometry.tum import NS_PER_S
 from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.run.evaluation import (
@@ -27,7 +29,7 @@ from slam.app.run.evaluation import (
     position_errors_m,
     world_from_odom,
 )
-from slam.app.run.runner import LinkChange, LinkLanes, LinkState
+from slam.app.run.runner import LinkChange, LinkState, LinkStates
 from slam.app.view.frames import BLOCK_FRAMES, FrameLayer
 from slam.app.view.map import TRAIL_STATES, MapLayer, beams_of
 from slam.app.view.rerun_recording import (
@@ -215,7 +217,7 @@ class LinkLayer:
 
     def __init__(self, recording: Recording, radars: Sequence[RadarInfo]) -> None:
         self._recording = recording
-        self._lanes = LinkLanes(tuple(radars))
+        self._states = LinkStates(tuple(radars))
         self._heard: deque[LogLine] = deque()
         self._changes: list[tuple[LinkChange, int, int | None]] = []
         self._losses: dict[str, tuple[Stamps, list[int]]] = {
@@ -245,9 +247,9 @@ class LinkLayer:
         """Take the frames of one tick: who sent, who lost."""
         self._follow_log()
         self._counter, self._t_ns, self._host_ns = scan.counter, scan.t_ns, host_ns
-        before = {name: count.lost for name, count in self._lanes.counts.items()}
-        self._note(self._lanes.on_scan(scan))
-        for name, count in self._lanes.counts.items():
+        before = {name: count.lost for name, count in self._states.counts.items()}
+        self._note(self._states.on_scan(scan))
+        for name, count in self._states.counts.items():
             stamps, values = self._losses[name]
             # A step, so also where it starts; a line that never moves needs its ends only.
             if count.lost != before[name] or count.frames == 1:
@@ -262,7 +264,7 @@ class LinkLayer:
         """Send what waits."""
         self._follow_log()
         changes, self._changes = self._changes, []
-        for radar in self._lanes.radars:
+        for radar in self._states.radars:
             stamps = Stamps.none()
             states = []
             for change, counter, host_ns in changes:
@@ -281,8 +283,8 @@ class LinkLayer:
     def finish(self) -> None:
         """Send what waits, and end every lane."""
         self._follow_log()
-        self._note(self._lanes.end(self._t_ns))
-        for name, count in self._lanes.counts.items():
+        self._note(self._states.end(self._t_ns))
+        for name, count in self._states.counts.items():
             stamps, values = self._losses[name]
             stamps.add(self._t_ns, self._counter, self._host_ns)
             values.append(count.lost)
@@ -297,7 +299,7 @@ class LinkLayer:
         while self._heard:  # not a swap: another thread may add while this runs
             lines.append(self._heard.popleft())
         for line in lines:
-            self._note(self._lanes.on_log(line))
+            self._note(self._states.on_log(line))
         for name in dict.fromkeys(line.radar for line in lines):
             self._send_lines(name, [line for line in lines if line.radar == name])
 
@@ -309,9 +311,9 @@ class LinkLayer:
         )
         self._recording.rows(f"link/log/{part(name)}", stamps, columns)
         faults = [line for line in lines if line.warning]
-        if faults and name in self._lanes.counts:
+        if faults and name in self._states.counts:
             # The number of the fault, so that a burst of them is a steep stair.
-            last = self._lanes.counts[name].faults
+            last = self._states.counts[name].faults
             numbers = np.arange(last - len(faults) + 1, last + 1, dtype=np.float64)
             scalars = rr.Scalars.columns(scalars=numbers)
             self._recording.rows(f"link/faults/{part(name)}", self._stamps_of(faults), scalars)
@@ -501,6 +503,19 @@ class RerunView(SessionObserver):
         self._numbers.send()
         self._link.finish()
         self._recording.finish()
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close; an error of the run itself takes precedence over one of its view."""
+        try:
+            self.close()
+        except AppError:
+            if error is None:
+                raise
 
     def _send(self, older_than_ns: int) -> None:
         self._flushed_s = self._clock_s()

@@ -1,9 +1,7 @@
-"""A session seen while it happens: a viewer of our own or somebody's, told of everything.
+"""A session shown while it happens, in a viewer that is started here or runs already.
 
-The viewer is started here rather than by Rerun's own `spawn`, since that listens to the whole
-network.
-
-A viewer is never waited for and never missed: if it is closed in the middle, the run goes on.
+The viewer is not started by Rerun's own `spawn`, since that listens to the whole network. If a
+viewer is closed in the middle, the run goes on without it.
 """
 
 from __future__ import annotations
@@ -28,6 +26,7 @@ from slam.app.errors import AppError
 from slam.app.records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.rig.emulated import signal_at_parents_death
 from slam.app.view import SERVE_WEB, SPAWN
+from xethru_protocol.system import StopFlag
 
 _HERE = "127.0.0.1"
 _DEFAULT_PORT = 9876
@@ -43,7 +42,7 @@ _DRIVER_VARIABLES = ("VK_ICD_FILENAMES", "VK_DRIVER_FILES")
 
 
 class ViewerKind(Enum):
-    """What a viewer shows itself in; the value is its command line."""
+    """Where a viewer draws; the value is its command line."""
 
     WINDOW = ("--hide-welcome-screen", "--expect-data-soon")
     WEB = ("--serve-web",)
@@ -56,9 +55,9 @@ class ViewerProcess:
     Parameters
     ----------
     kind
-        What it shows itself in.
+        Where it draws.
     files
-        Recordings to open at once; none where rows will be sent.
+        Recordings to open at once; none if rows will be sent.
     """
 
     def __init__(self, kind: ViewerKind, *files: Path) -> None:
@@ -78,7 +77,7 @@ class ViewerProcess:
 
     @property
     def has_ended(self) -> bool:
-        """Whether the process is gone, for whatever reason."""
+        """Whether the process is gone."""
         return self._process is None or self._process.poll() is not None
 
     def __enter__(self) -> Self:
@@ -102,7 +101,7 @@ class ViewerProcess:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             env=_environment(self._kind),
-            # Ctrl-C is for us; a window stays when we end.
+            # Ctrl-C ends this process only; a window stays
             start_new_session=True,
             preexec_fn=signal_at_parents_death(signal.SIGTERM) if is_ours else None,
         )
@@ -114,14 +113,12 @@ class ViewerProcess:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """End the process, unless it is a window: that is the user's to close."""
+        """End the process, unless it is a window, which the user closes."""
         process = self._process
         if process is None:
             return
         if self._kind is ViewerKind.WINDOW and error is None:
-            process.returncode = (
-                process.poll() or 0
-            )  # left open, and not a zombie of ours to warn of
+            process.returncode = process.poll() or 0  # left open, and without a ResourceWarning
             return
         process.terminate()
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -130,13 +127,8 @@ class ViewerProcess:
         process.kill()
         process.wait()
 
-    def wait_until_ready(self, check: Callable[[], None]) -> None:
+    def wait_until_ready(self, stop: StopFlag) -> None:
         """Wait until the viewer takes recordings.
-
-        Parameters
-        ----------
-        check
-            Called again and again; may raise to stop.
 
         Raises
         ------
@@ -147,7 +139,7 @@ class ViewerProcess:
         ports = [self._port] + ([self._web_port] if self._kind is ViewerKind.WEB else [])
         for port in ports:
             while not _listens(port):
-                check()
+                stop.check()
                 self._require_alive()
                 if time.monotonic() > give_up:
                     raise AppError(f"the Rerun viewer did not listen within {_START_LIMIT_S:g} s")
@@ -155,7 +147,7 @@ class ViewerProcess:
         if self._kind is not ViewerKind.WEB:
             settled = time.monotonic() + _SETTLE_S
             while time.monotonic() < settled:
-                check()
+                stop.check()
                 self._require_alive()
                 time.sleep(_POLL_S)
 
@@ -169,12 +161,12 @@ class ViewerProcess:
 
 
 def require_listening(url: str) -> None:
-    """See that somebody listens at the `rerun+http://` address of a viewer.
+    """Require that a viewer listens at a `rerun+http://` address.
 
     Raises
     ------
     AppError
-        Nobody does; names the remedy.
+        None does; the message names the remedy.
     """
     try:
         parts = urlsplit(url)
@@ -191,7 +183,7 @@ def require_listening(url: str) -> None:
 
 
 def executable() -> Path:
-    """Return the viewer that came with the SDK: the same version, whatever is on the path."""
+    """Return the viewer that came with the SDK, and so has the same version."""
     found = importlib.util.find_spec("rerun_cli")
     folder = Path(found.origin).parent if found is not None and found.origin else None
     names = ("Rerun.app/Contents/MacOS/Rerun", "rerun")
@@ -205,7 +197,7 @@ def _environment(kind: ViewerKind) -> dict[str, str]:
     environment = dict(os.environ) | {"RERUN_APP_ONLY": "true"}
     environment.pop("RUST_LOG", None)
     if kind is ViewerKind.HEADLESS and not any(os.environ.get(v) for v in _DRIVER_VARIABLES):
-        # The software driver is asked for by name: pictures then look the same with every card.
+        # the software driver by name: pictures then look the same with every card
         drivers = [path for folder in _LAVAPIPE for path in sorted(folder.glob("lvp_icd*.json"))]
         if drivers:
             environment["VK_ICD_FILENAMES"] = str(drivers[0])
@@ -239,32 +231,30 @@ _VIEW_POLL_S = 0.1
 
 
 class LiveView:
-    """Gives an observer that shows a run, while it is entered.
+    """A viewer, while it is entered; `observer` shows a run in it.
 
     Parameters
     ----------
     where
         `spawn`: a window; `serve-web`: a page for a browser; else the `rerun+http://` address of a
-        viewer that listens already.
-    check
-        Called again and again while waiting; may raise to stop.
+        running viewer.
+    stop
+        Checked again and again while waiting.
     files
-        Recordings that a viewer of our own opens at once.
+        Recordings that a viewer started here opens at once.
     is_replay
-        What is shown happened before: when it comes says nothing.
+        Whether the run happened before, so that the time of arrival has no meaning.
     """
 
-    def __init__(
-        self, where: str, check: Callable[[], None], *files: Path, is_replay: bool = False
-    ) -> None:
-        self._where, self._check, self._files = where, check, files
+    def __init__(self, where: str, stop: StopFlag, *files: Path, is_replay: bool = False) -> None:
+        self._where, self._stop, self._files = where, stop, files
         self._is_replay, self._has_shown = is_replay, bool(files)
         self._stack = ExitStack()
         self._url, self._web_url = where, ""
         self._has_ended: Callable[[], bool] = lambda: False
 
     def __enter__(self) -> Self:
-        """Start the viewer, where it is ours.
+        """Start the viewer, unless it runs already.
 
         Raises
         ------
@@ -275,7 +265,7 @@ class LiveView:
             kind = ViewerKind.WEB if self._where == SERVE_WEB else ViewerKind.WINDOW
             with ExitStack() as starting:
                 viewer = starting.enter_context(ViewerProcess(kind, *self._files))
-                viewer.wait_until_ready(self._check)
+                viewer.wait_until_ready(self._stop)
                 self._stack = starting.pop_all()
             self._url, self._has_ended = viewer.url, lambda: viewer.has_ended
             if kind is ViewerKind.WEB:
@@ -291,14 +281,14 @@ class LiveView:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """End a viewer that serves a browser; a window stays open, however what it shows ended."""
+        """End a viewer that serves a browser; a window stays open if a run was shown in it."""
         if self._has_shown:
             self._stack.close()
         else:
             self._stack.__exit__(kind, error, trace)
 
     def observer(self, info: SessionInfo) -> SessionObserver:
-        """Return what shows a run; to be closed like every other."""
+        """Return an observer that shows a run."""
         from slam.app.view.panels import RerunView
         from slam.app.view.rerun_recording import ViewerTarget  # half a second, as in the run
 
@@ -312,24 +302,23 @@ class LiveView:
         return _WhileWatched(view, self._has_ended)
 
     def keep_serving(self) -> None:
-        """Keep a page for the browser until a signal comes; a window needs nothing."""
+        """Serve a page for the browser until a signal comes; a window needs nothing."""
         if not self._web_url:
             return
         _say(f"the view stays at {self._web_url} until Ctrl-C")
         while not self._has_ended():
-            self._check()
+            self._stop.check()
             time.sleep(_VIEW_POLL_S)
 
 
 class _WhileWatched(SessionObserver):
-    """Passes everything on until the viewer is gone."""
+    """Passes everything on until the viewer has ended."""
 
     def __init__(self, view: SessionObserver, has_ended: Callable[[], bool]) -> None:
         self._view, self._has_ended = view, has_ended
         self._is_watched = True
 
     def on_scan(self, scan: Scan) -> None:
-        """Pass on a scan; notice once that nobody looks."""
         if self._is_watched and self._has_ended():
             self._is_watched = False
             _say("the viewer was closed; the run goes on without it")
@@ -337,17 +326,15 @@ class _WhileWatched(SessionObserver):
             self._view.on_scan(scan)
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
-        """Pass on a state."""
         if self._is_watched:
             self._view.on_snapshot(snapshot)
 
     def on_log(self, line: LogLine) -> None:
-        """Pass on a line."""
         if self._is_watched:
             self._view.on_log(line)
 
     def close(self) -> None:
-        """Send the last rows; a viewer that is gone takes none, which harms nobody."""
+        """Send the last rows; a viewer that is gone takes none."""
         self._view.close()
 
 

@@ -105,7 +105,6 @@ class BinaryKind(_Kind):
 
     @property
     def element_bytes(self) -> int:
-        """Bytes per element."""
         return self.columns * np.dtype(self.values).itemsize
 
     def record(self, message: Response, time_ms: int, zone: tzinfo | None) -> bytes:

@@ -307,7 +307,7 @@ def _files_by_entry(
 
 
 def vendor_facts(path: Path) -> RecordingFacts:
-    """Return what a recording says about itself; next to nothing without a meta file.
+    """Return the facts about a recording; almost none without a meta file.
 
     Raises
     ------
@@ -385,7 +385,7 @@ def _data_files(directory: Path) -> list[Path]:
 def _split_directories(path: Path) -> list[tuple[Path, list[Path]]]:
     names = sorted(child for child in path.iterdir() if child.name.startswith(_DIRECTORY_PREFIX))
     parts = [(child, files) for child in names if child.is_dir() and (files := _data_files(child))]
-    # Without a session id, nothing says that two directories are of one radar.
+    # Without a session id, two directories cannot be assigned to one radar.
     sessions = {_session(directory) or directory for directory, _ in parts}
     if len(sessions) > 1:
         raise RecordingError(

@@ -146,7 +146,7 @@ class RecordingWriter:
         try:
             self.close()
         except RecordingError:
-            if value is None:  # else what went wrong first says why
+            if value is None:  # the first error is raised
                 raise
 
     def write(self, message: Response, t_ns: int) -> bool:

@@ -9,18 +9,13 @@ from emulator.chip.chip import Refusal
 from emulator.device import radar_device
 from emulator.module.memory import FileSystem
 from emulator.module.settings import DeviceOptions
-from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource, ramp_device
+from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource
 from xethru_protocol.wire import messages as m
 
 SECOND = 1_000_000_000
 USER = 0x80000000
 KEY = {"file_type": USER, "identifier": 1}
 MISSING = {"file_type": USER, "identifier": 2}
-
-
-@pytest.fixture
-def host() -> BareHost:
-    return BareHost(ramp_device())
 
 
 def with_file(host: BareHost, *, is_open: bool) -> None:
@@ -70,16 +65,14 @@ def test_ten_files_may_be_open(host: BareHost) -> None:
         assert host.ask(m.CreateFile(file_type=USER, identifier=identifier, length=1)) == m.Ack()
     eleventh = m.CreateFile(file_type=USER, identifier=10, length=1)
     assert host.ask(eleventh) == m.Error(code=11)
-    assert host.ask(m.CloseFile(file_type=USER, identifier=0)) == m.Ack()
-    assert host.ask(eleventh) == m.Ack()
+    host.command(m.CloseFile(file_type=USER, identifier=0), eleventh)
     assert host.ask(m.OpenFile(file_type=USER, identifier=0)) == m.Error(code=11)
 
 
 def test_twenty_files_exist(host: BareHost) -> None:
     for identifier in range(20):
         key = {"file_type": USER, "identifier": identifier}
-        assert host.ask(m.CreateFile(**key, length=1)) == m.Ack()
-        assert host.ask(m.CloseFile(**key)) == m.Ack()
+        host.command(m.CreateFile(**key, length=1), m.CloseFile(**key))
     assert host.ask(m.CreateFile(file_type=USER, identifier=99, length=1)) == m.Error(code=9)
     assert host.ask(m.SearchFileType(file_type=USER)) == m.ReplyInt(values=tuple(range(20)))
 

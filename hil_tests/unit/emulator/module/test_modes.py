@@ -105,8 +105,7 @@ def test_the_direct_jump_to_manual_may_be_refused() -> None:
     host = host_of(DeviceOptions(run_to_manual="refuse"))
     assert host.ask(m.SetMode(mode=MANUAL)) == m.Error(code=0x21)
     assert mode_of(host) == RUN
-    assert host.ask(m.SetMode(mode=STOP)) == m.Ack()
-    assert host.ask(m.SetMode(mode=MANUAL)) == m.Ack()
+    host.command(m.SetMode(mode=STOP), m.SetMode(mode=MANUAL))
 
 
 @pytest.mark.parametrize(("kept", "iterations"), [("keep", 77), ("init", 8)])
@@ -139,13 +138,12 @@ def test_noise_maps_are_stored_periodically_while_the_profile_runs() -> None:
     """16."""
     minute = 60_000_000_000
     host = host_of(DeviceOptions())
-    for command in (
+    host.command(
         m.SetMode(mode=STOP),
         m.LoadApp(profile_id=0x014D4AB8),
         m.NoiseMapSetPeriodicStore(interval_min=2),
         m.SetMode(mode=RUN),
-    ):
-        assert host.ask(command) == m.Ack()
+    )
     files = host.device.module.files
     host.device.module.advance(2 * minute - 1)
     assert files.names() == []

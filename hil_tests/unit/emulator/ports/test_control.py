@@ -76,31 +76,31 @@ def test_a_reset_is_a_reboot() -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "said"),
+    ("asked", "place"),
     [
-        ({}, "verb: must be one of state, fault add"),
-        ({"verb": "sing"}, "verb: must be one of state, fault add"),
-        ({"verb": "state", "colour": 1}, "colour: unknown key; allowed are verb, radar"),
-        ({"verb": "state", "radar": "nose"}, "radar: must be one of radar_1"),
-        ({"verb": "fault add"}, "fault: Input should be"),
+        ({}, "verb: "),
+        ({"verb": "sing"}, "verb: "),
+        ({"verb": "state", "colour": 1}, "colour: "),
+        ({"verb": "state", "radar": "nose"}, "radar: "),
+        ({"verb": "fault add"}, "fault: "),
         ({"verb": "fault add", "fault": {"kind": "crc"}}, "no kind of fault is called 'crc'"),
         ({"verb": "fault add", "fault": {"kind": "stall", "radar": ["x"]}}, "must be some of"),
-        ({"verb": "fault clear", "id": 9}, "id: no armed fault has number 9"),
-        ({"verb": "unplug", "seconds": -1}, "seconds: must be a number from 0"),
-        ({"verb": "unplug", "seconds": 10**400}, "seconds: must be a number from 0"),
-        ({"verb": "unplug", "seconds": float("nan")}, "seconds: must be a number from 0"),
-        ({"verb": "unplug", "seconds": float("inf")}, "seconds: must be a number from 0"),
-        ({"verb": "rate", "value": 10**400}, "value: must be a number from 0"),
+        ({"verb": "fault clear", "id": 9}, "id: "),
+        ({"verb": "unplug", "seconds": -1}, "seconds: "),
+        ({"verb": "unplug", "seconds": 10**400}, "seconds: "),
+        ({"verb": "unplug", "seconds": float("nan")}, "seconds: "),
+        ({"verb": "unplug", "seconds": float("inf")}, "seconds: "),
+        ({"verb": "rate", "value": 10**400}, "value: "),
         ({"verb": "pause"}, "nothing is played here"),
-        ({"verb": "rate", "value": "fast"}, "value: must be a number from 0"),
-        ({"verb": "loop", "value": 1}, "value: must be true or false"),
-        ({"verb": "filter", "kinds": [1]}, "kinds: must be a list of names"),
+        ({"verb": "rate", "value": "fast"}, "value: "),
+        ({"verb": "loop", "value": 1}, "value: "),
+        ({"verb": "filter", "kinds": [1]}, "kinds: "),
     ],
 )
-def test_what_cannot_be_done_is_told(asked: dict[str, Any], said: str) -> None:
+def test_what_cannot_be_done_names_the_place(asked: dict[str, Any], place: str) -> None:
     answer = ask(FaultyLine(), **asked)
     assert answer["ok"] is False
-    assert said in answer["error"]
+    assert place in answer["error"]
 
 
 @given(line=st.binary(max_size=200))

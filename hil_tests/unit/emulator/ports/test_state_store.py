@@ -39,14 +39,12 @@ def sensitivity(host: BareHost) -> int:
 def test_settings_are_saved_when_the_profile_starts(tmp_path: Path) -> None:
     """8.2: changes made but never run are lost at power-off."""
     host = start(tmp_path)
-    for command in (STOP, LOAD, m.SetSensitivity(sensitivity=7)):
-        assert host.ask(command) == m.Ack()
+    host.command(STOP, LOAD, m.SetSensitivity(sensitivity=7))
     host = start(tmp_path)
     assert host.ask(m.GetMode()) == m.ReplyByte(values=b"\x13"), "it was in STOP, and stays"
     assert host.ask(LOAD) == m.Ack()
     assert sensitivity(host) == 5
-    for command in (m.SetSensitivity(sensitivity=7), RUN):
-        assert host.ask(command) == m.Ack()
+    host.command(m.SetSensitivity(sensitivity=7), RUN)
     host = start(tmp_path)
     assert host.ask(m.GetMode()) == m.ReplyByte(values=b"\x01")
     assert sensitivity(host) == 7
@@ -62,8 +60,7 @@ def test_presence_outputs_are_kept_and_the_others_are_off(tmp_path: Path) -> Non
         OutputFeature.NOISEMAP_BYTE,
     ]
     on = [m.OutputSetControl(feature=feature, control=1) for feature in wanted]
-    for command in (STOP, LOAD, *on, RUN):
-        assert host.ask(command) == m.Ack()
+    host.command(STOP, LOAD, *on, RUN)
     host = start(tmp_path)
     controls = [host.ask(m.OutputGetControl(feature=feature)) for feature in wanted]
     assert controls == [m.ReplyInt(values=(bits,)) for bits in (1, 0, 0, 0)]
@@ -73,8 +70,7 @@ def test_files_survive(tmp_path: Path) -> None:
     host = start(tmp_path)
     key = {"file_type": USER, "identifier": 3}
     content = bytes(range(256))
-    assert host.ask(m.CreateFile(**key, length=300)) == m.Ack()
-    assert host.ask(m.SetFileData(**key, offset=10, data=content)) == m.Ack()
+    host.command(m.CreateFile(**key, length=300), m.SetFileData(**key, offset=10, data=content))
     host = start(tmp_path)
     assert host.ask(m.GetFileData(**key, offset=0, length=1)) == m.Error(code=6), "closed now"
     assert host.ask(m.OpenFile(**key)) == m.Ack()
@@ -106,8 +102,7 @@ BROKEN: dict[str, Callable[[str], str]] = {
 @pytest.mark.parametrize("damage", BROKEN)
 def test_a_broken_state_gives_one_line_and_a_fresh_module(tmp_path: Path, damage: str) -> None:
     host = start(tmp_path)
-    for command in (STOP, LOAD, RUN, m.StoreNoiseMap(), STOP):
-        assert host.ask(command) == m.Ack()
+    host.command(STOP, LOAD, RUN, m.StoreNoiseMap(), STOP)
     path = tmp_path / f"{IDENTITY.serial}.json"
     before = path.read_text()
     path.write_text(BROKEN[damage](before))
@@ -142,8 +137,7 @@ def test_a_crash_while_writing_leaves_the_old_state(
         raise OSError(5, "power cut")
 
     monkeypatch.setattr(os, "replace", fails)
-    for command in (LOAD, RUN):
-        assert host.ask(command) == m.Ack()
+    host.command(LOAD, RUN)
     monkeypatch.undo()
     warnings: list[str] = []
     assert start(tmp_path, warnings).ask(m.GetMode()) == m.ReplyByte(values=b"\x13")

@@ -16,16 +16,12 @@ import pytest
 from emulator.ports.module_ports import DevicePorts, LinkOptions, NamedDevice, open_ports
 from emulator.ports.pty import LinkError
 from emulator.ports.server import Server
-from hil_tests.patience import seconds, wait_until
-from hil_tests.unit.emulator.doubles import ramp_device
+from hil_tests.patience import wait_until
+from hil_tests.unit.emulator.doubles import PortHost, ramp_device
 from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.codes import SensorMode, X4Setting
-from xethru_protocol.wire.connection import Connection, Role
-from xethru_protocol.wire.framing import NeedData
+from xethru_protocol.wire.codes import X4Setting
 
 PONG = m.Pong(value=0xAAEEAEEA)
-LIMIT_S = seconds(30)
-"""Only ends a test that has failed anyway."""
 
 
 class Bench:
@@ -57,36 +53,11 @@ class Bench:
         return Host(self, os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK))
 
 
-class Host:
-    """One end of a line, stepping the server as it waits."""
-
+class Host(PortHost):
     def __init__(self, bench: Bench, fd: int) -> None:
+        super().__init__(fd, bench.server)
         self.bench = bench
-        self.fd = fd
-        self.line = Connection(Role.HOST)
         bench.cleanup.callback(self.close)
-
-    def send(self, command: m.Command[m.Response]) -> None:
-        os.write(self.fd, self.line.send(command))
-
-    def hear(self) -> m.Message:
-        deadline = time.monotonic() + LIMIT_S
-        while time.monotonic() < deadline:
-            event = self.line.next_event()
-            if isinstance(event, m.Message):
-                return event
-            assert isinstance(event, NeedData), event
-            try:
-                data = os.read(self.fd, 65536)
-                assert data, "hung up"
-                self.line.receive_data(data)
-            except BlockingIOError:
-                self.bench.server.turn(longest_wait_s=0.01)
-        raise AssertionError("the device says nothing")
-
-    def ask(self, command: m.Command[m.Response]) -> m.Message:
-        self.send(command)
-        return self.hear()
 
     def is_hung_up(self) -> bool:
         def is_readable() -> list[int]:
@@ -98,11 +69,6 @@ class Host:
             return os.read(self.fd, 65536) == b""
         except ConnectionError:
             return True
-
-    def close(self) -> None:
-        if self.fd >= 0:
-            os.close(self.fd)
-            self.fd = -1
 
 
 @pytest.fixture
@@ -121,12 +87,7 @@ def test_every_module_answers_on_a_port_of_its_own(bench: Bench) -> None:
 def test_the_same_bytes_come_through_tcp_and_terminal(bench: Bench) -> None:
     streams = []
     for host in (bench.tcp(0), bench.pty(1)):
-        for command in (
-            m.SetMode(mode=SensorMode.XTID_SM_MANUAL),
-            m.X4DriverInit(),
-            m.X4DriverSet(setting=X4Setting.FPS, value=17.0),
-        ):
-            assert host.ask(command) == m.Ack()
+        host.stream()
         frame = host.hear()
         assert isinstance(frame, m.DataFloat)
         streams.append((frame.info, frame.values.tobytes()))
@@ -170,12 +131,7 @@ def test_who_has_the_terminal_open_keeps_the_module(bench: Bench) -> None:
 
 def test_a_client_that_leaves_amid_a_frame_leaves_nothing_to_the_next(bench: Bench) -> None:
     first = bench.tcp()
-    for command in (
-        m.SetMode(mode=SensorMode.XTID_SM_MANUAL),
-        m.X4DriverInit(),
-        m.X4DriverSet(setting=X4Setting.FPS, value=90.0),
-    ):
-        assert first.ask(command) == m.Ack()
+    first.stream(90.0)
     bench.turns(200)  # never reading: its line fills up, a frame is half sent
     first.close()
     bench.turns()

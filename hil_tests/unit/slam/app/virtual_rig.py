@@ -25,11 +25,10 @@ from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, rig_of
 from slam.app.rig.sources import RadarLink, RigSource
 from slam.app.run.live_source import (
     Event,
-    FrameCame,
-    LinkSaid,
+    FrameArrived,
+    LiveLog,
     OdometryEnded,
     OdometryLine,
-    WireCame,
 )
 from xethru_protocol.driver.radar import X4M300
 
@@ -69,22 +68,17 @@ class VirtualInbox:
         return self.get_nowait()
 
 
-class Words:
-    """Listens, and keeps what was said."""
-
+class Words(LiveLog):
     def __init__(self) -> None:
+        super().__init__()
         self.said: list[tuple[str, str]] = []
         self.samples: list[TumSample] = []
 
     def on_odometry(self, sample: TumSample) -> None:
         self.samples.append(sample)
 
-    def on_wire(self, event: WireCame) -> None: ...
-
-    def on_link(self, event: LinkSaid) -> None: ...
-
-    def say(self, who: str, text: str, *, warning: bool) -> None:
-        self.said.append((who, text))
+    def log(self, subject: str, text: str, *, warning: bool) -> None:
+        self.said.append((subject, text))
 
     def about(self, who: str) -> str:
         return " | ".join(text for name, text in self.said if name == who)
@@ -123,7 +117,7 @@ def radar_events(
                 # a line keeps the order of what it delays
                 last_ns = max(frame.arrival_ns + delay_ns(), last_ns + 1)
                 late = replace(frame, arrival_ns=last_ns)
-                events.append(Timed(last_ns, FrameCame(radar=radar_index, frame=late)))
+                events.append(Timed(last_ns, FrameArrived(radar=radar_index, frame=late)))
     return rig.radars, events
 
 

@@ -12,12 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.config import WheelNoise
 from slam.geometry import Mount, paper_rig
-from slam.robust.parameters import (
-    BackEndParameters,
-    RangeNoise,
-    WheelNoise,
-)
+from slam.robust.parameters import BackEndParameters, RangeNoise
 from slam.robust.ranges import RangeScan
 
 Array = NDArray[np.float64]
@@ -25,13 +22,10 @@ Array = NDArray[np.float64]
 STEP_M = 0.01
 TURN_STEPS = 16
 LAPS = 4
-NEES_BAND_100 = (2.54, 3.50)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Room:
-    """What differs between the two rooms."""
-
     side_m: float
     n_landmarks: int
     min_spacing_m: float
@@ -45,7 +39,6 @@ LAB = Room(
 CLASSROOM = Room(
     side_m=3.0, n_landmarks=10, min_spacing_m=1.0, scale_sigma=0.023, curvature_sigma=0.0139
 )
-ROOMS = {"lab": LAB, "classroom": CLASSROOM}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -269,21 +262,4 @@ def odometry_path(increments: Array) -> Array:
     return np.column_stack([x, y, heading])
 
 
-STRESSES = {
-    "clean": Stress(),
-    "random20": Stress(random_share=0.2),
-    "dropped10": Stress(dropped_share=0.1),
-    "skew": Stress(sampled_after=(0.0, -0.95, -0.5, -0.75)),
-    "offsets20": Stress(offset_m=0.02),
-    "dead": Stress(dead=(1,)),
-    "silent10": Stress(silent_share=0.1),
-    "walk": Stress(walk=1.0),
-    "carried": Stress(carried_at=0.6),
-    "all": Stress(
-        random_share=0.2,
-        dropped_share=0.1,
-        sampled_after=(0.0, -0.95, -0.5, -0.75),
-        silent_share=0.1,
-        walk=1.0,
-    ),
-}
+STRESSES = {"clean": Stress(), "offsets20": Stress(offset_m=0.02)}

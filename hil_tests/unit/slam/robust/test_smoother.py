@@ -8,16 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from hil_tests.property.robust_oracles import derivative
 from hil_tests.unit.slam.robust.range_world import LAB, parameters_for, simulate
 from hil_tests.unit.slam.robust.test_roundness import RODS, SIGMA_M, drive
+from slam.config import WheelNoise
 from slam.geometry import paper_rig
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import RangeBearing
-from slam.robust.parameters import RelinearisationRule, WheelNoise
+from slam.robust.parameters import RelinearisationRule
 from slam.robust.ranges import RangeScan
-from slam.robust.run_log import Condensed, Estimate, Prior, Problem, RunLog, start_prior
+from slam.robust.run_log import Condensed, Estimate, Prior, Problem, RunLog, _keep, start_prior
 from slam.robust.smoother import (
     Smoother,
     first_values,
@@ -114,9 +116,9 @@ def packed(estimate: Estimate) -> Array:
     return np.concatenate([part.ravel() for part in parts])
 
 
-def white_beginning(problem: Problem, gone: int, n_cal: int, x: Complex) -> Complex:
-    """Return the white residuals of prior, steps and measurements of the poses before ``gone``."""
-    n_poses = gone + 1
+def white_residuals(problem: Problem, n_steps: int, end: int, n_cal: int, x: Complex) -> Complex:
+    """Return the white residuals of prior, steps, and measurements of the poses before ``end``."""
+    n_poses = n_steps + 1
     poses, rest = x[: 3 * n_poses].reshape(-1, 3), x[3 * n_poses :]
     calibration, rest = rest[: 3 * n_cal].reshape(-1, 3), rest[3 * n_cal :]
     offsets, marks = rest[:N_RADARS], rest[N_RADARS:].reshape(-1, 2)
@@ -124,7 +126,7 @@ def white_beginning(problem: Problem, gone: int, n_cal: int, x: Complex) -> Comp
         problem.prior.mean[: 6 + N_RADARS], np.concatenate([poses[0], calibration[0], offsets])
     )
     result: list[Complex] = [first * np.sqrt(np.diag(problem.prior.information)[: len(first)])]
-    for k in range(gone):
+    for k in range(n_steps):
         s, w, kappa = calibration[k if n_cal > 1 else 0]
         d = problem.increments[k, :2] / (1 + s)
         a = (problem.increments[k, 2] - kappa * np.sqrt(d @ d)) / (1 + w)
@@ -144,7 +146,7 @@ def white_beginning(problem: Problem, gone: int, n_cal: int, x: Complex) -> Comp
         problem.range_sigmas_m,
         strict=True,
     ):
-        if k < gone:
+        if k < end:
             c, sn = np.cos(poses[k, 2]), np.sin(poses[k, 2])
             away = marks[mark] - poses[k, :2] - np.array([[c, -sn], [sn, c]]) @ m
             miss = np.sqrt(away @ away) + offsets[radar] - z
@@ -156,7 +158,7 @@ def white_beginning(problem: Problem, gone: int, n_cal: int, x: Complex) -> Comp
         problem.point_roots,
         strict=True,
     ):
-        if k < gone:
+        if k < end:
             away = marks[mark] - poses[k, :2]
             c, sn = np.cos(poses[k, 2]), np.sin(poses[k, 2])
             along, across = c * away[0] + sn * away[1], -sn * away[0] + c * away[1]
@@ -177,6 +179,39 @@ def invariant_errors(mean: Array, x: Complex) -> Complex:
     return e
 
 
+def newest(n_poses: int, n_cal: int, size: int) -> NDArray[np.intp]:
+    """Return the rows of the last pose and calibration, the offsets and the landmarks."""
+    return np.concatenate(
+        [
+            np.arange(3 * n_poses - 3, 3 * n_poses),
+            3 * n_poses + np.arange(3 * n_cal - 3, 3 * n_cal),
+            np.arange(3 * n_poses + 3 * n_cal, size),
+        ]
+    )
+
+
+@pytest.mark.parametrize("walk", [0.0, 1e-5])
+def test_the_smoother_is_least_squares_and_its_complement_the_marginal(walk: float) -> None:
+    problem, start = short_run(1, walk)
+    solution = Smoother(problem, RULE).solve(start, tolerance=1e-14)
+    assert solution is not None
+    n_cal = len(start.calibration)
+
+    def residuals(y: Complex) -> Complex:
+        return white_residuals(problem, N_STEPS, N_STEPS + 1, n_cal, y)
+
+    def real(x: Array) -> Array:
+        return residuals(x.astype(np.complex128)).real
+
+    oracle = least_squares(real, packed(start), xtol=1e-15, ftol=1e-15, gtol=1e-12, x_scale="jac")
+    assert np.abs(packed(solution.estimate) - oracle.x).max() <= 1e-6
+    J = derivative(residuals, oracle.x)
+    keep = newest(N_STEPS + 1, n_cal, len(oracle.x))
+    wanted = np.linalg.inv(J.T @ J)[np.ix_(keep, keep)]
+    marginal = np.linalg.inv(solution.information)
+    assert np.abs(marginal - wanted).max() <= 1e-4 * np.abs(wanted).max()
+
+
 @pytest.mark.parametrize("walk", [0.0, 1e-5])
 def test_the_prior_is_the_dense_schur_complement_of_the_poses_gone(walk: float) -> None:
     problem, start = short_run(0, walk)
@@ -186,17 +221,10 @@ def test_the_prior_is_the_dense_schur_complement_of_the_poses_gone(walk: float) 
         start, poses=start.poses[: N_GONE + 1], calibration=start.calibration[:n_cal]
     )
     x = packed(beginning)
-    J = derivative(lambda y: white_beginning(problem, N_GONE, n_cal, y), x)
-    r = white_beginning(problem, N_GONE, n_cal, x.astype(np.complex128)).real
+    J = derivative(lambda y: white_residuals(problem, N_GONE, N_GONE, n_cal, y), x)
+    r = white_residuals(problem, N_GONE, N_GONE, n_cal, x.astype(np.complex128)).real
     H, g = J.T @ J, J.T @ r
-    n_poses = N_GONE + 1
-    keep = np.concatenate(
-        [
-            np.arange(3 * n_poses - 3, 3 * n_poses),
-            3 * n_poses + np.arange(3 * n_cal - 3, 3 * n_cal),
-            np.arange(3 * n_poses + 3 * n_cal, len(x)),
-        ]
-    )
+    keep = newest(N_GONE + 1, n_cal, len(x))
     gone = np.delete(np.arange(len(x)), keep)
     gain = np.linalg.solve(H[np.ix_(gone, gone)], H[np.ix_(gone, keep)]).T
     wanted = H[np.ix_(keep, keep)] - gain @ H[np.ix_(gone, keep)]
@@ -484,7 +512,7 @@ def test_a_range_beyond_the_limit_is_no_part_of_what_is_condensed() -> None:
         if is_measured:
             ranges.ranges_m[5] += 50 * SIGMA_M
         else:
-            ranges.keep([row for row in range(len(ranges.poses)) if row != 5])
+            _keep(ranges, [row for row in range(len(ranges.poses)) if row != 5])
         assert relinearise(log, state, parameters)
         assert log.n_kept < 60
         unused = start_prior((1.0,) * 3, (1.0,) * 4, len(state.feature_ids))

@@ -11,11 +11,12 @@ import pytest
 
 from hil_tests.unit.slam.app.sessions import scan, session_info
 from slam.app.cli import CSV_TO_TUM, main
-from slam.app.commands.run import LoggingListener, parse_clock
+from slam.app.commands.run import parse_clock
 from slam.app.errors import UsageError
 from slam.app.odometry.live import parse_source
 from slam.app.odometry.tum import TumSample, parse_tum_line
 from slam.app.records import LogLine, SessionObserver
+from slam.app.run.live_source import LiveLog
 from slam.app.session import messages as ros
 from slam.app.session.log import SessionLog
 from slam.app.session.mcap import CannotWriteError
@@ -23,13 +24,10 @@ from slam.app.session.reader import open_session
 
 
 class Heard(SessionObserver):
-    """Keeps the lines that a user would see."""
-
     def __init__(self) -> None:
         self.lines: list[LogLine] = []
 
     def on_log(self, line: LogLine) -> None:
-        """Keep it."""
         self.lines.append(line)
 
 
@@ -42,15 +40,15 @@ def refuse(*_: object) -> None:
 
 
 def test_odometry_from_before_the_log_is_in_it_once_and_in_order(tmp_path: Path) -> None:
-    listener = LoggingListener()
+    listener = LiveLog()
     listener.on_odometry(pose(1))
     listener.on_odometry(pose(2))
-    listener.attach(SessionLog(tmp_path / "session.mcap", session_info()))
+    listener.begin(SessionLog(tmp_path / "session.mcap", session_info()))
     listener.on_odometry(pose(3))
-    listener.end_log()
+    listener.close()
     recorded = open_session(tmp_path / "session.mcap").records()
     assert [row.t_ns for row in recorded if isinstance(row, TumSample)] == [1, 2, 3]
-    assert not listener.log_trouble
+    assert not listener.failure
 
 
 @pytest.mark.parametrize("refused", ["on_odometry", "on_scan"])
@@ -58,33 +56,34 @@ def test_a_disk_that_fills_up_is_said_once_and_the_run_goes_on(
     refused: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also where it is full as soon as what was kept for the log is written."""
-    listener, heard = LoggingListener(), Heard()
+    listener, heard = LiveLog(), Heard()
     listener.on_odometry(pose(1))
     listener.on_odometry(pose(2))
     log = SessionLog(tmp_path / "session.mcap", session_info())
     monkeypatch.setattr(log, refused, refuse)
-    listener.attach(log, heard)
+    listener.begin(log)
+    listener.attach(heard)
     for number in range(3):
         listener.on_odometry(pose(3 + number))
         listener.on_scan(scan(number))
-    listener.end_log()
+    listener.close()
     log.close()
     (line,) = heard.lines
     assert line.warning
     assert line.text.endswith("No space left on device; the run goes on and is not recorded")
-    assert listener.log_trouble.endswith("No space left on device")
+    assert listener.failure.endswith("No space left on device")
 
 
 def test_a_last_chunk_that_does_not_fit_is_told_and_nothing_raised(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    listener = LoggingListener()
+    listener = LiveLog()
     log = SessionLog(tmp_path / "session.mcap", session_info())
-    listener.attach(log)
+    listener.begin(log)
     with monkeypatch.context() as full:
         full.setattr(log, "close", refuse)
-        listener.end_log()
-    assert listener.log_trouble.endswith("No space left on device")
+        listener.close()
+    assert listener.failure.endswith("No space left on device")
     log.close()
 
 
@@ -137,4 +136,4 @@ def test_a_unix_clock_shows_the_seconds_since_1970(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(time, "time_ns", lambda: 1_700_000_100_000_000_007)
     clock = parse_clock("unix", parse_source("-"))
     assert clock is not None
-    assert clock.session_ns(105_000_000_000) == 1_700_000_105_000_000_007
+    assert clock.nominal_ns(105_000_000_000) == 1_700_000_105_000_000_007

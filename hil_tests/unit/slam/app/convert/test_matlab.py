@@ -206,12 +206,9 @@ def test_a_file_that_cannot_be_written_says_why(tmp_path: Path) -> None:
         write_mat(tmp_path / "no folder" / "b.mat", drive)
 
 
-@pytest.mark.parametrize(
-    ("sigma_m", "code", "message"),
-    [(0.0, 0, ""), (1e-3, 1, "robust.calibrated_offset_sigma_m: version 0.1.0 was the last")],
-)
+@pytest.mark.parametrize(("sigma_m", "code"), [(0.0, 0), (1e-3, 1)])
 def test_a_removed_setting_of_a_session_is_read_at_its_default_only(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], sigma_m: float, code: int, message: str
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], sigma_m: float, code: int
 ) -> None:
     stored = json.loads(settings_text(SlamConfig()))
     stored["robust"]["calibrated_offset_sigma_m"] = sigma_m
@@ -222,7 +219,6 @@ def test_a_removed_setting_of_a_session_is_read_at_its_default_only(
     log.close()
     ended, _, err = run(capsys, tmp_path / "s.mcap", tmp_path / "a.mat")
     assert ended == code
-    assert message in err
     assert err.count("\n") == code
 
 
@@ -246,26 +242,13 @@ def test_a_file_that_was_begun_is_removed(
     assert not out.exists()
 
 
-def problem(capsys: pytest.CaptureFixture[str], path: Path) -> str:
-    out = path.parent / "s.mcap"
-    code, said, err = run(capsys, path, out)
-    assert (code, said) == (1, "")
-    assert len(err.splitlines()) == 1
-    assert str(path) in err
-    assert not out.exists()
-    return err
-
-
-def test_what_is_no_such_file_is_named(
+def test_a_cut_file_is_one_line(
     authors_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = tmp_path / "x.mat"
-    assert "No such file" in problem(capsys, path)
-    path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(400))
-    assert "of version 7.3; in MATLAB, save it with '-v7'" in problem(capsys, path)
-    path.write_bytes(b"RRF2" + bytes(300))
-    assert "it is a Rerun recording" in problem(capsys, path)
+    path, out = tmp_path / "x.mat", tmp_path / "s.mcap"
     content = authors_file.read_bytes()
     for share in (0.0, 0.1, 0.5, 0.9):
         path.write_bytes(content[: round(share * len(content))])
-        problem(capsys, path)
+        code, said, err = run(capsys, path, out)
+        assert (code, said, err.count("\n")) == (1, "", 1)
+        assert not out.exists()

@@ -25,7 +25,8 @@ from hil_tests.unit.slam.app.virtual_rig import (
     radar_events,
 )
 from slam.app.errors import AppError
-from slam.app.odometry.live import FixedClock, LiveOdometry, parse_source
+from slam.app.odometry.arrival import ClockLine
+from slam.app.odometry.live import LiveOdometry, parse_source
 from slam.app.records import RadarInfo, Scan, SessionObserver
 from slam.app.rig.emulated import RAW_CONFIG, rig_of, wheels_of
 from slam.app.rig.sources import RadarLink, sampler_limits
@@ -33,7 +34,7 @@ from slam.app.run import live_source as run_readers
 from slam.app.run.live_source import (
     GRACE_NS,
     Event,
-    FrameCame,
+    FrameArrived,
     Inbox,
     LiveSource,
     OdometryEnded,
@@ -49,8 +50,9 @@ from slam.config import load_preset
 from slam.evaluation import ate_rmse_m
 from slam.frames import RadarFrame
 from slam.geometry import Mount
-from slam.robust.pipeline import make_slam
+from slam.pipelines import make_slam
 from xethru_protocol.driver.frames import Frame, FrameGeometry
+from xethru_protocol.system import StopFlag
 from xethru_protocol.wire.errors import Disconnected, ResponseTimeout
 from xethru_protocol.wire.x4 import frame_time_ns
 
@@ -113,7 +115,7 @@ def test_a_radar_that_vanishes_is_looked_for_until_it_is_back(
     driver = ScriptedDriver(7, 8, Disconnected("unplugged"), 9)
     driver.reconnects = [Disconnected("not yet"), Disconnected("not yet"), "found"]
     events = told_until([link_of(driver)], silent_fifo, lambda events: len(events) == 5)
-    assert [e.frame.counter for e in events if isinstance(e, FrameCame)] == [7, 8, 9]
+    assert [e.frame.counter for e in events if isinstance(e, FrameArrived)] == [7, 8, 9]
     assert events[2] == RadarLost(radar=0, text="unplugged")
     assert events[3] == RadarBack(radar=0, port="somewhere else")
 
@@ -172,7 +174,7 @@ def frame(radar: int, t_ns: int, counter: int = 0) -> ReceivedFrame:
 
 
 def odometry_until(end_s: float) -> LiveOdometry:
-    odometry = LiveOdometry("a test", FixedClock(0))
+    odometry = LiveOdometry("a test", ClockLine(origin_ns=0))
     for number in range(int(end_s * 10) + 1):
         odometry.take(f"{number / 10:.9f} 0 0 0 0 0 0 1", 0)
     return odometry
@@ -385,8 +387,6 @@ class Drive:
 
 @dataclass
 class Heard(SessionObserver):
-    """What an observer of a run was told."""
-
     scans: list[Scan] = field(default_factory=list)
 
     def on_scan(self, scan: Scan) -> None:
@@ -412,7 +412,7 @@ def source_of(
 
 
 def source_on(
-    drive: Drive, inbox: VirtualInbox, clock: FixedClock | None = None
+    drive: Drive, inbox: VirtualInbox, clock: ClockLine | None = None
 ) -> tuple[LiveSource, LiveOdometry, Words]:
     odometry, words = LiveOdometry("the test", clock), Words()
     source = LiveSource(
@@ -421,7 +421,7 @@ def source_on(
         odometry,
         inbox,
         words,
-        lambda: None,
+        StopFlag(),
         clock_ns=inbox.clock_ns,
     )
     return source, odometry, words
@@ -469,7 +469,7 @@ def test_a_dead_radar_is_told_and_the_others_go_on(drive: Drive) -> None:
     lost, back = round(10 * NS_PER_S), round(20 * NS_PER_S)
 
     def keep(row: Timed) -> bool:
-        is_theirs = isinstance(row.event, FrameCame) and row.event.radar == 2
+        is_theirs = isinstance(row.event, FrameArrived) and row.event.radar == 2
         return row.t_ns < END_S * NS_PER_S and not (is_theirs and lost < row.t_ns < back)
 
     source, odometry, words = source_of(
@@ -537,14 +537,14 @@ def test_odometry_that_falls_silent_ends_the_run_with_all_its_states(drive: Driv
 
 
 def test_a_rig_without_odometry_does_not_begin(drive: Drive) -> None:
-    source, _, _ = source_of(drive, lambda row: isinstance(row.event, FrameCame))
+    source, _, _ = source_of(drive, lambda row: isinstance(row.event, FrameArrived))
     with pytest.raises(AppError, match="odometry from the test: no line for 10 s"):
         source.settle()
 
 
 def test_a_radar_that_never_streams_is_named(drive: Drive) -> None:
     source, _, _ = source_of(
-        drive, lambda row: not (isinstance(row.event, FrameCame) and row.event.radar == 1)
+        drive, lambda row: not (isinstance(row.event, FrameArrived) and row.event.radar == 1)
     )
     with pytest.raises(AppError, match="radar rear_left: no frame in 15 s"):
         source.settle()
@@ -574,7 +574,7 @@ def test_a_counter_that_goes_back_by_one_loses_no_frame(drive: Drive) -> None:
         if row.t_ns > 14 * NS_PER_S:
             continue
         event = row.event
-        if isinstance(event, FrameCame) and event.radar == 1 and row.t_ns > 10 * NS_PER_S:
+        if isinstance(event, FrameArrived) and event.radar == 1 and row.t_ns > 10 * NS_PER_S:
             event = replace(event, frame=replace(event.frame, counter=event.frame.counter - 2))
         events.append(replace(row, event=event))
     source, _, _ = source_on(drive, VirtualInbox(events))
@@ -597,7 +597,7 @@ def test_odometry_whose_clock_is_set_while_it_is_trusted_is_told(drive: Drive) -
             events.append(replace(row, event=late))
         else:
             events.append(row)
-    source, _, words = source_on(drive, VirtualInbox(events), FixedClock(0))
+    source, _, words = source_on(drive, VirtualInbox(events), ClockLine(origin_ns=0))
     source.settle()
     assert {scan.used for scan in source.scans()} == {True, False}
     assert "SLAM got no scan for 5 s" in words.about("run")

@@ -14,10 +14,10 @@ from slam.app.odometry.track import OdometryTrack
 from slam.app.odometry.tum import TumSample
 from slam.app.records import LogLine, Scan, SessionObserver, Snapshot
 from slam.app.run.output import Progress
-from slam.app.run.runner import LinkLanes, nobody_knows, run_slam
+from slam.app.run.runner import LinkStates, run_slam, unknown_truth
 from slam.frames import RadarFrame
-from slam.paper.ekf import Belief
-from slam.paper.pipeline import PoseAt, StepResult, UwbRadarSlam
+from slam.paper.pipeline import UwbRadarSlam
+from slam.results import Belief, PoseAt, StepResult
 
 COUNTERS = (5, 6, 8, 11, 12)
 LAG = 2
@@ -102,7 +102,7 @@ def test_an_unused_scan_is_told_and_not_stepped() -> None:
     listener = Listener()
     scans = [replace(scan(counter), used=counter not in (5, 8)) for counter in COUNTERS]
     slam = cast(UwbRadarSlam, LateSlam())
-    record = run_slam(scans, OdometryTrack(ends), slam, nobody_knows, [listener])
+    record = run_slam(scans, OdometryTrack(ends), slam, unknown_truth, [listener])
     assert tuple(listener.scans) == COUNTERS
     assert [snapshot.counter for snapshot in listener.snapshots] == [6, 11, 12]
     assert record.n_frames == 2 * 3
@@ -131,7 +131,7 @@ def test_slam_hears_radars_less_their_gains_and_observers_as_they_are() -> None:
         [made],
         OdometryTrack(ends),
         cast(UwbRadarSlam, Hearing()),
-        nobody_knows,
+        unknown_truth,
         gains_db=[0.0, 20.0 * math.log10(2.0)],
     )
     as_it_was, halved = heard
@@ -146,56 +146,56 @@ def line(text: str, *, warning: bool = False, radar: str = "radar0") -> LogLine:
 
 
 def test_a_gap_in_the_counters_is_a_loss_until_the_next_frame() -> None:
-    lanes = LinkLanes(session_info(1).radars)
+    links = LinkStates(session_info(1).radars)
     changes = [
         (change.t_ns // FRAME_NS, str(change.state))
         for counter in (5, 6, 9, 10)
-        for change in lanes.on_scan(scan(counter, 1))
+        for change in links.on_scan(scan(counter, 1))
     ]
     assert changes == [(5, "streaming"), (9, "frames lost"), (10, "streaming")]
-    count = lanes.counts["radar0"]
+    count = links.counts["radar0"]
     assert (count.frames, count.lost, count.longest_gap) == (4, 2, 2)
 
 
 def test_a_radar_without_a_frame_in_a_tick_is_silent_and_others_go_on() -> None:
-    lanes = LinkLanes(session_info(2).radars)
-    list(lanes.on_scan(scan(0)))
+    links = LinkStates(session_info(2).radars)
+    list(links.on_scan(scan(0)))
     both = scan(1)
-    (change,) = lanes.on_scan(replace(both, frames=both.frames[:1]))
+    (change,) = links.on_scan(replace(both, frames=both.frames[:1]))
     assert (change.radar, str(change.state), change.t_ns) == ("radar1", "silent", FRAME_NS)
-    changes = {change.radar: str(change.state) for change in lanes.on_scan(scan(2))}
+    changes = {change.radar: str(change.state) for change in links.on_scan(scan(2))}
     assert changes == {"radar1": "frames lost"}
 
 
 def test_late_frames_that_slam_did_not_use_make_no_other_radar_silent() -> None:
-    lanes = LinkLanes(session_info(2).radars)
-    list(lanes.on_scan(scan(0)))
+    links = LinkStates(session_info(2).radars)
+    list(links.on_scan(scan(0)))
     late = scan(1)
-    assert list(lanes.on_scan(replace(late, frames=late.frames[:1], used=False))) == []
+    assert list(links.on_scan(replace(late, frames=late.frames[:1], used=False))) == []
 
 
 def test_a_module_is_set_up_streams_fails_and_streams_again() -> None:
-    lanes = LinkLanes(session_info(1).radars)
+    links = LinkStates(session_info(1).radars)
     states = [
         str(change.state)
         for changes in (
-            lanes.on_log(line("tx SetMode")),
-            lanes.on_log(line("rx Ack")),
-            lanes.on_scan(scan(0, 1)),
-            lanes.on_log(line("tx Ping")),
-            lanes.on_log(line("fault CRC", warning=True)),
-            lanes.on_scan(scan(1, 1)),
-            lanes.end(2 * FRAME_NS),
+            links.on_log(line("tx SetMode")),
+            links.on_log(line("rx Ack")),
+            links.on_scan(scan(0, 1)),
+            links.on_log(line("tx Ping")),
+            links.on_log(line("fault CRC", warning=True)),
+            links.on_scan(scan(1, 1)),
+            links.end(2 * FRAME_NS),
         )
         for change in changes
     ]
     assert states == ["setting up", "streaming", "fault", "streaming", "ended"]
-    assert lanes.counts["radar0"].faults == 1
+    assert links.counts["radar0"].faults == 1
 
 
 def test_a_line_about_something_else_changes_no_lane() -> None:
-    lanes = LinkLanes(session_info(1).radars)
-    assert list(lanes.on_log(line("stopped", warning=True, radar="odometry"))) == []
+    links = LinkStates(session_info(1).radars)
+    assert list(links.on_log(line("stopped", warning=True, radar="odometry"))) == []
 
 
 class Terminal(io.StringIO):

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from emulator.scene.scene import ObjectSpec, Scene, TargetSpec, WallSpec, empty_room
+from hil_tests.unit.slam.app.sweep_runs import run_of
 from slam.app.run.evaluation import LandmarkSummary
 from slam.app.run.runner import RunRecord
 from slam.app.sweep.bound import BoundSummary
-from slam.app.sweep.run import SweepRun, distance_m, false_landmarks
+from slam.app.sweep.run import SweepRun, distance_m, false_landmarks, make_case
 from slam.app.sweep.statistics import (
     group_line,
     in_band,
@@ -21,25 +22,20 @@ from slam.app.sweep.statistics import (
     summarise_groups,
     times_clean,
 )
-from slam.paper.ekf import Belief
-from slam.paper.pipeline import StepResult
+from slam.results import Belief, StepResult
 
-RUN = SweepRun(
+RUN = dataclasses.replace(
+    run_of(make_case("lab", "paper", 0)),
     scene="a",
-    preset="paper",
-    seed=0,
-    frames=100,
-    duration_s=10.0,
-    realtime_factor=50.0,
     ate_rmse_m=0.01,
-    ate_icp_rmse_m=0.005,
-    odometry_ate_rmse_m=0.04,
-    final_error_m=0.02,
     landmarks=LandmarkSummary(
         true=4, estimated=4, precision=1.0, recall=1.0, duplicates=0, rmse_m=0.01
     ),
-    nees_pose=((1.0, 2.0), (9.9, 1.0)),
     nis_mean=0.5,
+    nis_times=(),
+    false=0,
+    confident_false=0,
+    bound=None,
 )
 
 

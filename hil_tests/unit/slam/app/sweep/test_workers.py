@@ -50,6 +50,13 @@ def started(tmp_path: Path, body: str) -> subprocess.Popen[str]:
     )
 
 
+def ended(tmp_path: Path, body: str) -> tuple[int, str, str]:
+    """Return exit code, output and errors of a fresh interpreter."""
+    with started(tmp_path, body) as process:
+        output, errors = process.communicate(timeout=LIMIT_S)
+    return process.returncode, output, errors
+
+
 def test_every_worker_begins_with_the_groups_signals_blocked(tmp_path: Path) -> None:
     body = (
         "with worker_results(work, [('mask',)] * 4, 2) as masks:\n"
@@ -57,9 +64,8 @@ def test_every_worker_begins_with_the_groups_signals_blocked(tmp_path: Path) -> 
         "        print(*(int(number) for number in mask))\n"
         "print(*(int(one) for one in signal.pthread_sigmask(signal.SIG_BLOCK, ())))\n"
     )
-    with started(tmp_path, body) as process:
-        output, errors = process.communicate(timeout=LIMIT_S)
-    assert (process.returncode, errors) == (0, "")
+    code, output, errors = ended(tmp_path, body)
+    assert (code, errors) == (0, "")
     blocked = sorted((signal.SIGINT, signal.SIGTERM, signal.SIGHUP))
     *workers, parent = output.split("\n")[:-1]
     assert workers == [" ".join(str(int(number)) for number in blocked)] * 4
@@ -88,9 +94,7 @@ def test_work_that_is_thrown_away_ends_at_once_and_without_a_word(tmp_path: Path
         "with worker_results(work, [('pid',)] + [('sleep',)] * 20, 2) as results:\n"
         "    next(results)\n"
     )
-    with started(tmp_path, body) as process:
-        output, errors = process.communicate(timeout=LIMIT_S)
-    assert (process.returncode, output, errors) == (0, "", "")
+    assert ended(tmp_path, body) == (0, "", "")
 
 
 def test_what_killed_workers_leave_is_removed_without_a_word(tmp_path: Path) -> None:
@@ -101,9 +105,7 @@ def test_what_killed_workers_leave_is_removed_without_a_word(tmp_path: Path) -> 
         "resource_tracker.register('/gone', 'semlock')\n"
         "print('PYTHONWARNINGS' in os.environ)\n"
     )
-    with started(tmp_path, body) as process:
-        output, errors = process.communicate(timeout=LIMIT_S)
-    assert (process.returncode, output, errors) == (0, "False\n", "")
+    assert ended(tmp_path, body) == (0, "False\n", "")
 
 
 def test_a_worker_that_dies_breaks_the_results(tmp_path: Path) -> None:
@@ -115,9 +117,7 @@ def test_a_worker_that_dies_breaks_the_results(tmp_path: Path) -> None:
         "except BrokenExecutor:\n"
         "    print('broken')\n"
     )
-    with started(tmp_path, body) as process:
-        output, errors = process.communicate(timeout=LIMIT_S)
-    assert (process.returncode, output, errors) == (0, "broken\n", "")
+    assert ended(tmp_path, body) == (0, "broken\n", "")
 
 
 @pytest.mark.parametrize(
@@ -154,7 +154,6 @@ def test_only_the_managers_search_for_lost_work_is_silent(
 
 @pytest.fixture
 def port() -> Iterator[int]:
-    """Give a port that nobody listens on."""
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         yield taken.getsockname()[1]

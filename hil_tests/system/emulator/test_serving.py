@@ -1,0 +1,144 @@
+"""Serving: modules that come back, keep their state, hang on a UART or behind a proxy."""
+
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hil_tests.bench.virtual_time import counters_of
+from hil_tests.device.serving import Served, emulator, open_radar
+from hil_tests.patience import seconds
+from xethru_protocol.driver.files import FileName
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.recordings.wire_capture import read_chunks
+from xethru_protocol.wire.codes import PongCode
+from xethru_protocol.wire.errors import ResponseTimeout
+
+
+def test_driver_goes_on_when_its_emulator_comes_back(tmp_path: Path) -> None:
+    links = tmp_path / "links"
+    serve = ("serve", "--bare", "--link-dir", links)
+    with emulator(*serve) as first:
+        radar = open_radar(first.paths[0], reconnect_s=15.0)
+        geometry = radar.configure_raw(RawConfig(frame_area_m=(0.4, 5.0)))
+        radar.start(17.0)
+        radar.read_frame()
+        first.end(signal.SIGKILL)  # no goodbye, and links that lead nowhere
+    with emulator(*serve) as second, radar:
+        assert second.serials == first.serials
+        while radar.reconnects == 0:
+            radar.read_frame()
+        frame = radar.read_frame()
+        assert frame.geometry == geometry
+        assert frame.samples.shape == (716,)  # Protocol reference 9.4
+        assert radar.frames_lost == 0
+        assert radar.statistics.off_lattice_samples == 0
+
+
+FILE = FileName(file_type=0x80000001, identifier=7)
+
+
+def test_a_file_survives_the_emulator(tmp_path: Path) -> None:
+    content = bytes(range(256)) * 3
+    serve = ("serve", "--bare", "--state-dir", tmp_path)
+    with emulator(*serve) as served:
+        with open_radar(served.paths[0]) as radar:
+            radar.files.write(FILE.file_type, FILE.identifier, content)
+        assert served.end() == 0
+    assert [path.name for path in tmp_path.iterdir()] == [f"{served.serials[0]}.json"]
+    with emulator(*serve) as served, open_radar(served.paths[0]) as radar:
+        assert radar.files.find_all() == (FILE,)
+        assert radar.files.read(FILE.file_type, FILE.identifier) == content
+        radar.files.delete(FILE.file_type, FILE.identifier)
+        assert not radar.files.find_all()
+
+
+def test_without_a_state_dir_nothing_is_kept() -> None:
+    for _ in range(2):
+        with emulator("serve", "--bare") as served, open_radar(served.paths[0]) as radar:
+            assert not radar.files.find_all()
+            radar.files.write(FILE.file_type, FILE.identifier, b"x")
+
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with emulator("serve", "--bare", "--link", "uart") as made:
+        yield made
+
+
+def test_the_speed_must_fit_and_can_be_changed(served: Served) -> None:
+    with X4M300.open(served.paths[0], baudrate=57600) as deaf, pytest.raises(ResponseTimeout):
+        deaf.ping()
+    with X4M300.open(served.paths[0]) as radar:
+        assert radar.ping() is PongCode.XTS_SPRP_READY
+        radar.set_baud_rate(921600)
+        radar.configure_raw(RawConfig(frame_area_m=(0.4, 5.0)))
+        radar.start(17.0)
+        counters = [frame.counter for frame in radar.frames(8)]
+        assert counters == list(range(counters[0], counters[0] + 8)), "716 bins fit"
+        # back at 115200, from where the driver takes it again
+        radar.reset(wait=True, timeout_s=seconds(15))
+        assert radar.ping() is PongCode.XTS_SPRP_READY
+
+
+SHORT = RawConfig(frame_area_m=(0.4, 1.0))
+
+
+def test_no_byte_changes_without_a_fault_and_the_capture_holds_them_all(tmp_path: Path) -> None:
+    wire = tmp_path / "line.xtwire"
+    passed: dict[str, bytes] = {"rx": b"", "tx": b""}
+
+    def heard(direction: str, data: bytes, t_ns: int) -> None:
+        passed[direction] += data
+
+    with (
+        emulator("serve", "--bare") as module,
+        emulator("proxy", "--port", module.paths[0], "--wire", str(wire)) as proxy,
+    ):
+        with open_radar(proxy.paths[0]) as radar:
+            radar.raw_listener = heard
+            radar.configure_raw(SHORT)
+            radar.start(50.0)
+            frames = list(radar.frames(50))
+            assert radar.statistics.clean
+        assert len(frames) == 50
+    captured = {"rx": b"", "tx": b""}
+    for chunk in read_chunks(wire):
+        captured[chunk.way] += chunk.data
+    assert captured["tx"] == passed["tx"]
+    assert passed["rx"] in captured["rx"]  # what came before we listened is there, too
+
+
+def test_faults_hit_the_line_of_the_module(tmp_path: Path) -> None:
+    scenario = tmp_path / "gaps.toml"
+    scenario.write_text(
+        '[[fault]]\nkind = "missing_frames"\nevery = 10\ncount = 2\nparameters = { frames = 3 }\n'
+    )
+    with (
+        emulator("serve", "--bare") as module,
+        emulator("proxy", "--port", module.paths[0], "--faults", str(scenario)) as proxy,
+        open_radar(proxy.paths[0]) as radar,
+    ):
+        radar.configure_raw(SHORT)
+        radar.start(50.0)
+        list(radar.frames(40))
+        assert radar.frames_lost == 6
+        assert radar.fault_count == 0
+
+
+TIMER_HZ_AT_17 = 17.049379
+"""What the chip's timer makes of FPS 17, measured. Protocol reference 9.6."""
+
+
+@pytest.mark.parametrize("downconversion", [False, True], ids=["rf", "baseband"])
+def test_three_minutes_lack_no_frame(downconversion: bool) -> None:
+    counters = counters_of(180.0, RawConfig(downconversion=downconversion))
+    assert len(counters) == pytest.approx(180.0 * TIMER_HZ_AT_17, abs=1.5)
+    assert counters == list(range(counters[0], counters[0] + len(counters)))
+    assert counters[0] <= 1
