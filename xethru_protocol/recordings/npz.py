@@ -216,8 +216,8 @@ def read_npz(path: Path) -> TimedMessages:
 
 
 def npz_facts(path: Path) -> RecordingFacts:
-    """Return what an archive says about itself; RecordingError if it cannot be read."""
-    with _open(path, ": what it says about itself is damaged") as archive:
+    """Return the facts of an archive; RecordingError if it cannot be read."""
+    with _open(path, ": its description is damaged") as archive:
         return RecordingFacts.from_json(json.loads(str(archive["facts"])))
 
 

@@ -8,7 +8,7 @@ fields, or from what others report of such files.
 A binary data file holds records without separators: a message's payload without its leading codes.
 
 A text file holds lines: an ISO time stamp and the message's fields, separated by ``;``, below a
-line of titles. Lists stand in square brackets, separated by commas. Only PRESENCE_SINGLE is known
+line of titles. Lists are in square brackets, separated by commas. Only PRESENCE_SINGLE is known
 from a recording; a line with other columns is reported and not interpreted.
 
 The meta file was worked out from recordings that the vendor's library wrote from known messages; a

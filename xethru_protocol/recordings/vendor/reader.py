@@ -165,7 +165,7 @@ class _DataFile:
 
 
 def _user_header_bytes(start: bytes, size: int, kind: BinaryKind | TextKind) -> int:
-    """Return the length of what stands before the first record, as far as the records show it.
+    """Return the length of what precedes the first record, as far as the records show it.
 
     ``start`` is the beginning of the file of ``size`` bytes. 0 where records begin at once, and
     where no place is better.
