@@ -181,46 +181,27 @@ def _whole_ms(timeout_s: float) -> int:
     return math.ceil(min(max(timeout_s, 0.0), _LONGEST_WAIT_S) * 1000)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class UsbSerialPort:
-    """A serial port and the USB ids behind it, None where it has none."""
-
-    path: str
-    vendor_id: int | None
-    product_id: int | None
-    serial: str | None
-
-
-def usb_serial_ports() -> tuple[UsbSerialPort, ...]:
-    """Return the serial ports the system lists, by path; pseudo-terminals are never among them."""
-    return tuple(
-        UsbSerialPort(
-            path=port.device, vendor_id=port.vid, product_id=port.pid, serial=port.serial_number
-        )
-        for port in sorted(list_ports.comports(), key=lambda found: found.device)
-    )
-
-
 def _why(path: str, error: Exception) -> str:
-    number = getattr(error, "errno", None)
+    in_use = f"port {path} is in use by another program; close that first"
+    not_serial = f"{path} is not a serial port"
     reasons = {
         errno.ENOENT: f"there is no port {path}; 'xethru list' shows the ports there are",
         errno.ENXIO: f"there is no module behind {path}; plug it in again",
         errno.EACCES: f"port {path} may not be opened by this user; "
         "join its group (often 'dialout') and log in again",
-        errno.EBUSY: f"port {path} is in use by another program; close that first",
-        errno.EAGAIN: f"port {path} is in use by another program; close that first",
-        errno.ENOTTY: f"{path} is not a serial port",
-        errno.EISDIR: f"{path} is not a serial port",
-        errno.EINVAL: f"{path} is not a serial port",
+        errno.EBUSY: in_use,
+        errno.EAGAIN: in_use,
+        errno.ENOTTY: not_serial,
+        errno.EISDIR: not_serial,
+        errno.EINVAL: not_serial,
     }
+    number, text = getattr(error, "errno", None), str(error)
     if number in reasons:
         return reasons[number]
-    text = str(error)
     if "exclusively lock" in text:  # pyserial marks this one by its text only
-        return reasons[errno.EAGAIN]
+        return in_use
     if "Could not configure port" in text:
-        return reasons[errno.ENOTTY]
+        return not_serial
     return f"port {path} cannot be opened: {text}"
 
 
@@ -250,9 +231,10 @@ class AsyncTransport(Protocol):
 class AsyncSerialTransport:
     """A serial port whose descriptor the running event loop watches; see `SerialTransport`."""
 
-    def __init__(self, path: str, baudrate: int = 115200) -> None:
+    def __init__(self, path: str, baudrate: int = _BAUD) -> None:
         self._port = SerialTransport(path, baudrate)
-        self._waiting: set[_Waiting] = set()
+        # Tasks that wait for the descriptor, which must not be watched once it is closed.
+        self._waiting: dict[asyncio.Future[bool], Callable[[int], object]] = {}
         self._turn_ends_s = 0.0
 
     @property
@@ -288,10 +270,11 @@ class AsyncSerialTransport:
                 raise Disconnected(f"{self.name} takes no data any more; is the module hanging?")
 
     def close(self) -> None:
-        for waiting in tuple(self._waiting):
-            waiting.unwatch()
-            if not waiting.ready.done():
-                waiting.ready.set_exception(Disconnected(f"{self.name} was closed"))
+        while self._waiting:
+            ready, unwatch = self._waiting.popitem()
+            unwatch(self._port.fileno())
+            if not ready.done():
+                ready.set_exception(Disconnected(f"{self.name} was closed"))
         self._port.close()
 
     async def _wait(
@@ -301,38 +284,24 @@ class AsyncSerialTransport:
         timeout_s: float,
     ) -> bool:
         """Wait until the descriptor is ready; False if it is not in time."""
-        waiting = _Waiting(self._waiting, self._port.fileno(), unwatch)
-        watch(waiting.descriptor, waiting.end, True)
-        limit_s = min(max(timeout_s, 0.0), _LONGEST_WAIT_S)
+        loop = asyncio.get_running_loop()
+        descriptor = self._port.fileno()
+        ready: asyncio.Future[bool] = loop.create_future()
+
+        def end(in_time: bool) -> None:
+            if not ready.done():
+                ready.set_result(in_time)
+
+        self._waiting[ready] = unwatch
+        watch(descriptor, end, True)
         # half the cost of wait_for(), which a stream of frames would feel
-        timer = asyncio.get_running_loop().call_later(limit_s, waiting.end, False)
+        timer = loop.call_later(min(max(timeout_s, 0.0), _LONGEST_WAIT_S), end, False)
         try:
-            return await waiting.ready
+            return await ready
         finally:
             timer.cancel()
-            waiting.unwatch()
-
-
-class _Waiting:
-    """A task that waits for a descriptor, which must not be watched once it is closed."""
-
-    def __init__(
-        self, others: "set[_Waiting]", descriptor: int, unwatch: Callable[[int], object]
-    ) -> None:
-        self.descriptor = descriptor
-        self.ready: asyncio.Future[bool] = asyncio.get_running_loop().create_future()
-        self._others = others
-        self._unwatch = unwatch
-        others.add(self)
-
-    def end(self, ready: bool) -> None:
-        if not self.ready.done():
-            self.ready.set_result(ready)
-
-    def unwatch(self) -> None:
-        if self in self._others:
-            self._others.discard(self)
-            self._unwatch(self.descriptor)
+            if self._waiting.pop(ready, None) is not None:
+                unwatch(descriptor)
 
 
 # Vendor and product ids; the vendor's sources disagree on which of the first two is the
@@ -369,22 +338,24 @@ def run_directory() -> Path:
 
 
 def _usb_ports() -> Iterator[PortInfo]:
-    for port in usb_serial_ports():
-        description = _USB_IDS.get((port.vendor_id, port.product_id))
+    for port in sorted(list_ports.comports(), key=lambda found: found.device):
+        description = _USB_IDS.get((port.vid, port.pid))
         if description is not None:
-            yield PortInfo(path=port.path, kind="usb", description=description, serial=port.serial)
+            yield PortInfo(
+                path=port.device, kind="usb", description=description, serial=port.serial_number
+            )
 
 
 def _emulated_ports(folder: Path) -> Iterator[PortInfo]:
     if not folder.is_dir():
         return
-    for entry in sorted(folder.glob("*.json")):
+    for file in sorted(folder.glob("*.json")):
         try:
-            word: dict[str, Any] = json.loads(entry.read_text())
-            if not is_running(int(word["pid"])):
+            entry: dict[str, Any] = json.loads(file.read_text())
+            if not is_running(int(entry["pid"])):
                 continue
             devices = [
-                (str(one["path"]), str(one["name"]), one["serial"]) for one in word["devices"]
+                (str(one["path"]), str(one["name"]), one["serial"]) for one in entry["devices"]
             ]
         except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
             continue  # not an emulator's entry, or one that is being written
