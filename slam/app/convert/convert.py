@@ -49,7 +49,6 @@ def write_wire(session: RecordedSession, out: Path, radar: str | None, stop: Sto
     except RecordingError as error:
         raise AppError(str(error)) from None
     if not any(sizes.values()):
-        out.unlink()
         raise AppError(f"{session.path}: holds no raw bytes; record with --wire")
     return f"{out}: {sizes['rx']} bytes from the module, {sizes['tx']} to it"
 

@@ -33,6 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.io import loadmat, savemat
 
+from slam.app.convert.rosbag import authors_rig, rig_of
 from slam.app.errors import AppError, OdometryError, naming
 from slam.app.odometry.track import OdometryTrack
 from slam.app.odometry.tum import NS_PER_S, TumSample
@@ -51,7 +52,7 @@ from slam.paper.trilateration import Trilaterator
 _MM = 1e-3
 _POSE_UNITS = np.array([_MM, _MM, 1.0])
 _FEWEST_FIXES = 5  # that the authors' programs have room for
-_FRAME_NAMES = ("R1", "R2", "R3", "R4")
+_RADARS = range(1, 5)
 
 Array = NDArray[np.float64]
 
@@ -88,7 +89,7 @@ def read_mat(path: Path) -> MatDrive:
     Raises
     ------
     AppError
-        No such MATLAB file, or without the variables above; one line.
+        No such MATLAB file, or without the variables above.
     """
     try:
         with path.open("rb") as stream:
@@ -111,9 +112,9 @@ def read_mat(path: Path) -> MatDrive:
     left = _variable(path, table, "obsLHS", (None, 2), n_states)
     right = _variable(path, table, "obsRHS", (None, 2), n_states)
     frames = {
-        number: _variable(path, table, name, (None,), n_states).astype(np.float32)
-        for number, name in enumerate(_FRAME_NAMES, start=1)
-        if name in table
+        number: _variable(path, table, f"R{number}", (None,), n_states).astype(np.float32)
+        for number in _RADARS
+        if f"R{number}" in table
     }
     stamps_s = _variable(path, table, "t", (1,), n_states)[:, 0] if "t" in table else None
     if stamps_s is not None and not np.all(np.diff(stamps_s) > 0):
@@ -202,14 +203,7 @@ def _polar_of(states: tuple[Array, ...], *, unwrapped: bool) -> Array:
 
 
 # The authors' later robot: 18 cm from the middle to the side, 21 cm between the radars of a side.
-MAT_RIG = Rig(
-    mounts=(
-        Mount(name="UWBradar1", x_m=0.105, y_m=-0.18, yaw_rad=-math.pi / 2),
-        Mount(name="UWBradar2", x_m=-0.105, y_m=0.18, yaw_rad=math.pi / 2),
-        Mount(name="UWBradar3", x_m=-0.105, y_m=-0.18, yaw_rad=-math.pi / 2),
-        Mount(name="UWBradar4", x_m=0.105, y_m=0.18, yaw_rad=math.pi / 2),
-    )
-)
+MAT_RIG = authors_rig(0.105, 0.18)
 # As their programs label bins: from zero, 143 of them in 92 cm.
 _BIN_M = 0.92 / 143
 _SAME_RANGE_M = 1e-4
@@ -237,9 +231,13 @@ def convert_mat(
         The file makes no sense, or the rig has not one pair of radars on each side.
     """
     drive = read_mat(mat)
-    rig = rig or _rig_of(drive)
+    if rig is None:
+        rig = MAT_RIG if drive.mounts is None else rig_of(drive.mounts.tolist())
     pairs = _sides(mat, rig)
-    stamps_ns = _stamps_ns(drive, rate_hz)
+    if drive.stamps_s is None:
+        stamps_ns = [round(row * NS_PER_S / rate_hz) for row in range(len(drive.odometry))]
+    else:
+        stamps_ns = [round(stamp_s * NS_PER_S) for stamp_s in drive.stamps_s.tolist()]
     radars = tuple(
         imported_radar(
             # whatever a module measures too long, it is in the fixes already
@@ -286,11 +284,9 @@ def write_detections(
     Raises
     ------
     AppError
-        The session is damaged or has no odometry, the rig has not one pair of radars on each
-        side, or the file exists.
+        The session is damaged or has no odometry, or the rig has not one pair of radars on each
+        side.
     """
-    if out.exists():
-        raise AppError(f"{out}: exists; choose another name")
     rig = session.rig
     sides = _sides(session.path, rig)
     detector, trilaterator = make_detector(config), Trilaterator(config.trilateration, rig)
@@ -304,7 +300,7 @@ def write_detections(
     poses: list[Array] = []
     stamps_s: list[float] = []
     fixes: tuple[list[Array], list[Array]] = ([], [])
-    frames: dict[int, list[NDArray[np.float32]]] = {number: [] for number in range(1, 5)}
+    frames: dict[int, list[NDArray[np.float32]]] = {number: [] for number in _RADARS}
     for scan, _ in session.scans():
         check()
         # in the order of counters, whether the state is collected or not: a front end may learn
@@ -323,7 +319,7 @@ def write_detections(
             points = [(fix.x_m, fix.y_m) for fix in located if side_of.get(fix.pair) == side]
             fixes[side].append(np.array(points).reshape(-1, 2))
         of_radar = {frame.radar: frame.samples for frame in scan.frames}
-        for number in range(1, 5):
+        for number in _RADARS:
             n_bins = session.info.radars[number - 1].n_bins
             frames[number].append(of_radar.get(number - 1, np.zeros(n_bins, dtype=np.float32)))
     if not poses:
@@ -359,23 +355,6 @@ def _ranges(points: Array, mount: Mount) -> Array:
     ranges_m = np.sort(np.hypot(points[:, 0] - mount.x_m, points[:, 1] - mount.y_m))
     new = np.diff(ranges_m, prepend=-math.inf) > _SAME_RANGE_M
     return ranges_m[new]
-
-
-def _rig_of(drive: MatDrive) -> Rig:
-    if drive.mounts is None:
-        return MAT_RIG
-    return Rig(
-        mounts=tuple(
-            Mount(name=f"UWBradar{number}", x_m=x, y_m=y, yaw_rad=yaw)
-            for number, (x, y, yaw) in enumerate(drive.mounts.tolist(), start=1)
-        )
-    )
-
-
-def _stamps_ns(drive: MatDrive, rate_hz: float) -> list[int]:
-    if drive.stamps_s is None:
-        return [round(row * NS_PER_S / rate_hz) for row in range(len(drive.odometry))]
-    return [round(stamp_s * NS_PER_S) for stamp_s in drive.stamps_s.tolist()]
 
 
 def _frames(

@@ -20,7 +20,7 @@ import math
 import re
 import shutil
 import sqlite3
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -62,51 +62,45 @@ ODOMETRY_TOPIC = "/odom"
 TRUTH_TOPIC = "/slam_out_pose"
 SESSION_TOPIC = "/session"
 
-_FRAMES = re.compile(r"/?(UWBradar(\d+))(/readings)?")
-_INFO = re.compile(r"/?(UWBradar(\d+))/info")
+_FRAMES = re.compile(r"/?(UWBradar\d+)(/readings)?")
+_INFO = re.compile(r"/?(UWBradar\d+)/info")
 
-AUTHORS_RIG = Rig(
-    mounts=(
-        Mount(name="UWBradar1", x_m=0.1, y_m=-0.2, yaw_rad=-math.pi / 2),
-        Mount(name="UWBradar2", x_m=-0.1, y_m=0.2, yaw_rad=math.pi / 2),
-        Mount(name="UWBradar3", x_m=-0.1, y_m=-0.2, yaw_rad=-math.pi / 2),
-        Mount(name="UWBradar4", x_m=0.1, y_m=0.2, yaw_rad=math.pi / 2),
+
+def rig_of(mounts: Iterable[Sequence[float]]) -> Rig:
+    """Return the rig of radars UWBradar1 and on, each at x [m], y [m], boresight [rad]."""
+    return Rig(
+        mounts=tuple(
+            Mount(name=f"UWBradar{number}", x_m=x, y_m=y, yaw_rad=yaw)
+            for number, (x, y, yaw) in enumerate(mounts, start=1)
+        )
     )
-)
+
+
+def authors_rig(ahead_m: float, aside_m: float) -> Rig:
+    """Return the authors' four radars, so far ahead of or behind the middle, and to its side."""
+    right, left = -math.pi / 2, math.pi / 2
+    return rig_of(
+        (
+            (ahead_m, -aside_m, right),
+            (-ahead_m, aside_m, left),
+            (-ahead_m, -aside_m, right),
+            (ahead_m, aside_m, left),
+        )
+    )
+
+
+AUTHORS_RIG = authors_rig(0.1, 0.2)
 """The paper's mounts under the names of their topics."""
 
 
-def frames_topic(radar: int) -> str:
-    """Return the topic of the frames of a radar by its index, from 0.
+def _radar_of(pattern: re.Pattern[str], topic: str) -> str | None:
+    """Return the radar of a topic, None for other topics.
 
-    >>> frames_topic(0)
-    '/UWBradar1/readings'
+    >>> [_radar_of(_FRAMES, topic) for topic in ("UWBradar3", "/UWBradar3/readings", "/x")]
+    ['UWBradar3', 'UWBradar3', None]
     """
-    return f"/UWBradar{radar + 1}/readings"
-
-
-def info_topic(radar: int) -> str:
-    return f"/UWBradar{radar + 1}/info"
-
-
-def radar_of_frames(topic: str) -> str | None:
-    """Return the radar whose frames a topic holds, None for other topics.
-
-    >>> radar_of_frames("UWBradar3"), radar_of_frames("/UWBradar3/readings"), radar_of_frames("/x")
-    ('UWBradar3', 'UWBradar3', None)
-    """
-    found = _FRAMES.fullmatch(topic)
+    found = pattern.fullmatch(topic)
     return found[1] if found else None
-
-
-def radar_of_info(topic: str) -> str | None:
-    found = _INFO.fullmatch(topic)
-    return found[1] if found else None
-
-
-def radar_order(name: str) -> int:
-    """Return the number in a radar's name, by which radars are ordered."""
-    return int(name.removeprefix("UWBradar"))
 
 
 # A header's stamp further from the time of recording is of another clock.
@@ -121,7 +115,6 @@ class _Stream:
 
     n_bins: int
     stamps_ns: list[int] = field(default_factory=list)
-    info: str | None = None
 
 
 @dataclass(slots=True, kw_only=True)
@@ -168,13 +161,13 @@ def convert_bag(
     ------
     AppError
         No bag, a damaged one, one without radars or odometry, or frames that do not fit the frame
-        area; one line.
+        area.
     """
     contents = _look_through(bag, truth_topic, check)
     warnings = []
     if contents.left_out:
         warnings.append(f"poses that went back in time and are left out: {contents.left_out}")
-    names = sorted(contents.streams, key=radar_order)
+    names = sorted(contents.streams, key=lambda name: int(name.removeprefix("UWBradar")))
     radars = tuple(_radar_info(bag, name, contents, rig, area_m) for name in names)
     try:
         odometry = OdometryTrack(contents.odometry)
@@ -220,7 +213,7 @@ def _look_through(bag: Path, truth_topic: str, check: Callable[[], None]) -> _Co
         for connection, t_ns, raw in reader.messages():
             check()
             topic = connection.topic
-            if (radar := radar_of_frames(topic)) is not None:
+            if (radar := _radar_of(_FRAMES, topic)) is not None:
                 n_bins = len(reader.deserialize(raw, connection.msgtype).data)
                 stream = contents.streams.setdefault(radar, _Stream(n_bins=n_bins))
                 if n_bins != stream.n_bins:
@@ -228,7 +221,7 @@ def _look_through(bag: Path, truth_topic: str, check: Callable[[], None]) -> _Co
                         f"{bag}: {topic} has frames of {stream.n_bins} and of {n_bins} bins"
                     )
                 stream.stamps_ns.append(t_ns)
-            elif (radar := radar_of_info(topic)) is not None:
+            elif (radar := _radar_of(_INFO, topic)) is not None:
                 contents.infos[radar] = reader.deserialize(raw, connection.msgtype).data
             elif topic == SESSION_TOPIC:
                 contents.session = reader.deserialize(raw, connection.msgtype).data
@@ -241,15 +234,15 @@ def _look_through(bag: Path, truth_topic: str, check: Callable[[], None]) -> _Co
                     poses.append(sample)
     if not contents.streams:
         raise AppError(
-            f"{bag}: holds no frames; they are looked for on {frames_topic(0)} and so on"
+            f"{bag}: holds no frames; they are looked for on /UWBradar1/readings and so on"
         )
     return contents
 
 
 def _check_type(bag: Path, topic: str, message_type: str, truth_topic: str) -> None:
-    if radar_of_frames(topic) is not None:
+    if _radar_of(_FRAMES, topic) is not None:
         allowed: tuple[str, ...] = (FLOAT_ARRAY,)
-    elif radar_of_info(topic) is not None or topic == SESSION_TOPIC:
+    elif _radar_of(_INFO, topic) is not None or topic == SESSION_TOPIC:
         allowed = (STRING,)
     elif topic == ODOMETRY_TOPIC:
         allowed = (ros.ODOMETRY,)
@@ -371,23 +364,22 @@ def _poses_of(track: OdometryTrack) -> Callable[[NDArray[np.int64]], NDArray[np.
 def _frames(
     bag: Path, names: Sequence[str], radars: Sequence[RadarInfo], check: Callable[[], None]
 ) -> Iterator[RadarFrame]:
-    counters = dict.fromkeys(names, 0)
+    counters = [0] * len(names)
     with _open(bag) as reader:
-        wanted = [c for c in reader.connections if radar_of_frames(c.topic) is not None]
+        wanted = [one for one in reader.connections if _radar_of(_FRAMES, one.topic) is not None]
         for connection, t_ns, raw in reader.messages(wanted):
             check()
-            name = radar_of_frames(connection.topic)
-            index = names.index(str(name))
+            index = names.index(str(_radar_of(_FRAMES, connection.topic)))
             message = reader.deserialize(raw, connection.msgtype)
             yield RadarFrame(
                 radar=index,
                 t_ns=t_ns,
-                counter=counters[str(name)],
+                counter=counters[index],
                 samples=np.asarray(message.data, dtype=np.float32),
                 range_start_m=radars[index].range_start_m * TRUE_PER_MODULE_METRE,
                 bin_length_m=radars[index].bin_length_m * TRUE_PER_MODULE_METRE,
             )
-            counters[str(name)] += 1
+            counters[index] += 1
 
 
 def _scans(frames: Iterator[RadarFrame], period_ns: float) -> Iterator[Scan]:
@@ -416,13 +408,12 @@ class _Bag:
     def __init__(self, path: Path) -> None:
         self._is_ros1 = path.suffix == ".bag"
         self._ros2_store: Any = get_typestore(Stores.ROS2_HUMBLE)
-        self._store: Any
+        self._store: Any = self._ros2_store
         self._writer: Any
         if self._is_ros1:
             self._store = get_typestore(Stores.ROS1_NOETIC)
             self._writer = Rosbag1Writer(path)
         else:
-            self._store = self._ros2_store
             # 8 is the older of two versions: older releases of ROS 2 read it, too
             self._writer = Rosbag2Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3)
         self._writer.open()
@@ -469,10 +460,12 @@ def write_bag(session: RecordedSession, out: Path, check: Callable[[], None]) ->
         finally:
             bag.close()
     except BaseException as error:
-        _remove(out)
-        if isinstance(
-            error, OSError | sqlite3.Error
-        ):  # SQLite has an error of its own for a full disk
+        if out.is_dir():
+            shutil.rmtree(out, ignore_errors=True)
+        else:
+            out.unlink(missing_ok=True)
+        # SQLite has an error of its own for a full disk.
+        if isinstance(error, OSError | sqlite3.Error):
             reason = getattr(error, "strerror", None) or error
             raise AppError(f"{out}: cannot be written: {reason}") from None
         raise
@@ -482,15 +475,19 @@ def write_bag(session: RecordedSession, out: Path, check: Callable[[], None]) ->
 
 
 def _fill(bag: _Bag, session: RecordedSession, check: Callable[[], None]) -> tuple[int, int, int]:
-    begun = False
+    head_is_written = False
     frames = poses = truths = 0
     for record in session.records():
         check()
-        if isinstance(record, RadarFrame | TumSample | ScanEnd) and not begun:
-            begun = True
-            _write_head(bag, session, record.t_ns)
+        if isinstance(record, RadarFrame | TumSample | ScanEnd) and not head_is_written:
+            head_is_written = True
+            table = json.dumps(session_table(session.info))
+            bag.write(SESSION_TOPIC, record.t_ns, STRING, pack_string(table))
+            for number, radar in enumerate(session.info.radars, start=1):
+                topic = f"/UWBradar{number}/info"
+                bag.write(topic, record.t_ns, STRING, pack_string(radar_text(radar)))
         if isinstance(record, RadarFrame):
-            topic = frames_topic(record.radar)
+            topic = f"/UWBradar{record.radar + 1}/readings"
             bag.write(topic, record.t_ns, FLOAT_ARRAY, pack_array(FLOAT_ARRAY, record.samples))
             frames += 1
         elif isinstance(record, TumSample):
@@ -504,17 +501,3 @@ def _fill(bag: _Bag, session: RecordedSession, check: Callable[[], None]) -> tup
     if not frames:
         raise AppError(f"{session.path}: holds no frame")
     return frames, poses, truths
-
-
-def _write_head(bag: _Bag, session: RecordedSession, t_ns: int) -> None:
-    table = json.dumps(session_table(session.info))
-    bag.write(SESSION_TOPIC, t_ns, STRING, pack_string(table))
-    for index, radar in enumerate(session.info.radars):
-        bag.write(info_topic(index), t_ns, STRING, pack_string(radar_text(radar)))
-
-
-def _remove(out: Path) -> None:
-    if out.is_dir():
-        shutil.rmtree(out, ignore_errors=True)
-    else:
-        out.unlink(missing_ok=True)
