@@ -22,10 +22,7 @@ from xethru_protocol.system import StopFlag
 
 if TYPE_CHECKING:
     from emulator.faults.kind import Kind
-    from emulator.module.memory import Memory
-    from emulator.ports.module_ports import LinkOptions
 
-COMMANDS = ("faults", "ctl")
 TIMEOUT_S = 10.0
 _INTERRUPTED = 130
 """Exit code after SIGINT, as of a shell."""
@@ -50,66 +47,6 @@ Prints the answer as one JSON line. Exit 1 when the emulator refuses. For exampl
   xethru-emulator ctl SOCKET fault add bad_checksum count=3
   xethru-emulator ctl SOCKET fault add missing_frames every=50 count=0 frames=2
 """
-
-
-def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    faults = commands.add_parser(
-        "faults",
-        help="list the kinds of faults",
-        description="Lists the kinds of faults with their parameters; of one KIND all about it, "
-        "with an example for a scenario file, which `serve --faults FILE` takes.",
-    )
-    faults.add_argument("kind", nargs="?", metavar="KIND", help="only this one")
-    faults.add_argument("--json", action="store_true", help="as JSON")
-
-    ctl = commands.add_parser(
-        "ctl",
-        help="control a running emulator",
-        description=_CTL_HELP,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    ctl.add_argument("socket", type=Path, metavar="SOCKET|PORT", help="control socket, or a port")
-    ctl.add_argument("words", nargs="+", metavar="VERB", help="what to do, see above")
-    ctl.add_argument("--radar", metavar="NAME", help="which radar; all if left out")
-    ctl.set_defaults(usage_error=ctl.error)
-
-
-def add_proxy(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser],
-) -> argparse.ArgumentParser:
-    proxy = commands.add_parser(
-        "proxy", help="put faults on the line of a real module", description=_PROXY_HELP
-    )
-    proxy.add_argument("--port", type=Path, required=True, metavar="P", help="port of the module")
-    proxy.add_argument(
-        "--baud", type=int, default=115_200, metavar="B", help="of a UART (default 115200)"
-    )
-    proxy.add_argument(
-        "--faults", metavar="FILE", help="fault scenario: a .toml file, or a shipped one by name"
-    )
-    proxy.add_argument(
-        "--truth", type=Path, metavar="FILE", help="gets a JSON line for every injected fault"
-    )
-    proxy.add_argument(
-        "--wire",
-        type=Path,
-        metavar="FILE",
-        help="new .xtwire file: all that passes the module's port",
-    )
-    return proxy
-
-
-def run(arguments: argparse.Namespace) -> int:
-    try:
-        return _list(arguments) if arguments.command == "faults" else _control(arguments)
-    except KeyboardInterrupt:
-        return _INTERRUPTED
-    except BrokenPipeError:  # whoever read our output has enough
-        _forget_output()
-        return 0
-    except OSError as error:
-        _forget_output()
-        return _failed(f"stdout: cannot write: {error.strerror}")
 
 
 # --- faults -------------------------------------------------------------------------------------
@@ -296,7 +233,6 @@ def _failed(text: str, *, exit_code: int = 1) -> int:
 
 MOST_BARE = 64
 LAST_PORT = 65535
-NS_PER_MS = 1_000_000
 _LINKS = {"usb": (0, 1000), "uart": (600, 10_000_000)}
 """Links and the numbers they take: latency in ms, baud rate."""
 
@@ -349,96 +285,34 @@ who opens a port, a host's first command counts as opening it.)
 def main(argv: Sequence[str] | None = None) -> int:
     with StopFlag("same") as stop:  # the imports take most of a second: a signal may come in them
         arguments = _parse(argv)
-        if arguments.command not in COMMANDS:
+        if arguments.command not in ("faults", "ctl"):
             return _run(arguments, stop)
-    return run(arguments)  # a signal ends these at once: there is nothing to clean up
+    # a signal ends these at once: there is nothing to clean up
+    try:
+        return _list(arguments) if arguments.command == "faults" else _control(arguments)
+    except KeyboardInterrupt:
+        return _INTERRUPTED
+    except BrokenPipeError:  # whoever read our output has enough
+        _forget_output()
+        return 0
+    except OSError as error:
+        _forget_output()
+        return _failed(f"stdout: cannot write: {error.strerror}")
 
 
 def _run(arguments: argparse.Namespace, stop: StopFlag) -> int:
     # heavy imports only now: --help and usage errors answer at once
-    from emulator.playback import PlayOptions
-    from emulator.serving import CannotServeError, play, proxy, serve
+    from emulator import serving
 
     if stop.requested:
         return 0
-    folder = arguments.link_dir
+    start = {"serve": serving.serve, "play": serving.play, "proxy": serving.proxy}
     try:
-        if arguments.command == "play":
-            kinds = None if arguments.only is None else frozenset(arguments.only)
-            play(
-                arguments.recording,
-                PlayOptions(
-                    rate=arguments.rate,
-                    loop=arguments.loop,
-                    from_ns=round(arguments.from_s * 1e9),
-                    kinds=kinds,
-                ),
-                folder,
-                warn=_warn,
-                stop=stop,
-            )
-        elif arguments.command == "proxy":
-            proxy(
-                arguments.port,
-                arguments.baud,
-                folder,
-                stop,
-                faults=arguments.faults,
-                truth=arguments.truth,
-                wire=arguments.wire,
-            )
-        else:
-            scene = arguments.count if arguments.bare else arguments.scene
-            links = _link_options(arguments)
-            serve(
-                scene,
-                arguments.seed,
-                arguments.pace,
-                folder,
-                stop,
-                links=links,
-                faults=arguments.faults,
-                truth=arguments.truth,
-                memory=_memory(arguments.state_dir),
-            )
-    except CannotServeError as error:
+        start[arguments.command](arguments, stop, _warn)
+    except serving.CannotServeError as error:
         _say(str(error))
         return error.exit_code
     return 0
-
-
-def _link_options(arguments: argparse.Namespace) -> LinkOptions:
-    from emulator.ports.module_ports import LinkOptions
-    from emulator.ports.tcp import is_loopback
-
-    host: str = arguments.tcp_host
-    if arguments.tcp is not None and not is_loopback(host):
-        _warn(f"--tcp-host {host}: whoever reaches this address can command the modules")
-    kind, number = arguments.link
-    usb_latency_ns = round(number * NS_PER_MS) if kind == "usb" and number is not None else None
-    return LinkOptions(
-        kind=kind,
-        usb_latency_ns=usb_latency_ns,
-        host_baud=round(number) if kind == "uart" and number is not None else None,
-        port_on_reset=arguments.port_on_reset,
-        tcp_base=arguments.tcp,
-        tcp_host=host,
-    )
-
-
-def _memory(state_dir: Path | None) -> Callable[[str], Memory] | None:
-    if state_dir is None:
-        return None
-    from emulator.ports.folders import DirectoryMemory, make_state_directory
-    from emulator.serving import CannotServeError
-
-    try:
-        make_state_directory(state_dir)
-    except OSError as error:
-        raise CannotServeError(
-            f"{state_dir}: cannot keep state there: {error.strerror}; choose another --state-dir"
-        ) from error
-    return lambda serial: DirectoryMemory(state_dir, serial, _warn)
 
 
 def _warn(text: str) -> None:
@@ -468,10 +342,17 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     serve.add_argument("scene", nargs="?", metavar="SCENE", help="name or .toml file of a scene")
     serve.add_argument("--bare", action="store_true", help="stock modules in an empty room")
     serve.add_argument(
-        "--count", type=_count, metavar="N", help="with --bare: how many modules (default 1)"
+        "--count",
+        type=_whole(1, MOST_BARE),
+        metavar="N",
+        help="with --bare: how many modules (default 1)",
     )
     serve.add_argument(
-        "--seed", type=_seed, default=0, metavar="S", help="of noise and odometry (default 0)"
+        "--seed",
+        type=_whole(0, 2**63 - 1, "2**63 - 1"),
+        default=0,
+        metavar="S",
+        help="of noise and odometry (default 0)",
     )
     serve.add_argument(
         "--pace",
@@ -482,15 +363,10 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         help="which clock drives the modules (default realtime)",
     )
     _add_link_dir(serve)
-    serve.add_argument(
-        "--faults", metavar="FILE", help="fault scenario: a .toml file, or a shipped one by name"
-    )
-    serve.add_argument(
-        "--truth", type=Path, metavar="FILE", help="gets a JSON line for every injected fault"
-    )
+    _add_faults(serve)
     serve.add_argument(
         "--tcp",
-        type=_tcp_port,
+        type=_whole(0, LAST_PORT),
         metavar="BASEPORT",
         help="a TCP port for each module, from this one on; 0: any that are free",
     )
@@ -553,9 +429,42 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     _add_link_dir(play)
 
-    proxy = add_proxy(commands)
+    proxy = commands.add_parser(
+        "proxy", help="put faults on the line of a real module", description=_PROXY_HELP
+    )
+    proxy.add_argument("--port", type=Path, required=True, metavar="P", help="port of the module")
+    proxy.add_argument(
+        "--baud", type=int, default=115_200, metavar="B", help="of a UART (default 115200)"
+    )
+    _add_faults(proxy)
+    proxy.add_argument(
+        "--wire",
+        type=Path,
+        metavar="FILE",
+        help="new .xtwire file: all that passes the module's port",
+    )
     _add_link_dir(proxy)
-    add_commands(commands)
+
+    faults = commands.add_parser(
+        "faults",
+        help="list the kinds of faults",
+        description="Lists the kinds of faults with their parameters; of one KIND all about it, "
+        "with an example for a scenario file, which `serve --faults FILE` takes.",
+    )
+    faults.add_argument("kind", nargs="?", metavar="KIND", help="only this one")
+    faults.add_argument("--json", action="store_true", help="as JSON")
+
+    ctl = commands.add_parser(
+        "ctl",
+        help="control a running emulator",
+        description=_CTL_HELP,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    ctl.add_argument("socket", type=Path, metavar="SOCKET|PORT", help="control socket, or a port")
+    ctl.add_argument("words", nargs="+", metavar="VERB", help="what to do, see above")
+    ctl.add_argument("--radar", metavar="NAME", help="which radar; all if left out")
+    ctl.set_defaults(usage_error=ctl.error)
+
     arguments = parser.parse_args(argv)
     if arguments.command == "serve":
         if arguments.bare == (arguments.scene is not None):
@@ -578,18 +487,28 @@ def _add_link_dir(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _count(text: str) -> int:
-    value = _whole(text)
-    if not 1 <= value <= MOST_BARE:
-        raise argparse.ArgumentTypeError(f"{value} is not in 1...{MOST_BARE}")
-    return value
+def _add_faults(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--faults", metavar="FILE", help="fault scenario: a .toml file, or a shipped one by name"
+    )
+    parser.add_argument(
+        "--truth", type=Path, metavar="FILE", help="gets a JSON line for every injected fault"
+    )
 
 
-def _seed(text: str) -> int:
-    value = _whole(text)
-    if not 0 <= value < 2**63:
-        raise argparse.ArgumentTypeError(f"{value} is not in 0...2**63 - 1")
-    return value
+def _whole(least: int, most: int, shown: str | None = None) -> Callable[[str], int]:
+    """Return the type of an option that takes a whole number within limits."""
+
+    def value_of(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(f"{value} is not in {least}...{shown or most}")
+        return value
+
+    return value_of
 
 
 def _host(text: str) -> str:
@@ -616,20 +535,6 @@ def _finite_number(text: str) -> float:
         return float(text)
     except ValueError:
         return math.nan
-
-
-def _tcp_port(text: str) -> int:
-    value = _whole(text)
-    if not 0 <= value <= LAST_PORT:
-        raise argparse.ArgumentTypeError(f"{value} is not in 0...{LAST_PORT}")
-    return value
-
-
-def _whole(text: str) -> int:
-    try:
-        return int(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
 
 
 def _seconds(text: str) -> float:

@@ -12,7 +12,7 @@ Source: protocol reference 8.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from emulator.chip import Pace
 from emulator.chip.chip import Chip, EchoSource, ModuleClock
@@ -219,6 +219,25 @@ class BootTiming:
 def _is_oversized(command: Command[Response]) -> bool:
     """Whether a command fits no block of the firmware's message pool; it drops those silently."""
     return isinstance(command, _LONG_COMMANDS) and len(encode(command)) > LARGEST_POOL_BLOCK
+
+
+class ByteDevice(Protocol):
+    """What the owner of a line needs of a device; all times are of one monotonic clock."""
+
+    @property
+    def wants_data(self) -> bool: ...
+
+    def receive_data(self, data: bytes, now_ns: int) -> None: ...
+
+    def advance(self, now_ns: int) -> None: ...
+
+    def next_packet(self, now_ns: int) -> bytes | None:
+        """Return the next packet to send now."""
+        ...
+
+    def wake_ns(self, now_ns: int) -> int | None:
+        """Return when time alone changes something."""
+        ...
 
 
 class _Held(NamedTuple):

@@ -1,18 +1,18 @@
 """Recordings played at emulated ports.
 
-Both are pure. A `PlayClock` maps times of the recording to times of the device, piece by piece:
-within a piece ``due = anchor + (position - anchor position) / rate``, and every pause, seek and
-change of rate begins a new piece. `KindSteps` remembers which kinds were asked for when.
-
 Playing begins anew for every host that opens the port: at once when it starts the radar (FPS > 0
 or SETMODE RUN), else after half a second without a command, so that a host that only listens has
 had time to flush its side. It ends when the last host has closed the port. Meanwhile the module
 answers every command like any other; FPS, mode and geometry settings are acknowledged and change
 nothing about what is played. Nothing is dropped: a host that reads slowly makes the recording
-wait. A host that only asks something and leaves within half a second hears none of it.
+wait. A host that only asks something and leaves within half a second gets none of it.
 
 A host sets a frame area, reads back what the module made of it, and takes only frames of that
 size. While a recording plays, its frames are what they are, so the read-back must be theirs.
+
+Times of the recording are mapped to times of the device piece by piece: within a piece
+``due = anchor + (position - anchor position) / rate``, and every pause, seek and change of rate
+begins a new piece.
 """
 
 from __future__ import annotations
@@ -76,15 +76,11 @@ class PlayState:
     ----------
     playing
         Whether a host has the port and something is left to play.
-    paused
-        Whether it was told to pause.
     position_ns
         Time of the recording that has been reached, ns since its first message; below its
         beginning in the gap between two rounds.
     rate
         Multiple of real time; 0 for as fast as the port takes it.
-    loop
-        Whether it begins again at the end.
     kinds
         Which kinds it plays, as from `kind_of`; None for all.
     """
@@ -110,33 +106,26 @@ class PlayClock:
     def __init__(self, rate: float) -> None:
         self.rate = rate
         self.paused = False
-        self._anchor_ns = 0
+        self.anchor_ns = 0  # when the piece in force begins, or began
         self._anchor_position_ns = 0
 
     def start(self, position_ns: int, at_ns: int) -> None:
         """Be at a position of the recording at a time of the device, which may lie ahead."""
         self._anchor_position_ns = position_ns
-        self._anchor_ns = at_ns
-
-    @property
-    def begins_ns(self) -> int:
-        return self._anchor_ns
-
-    def begin_at(self, at_ns: int) -> None:
-        self._anchor_ns = at_ns
+        self.anchor_ns = at_ns
 
     def due_ns(self, position_ns: int) -> int | None:
         """Return when the device's clock reaches a position; None while paused."""
         if self.paused:
             return None
         if not self.rate:
-            return self._anchor_ns
-        return self._anchor_ns + round((position_ns - self._anchor_position_ns) / self.rate)
+            return self.anchor_ns
+        return self.anchor_ns + round((position_ns - self._anchor_position_ns) / self.rate)
 
     def position_ns(self, now_ns: int) -> int:
-        if self.paused or not self.rate or now_ns <= self._anchor_ns:
+        if self.paused or not self.rate or now_ns <= self.anchor_ns:
             return self._anchor_position_ns
-        return self._anchor_position_ns + math.floor((now_ns - self._anchor_ns) * self.rate)
+        return self._anchor_position_ns + math.floor((now_ns - self.anchor_ns) * self.rate)
 
     def reached(self, position_ns: int) -> None:
         """Note that a message was played; at rate 0 nothing else moves the position."""
@@ -154,16 +143,16 @@ class PlayClock:
     def resume(self, now_ns: int) -> None:
         if self.paused:
             self.paused = False
-            self._anchor_ns = max(self._anchor_ns, now_ns)
+            self.anchor_ns = max(self.anchor_ns, now_ns)
 
     def set_rate(self, rate: float, now_ns: int) -> None:
         self._settle(now_ns)
         self.rate = rate
 
     def _settle(self, now_ns: int) -> None:
-        if now_ns > self._anchor_ns:
+        if now_ns > self.anchor_ns:
             self._anchor_position_ns = self.position_ns(now_ns)
-            self._anchor_ns = now_ns
+            self.anchor_ns = now_ns
 
 
 class KindSteps:
@@ -267,19 +256,11 @@ class TimedMessage:
 def schedule(
     messages: Iterable[tuple[Response, int | None]], rate: float
 ) -> Iterator[TimedMessage]:
-    """Tell when each message of a recording is played.
+    """Yield the messages of a recording with the time at which each is played.
 
-    Parameters
-    ----------
-    messages
-        The messages in order, each with the recording's own time of it, ns; None where it has
-        none.
-    rate
-        Multiple of real time; 0 for as fast as the port takes them.
-
-    Yields
-    ------
-    Times that never decrease: a stamp that runs backwards plays at once.
+    ``messages`` come in order with the recording's own time of each, ns, or None; at ``rate`` 0
+    all are played at once. Times never decrease: a message whose stamp runs backwards is played
+    at once.
 
     Raises
     ------
@@ -384,8 +365,8 @@ class PlayStream(MessageStream):
             return
         if not self._listening:
             self.port_opened(now_ns)
-        if self._clock.begins_ns > now_ns:
-            self._clock.begin_at(now_ns if _starts_radar(command) else now_ns + QUIET_NS)
+        if self._clock.anchor_ns > now_ns:
+            self._clock.anchor_ns = now_ns if _starts_radar(command) else now_ns + QUIET_NS
 
     def port_opened(self, now_ns: int) -> None:
         """Play from the beginning, or from where a seek without a host went, soon."""
@@ -445,7 +426,7 @@ class PlayStream(MessageStream):
         if not self._listening:
             self._sought_ns = position_ns
             return
-        self._go(position_ns, max(now_ns, self._clock.begins_ns))
+        self._go(position_ns, max(now_ns, self._clock.anchor_ns))
 
     def set_loop(self, loop: bool, now_ns: int) -> None:
         """Begin again at the end, or not; at the end already, begin again at once."""
@@ -526,38 +507,11 @@ class PlayedFrames:
     n_values
         float32 values per frame: bins of RF, or twice the bins of baseband.
     area_m
-        Frame area as the recorded module read it back [module metres]; None if nobody asked it.
+        Frame area as the recorded module read it back last [module metres]; None if unknown.
     """
 
     n_values: int
     area_m: tuple[float, float] | None
-
-
-class FrameSurvey:
-    """Looks for radar frames among the messages of a recording."""
-
-    def __init__(self) -> None:
-        self._sizes: Counter[int] = Counter()
-        self._area_m: tuple[float, float] | None = None
-
-    def look_at(self, message: Response) -> None:
-        if isinstance(message, DataFloat) and message.content_id == 0:
-            self._sizes[message.values.size] += 1
-        elif (
-            isinstance(message, ReplyFloat)
-            and message.content_id == X4Setting.FRAMEAREA
-            and len(message.values) == 2
-        ):
-            self._area_m = message.values[0], message.values[1]
-
-    def found(self) -> PlayedFrames | None:
-        """Return what was found; of several sizes the most frequent counts. None: no frames.
-
-        The area is the last one the host of the recording asked for.
-        """
-        if not self._sizes:
-            return None
-        return PlayedFrames(n_values=self._sizes.most_common(1)[0][0], area_m=self._area_m)
 
 
 class PlayedChip(Chip):
@@ -607,7 +561,7 @@ class PlayOptions:
     from_ns
         Where every host and round begins, ns since the first message of the recording.
     kinds
-        Which kinds of messages, as from `playback_control.kinds`; None for all.
+        Which kinds of messages, as from `kinds`; None for all.
     """
 
     rate: float = 1.0
@@ -650,22 +604,19 @@ def played_radars(
     """Return one module per radar of a recording; each plays its own to whoever opens its port.
 
     The recording is read once per radar now and again for every host, so that it may be larger
-    than the memory. Times of all radars count from the first message of any.
-
-    Recorded answers are not played: nobody asks for them, and the module answers for itself.
+    than the memory. Times of all radars count from the first message of any. Recorded answers are
+    not played: the module answers for itself.
 
     Parameters
     ----------
     recording
         Anything that `read_recording` takes, and sessions of several radars.
-    options
-        How it is played.
     identity
         What every module says about itself; None: a stock one with the recorded serial number.
     on_fault
         Called with what could not be read; the rest plays.
     warn
-        Called with one line about what the recording does not tell.
+        Called with one line about what the recording does not say.
 
     Raises
     ------
@@ -675,7 +626,7 @@ def played_radars(
     surveys: list[_Survey] = []
     for facts in recording_radars(recording) or (RadarFacts(),):
         surveys.append(_Survey(recording, facts, on_fault))
-        on_fault = _told_already
+        on_fault = _reported_already
     zero_ns = min((s.first_ns for s in surveys if s.first_ns is not None), default=0)
     _check(recording, surveys, zero_ns, options)
     end_ns = max(survey.offset_ns(zero_ns) + survey.lasts_ns for survey in surveys)
@@ -702,7 +653,8 @@ class _Survey:
         self.plays = False
         self.first_ns: int | None = None
         self.lasts_ns = 0
-        self._frames = FrameSurvey()
+        self._frame_sizes: Counter[int] = Counter()
+        self._area_m = facts.area_m
         records = read_recording(recording, on_fault, radar=facts.name)
         for timed in schedule(self._played(records), rate=1.0):
             self.plays = True
@@ -710,11 +662,10 @@ class _Survey:
 
     @property
     def frames(self) -> PlayedFrames | None:
-        """The radar frames; what a module answered counts more than what is said of it."""
-        found = self._frames.found()
-        if found is None or found.area_m is not None:
-            return found
-        return PlayedFrames(n_values=found.n_values, area_m=self.facts.area_m)
+        """The radar frames, None without any; of several sizes the most frequent counts."""
+        if not self._frame_sizes:
+            return None
+        return PlayedFrames(n_values=self._frame_sizes.most_common(1)[0][0], area_m=self._area_m)
 
     def offset_ns(self, zero_ns: int) -> int:
         """How much later than the recording this radar begins, ns."""
@@ -723,7 +674,11 @@ class _Survey:
     def _played(self, records: Iterable[tuple[Response, int | None]]) -> TimedMessages:
         for message, stamp_ns in records:
             self.messages += 1
-            self._frames.look_at(message)
+            match message:
+                case DataFloat(content_id=0):
+                    self._frame_sizes[message.values.size] += 1
+                case ReplyFloat(content_id=X4Setting.FRAMEAREA, values=(start_m, end_m)):
+                    self._area_m = start_m, end_m  # counts more than what is said of the radar
             if not is_answer(message):
                 if not self.plays:
                     self.first_ns = stamp_ns
@@ -791,7 +746,7 @@ def _serial(facts: RadarFacts) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Program:
-    """What is played, read from the disk again each time; its faults are told already."""
+    """What is played, read from the disk again each time; its faults were reported before."""
 
     recording: Path
     radar: str | None
@@ -800,7 +755,7 @@ class _Program:
 
     def __iter__(self) -> Iterator[TimedMessage]:
         try:
-            records = read_recording(self.recording, _told_already, radar=self.radar)
+            records = read_recording(self.recording, _reported_already, radar=self.radar)
             played = (item for item in records if not is_answer(item[0]))
             for item in schedule(played, rate=1.0):
                 yield TimedMessage(time_ns=item.time_ns + self.offset_ns, message=item.message)
@@ -808,5 +763,5 @@ class _Program:
             self.warn(str(error))
 
 
-def _told_already(fault: RecordingFault) -> None:
+def _reported_already(fault: RecordingFault) -> None:
     del fault

@@ -7,40 +7,48 @@ import json
 import os
 import sys
 import time
+from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-from emulator.chip import Pace
-from emulator.device import Device, radar_device
+from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.faults.faulty_device import FaultyDevice, wrap
 from emulator.faults.kind import InnerDevice
 from emulator.faults.plan import FaultPlan, FaultPlanError, TruthLog, load_plan
 from emulator.module.memory import Identity, Memory
+from emulator.module.module import Module
 from emulator.module.settings import DeviceOptions
 from emulator.playback import PlayOptions, PlayStream, played_radars
 from emulator.ports.control import Control, ControlSocket
-from emulator.ports.folders import Announcement, link_folder, socket_path
+from emulator.ports.folders import (
+    Announcement,
+    DirectoryMemory,
+    link_folder,
+    make_state_directory,
+    socket_path,
+)
 from emulator.ports.module_ports import DevicePorts, LinkOptions, NamedDevice, open_ports
 from emulator.ports.odometry import OdometryFeed
 from emulator.ports.proxy import ModuleLine, open_module
 from emulator.ports.pty import LinkError, PortWatch
 from emulator.ports.server import Server, Service
-from emulator.scene.scene import Scene, SceneError, UnknownSceneError, empty_room, load_scene
+from emulator.ports.tcp import is_loopback
+from emulator.scene.scene import SceneError, UnknownSceneError, empty_room, load_scene
 from emulator.scene.wheels import scene_odometry
 from xethru_protocol.recordings import RecordingError
 from xethru_protocol.recordings.wire_capture import Way, WireCapture
 from xethru_protocol.system import StopFlag
 
 
-class FaultBench:
-    """Wraps radars, writes one truth log, offers one control socket.
+class FaultSession:
+    """The faults of all radars: one scenario, one truth log, one control socket.
 
     Parameters
     ----------
-    plan
-        None: no faults until somebody asks for some.
+    scenario
+        Name or path; None: no faults until the control socket adds some.
     truth
         File of the truth log, made anew; None: kept in memory only.
     cleanup
@@ -50,19 +58,21 @@ class FaultBench:
 
     Raises
     ------
+    FaultPlanError
+        When the scenario cannot be used.
     LinkError
         When the truth log cannot be written.
     """
 
     def __init__(
         self,
-        plan: FaultPlan | None,
+        scenario: str | None,
         truth: Path | None,
         cleanup: contextlib.ExitStack,
         *,
         zero_ns: int,
     ) -> None:
-        self._plan = FaultPlan() if plan is None else plan
+        self._plan = FaultPlan() if scenario is None else load_plan(scenario)
         self._zero_ns = zero_ns
         self._cleanup = cleanup
         self.devices: dict[str, FaultyDevice] = {}
@@ -97,6 +107,7 @@ class FaultBench:
         return offered
 
 
+NS_PER_MS = 1_000_000
 SOCKET_NAME = "odometry.sock"
 CONTROL_NAME = "control.sock"
 PROXY_NAME = "proxy"
@@ -116,64 +127,63 @@ class CannotServeError(Exception):
         self.exit_code = exit_code
 
 
-def serve(
-    scene: str | int,
-    seed: int,
-    pace: Pace,
-    link_dir: Path | None,
-    stop: StopFlag,
-    *,
-    links: LinkOptions,
-    faults: Path | str | None = None,
-    truth: Path | None = None,
-    memory: Callable[[str], Memory] | None = None,
-) -> None:
+Warn = Callable[[str], None]
+"""Gets a warning in one line."""
+
+
+def serve(options: Namespace, stop: StopFlag, warn: Warn) -> None:
     """Emulate the radars of a scene until a signal asks for the end.
 
     Parameters
     ----------
-    scene
-        Name or path of a scene, or the number of modules in an empty room.
-    seed
-        Of receiver noise and odometry.
-    pace
-        Which clock drives the modules.
-    link_dir
-        Where the links appear; a fresh directory if None.
-    stop
-        Ends it, also before it has begun.
-    links
-        What leads to the modules.
-    faults
-        Name or path of a fault scenario; None: no faults until the control socket adds some.
-    truth
-        File that gets a line for every injected fault; None: none.
-    memory
-        Returns where the module with a serial number keeps its flash; None: nowhere.
+    options
+        Those of the command, as `emulator.cli` parses them; likewise for `play` and `proxy`.
 
     Raises
     ------
     CannotServeError
         When scene, fault scenario or ports cannot be had.
     """
+    links = _link_options(options, warn)
+    memory = _memory(options.state_dir, warn)
     with contextlib.ExitStack() as cleanup:
         try:
-            bare = isinstance(scene, int)
-            loaded = empty_room(scene) if isinstance(scene, int) else load_scene(scene)
-            folder = cleanup.enter_context(link_folder(link_dir))
+            scene = empty_room(options.count) if options.bare else load_scene(options.scene)
+            folder = cleanup.enter_context(link_folder(options.link_dir))
             zero_ns = time.monotonic_ns()
-            plan = None if faults is None else load_plan(faults)
-            bench = FaultBench(plan, truth, cleanup, zero_ns=zero_ns)
-            options = _device_options(links)
-            devices = _radar_devices(loaded, seed, pace, zero_ns, options, bench, memory)
-            bench.check_names()
-            control = bench.control(socket_path(folder, cleanup, CONTROL_NAME))
+            session = FaultSession(options.faults, options.truth, cleanup, zero_ns=zero_ns)
+            stays = links.port_on_reset == "stay"
+            device_options = DeviceOptions(port_on_reset="stay" if stays else "vanish")
+            devices = []
+            for index, radar in enumerate(scene.radars):
+                device = radar_device(
+                    Identity(serial=radar.serial),
+                    echo_source(scene, index, options.seed),
+                    options.pace,
+                    scene_time_zero_ns=zero_ns,
+                    clock=radar.clock,
+                    options=device_options,
+                    memory=None if memory is None else memory(radar.serial),
+                )
+                faulty = session.wrap(device, radar.name)
+                devices.append(
+                    NamedDevice(
+                        name=radar.name,
+                        serial=radar.serial,
+                        device=faulty,
+                        start_skew_ns=radar.clock.skew_ns,
+                        present=faulty.port_present,
+                        uart_baud=partial(_uart_baud, device.module),
+                    )
+                )
+            session.check_names()
+            control = session.control(socket_path(folder, cleanup, CONTROL_NAME))
             feed = None
-            if not bare:
+            if not options.bare:
                 feed = OdometryFeed(
                     socket_path(folder, cleanup, SOCKET_NAME),
-                    scene_odometry(loaded, seed),
-                    pace,
+                    scene_odometry(scene, options.seed),
+                    options.pace,
                     scene_time_zero_ns=zero_ns,
                 )
                 cleanup.callback(feed.close)
@@ -187,52 +197,38 @@ def serve(
         _run(ports, services, ready, stop, cleanup)
 
 
-def play(
-    recording: Path,
-    options: PlayOptions,
-    link_dir: Path | None,
-    *,
-    warn: Callable[[str], None],
-    stop: StopFlag,
-) -> None:
+def play(options: Namespace, stop: StopFlag, warn: Warn) -> None:
     """Play a recording, each radar at a port of its own, until a signal asks for the end.
-
-    Parameters
-    ----------
-    recording
-        Anything that `read_recording` takes.
-    options
-        How it is played.
-    link_dir
-        Where the links appear; a fresh directory if None.
-    warn
-        Called with one line about a part of the recording that cannot be read; the rest plays.
-    stop
-        Ends it, also before it has begun.
 
     Raises
     ------
     CannotServeError
-        When the recording cannot be read or the port not be had.
+        When the recording cannot be read or a port cannot be had.
     """
+    played = PlayOptions(
+        rate=options.rate,
+        loop=options.loop,
+        from_ns=round(options.from_s * 1e9),
+        kinds=None if options.only is None else frozenset(options.only),
+    )
     with contextlib.ExitStack() as cleanup:
         try:
             radars = played_radars(
-                recording,
-                options,
+                options.recording,
+                played,
                 on_fault=lambda fault: warn(f"{fault.file}: {fault.reason}; the rest is played"),
                 warn=warn,
             )
-            folder = cleanup.enter_context(link_folder(link_dir))
-            bench = FaultBench(None, None, cleanup, zero_ns=time.monotonic_ns())
+            folder = cleanup.enter_context(link_folder(options.link_dir))
+            session = FaultSession(None, None, cleanup, zero_ns=time.monotonic_ns())
             devices = [
                 NamedDevice(
-                    name=one.name, serial=one.serial, device=bench.wrap(one.device, one.name)
+                    name=one.name, serial=one.serial, device=session.wrap(one.device, one.name)
                 )
                 for one in radars
             ]
             players = {radar.name: radar.stream for radar in radars}
-            control = bench.control(socket_path(folder, cleanup, CONTROL_NAME), players)
+            control = session.control(socket_path(folder, cleanup, CONTROL_NAME), players)
             ports = open_ports(devices, folder, LinkOptions(), cleanup)
         except (RecordingError, LinkError) as error:
             raise CannotServeError(str(error)) from error
@@ -250,28 +246,8 @@ def play(
         _run(ports, [*watches, control], ready, stop, cleanup)
 
 
-def proxy(
-    port: Path,
-    baud: int,
-    link_dir: Path | None,
-    stop: StopFlag,
-    *,
-    faults: Path | str | None,
-    truth: Path | None,
-    wire: Path | None,
-) -> None:
+def proxy(options: Namespace, stop: StopFlag, warn: Warn) -> None:
     """Put faults on the line of a real module until a signal asks for the end.
-
-    Parameters
-    ----------
-    port
-        Of the module.
-    baud
-        Of a UART; USB has none.
-    link_dir, stop, faults, truth
-        As for `serve`.
-    wire
-        New file for a capture of what passes the module's port; None: none.
 
     Raises
     ------
@@ -288,22 +264,23 @@ def proxy(
     with contextlib.ExitStack() as cleanup:
         try:
             capture = None
-            if wire is not None:
-                capture = cleanup.enter_context(WireCapture(wire, {"port": os.fspath(port)}))
+            if options.wire is not None:
+                capture = cleanup.enter_context(
+                    WireCapture(options.wire, {"port": os.fspath(options.port)})
+                )
 
             def tap(direction: Way, data: bytes) -> None:
                 if capture is not None:
                     capture.write(direction, data, time.time_ns())
 
             zero_ns = time.monotonic_ns()
-            plan = None if faults is None else load_plan(faults)
-            bench = FaultBench(plan, truth, cleanup, zero_ns=zero_ns)
-            module = ModuleLine(open_module(port, baud), tap, gone)
+            session = FaultSession(options.faults, options.truth, cleanup, zero_ns=zero_ns)
+            module = ModuleLine(open_module(options.port, options.baud), tap, gone)
             cleanup.callback(module.close)
-            faulty = bench.wrap(module, PROXY_NAME)
-            bench.check_names()
-            folder = cleanup.enter_context(link_folder(link_dir))
-            control = bench.control(socket_path(folder, cleanup, CONTROL_NAME))
+            faulty = session.wrap(module, PROXY_NAME)
+            session.check_names()
+            folder = cleanup.enter_context(link_folder(options.link_dir))
+            control = session.control(socket_path(folder, cleanup, CONTROL_NAME))
             named = NamedDevice(
                 name=PROXY_NAME, serial="", device=faulty, present=faulty.port_present
             )
@@ -313,50 +290,37 @@ def proxy(
         ready = _ready_line(ports, zero_ns, None, control.path)
         _run(ports, [module, control], ready, stop, cleanup)
     if lost:
-        raise CannotServeError(f"{port}: the module's port vanished")
+        raise CannotServeError(f"{options.port}: the module's port vanished")
 
 
-def _device_options(links: LinkOptions) -> DeviceOptions:
-    stays = links.port_on_reset == "stay"
-    return DeviceOptions(port_on_reset="stay" if stays else "vanish")
+def _link_options(options: Namespace, warn: Warn) -> LinkOptions:
+    if options.tcp is not None and not is_loopback(options.tcp_host):
+        warn(f"--tcp-host {options.tcp_host}: whoever reaches this address can command the modules")
+    kind, number = options.link
+    return LinkOptions(
+        kind=kind,
+        usb_latency_ns=round(number * NS_PER_MS) if kind == "usb" and number is not None else None,
+        host_baud=round(number) if kind == "uart" and number is not None else None,
+        port_on_reset=options.port_on_reset,
+        tcp_base=options.tcp,
+        tcp_host=options.tcp_host,
+    )
 
 
-def _radar_devices(  # noqa: PLR0917 - what makes a radar
-    scene: Scene,
-    seed: int,
-    pace: Pace,
-    zero_ns: int,
-    options: DeviceOptions,
-    bench: FaultBench,
-    memory: Callable[[str], Memory] | None,
-) -> list[NamedDevice]:
-    made = []
-    for index, radar in enumerate(scene.radars):
-        device = radar_device(
-            Identity(serial=radar.serial),
-            echo_source(scene, index, seed),
-            pace,
-            scene_time_zero_ns=zero_ns,
-            clock=radar.clock,
-            options=options,
-            memory=None if memory is None else memory(radar.serial),
-        )
-        faulty = bench.wrap(device, radar.name)
-        made.append(
-            NamedDevice(
-                name=radar.name,
-                serial=radar.serial,
-                device=faulty,
-                start_skew_ns=radar.clock.skew_ns,
-                present=faulty.port_present,
-                uart_baud=partial(_uart_baud, device),
-            )
-        )
-    return made
+def _memory(state_dir: Path | None, warn: Warn) -> Callable[[str], Memory] | None:
+    if state_dir is None:
+        return None
+    try:
+        make_state_directory(state_dir)
+    except OSError as error:
+        raise CannotServeError(
+            f"{state_dir}: cannot keep state there: {error.strerror}; choose another --state-dir"
+        ) from error
+    return lambda serial: DirectoryMemory(state_dir, serial, warn)
 
 
-def _uart_baud(device: Device) -> int:
-    return device.module.uart_baudrate
+def _uart_baud(module: Module) -> int:
+    return module.uart_baudrate
 
 
 def _ready_line(

@@ -20,9 +20,10 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
 
+from emulator.device import ByteDevice
 from emulator.scene.philox import Dice
+from emulator.scene.tables import Table
 from xethru_protocol.driver.frames import Lattice
 from xethru_protocol.wire.codes import ElementType, ResponseCode
 from xethru_protocol.wire.connection import Connection, Role
@@ -134,23 +135,8 @@ def command_bytes(command: Command[Response]) -> bytes:
     return Connection(Role.HOST).send(command)
 
 
-class InnerDevice(Protocol):
+class InnerDevice(ByteDevice, Protocol):
     """A module as its port sees it: see `emulator.device.Device`."""
-
-    @property
-    def wants_data(self) -> bool: ...
-
-    def receive_data(self, data: bytes, now_ns: int) -> None: ...
-
-    def advance(self, now_ns: int) -> None: ...
-
-    def next_packet(self, now_ns: int) -> bytes | None:
-        """Return the next packet to send now."""
-        ...
-
-    def wake_ns(self, now_ns: int) -> int | None:
-        """Return when time alone changes something."""
-        ...
 
     def port_opened(self, now_ns: int) -> None: ...
 
@@ -197,10 +183,8 @@ class Target(Enum):
     MOMENT = "a moment"
 
 
-class Parameters(BaseModel):
-    """Parameters of a kind: frozen, and an unknown one is an error."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
+class Parameters(Table):
+    """Parameters of a kind."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,8 @@
-"""Scenario files: which faults hit which radar, when, how often.
+"""Scenario files: which faults hit which radar, when, how often; and the truth log.
 
-JSON lines, one object per fault: ``t_ns`` (device time), ``radar``, ``kind``, ``parameters``,
-``counter`` (of the last radar frame, null before the first), ``offset`` (bytes sent to the host
-before the packet that it hit).
+The truth log is JSON lines, one object per injected fault: ``t_ns`` (device time), ``radar``,
+``kind``, ``parameters``, ``counter`` (of the last radar frame, null before the first), ``offset``
+(bytes sent to the host before the packet that it hit).
 
 A scenario is TOML that a person reads and writes; a mistake is one `FaultPlanError` line naming
 file, key and what is allowed::
@@ -26,8 +26,6 @@ file, key and what is allowed::
 from __future__ import annotations
 
 import json
-import math
-import tomllib
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -35,9 +33,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import (
-    BaseModel,
     BeforeValidator,
-    ConfigDict,
     Field,
     StrictInt,
     ValidationError,
@@ -47,7 +43,14 @@ from pydantic import (
 
 from emulator.faults.kind import Kind, Parameters, Target
 from emulator.faults.kinds import KINDS
-from xethru_protocol.system import read_bounded
+from emulator.scene.tables import (
+    Table,
+    finite,
+    load_table,
+    one_line,
+    parse_table,
+    shipped_names,
+)
 from xethru_protocol.wire.messages import Command
 from xethru_protocol.wire.table import ROWS
 
@@ -91,8 +94,8 @@ def example(kind: Kind) -> str:
 def _parameter(field: dict[str, Any]) -> dict[str, Any]:
     options = [option for option in field.get("anyOf", ()) if option.get("type") != "null"]
     limits = {**field, **(options[0] if options else {})}
-    said = {"default": field.get("default"), "meaning": field.get("description", "")}
-    return said | {ours: limits[name] for name, ours in _LIMITS.items() if name in limits}
+    described = {"default": field.get("default"), "meaning": field.get("description", "")}
+    return described | {ours: limits[name] for name, ours in _LIMITS.items() if name in limits}
 
 
 def _toml(value: object) -> str:
@@ -142,8 +145,6 @@ class TruthLog:
             self._write(json.dumps(asdict(injected), separators=(",", ":")) + "\n")
 
 
-# Beside this package, in the repository and in the wheel alike.
-_SHIPPED = Path(__file__).parents[2] / "fixtures" / "faults"
 _COMMANDS = frozenset(row.name for message, row in ROWS.items() if issubclass(message, Command))
 
 
@@ -151,23 +152,11 @@ class FaultPlanError(ValueError):
     """A scenario that cannot be used; the message is one line with the remedy."""
 
 
-def _finite(value: object) -> object:
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError("must be a finite number")
-    return value
-
-
-Seconds = Annotated[float, BeforeValidator(_finite), Field(ge=0, le=86_400 * 365)]
+Seconds = Annotated[float, BeforeValidator(finite), Field(ge=0, le=86_400 * 365)]
 Seed = Annotated[StrictInt, Field(ge=0, lt=2**63)]
 
 
-class _Table(BaseModel):
-    """One TOML table: frozen, and an unknown key is an error."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class FaultSpec(_Table):
+class FaultSpec(Table):
     """One fault of a scenario: what, to whom, when, how often; see the module for the keys."""
 
     kind: str
@@ -177,7 +166,7 @@ class FaultSpec(_Table):
     until_s: Seconds | None = None
     frame: Annotated[StrictInt, Field(ge=0, lt=2**32)] | None = None
     every: Annotated[StrictInt, Field(ge=1)] = 1
-    probability: Annotated[float, BeforeValidator(_finite), Field(gt=0, le=1)] = 1.0
+    probability: Annotated[float, BeforeValidator(finite), Field(gt=0, le=1)] = 1.0
     packet: Literal["any", "frame", "reply", "system", "data"] = "any"
     count: Annotated[StrictInt, Field(ge=0)] = 1
     seed: Seed | None = None
@@ -211,8 +200,7 @@ class FaultSpec(_Table):
         try:
             self.kind_parameters()
         except ValidationError as error:
-            allowed = list(self.row.parameters.model_fields)
-            raise ValueError(f"parameters.{_one_line(error, allowed)}") from None
+            raise ValueError(f"parameters.{one_line(error, self.row.parameters)}") from None
         if self.packet != "any" and self.row.target is not Target.PACKET:
             raise ValueError(f"packet: {self.kind} acts on {self.row.target.value} anyway")
         return self
@@ -225,7 +213,7 @@ class FaultSpec(_Table):
         return self.row.parameters.model_validate(self.parameters)
 
 
-class FaultPlan(_Table):
+class FaultPlan(Table):
     """A scenario. ``seed`` is that of every fault without its own."""
 
     seed: Seed = 0
@@ -254,28 +242,16 @@ def parse_fault(table: object, source: str = "fault") -> FaultSpec:
     try:
         return FaultSpec.model_validate(table)
     except ValidationError as error:
-        said = _one_line(error, list(FaultSpec.model_fields))
-        raise FaultPlanError(f"{source}: {said}") from None
+        raise FaultPlanError(f"{source}: {one_line(error, FaultSpec)}") from None
 
 
 def parse_plan(text: str, source: str = "scenario") -> FaultPlan:
     """Return a plan from TOML text; `FaultPlanError` naming the source otherwise."""
-    try:
-        table = tomllib.loads(text)
-    except ValueError as error:  # not TOML, or an integer of thousands of digits
-        raise FaultPlanError(f"{source}: not valid TOML: {error}") from None
-    except RecursionError:
-        raise FaultPlanError(f"{source}: brackets are nested too deep for a scenario") from None
-    try:
-        return FaultPlan.model_validate(table)
-    except ValidationError as error:
-        in_fault = len(error.errors(include_url=False)[0]["loc"]) > 1
-        model = FaultSpec if in_fault else FaultPlan
-        raise FaultPlanError(f"{source}: {_one_line(error, list(model.model_fields))}") from None
+    return parse_table(FaultPlan, text, source=source, error=FaultPlanError)
 
 
 def plan_names() -> tuple[str, ...]:
-    return tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))
+    return shipped_names("faults")
 
 
 def load_plan(path: Path | str) -> FaultPlan:
@@ -288,45 +264,11 @@ def load_plan(path: Path | str) -> FaultPlan:
     FaultPlanError
         Name unknown, file missing or unreadable, TOML broken, key unknown, or value refused.
     """
-    source = Path(path)
-    if isinstance(path, str) and "/" not in path and not path.endswith(".toml"):
-        if path not in plan_names():
-            raise FaultPlanError(
-                f"{path}: no such scenario; known are {', '.join(plan_names())}, "
-                "or give the path of a .toml file"
-            )
-        source = _SHIPPED / f"{path}.toml"
-    try:
-        text = read_bounded(source).decode()
-    except OSError as error:
-        raise FaultPlanError(f"{path}: cannot read the scenario: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise FaultPlanError(f"{path}: not UTF-8 text at byte {error.start}") from error
-    return parse_plan(text, str(path))
-
-
-def _shown(value: object) -> str:
-    try:
-        shown = repr(value)
-    except ValueError:  # an integer of thousands of digits
-        return "a number of thousands of digits"
-    return shown if len(shown) <= 60 else shown[:57] + "..."
-
-
-def _one_line(error: ValidationError, allowed: list[str]) -> str:
-    """Say the first problem in one line, and how many more there are."""
-    problems = error.errors(include_url=False)
-    first = problems[0]
-    parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"])
-    key = "".join(parts).removeprefix(".")
-    match first["type"]:
-        case "extra_forbidden":
-            said = f"unknown key; allowed are {', '.join(allowed) or 'none'}"
-        case "missing":
-            said = "missing; this key is required"
-        case "value_error":
-            said = str(first["ctx"]["error"])
-        case _:
-            said = f"{first['msg'].replace('tuple', 'list')}, got {_shown(first['input'])}"
-    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-    return f"{key}: {said}{more}" if key else f"{said}{more}"
+    return load_table(
+        FaultPlan,
+        path,
+        folder="faults",
+        what="scenario",
+        error=FaultPlanError,
+        unknown=FaultPlanError,
+    )

@@ -1,10 +1,10 @@
 """Which lines lead to each emulated module, and what they are called.
 
-A module talks to one host at a time. While a guest is connected, the port is deaf and dumb: what a
-host writes there is lost, as on a line that leads nowhere.
+A module talks to one host at a time. While a TCP client is connected, what a host writes to the
+pseudo-terminal is lost, and nothing comes out of it, as on a line that leads nowhere.
 
-What a host sees is what a real unplug shows: its open port hangs up, the name is gone; later there
-is a fresh port, under the same name or another one.
+When a port goes away a host sees what a real unplug shows: its open port hangs up, the name is
+gone; later there is a fresh port, under the same name or another one.
 """
 
 from __future__ import annotations
@@ -14,67 +14,42 @@ import os
 import selectors
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from emulator.device import ByteDevice
 from emulator.module.settings import DEFAULT_BAUDRATE
 from emulator.ports.lines import UartLine, UsbLine
 from emulator.ports.pty import LinkError, PortWatch, PtyLink
-from emulator.ports.server import ByteDevice, Port, Service
+from emulator.ports.server import Port, Service
 from emulator.ports.tcp import TcpLink
 
 
-class SharedDevice:
-    """A device and who has it.
-
-    Parameters
-    ----------
-    device
-        The module.
-
-    Attributes
-    ----------
-    port, guest
-        The two sides, each a `emulator.ports.server.ByteDevice`.
-    guest_present
-        Whether the guest has the module.
-    """
-
-    def __init__(self, device: ByteDevice) -> None:
-        self.device = device
-        self.guest_present = False
-        self.port = DeviceSide(self, guest=False)
-        self.guest = DeviceSide(self, guest=True)
-
-
 class DeviceSide:
-    """The module as one of its two lines sees it."""
+    """A module as one of its two lines sees it: only one of them has it at a time."""
 
-    def __init__(self, shared: SharedDevice, *, guest: bool) -> None:
-        self._shared = shared
-        self._guest = guest
+    def __init__(self, device: ByteDevice, has_it: Callable[[], bool]) -> None:
+        self._device = device
+        self._has_it = has_it
 
     @property
     def wants_data(self) -> bool:
         """Whether to read from the host; what is read without having the module is thrown away."""
-        return not self._has_it or self._shared.device.wants_data
+        return not self._has_it() or self._device.wants_data
 
     def receive_data(self, data: bytes, now_ns: int) -> None:
-        if self._has_it:
-            self._shared.device.receive_data(data, now_ns)
+        if self._has_it():
+            self._device.receive_data(data, now_ns)
 
     def advance(self, now_ns: int) -> None:
-        self._shared.device.advance(now_ns)
+        self._device.advance(now_ns)
 
     def next_packet(self, now_ns: int) -> bytes | None:
-        return self._shared.device.next_packet(now_ns) if self._has_it else None
+        return self._device.next_packet(now_ns) if self._has_it() else None
 
     def wake_ns(self, now_ns: int) -> int | None:
-        return self._shared.device.wake_ns(now_ns) if self._has_it else None
-
-    @property
-    def _has_it(self) -> bool:
-        return self._shared.guest_present is self._guest
+        return self._device.wake_ns(now_ns) if self._has_it() else None
 
 
 LOOK_AGAIN_NS = 20_000_000
@@ -99,11 +74,6 @@ class Plug(Service):
         finds the module by its serial number only.
     moved
         Called when the port is back.
-
-    Attributes
-    ----------
-    pulled
-        Set to take the port away, whatever the module does, and unset to allow it back.
     """
 
     def __init__(
@@ -125,25 +95,20 @@ class Plug(Service):
         self._returns = 0
         self._moved = moved
         self._selector: selectors.BaseSelector | None = None
-        self.pulled = False
-
-    @property
-    def is_in(self) -> bool:
-        return self._link.fileno() >= 0
 
     def register(self, selector: selectors.BaseSelector) -> None:
         """Remember the loop's selector: a port that goes away is no longer waited for."""
         self._selector = selector
 
     def advance(self, now_ns: int) -> None:
-        wanted = self._present(now_ns) and not self.pulled
-        if self.is_in and not wanted:
+        wanted = self._present(now_ns)
+        if _is_open(self._link) and not wanted:
             self._take_away()
-        elif wanted and not self.is_in:
+        elif wanted and not _is_open(self._link):
             self._bring_back()
 
     def wake_ns(self, now_ns: int) -> int | None:
-        return None if self.is_in else now_ns + LOOK_AGAIN_NS
+        return None if _is_open(self._link) else now_ns + LOOK_AGAIN_NS
 
     def _take_away(self) -> None:
         if self._selector is not None:
@@ -227,10 +192,6 @@ class LinkOptions:
     tcp_host: str = "127.0.0.1"
 
 
-def _nothing_moved() -> None:
-    """Nobody wants to know that a port came back."""
-
-
 @dataclass(slots=True, kw_only=True)
 class DevicePorts:
     """Everything that leads to the modules of one emulator.
@@ -241,16 +202,13 @@ class DevicePorts:
         For the server's loop.
     services
         Likewise.
-    plugs
-        What takes the ports away, by the modules' names.
     moved
         Called when a port came back, maybe under another name.
     """
 
     ports: list[Port] = field(default_factory=list)
     services: list[Service] = field(default_factory=list)
-    plugs: dict[str, Plug] = field(default_factory=dict)
-    moved: Callable[[], None] = _nothing_moved
+    moved: Callable[[], None] = field(default=lambda: None)
     _words: list[tuple[NamedDevice, PtyLink, TcpLink | None]] = field(default_factory=list)
 
     def entries(self) -> list[dict[str, object]]:
@@ -285,15 +243,16 @@ class DevicePorts:
         link = cleanup.enter_context(PtyLink(path, flushed=flushed))
         if isinstance(line, UartLine) and options.host_baud is None:
             line.host_baud = link.host_baud
-        tcp, watch, device = None, None, named.device
+        tcp, watch = None, None
+        device: ByteDevice = named.device
         if tcp_port is not None:
-            watch = PortWatch(link.terminal, opened=_unheard, closed=_unheard)
+            watch = PortWatch(link.terminal)
             cleanup.callback(watch.close)
-            shared = SharedDevice(device)
-            tcp = _tcp_link(shared, link, watch, tcp_port, options)
+            tcp = TcpLink(options.tcp_host, tcp_port, admits=partial(_is_free, link, watch))
             cleanup.callback(tcp.close)
-            device = shared.port
-            self.ports.append(Port(tcp, shared.guest, _line(named, options)))
+            device = DeviceSide(named.device, partial(_is_closed, tcp))
+            guest = DeviceSide(named.device, partial(_is_open, tcp))
+            self.ports.append(Port(tcp, guest, _line(named, options)))
             self.services += [watch, tcp]
         self.ports.append(Port(link, device, line))
         plug = Plug(
@@ -305,7 +264,6 @@ class DevicePorts:
             moved=lambda: self.moved(),
         )
         self.services.append(plug)
-        self.plugs[named.name] = plug
         self._words.append((named, link, tcp))
 
 
@@ -336,23 +294,16 @@ def _line(named: NamedDevice, options: LinkOptions) -> UsbLine | UartLine | None
     return None if options.usb_latency_ns is None else UsbLine(options.usb_latency_ns)
 
 
-def _tcp_link(
-    shared: SharedDevice, link: PtyLink, watch: PortWatch, tcp_port: int, options: LinkOptions
-) -> TcpLink:
-    def set_guest(present: bool) -> None:
-        shared.guest_present = present
-
-    return TcpLink(
-        options.tcp_host,
-        tcp_port,
-        admits=lambda: link.fileno() >= 0 and not watch.in_use,
-        came=lambda: set_guest(True),
-        left=lambda: set_guest(False),
-    )
+def _is_open(link: PtyLink | TcpLink) -> bool:
+    return link.fileno() >= 0
 
 
-def _unheard(now_ns: int) -> None:
-    """Who opens a terminal matters only when somebody else wants the module."""
+def _is_closed(link: TcpLink) -> bool:
+    return link.fileno() < 0
+
+
+def _is_free(link: PtyLink, watch: PortWatch) -> bool:
+    return _is_open(link) and not watch.in_use
 
 
 def _always(now_ns: int) -> bool:

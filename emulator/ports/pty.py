@@ -27,6 +27,10 @@ _IN_NONBLOCK = os.O_NONBLOCK
 _EVENT = struct.Struct("iIII")  # watch, mask, cookie, length of a name (none for a device)
 
 
+def _ignore(now_ns: int) -> None:
+    pass
+
+
 class PortWatch(Service):
     """Calls back when the first host opens a terminal and when the last one closes it.
 
@@ -42,7 +46,11 @@ class PortWatch(Service):
     """
 
     def __init__(
-        self, terminal: str, *, opened: Callable[[int], None], closed: Callable[[int], None]
+        self,
+        terminal: str,
+        *,
+        opened: Callable[[int], None] = _ignore,
+        closed: Callable[[int], None] = _ignore,
     ) -> None:
         self._opened = opened
         self._closed = closed

@@ -14,33 +14,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
+from emulator.device import ByteDevice
 from emulator.ports.lines import Line
-
-__all__ = ["ByteDevice", "ByteLink", "Port", "Server", "Service"]
 
 NS_PER_S = 1_000_000_000
 PACKETS_PER_TURN = 8
 LONGEST_WAIT_S = 86400.0
 """The system waits no longer than 24 days; a playback at a small rate may ask for years."""
-
-
-class ByteDevice(Protocol):
-    """What the server needs of a device: see `emulator.device.Device`."""
-
-    @property
-    def wants_data(self) -> bool: ...
-
-    def receive_data(self, data: bytes, now_ns: int) -> None: ...
-
-    def advance(self, now_ns: int) -> None: ...
-
-    def next_packet(self, now_ns: int) -> bytes | None:
-        """Return the next packet to send now."""
-        ...
-
-    def wake_ns(self, now_ns: int) -> int | None:
-        """Return when time alone changes something."""
-        ...
 
 
 class ByteLink(Protocol):

@@ -16,8 +16,6 @@ from collections.abc import Callable
 from emulator.ports.pty import LinkError
 from emulator.ports.server import Service
 
-__all__ = ["TcpLink", "is_loopback"]
-
 LARGEST_READ = 4096  # as a pseudo-terminal hands out at once
 BACKLOG = 16
 LAST_PORT = 65535
@@ -37,7 +35,7 @@ def is_loopback(host: str) -> bool:
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
-        return False  # a name: who knows where it leads
+        return False  # a name may lead anywhere
 
 
 class TcpLink(Service):
@@ -51,8 +49,6 @@ class TcpLink(Service):
         Port number; 0 for any that is free.
     admits
         Asked when a client comes while there is none; False hangs up on it.
-    came, left
-        Called when a client was admitted and when it is gone.
 
     Attributes
     ----------
@@ -65,18 +61,8 @@ class TcpLink(Service):
         When the port cannot be had.
     """
 
-    def __init__(
-        self,
-        host: str,
-        port: int,
-        *,
-        admits: Callable[[], bool],
-        came: Callable[[], None],
-        left: Callable[[], None],
-    ) -> None:
+    def __init__(self, host: str, port: int, *, admits: Callable[[], bool]) -> None:
         self._admits = admits
-        self._came = came
-        self._left = left
         self._selector: selectors.BaseSelector | None = None
         self._client: socket.socket | None = None
         if port > LAST_PORT:
@@ -136,7 +122,6 @@ class TcpLink(Service):
             with contextlib.suppress(KeyError):  # not waited for yet
                 self._selector.unregister(client)
         client.close()
-        self._left()
 
     def close(self) -> None:
         self._selector = None
@@ -160,7 +145,6 @@ class TcpLink(Service):
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         client.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         self._client = client
-        self._came()
 
     def _turn_away(self) -> None:
         """Hang up on a waiting client without a descriptor for it, which would wake us for ever."""
@@ -175,7 +159,7 @@ class TcpLink(Service):
 
 
 def _reason(error: OSError | UnicodeError) -> str:
-    """Return what the system says; Python adds the address to it, which was told already."""
+    """Return what the system says, without the address that Python adds to it."""
     if isinstance(error, OSError) and error.errno is not None and error.errno > 0:
         return os.strerror(error.errno)
     return str(error.args[-1])

@@ -19,7 +19,9 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictFloat, model_validator
+from pydantic import Field, model_validator
+
+from emulator.scene.tables import Number, Table
 
 # A turn smaller than this is straight on; a U-turn within it of -180 deg is taken as +180 deg.
 _ANGLE_TOLERANCE_RAD = 1e-9
@@ -171,17 +173,11 @@ Assumed: a scene's rod of 0.015 is a cylinder of 1 cm radius seen over one Fresn
 2 pi a h**2 / wavelength = 0.06 m**2, and amplitude goes with the root of the cross section."""
 
 
-def _finite(value: object) -> object:
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError("must be a finite number")
-    return value
+_Metres = Annotated[Number, Field(ge=-1000, le=1000)]
+_Seconds = Annotated[Number, Field(ge=0, le=86_400)]
 
 
-_Metres = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-1000, le=1000)]
-_Seconds = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=86_400)]
-
-
-class PersonSpec(BaseModel):
+class PersonSpec(Table):
     """One person, in the world frame.
 
     It is in the scene from ``enters_s`` to ``leaves_s`` (for ever if that is left out), and walks
@@ -191,21 +187,17 @@ class PersonSpec(BaseModel):
     the chest (half of its travel). The reflection phase is fixed by the name.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
     waypoints_m: Annotated[
         tuple[tuple[_Metres, _Metres], ...], Field(min_length=1, max_length=1000)
     ]
-    speed_mps: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=1e-3, le=10)] = 1.0
+    speed_mps: Annotated[Number, Field(ge=1e-3, le=10)] = 1.0
     walk: Literal["once", "to_and_fro", "round"] = "once"
     enters_s: _Seconds = 0.0
     leaves_s: _Seconds | None = None
-    rcs_m2: Annotated[StrictFloat, BeforeValidator(_finite), Field(gt=0, le=100)] = 1.0
-    breaths_per_min: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=60)] = 15.0
-    breath_amplitude_m: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=0.05)] = (
-        0.004
-    )
+    rcs_m2: Annotated[Number, Field(gt=0, le=100)] = 1.0
+    breaths_per_min: Annotated[Number, Field(ge=0, le=60)] = 15.0
+    breath_amplitude_m: Annotated[Number, Field(ge=0, le=0.05)] = 0.004
 
     @model_validator(mode="after")
     def _leaves_after_it_enters(self) -> PersonSpec:

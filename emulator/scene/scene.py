@@ -1,63 +1,42 @@
-"""Scene files: who stands where, how the robot drives, what its radars and wheels are like.
+"""Scene files: where everything stands, how the robot drives, what its radars and wheels are like.
 
-Lengths are true metres, angles degrees, amplitudes normalised X4 units (full scale of the 11 bit
-DAC is +-1). What each number does to an echo is on the model page, ``emulator.echo.echo``; to the
-odometry, in ``emulator.scene.wheels``.
+Lengths are true metres, angles in the file degrees, amplitudes normalised X4 units (full scale of
+the 11 bit DAC is +-1). What each number does to an echo is on the model page,
+``emulator.echo.echo``; to the odometry, in ``emulator.scene.wheels``.
 
-A scene is TOML that a person reads and writes; ``load_scene`` turns it into frozen, validated
-models or one :class:`SceneError` line naming file, key and what is allowed. Lengths are true
-metres, angles in the file degrees, amplitudes normalised X4 units (full scale of the 11 bit DAC
-is +-1). Nothing here computes echoes or odometry.
+A scene is TOML; ``load_scene`` turns it into frozen, validated models or one :class:`SceneError`
+line naming file, key and what is allowed.
 """
 
 from __future__ import annotations
 
 import math
-import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
     Field,
     StrictBool,
-    StrictFloat,
     StrictInt,
-    ValidationError,
     field_validator,
     model_validator,
 )
 
 from emulator.chip.chip import ModuleClock
 from emulator.scene.motion import AMPLITUDE_OF_1_M2, PersonSpec, Trajectory, carried, drive
-from xethru_protocol.system import read_bounded
+from emulator.scene.tables import Number, Table, load_table, shipped_names
 
 MIRROR_AMPLITUDE_1M = AMPLITUDE_OF_1_M2 * math.sqrt(math.pi)
 """Echo of a large perfect mirror on boresight at 1 m: 0.106, as strong as pi R**2 at R."""
 SHORTEST_FACE_M = 0.01
 
 
-def _finite(value: object) -> object:
-    """Refuse TOML's inf and nan with words a person can act on."""
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError("must be a finite number")
-    return value
-
-
-Metres = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-1000, le=1000)]
-Degrees = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-360, le=360)]
-Sigma = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=1)]
-Seconds = Annotated[StrictFloat, BeforeValidator(_finite), Field(gt=0, le=86_400)]
-CorrelationTime = Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=1e-3, le=86_400)]
+Metres = Annotated[Number, Field(ge=-1000, le=1000)]
+Degrees = Annotated[Number, Field(ge=-360, le=360)]
+Sigma = Annotated[Number, Field(ge=0, le=1)]
+Seconds = Annotated[Number, Field(gt=0, le=86_400)]
+CorrelationTime = Annotated[Number, Field(ge=1e-3, le=86_400)]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
-
-
-class Table(BaseModel):
-    """One TOML table: frozen, and an unknown key is an error."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class RadarSpec(Table):
@@ -77,10 +56,10 @@ class RadarSpec(Table):
     x_m: Metres
     y_m: Metres
     yaw_deg: Degrees
-    range_offset_m: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-1, le=1)] = 0.0
-    gain_db: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-40, le=40)] = 0.0
-    start_skew_ms: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=10_000)] = 0.0
-    clock_ppm: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=-1000, le=1000)] = 0.0
+    range_offset_m: Annotated[Number, Field(ge=-1, le=1)] = 0.0
+    gain_db: Annotated[Number, Field(ge=-40, le=40)] = 0.0
+    start_skew_ms: Annotated[Number, Field(ge=0, le=10_000)] = 0.0
+    clock_ppm: Annotated[Number, Field(ge=-1000, le=1000)] = 0.0
 
     @property
     def clock(self) -> ModuleClock:
@@ -100,8 +79,8 @@ class TargetSpec(Table):
     kind: Literal["rod", "point", "cylinder"]
     x_m: Metres
     y_m: Metres
-    amplitude_1m: Annotated[StrictFloat, BeforeValidator(_finite), Field(gt=0, le=10)] = 0.015
-    radius_m: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=10)] = 0.0
+    amplitude_1m: Annotated[Number, Field(gt=0, le=10)] = 0.015
+    radius_m: Annotated[Number, Field(ge=0, le=10)] = 0.0
 
     @model_validator(mode="after")
     def _radius_belongs_to_a_cylinder(self) -> TargetSpec:
@@ -121,8 +100,8 @@ class _Surface(Table):
     more than what arrives.
     """
 
-    amplitude_1m: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=1)] = 0.035
-    transmission: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=1)] = 0.0
+    amplitude_1m: Annotated[Number, Field(ge=0, le=1)] = 0.035
+    transmission: Annotated[Number, Field(ge=0, le=1)] = 0.0
 
     @property
     def reflection(self) -> float:
@@ -164,8 +143,8 @@ class ObjectSpec(_Surface):
     name: Name
     x_m: Metres
     y_m: Metres
-    width_m: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=SHORTEST_FACE_M, le=100)]
-    depth_m: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=SHORTEST_FACE_M, le=100)]
+    width_m: Annotated[Number, Field(ge=SHORTEST_FACE_M, le=100)]
+    depth_m: Annotated[Number, Field(ge=SHORTEST_FACE_M, le=100)]
     yaw_deg: Degrees = 0.0
 
 
@@ -224,10 +203,8 @@ class PathSpec(Table):
 
     waypoints_m: tuple[tuple[Metres, Metres], ...] = ((0.0, 0.0),)
     laps: tuple[Literal["forward", "backward"], ...] = ()
-    speed_mps: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=1e-3, le=10)] = 0.05
-    turn_rate_deg_per_s: Annotated[
-        StrictFloat, BeforeValidator(_finite), Field(ge=0.1, le=3600)
-    ] = 28.125
+    speed_mps: Annotated[Number, Field(ge=1e-3, le=10)] = 0.05
+    turn_rate_deg_per_s: Annotated[Number, Field(ge=0.1, le=3600)] = 28.125
     carried: CarriedSpec | None = None
 
     @field_validator("waypoints_m")
@@ -260,7 +237,7 @@ class OdometrySpec(Table):
     their own standard deviations per square root of a second.
     """
 
-    rate_hz: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0.1, le=1000)] = 5.0
+    rate_hz: Annotated[Number, Field(ge=0.1, le=1000)] = 5.0
     scale_sigma: Sigma = 0.0
     turn_scale_sigma: Sigma = 0.0
     curvature_sigma_rad_per_m: Sigma = 0.0
@@ -282,17 +259,13 @@ class NoiseSpec(Table):
 class LeakageSpec(Table):
     """The direct pulse from transmitter to receiver, at TX power 2."""
 
-    amplitude: Annotated[StrictFloat, BeforeValidator(_finite), Field(ge=0, le=10)] = 0.06
+    amplitude: Annotated[Number, Field(ge=0, le=10)] = 0.06
     range_m: Metres = 0.05
 
 
 LONGEST_DRIVE_S = 24 * 3600
 MOST_ODOMETRY_LINES = 500_000
 """A day at the default rate; all lines are computed before the ports open."""
-
-# Beside this package, in the repository and in the wheel alike. Not importlib.resources on the
-# name "fixtures": a folder of that name in the user's own project would come first.
-_SHIPPED_SCENES = Path(__file__).parents[2] / "fixtures" / "scenes"
 
 
 class SceneError(ValueError):
@@ -397,7 +370,7 @@ def empty_room(count: int = 1) -> Scene:
 
 
 def scene_names() -> tuple[str, ...]:
-    return tuple(sorted(path.stem for path in _SHIPPED_SCENES.glob("*.toml")))
+    return shipped_names("scenes")
 
 
 def load_scene(path_or_name: str | Path) -> Scene:
@@ -412,72 +385,11 @@ def load_scene(path_or_name: str | Path) -> Scene:
     SceneError
         File missing or unreadable, TOML broken, key unknown, or value refused.
     """
-    text = str(path_or_name)
-    is_name = isinstance(path_or_name, str) and not text.endswith(".toml") and "/" not in text
-    if is_name and text not in scene_names():
-        raise UnknownSceneError(
-            f"{text}: no such scene; known are {', '.join(scene_names())}, "
-            "or give the path of a .toml file"
-        )
-    source = _SHIPPED_SCENES / f"{text}.toml" if is_name else Path(path_or_name)
-    try:
-        table = tomllib.loads(read_bounded(source).decode())
-    except OSError as error:
-        raise SceneError(f"{text}: cannot read the scene file: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise SceneError(f"{text}: not UTF-8 text at byte {error.start}") from error
-    except ValueError as error:  # not TOML, or an integer of thousands of digits
-        raise SceneError(f"{text}: not valid TOML: {error}") from error
-    except RecursionError as error:
-        raise SceneError(f"{text}: brackets are nested too deep for a scene") from error
-    try:
-        return Scene.model_validate(table)
-    except ValidationError as error:
-        raise SceneError(f"{text}: {_one_line(error)}") from error
-
-
-def _one_line(error: ValidationError) -> str:
-    """Say the first problem in one line, and how many more there are."""
-    found = error.errors(include_url=False)
-    # A refused row makes its list too short as well: that is no problem of its own.
-    refused = {each["loc"][:depth] for each in found for depth in range(len(each["loc"]))}
-    problems = [e for e in found if e["type"] != "too_short" or e["loc"] not in refused]
-    first = problems[0]
-    location = first["loc"]
-    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
-    match first["type"]:
-        case "extra_forbidden":
-            allowed = ", ".join(_allowed_keys(location[:-1]))
-            said = f"unknown key; allowed are {allowed}"
-        case "tuple_type" if isinstance(first["input"], dict):
-            name = location[-1]
-            said = f"must be a list of tables; begin each with [[{name}]], not [{name}]"
-        case "missing":
-            said = "missing; this key is required"
-        case "value_error":
-            said = str(first["ctx"]["error"])
-        case _:
-            said = f"{first['msg']}, got {_short(first['input'])}"
-    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-    return f"{key.removeprefix('.')}: {said}{more}" if key else f"{said}{more}"
-
-
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def _allowed_keys(location: tuple[int | str, ...]) -> list[str]:
-    """Return the keys of the table at a location, by walking the models' fields."""
-    model: type[BaseModel] = Scene
-    for part in location:
-        if isinstance(part, str):
-            model = _table_type(model.model_fields[part].annotation)
-    return list(model.model_fields)
-
-
-def _table_type(annotation: Any) -> type[BaseModel]:  # noqa: ANN401 - any type expression
-    """Return the table model inside ``Table`` or ``tuple[Table, ...]``."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    return _table_type(annotation.__args__[0])
+    return load_table(
+        Scene,
+        path_or_name,
+        folder="scenes",
+        what="scene",
+        error=SceneError,
+        unknown=UnknownSceneError,
+    )

@@ -5,6 +5,7 @@ Results go to stdout, everything else to stderr. Exit 0 done, 1 failed, 2 wrong 
 """
 
 from collections.abc import Sequence
+from importlib import import_module
 
 from xethru_protocol.system import (
     StopFlag,
@@ -24,7 +25,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
     except StopRequestedError as stopped:
         return stopped.exit_code
-    except BrokenPipeError:  # whoever read our output has enough
+    except BrokenPipeError:  # the reader of our output has ended
         return 0
 
 
@@ -36,7 +37,9 @@ def _run(argv: Sequence[str] | None) -> int:
     try:
         arguments = parse(argv)
         try:
-            code: int = arguments.run(arguments)
+            file, _, function = arguments.run.partition(":")
+            run = getattr(import_module(f"xethru_protocol.cli.{file}"), function)
+            code: int = run(arguments)
         except XeThruError as error:
             warn(f"xethru {arguments.command}: {one_line(str(error))}")
             return 1

@@ -6,6 +6,7 @@ touched, so whatever opens the port comes after the rows that look for such prog
 
 import json
 import textwrap
+from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -13,7 +14,14 @@ from pathlib import Path
 from typing import Any
 
 from xethru_protocol.cli.output import counted, one_line, print_json, print_line, profile_name
-from xethru_protocol.cli.port_probe import USUAL_BAUDRATE, Check, Finding, Level, Patient, examine
+from xethru_protocol.cli.port_probe import (
+    USUAL_BAUDRATE,
+    Check,
+    Finding,
+    Level,
+    PortProbe,
+    run_checks,
+)
 from xethru_protocol.transport import find_ports, is_running, run_directory
 from xethru_protocol.wire.codes import PongCode, ProfileId, SensorMode
 from xethru_protocol.wire.errors import XeThruError
@@ -22,14 +30,14 @@ from xethru_protocol.wire.messages import Ping
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Machine:
-    """A computer: ports found, and the folder in which emulators leave word."""
+    """A computer: ports found, and the folder in which running emulators are registered."""
 
     ports: tuple[str, ...]
     run_directory: Path
 
     @property
     def stale(self) -> tuple[Path, ...]:
-        """What emulators left that are not running any more."""
+        """Entries of emulators that do not run any more."""
         return tuple(
             entry
             for entry in sorted(self.run_directory.glob("*"))
@@ -73,19 +81,19 @@ def _no_module(machine: Machine) -> str | None:
 def _stale_entries(machine: Machine) -> str | None:
     if not machine.stale:
         return None
-    return f"{machine.run_directory} still holds what emulators left that have died"
+    return f"{machine.run_directory} still holds entries of emulators that have died"
 
 
 def _damaged_entries(machine: Machine) -> str | None:
     if not machine.damaged:
         return None
-    return "what a running emulator says about its ports cannot be read"
+    return "the entry of a running emulator cannot be read"
 
 
 MACHINE_CHECKS = (
     Check(
         name="modules found",
-        looks_at="USB ids, and the word of running emulators",
+        looks_at="USB ids, and the run directory of emulators",
         find=_no_module,
         remedy="plug one in, run xethru-emulator serve --bare, or name a port with --port",
     ),
@@ -93,7 +101,7 @@ MACHINE_CHECKS = (
         name="no dead emulators",
         looks_at="processes named in the run directory",
         find=_stale_entries,
-        remedy="start an emulator, which tidies up, or run: rm -r {stale}",
+        remedy="start an emulator, which removes them, or run: rm -r {stale}",
     ),
     Check(
         name="emulators' word readable",
@@ -112,95 +120,95 @@ _POWER_CYCLE = "take the module's power away for some seconds"
 # --- the port ---------------------------------------------------------------------------------
 
 
-def _stale_link(patient: Patient) -> str | None:
-    if patient.is_stale_link:
-        return f"it is a link to {patient.target}, which is gone: its emulator has died"
+def _stale_link(probe: PortProbe) -> str | None:
+    if probe.is_stale_link:
+        return f"it is a link to {probe.target}, which is gone: its emulator has died"
     return None
 
 
-def _missing(patient: Patient) -> str | None:
-    return None if patient.exists else "there is no such port"
+def _missing(probe: PortProbe) -> str | None:
+    return None if probe.exists else "there is no such port"
 
 
-def _no_port(patient: Patient) -> str | None:
-    return None if patient.is_serial_port else "it is no serial port"
+def _no_port(probe: PortProbe) -> str | None:
+    return None if probe.is_serial_port else "it is no serial port"
 
 
-def _no_rights(patient: Patient) -> str | None:
-    if patient.may_be_opened:
+def _no_rights(probe: PortProbe) -> str | None:
+    if probe.may_be_opened:
         return None
-    return f"user {patient.user} may not open it; it belongs to group {patient.group}"
+    return f"user {probe.user} may not open it; it belongs to group {probe.group}"
 
 
-def _no_rights_for_the_group(patient: Patient) -> str | None:
-    return None if patient.group_may_open else _no_rights(patient)
+def _no_rights_for_the_group(probe: PortProbe) -> str | None:
+    return None if probe.group_may_open else _no_rights(probe)
 
 
-def _shared(patient: Patient) -> str | None:
-    if len(patient.users) < 2:
+def _shared(probe: PortProbe) -> str | None:
+    if len(probe.users) < 2:
         return None
-    names = " and ".join(map(str, patient.users[:_FEW]))
-    if len(patient.users) > _FEW:
-        names += f" and {len(patient.users) - _FEW} more"
+    names = " and ".join(map(str, probe.users[:_FEW]))
+    if len(probe.users) > _FEW:
+        names += f" and {len(probe.users) - _FEW} more"
     return f"{names} have it open at once: each gets only a part of what the module sends"
 
 
-def _in_use(patient: Patient) -> str | None:
-    return f"{patient.users[0]} has it open" if patient.users else None
+def _in_use(probe: PortProbe) -> str | None:
+    return f"{probe.users[0]} has it open" if probe.users else None
 
 
-def _cannot_open(patient: Patient) -> str | None:
-    if patient.opens or patient.refusal is None:
+def _cannot_open(probe: PortProbe) -> str | None:
+    if probe.opens or probe.refusal is None:
         return None
-    return patient.refusal
+    return probe.refusal
 
 
 # --- whether a module answers -------------------------------------------------------------------
 
 
-def _gone(patient: Patient) -> str | None:
-    return "it went away while the module was asked" if patient.contact.gone else None
+def _gone(probe: PortProbe) -> str | None:
+    return "it went away while the module was checked" if probe.contact.gone else None
 
 
-def _bootloader(patient: Patient) -> str | None:
-    if not patient.contact.bootloader:
+def _bootloader(probe: PortProbe) -> str | None:
+    if not probe.contact.bootloader:
         return None
     return "the module is in its bootloader; more than 15 faults in a row bring it there, too"
 
 
-def _gibberish(patient: Patient) -> str | None:
-    contact = patient.contact
+def _gibberish(probe: PortProbe) -> str | None:
+    contact = probe.contact
     if contact.pong is None and contact.damaged:
         return "it sends bytes, but no XeThru packets, and answers at none of the known rates"
     return None
 
 
-def _deaf(patient: Patient) -> str | None:
-    contact = patient.contact
+def _deaf(probe: PortProbe) -> str | None:
+    contact = probe.contact
     if contact.pong is None and contact.talks:
         return "the module sends messages, but does not answer"
     return None
 
 
-def _silent(patient: Patient) -> str | None:
-    return "nothing answers" if patient.contact.pong is None else None
+def _silent(probe: PortProbe) -> str | None:
+    return "nothing answers" if probe.contact.pong is None else None
 
 
-def _echo(patient: Patient) -> str | None:
-    if patient.contact.pong == Ping().seed:
+def _echo(probe: PortProbe) -> str | None:
+    if probe.contact.pong == Ping().seed:
         return "it sends back what it gets, like a cable whose ends are joined"
     return None
 
 
-def _stranger(patient: Patient) -> str | None:
-    pong = patient.contact.pong
+def _stranger(probe: PortProbe) -> str | None:
+    pong = probe.contact.pong
     if pong in set(PongCode):
         return None
     return f"it answers PING with 0x{pong:08X}, as no XeThru module does"
 
 
-def _other_rate(patient: Patient) -> str | None:
-    rate = patient.contact.baudrate
+def _other_rate(probe: PortProbe) -> str | None:
+    rate = probe.contact.baudrate
     if rate == USUAL_BAUDRATE:
         return None
     return f"it answers at {rate} baud, not at {USUAL_BAUDRATE}"
@@ -209,62 +217,62 @@ def _other_rate(patient: Patient) -> str | None:
 # --- the module -------------------------------------------------------------------------------
 
 
-def _not_ready(patient: Patient) -> str | None:
-    if patient.contact.pong == PongCode.XTS_SPRP_NOTREADY:
-        return "the module says it is not ready yet"
+def _not_ready(probe: PortProbe) -> str | None:
+    if probe.contact.pong == PongCode.XTS_SPRP_NOTREADY:
+        return "the module reports that it is not ready yet"
     return None
 
 
-def _safe_mode(patient: Patient) -> str | None:
-    if patient.contact.pong == PongCode.XTS_SPRP_SAFEMODE:
+def _safe_mode(probe: PortProbe) -> str | None:
+    if probe.contact.pong == PongCode.XTS_SPRP_SAFEMODE:
         return "it is in safe mode: ten faults in a row made it start without its profiles"
     return None
 
 
-def _bare_xep(patient: Patient) -> str | None:
-    if not patient.is_bare_xep:
+def _bare_xep(probe: PortProbe) -> str | None:
+    if not probe.is_bare_xep:
         return None
-    return f"bare {patient.info.firmware_id or 'XEP'} firmware without profiles: raw frames only"
+    return f"bare {probe.info.firmware_id or 'XEP'} firmware without profiles: raw frames only"
 
 
-def _stale_firmware(patient: Patient) -> str | None:
-    version = patient.version
-    if patient.is_bare_xep or version is None or version >= _OLDEST_SOUND_FIRMWARE:
+def _stale_firmware(probe: PortProbe) -> str | None:
+    version = probe.version
+    if probe.is_bare_xep or version is None or version >= _OLDEST_SOUND_FIRMWARE:
         return None
     return (
-        f"firmware {patient.info.version} sets the chip's DAC settle time wrongly, "
+        f"firmware {probe.info.version} sets the chip's DAC settle time wrongly, "
         "which costs 3 dB of signal"
     )
 
 
-def _other_product(patient: Patient) -> str | None:
-    code = patient.info.order_code
+def _other_product(probe: PortProbe) -> str | None:
+    code = probe.info.order_code
     return None if code is None or code == "X4M300" else f"it is an {code}, not an X4M300"
 
 
-def _wrong_profile(patient: Patient) -> str | None:
-    loaded = patient.profile_id
+def _wrong_profile(probe: PortProbe) -> str | None:
+    loaded = probe.profile_id
     if loaded is None or loaded in (ProfileId.XTS_ID_APP_NONE, ProfileId.XTS_ID_APP_PRESENCE_2):
         return None
     return f"profile {profile_name(loaded)} is loaded, not PRESENCE_2, the X4M300's own"
 
 
-def _no_profile(patient: Patient) -> str | None:
-    if patient.profile_id == ProfileId.XTS_ID_APP_NONE:
-        return f"no profile is loaded (mode {patient.info.mode}); raw programs leave it so"
+def _no_profile(probe: PortProbe) -> str | None:
+    if probe.profile_id == ProfileId.XTS_ID_APP_NONE:
+        return f"no profile is loaded (mode {probe.info.mode}); raw programs leave it so"
     return None
 
 
-def _stopped(patient: Patient) -> str | None:
+def _stopped(probe: PortProbe) -> str | None:
     paused = (SensorMode.XTID_SM_IDLE.label, SensorMode.XTID_SM_STOP.label)
-    if patient.profile_id != ProfileId.XTS_ID_APP_NONE and patient.info.mode in paused:
-        return f"the radar stands still (mode {patient.info.mode})"
+    if probe.profile_id != ProfileId.XTS_ID_APP_NONE and probe.info.mode in paused:
+        return f"the radar stands still (mode {probe.info.mode})"
     return None
 
 
-def _transmitter_off(patient: Patient) -> str | None:
+def _transmitter_off(probe: PortProbe) -> str | None:
     # asking the chip would disturb a running profile
-    if patient.info.mode not in (None, SensorMode.XTID_SM_MANUAL.label) or patient.tx_power != 0:
+    if probe.info.mode not in (None, SensorMode.XTID_SM_MANUAL.label) or probe.tx_power != 0:
         return None
     return "the transmitter is off; the module does that itself after 100 frames of zeros"
 
@@ -337,7 +345,7 @@ PORT_CHECKS = (
     ),
     Check(
         name="not in the bootloader",
-        looks_at="the answer to a question only the bootloader knows",
+        looks_at="the answer to a command only the bootloader knows",
         find=_bootloader,
         remedy=f"{_POWER_CYCLE}; if it stays there, write its firmware anew",
         ends=True,
@@ -461,16 +469,16 @@ class Report:
     findings: tuple[Finding, ...]
 
 
-def doctor(paths: Sequence[str], *, as_json: bool) -> int:
-    """Examine the named ports, or all that can be found and the machine; 1 if there is a fault."""
+def doctor(arguments: Namespace) -> int:
+    """Check the named ports, or all that can be found and the machine; 1 if there is a fault."""
     reports = []
-    for report in _reports(paths):
+    for report in _reports(arguments.port):
         reports.append(report)
-        if not as_json:  # at once: silent ports take seconds
+        if not arguments.json:  # at once: silent ports take seconds
             for line in _lines(report):
                 print_line(line)
     faults = sum(f.level is Level.FAULT for report in reports for f in report.findings)
-    if as_json:
+    if arguments.json:
         print_json({"ok": not faults, "reports": [_as_json(report) for report in reports]})
     else:
         print_line("all is well" if not faults else counted(faults, "fault"))
@@ -481,28 +489,28 @@ def _reports(paths: Sequence[str]) -> Iterator[Report]:
     found = {port.path: port for port in find_ports()}
     for path in dict.fromkeys(paths or found):
         known = found.get(path)
-        yield _examine_port(path, known.description if known else "")
+        yield _check_port(path, known.description if known else "")
     if not paths:
         machine = Machine(ports=tuple(found), run_directory=run_directory())
-        findings = tuple(examine(machine, MACHINE_CHECKS))
+        findings = tuple(run_checks(machine, MACHINE_CHECKS))
         yield Report(subject="this machine", about="", findings=findings)
 
 
-def _examine_port(path: str, description: str) -> Report:
-    with closing(Patient(path)) as patient:
-        findings = tuple(examine(patient, PORT_CHECKS))
+def _check_port(path: str, description: str) -> Report:
+    with closing(PortProbe(path)) as probe:
+        findings = tuple(run_checks(probe, PORT_CHECKS))
         about = description
         if findings[-1].check == PORT_CHECKS[-1].name:  # it was asked about itself
-            about = ", ".join(filter(None, (description, _introduction(patient))))
+            about = ", ".join(filter(None, (description, _introduction(probe))))
         return Report(subject=path, about=about, findings=findings)
 
 
-def _introduction(patient: Patient) -> str:
+def _introduction(probe: PortProbe) -> str:
     try:
-        info = patient.info
+        info = probe.info
     except XeThruError:
         return ""
-    profile = patient.profile_id
+    profile = probe.profile_id
     parts = (
         info.order_code or info.firmware_id,
         f"serial {info.serial_number}" if info.serial_number else None,

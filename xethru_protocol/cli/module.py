@@ -2,11 +2,13 @@
 
 import sys
 import time
+from argparse import Namespace
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
+from xethru_protocol.cli.arguments import raw_config
 from xethru_protocol.cli.output import (
     counted,
     is_terminal,
@@ -14,12 +16,11 @@ from xethru_protocol.cli.output import (
     print_json,
     print_line,
     print_text,
+    print_warnings,
     rewriting,
-    say_warnings,
     warn,
 )
 from xethru_protocol.driver.frames import Frame
-from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.transport import find_ports
 from xethru_protocol.wire.codes import PongCode
@@ -32,10 +33,9 @@ _STATE = {
 }
 
 
-def list_modules(*, as_json: bool) -> int:
-    """Print the ports that may be modules."""
+def list_modules(arguments: Namespace) -> int:
     ports = find_ports()
-    if as_json:
+    if arguments.json:
         print_json({"ports": [asdict(port) for port in ports]})
     elif not ports:
         print_line("no module found: none on USB, no emulator running")
@@ -47,26 +47,26 @@ def list_modules(*, as_json: bool) -> int:
     return 0
 
 
-def ping(port: str, baudrate: int, *, as_json: bool) -> int:
-    """Print whether a module answers, and how fast."""
-    with module_at(port, baudrate) as module:
+def ping(arguments: Namespace) -> int:
+    port = arguments.port
+    with module_at(port, arguments.baudrate) as module:
         began_ns = time.monotonic_ns()
         state = _STATE[module.ping()]
         round_trip_ms = (time.monotonic_ns() - began_ns) * 1e-6
-    if as_json:
+    if arguments.json:
         print_json({"port": port, "state": state, "round_trip_ms": round_trip_ms})
     else:
         print_line(f"{port}: {state} ({round_trip_ms:.1f} ms)")
     return 0
 
 
-def info(port: str, baudrate: int, *, as_json: bool) -> int:
-    """Print what a module tells about itself and its radar chip."""
-    with module_at(port, baudrate) as module:
+def info(arguments: Namespace) -> int:
+    port = arguments.port
+    with module_at(port, arguments.baudrate) as module:
         state = _STATE[module.ping()]
         about = {"port": port, "state": state, **asdict(module.info())}
         chip = {setting.name: value for setting, value in module.x4_settings().items()}
-    if as_json:
+    if arguments.json:
         print_json({**about, "x4": chip})
         return 0
     for name, value in about.items():
@@ -84,11 +84,11 @@ def _number(value: X4Value | None) -> str:
     return "-" if value is None else str(value)
 
 
-def reset(port: str, baudrate: int, *, as_json: bool) -> int:
-    """Restart a module; returns when it has agreed to."""
-    with module_at(port, baudrate) as module:
+def reset(arguments: Namespace) -> int:
+    port = arguments.port
+    with module_at(port, arguments.baudrate) as module:
         module.reset()
-    if as_json:
+    if arguments.json:
         print_json({"port": port, "reset": True})
     else:
         print_line(f"{port}: restarting; a USB port vanishes for some seconds")
@@ -98,26 +98,19 @@ def reset(port: str, baudrate: int, *, as_json: bool) -> int:
 _REFRESH_NS = 200_000_000
 
 
-def stream(
-    port: str,
-    baudrate: int,
-    config: RawConfig,
-    *,
-    fps: float,
-    count: int | None,
-    with_samples: bool,
-    as_json: bool,
-) -> int:
-    """Print frames until ``count``, a signal, or the reader's end; the module is stopped then."""
-    with module_at(port, baudrate) as radar:
+def stream(arguments: Namespace) -> int:
+    """Print frames until ``--count``, a signal, or the reader's end; the module is stopped then."""
+    config = raw_config(arguments)
+    with module_at(arguments.port, arguments.baudrate) as radar:
         radar.configure_raw(config)
-        rate = radar.start(fps)
-        say_warnings(radar)
-        live = None if as_json or with_samples or not is_terminal(sys.stdout) else _Live(radar)
+        rate = radar.start(arguments.fps)
+        print_warnings(radar)
+        as_json = arguments.json or arguments.samples or not is_terminal(sys.stdout)
+        live = None if as_json else _Live(radar)
         try:
-            for frame in radar.frames(count, timeout_s=max(2.0, 3.0 / rate)):
+            for frame in radar.frames(arguments.count, timeout_s=max(2.0, 3.0 / rate)):
                 if live is None:
-                    print_json(_as_json(frame, with_samples))
+                    print_json(_as_json(frame, arguments.samples))
                 else:
                     live.show(frame)
         finally:
@@ -152,7 +145,6 @@ class _Live:
         self._began_ns = 0  # arrival of the first
 
     def show(self, frame: Frame) -> None:
-        """Count a frame, and say so a few times a second."""
         if self._newest is None:
             self._began_ns = time.monotonic_ns()
         self._frames += 1
@@ -163,7 +155,6 @@ class _Live:
             self._write(frame, now_ns)
 
     def finish(self) -> None:
-        """Bring the line up to date and leave it."""
         if self._newest is not None:
             self._write(self._newest, time.monotonic_ns())
         warn("")

@@ -1,9 +1,7 @@
 """What `doctor` finds out about one port, each fact when it is first asked for.
 
-Two programs that read one port each get a part of the bytes, and the mere opening of a port
-flushes what waits in it: so this is asked first.
-
-The order in which the checks ask matters: a port that another program has open is never opened.
+Two programs that read one port each get a part of the bytes, and opening a port flushes what
+waits in it. So programs that have it open are looked for first, and a port in use is not opened.
 """
 
 import getpass
@@ -38,7 +36,7 @@ from xethru_protocol.wire.messages import (
     X4DriverGet,
 )
 
-PatientT = TypeVar("PatientT")
+SubjectT = TypeVar("SubjectT")
 
 
 class Level(Enum):
@@ -50,30 +48,30 @@ class Level(Enum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Check(Generic[PatientT]):
+class Check(Generic[SubjectT]):
     """A row of a table.
 
     Attributes
     ----------
     name
-        What is all right if nothing is found.
+        What is in order if nothing is found.
     looks_at
         Where the evidence comes from.
     find
         Returns what is wrong, None if nothing is.
     remedy
-        What to do about it; ``{...}`` may name any attribute of the patient, which is quoted as
-        a shell needs it.
+        What to do about it; ``{...}`` may name any attribute of the subject, which is quoted for
+        a shell.
     level
         NOTE for what is a fault only to some users.
     ends
-        Whether this finding ends the examination: it leaves nothing that later rows could look
-        at, or they would disturb another program.
+        Whether no check follows this finding: later ones have nothing to look at, or would
+        disturb another program.
     """
 
     name: str
     looks_at: str
-    find: Callable[[PatientT], str | None]
+    find: Callable[[SubjectT], str | None]
     remedy: str
     level: Level = Level.FAULT
     ends: bool = False
@@ -81,7 +79,7 @@ class Check(Generic[PatientT]):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """What a check came to; ``found`` and ``remedy`` are empty if all is well."""
+    """Result of a check; ``found`` and ``remedy`` are empty if all is well."""
 
     check: str
     looks_at: str
@@ -90,11 +88,11 @@ class Finding:
     remedy: str = ""
 
 
-def examine(patient: PatientT, checks: Sequence[Check[PatientT]]) -> Iterator[Finding]:
-    """Carry out checks in order, until one ends the examination."""
+def run_checks(subject: SubjectT, checks: Sequence[Check[SubjectT]]) -> Iterator[Finding]:
+    """Run checks in order, until one with ``ends`` finds something."""
     for check in checks:
         try:
-            found = check.find(patient)
+            found = check.find(subject)
         except (XeThruError, OSError) as error:  # a module that answered, a port that was there
             yield Finding(
                 check=check.name,
@@ -112,7 +110,7 @@ def examine(patient: PatientT, checks: Sequence[Check[PatientT]]) -> Iterator[Fi
             looks_at=check.looks_at,
             level=check.level,
             found=found,
-            remedy=check.remedy.format_map(_Attributes(patient)),
+            remedy=check.remedy.format_map(_Attributes(subject)),
         )
         if check.ends:
             return
@@ -145,15 +143,13 @@ class PortUser:
     name: str
 
     def __str__(self) -> str:
-        """Name and process id, for messages."""
         return f"{self.name!r} (pid {self.pid})"
 
 
 def port_users(path: str) -> tuple[PortUser, ...]:
     """Programs that have a port open, as far as this user may know; by process id.
 
-    Whoever serves the port of a pseudo-terminal is none of them. Other users' programs are
-    seen by root only.
+    The program that serves a pseudo-terminal is not listed. Only root sees other users' programs.
     """
     try:
         device = os.stat(path)
@@ -283,8 +279,8 @@ class Contact:
     gone: bool = False
 
 
-class Patient:
-    """One port under examination."""
+class PortProbe:
+    """Facts about one port."""
 
     def __init__(self, path: str) -> None:
         self.path = path
@@ -292,7 +288,6 @@ class Patient:
         self._transport: Transport | None = None
 
     def close(self) -> None:
-        """Release the port, if it was opened."""
         if self._transport is not None:
             self._transport.close()
 
@@ -305,17 +300,15 @@ class Patient:
 
     @property
     def is_stale_link(self) -> bool:
-        """Whether the path is a link to something that is gone."""
         return os.path.islink(self.path) and not os.path.exists(self.path)
 
     @property
     def exists(self) -> bool:
-        """Whether there is anything of that name."""
         return os.path.exists(self.path)
 
     @property
     def is_serial_port(self) -> bool:
-        """Whether it is a device, and, where the system tells (Linux), one of a serial driver."""
+        """Whether it is a device, and of a serial driver where the system lists them (Linux)."""
         status = os.stat(self.path)
         if not stat.S_ISCHR(status.st_mode):
             return False
@@ -327,12 +320,10 @@ class Patient:
 
     @property
     def may_be_opened(self) -> bool:
-        """Whether this user may read and write it."""
         return os.access(self.path, os.R_OK | os.W_OK)
 
     @property
     def group(self) -> str:
-        """Group the device belongs to."""
         number = os.stat(self.path).st_gid
         try:
             return grp.getgrgid(number).gr_name
@@ -346,7 +337,6 @@ class Patient:
 
     @property
     def user(self) -> str:
-        """Who examines."""
         try:
             return getpass.getuser()
         except (KeyError, OSError):
@@ -354,14 +344,13 @@ class Patient:
 
     @cached_property
     def users(self) -> tuple[PortUser, ...]:
-        """Programs that have the port open."""
         return port_users(self.path)
 
     # --- having opened it -----------------------------------------------------------------------
 
     @cached_property
     def opens(self) -> bool:
-        """Open the port; if that fails, `refusal` says why."""
+        """Open the port; if that fails, `refusal` holds the reason."""
         try:
             self._transport = SerialTransport(self.path)
         except PortUnavailable as error:
@@ -371,7 +360,7 @@ class Patient:
 
     @cached_property
     def contact(self) -> Contact:
-        """Ask for a sign of life, at other rates too, and whether it is the bootloader."""
+        """Send PING, at other rates too, and a command of the bootloader."""
         first = self._ask(Ping(), _PATIENCE_S)
         if first.pong is not None or first.gone:
             return first
@@ -388,13 +377,11 @@ class Patient:
 
     @cached_property
     def module(self) -> X4M300:
-        """The driver of a module that answers."""
         assert self._transport is not None, "the checks open the port first"
         return X4M300(self._transport)
 
     @cached_property
     def info(self) -> ModuleInfo:
-        """What the module tells about itself."""
         return self.module.info()
 
     @property
@@ -410,7 +397,7 @@ class Patient:
 
     @cached_property
     def profile_id(self) -> int | None:
-        """Loaded profile, 0 for none; None where the module does not say."""
+        """Loaded profile, 0 for none; None where the module refuses."""
         try:
             values = self.module.request(GetProfileId()).values
         except DeviceError:
@@ -419,7 +406,7 @@ class Patient:
 
     @cached_property
     def tx_power(self) -> int | None:
-        """Transmitter power, 0 for off; None where the module does not say."""
+        """Transmitter power, 0 for off; None where the module refuses."""
         try:
             values = self.module.request(X4DriverGet(setting=X4Setting.TXPOWER)).values
         except DeviceError:

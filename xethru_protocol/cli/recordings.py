@@ -2,6 +2,7 @@
 
 import json
 import sys
+from argparse import Namespace
 from collections.abc import Iterable, Iterator
 from contextlib import nullcontext
 from datetime import UTC, datetime
@@ -49,18 +50,20 @@ _CHUNK_BYTES = 65536
 
 
 class DecodeError(XeThruError):
-    """The input cannot be read as what it was said to be."""
+    """The input is not of the format that was named."""
 
 
-def decode(file: str | None, *, is_hex: bool, sender: str, with_statistics: bool = False) -> int:
+def decode(arguments: Namespace) -> int:
     """Print one JSON object per packet and per fault; totals at the end, on stderr, if wanted."""
+    file = None if arguments.file == "-" else arguments.file
+    sender = arguments.sender
     name = file or "standard input"
     statistics = LinkStatistics()
     if file is None and sys.stdin is None:
         raise DecodeError("standard input is closed; there is nothing to decode")
     try:
         with Path(file).open("rb") if file else nullcontext(sys.stdin.buffer) as source:
-            if is_hex:
+            if arguments.hex:
                 for number, line in enumerate(source, start=1):
                     _print_all(iter((_from_hex(line, name, number),)), sender, statistics)
             else:
@@ -70,7 +73,7 @@ def decode(file: str | None, *, is_hex: bool, sender: str, with_statistics: bool
     except OSError as error:
         raise DecodeError(f"{name} cannot be read: {error.strerror}") from None
     finally:
-        if with_statistics:
+        if arguments.statistics:
             warn(json.dumps(statistics.summary()))
     return 0
 
@@ -78,7 +81,7 @@ def decode(file: str | None, *, is_hex: bool, sender: str, with_statistics: bool
 def found_in(
     chunks: Iterable[bytes], sender: str, statistics: LinkStatistics
 ) -> Iterator[Packet | FramingFault]:
-    """Packets and faults of a stream that comes in chunks, each as soon as it can be told."""
+    """Packets and faults of a stream that comes in chunks, each as soon as it is complete."""
     direction = Direction.FROM_HOST if sender == "host" else Direction.FROM_MODULE
     reader = PacketReader(direction, statistics)
     for chunk in chunks:
@@ -162,10 +165,11 @@ _FEW = 3  # elements of an array that are shown
 _LONGEST_TEXT = 60
 
 
-def dump(file: str, *, with_samples: bool, as_json: bool, radar: str | None) -> int:
+def dump(arguments: Namespace) -> int:
     """Print every message of a recording; 1 if a part could not be read."""
+    file, radar = arguments.file, arguments.radar
     faults: list[RecordingFault] = []
-    if as_json:
+    if arguments.json:
         for message, t_ns in read_recording(file, faults.append, radar=radar):
             print_json(_as_json(message, t_ns))
     else:
@@ -174,7 +178,7 @@ def dump(file: str, *, with_samples: bool, as_json: bool, radar: str | None) -> 
             print_line(line)
         for message, t_ns in read_recording(file, faults.append, radar=radar):
             time = _since(t_ns, summary.start_ns)
-            print_line(f"{time}  {message_line(message, with_samples=with_samples)}")
+            print_line(f"{time}  {message_line(message, with_samples=arguments.samples)}")
     warn_of("dump", faults)
     return 1 if faults else 0
 
@@ -248,8 +252,9 @@ def _text(value: Any, whole: bool) -> str:  # noqa: ANN401 - any JSON value
     return text if whole or len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]}..."
 
 
-def convert(source: str, target: str, *, replace: bool, as_json: bool, radar: str | None) -> int:
-    """Write ``source`` again as ``target``; 1 if a part of it could not be read."""
+def convert(arguments: Namespace) -> int:
+    """Write a recording in another format; 1 if a part of it could not be read."""
+    source, target = arguments.source, arguments.target
     recording_facts(source)  # raises before anything is removed
     path = Path(target)
     if is_part_of(Path(source), path):
@@ -262,12 +267,12 @@ def convert(source: str, target: str, *, replace: bool, as_json: bool, radar: st
         newest = messages
         progress.show(lambda: f"{newest} messages")
 
-    with set_aside(path, replace=replace):
+    with set_aside(path, replace=arguments.force):
         try:
-            done = convert_recording(source, target, show, radar=radar)
+            done = convert_recording(source, target, show, radar=arguments.radar)
         finally:
             progress.finish(lambda: f"{newest} messages")
-    if as_json:
+    if arguments.json:
         print_json(
             {
                 "target": target,

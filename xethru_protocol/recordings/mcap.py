@@ -17,7 +17,7 @@ Recordings
     ``/radar/<name>/info`` once what is known of them, where the recorded module answered for its
     settings. Every other message is on ``/radar/<name>/payload``, its payload as UInt8MultiArray,
     and for reading, if it is a short one, on ``/radar/<name>/message`` as JSON. Messages without a
-    time have time 0 and a channel that says so.
+    time have time 0, and their channel is marked.
 
 Specification of the format: https://mcap.dev/spec
 """
@@ -51,9 +51,9 @@ from xethru_protocol.recordings.records import (
     RecordingFault,
     Timed,
     TimedMessages,
+    reading,
     report,
-    unreadable,
-    unwritable,
+    writing,
 )
 from xethru_protocol.wire.codec import decode_response, describe, encode
 from xethru_protocol.wire.codes import X4Setting
@@ -103,7 +103,6 @@ SCHEMAS = {
 
 
 def pack_string(text: str) -> bytes:
-    """Return the bytes of a String."""
     return _LITTLE_ENDIAN + _counted(text)
 
 
@@ -172,7 +171,7 @@ MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
 MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END = 7, 9, 12, 15
 _OF_SUMMARY = (8, 10, 11, 13, 14)  # indexes and statistics, behind the data
-_LAST_CODE = 15  # private ones from 128 on are nobody's here, and more likely damage
+_LAST_CODE = 15  # private ones, from 128 on, are taken for damage
 
 _HEAD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQI")
@@ -208,7 +207,7 @@ class Cut:
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """What stands between two places is not what was written."""
+    """The bytes between two places are not what was written."""
 
     at: int
     until: int
@@ -267,7 +266,7 @@ class RecordReader:
             at = None if code == FOOTER else end
 
     def _check(self, at: int, code: int, body: bytes) -> None:
-        """Raise ValueError where a record cannot be what its first byte says.
+        """Raise ValueError where a record does not fit its opcode.
 
         One flipped bit there would hide a chunk, or end the file.
         """
@@ -413,7 +412,7 @@ def _content(body: bytes) -> bytes:
 
 
 def _content_before_cut(body: bytes) -> bytes:
-    """Decompress what there is of a chunk; nothing if that says nothing."""
+    """Decompress what there is of a cut chunk, possibly nothing."""
     try:
         size = _CHUNK.unpack_from(body)[2]
         name, at = text_at(body, _CHUNK.size)
@@ -465,7 +464,7 @@ class Channel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Message:
-    """One message as stored."""
+    """A message as stored; times in ns."""
 
     channel: Channel
     sequence: int
@@ -576,7 +575,6 @@ class McapWriter(Writer):
         self._Writer__finalize_chunk()  # type: ignore[attr-defined]  # see above
 
     def finish(self) -> None:
-        """Write index and footer."""
         super().finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
 
 
@@ -618,7 +616,6 @@ class _RecordingWriter:
         self._settings: dict[str, X4Value] = {}  # as the recorded module read them back
 
     def write(self, message: Response, t_ns: int | None) -> None:
-        """Add a message."""
         if isinstance(message, DataFloat) and message.content_id == 0:
             self._info(message, t_ns)
             data = pack_array(FLOAT_ARRAY, message.values)
@@ -641,7 +638,7 @@ class _RecordingWriter:
         self._writer.finish()
 
     def _info(self, frame: DataFloat | BasebandIq | BasebandAp, t_ns: int | None) -> None:
-        """Say once what is known of the frames; what is not is null."""
+        """Write once what is known of the frames; null is unknown."""
         if self._has_info:
             return
         self._has_info = True
@@ -664,7 +661,7 @@ class _RecordingWriter:
         self._add("info", STRING, pack_string(json.dumps(info)), t_ns, 0)
 
     def _geometry(self, frame: DataFloat | BasebandIq | BasebandAp) -> FrameGeometry | None:
-        """Where the bins lie: as the message says, or as the module answered before it."""
+        """Where the bins lie, from the message or from earlier answers of the module."""
         if not isinstance(frame, DataFloat):
             return FrameGeometry(
                 range_start_m=frame.range_offset_m,
@@ -727,14 +724,11 @@ def write_mcap(
     RecordingError
         If the file exists or cannot be written. What was written before stays.
     """
-    try:
-        with path.open("xb") as stream:
-            writer = _RecordingWriter(stream, radar, facts)
-            for message, t_ns in messages:
-                writer.write(message, t_ns)
-            writer.finish()
-    except OSError as error:
-        raise unwritable(path, error) from None
+    with writing(path), path.open("xb") as stream:
+        writer = _RecordingWriter(stream, radar, facts)
+        for message, t_ns in messages:
+            writer.write(message, t_ns)
+        writer.finish()
 
 
 def read_mcap(path: Path, on_fault: FaultHandler | None, radar: str | None = None) -> TimedMessages:
@@ -780,7 +774,7 @@ def read_mcap(path: Path, on_fault: FaultHandler | None, radar: str | None = Non
 
 
 def mcap_radars(path: Path) -> tuple[RadarFacts, ...]:
-    """Return the radars of a file in the order in which their topics begin; damage passes."""
+    """Return the radars of a file in the order of their first topics; damage is ignored."""
     names: dict[str, None] = {}  # a set in order
     facts: dict[str, RadarFacts] = {}
     for entry in _entries_of(path, lambda fault: None):
@@ -799,7 +793,7 @@ def _names(path: Path) -> str:
 
 
 def _radar_facts(name: str, data: bytes) -> RadarFacts:
-    """Read what a latched info says of a radar; nothing where it makes no sense."""
+    """Read a latched info; facts without content if it is invalid."""
     try:
         info = json.loads(unpack_string(data))
         start_m, bin_m = float(info["range_start_m"]), float(info["bin_length_m"])
@@ -817,7 +811,7 @@ def _radar_facts(name: str, data: bytes) -> RadarFacts:
 
 
 def mcap_facts(path: Path) -> RecordingFacts:
-    """Return what a file says about itself; defaults where it says nothing."""
+    """Return what a file holds about itself, or defaults."""
     for entry in _entries_of(path, lambda fault: None):
         if isinstance(entry, Metadata) and entry.name == _FACTS:
             try:
@@ -843,19 +837,16 @@ def _radar_topic(topic: str) -> tuple[str, str]:
 
 def _entries_of(path: Path, on_fault: FaultHandler | None) -> Iterator[Entry]:
     """Yield what a file holds before it is cut or damaged, which is reported."""
-    try:
-        with path.open("rb") as stream:
-            fault: Cut | Damage | None = None
-            if stream.read(len(MAGIC)) != MAGIC:
-                fault = Damage(0, 0, "it does not begin as an MCAP file")
-            else:
-                for found in read_entries(stream, os.fstat(stream.fileno()).st_size):
-                    if isinstance(found, Cut | Damage):
-                        fault = found
-                        break
-                    yield found
-    except OSError as error:
-        raise unreadable(path, error) from None
+    fault: Cut | Damage | None = None
+    with reading(path), path.open("rb") as stream:
+        if stream.read(len(MAGIC)) != MAGIC:
+            fault = Damage(0, 0, "it does not begin as an MCAP file")
+        else:
+            for found in read_entries(stream, os.fstat(stream.fileno()).st_size):
+                if isinstance(found, Cut | Damage):
+                    fault = found
+                    break
+                yield found
     if fault is not None:
         reason = "it ends too early" if isinstance(fault, Cut) else fault.reason
         reason = f"it is cut or damaged: {reason}"

@@ -1,4 +1,4 @@
-"""What `xethru` and `xethru-emulator` print, one transcript per command.
+"""What `xethru` and `xethru-emulator` print, one transcript per command; see `test_uwb_slam`, too.
 
 A transcript holds command lines behind ``$``, what each prints (lines of stderr behind ``!``) and
 its exit code in brackets. The commands run in a folder with the files that `folder` makes.
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import pytest
@@ -18,6 +18,7 @@ from emulator.cli import main as xethru_emulator
 from hil_tests.paths import FIXTURES
 from hil_tests.unit.emulator.test_playback_control import write_session
 from hil_tests.unit.xethru_protocol.pty_module import PtyModule
+from slam.app.cli import main as uwb_slam
 from xethru_protocol.cli import main as xethru
 from xethru_protocol.recordings import WireCapture
 
@@ -27,6 +28,7 @@ UPDATE = os.environ.get("XETHRU_UPDATE_SNAPSHOTS") == "1"
 PROGRAMS: dict[str, Callable[[Sequence[str]], int]] = {
     "xethru": xethru,
     "xethru-emulator": xethru_emulator,
+    "uwb-slam": uwb_slam,
 }
 
 
@@ -71,22 +73,35 @@ def plain(text: str) -> str:
     return " ".join(text.replace("'", "").replace("\n!", "\n").split())
 
 
+def check_transcript(
+    path: Path, capsys: pytest.CaptureFixture[str], masks: Mapping[str, str]
+) -> list[str]:
+    """Compare a transcript with what is printed now, some parts masked; return the latter."""
+    expected = path.read_text("utf-8")
+    commands = [line[2:] for line in expected.splitlines() if line.startswith("$ ")]
+    assert commands, f"{path}: no command"
+    assert " _" not in expected, "a name of ours tells a user nothing"
+    printed = []
+    for command in commands:
+        text = run(shlex.split(command), capsys)
+        for part, mask in masks.items():
+            text = text.replace(part, mask)
+        printed.append(f"$ {command}\n{text}\n")
+    if UPDATE:
+        path.write_text("\n".join(printed), "utf-8")
+        return printed
+    for command, now, before in zip(
+        commands, printed, expected.removeprefix("$ ").split("\n$ "), strict=True
+    ):
+        assert plain(now) == plain(f"$ {before}"), f"{command}: see XETHRU_UPDATE_SNAPSHOTS above"
+    return printed
+
+
 @pytest.mark.parametrize(
-    "path", sorted(HERE.glob("*/*.txt")), ids=lambda path: f"{path.parent.name}-{path.stem}"
+    "path", sorted(HERE.glob("xethru*/*.txt")), ids=lambda path: f"{path.parent.name}-{path.stem}"
 )
 @pytest.mark.usefixtures("folder")
 def test_every_command_prints_its_transcript(
     path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    expected = path.read_text("utf-8")
-    commands = [line[2:] for line in expected.splitlines() if line.startswith("$ ")]
-    assert commands, f"{path}: no command"
-    assert " _" not in expected, "a name of ours tells a user nothing"
-    printed = [f"$ {command}\n{run(shlex.split(command), capsys)}\n" for command in commands]
-    if UPDATE:
-        path.write_text("\n".join(printed), "utf-8")
-        return
-    for command, now, before in zip(
-        commands, printed, expected.removeprefix("$ ").split("\n$ "), strict=True
-    ):
-        assert plain(now) == plain(f"$ {before}"), f"{command}: see XETHRU_UPDATE_SNAPSHOTS above"
+    check_transcript(path, capsys, {})

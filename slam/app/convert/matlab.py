@@ -7,7 +7,7 @@ odom    (n, 3)           pose by the wheels: x, y [mm], heading [rad]
 obsLHS  (n, m, 2)        fixes of the two left radars: distance [mm], bearing [rad], from the body's
 obsRHS  (n, m, 2)        origin and counter-clockwise from forward; of the right ones, unwrapped to
                          pi and more; rows of zeros are empty
-R1..R4  (n, n_bins)      raw frames of the four radars; rows of zeros are none
+R1..R4  (n, n_bins)      raw frames of the four radars; rows of zeros are missing
 ======  ===============  ========================================================================
 
 Two more variables, which their programs ignore and ours write::
@@ -15,10 +15,10 @@ Two more variables, which their programs ignore and ours write::
     t       (n, 1)   session time of the state [s]
     mounts  (4, 3)   of the radars: x, y [mm], boresight [rad], body frame
 
-Their fixes are points; SLAM here takes ranges. A fix says exactly which two ranges it is made of,
-since it is where the circles around the two radars of its side meet, so these are what a session
-gets: each once, however many fixes share it. Paired again they give the same fixes, and ghosts that
-the authors' narrower field of view left out are for the settings of SLAM to judge.
+Their fixes are points; SLAM here takes ranges. A fix determines the two ranges it is made of, since
+it is where the circles around the two radars of its side meet. A session gets these ranges, each
+once, however many fixes share it. Paired again they give the same fixes, and ghosts that the
+authors' narrower field of view left out.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from slam.app.session.messages import SlamSettings, imported_info, imported_rada
 from slam.app.session.reader import RecordedSession
 from slam.config import SlamConfig
 from slam.frames import RadarFrame
-from slam.front_end.paper import make_detector
+from slam.front_end import make_detector
 from slam.geometry import Mount, RadarPair, Rig
 from slam.paper.trilateration import Trilaterator
 
@@ -69,9 +69,9 @@ class MatDrive:
     frames
         Raw frames by the number of the radar, 1 to 4, shape (n, n_bins), float32; zeros: none.
     stamps_s
-        Shape (n,), ascending; None where the file does not tell.
+        Shape (n,), ascending; None if not in the file.
     mounts
-        Shape (4, 3): x [m], y [m], boresight [rad], body frame; None where the file does not tell.
+        Shape (4, 3): x [m], y [m], boresight [rad], body frame; None if not in the file.
     """
 
     odometry: Array
@@ -99,7 +99,7 @@ def read_mat(path: Path) -> MatDrive:
         ) from None
     except OSError as error:
         raise AppError(f"{path}: cannot read: {error.strerror or error}") from None
-    except Exception as error:  # scipy does not say what it may raise of a damaged file
+    except Exception as error:  # scipy documents no exceptions for damaged files
         words = " ".join(str(error).split()) or type(error).__name__
         raise AppError(
             f"{path}: no MATLAB file, or a damaged one{describe_kind(path)}: {words}"
@@ -148,7 +148,7 @@ def write_mat(path: Path, drive: MatDrive) -> None:
     if drive.mounts is not None:
         table["mounts"] = drive.mounts / _POSE_UNITS
     with naming(path):
-        path.open("wb").close()  # savemat's own words would not say why it cannot be
+        path.open("wb").close()  # savemat's own error would not name the reason
         savemat(path, table, appendmat=False, do_compression=True)
 
 
@@ -217,20 +217,19 @@ _SAME_RANGE_M = 1e-4
 _STEP_M2, _STEP_RAD = 20e-6, 2e-3
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MatOptions:
-    """What such a file may not say: mounts, states per second, settings of SLAM.
+def convert_mat(
+    mat: Path,
+    out: Path,
+    check: Callable[[], None],
+    *,
+    settings: SlamSettings,
+    rig: Rig | None = None,
+    rate_hz: float = 5.0,
+) -> str:
+    """Write the detections and odometry of a file as a session; return a line about it.
 
-    Without ``rig`` the mounts are those in the file, or else those of the authors' robot.
-    """
-
-    rig: Rig | None = None
-    rate_hz: float = 5.0
-    settings: SlamSettings
-
-
-def convert_mat(mat: Path, out: Path, options: MatOptions, check: Callable[[], None]) -> str:
-    """Write the detections and odometry of a file as a session; return in words what was written.
+    Without ``rig`` the mounts are those in the file, or else those of the authors' robot;
+    ``rate_hz`` is of states, for a file without stamps.
 
     Raises
     ------
@@ -238,9 +237,9 @@ def convert_mat(mat: Path, out: Path, options: MatOptions, check: Callable[[], N
         The file makes no sense, or the rig has not one pair of radars on each side.
     """
     drive = read_mat(mat)
-    rig = options.rig or _rig_of(drive)
+    rig = rig or _rig_of(drive)
     pairs = _sides(mat, rig)
-    stamps_ns = _stamps_ns(drive, options.rate_hz)
+    stamps_ns = _stamps_ns(drive, rate_hz)
     radars = tuple(
         imported_radar(
             # whatever a module measures too long, it is in the fixes already
@@ -248,11 +247,11 @@ def convert_mat(mat: Path, out: Path, options: MatOptions, check: Callable[[], N
             range_start_m=0.0,
             bin_length_m=_BIN_M,
             n_bins=drive.frames[number].shape[1] if number in drive.frames else 0,
-            rate_hz=options.rate_hz,
+            rate_hz=rate_hz,
         )
         for number, mount in enumerate(rig.mounts, start=1)
     )
-    info = imported_info(mat, radars, options.settings, time_base="states", has_detections=True)
+    info = imported_info(mat, radars, settings, time_base="states", has_detections=True)
     poses = [
         TumSample(t_ns=t_ns, x_m=x, y_m=y, qz=math.sin(turn / 2), qw=math.cos(turn / 2))
         for t_ns, (x, y, turn) in zip(stamps_ns, drive.odometry.tolist(), strict=True)
@@ -271,16 +270,16 @@ def convert_mat(mat: Path, out: Path, options: MatOptions, check: Callable[[], N
             log.on_scan(Scan(counter=row, t_ns=t_ns, frames=_frames(drive, radars, row, t_ns)))
     finally:
         log.close()
-    said = f"{out}: {len(poses)} states with {n_fixes} fixes, made of {n_ranges} ranges"
+    result = f"{out}: {len(poses)} states with {n_fixes} fixes, made of {n_ranges} ranges"
     if drive.stamps_s is None:
-        said += f"; the file has no stamps, {options.rate_hz:g} states/s are assumed"
-    return said
+        result += f"; the file has no stamps, {rate_hz:g} states/s are assumed"
+    return result
 
 
 def write_detections(
     session: RecordedSession, out: Path, config: SlamConfig, check: Callable[[], None]
 ) -> str:
-    """Write what the front end of ``config`` finds in a session; return in words what was written.
+    """Write what the front end of ``config`` finds in a session; return a line about it.
 
     A state is collected as the authors do: after 4.5 mm or 2 mrad of odometry.
 

@@ -4,7 +4,7 @@ Their bags hold, per radar, `/UWBradar<k>/readings` (in earlier ones `/UWBradar<
 per message as std_msgs/Float32MultiArray, which has neither stamp nor counter; `/odom` as
 nav_msgs/Odometry; and a pose by laser as truth: Hector SLAM's `/slam_out_pose`, a
 geometry_msgs/PoseStamped. Radars 2 and 4 look to the left, 1 and 3 to the right, as their public
-launch file pairs them; each data set says so in a file of its own, so a rig file can say otherwise.
+launch file pairs them; each data set has a file of its own for that, so a rig file can change it.
 
 What this program writes has two more kinds of topic, std_msgs/String with JSON, so that nothing is
 lost on the way back: `/UWBradar<k>/info` and `/session`.
@@ -86,7 +86,6 @@ def frames_topic(radar: int) -> str:
 
 
 def info_topic(radar: int) -> str:
-    """Return the topic that says what a radar is."""
     return f"/UWBradar{radar + 1}/info"
 
 
@@ -101,7 +100,6 @@ def radar_of_frames(topic: str) -> str | None:
 
 
 def radar_of_info(topic: str) -> str | None:
-    """Return the radar that a topic tells of, None for other topics."""
     found = _INFO.fullmatch(topic)
     return found[1] if found else None
 
@@ -115,28 +113,6 @@ def radar_order(name: str) -> int:
 _SAME_CLOCK_NS = NS_PER_S
 _TRUTH_TYPES = (ros.POSE, "geometry_msgs/msg/PoseWithCovarianceStamped", ros.ODOMETRY)
 _PAPER_BINS, _PAPER_AREA_M = 1431, (0.2, 9.4)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BagOptions:
-    """What a bag does not say itself.
-
-    Attributes
-    ----------
-    rig
-        Mounts under the names of the topics (UWBradar1, ...); ignored where the bag tells.
-    area_m
-        Frame area that the modules were asked for, module metres; None: the paper's.
-    truth_topic
-        Of geometry_msgs/PoseStamped or PoseWithCovarianceStamped or nav_msgs/Odometry.
-    settings
-        For bags that no session of this program became.
-    """
-
-    rig: Rig = AUTHORS_RIG
-    area_m: tuple[float, float] | None = None
-    truth_topic: str = TRUTH_TOPIC
-    settings: SlamSettings
 
 
 @dataclass(slots=True, kw_only=True)
@@ -162,9 +138,31 @@ class _Contents:
 
 
 def convert_bag(
-    bag: Path, out: Path, options: BagOptions, check: Callable[[], None]
+    bag: Path,
+    out: Path,
+    check: Callable[[], None],
+    *,
+    settings: SlamSettings,
+    rig: Rig = AUTHORS_RIG,
+    area_m: tuple[float, float] | None = None,
+    truth_topic: str = TRUTH_TOPIC,
 ) -> tuple[str, list[str]]:
-    """Write a bag as a session; return what was written, in words, and what was odd about it.
+    """Write a bag as a session; return a line about it, and warnings.
+
+    Parameters
+    ----------
+    bag, out
+        The files.
+    check
+        Called for every message; may raise to stop.
+    settings
+        For bags that were not made of a session of this program.
+    rig
+        Mounts under the names of the topics (UWBradar1, ...); ignored if the bag has them.
+    area_m
+        Frame area that the modules were asked for, module metres; None: the paper's.
+    truth_topic
+        Of geometry_msgs/PoseStamped or PoseWithCovarianceStamped or nav_msgs/Odometry.
 
     Raises
     ------
@@ -172,24 +170,24 @@ def convert_bag(
         No bag, a damaged one, one without radars or odometry, or frames that do not fit the frame
         area; one line.
     """
-    contents = _look_through(bag, options.truth_topic, check)
-    odd = []
+    contents = _look_through(bag, truth_topic, check)
+    warnings = []
     if contents.left_out:
-        odd.append(f"poses that went back in time and are left out: {contents.left_out}")
+        warnings.append(f"poses that went back in time and are left out: {contents.left_out}")
     names = sorted(contents.streams, key=radar_order)
-    radars = tuple(_radar_info(bag, name, contents, options) for name in names)
+    radars = tuple(_radar_info(bag, name, contents, rig, area_m) for name in names)
     try:
         odometry = OdometryTrack(contents.odometry)
     except OdometryError:
         raise AppError(f"{bag}: holds no pose on {ODOMETRY_TOPIC}, nav_msgs/Odometry") from None
     truth = OdometryTrack(contents.truth) if contents.truth else None
     if truth is None:
-        odd.append(f"no truth on {options.truth_topic}: numbers that need it will be null")
+        warnings.append(f"no truth on {truth_topic}: numbers that need it will be null")
     period_ns = float(np.median([1e9 / radar.rate_hz for radar in radars]))
     start_ns = min(stream.stamps_ns[0] for stream in contents.streams.values())
     log = SessionLog(
         out,
-        _session_info(bag, contents, radars, options),
+        _session_info(bag, contents, radars, settings),
         odometry,
         truth_at=None if truth is None else _poses_of(truth),
         start_ns=min(start_ns, odometry.first_ns),
@@ -205,12 +203,12 @@ def convert_bag(
     finally:
         log.close()
     if unused:
-        odd.append(f"{unused} scans lie outside the odometry and are marked as not to be used")
+        warnings.append(f"{unused} scans lie outside the odometry and are marked as not to be used")
     n_frames = sum(len(stream.stamps_ns) for stream in contents.streams.values())
     return (
         f"{out}: {n_frames} frames of {len(radars)} radars in {n_scans} scans, "
         f"{len(odometry.samples)} poses of the wheels, {len(contents.truth)} true poses",
-        odd,
+        warnings,
     )
 
 
@@ -277,7 +275,7 @@ def _open(bag: Path) -> Iterator[Any]:
         raise AppError(f"{bag}: no bag is there") from None
     except OSError as error:
         raise AppError(f"{bag}: cannot read: {error.strerror or error}") from None
-    except Exception as error:  # rosbags does not say what it may raise of a damaged bag
+    except Exception as error:  # rosbags documents no exceptions for damaged bags
         words = " ".join(str(error).split()) or type(error).__name__
         raise AppError(
             f"{bag}: no bag of ROS 1 or 2, or a damaged one: {words}; `rosbag reindex` or "
@@ -301,20 +299,26 @@ def _sample(message: ros.Message, t_ns: int) -> TumSample:
     )
 
 
-def _radar_info(bag: Path, name: str, contents: _Contents, options: BagOptions) -> RadarInfo:
+def _radar_info(
+    bag: Path,
+    name: str,
+    contents: _Contents,
+    rig: Rig,
+    area_m: tuple[float, float] | None,
+) -> RadarInfo:
     stream = contents.streams[name]
     if name in contents.infos:
         return read_radar_text(bag, f"/{name}/info", contents.infos[name])
-    mount = next((mount for mount in options.rig.mounts if mount.name == name), None)
+    mount = next((mount for mount in rig.mounts if mount.name == name), None)
     if mount is None:
-        known = ", ".join(mount.name for mount in options.rig.mounts)
+        known = ", ".join(mount.name for mount in rig.mounts)
         raise AppError(f"{bag}: radar {name} is not in the rig ({known}); give --rig")
-    if options.area_m is None and stream.n_bins != _PAPER_BINS:
+    if area_m is None and stream.n_bins != _PAPER_BINS:
         raise AppError(
             f"{bag}: frames of {stream.n_bins} bins, not the paper's {_PAPER_BINS}; "
             "say --frame-area START END, in metres, as the modules were asked for"
         )
-    area_m = options.area_m or _PAPER_AREA_M
+    area_m = area_m or _PAPER_AREA_M
     try:
         area = frame_area(*area_m)
     except XeThruError as error:
@@ -341,7 +345,7 @@ def _rate_hz(stream: _Stream) -> float:
 
 
 def _session_info(
-    bag: Path, contents: _Contents, radars: tuple[RadarInfo, ...], options: BagOptions
+    bag: Path, contents: _Contents, radars: tuple[RadarInfo, ...], settings: SlamSettings
 ) -> SessionInfo:
     if contents.session is not None:
         try:
@@ -349,7 +353,7 @@ def _session_info(
         except ValueError as error:
             raise AppError(f"{bag}: {SESSION_TOPIC} cannot be read: {error}") from None
         return read_session_table(bag, table, radars)
-    return imported_info(bag, radars, options.settings, time_base="recording")
+    return imported_info(bag, radars, settings, time_base="recording")
 
 
 def _poses_of(track: OdometryTrack) -> Callable[[NDArray[np.int64]], NDArray[np.float64]]:
@@ -436,12 +440,11 @@ class _Bag:
         self._writer.write(self._connections[topic], t_ns, data)
 
     def close(self) -> None:
-        """Write the index."""
         self._writer.close()
 
 
 def write_bag(session: RecordedSession, out: Path, check: Callable[[], None]) -> str:
-    """Write frames, odometry and truth of a session; return what was written, in words.
+    """Write frames, odometry and truth of a session; return a line about it.
 
     Parameters
     ----------
@@ -469,7 +472,7 @@ def write_bag(session: RecordedSession, out: Path, check: Callable[[], None]) ->
         _remove(out)
         if isinstance(
             error, OSError | sqlite3.Error
-        ):  # SQLite has words of its own for a full disk
+        ):  # SQLite has an error of its own for a full disk
             reason = getattr(error, "strerror", None) or error
             raise AppError(f"{out}: cannot be written: {reason}") from None
         raise

@@ -60,7 +60,6 @@ class Experiment:
 
 
 def add_experiments(experiment: argparse.ArgumentParser) -> None:
-    """Add a command for each experiment."""
     names = experiment.add_subparsers(required=True, metavar="NAME", dest="name")
     for row in EXPERIMENTS.values():
         parser = names.add_parser(row.name, help=row.help, description=row.help)

@@ -67,7 +67,6 @@ def _name(group: dict[str, Any]) -> str:
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
-    """Draw the clean groups of a sweep against their bands, and count the times inside."""
     groups = clean_groups(arguments.sweep, arguments.out / "consistency.json")
     stop.check()
     scenes = list(dict.fromkeys(group["scene"] for group in groups))

@@ -19,7 +19,8 @@ from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, open_loopback
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label
 from slam.config import DetectionConfig, FrontEnd, SlamConfig, load_preset
 from slam.frames import Detection, RadarFrame
-from slam.front_end.paper import PaperDetector, make_detector
+from slam.front_end import make_detector
+from slam.front_end.paper import PaperDetector
 from xethru_protocol.system import StopFlag
 
 Array = NDArray[np.float64]
@@ -65,7 +66,6 @@ class RangeErrors:
 
     @property
     def found(self) -> float:
-        """Return the share of frames in which the rod was found."""
         return float(np.isfinite(self.residuals_m).mean())
 
     @property
@@ -76,12 +76,10 @@ class RangeErrors:
 
     @property
     def bias_m(self) -> float:
-        """Return the mean residual; NaN where the rod was never found."""
         return float(np.nanmean(self.residuals_m)) if self.found else math.nan
 
     @property
     def std_m(self) -> float:
-        """Return the standard deviation of all residuals."""
         return float(np.nanstd(self.residuals_m)) if self.found else math.nan
 
     @property
@@ -101,11 +99,9 @@ class RangeErrors:
 
     @property
     def worst_position_m(self) -> float:
-        """Return the largest mean residual of a position, by amount."""
         return float(np.nanmax(np.abs(self.position_means_m))) if self.found else math.nan
 
     def numbers(self) -> dict[str, object]:
-        """Return what goes into the JSON file."""
         return {
             "found": self.found,
             "others_per_frame": self.others_per_frame,
@@ -382,7 +378,6 @@ def _draw_residuals(axes: Axes, steps: Steps, errors: Mapping[str, RangeErrors])
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
-    """Move a rod from 0.5 to 1.4 m in 1 cm steps past one radar of the lab."""
     steps = measure_steps(seed=arguments.seed, frames_per_step=arguments.frames, check=stop.check)
     errors = range_errors(steps, check=stop.check)
     title = (

@@ -23,12 +23,13 @@ from slam.app.odometry.tum import NS_PER_S
 from slam.app.rig.emulated import rig_of, scene_and_config, true_landmarks_m
 from slam.app.run.output import share_text
 from slam.app.run.pictures import ESTIMATE, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label
-from slam.app.sweep.run import drive_in_process
+from slam.app.run.runner import execute
+from slam.app.sweep.run import loopback_source
 from slam.config import ClusteringConfig, SlamConfig, load_preset
 from slam.geometry import Rig, transform
 from slam.paper.clustering import CollectedState, filter_window
 from slam.paper.pipeline import UwbRadarSlam
-from slam.paper.trilateration import Fix
+from slam.results import Fix
 from xethru_protocol.system import StopFlag
 
 Array = NDArray[np.float64]
@@ -40,7 +41,7 @@ WRONG_M = 0.15
 
 
 class Origin(Enum):
-    """What a fix is of."""
+    """What a fix is of, see the module."""
 
     TRUE = "true"
     GHOST = "ghost"
@@ -56,7 +57,6 @@ class Setting:
     search_rad_m: float
 
     def __str__(self) -> str:
-        """Return the three numbers as a row of a table has them."""
         return f"{self.window_size}, {self.min_opc}, {1e2 * self.search_rad_m:g} cm"
 
 
@@ -101,11 +101,9 @@ class Seen:
     landmarks_m: Array
 
     def count(self, origin: Origin) -> int:
-        """Return how many fixes are of this origin."""
         return sum(each is origin for of_state in self.origins for each in of_state)
 
     def numbers(self) -> dict[str, object]:
-        """Return what goes into the JSON file."""
         return {
             "scene": self.scene,
             "states": len(self.states),
@@ -153,7 +151,7 @@ def drive(scene: str, *, seed: int, check: Callable[[], None] = lambda: None) ->
     rig = rig_of(lap)
     # With a window of one state each comes out as it is collected.
     alone = config.model_copy(update={"window": config.window.model_copy(update={"size": 1})})
-    record = drive_in_process(lap, UwbRadarSlam(alone, rig), seed, check=check)
+    record = execute(loopback_source(lap, "paper", UwbRadarSlam(alone, rig), seed, check=check))
     return Seen(
         scene=lap.name,
         states=tuple(
@@ -259,7 +257,6 @@ _PARAMETERS: tuple[tuple[str, str, _Value], ...] = (
 
 
 def _draw_studies(figure: Figure, studies: Sequence[tuple[Seen, Sequence[Outcome]]]) -> None:
-    """Draw the shares kept over each of the three parameters, a row per scene."""
     panels = figure.subplots(len(studies), len(_PARAMETERS), squeeze=False, sharey=True)
     for row, (seen, outcomes) in zip(panels, studies, strict=True):
         for axes, (name, x_label, value) in zip(row, _PARAMETERS, strict=True):
@@ -308,7 +305,6 @@ _HEADER = (
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
-    """Drive one lap per scene and filter what was seen with every setting."""
     for scene in arguments.scene:
         scene_and_config(scene, "paper")  # a bad one is refused before the first is driven
     studies = []

@@ -40,9 +40,9 @@ from emulator.scene.scene import LeakageSpec, NoiseSpec, RadarSpec, Scene
 from slam.app.rig.sources import sampler_limits
 from slam.config import FrontEnd, MatchedFilterConfig, SlamConfig, override
 from slam.frames import Detector, RadarFrame
+from slam.front_end import make_detector
 from slam.front_end.matched_filter import threshold_sigmas
 from slam.front_end.overlapping import KnownPulse, SplitTest, split_threshold
-from slam.front_end.paper import make_detector
 from slam.front_end.pulse import PulseModel
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.wire.x4 import Normalisation
@@ -162,7 +162,6 @@ class Echoes:
         return (self.range_m - RANGE_START_M) / BIN_LENGTH_M
 
     def beside(self, other: Echoes) -> Echoes:
-        """Return frames with the echoes of both."""
         return Echoes(
             range_m=np.hstack([self.range_m, other.range_m]),
             amplitude=np.hstack([self.amplitude, other.amplitude]),
@@ -495,7 +494,6 @@ def front_end(name: str, settings: Mapping[str, object] | None = None) -> Detect
 
 
 def ranges_of(detector: Detector, frames: Sequence[RadarFrame]) -> list[Array]:
-    """Return the detected ranges of each frame, ascending."""
     found = detector.detect_many(frames, [0.0] * len(frames))
     return [np.array([d.range_m for d in each]) for each in found]
 
@@ -593,7 +591,7 @@ def resolution_against_separation(
 ) -> list[dict[str, object]]:
     """Return one row per separation of two equal echoes: the bound, and each method.
 
-    The methods of `echo_separators` get the window of each frame that holds the two echoes, 3.5
+    The methods of `SEPARATORS` get the window of each frame that holds the two echoes, 3.5
     envelope sigmas either side; the front ends get the frame.
     """
     rows: list[dict[str, object]] = []

@@ -42,7 +42,6 @@ _Row = Mapping[str, Any]
 
 
 def _draw(figure: Figure, tables: Mapping[str, Sequence[_Row]]) -> None:
-    """Draw ranging, resolution, detection and saturation, a panel each."""
     panels = figure.subplots(2, 2)
     _ranging(panels[0, 0], tables["ranging"])
     _resolution(panels[0, 1], tables["resolution"])
@@ -114,7 +113,6 @@ def _line(axes: Axes, x: Sequence[float], y: Sequence[float | None], name: str) 
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
-    """Measure every cell of the table."""
     cells = {
         "ranging": ranging_against_snr,
         "detection": detection_against_snr,

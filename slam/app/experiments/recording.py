@@ -9,15 +9,15 @@ of its ten farthest bins, 1.4e-4 per component with an autocorrelation of 0.98 a
 2.1e-5 are new with every frame; of its strongest reflector, a phase that wanders by 0.032 rad, of
 which 0.0056 rad are new with every frame.
 
-What one recording cannot tell:
+What one recording does not show:
 
 * The working point. 17 frames/s and 54 bins fit the vendor's example settings, 16 iterations x 300
   pulses per step, which are assumed here; the samples lie on no lattice that would show it.
 * What is the module and what is the room. In its quietest 7 s the floor of all bins from the 18th
-  on is 6e-6, three times below the anchor, and the phase wanders by 0.0014 rad; later somebody
+  on is 6e-6, three times below the anchor, and the phase wanders by 0.0014 rad; later a person
   moves close by. The anchors are what the whole recording shows: upper bounds on the module.
 * Whether the phase is common to all echoes, as a jitter's is: the strongest echo's fluctuation is
-  nearly as large in amplitude as in phase, which says that a part of it is other echoes.
+  nearly as large in amplitude as in phase, so a part of it is other echoes.
 """
 
 from __future__ import annotations
@@ -88,7 +88,6 @@ class SlowTime:
 
     @property
     def strongest(self) -> int:
-        """Return the bin of the largest mean amplitude."""
         return int(np.argmax(self.amplitude))
 
     @property
@@ -195,7 +194,6 @@ def _neighbours(values: NDArray[np.complex128]) -> float:
 
 
 def spread_of(values: Sequence[float]) -> tuple[float, float, float]:
-    """Return the 10th percentile, the median and the 90th percentile."""
     low, middle, high = np.percentile(values, (10, 50, 90))
     return float(low), float(middle), float(high)
 

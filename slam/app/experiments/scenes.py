@@ -21,7 +21,6 @@ from xethru_protocol.system import StopFlag
 
 
 def _draw(figure: Figure, groups: Sequence[dict[str, Any]]) -> None:
-    """Draw the errors of wheels and SLAM beside the consistency, a row per group."""
     errors, consistency = figure.subplots(1, 2)
     _draw_errors(errors, groups, [group_name(group) for group in groups])
     draw_consistency(consistency, groups, [""] * len(groups))
@@ -54,7 +53,6 @@ def _draw_errors(axes: Axes, groups: Sequence[dict[str, Any]], names: Sequence[s
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
-    """Draw and print the clean groups of a sweep, a row per scene."""
     groups = clean_groups(arguments.sweep, arguments.out / "scenes.json")
     stop.check()
     rows = [

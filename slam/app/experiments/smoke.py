@@ -29,12 +29,11 @@ from slam.app.experiments import Result
 from slam.app.rig.emulated import rig_of, scene_and_config, true_landmarks_m
 from slam.app.run.output import mm_text
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, TRUTH, label
-from slam.app.run.runner import RunRecord
-from slam.app.sweep.run import drive_in_process
+from slam.app.run.runner import RunRecord, execute
+from slam.app.sweep.run import loopback_source
 from slam.geometry import transform
-from slam.paper.clustering import Observation
-from slam.paper.pipeline import StepResult, UwbRadarSlam
-from slam.paper.trilateration import Fix
+from slam.paper.pipeline import UwbRadarSlam
+from slam.results import Fix, Observation, StepResult
 from xethru_protocol.system import StopFlag
 
 Array = NDArray[np.float64]
@@ -97,7 +96,6 @@ class ObservedRun:
     landmarks_m: Array
 
     def numbers(self) -> dict[str, object]:
-        """Return what goes into the JSON file."""
         return {
             "name": self.name,
             "detections": self.n_detections,
@@ -118,7 +116,7 @@ def drive_in_clear_air_and_smoke(
     """Return the runs: clear air, smoke, smoke under other receiver noise, and the lab.
 
     The first two share receiver noise and odometry, so what differs is the smoke's doing; the
-    third tells how much another noise of the receivers does. The lab, in clear air, is there for
+    third shows the effect of other receiver noise. The lab, in clear air, is there for
     its ghosts: with one landmark there are none.
 
     Parameters
@@ -143,7 +141,9 @@ def drive_in_clear_air_and_smoke(
     runs: list[ObservedRun] = []
     for name, scene, settings, noise_seed in cells:
         slam = UwbRadarSlam(settings, rig_of(scene))
-        record = drive_in_process(scene, slam, seed, noise_seed=noise_seed, check=check)
+        record = execute(
+            loopback_source(scene, "paper", slam, seed, noise_seed=noise_seed, check=check)
+        )
         if not runs:
             reference = record
         runs.append(_observed(name, scene, record, reference if scene is not lab else None))
@@ -224,7 +224,6 @@ _SHOWN = ("clear air", "smoke", "lab, clear air")
 
 
 def _draw_runs(figure: Figure, runs: Sequence[ObservedRun]) -> None:
-    """Draw raw observations above filtered ones, run by run, on odometry poses."""
     shown = [run for run in runs if run.name in _SHOWN]
     panels = figure.subplots(2, len(shown), sharex="col", sharey="col")
     for column, run in zip(panels.T, shown, strict=True):
@@ -278,7 +277,6 @@ def _draw(axes: Axes, run: ObservedRun, points: NDArray[np.float64], colour: str
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
-    """Drive round one point feature in clear air and in smoke; filter what was observed."""
     runs = drive_in_clear_air_and_smoke(seed=arguments.seed, check=stop.check)
     radar_db = smoke_attenuation_db(_LARGEST_RANGE_M)
     light_db = light_attenuation_db(_LARGEST_RANGE_M)

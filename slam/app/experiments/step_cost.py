@@ -23,9 +23,10 @@ from threadpoolctl import threadpool_limits
 from slam.app.errors import UsageError
 from slam.app.experiments import Result
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label
+from slam.config import WheelNoise
 from slam.geometry import paper_rig
 from slam.robust.matching import sure_landmarks
-from slam.robust.parameters import ContinuationRule, RangeNoise, WheelNoise
+from slam.robust.parameters import ContinuationRule, RangeNoise
 from slam.robust.ranges import antennas_of, rows_of, sides_of, view
 from slam.robust.state import Motion, State, SymmetricMatrix, calibrated_motion, predict
 from xethru_protocol.system import StopFlag
@@ -41,7 +42,7 @@ _DENSITY_PER_M2 = 1.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reference:
-    """A number somebody else's code takes at 1000 landmarks, as quoted: low and high [ms]."""
+    """What other code takes at 1000 landmarks, as quoted: low and high [ms]."""
 
     name: str
     low_ms: float
@@ -169,7 +170,6 @@ def slope_of(costs: Sequence[StepCost]) -> float | None:
 
 
 def numbers_of(costs: Sequence[StepCost], *, repetitions: int) -> dict[str, object]:
-    """Return what goes into the JSON file."""
     return {
         "measured": "CPU time of one thread, one BLAS thread, the least of the repetitions of "
         "every step; mean and slowest over a cycle of steps",
@@ -234,7 +234,6 @@ def _at_rest() -> Motion:
 
 
 def _draw(figure: Figure, costs: Sequence[StepCost]) -> None:
-    """Draw the cost of a step over the number of landmarks, both logarithmic."""
     n = np.array([cost.n_landmarks for cost in costs])
     slope = slope_of(costs)
     fitted = "" if slope is None else f", slope {slope:.2f} from n = {SLOPE_FROM} on"

@@ -75,7 +75,6 @@ _Tables = Sequence[tuple[dict[str, Any], Sequence[dict[str, Any]]]]
 
 
 def _draw(figure: Figure, tables: _Tables) -> None:
-    """Draw the error in units of the clean one beside the consistency, a row per table."""
     panels = figure.subplots(len(tables), 2, squeeze=False, sharex="col")
     for (errors, consistency), (clean, groups) in zip(panels, tables, strict=True):
         _draw_errors(errors, clean, groups)
@@ -163,7 +162,6 @@ def legend_below(figure: Figure, *panels: Axes) -> None:
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
-    """Draw and print the stress tables of a sweep."""
     tables = stress_tables(read_groups(arguments.sweep, arguments.out / "stress.json"))
     if not tables:
         raise AppError(f"{arguments.sweep}: has no stressed runs; `uwb-slam sweep --stress` does")

@@ -32,11 +32,12 @@ from slam.app.experiments import Result
 from slam.app.run.output import share_text
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, TRUTH, label
 from slam.app.sweep.bound import load_gtsam
+from slam.config import WheelNoise
 from slam.evaluation import ate_rmse_m
 from slam.geometry import Rig, compose, wrap_angle
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import RangeBearing
-from slam.robust.parameters import BackEndParameters, RelinearisationRule, WheelNoise
+from slam.robust.parameters import BackEndParameters, RelinearisationRule
 from slam.robust.state import CALIBRATION
 from xethru_protocol.system import StopFlag
 
@@ -63,18 +64,15 @@ class Drive:
 
     @property
     def n_observations(self) -> int:
-        """Return how often a landmark was seen."""
         return sum(len(points) for points in self.seen)
 
     @property
     def labels(self) -> frozenset[int]:
-        """Return the ids of all landmarks."""
         return frozenset(
             point.label for points in self.seen for point in points if point.label is not None
         )
 
     def first(self, n_steps: int) -> Drive:
-        """Return the drive up to a pose."""
         return Drive(
             increments=self.increments[:n_steps],
             covariances=self.covariances[:n_steps],
@@ -105,7 +103,7 @@ def read_drive(path: Path) -> Drive:
     Raises
     ------
     AppError
-        It cannot be read, or a line is not as the module's text says; file and line are named.
+        It cannot be read, or a line is not in the format above; file and line are named.
     """
     increments: list[list[float]] = []
     covariances: list[Array] = []
@@ -221,7 +219,7 @@ def drive_back_end(
     drive
         The data; the noise of each step is in it.
     with_ids
-        Whether the back end is told which tree each observation is of.
+        Whether the back end gets the id of the tree of each observation.
     wheels
         Standard deviations of the wheels' calibration errors; the reference's model has none.
     check
@@ -237,8 +235,8 @@ def drive_back_end(
         check()
         if step > 0:
             back_end.predict(drive.increments[step - 1], drive.covariances[step - 1])
-        told = points if with_ids else [replace(point, label=None) for point in points]
-        ids = back_end.update_points(told)
+        given_points = points if with_ids else [replace(point, label=None) for point in points]
+        ids = back_end.update_points(given_points)
         given += [
             (point.label, id_)
             for point, id_ in zip(points, ids, strict=True)
@@ -353,7 +351,7 @@ def batch_reference(drive: Drive, check: Callable[[], None] = lambda: None) -> R
     )
 
 
-def _vector(pose: Any) -> Array:  # noqa: ANN401 - GTSAM's own types, see gtsam_door
+def _vector(pose: Any) -> Array:  # noqa: ANN401 - GTSAM's own types
     return np.array([pose.x(), pose.y(), wrap_angle(pose.theta())])
 
 
@@ -371,7 +369,7 @@ class PathScore:
         Landmarks in the map.
     right_share
         Share of the observations taken in whose landmark is the one that its tree is mostly
-        called, and is mostly called so for its tree; None where the ids were told.
+        called, and is mostly called so for its tree; None where the ids were given.
     left_out
         Observations that were in doubt and not taken in.
     seconds
@@ -389,20 +387,19 @@ class PathScore:
 
 
 def scores(drive: Drive, reference: Reference, runs: Mapping[str, ParkRun]) -> list[PathScore]:
-    """Return the scores of odometry, of ISAM2's causal path, and of our runs."""
     rows = [
         _score("odometry", odometry_path(drive), reference),
         _score("ISAM2, true ids", reference.causal, reference),
     ]
     for name, run in runs.items():
-        told = name.startswith("true ids")
+        has_ids = name.startswith("true ids")
         rows.append(
             _score(
                 f"robust, {name}",
                 run.poses,
                 reference,
                 n_landmarks=len(run.landmarks_m),
-                right_share=None if told else right_share(run.given),
+                right_share=None if has_ids else right_share(run.given),
                 left_out=sum(given is None for _, given in run.given),
                 seconds=run.seconds,
             )
@@ -532,7 +529,6 @@ def _map(axes: Axes, odometry: Array, reference: Reference, run: ParkRun) -> Non
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
-    """Drive through the park with and without ids; compare with GTSAM on the same data."""
     drive = read_drive(shipped_file())
     if arguments.steps is not None:
         drive = drive.first(arguments.steps)

@@ -2,10 +2,10 @@
 
 A frame carries a counter and no time. It arrives after it was taken, later by a delay that is
 never negative and often small: what a USB hub or a busy host adds comes and goes. So the frames
-that came soonest tell the module's clock, and all others are explained by it: the line below all
-points (counter, arrival) that lies closest to them. Jitter goes, drift stays.
+that came soonest give the module's clock: the line below all points (counter, arrival) that lies
+closest to them. Jitter goes, drift stays.
 
-The smallest delay itself cannot be told from the module's own time; it stays in every stamp.
+The smallest delay cannot be separated from the module's own time; it stays in every stamp.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from slam.app.odometry.tum import NS_PER_S
 from xethru_protocol.wire.x4 import frame_time_ns
 
 WINDOW_S = 300
-"""How much of the past a clock is judged by: crystals change with temperature, over minutes."""
+"""How much of the past is used for a clock: crystals change with temperature, over minutes."""
 DRIFT_SIGMA = 30e-6
 """Crystals are off by tens of millionths; this is known of one before its first frame."""
 KNOWN_DRIFT_SIGMA = 5e-6
@@ -32,7 +32,7 @@ LEAST_DELAY_NS = 20_000.0
 """Mean delay below which a host does not keep time itself; keeps the sums finite."""
 _KNOWN_AFTER_NS = 30 * NS_PER_S
 _BREAK_NS = NS_PER_S
-"""A frame this much earlier than its clock says, or ten times as late, is of another count."""
+"""A frame this much too early for its clock, or ten times as late, belongs to a new count."""
 _LATE_BREAK_NS = 10 * NS_PER_S
 
 

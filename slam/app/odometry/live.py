@@ -1,7 +1,7 @@
 """Where a robot's odometry comes from, as text: stdin, files, sockets, serial ports.
 
-Session time is the odometry's own clock. What the host's clock shows against it is told by when
-lines arrive, or known beforehand; then radar frames, stamped with the host's time, can be placed.
+Session time is the odometry's own clock. Its relation to the host's clock follows from when lines
+arrive, or is known beforehand; it places radar frames, which are stamped with the host's time.
 
 `parse_source` turns what the user wrote into a `LineSource`; `read_lines` gives its lines with the
 host's time at which each one came, so that a thread can follow any of them alike.
@@ -34,9 +34,9 @@ from xethru_protocol.transport import SerialTransport
 from xethru_protocol.wire.errors import XeThruError
 
 MOST_GAP_NS = NS_PER_S
-"""Between two samples farther apart nobody knows how the robot moved."""
+"""Between two samples farther apart the motion of the robot is unknown."""
 SILENCE_S = 10.0
-"""A source without a new pose for so long is dead; that of wheels that stand still talks on."""
+"""A source without a new pose for so long is dead: wheels that stand still send poses, too."""
 MOST_SPEED_MPS = 10.0
 """Faster robots do not carry these radars; a pose that far off was set by hand or reset."""
 AHEAD_NS = 60 * NS_PER_S
@@ -48,26 +48,15 @@ MOST_M = 1e8
 _COMPLAINTS = 5
 
 
-class FixedClock:
-    """A clock known beforehand: `origin_ns` is the host's time at session time 0."""
-
-    def __init__(self, origin_ns: int) -> None:
-        self._line = ClockLine(origin_ns=origin_ns)
-
-    def session_ns(self, host_ns: int) -> int:
-        """Return the session time of a host time."""
-        return self._line.nominal_ns(host_ns)
-
-
 class LiveOdometry:
-    """Lines in, poses out; what is wrong comes out as words.
+    """Turns lines into poses, and reports what is wrong with them.
 
     Parameters
     ----------
     name
         What to call the source in messages to people.
     clock
-        Host time of session time 0, if known; None: from when lines arrive.
+        Its clock against the host's, if known; None: from when lines arrive.
 
     Attributes
     ----------
@@ -79,7 +68,7 @@ class LiveOdometry:
         Why they will not; "" where the source just ended.
     """
 
-    def __init__(self, name: str, clock: FixedClock | None = None) -> None:
+    def __init__(self, name: str, clock: ClockLine | None = None) -> None:
         self._name = name
         self._fixed = clock
         self._envelope = LowerEnvelope()
@@ -93,17 +82,14 @@ class LiveOdometry:
 
     @property
     def has_pose(self) -> bool:
-        """Whether a pose came."""
         return self._track is not None
 
     @property
     def first_ns(self) -> int:
-        """Session time of the first pose."""
         return self._whole().first_ns
 
     @property
     def last_ns(self) -> int:
-        """Session time of the newest pose."""
         return self._whole().last_ns
 
     @property
@@ -112,9 +98,8 @@ class LiveOdometry:
         return None if self._fixed else self._envelope.line.drift_ppm
 
     def session_ns(self, host_ns: int) -> int:
-        """Return the session time of a host time; needs a pose, unless the clock is known."""
         if self._fixed is not None:
-            return self._fixed.session_ns(host_ns)
+            return self._fixed.nominal_ns(host_ns)
         return self._envelope.line.nominal_ns(host_ns)
 
     def take(self, line: str, arrival_ns: int) -> tuple[TumSample | None, str]:
@@ -123,13 +108,13 @@ class LiveOdometry:
         Parameters
         ----------
         line
-            TUM text; empty ones and comments are passed over.
+            TUM text; empty lines and comments are skipped.
         arrival_ns
             Host time when it came.
 
         Returns
         -------
-        The pose, None if the line gave none; and what the user should know, or "".
+        The pose, None if the line has none; and a warning for the user, or "".
         """
         if not line.strip() or line.lstrip().startswith("#"):
             return None, ""
@@ -146,11 +131,11 @@ class LiveOdometry:
                 if back_s
                 else f"stamp {sample.t_ns / NS_PER_S:.3f} s came twice"
             )
-        words = self._accept(sample)
+        warning = self._accept(sample)
         if self._fixed is None:
             self._envelope.take(sample.t_ns, arrival_ns)
         self._heard_ns = arrival_ns
-        return sample, words
+        return sample, warning
 
     def _accept(self, sample: TumSample) -> str:
         if self._track is None:
@@ -158,22 +143,22 @@ class LiveOdometry:
             return ""
         before = self._track.last
         self._track.append(sample)
-        words = []
+        warnings = []
         if self._trouble:
-            words.append("its lines are sound again")
+            warnings.append("its lines are sound again")
             self._trouble, self._complaints = "", 0
         elapsed_ns = sample.t_ns - before.t_ns
         step_m = math.hypot(sample.x_m - before.x_m, sample.y_m - before.y_m)
         if elapsed_ns > MOST_GAP_NS:
-            words.append(
+            warnings.append(
                 f"{elapsed_ns / NS_PER_S:.1f} s of it are missing; no scan of them is used"
             )
         if step_m > MOST_SPEED_MPS * elapsed_ns / NS_PER_S:
-            words.append(
+            warnings.append(
                 f"the pose jumped by {step_m:.2f} m in {elapsed_ns / NS_PER_S:.3f} s; "
                 "was it reset? SLAM takes it for a drive"
             )
-        return "; ".join(words)
+        return "; ".join(warnings)
 
     def _refuse(self, trouble: str) -> str:
         self.n_refused += 1
@@ -187,7 +172,6 @@ class LiveOdometry:
         return ""
 
     def end(self, trouble: str) -> None:
-        """Take note that no more lines will come."""
         if not trouble and self._track is None:
             trouble = f"odometry from {self._name}: ended before its first pose"
             trouble += f": {self._trouble}" if self._trouble else ""
@@ -214,7 +198,7 @@ class LiveOdometry:
         return f"odometry from {self._name}: {said} for {SILENCE_S:g} s; is its sender running?"
 
     def is_elsewhere(self, now_ns: int) -> str:
-        """Return why its stamps cannot be of the clock that it was said to have, "" if they can."""
+        """Return why its stamps cannot be of the given clock, "" if they can."""
         t_ns = self.session_ns(now_ns)
         if self._fixed is None or self.first_ns - AHEAD_NS <= t_ns <= self.last_ns + AHEAD_NS:
             return ""
@@ -225,7 +209,6 @@ class LiveOdometry:
         )
 
     def covers(self, t_ns: int) -> bool:
-        """Return whether a pose at or after this time is known."""
         return self._track is not None and t_ns <= self._track.last_ns
 
     def is_known(self, t_ns: int) -> bool:
@@ -233,7 +216,6 @@ class LiveOdometry:
         return self._track is not None and self._track.gap_ns(t_ns) <= MOST_GAP_NS
 
     def pose_at(self, t_ns: int) -> NDArray[np.float64]:
-        """Return the pose at a session time; see `OdometryTrack.pose_at`."""
         return self._whole().pose_at(t_ns)
 
     def _whole(self) -> OdometryTrack:
@@ -246,8 +228,8 @@ def _cannot_be(sample: TumSample) -> str:
     """Return why a session cannot hold a pose, or the filter not take it; "" if both can."""
     if not 0 <= sample.t_ns < MOST_STAMP_NS:
         return (
-            f"stamp {sample.t_ns / NS_PER_S:.3f} s is none of 0 to {MOST_STAMP_NS // NS_PER_S} s, "
-            "which a session can hold"
+            f"stamp {sample.t_ns / NS_PER_S:.3f} s is outside 0 to {MOST_STAMP_NS // NS_PER_S} s, "
+            "the range of a session"
         )
     if max(abs(sample.x_m), abs(sample.y_m)) > MOST_M:
         return f"position ({sample.x_m:g}, {sample.y_m:g}) m is nowhere on Earth"
@@ -267,7 +249,7 @@ HELP = (
 
 
 class SourceKind(StrEnum):
-    """What stands behind a source."""
+    """What stands behind a source, in words for messages."""
 
     STDIN = "stdin"
     FILE = "file"
@@ -287,7 +269,6 @@ class LineSource:
 
     @property
     def name(self) -> str:
-        """Return what to call it in messages to people."""
         if self.kind is SourceKind.STDIN:
             return "stdin"
         where = f"{self.place}:{self.number}" if self.kind is SourceKind.TCP else self.place
@@ -295,7 +276,7 @@ class LineSource:
 
     @property
     def is_live(self) -> bool:
-        """Whether lines come when they are new, so that their arrival tells the time."""
+        """Whether lines arrive as they are made, so that their arrival gives the time."""
         return self.kind is not SourceKind.FILE
 
 
@@ -435,7 +416,7 @@ class _Descriptor:
 
 
 class _Fifo:
-    """A FIFO: nobody writing yet is no end, the last writer gone is one."""
+    """A FIFO: it ends when the last writer closes it, not while there is no writer yet."""
 
     def __init__(self, path: str) -> None:
         self._fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK)

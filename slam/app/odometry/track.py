@@ -44,22 +44,18 @@ class OdometryTrack:
 
     @property
     def samples(self) -> tuple[TumSample, ...]:
-        """All samples so far."""
         return tuple(self._samples)
 
     @property
     def last(self) -> TumSample:
-        """The newest sample."""
         return self._samples[-1]
 
     @property
     def first_ns(self) -> int:
-        """Time of the oldest sample."""
         return self._stamps_ns[0]
 
     @property
     def last_ns(self) -> int:
-        """Time of the newest sample."""
         return self._stamps_ns[-1]
 
     def gap_ns(self, t_ns: int) -> float:

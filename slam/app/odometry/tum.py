@@ -20,13 +20,13 @@ from slam.app.errors import AppError
 NS_PER_S = 1_000_000_000
 _FIELDS = 8
 _MAX_BYTES = 1 << 28
-"""Weeks of poses; what is longer, or endless, is no trajectory."""
+"""Weeks of poses; a longer or endless file is not a trajectory."""
 _MAX_STAMP_S = Decimal(2**63) / NS_PER_S
 """Where int64 nanoseconds end; a larger stamp was written in another unit."""
 
 
 class TumError(AppError):
-    """A line is not TUM text; says which line and what is expected."""
+    """A line is not TUM text; the message names the line and what is expected."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -114,7 +114,6 @@ def format_tum_line(t_ns: int, pose: NDArray[np.float64]) -> str:
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
-    """Write a trajectory as a TUM file."""
     lines = map(format_tum_line, trajectory.stamps_ns.tolist(), trajectory.poses)
     path.write_text("".join(f"{line}\n" for line in lines), encoding="ascii")
 
@@ -152,7 +151,6 @@ def read_tum(path: Path) -> Trajectory:
 
 
 def trajectory_of(samples: Iterable[TumSample]) -> Trajectory:
-    """Stack samples into arrays."""
     rows = [(s.t_ns, s.x_m, s.y_m, s.heading_rad) for s in samples]
     return Trajectory(
         stamps_ns=np.array([row[0] for row in rows], dtype=np.int64),

@@ -33,9 +33,8 @@ from emulator.scene.scene import Scene, SceneError, UnknownSceneError, load_scen
 from slam.app.errors import AppError, EmulatorError, UsageError
 from slam.app.odometry.tum import NS_PER_S
 from slam.app.rig.sources import RadarLink, RigSource
-from slam.config import ConfigError, SlamConfig, load_preset
+from slam.config import ConfigError, SlamConfig, WheelNoise, load_preset
 from slam.geometry import Mount, Rig, transform
-from slam.robust.parameters import WheelNoise
 from xethru_protocol.driver.conversation import ProtocolRecord
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
@@ -95,7 +94,6 @@ class EmulatorProcess:
         self._control_socket = ""
 
     def __enter__(self) -> Self:
-        """Start the process; its ports are there after `wait_until_ready`."""
         with self._cleanup:
             self._errors: IO[bytes] = self._cleanup.enter_context(tempfile.TemporaryFile())
             # -P: a folder "emulator" where the user happens to stand must not come first
@@ -119,7 +117,6 @@ class EmulatorProcess:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Do what `end` does."""
         self.end()
 
     def end(self) -> None:
@@ -349,7 +346,6 @@ def end_counter(duration_ns: int) -> int:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions a run depends on."""
     return {"python": python_version()} | {name: version(name) for name in _VERSIONED}
 
 

@@ -26,8 +26,8 @@ from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, Valid
 
 from slam.app.errors import AppError, naming
 from slam.app.rig.sources import RadarLink
+from slam.config import WheelNoise
 from slam.geometry import Mount, Rig
-from slam.robust.parameters import WheelNoise
 from xethru_protocol.driver.conversation import ProtocolRecord
 from xethru_protocol.driver.radar import X4M300, known_ports
 from xethru_protocol.system import read_bounded
@@ -56,7 +56,7 @@ class RigRadar(BaseModel):
 
 
 class RigWheels(BaseModel):
-    """How the robot's odometry errs, as its data sheet or a test drive tells; see `WheelNoise`.
+    """How the robot's odometry errs, from its data sheet or a test drive; see `WheelNoise`.
 
     The keys are those of a scene's table ``odometry``. White noise grows with the square root of
     the way and with the angle turned; the three other standard deviations are of errors that stay.
@@ -74,7 +74,6 @@ class RigWheels(BaseModel):
 
     @property
     def noise(self) -> WheelNoise:
-        """Return what SLAM is told."""
         return WheelNoise(
             along_m_per_sqrt_m=float(self.along_sigma_m_per_sqrt_m),
             across_m_per_sqrt_m=float(self.across_sigma_m_per_sqrt_m),
@@ -96,7 +95,6 @@ class RigFile(BaseModel):
 
     @property
     def rig(self) -> Rig:
-        """Return the mounts; gains play no part in them."""
         return Rig(
             mounts=tuple(
                 Mount(
@@ -189,7 +187,7 @@ class _Module:
 
 
 class _LinkLog:
-    """Passes on what happens on a link, once it is known whose it is."""
+    """Passes on what happens on a link, as soon as the name of its radar is known."""
 
     def __init__(self, observer: NamedObserver) -> None:
         self._observer = observer
@@ -224,9 +222,9 @@ def open_rig(
     ports
         Where the modules are; None: wherever this machine has modules or running emulators.
     observer
-        Told of everything on their links, from other threads later on.
+        Gets everything that happens on their links, later on from other threads.
     note
-        Told where every radar was found, and which ports were passed over.
+        Gets a line about where each radar was found, and about each port that is skipped.
 
     Returns
     -------
@@ -235,7 +233,7 @@ def open_rig(
     Raises
     ------
     AppError
-        A module is missing, is in no rig, is there twice, or a port that was named is none; one
+        A module is missing, not in the rig, or found twice, or a named port has no module; one
         line that names it.
     """
     with ExitStack() as unless_it_works:
@@ -265,7 +263,7 @@ def open_rig(
 
 
 def are_emulated(links: Sequence[RadarLink]) -> bool:
-    """Return whether any of these modules is a running emulator's, as far as emulators tell."""
+    """Return whether any of these modules is that of a running emulator."""
     emulated = {os.path.realpath(port.path) for port in find_ports() if port.kind == "emulated"}
     return any(os.path.realpath(link.port) in emulated for link in links)
 

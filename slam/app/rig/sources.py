@@ -136,7 +136,6 @@ class RigSource:
         self.lost_frames = 0
 
     def __enter__(self) -> Self:
-        """Return the source; its links are open already."""
         return self
 
     def __exit__(
@@ -145,7 +144,6 @@ class RigSource:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close; see there."""
         self.close()
 
     def close(self) -> None:

@@ -43,7 +43,7 @@ class SessionLog(SessionObserver):
     latched `/radar/<name>/info` (JSON); `/scan` after the frames of each scan, with their counters
     and the true pose where it is known, or `/scan_unused`; `/odom`, `/truth`, `/estimate`,
     `/landmarks`, `/tf`, `/tf_static`, `/log`; `/slam/state`, the same states to the last bit
-    (`session_states`); where there are such, raw bytes in `/radar/<name>/rx` and `tx`, and ranges
+    (`state_row`); where there are such, raw bytes in `/radar/<name>/rx` and `tx`, and ranges
     that another program found in `/radar/<name>/detections`. A metadata record names scene, preset,
     seed, settings, versions.
 
@@ -56,7 +56,7 @@ class SessionLog(SessionObserver):
     odometry
         The whole track where it is known before the run; None where `on_odometry` brings it.
     truth_at
-        The robot's true pose; None where nobody knows.
+        The robot's true pose; None if unknown.
     start_ns
         Session time [ns] at which the file begins.
     clock_ns
@@ -142,7 +142,6 @@ class SessionLog(SessionObserver):
         self._file.write(channel, t_ns, pack_array(DOUBLE_ARRAY, ranges_m, "range_m"))
 
     def on_odometry(self, sample: TumSample) -> None:
-        """Write a pose of the wheels as it comes."""
         self._write(self._odometry, sample.t_ns, ros.odometry(sample))
         self._odometry_ns = sample.t_ns
 
@@ -166,7 +165,6 @@ class SessionLog(SessionObserver):
         self._file.write(self._states, t_ns, row, sequence=snapshot.counter)
 
     def on_log(self, line: LogLine) -> None:
-        """Write a line about the link."""
         message = ros.log_line(line.t_ns, line.radar, line.text, warning=line.warning)
         self._write(self._log, line.t_ns, message)
 
@@ -193,5 +191,4 @@ class SessionLog(SessionObserver):
         return self._rare[topic]
 
     def close(self) -> None:
-        """Write index and footer, and close the file; doing so again does nothing."""
         self._file.close()

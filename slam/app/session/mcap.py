@@ -70,9 +70,9 @@ def describe_kind(path: Path) -> str:
         head = stream.read(32)
     if not head:
         return ", it is empty; whatever was to write it ended before it did"
-    for magic, words in _KINDS.items():
+    for magic, kind in _KINDS.items():
         if head.startswith(magic):
-            return f", it is {words}"
+            return f", it is {kind}"
     return "; give the session.mcap of a run"
 
 
@@ -89,7 +89,7 @@ def open_mcap(path: Path, size: int | None = None) -> Iterator[tuple[BinaryIO, i
     Raises
     ------
     DamagedFileError
-        Missing, unreadable or not MCAP; says what it is instead, where that is known.
+        Missing, unreadable or not MCAP; the message names the kind of file if it is known.
     """
     with ExitStack() as stack:
         try:
@@ -166,11 +166,11 @@ _LATCHED_QOS = """\
 
 
 class CannotWriteError(AppError):
-    """The file cannot be written any further; what was written is kept, the line says how."""
+    """The file cannot be written any further; the line describes what is kept."""
 
 
 class _Disk(FileIO):
-    """Writes until it is told to give up; from then on it swallows, so that closing succeeds."""
+    """Writes until `gave_up` is set, and then discards, so that closing succeeds."""
 
     gave_up = False
 
@@ -219,7 +219,6 @@ class SessionFile:
         self._chunk_started_ns = clock_ns()
 
     def add_metadata(self, name: str, table: Mapping[str, str]) -> None:
-        """Write a named table."""
         if self._disk.gave_up:
             return
         with self._giving_up():
@@ -301,7 +300,7 @@ class SessionFile:
         try:
             yield
         except OSError as error:
-            # Bytes of a chunk that did not fit are of no use to anyone, and their room is.
+            # the bytes of an incomplete chunk are useless, and their room is needed
             with contextlib.suppress(OSError):
                 os.ftruncate(self._disk.fileno(), self._whole_bytes)
             self._disk.gave_up = True

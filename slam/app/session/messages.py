@@ -1,6 +1,6 @@
-"""What a session of somebody else's recording says about itself.
+"""What is in a session: messages of ROS 2, the table of the run, the description of a radar.
 
-The row::
+The row of a state, float64, in /slam/state::
 
     n_landmarks, n_nis,
     truth (3), odometry (3), estimate (3), world_from_map (3),
@@ -10,8 +10,7 @@ The row::
 
 in the units and frames of `Snapshot`; an unknown truth is NaN.
 
-Types and serialisation are those of the rosbags library; the arrays of a frame are copied once,
-into the serialised bytes.
+Composite messages are made and serialised by the rosbags library.
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ def snapshot_of(counter: int, t_ns: int, row: NDArray[np.float64]) -> Snapshot:
     Raises
     ------
     ValueError
-        The row's length is not what its first two numbers say.
+        The row's length does not fit its first two numbers.
     """
     n_landmarks, n_nis = (int(value) for value in row[:_COUNTS])
     ends = np.cumsum([_COUNTS, 3, 3, 3, 3, 9, _PER_LANDMARK * n_landmarks, n_nis])
@@ -135,7 +134,6 @@ def schema_text(message_type: str) -> bytes:
 
 
 def serialise(message: Message) -> memoryview:
-    """Serialise any of the messages of this module to CDR."""
     data: memoryview = _typestore().serialize_cdr(message, message.__msgtype__)
     return data
 
@@ -167,7 +165,6 @@ def odometry(sample: TumSample) -> Message:
 
 
 def odometry_sample(message: Message) -> TumSample:
-    """Read an odometry message back."""
     pose = message.pose.pose
     stamp = message.header.stamp
     return TumSample(
@@ -315,7 +312,6 @@ def settings_text(config: SlamConfig) -> str:
 
 
 def radar_text(radar: RadarInfo) -> str:
-    """Return what a session says of a radar."""
     return json.dumps(asdict(radar) | {"length_unit": LENGTH_UNIT})
 
 
@@ -339,7 +335,7 @@ def check_format(path: Path, table: Mapping[str, str]) -> None:
 def read_session_table(
     path: Path, table: Mapping[str, str], radars: tuple[RadarInfo, ...]
 ) -> SessionInfo:
-    """Read the table of a run back; what older files did not say has its default.
+    """Read the table of a run back; keys that older files lack have their defaults.
 
     Raises
     ------
@@ -373,7 +369,7 @@ def read_session_table(
 
 
 def read_radar_text(path: Path, topic: str, text: str) -> RadarInfo:
-    """Read what a session says of a radar.
+    """Read the description of a radar in a session.
 
     Raises
     ------
@@ -404,7 +400,7 @@ def read_radar_text(path: Path, topic: str, text: str) -> RadarInfo:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlamSettings:
-    """How SLAM is to be set; see the fields of `SessionInfo` of these names."""
+    """Settings of SLAM; see the fields of `SessionInfo` of these names."""
 
     preset: str = "robust"
     config_json: str = ""
@@ -438,7 +434,7 @@ def imported_info(
 def imported_radar(
     mount: Mount, *, range_start_m: float, bin_length_m: float, n_bins: int, rate_hz: float
 ) -> RadarInfo:
-    """Return a radar of whose serial number, port and settings nobody told; module metres."""
+    """Return a radar with unknown serial number, port and settings; module metres."""
     return RadarInfo(
         name=mount.name,
         serial="",

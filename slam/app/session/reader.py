@@ -58,7 +58,7 @@ class TruthPose:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReceivedFrame:
-    """A frame and when it arrived at the host, nanoseconds since 1970; None where nobody noted."""
+    """A frame and when it arrived at the host, nanoseconds since 1970; None if not recorded."""
 
     frame: RadarFrame
     host_ns: int | None
@@ -69,7 +69,7 @@ class ScanEnd:
     """The frames before it made a scan; see `Scan`.
 
     ``members`` are their radars and counters, so that a scan is known to be whole.
-    ``truth`` has shape (3,), [x m, y m, heading rad], world frame; None where nobody knew.
+    ``truth`` has shape (3,), [x m, y m, heading rad], world frame; None if unknown.
     """
 
     counter: int
@@ -80,14 +80,14 @@ class ScanEnd:
 
 
 Recorded: TypeAlias = ReceivedFrame | TumSample | TruthPose | LogLine | ScanEnd | Snapshot
-"""What the messages of a session say; a TumSample is odometry."""
+"""What is in a session; a TumSample is odometry."""
 
 FrameTopics: TypeAlias = Mapping[str, tuple[int, RadarInfo, tuple[float, float] | None]]
 """By topic: index and description of a radar, and the limits of its sampler."""
 
 
 def read_record(message: Message, frame_of: FrameTopics) -> Recorded | None:
-    """Return what a message says; None for those that say nothing new."""
+    """Return the content of a message; None for messages that repeat others."""
     found = frame_of.get(message.topic)
     if found is not None:
         host_ns = None if message.publish_ns == message.t_ns else message.publish_ns
@@ -209,7 +209,6 @@ class RecordedSession:
 
     @property
     def rig(self) -> Rig:
-        """Return the mounts as the run knew them."""
         return Rig(
             mounts=tuple(
                 Mount(
@@ -359,7 +358,7 @@ def open_session(path: Path) -> RecordedSession:
     try:
         size = path.stat().st_size
     except OSError:
-        size = None  # what is wrong with it is told below
+        size = None  # reading it reports what is wrong
     for entry in read_entries(path, cut.append, size):
         if isinstance(entry, Metadata):
             if entry.name == METADATA_NAME:

@@ -30,8 +30,6 @@ _CHECKED_FOOTER_BYTES = 16  # of its body, that its checksum covers
 
 @dataclass(slots=True, kw_only=True)
 class _Survey:
-    """What one look at the whole file finds."""
-
     cut_at: int | None = None
     damages: list[mcap.Damage] = field(default_factory=list)
     has_index: bool = False
@@ -47,7 +45,6 @@ class _Survey:
 
     @property
     def is_whole(self) -> bool:
-        """Whether there is nothing to do."""
         return self.cut_at is None and not self.damages and self.has_index
 
 
@@ -81,7 +78,6 @@ class Repair:
     kept: Path | None
 
     def __str__(self) -> str:
-        """Say so to a person."""
         span = f"{self.n_messages} messages, {(self.last_ns - self.first_ns) / 1e9:.1f} s"
         if self.was_whole:
             return f"{self.path}: whole, nothing to repair: {span}"

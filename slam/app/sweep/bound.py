@@ -40,11 +40,10 @@ from slam.app.odometry.tum import NS_PER_S
 from slam.app.rig.emulated import rig_of, true_landmarks_m, wheels_of
 from slam.app.run.evaluation import NEES_AT
 from slam.app.run.runner import RunRecord
-from slam.config import BackEnd, SlamConfig
+from slam.config import BackEnd, SlamConfig, WheelNoise
 from slam.evaluation import ate_rmse_m, nees_pose
 from slam.frames import Detection
 from slam.geometry import Mount, Rig, between, mount_at, pair_of, transform, wrap_angle, wrap_angles
-from slam.robust.parameters import WheelNoise
 from slam.robust.ranges import fix_of_pair
 from slam.robust.state import calibrated_motion, rotation
 
@@ -55,7 +54,7 @@ def load_gtsam(purpose: str) -> Any:  # noqa: ANN401 - types must not depend on 
     Raises
     ------
     AppError
-        It is not installed; one line that says what it was wanted for and how to get it.
+        It is not installed; one line with the purpose and how to install it.
     """
     try:
         return import_module("gtsam")
@@ -113,23 +112,15 @@ def wheel_derivatives(
 
 
 def wheel_factor(
-    gtsam: Any,  # noqa: ANN401 - GTSAM's own types, see gtsam_door
+    gtsam: Any,  # noqa: ANN401 - GTSAM's own types
     keys: tuple[int, int, int],
     increment: Array,
     sigmas: Array,
 ) -> Any:  # noqa: ANN401
-    """Return the factor.
+    """Return the factor of one step of the wheels.
 
-    Parameters
-    ----------
-    gtsam
-        The module.
-    keys
-        Of the pose before, the pose after, and (s, w, kappa).
-    increment
-        Shape (3,), as reported: ux, uy [m], ua [rad].
-    sigmas
-        Shape (3,), standard deviations of r.
+    ``keys`` are of the pose before, the pose after, and (s, w, kappa); ``increment`` and
+    ``sigmas``, shape (3,), are what odometry reported [m, m, rad] and the standard deviations of r.
     """
     ux, uy, ua = (float(value) for value in increment)
     before_key, after_key, calibration_key = keys
@@ -158,7 +149,7 @@ class KnownRange:
     """One range of one true landmark.
 
     ``motion`` (3,) leads from the pose to where the body was when the radar sampled, as odometry
-    tells it; ``sigma_m`` is the standard deviation of ``range_m``.
+    has it; ``sigma_m`` is the standard deviation of ``range_m``.
     """
 
     radar: int
@@ -185,18 +176,18 @@ def known_run(
     offset_sigma_m: float = 0.0,
     gate_sigmas: float = GATE_SIGMAS,
 ) -> KnownRun:
-    """Return the same data that SLAM had, with the ids it had not.
+    """Return the data that SLAM had, with the ids of the true landmarks.
 
     Parameters
     ----------
     record
         The run; one increment per result, from odometry's zero on.
     rig
-        The mounts as SLAM was told of them.
+        The mounts as SLAM knew them.
     true_landmarks_m
         Shape (n, 2), world frame.
     range_sigma_m
-        Standard deviation of a range in results that do not tell it (``range_sigmas_m``).
+        Standard deviation of a range in results without ``range_sigmas_m``.
     offset_sigma_m
         Standard deviation of each radar's unknown range offset; widens the gate.
     gate_sigmas
@@ -211,9 +202,9 @@ def known_run(
         pose = result.odometry_pose
         increments.append(between(last, pose))
         last = pose
-        told = result.range_sigmas_m or (range_sigma_m,) * len(result.detections)
+        used = result.range_sigmas_m or (range_sigma_m,) * len(result.detections)
         by_frame: dict[tuple[int, int], list[tuple[Detection, float]]] = {}
-        for detection, sigma in zip(result.detections, told, strict=True):
+        for detection, sigma in zip(result.detections, used, strict=True):
             if sigma < math.inf:  # else SLAM was not given it
                 frame = by_frame.setdefault((detection.radar, detection.t_ns), [])
                 frame.append((detection, sigma))
@@ -340,7 +331,7 @@ def first_position(rig: Rig, seen: Sequence[SeenFrom], poses: Sequence[Array]) -
 
 
 def _from_many(seen: Sequence[SeenFrom], poses: Sequence[Array]) -> Array | None:
-    """Return the least-squares point of many ranges if they tell it to ``ALONE_SIGMA_M``."""
+    """Return the least-squares point of many ranges if they determine it to ``ALONE_SIGMA_M``."""
     antennas = [mount_at(item.antenna, poses[item.step]) for item in seen]
     at = np.array([[antenna.x_m, antenna.y_m] for antenna in antennas])
     ranges = np.array([item.known.range_m for item in seen])
@@ -392,57 +383,27 @@ class KnownAssociation:
     calibration: Array
 
 
-def known_association_paths(
-    record: RunRecord,
-    rig: Rig,
-    wheels: WheelNoise,
-    true_landmarks_m: Array,
-    *,
-    range_sigma_m: float,
-    offset_sigma_m: float = 0.0,
-    gate_sigmas: float = GATE_SIGMAS,
+def solve_known(
+    run: KnownRun, rig: Rig, wheels: WheelNoise, *, offset_sigma_m: float = 0.0
 ) -> KnownAssociation:
-    """Return the bound of a run, one row per result of the record.
+    """Return the paths of labelled data.
 
     Parameters
     ----------
-    record
-        The run; its increments and detections are used, and the truth only to tell whose a range
-        is (``slam.app.sweep.bound``).
+    run
+        See `known_run`.
     rig
-        The mounts as SLAM was told of them.
+        The mounts as SLAM knew them.
     wheels
         How odometry errs, by its specification.
-    true_landmarks_m
-        Shape (n, 2), world frame.
-    range_sigma_m
-        Standard deviation of a range where the results do not tell what SLAM was told of each;
-        those it was not given the bound does not use either.
     offset_sigma_m
         Standard deviation of each radar's unknown range offset; zero: calibrated.
-    gate_sigmas
-        How far from the true range a detection of a landmark may lie.
 
     Raises
     ------
     AppError
         GTSAM is not installed.
     """
-    run = known_run(
-        record,
-        rig,
-        true_landmarks_m,
-        range_sigma_m=range_sigma_m,
-        offset_sigma_m=offset_sigma_m,
-        gate_sigmas=gate_sigmas,
-    )
-    return solve_known(run, rig, wheels, offset_sigma_m=offset_sigma_m)
-
-
-def solve_known(
-    run: KnownRun, rig: Rig, wheels: WheelNoise, *, offset_sigma_m: float = 0.0
-) -> KnownAssociation:
-    """Return the paths of labelled data; see ``known_association_paths``."""
     estimator = _Estimator(rig, wheels, offset_sigma_m)
     filtered, covariances = [], []
     for increment, ranges in zip(run.increments, run.ranges, strict=True):
@@ -595,7 +556,7 @@ class _Estimator:
         self._graph.add(kind(*keys, known.range_m, noise, sensor))
 
 
-def _isam_parameters(gtsam: Any) -> Any:  # noqa: ANN401 - GTSAM's own types, see gtsam_door
+def _isam_parameters(gtsam: Any) -> Any:  # noqa: ANN401 - GTSAM's own types
     """Return ISAM2's parameters; QR, for wheels that stand still make Cholesky fail."""
     thresholds = gtsam.ISAM2ThresholdMap()
     for symbol, size, threshold in (
@@ -634,14 +595,13 @@ class BoundSummary:
 
 
 def require_gtsam() -> None:
-    """Raise AppError, one line with the remedy, where GTSAM is not installed."""
     load_gtsam(PURPOSE)
 
 
 def bound_of(record: RunRecord, scene: Scene, config: SlamConfig) -> BoundSummary:
     """Return the bound of a run that has a state.
 
-    Told of rig, wheels and offsets is what SLAM was told; the truth tells whose each range is.
+    Rig, wheels and offsets are those that SLAM knew; the truth only gives each range its landmark.
 
     Raises
     ------
@@ -649,14 +609,16 @@ def bound_of(record: RunRecord, scene: Scene, config: SlamConfig) -> BoundSummar
         GTSAM is not installed.
     """
     is_robust = config.back_end is BackEnd.ROBUST
-    paths = known_association_paths(
+    rig = rig_of(scene)
+    offset_sigma_m = config.robust.offset_sigma_m if is_robust else 0.0
+    run = known_run(
         record,
-        rig_of(scene),
-        wheels_of(scene),
+        rig,
         true_landmarks_m(scene),
         range_sigma_m=config.robust.range_sigma_m if is_robust else _PAPER_RANGE_SIGMA_M,
-        offset_sigma_m=config.robust.offset_sigma_m if is_robust else 0.0,
+        offset_sigma_m=offset_sigma_m,
     )
+    paths = solve_known(run, rig, wheels_of(scene), offset_sigma_m=offset_sigma_m)
     stamps_ns = np.array([result.t_ns for result in record.results])
     values = []
     for part in NEES_AT:

@@ -132,7 +132,6 @@ def _bound(runs: Sequence[SweepRun]) -> dict[str, Any] | None:
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:
-    """Return median and 90th percentile."""
     return {"median": float(np.median(values)), "p90": float(np.quantile(values, 0.9))}
 
 

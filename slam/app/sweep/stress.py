@@ -1,6 +1,6 @@
 """The stress table: named hardships that a run goes through, from its echoes on.
 
-Light, so that ``--help`` is; `slam.app.sweep.run` does what a row says.
+Imports nothing heavy, since ``--help`` lists them; `slam.app.sweep.run` applies them.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ CLEAN = "clean"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stress:
-    """One row: what it is called, what it says in a line, and how hard each hardship is.
+    """One row: its name, its help, and the size of each hardship.
 
-    What is random about it depends on the run's seed alone. SLAM is told nothing of it, but that
-    frames carry the time they were really taken at, as they always do.
+    Random choices depend on the run's seed alone. SLAM knows nothing of the stress;
+    frames carry the time at which they were really taken, as always.
 
     Attributes
     ----------

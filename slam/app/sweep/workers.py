@@ -99,7 +99,7 @@ def _signals_left_to_the_parent() -> Iterator[None]:
 def _start_trackers() -> None:
     """Start the processes that remove what killed workers leave behind, and let them do it quietly.
 
-    They warn on our stderr about each semaphore that somebody left, or removed before them.
+    They would warn on stderr about each semaphore that is left or was removed before.
     """
     before = os.environ.get("PYTHONWARNINGS")
     os.environ["PYTHONWARNINGS"] = ",".join(filter(None, (before, "ignore:resource_tracker")))
@@ -150,9 +150,9 @@ def dask_results(
     Raises
     ------
     UsageError
-        The address is none, or Dask is not installed.
+        The address is invalid, or Dask is not installed.
     AppError
-        Nobody answers there, or there is no worker.
+        No scheduler answers there, or there is no worker.
     ClusterLostError
         See there; while results are awaited.
     """
@@ -166,7 +166,7 @@ def dask_results(
         client.close(timeout=PATIENCE_S)
 
 
-def _connect(address: str) -> Any:  # noqa: ANN401 - Dask is not there where nobody wants it
+def _connect(address: str) -> Any:  # noqa: ANN401 - Dask is optional
     try:
         import distributed  # heavy, and an extra
     except ImportError:

@@ -36,7 +36,13 @@ class Bench:
         self.told: list[str] = []
         options = DeviceOptions(port_on_reset="vanish")
         device = radar_device(IDENTITY, RampSource(), Pace.REALTIME, options=options)
-        named = NamedDevice(name="radar", serial="1", device=device, present=device.port_present)
+        self.pulled = False
+        named = NamedDevice(
+            name="radar",
+            serial="1",
+            device=device,
+            present=lambda now_ns: device.port_present(now_ns) and not self.pulled,
+        )
         self.opened: DevicePorts = open_ports([named], folder, links, cleanup)
         self.opened.moved = lambda: self.told.append(str(self.opened.entries()[0]["path"]))
         self.server = Server(self.opened.ports, self.opened.services, clock_ns=lambda: self.now_ns)
@@ -124,7 +130,7 @@ def test_an_open_port_hangs_up_and_its_name_is_gone_until_the_module_is_back(ben
 def test_the_loop_wakes_by_itself_when_the_port_is_due(bench: Bench) -> None:
     host = bench.open()
     bench.reset(host)
-    plug = bench.opened.plugs["radar"]
+    (plug,) = bench.opened.services
     assert plug.wake_ns(0) is None
     bench.at_ms(RESTART_MS)
     wake_ns = plug.wake_ns(bench.now_ns)
@@ -170,13 +176,12 @@ def test_a_tcp_client_is_hung_up_on_and_none_is_let_in_meanwhile(with_tcp: Bench
 
 
 def test_a_pulled_plug_stays_out_until_it_is_put_in(bench: Bench) -> None:
-    plug = bench.opened.plugs["radar"]
-    plug.pulled = True
+    bench.pulled = True
     bench.at_ms(1)
     assert bench.names() == []
     bench.at_ms(10_000)
     assert bench.names() == []
-    plug.pulled = False
+    bench.pulled = False
     bench.at_ms(10_001)
     assert bench.names() == ["radar"]
 
@@ -184,11 +189,10 @@ def test_a_pulled_plug_stays_out_until_it_is_put_in(bench: Bench) -> None:
 def test_a_hundred_restarts_leak_nothing(bench: Bench) -> None:
     gc.collect()  # what earlier tests left must not go away in between
     before = sorted(os.listdir("/dev/fd"))
-    plug = bench.opened.plugs["radar"]
     for _ in range(100):
         host = bench.open()
         for pulled in (True, False):
-            plug.pulled = pulled
+            bench.pulled = pulled
             bench.server.turn(longest_wait_s=0)
         os.close(host)
     bench.at_ms(1)
@@ -200,11 +204,10 @@ def test_a_hundred_restarts_leak_nothing(bench: Bench) -> None:
 
 
 def test_a_file_in_the_way_is_waited_for_not_died_of(bench: Bench) -> None:
-    plug = bench.opened.plugs["radar"]
-    plug.pulled = True
+    bench.pulled = True
     bench.at_ms(1)
     (bench.folder / "radar").write_text("mine")
-    plug.pulled = False
+    bench.pulled = False
     bench.at_ms(2)
     assert (bench.folder / "radar").read_text() == "mine"
     (bench.folder / "radar").unlink()

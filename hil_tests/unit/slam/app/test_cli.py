@@ -27,6 +27,12 @@ def test_two_runs_into_one_place_are_refused_and_the_first_goes_on(
     assert first.read_text() == "of the first run"
 
 
+def test_a_name_that_is_no_utf_8_is_wrong_usage() -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["demo", "--out", os.fsdecode(b"\xff")])
+    assert end.value.code == 2
+
+
 def trajectory(folder: Path) -> str:
     path = folder / "path.tum"
     path.write_text("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n3 1 1 0 0 0 0 1\n")

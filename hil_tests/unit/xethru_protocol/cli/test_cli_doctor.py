@@ -24,8 +24,7 @@ from hil_tests.unit.xethru_protocol.pty_module import (
     silent,
     stock,
 )
-from xethru_protocol.cli import main
-from xethru_protocol.cli import port_probe as patient
+from xethru_protocol.cli import main, port_probe
 from xethru_protocol.cli.doctor import MACHINE_CHECKS, PORT_CHECKS
 from xethru_protocol.cli.port_probe import PortUser, port_users
 from xethru_protocol.transport import SerialTransport
@@ -44,8 +43,8 @@ def only_own_emulators(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 @pytest.fixture
 def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait less for modules that never answer, and longer at a rate at which one may."""
-    monkeypatch.setattr(patient, "_PATIENCE_S", 0.3)
-    monkeypatch.setattr(patient, "_GLANCE_S", 1.0)
+    monkeypatch.setattr(port_probe, "_PATIENCE_S", 0.3)
+    monkeypatch.setattr(port_probe, "_GLANCE_S", 1.0)
 
 
 def examined(capsys: Capture, *arguments: str) -> tuple[int, list[dict[str, Any]]]:
@@ -155,7 +154,7 @@ def test_firmware_that_is_not_stale(version: str, capsys: Capture) -> None:
 
 @pytest.mark.usefixtures("hurried")
 def test_a_module_at_another_baud_rate(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(patient, "ignores_baudrate", lambda path: False)
+    monkeypatch.setattr(port_probe, "ignores_baudrate", lambda path: False)
     with PtyModule(stock(), baudrate=termios.B460800) as module:
         code, finding = only_finding(capsys, module.path)
     assert (code, finding["check"]) == (1, "usual baud rate")
@@ -174,7 +173,7 @@ def test_a_module_at_another_baud_rate(capsys: Capture, monkeypatch: pytest.Monk
     ],
 )
 def test_only_real_uarts_are_tried_at_other_rates(path: str, ignores: bool) -> None:
-    assert patient.ignores_baudrate(path) is ignores
+    assert port_probe.ignores_baudrate(path) is ignores
 
 
 def test_a_module_that_stops_answering_half_way(capsys: Capture) -> None:
@@ -211,7 +210,7 @@ def test_names_in_remedies_can_be_given_to_a_shell(tmp_path: Path, capsys: Captu
 def test_a_port_that_vanishes_while_it_is_examined(
     capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(patient.Patient, "exists", True)
+    monkeypatch.setattr(port_probe.PortProbe, "exists", True)
     _, finding = only_finding(capsys, "/dev/none")
     assert finding["check"] == "is a serial port"
     assert finding["found"] == "this could not be found out: No such file or directory"
@@ -240,7 +239,7 @@ def test_no_rights(
         # root may open everything, and tests may run as root
         monkeypatch.setattr("os.access", lambda path, wanted: False)
         code, finding = only_finding(capsys, module.path)
-        group = patient.Patient(module.path).group
+        group = port_probe.PortProbe(module.path).group
     assert (code, finding["check"]) == (1, check)
     assert f"group {group}" in finding["found"]
     assert remedy in finding["remedy"]
@@ -268,7 +267,7 @@ def test_a_port_that_another_program_has_open_is_left_alone(
     capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened: list[str] = []
-    monkeypatch.setattr(patient, "SerialTransport", opened.append)
+    monkeypatch.setattr(port_probe, "SerialTransport", opened.append)
     with PtyModule(stock()) as module, reader(module.path) as pid:
         code, finding = only_finding(capsys, module.path)
     assert (code, finding["check"]) == (1, "nobody else has it open")
@@ -288,7 +287,7 @@ def test_two_programs_that_split_the_stream(capsys: Capture) -> None:
 
 
 @needs_proc
-def test_whoever_serves_a_port_is_no_user_of_it() -> None:
+def test_the_process_that_serves_a_port_is_not_its_user() -> None:
     with PtyModule(stock()) as module:
         assert port_users(module.path) == ()
         with reader(module.path) as pid:
@@ -302,7 +301,7 @@ def test_whoever_serves_a_port_is_no_user_of_it() -> None:
 def test_a_port_locked_by_a_program_that_cannot_be_seen(
     capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(patient, "port_users", lambda path: ())
+    monkeypatch.setattr(port_probe, "port_users", lambda path: ())
     with PtyModule(stock()) as module:
         other = SerialTransport(module.path)
         code, finding = only_finding(capsys, module.path)
@@ -314,7 +313,7 @@ def test_a_port_locked_by_a_program_that_cannot_be_seen(
 
 def test_many_readers_are_not_all_named(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     users = tuple(PortUser(pid=number, name="reader") for number in range(10, 20))
-    monkeypatch.setattr(patient, "port_users", lambda path: users)
+    monkeypatch.setattr(port_probe, "port_users", lambda path: users)
     with PtyModule(stock()) as module:
         _, finding = only_finding(capsys, module.path)
     assert "(pid 13) and 6 more have it open" in finding["found"]
@@ -364,26 +363,6 @@ def test_all_found_ports_are_examined(
 
 
 # --- the report -------------------------------------------------------------------------------
-
-
-def test_the_report_for_people(capsys: Capture, tmp_path: Path) -> None:
-    missing = str(tmp_path / "radar")
-    with PtyModule(stock(pong=SAFE_MODE)) as module:
-        assert main(["doctor", "--port", module.path, "--port", missing]) == 1
-    assert capsys.readouterr().out == (
-        f"{module.path}\n"
-        "  ok     17 checks\n"
-        "  fault  it is in safe mode: ten faults in a row made it start without its profiles\n"
-        f"      -> xethru reset --port {module.path}, or take the module's power away for some "
-        "seconds\n"
-        "\n"
-        f"{missing}\n"
-        "  ok     1 check\n"
-        "  fault  there is no such port\n"
-        "      -> plug the module in; 'xethru list' shows the ports there are\n"
-        "\n"
-        "2 faults\n"
-    )
 
 
 def test_every_row_says_what_it_needs_to() -> None:
