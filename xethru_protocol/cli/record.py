@@ -31,22 +31,11 @@ from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings import RecordingError, RecordingWriter, WireCapture
 from xethru_protocol.system import StopFlag
+from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import ProfileId
 from xethru_protocol.wire.errors import ResponseTimeout, XeThruError
 from xethru_protocol.wire.framing import LinkStatistics
-from xethru_protocol.wire.messages import (
-    Ack,
-    Error,
-    Pong,
-    ReplyByte,
-    ReplyFloat,
-    ReplyInt,
-    ReplyNone,
-    ReplyString,
-    ReplyUser,
-    Response,
-    System,
-)
+from xethru_protocol.wire.table import Response
 
 
 def what_must_go(targets: Iterable[Path], *, replace: bool) -> list[Path]:
@@ -205,8 +194,8 @@ class Presence(Listen):
 
 
 _ANSWERS = (
-    *(Ack, Error, Pong, System),
-    *(ReplyByte, ReplyFloat, ReplyInt, ReplyNone, ReplyString, ReplyUser),
+    *(m.Ack, m.Error, m.Pong, m.System),
+    *(m.ReplyByte, m.ReplyFloat, m.ReplyInt, m.ReplyNone, m.ReplyString, m.ReplyUser),
 )
 
 
