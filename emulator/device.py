@@ -57,17 +57,6 @@ class ChipStream(MessageStream):
     ``scene_time_zero_ns`` + the scene time at which the module's clock shows k's nominal time; a
     stream that starts late begins with the first counter still ahead, because the chip's counter
     runs on.
-
-    Parameters
-    ----------
-    module
-        The module whose chip makes the frames.
-    pace
-        Whether frames wait for their time.
-    clock
-        The module's own: its start skew and its rate error.
-    scene_time_zero_ns
-        Device time of scene time 0, ns.
     """
 
     def __init__(
@@ -135,15 +124,7 @@ class ChipStream(MessageStream):
 
 
 class CombinedStream(MessageStream):
-    """Messages of a module in any mode; at most one of its two streams has any.
-
-    Parameters
-    ----------
-    raw
-        Radar frames, in MANUAL.
-    profile
-        Output of the profile, in RUN.
-    """
+    """Messages of a module in any mode; at most one of its two streams has any."""
 
     def __init__(self, raw: ChipStream, profile: ProfileStream) -> None:
         self._raw = raw
@@ -428,10 +409,6 @@ def radar_device(
 
     Parameters
     ----------
-    identity
-        Serial number and version strings.
-    source
-        The world in front of the antennas.
     pace
         `Pace.ASAP`: nothing is dropped, frames are made as the line takes them.
         `Pace.REALTIME`: frames at absolute deadlines, firmware overflow.
@@ -439,10 +416,6 @@ def radar_device(
         Device time of scene time 0 (`Pace.REALTIME`), ns.
     clock
         The module's own, which the source must know, too; one without error if None.
-    boot
-        Timing of a restart; the documented one if None.
-    options
-        How it answers what the reference leaves open; the documented defaults if None.
     memory
         Where its flash is kept; None forgets it with the device.
     """

@@ -303,8 +303,6 @@ class PlayStream(MessageStream):
     loop_gap_ns
         Time of the recording between the last message and the first when playing in a loop; None
         to play once.
-    rate
-        Multiple of real time; 0 for as fast as the line takes it.
     from_ns
         Where every host and round begins, ns since the first message.
     kinds
@@ -556,12 +554,8 @@ class PlayOptions:
     ----------
     rate
         Multiple of real time; 0 for as fast as the port takes it.
-    loop
-        Whether to begin again at the end.
     from_ns
         Where every host and round begins, ns since the first message of the recording.
-    kinds
-        Which kinds of messages, as from `kinds`; None for all.
     """
 
     rate: float = 1.0
@@ -581,10 +575,6 @@ class PlayedRadar:
         names are plain ones, else ``player`` or ``radar0``, ``radar1`` and so on.
     serial
         Serial number it answers with: the recorded one where that is known.
-    device
-        The module.
-    stream
-        What it plays; takes the controls.
     """
 
     name: str

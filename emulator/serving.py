@@ -51,8 +51,6 @@ class FaultSession:
         Name or path; None: no faults until the control socket adds some.
     truth
         File of the truth log, made anew; None: kept in memory only.
-    cleanup
-        Closes what was opened.
     zero_ns
         Device time from which the scenario counts.
 

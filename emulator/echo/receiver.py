@@ -180,15 +180,7 @@ _COUNTERS_AT_ONCE = 256
 
 
 class CarrierJitter:
-    """The jitter of one radar.
-
-    Parameters
-    ----------
-    spec
-        Standard deviations and correlation time.
-    seed, serial
-        The run's seed and the module's serial number: they select the jitter.
-    """
+    """The jitter of one radar."""
 
     def __init__(self, spec: JitterSpec, *, seed: int, serial: int) -> None:
         self._spec = spec
@@ -265,15 +257,7 @@ _CLUTTER_INSTANTS_PER_KNOT = 4
 
 
 class ClutterField:
-    """The clutter of one radar, as a function of scene time and range.
-
-    Parameters
-    ----------
-    spec
-        Strength and correlation time.
-    seed, serial
-        The run's seed and the module's serial number: they select the clutter.
-    """
+    """The clutter of one radar, as a function of scene time and range."""
 
     def __init__(self, spec: ClutterSpec, *, seed: int, serial: int) -> None:
         self._sigma = spec.sigma
@@ -310,8 +294,6 @@ class ClutterField:
             Shape (n_frames, capture.n_samples), float64, normalised units.
         scene_times_ns
             Shape (n_frames,), int64: when this radar truly took each frame.
-        capture
-            The chip's settings.
         gain
             Amplitude of the transmitter at its power setting times the receiver's gain.
         """
@@ -354,10 +336,6 @@ class _Row:
     ----------
     first_sample
         Number of the frame's first RF sample, counted from range label 0.
-    n_samples
-        Length of the frame.
-    tx_center_frequency
-        Which carrier.
     """
 
     first_sample: int
@@ -471,8 +449,6 @@ class Receiver:
             Shape (n_frames,), int64; they select the noise.
         scene_times_ns
             Shape (n_frames,), int64: when this radar truly took each frame.
-        capture
-            The chip's settings.
         gain
             Amplitude of the transmitter at its power setting times the receiver's gain: the
             factor that the signal already has and the clutter needs. The noise has none.

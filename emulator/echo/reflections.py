@@ -279,15 +279,7 @@ def person_scatterer(person: PersonSpec, t_ns: NDArray[np.int64]) -> Scatterers:
 
 
 def direct_reflections(scatterers: Scatterers, view: Viewpoint) -> Reflections:
-    """Return the echoes by the straight way there and back; nothing stands in between.
-
-    Parameters
-    ----------
-    scatterers
-        Targets or a person, k of them.
-    view
-        The radar in n_frames frames.
-    """
+    """Return the echoes by the straight way there and back; nothing stands in between."""
     dx = scatterers.x_m - view.x_m
     dy = scatterers.y_m - view.y_m
     range_m = np.sqrt(dx * dx + dy * dy)

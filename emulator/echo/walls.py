@@ -57,8 +57,6 @@ def past_edge(
         How much longer the way over the edge is, >= 0.
     beyond
         Whether the straight way is on the open side of the edge, so that v is negative.
-    wavelength_m
-        Of the carrier.
     """
     v = _parameter(detour_m, wavelength_m)
     sine, cosine = fresnel(v)
@@ -271,8 +269,6 @@ def closed_ends(faces: Faces, height_m: Array) -> NDArray[np.bool_]:
 
     Parameters
     ----------
-    faces
-        The faces.
     height_m
         Shape (n_frames, n_faces): the radar's height over each of them.
     """
@@ -308,8 +304,6 @@ def passing(
         Shape (m,) each, world frame [m].
     but
         Bodies that do not count, shape (m,) each: those a leg was reflected by; -1 is none.
-    wavelength_m
-        Of the carrier.
     """
     share = np.ones(len(from_x))
     step = max(_LEGS_TIMES_FACES // max(len(faces), 1), 1)
@@ -581,16 +575,10 @@ def ghost_reflections(
 
     Parameters
     ----------
-    faces
-        The mirrors.
     scatterers
         Targets or a person, k of them.
-    view
-        The radar.
     share
         Shape (n_frames, k): of the straight leg, from `direct_share`.
-    wavelength_m
-        Of the carrier.
     """
     legs = _legs(faces, scatterers, view, share, wavelength_m)
     swell_m = np.broadcast_to(scatterers.swell_m, share.shape)
@@ -632,8 +620,6 @@ def spread(scatterers: Scatterers, out_m: Array, back_m: Array, half_cosine: Arr
 
     Parameters
     ----------
-    scatterers
-        k of them.
     out_m, back_m
         Shape (n_frames, k): lengths of the legs, to the scatterer's axis.
     half_cosine

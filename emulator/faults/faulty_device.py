@@ -61,10 +61,6 @@ class Armed:
 
     Parameters
     ----------
-    number
-        By which it is cleared again.
-    spec
-        What it is.
     radar
         Name of the radar: every radar has its own chance.
     seed
@@ -72,8 +68,6 @@ class Armed:
 
     Attributes
     ----------
-    firings
-        How often it was injected.
     since_ns, first_counter, packets_since
         Time, frame counter and packets since it was injected last.
     """
@@ -213,11 +207,6 @@ class Power:
 
     A module that is not emulated here, as one behind a proxy, can only be told to reset itself.
 
-    Parameters
-    ----------
-    module
-        The module.
-
     Attributes
     ----------
     deaf
@@ -262,14 +251,8 @@ class FaultyDevice:
 
     Parameters
     ----------
-    inner
-        The module.
     name
         Of the radar, as scenarios and the truth log call it.
-    plan
-        What to do to it.
-    truth
-        Where every injected fault is written down.
     zero_ns
         Device time from which the scenario counts; the first time it hears of if None.
     """
@@ -585,10 +568,6 @@ def wrap(
 
     Parameters
     ----------
-    device
-        The module.
-    name
-        Of the radar, as scenarios and the truth log call it.
     plan
         None: no faults until some are added.
     truth
@@ -617,10 +596,6 @@ def fault(device: FaultyDevice, kind: str, **keys: Any) -> Iterator[Injection]: 
 
     Parameters
     ----------
-    device
-        The module to spoil.
-    kind
-        See `xethru-emulator faults`.
     keys
         Those of a scenario file (``count``, ``every``, ``command`` ...); what is none of them is
         a parameter of the kind.

@@ -193,8 +193,6 @@ class Piece:
 
     Attributes
     ----------
-    data
-        What to send.
     delay_ns
         How much later than without the fault. What comes after keeps its place behind it.
     aside
@@ -215,8 +213,6 @@ class Context:
 
     Attributes
     ----------
-    now_ns
-        Time, ns.
     since_ns
         When the fault fired last (now, if it fires with this packet), ns.
     firings
@@ -225,8 +221,6 @@ class Context:
         Packets it has seen since it fired; 0 for the one with which it fired.
     first_counter
         Counter of the frame with which it fired last; None if it was no frame.
-    packet_class
-        What the packet is.
     command
         The command itself, or the one that a reply answers; None if unknown.
     previous_frame
@@ -310,8 +304,6 @@ class Kind:
     ----------
     name
         In scenario files and in the truth log.
-    summary
-        What happens, in a sentence.
     counted
         What an X4M300 driver counts for each one injected.
     lasting

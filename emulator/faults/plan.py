@@ -129,8 +129,6 @@ class TruthLog:
     ----------
     records
         The last 100 000.
-    counts
-        How often each kind was injected.
     """
 
     def __init__(self, write: Callable[[str], object] | None = None) -> None:

@@ -30,14 +30,8 @@ class Identity:
     ----------
     serial
         Serial number, 12 digits.
-    order_code
-        Product name.
     item_number
         Novelda item number, form ``000ddd-ddd``.
-    firmware_id
-        Name of the firmware binary.
-    version
-        Firmware version.
     xep_version
         Version of the base firmware inside it.
     dsp_library
@@ -244,8 +238,6 @@ class SavedState:
         Settings of each profile as of its last start, by profile id.
     files
         Content of the file system; noise maps and the crash dump are files.
-    parameter_file_name
-        Name of the parameter file, if there is one.
     certification
         Whether the module starts in certification mode.
     """
@@ -290,11 +282,6 @@ class FaultCounter:
     ----------
     memory_ns
         Time without fault after which the count begins anew.
-
-    Attributes
-    ----------
-    count
-        Faults in a row.
     """
 
     def __init__(self, memory_ns: int) -> None:

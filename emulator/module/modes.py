@@ -124,8 +124,6 @@ class Start:
     ----------
     state
         RUN, LOADED or STOPPED; what the next power-up enters.
-    profile_id
-        Profile that ran last.
     """
 
     state: State = State.RUN
@@ -137,12 +135,8 @@ class ModeMachine:
 
     Attributes
     ----------
-    state
-        Current state.
     profile_id
         Loaded profile, 0 for none.
-    start
-        What the next power-up enters.
     """
 
     def __init__(self, options: DeviceOptions | None = None, start: Start | None = None) -> None:

@@ -64,10 +64,6 @@ class Module:
 
     Parameters
     ----------
-    identity
-        What it says about itself.
-    chip
-        Its radar chip.
     options
         How it answers what the reference leaves open; the documented defaults if None.
     memory
@@ -75,16 +71,8 @@ class Module:
 
     Attributes
     ----------
-    modes
-        Its mode machine.
     profile
         Settings of the profile loaded last.
-    files
-        Its file system.
-    pins
-        Its IO pins.
-    faults
-        Consecutive faults.
     postprocessing
         Frame post-processing settings by id; kept, without effect on frames.
     i2c
@@ -95,12 +83,8 @@ class Module:
         How much it tells as DATA STRING.
     certification
         Whether it starts in certification mode.
-    parameter_file_name
-        Name of the parameter file.
     noise_maps
         Returns the current noise maps, slow and fast, as bytes; whoever computes them sets it.
-    now_ns
-        Time of the current command.
     restart
         A restart asked for; whoever keeps the time carries it out.
     notices

@@ -316,8 +316,6 @@ class ProfileSettings:
         Interval at which the noise map is stored, 0 for never [min].
     outputs
         Control bits by message id; what is off is absent.
-    debug_outputs
-        The same for the debug line.
     """
 
     zone_m: tuple[float, float] = snapped_zone(*ZONE_LIMITS_M)

@@ -44,15 +44,7 @@ class _RefusedError(Exception):
 
 
 class Control:
-    """Carries out what is asked.
-
-    Parameters
-    ----------
-    devices
-        The radars by name.
-    players
-        Playbacks by the names of their radars.
-    """
+    """Carries out what is asked."""
 
     def __init__(
         self,

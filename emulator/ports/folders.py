@@ -215,8 +215,6 @@ class DirectoryMemory:
     ----------
     directory
         Where the documents of all modules are; made if it is missing.
-    serial
-        Serial number of this module, the name of its document.
     warn
         Called with one line about what cannot be read or written.
     """

@@ -61,19 +61,13 @@ class Plug(Service):
 
     Parameters
     ----------
-    link
-        The module's pseudo-terminal.
     present
         Whether the module's own port is there at a time, ns.
     tcp
         Its TCP port; a client is hung up on, and none admitted before the module is back.
-    watch
-        Who has the terminal open.
     renames
         Whether it returns under another name every time: NAME-2, NAME-3 and so on, so that a host
         finds the module by its serial number only.
-    moved
-        Called when the port is back.
     """
 
     def __init__(
@@ -142,10 +136,6 @@ class NamedDevice:
 
     Attributes
     ----------
-    name, serial
-        For the ready line.
-    device
-        The module.
     start_skew_ns
         Scene time at which it takes the frame of counter 0; None where nobody knows.
     present
@@ -168,8 +158,6 @@ class LinkOptions:
 
     Attributes
     ----------
-    kind
-        What the module is connected by.
     usb_latency_ns
         How long USB transfers of at most 512 bytes are under way; None: bytes pass at once.
     host_baud
@@ -180,8 +168,6 @@ class LinkOptions:
         another name.
     tcp_base
         TCP port of the first module, the others' follow; 0: any that are free; None: no TCP.
-    tcp_host
-        Address to listen at.
     """
 
     kind: Literal["usb", "uart"] = "usb"
@@ -198,10 +184,6 @@ class DevicePorts:
 
     Attributes
     ----------
-    ports
-        For the server's loop.
-    services
-        Likewise.
     moved
         Called when a port came back, maybe under another name.
     """

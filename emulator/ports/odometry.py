@@ -30,8 +30,6 @@ class OdometryFeed(SocketService[_Client]):
 
     Parameters
     ----------
-    path
-        Where the socket appears.
     lines
         TUM lines without line ends, in time order; the stamp is exact decimal seconds.
     pace

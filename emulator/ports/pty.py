@@ -177,11 +177,6 @@ class PtyLink:
     def reopen(self, path: Path) -> None:
         """Appear with a fresh terminal after `close`, as a device that was plugged in again.
 
-        Parameters
-        ----------
-        path
-            Where the link appears; `path` is this from now on.
-
         Raises
         ------
         LinkError

@@ -41,8 +41,6 @@ class SocketService(Service, Generic[ClientT]):
     ----------
     path
         Where the socket appears; one left behind by a killed emulator is replaced.
-    name
-        What errors call it.
     most_clients
         Further ones are hung up on.
     private

@@ -43,8 +43,6 @@ class TcpLink(Service):
 
     Parameters
     ----------
-    host
-        Address to listen at.
     port
         Port number; 0 for any that is free.
     admits

@@ -66,14 +66,10 @@ class ProfileSweep:
 
     Parameters
     ----------
-    source
-        What the radar sees.
     zone_m
         Detection zone, start and end, on the grid of the bins [module metres].
     tx_center_frequency
         Band, 3 or 4.
-    largest_block
-        Most frames synthesised at once.
 
     Attributes
     ----------
@@ -81,8 +77,6 @@ class ProfileSweep:
         Shape (n_bins,), float64: range of each bin [module metres].
     in_zone
         Shape (n_bins,), bool: the bins inside the zone.
-    timeline
-        Scene times of the counters.
     """
 
     def __init__(
@@ -300,10 +294,6 @@ class StoredMap:
     ----------
     zone_m
         Detection zone it was made in [module metres].
-    tx_center_frequency
-        Band it was made in.
-    noise_map
-        The map.
     """
 
     zone_m: tuple[float, float]

@@ -70,8 +70,6 @@ class Detection:
         Largest excess of the run over the noise map.
     velocity_mps
         Radial velocity, positive away; 0 for somebody who does not walk.
-    moving
-        Whether it moves right now.
     """
 
     distance_m: float
@@ -130,16 +128,10 @@ def detections(
 
     Parameters
     ----------
-    sweep
-        The geometry.
-    excess
-        Over the noise map.
     noise_map
         The map itself: it tells the noise of a frame.
     frames
         Shape (n_frames, n_bins), the frames of the fast matrix, oldest first.
-    sensitivity
-        0...9.
     """
     threshold = 10 ** (threshold_db(sensitivity) / 10)
     residual = frames - frames.mean(axis=0)
@@ -279,8 +271,6 @@ class PresenceProcessing:
 
     Parameters
     ----------
-    sweep
-        The radar's geometry.
     noise_map
         The map to begin with; an incomplete one is created from the first matrices.
 

@@ -163,10 +163,6 @@ def matrix_reports(
     ----------
     feature
         A key of `MATRIX_REPORTS`.
-    matrix
-        Which of the two.
-    sweep
-        Its ranges.
     power
         Shape (n_bins, matrix.pulses), of pulse-Doppler or noise map; a snapshot.
     counter
@@ -223,18 +219,10 @@ class ProfileRun:
 
     Parameters
     ----------
-    sweep
-        Its radar.
-    processing
-        What it makes of the frames.
     settings
         Called for what to send; it may change at any time.
-    first_counter
-        Of its first frame.
     zero_ns
         Device time of scene time 0, ns.
-    clock
-        The module's own.
     sampling_hz
         Sampling frequency that baseband messages claim.
     """
@@ -396,18 +384,10 @@ class ProfileStream(MessageStream):
 
     Parameters
     ----------
-    module
-        Whose modes and settings to obey.
-    source
-        What its radar sees.
     pace
         Whether anything may be dropped.
-    clock
-        The module's own: its start skew and its rate error.
     scene_time_zero_ns
         Device time of scene time 0, and of power-up [ns].
-    largest_block
-        Most frames synthesised at once.
     """
 
     def __init__(

@@ -62,8 +62,6 @@ def drift(
     ----------
     true_poses
         Shape (n, 3), float64: x [m], y [m], heading [rad, continuous], any frame.
-    model
-        Standard deviations.
     seed
         Selects the run.
     unseen
