@@ -3,8 +3,8 @@
 `Device` joins the parts: the connection turns bytes into commands, `commands` answers them, a
 `MessageStream` makes messages of its own accord, an `Outbox` holds what waits for the line.
 
-A reset: ACK, half a second later the module restarts, is deaf for two seconds, then sends BOOTING
-and READY. Whoever owns the port asks `Device.port_present` whether it is there meanwhile.
+A reset: ACK, half a second later the module restarts, receives nothing for two seconds, then sends
+BOOTING and READY. Whatever owns the port asks `Device.port_present` whether it is there meanwhile.
 
 Source: protocol reference 8.
 """
@@ -265,7 +265,7 @@ class Device:
 
     @property
     def listens(self) -> bool:
-        """Whether it hears the host: not while it starts or sleeps."""
+        """Whether it receives: not while it starts or sleeps."""
         return self._ready_ns is None and not self._module.asleep
 
     def crash(self, reason: str, now_ns: int) -> None:

@@ -77,7 +77,7 @@ class FaultSession:
         self.truth = TruthLog()
         if truth is not None:
             try:
-                # by lines: whoever follows the file sees a fault when it is injected
+                # by lines: a fault is in the file as soon as it is injected
                 stream = cleanup.enter_context(truth.open("w", buffering=1, encoding="utf-8"))
             except OSError as error:
                 raise LinkError(f"{truth}: cannot write the truth log: {error.strerror}") from error
@@ -293,7 +293,7 @@ def proxy(options: Namespace, stop: StopFlag, warn: Warn) -> None:
 
 def _link_options(options: Namespace, warn: Warn) -> LinkOptions:
     if options.tcp is not None and not is_loopback(options.tcp_host):
-        warn(f"--tcp-host {options.tcp_host}: whoever reaches this address can command the modules")
+        warn(f"--tcp-host {options.tcp_host}: everyone who reaches it can command the modules")
     kind, number = options.link
     return LinkOptions(
         kind=kind,
@@ -341,7 +341,7 @@ def _run(
     cleanup: contextlib.ExitStack,
 ) -> None:
     if stop.requested:
-        return  # nobody shall learn of ports that go away at once
+        return  # do not announce ports that go away at once
     server = Server(ports.ports, [*services, *ports.services])
     cleanup.callback(server.close)
     stop.attach(server.stop)
@@ -360,6 +360,6 @@ def _say_ready(ready: dict[str, object]) -> None:
         sys.stdout.write(json.dumps(ready, separators=(",", ":")) + "\n")
         sys.stdout.flush()
     except OSError as error:
-        # nobody will ever learn our ports; and the interpreter must not try to flush again
+        # nobody can use ports that were not announced; the interpreter must not flush again
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise CannotServeError(f"stdout: cannot write the ready line: {error.strerror}") from error

@@ -395,7 +395,7 @@ def _with_low_3(value: int, byte: int) -> int:
 def _ignored(settings: ChipSettings, byte: int) -> ChipSettings:
     """Leave alone what follows from other settings: bytes per counter, and the receive delay.
 
-    Assumed: the reference says what they hold, not what writing them does to the frames.
+    Assumed: the reference gives what they hold, not what writing them does to the frames.
     """
     return settings
 
@@ -512,7 +512,7 @@ class Chip:
     Parameters
     ----------
     largest_block
-        Most frames synthesised at once: many are cheap each, few disturb nobody's deadline.
+        Most frames synthesised at once: large blocks cost less per frame, small ones delay others less.
     block_phase
         Blocks end with counters congruent to it modulo `largest_block`, so that of many radars
         in step only some synthesise at a time; None: each block is as long as it may be.

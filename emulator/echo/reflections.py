@@ -291,7 +291,7 @@ def direct_reflections(scatterers: Scatterers, view: Viewpoint) -> Reflections:
     if round_ones.any():
         radius_m = scatterers.radius_m
         surface_m = np.maximum(range_m - radius_m, NEAREST_M)
-        # Its mirror image is nearer the smaller the radius; inside it, nothing is heard.
+        # Its mirror image is nearer the smaller the radius; inside it, nothing is received.
         spread = np.sqrt((1 + radius_m) / (surface_m + radius_m)) * (range_m > radius_m)
         strength = strength * np.where(round_ones, spread, 1.0)
     return Reflections(

@@ -81,7 +81,7 @@ def _auxiliary(v: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.
 Array = NDArray[np.float64]
 
 TOUCHING_M = 0.02
-"""Ends that come this near to another face meet it: nobody draws a plan to the millimetre."""
+"""Ends that come this near to another face meet it: plans are not drawn to the millimetre."""
 ON_THE_FACE_M = 1e-3
 """What is nearer to a face than this stands on it: neither before it nor behind."""
 _RIGHT_ANGLE_TOLERANCE = math.sin(math.radians(1.0))
@@ -93,7 +93,7 @@ class Closure:
     """An end of a face that stands on another one at a right angle.
 
     For a radar in the quarter between the two they are an inner corner: with the corner's mirror
-    image the field is complete, and there is no edge to be heard. From behind an L it is one.
+    image the field is complete, and no edge is seen. From behind an L it is one.
 
     Attributes
     ----------
@@ -348,13 +348,13 @@ def face_reflections(faces: Faces, view: Viewpoint, wavelength_m: float) -> Refl
     height = faces.height(view.x_m, view.y_m)
     along = faces.along(view.x_m, view.y_m)
     mirror_m = np.abs(height)
-    heard = MIRROR_AMPLITUDE_1M * faces.reflection * ((height > 0) | ~faces.outward_only)
+    seen = MIRROR_AMPLITUDE_1M * faces.reflection * ((height > 0) | ~faces.outward_only)
     closed = closed_ends(faces, height)
     foot_x, foot_y = faces.at(along)
     on_it = (along >= 0) & (along <= faces.length_m)
 
     range_m = [mirror_m]
-    amplitude = [heard * on_it / np.maximum(mirror_m, NEAREST_M)]
+    amplitude = [seen * on_it / np.maximum(mirror_m, NEAREST_M)]
     phase_rad = [np.full(height.shape, np.pi)]
     at_x, at_y = [foot_x], [foot_y]
     for end, end_x, end_y, beyond in (
@@ -366,7 +366,7 @@ def face_reflections(faces: Faces, view: Viewpoint, wavelength_m: float) -> Refl
         obliquity = mirror_m / np.maximum(end_m, NEAREST_M)
         range_m.append(end_m)
         amplitude.append(
-            heard * size * obliquity * ~closed[:, :, end] / np.maximum(end_m, NEAREST_M)
+            seen * size * obliquity * ~closed[:, :, end] / np.maximum(end_m, NEAREST_M)
         )
         # Within the face an edge takes away from the mirror, beyond it an edge stands for it.
         phase_rad.append(lag_rad + np.where(beyond, np.pi, 0.0))

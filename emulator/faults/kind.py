@@ -1,12 +1,12 @@
 """What a kind of fault is: one row of the catalogue, and what its effect gets and returns.
 
-Effects are pure but for the `Dice` they are handed. There are three sorts, by what they touch:
+Effects are pure but for the `Rng` they are given. There are three sorts, by what they touch:
 
-- of a packet to the host: ``(packet, parameters, dice, context) -> pieces``;
-- of a command to the module: ``(packet, parameters, dice, context) -> Handling``;
-- of a moment: ``(parameters, dice) -> actions``.
+- of a packet to the host: ``(packet, parameters, rng, context) -> pieces``;
+- of a command to the module: ``(packet, parameters, rng, context) -> Handling``;
+- of a moment: ``(parameters, rng) -> actions``.
 
-None instead of a result says that there was nothing to spoil; the fault then waits for a packet
+None instead of a result means that there was nothing to spoil; the fault then waits for a packet
 that suits it, and nothing is written to the truth log.
 """
 
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.device import ByteDevice
-from emulator.scene.philox import Dice
+from emulator.scene.philox import Rng
 from emulator.scene.tables import Table
 from xethru_protocol.driver.frames import Lattice
 from xethru_protocol.wire.codes import ElementType, ResponseCode
@@ -149,7 +149,7 @@ class EmulatedInside(Protocol):
 
     @property
     def listens(self) -> bool:
-        """Whether it hears the host: not while it starts or sleeps."""
+        """Whether it receives: not while it starts or sleeps."""
         ...
 
     def crash(self, reason: str, now_ns: int) -> None:
@@ -247,11 +247,11 @@ class Handling:
     Attributes
     ----------
     to_module
-        What the module gets to hear.
+        What the module gets.
     command
         The command that this is; None if the module will not answer it.
     to_host
-        What the host hears at once.
+        What the host gets at once.
     """
 
     to_module: bytes = b""
@@ -279,17 +279,17 @@ class Unplug:
 
 
 @dataclass(frozen=True, slots=True)
-class SayToModule:
+class SendToModule:
     """The module carries out a command that no host sent, and does not answer it."""
 
     command: Command[Response]
 
 
 Pieces = Sequence[Piece] | None
-Action = Restart | Unplug | SayToModule
-PacketEffect = Callable[[bytes, Any, Dice, Context], Pieces]
-CommandEffect = Callable[[bytes, Any, Dice, Context], Handling | None]
-MomentEffect = Callable[[Any, Dice], Sequence[Action]]
+Action = Restart | Unplug | SendToModule
+PacketEffect = Callable[[bytes, Any, Rng, Context], Pieces]
+CommandEffect = Callable[[bytes, Any, Rng, Context], Handling | None]
+MomentEffect = Callable[[Any, Rng], Sequence[Action]]
 
 
 Effect = PacketEffect | CommandEffect | MomentEffect

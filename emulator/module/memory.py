@@ -294,7 +294,7 @@ class FaultCounter:
         return self.count >= SAFE_MODE_FAULTS
 
     @property
-    def hopeless(self) -> bool:
+    def needs_bootloader(self) -> bool:
         return self.count > BOOTLOADER_FAULTS
 
     def fault(self, now_ns: int) -> None:

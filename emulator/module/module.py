@@ -80,13 +80,13 @@ class Module:
     uart_baudrate
         Rate of its UART; a change takes effect half a second after its ACK.
     trace_level
-        How much it tells as DATA STRING.
+        How much it reports as DATA STRING.
     certification
         Whether it starts in certification mode.
     noise_maps
-        Returns the current noise maps, slow and fast, as bytes; whoever computes them sets it.
+        Returns the current noise maps, slow and fast, as bytes; set by what computes them.
     restart
-        A restart asked for; whoever keeps the time carries it out.
+        A restart asked for; the owner of the clock carries it out.
     notices
         Messages to send before the reply.
     reply_delay_ns
@@ -181,8 +181,8 @@ class Module:
         with suppress(Refusal):  # no room for a dump: the firmware has nowhere else to put it
             self.files.replace(CRASH_DUMP, dump)
         self.save()
-        self.restart = Restart(into_bootloader=self.faults.hopeless, at_ns=now_ns)
-        if self.faults.hopeless:
+        self.restart = Restart(into_bootloader=self.faults.needs_bootloader, at_ns=now_ns)
+        if self.faults.needs_bootloader:
             self.faults.clear()
 
     def load_profile(self, profile_id: int) -> None:
@@ -217,7 +217,7 @@ class Module:
         )
 
     def trace(self, level: TraceLevel, text: str) -> None:
-        """Tell something as DATA STRING, if the host wants to know that much."""
+        """Send a DATA STRING if the trace level includes it."""
         if level <= self.trace_level:
             self.notices.append(m.DataString(text=text))
 

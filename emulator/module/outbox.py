@@ -69,7 +69,7 @@ class Outbox(Protocol):
         ...
 
     def put(self, kind: MessageKind, message: Response, now_ns: int) -> None:
-        """Queue one message, or lose one, as the queue's rule says."""
+        """Queue one message, or lose one, as the queue's rule demands."""
         ...
 
     def refill_on_time(self, stream: MessageStream, now_ns: int) -> None:
@@ -170,7 +170,7 @@ class FirmwareOutbox:
 
     @property
     def takes_replies(self) -> bool:
-        """Whether another reply displaces a frame at worst, and not a reply nobody has read."""
+        """Whether another reply displaces a frame at worst, and not an unread reply."""
         if len(self._queue) < self.SLOTS:
             return True
         return any(queued.kind is not MessageKind.REPLY for queued in self._queue)

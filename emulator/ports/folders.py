@@ -5,7 +5,7 @@ emulator: its ready line with a ``pid`` added; and the ports of those that were 
 What belongs to a process that is gone is stale, and removed by the next emulator that starts.
 
 A document is replaced as a whole, so that a crash of the emulator leaves the old one or the new
-one. What cannot be read is told in one line and left alone until the module saves; the module
+one. What cannot be read is reported in one line and left alone until the module saves; the module
 starts as shipped.
 """
 
@@ -41,7 +41,7 @@ def fresh_port_folder() -> Path:
 
 
 def _private_run_directory() -> Path | None:
-    """Create the folder; None when it cannot be made or belongs to somebody else."""
+    """Create the folder; None when it cannot be made or belongs to another user."""
     folder = run_directory()
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
@@ -131,7 +131,7 @@ def link_folder(wanted: Path | None) -> Iterator[Path]:
             yield wanted.absolute()
         finally:
             if not existed:
-                with contextlib.suppress(OSError):  # somebody else uses it too
+                with contextlib.suppress(OSError):  # it is used otherwise, too
                     wanted.rmdir()
 
 
@@ -201,7 +201,7 @@ def make_state_directory(directory: Path) -> None:
     Raises
     ------
     OSError
-        When nothing could be kept there: told before the start, not at the first save.
+        When nothing could be kept there: better before the start than at the first save.
     """
     directory.mkdir(parents=True, exist_ok=True)
     if not os.access(directory, os.R_OK | os.W_OK | os.X_OK):

@@ -137,7 +137,7 @@ class NamedDevice:
     Attributes
     ----------
     start_skew_ns
-        Scene time at which it takes the frame of counter 0; None where nobody knows.
+        Scene time at which it takes the frame of counter 0; None where unknown.
     present
         Whether its own port is there at a time, ns; None if it always is.
     uart_baud
@@ -191,7 +191,7 @@ class DevicePorts:
     ports: list[Port] = field(default_factory=list)
     services: list[Service] = field(default_factory=list)
     moved: Callable[[], None] = field(default=lambda: None)
-    _words: list[tuple[NamedDevice, PtyLink, TcpLink | None]] = field(default_factory=list)
+    _lines: list[tuple[NamedDevice, PtyLink, TcpLink | None]] = field(default_factory=list)
 
     def entries(self) -> list[dict[str, object]]:
         return [
@@ -202,7 +202,7 @@ class DevicePorts:
                 "start_skew_ns": named.start_skew_ns,
                 "tcp": None if tcp is None else tcp.port,
             }
-            for named, link, tcp in self._words
+            for named, link, tcp in self._lines
         ]
 
     def add(
@@ -246,7 +246,7 @@ class DevicePorts:
             moved=lambda: self.moved(),
         )
         self.services.append(plug)
-        self._words.append((named, link, tcp))
+        self._lines.append((named, link, tcp))
 
 
 def open_ports(

@@ -21,7 +21,7 @@ Source: protocol reference 4.6 and 7.2.
 Noise map control chooses where the map of a starting profile comes from (`map_source`): a stored
 one, the default - the receiver noise of a nominal module, the same in every bin - or one created
 from the first 100 s after the matrices are full. Afterwards it follows the room with a time
-constant of ten minutes, but not in bins where somebody may be. The two last numbers of that
+constant of ten minutes, but not in bins where a person may be. The two last numbers of that
 sentence and the default map are ours; the reference names the 100 s only.
 
 Source: protocol reference 4.6.

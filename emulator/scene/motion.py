@@ -174,7 +174,7 @@ class PersonSpec(Table):
     """One person, in the world frame.
 
     It is in the scene from ``enters_s`` to ``leaves_s`` (for ever if that is left out), and walks
-    from the moment it enters. ``walk`` says what happens at the last waypoint: ``once`` stays
+    from the moment it enters. ``walk`` selects what happens at the last waypoint: ``once`` stays
     there, ``to_and_fro`` turns back, ``round`` goes on to the first one. One waypoint: it stands.
     ``rcs_m2`` is its radar cross section; breathing is ``breaths_per_min`` and the amplitude of
     the chest (half of its travel). The reflection phase is fixed by the name.

@@ -25,7 +25,7 @@ from emulator.faults.kind import (
 from emulator.faults.kinds import KINDS
 from emulator.faults.plan import FaultPlan, TruthLog, fault_spec
 from emulator.module.memory import Identity
-from emulator.scene.philox import Dice
+from emulator.scene.philox import Rng
 from emulator.scene.scene import empty_room
 from xethru_protocol.driver.frames import Lattice
 from xethru_protocol.wire import messages as m
@@ -140,7 +140,7 @@ def effect_of(kind: Kind, packet: bytes, seed: int) -> Any:  # noqa: ANN401 - of
         lattice=LATTICE,
     )
     effect = cast("Any", kind.effect)
-    return effect(packet, kind.parameters(), Dice(seed), context)
+    return effect(packet, kind.parameters(), Rng(seed), context)
 
 
 @pytest.mark.parametrize("kind", [k for k in KINDS if KINDS[k].target is not Target.MOMENT])
@@ -161,16 +161,16 @@ def test_effects_are_pure_and_take_any_bytes(kind: str, packet: bytes, seed: int
 
 @given(seed=st.integers(0, 2**64 - 1), count=st.integers(1, 1000))
 def test_dice_stay_in_their_range(seed: int, count: int) -> None:
-    dice = Dice(seed)
-    assert 0 <= dice.below(count) < count
-    assert 0 <= dice.uniform() < 1
-    assert abs(dice.normal()) <= 6
+    rng = Rng(seed)
+    assert 0 <= rng.below(count) < count
+    assert 0 <= rng.uniform() < 1
+    assert abs(rng.normal()) <= 6
 
 
 def test_dice_are_fair() -> None:
-    dice = Dice(1)
-    normals = np.array([dice.normal() for _ in range(4000)])
+    rng = Rng(1)
+    normals = np.array([rng.normal() for _ in range(4000)])
     assert abs(normals.mean()) < 4 / 4000**0.5
     assert abs(normals.var() - 1) < 4 * (2 / 4000) ** 0.5
-    counts = np.bincount([dice.below(6) for _ in range(6000)])
+    counts = np.bincount([rng.below(6) for _ in range(6000)])
     assert np.abs(counts - 1000).max() < 4 * (6000 * 5 / 36) ** 0.5
