@@ -14,7 +14,7 @@ from pathlib import Path
 
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source
-from emulator.faults.faulty_device import FaultyDevice, wrap
+from emulator.faults.faulty_device import FaultyDevice
 from emulator.faults.kind import InnerDevice
 from emulator.faults.plan import FaultPlan, FaultPlanError, TruthLog, load_plan
 from emulator.module.memory import Identity, Memory
@@ -84,7 +84,7 @@ class FaultSession:
             self.truth = TruthLog(stream.write)
 
     def wrap(self, device: InnerDevice, name: str) -> FaultyDevice:
-        faulty = wrap(device, name, self._plan, self.truth, zero_ns=self._zero_ns)
+        faulty = FaultyDevice(device, name, self._plan, self.truth, zero_ns=self._zero_ns)
         self.devices[name] = faulty
         return faulty
 

@@ -512,7 +512,8 @@ class Chip:
     Parameters
     ----------
     largest_block
-        Most frames synthesised at once: large blocks cost less per frame, small ones delay others less.
+        Most frames synthesised at once: large blocks cost less per frame, small ones delay other
+        radars less.
     block_phase
         Blocks end with counters congruent to it modulo `largest_block`, so that of many radars
         in step only some synthesise at a time; None: each block is as long as it may be.

@@ -253,6 +253,10 @@ class FaultyDevice:
     ----------
     name
         Of the radar, as scenarios and the truth log call it.
+    plan
+        None: no faults until some are added.
+    truth
+        None: a log of its own, in memory.
     zero_ns
         Device time from which the scenario counts; its first call if None.
     """
@@ -261,14 +265,15 @@ class FaultyDevice:
         self,
         inner: InnerDevice,
         name: str,
-        plan: FaultPlan,
-        truth: TruthLog,
+        plan: FaultPlan | None = None,
+        truth: TruthLog | None = None,
         *,
         zero_ns: int | None = None,
     ) -> None:
         self.inner = inner
         self.name = name
-        self.truth = truth
+        plan = plan or FaultPlan()
+        self.truth = TruthLog() if truth is None else truth
         self._seed = plan.seed
         self._zero_ns = zero_ns
         self._armed: list[Armed] = []
@@ -554,29 +559,6 @@ class FaultyDevice:
         if self._zero_ns is None:
             self._zero_ns = now_ns
         return now_ns - self._zero_ns
-
-
-def wrap(
-    device: InnerDevice,
-    name: str,
-    plan: FaultPlan | None = None,
-    truth: TruthLog | None = None,
-    *,
-    zero_ns: int | None = None,
-) -> FaultyDevice:
-    """Return a device with the faults of a plan.
-
-    Parameters
-    ----------
-    plan
-        None: no faults until some are added.
-    truth
-        None: a log of its own, in memory.
-    zero_ns
-        Device time from which the scenario counts; its first call if None.
-    """
-    truth = TruthLog() if truth is None else truth
-    return FaultyDevice(device, name, plan or FaultPlan(), truth, zero_ns=zero_ns)
 
 
 class Injection:

@@ -20,7 +20,7 @@ import stat
 import tempfile
 from base64 import b64decode, b64encode
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -253,7 +253,7 @@ class DirectoryMemory:
             os.replace(unfinished, self._path)
         except OSError as error:
             self._warn(f"{self._path}: the state of the module is not kept: {error}")
-            with suppress(OSError):
+            with contextlib.suppress(OSError):
                 unfinished.unlink(missing_ok=True)
 
 
@@ -264,15 +264,13 @@ def _document(state: SavedState, serial: str) -> _State:
         profile_id=state.start.profile_id,
         profiles=[
             _Profile(
-                profile_id=profile_id,
-                zone_m=list(settings.zone_m),
-                sensitivity=settings.sensitivity,
-                tx_center_frequency=settings.tx_center_frequency,
-                led=settings.led,
-                noise_map_control=settings.noise_map_control,
-                noise_map_interval_min=settings.noise_map_interval_min,
-                outputs=list(settings.outputs.items()),
-                debug_outputs=list(settings.debug_outputs.items()),
+                **asdict(settings)
+                | {
+                    "profile_id": profile_id,
+                    "zone_m": list(settings.zone_m),
+                    "outputs": list(settings.outputs.items()),
+                    "debug_outputs": list(settings.debug_outputs.items()),
+                }
             )
             for profile_id, settings in state.profiles.items()
         ],
@@ -290,14 +288,12 @@ def _saved(state: _State) -> SavedState:
         start=Start(state=State[state.start], profile_id=state.profile_id),
         profiles={
             profile.profile_id: ProfileSettings(
-                zone_m=(profile.zone_m[0], profile.zone_m[1]),
-                sensitivity=profile.sensitivity,
-                tx_center_frequency=profile.tx_center_frequency,
-                led=profile.led,
-                noise_map_control=profile.noise_map_control,
-                noise_map_interval_min=profile.noise_map_interval_min,
-                outputs=dict(profile.outputs),
-                debug_outputs=dict(profile.debug_outputs),
+                **profile.model_dump(exclude={"profile_id"})
+                | {
+                    "zone_m": (profile.zone_m[0], profile.zone_m[1]),
+                    "outputs": dict(profile.outputs),
+                    "debug_outputs": dict(profile.debug_outputs),
+                }
             )
             for profile in state.profiles
         },

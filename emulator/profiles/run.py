@@ -13,8 +13,8 @@ the next one, so that the module's queue of 50 slots can take them. Pulse-Dopple
 from when they are full, noise maps from when they are in use.
 
 Frames without a message to the host are not synthesised: a run that must catch up with a long
-silence goes through the frames that fill the matrices (and those that make the noise map), which leaves the
-same state but for the noise map's adaptation.
+silence goes through the frames that fill the matrices (and those that make the noise map), which
+leaves the same state but for the noise map's adaptation.
 
 The radar runs on the emulator's clock under both paces: a presence message a second is what makes
 a profile useful to a host. Under `Pace.REALTIME` counter k is due at

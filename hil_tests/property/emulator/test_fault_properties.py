@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from emulator.chip import Pace
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source
-from emulator.faults.faulty_device import wrap
+from emulator.faults.faulty_device import FaultyDevice
 from emulator.faults.kind import (
     Context,
     Handling,
@@ -93,7 +93,7 @@ def transcript(device: InnerDevice, chunk: int = 7) -> list[tuple[int, bytes]]:
 
 
 def test_without_a_plan_every_byte_is_the_same() -> None:
-    assert transcript(wrap(module(), "radar_1")) == transcript(module())
+    assert transcript(FaultyDevice(module(), "radar_1")) == transcript(module())
 
 
 @pytest.mark.parametrize(
@@ -101,14 +101,14 @@ def test_without_a_plan_every_byte_is_the_same() -> None:
 )
 def test_a_fault_that_never_fires_changes_no_byte(kind: str) -> None:
     plan = FaultPlan(fault=(fault_spec(kind, at_s=3600.0),))
-    assert transcript(wrap(module(), "radar_1", plan)) == transcript(module())
+    assert transcript(FaultyDevice(module(), "radar_1", plan)) == transcript(module())
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_one_seed_gives_the_same_bytes(kind: str) -> None:
     plan = FaultPlan(seed=5, fault=(fault_spec(kind, probability=0.5, count=0),))
     truths = TruthLog(), TruthLog()
-    first, second = (transcript(wrap(module(), "radar_1", plan, truth)) for truth in truths)
+    first, second = (transcript(FaultyDevice(module(), "radar_1", plan, truth)) for truth in truths)
     assert first == second
     assert truths[0].records == truths[1].records
 
@@ -116,7 +116,7 @@ def test_one_seed_gives_the_same_bytes(kind: str) -> None:
 def test_another_seed_or_radar_gives_other_bytes() -> None:
     def bytes_of(seed: int, radar: str) -> list[tuple[int, bytes]]:
         fault = fault_spec("flip_bits", packet="frame", probability=0.5, count=0, bits=20)
-        return transcript(wrap(module(), radar, FaultPlan(seed=seed, fault=(fault,))))
+        return transcript(FaultyDevice(module(), radar, FaultPlan(seed=seed, fault=(fault,))))
 
     assert bytes_of(1, "a") != bytes_of(2, "a")
     assert bytes_of(1, "a") != bytes_of(1, "b")
@@ -125,7 +125,7 @@ def test_another_seed_or_radar_gives_other_bytes() -> None:
 def test_a_plan_for_another_radar_changes_nothing() -> None:
     plan = FaultPlan(fault=(fault_spec("silent", radar=["other"]),))
     truth = TruthLog()
-    assert transcript(wrap(module(), "radar_1", plan, truth)) == transcript(module())
+    assert transcript(FaultyDevice(module(), "radar_1", plan, truth)) == transcript(module())
     assert not truth.records
 
 
