@@ -1,8 +1,8 @@
-"""Presets and settings: where a configuration comes from, and one clear line where it cannot.
+"""Settings of SLAM and the presets that hold them.
 
 Wherever the paper's text leaves a choice, or prints something an expert would do otherwise, the
-choice is an option here. The default is what is printed; each option's docstring says what the
-other values correct. Lengths in metres, angles in radians unless the name says degrees.
+choice is an option here. The default is what is printed; the comment of each other value says what
+it corrects. Lengths in metres, angles in radians unless the name says degrees.
 """
 
 from __future__ import annotations
@@ -10,10 +10,13 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import (
     BaseModel,
     ConfigDict,
@@ -136,7 +139,7 @@ class _Model(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _as_written(cls, value: object, info: ValidationInfo) -> object:
-        """Refuse what Python would read as a number: true, false and, in a file, quoted text."""
+        """Reject what Python would read as a number: true, false, quoted text in a file."""
         if isinstance(value, bool):
             raise ValueError("must be a number or a name, not true or false")
         assert info.field_name is not None
@@ -201,7 +204,6 @@ class TrilaterationConfig(_Model):
 
     @property
     def field_of_view_rad(self) -> float:
-        """Return the opening angle of one radar, theta of the paper."""
         return math.radians(self.field_of_view_deg)
 
 
@@ -225,6 +227,69 @@ class ClusteringConfig(_Model):
     evidence: Evidence = Evidence.CENTROID
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WheelNoise:
+    """Errors of wheel odometry: three calibration errors and white noise.
+
+    A step of true body increment (dx, dy) of length D and turn a is reported as
+    ``(1 + s) (dx, dy) + white`` and ``(1 + w) a + kappa D + white``.
+    """
+
+    # White noise of a step, in proportion to the square root of its length
+    along_m_per_sqrt_m: float = 2e-3
+    across_m_per_sqrt_m: float = 6e-4
+    heading_rad_per_sqrt_m: float = 4.2e-3
+    heading_rad_per_rad: float = 0.01  # white noise of a turn, in proportion to its angle
+    # Standard deviations of s (mean wheel radius), w (track width) and kappa (difference of the
+    # radii) at the start
+    scale_sigma: float = 0.007
+    turn_scale_sigma: float = 0.007
+    curvature_sigma_rad_per_m: float = 0.0042
+    # How far each of the three wanders per square root of a metre travelled, as a share of its
+    # standard deviation; a radian turned counts as ``walk_lever_m``. Zero: constants.
+    walk_per_sqrt_m: float = 0.0
+    walk_lever_m: float = 0.3  # see above
+    # Smallest standard deviation of one step
+    floor_m: float = 3e-6
+    floor_rad: float = 1e-6
+
+    @property
+    def calibration_sigmas(self) -> tuple[float, float, float]:
+        return (self.scale_sigma, self.turn_scale_sigma, self.curvature_sigma_rad_per_m)
+
+    def step_variances(self, distance_m: float, turn_rad: float) -> tuple[float, float, float]:
+        """Return the variances of one step: along [m^2], across [m^2], heading [rad^2]."""
+        floor = self.floor_m**2
+        heading = self.heading_rad_per_sqrt_m * math.sqrt(distance_m)
+        heading += self.heading_rad_per_rad * abs(turn_rad)
+        return (
+            self.along_m_per_sqrt_m**2 * distance_m + floor,
+            self.across_m_per_sqrt_m**2 * distance_m + floor,
+            heading**2 + self.floor_rad**2,
+        )
+
+    def step_sigmas(self, steps: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return standard deviations along [m], across [m] and of the turn [rad], shape (n, 3).
+
+        ``steps`` of shape (n, 3): ux [m], uy [m], ua [rad], body frame at the start of each. Here
+        the floors are bounds; in ``step_variances`` their squares are added.
+        """
+        distance = np.sqrt(steps[:, 0] ** 2 + steps[:, 1] ** 2)
+        root = np.sqrt(distance)
+        turn = self.heading_rad_per_sqrt_m * root + self.heading_rad_per_rad * np.abs(steps[:, 2])
+        return np.column_stack(
+            [
+                np.maximum(self.along_m_per_sqrt_m * root, self.floor_m),
+                np.maximum(self.across_m_per_sqrt_m * root, self.floor_m),
+                np.maximum(turn, self.floor_rad),
+            ]
+        )
+
+    def walk_variance(self, distance_m: float, turn_rad: float) -> float:
+        """Return the variance one step adds to a calibration error, in units of its own."""
+        return self.walk_per_sqrt_m**2 * (distance_m + self.walk_lever_m * abs(turn_rad))
+
+
 class MotionConfig(_Model):
     """Motion uncertainty R of the paper, and the coefficients of its proportional alternative."""
 
@@ -235,6 +300,18 @@ class MotionConfig(_Model):
     across_m_per_sqrt_m: NonNegative = 6e-4
     heading_rad_per_sqrt_m: NonNegative = 4.2e-3
     heading_rad_per_rad: NonNegative = 0.01
+
+    @property
+    def wheels(self) -> WheelNoise:
+        """Return the white noise of ``proportional``, without floors."""
+        return WheelNoise(
+            along_m_per_sqrt_m=self.along_m_per_sqrt_m,
+            across_m_per_sqrt_m=self.across_m_per_sqrt_m,
+            heading_rad_per_sqrt_m=self.heading_rad_per_sqrt_m,
+            heading_rad_per_rad=self.heading_rad_per_rad,
+            floor_m=0.0,
+            floor_rad=0.0,
+        )
 
 
 class ObservationConfig(_Model):
@@ -273,7 +350,7 @@ class AssociationConfig(_Model):
 
 
 class RobustConfig(_Model):
-    """What the robust back end is told of the radars; the wheels' errors come with the robot.
+    """The radars as the robust back end models them; the wheels' errors come with the robot.
 
     Limits of range are those of ``detection``; the window's rules say when a state is collected.
     """
@@ -307,12 +384,11 @@ class RobustConfig(_Model):
 
     @property
     def field_of_view_rad(self) -> float:
-        """Return the opening angle in radians."""
         return math.radians(self.field_of_view_deg)
 
 
 class SlamConfig(_Model):
-    """Everything one run of the pipeline is told."""
+    """All settings of one run of a pipeline."""
 
     detection: DetectionConfig = DetectionConfig()
     matched_filter: MatchedFilterConfig = MatchedFilterConfig()

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
-from slam.geometry import Mount, Rig, compose, transform, wrap_angle, wrap_angles
-from slam.paper.association import Association
-from slam.paper.pipeline import StepResult
+from slam.geometry import Mount, Rig, compose, has_moved, transform, wrap_angle, wrap_angles
+from slam.results import Association, StepResult
 
 Array = NDArray[np.float64]
 
@@ -235,7 +234,6 @@ def nees_pose(estimate: Array, covariance: Array, truth: Array) -> float:
 
 
 def _nearest(tree: KDTree, points: Array) -> tuple[Array, NDArray[np.intp]]:
-    """Return distance to and row of the nearest tree point, shape (n,) each."""
     distances, rows = tree.query(points)
     return np.asarray(distances, dtype=np.float64), np.asarray(rows, dtype=np.intp)
 
@@ -257,24 +255,18 @@ ECHO_LENGTH_M = 0.06
 def true_range_nis(result: StepResult, true_pose: Array, true_xy: Array) -> tuple[float, ...]:
     """Return the NIS (1 dof) of every range of the robust pipeline that is truly of a landmark.
 
-    The back end tells which ranges it expected, before it looked at any. Ground truth tells the
-    rest: a landmark of the map belongs to the true one nearest to it as seen from the robot,
+    The back end reports its predicted ranges, made before it looked at any. Ground truth decides
+    the rest: a landmark of the map belongs to the true one nearest to it as seen from the robot,
     within 0.15 m; of the detections the one nearest to that target's true range is of it, if no
-    farther than half a pulse, and if no other expected target is nearer to it. Gates play no part.
+    farther than half a pulse, and if no other predicted target is nearer to it. Gates play no part.
     Ranges that the front end itself called unfit for the back end are not judged.
 
-    Parameters
-    ----------
-    result
-        With a report.
-    true_pose
-        shape (3,), world frame, at ``result.t_ns``.
-    true_xy
-        shape (m, 2) [m], all true landmarks, world frame.
+    ``true_pose`` (3,) is that at ``result.t_ns``, ``true_xy`` (m, 2) all true landmarks, world
+    frame.
     """
-    if result.report is None or not result.report.expected or not len(true_xy):
+    if result.report is None or not result.report.predicted or not len(true_xy):
         return ()
-    expected = result.report.expected
+    expected = result.report.predicted
     points = transform(true_pose, np.array([each.point_m for each in expected]))
     antennas = transform(true_pose, np.array([each.antenna_m for each in expected]))
     gaps = np.linalg.norm(points[:, None] - true_xy[None], axis=2)
@@ -308,22 +300,17 @@ def true_range_nis(result: StepResult, true_pose: Array, true_xy: Array) -> tupl
 class TrueAssociationNis:
     """Collects the NIS of every observation against the landmark it is truly of, before gating.
 
-    Ground truth decides what an observation is of, its *origin*: the true landmark nearest to
-    where the true pose puts it, within 0.15 m, or clutter. A landmark of the map belongs to the
-    origin that more than half of its observations so far, its birth included, came from; so one
-    that wrong associations dragged from one true landmark to another changes its owner, and in
-    between has none. Of several that belong to one true landmark, the one with most observations
-    of it counts.
+    Ground truth decides the *origin* of an observation: the true landmark nearest to where the true
+    pose puts it, within 0.15 m, or clutter. A landmark of the map belongs to the origin that more
+    than half of its observations so far, its first included, came from; so one that wrong
+    associations dragged from one true landmark to another changes its owner, and in between has
+    none. Of several that belong to one true landmark, the one with most observations of it counts.
 
-    The observation itself is judged before it is counted and whatever the filter made of it, so a
-    tight gate cannot make the numbers look good. An observation of clutter, or of a true landmark
-    that no landmark of the map belongs to at that moment, is not counted: there is nothing it
-    could be compared with.
+    An observation is judged before it is counted and whatever the filter made of it, so a tight
+    gate cannot improve the numbers. An observation of clutter, or of a true landmark that no
+    landmark of the map belongs to at that moment, is not counted: there is no innovation.
 
-    Parameters
-    ----------
-    true_xy
-        shape (m, 2) [m], all true landmarks, world frame.
+    ``true_xy`` has shape (m, 2) [m], all true landmarks, world frame.
     """
 
     def __init__(self, true_xy: Array) -> None:
@@ -355,7 +342,7 @@ class TrueAssociationNis:
         return nearest if distances[nearest] <= LANDMARK_MATCH_M else None
 
     def _row_of(self, origin: int, association: Association) -> int | None:
-        """Return the candidate that is the true landmark's own, the older one of two equals."""
+        """Return the candidate that is the true landmark's own, the older of two."""
         best, most = None, 0
         for row, landmark_id in enumerate(association.candidate_ids):
             origins = self._origins.get(landmark_id)
@@ -380,25 +367,11 @@ DISTINCT_RAD = 0.1
 
 
 def observable_landmarks(rig: Rig, poses: Array, landmarks_xy: Array) -> NDArray[np.bool_]:
-    """Tell which landmarks lay in the joint view of one radar pair at nine or more poses.
+    """Tell which landmarks were in view of both radars of a pair at nine or more poses, shape (m,).
 
-    Joint view means within the 65 degree field of view and between 0.2 and 1.5 m of both radars
-    of one pair. Poses less than 5 mm and 0.1 rad from the last distinct one count with it, so
-    standing still adds nothing.
-
-    Parameters
-    ----------
-    rig
-        The mounts.
-    poses
-        shape (n, 3), true poses in time order, frame of the landmarks.
-    landmarks_xy
-        shape (m, 2) [m].
-
-    Returns
-    -------
-    observable
-        shape (m,).
+    In view means within the 65 degree field of view and between 0.2 and 1.5 m. Poses less than 5 mm
+    and 0.1 rad from the last distinct one count with it, so standing still adds nothing. ``poses``
+    (n, 3) are true poses in time order, frame of the landmarks, (m, 2) [m].
     """
     observable = np.zeros(len(landmarks_xy), dtype=bool)
     distinct = _distinct(poses)
@@ -411,14 +384,9 @@ def observable_landmarks(rig: Rig, poses: Array, landmarks_xy: Array) -> NDArray
 
 
 def _distinct(poses: Array) -> Array:
-    """Return the poses that differ from the one kept before them."""
     kept: list[Array] = []
     for pose in poses:
-        if (
-            not kept
-            or math.dist(kept[-1][:2], pose[:2]) >= DISTINCT_M
-            or abs(wrap_angle(pose[2] - kept[-1][2])) >= DISTINCT_RAD
-        ):
+        if not kept or has_moved(kept[-1], pose, DISTINCT_M, DISTINCT_RAD):
             kept.append(pose)
     return np.array(kept).reshape(-1, 3)
 

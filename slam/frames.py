@@ -10,6 +10,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.geometry import Rig
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RadarFrame:
@@ -45,7 +47,6 @@ class RadarFrame:
     limits: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse anything that is not one real-valued frame."""
         if self.samples.ndim != 1 or self.samples.dtype != np.float32:
             raise ValueError(
                 f"a radar frame is one row of float32 samples, not shape {self.samples.shape} "
@@ -114,9 +115,15 @@ class Detector(Protocol):
     ) -> list[tuple[Detection, ...]]:
         """Return what ``detect`` returns, for each frame with its range offset.
 
-        The frames may be of several radars; those that agree in length are filtered together.
+        The frames may be of several radars.
         """
         ...
+
+
+def detect_all(detector: Detector, frames: Sequence[RadarFrame], rig: Rig) -> tuple[Detection, ...]:
+    offsets_m = [rig.mounts[frame.radar].range_offset_m for frame in frames]
+    found = detector.detect_many(frames, offsets_m)
+    return tuple(detection for of_frame in found for detection in of_frame)
 
 
 def usable_samples(frame: RadarFrame) -> NDArray[np.bool_]:

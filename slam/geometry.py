@@ -39,10 +39,7 @@ def wrap_angles(angles_rad: ArrayLike) -> Array:
 
 
 def compose(first: Array, second: Array) -> Array:
-    """Return the pose ``second``, given in the frame of ``first``, in the frame of the outer world.
-
-    Shapes (3,) and (3,), result (3,) with the heading wrapped.
-    """
+    """Return ``second``, a pose in the frame of ``first``, in the outer frame; heading wrapped."""
     cosine, sine = math.cos(first[2]), math.sin(first[2])
     return np.array(
         [
@@ -54,15 +51,22 @@ def compose(first: Array, second: Array) -> Array:
 
 
 def between(origin: Array, pose: Array) -> Array:
-    """Return ``pose`` seen from ``origin``: the motion that leads from one to the other.
-
-    Shapes (3,) and (3,) in one frame, result (3,) in the frame of ``origin``, heading wrapped.
-    """
+    """Return ``pose`` seen from ``origin``, the motion from one to the other, heading wrapped."""
     cosine, sine = math.cos(origin[2]), math.sin(origin[2])
     dx, dy = pose[0] - origin[0], pose[1] - origin[1]
     return np.array(
         [cosine * dx + sine * dy, -sine * dx + cosine * dy, wrap_angle(pose[2] - origin[2])]
     )
+
+
+def has_moved(previous: Array, pose: Array, min_distance_m: float, min_turn_rad: float) -> bool:
+    """Tell whether two poses of shape (3,) differ by at least a distance or a turn.
+
+    The turn is wrapped, so a heading that passes pi is no motion.
+    """
+    distance_m = math.hypot(pose[0] - previous[0], pose[1] - previous[1])
+    turn_rad = abs(wrap_angle(pose[2] - previous[2]))
+    return distance_m >= min_distance_m or turn_rad >= min_turn_rad
 
 
 def transform(pose: Array, points: Array) -> Array:
@@ -106,15 +110,9 @@ class Mount:
 def mount_at(mount: Mount, motion: Array) -> Mount:
     """Return where a mount was when it sampled, in the body frame of another time.
 
-    ``m' = d + Rot(a) m`` and ``yaw' = yaw + a`` for a motion (d, a).
-
-    Parameters
-    ----------
-    mount
-        The mount on the robot.
-    motion
-        Shape (3,), [m, m, rad]: the pose of the robot at the sample's time, seen from its pose at
-        the time whose body frame is wanted (``between``).
+    ``m' = d + Rot(a) m`` and ``yaw' = yaw + a`` for a motion (d, a), [m, m, rad]: the pose of the
+    robot at the sample's time, seen from its pose at the time whose body frame is wanted
+    (``between``).
     """
     cosine, sine = math.cos(motion[2]), math.sin(motion[2])
     return replace(
@@ -159,12 +157,11 @@ class RadarPair:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rig:
-    """The mounts of all radars of one robot, index by index as frames name them."""
+    """The mounts of all radars of one robot, indexed as in frames."""
 
     mounts: tuple[Mount, ...]
 
     def pairs(self) -> tuple[RadarPair, ...]:
-        """Return every pair of mounts that look the same way, side by side."""
         pairs = []
         for first, second in combinations(range(len(self.mounts)), 2):
             pair = _side_by_side(self.mounts, first, second)
@@ -188,13 +185,9 @@ def paper_rig() -> Rig:
 def pair_of(first: int, second: int, mounts: tuple[Mount, Mount]) -> RadarPair | None:
     """Return the triangle base between two mounts; None where they are at the same place.
 
-    Parameters
-    ----------
-    first, second
-        What the pair calls its radars.
-    mounts
-        Where the two are, in one body frame: on the robot, or each moved to its own sample time.
-        The view is on the side of the base that the boresights look to.
+    ``first`` and ``second`` are their indices; the mounts are in one body frame: on the robot, or
+    each moved to its own sample time. The view is on the side of the base that the boresights look
+    to.
     """
     a, b = mounts
     baseline_m = math.hypot(b.x_m - a.x_m, b.y_m - a.y_m)

@@ -1,13 +1,171 @@
-"""What a SLAM pipeline reports of each step."""
+"""What a SLAM pipeline estimates and reports, and the protocol that every pipeline follows."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.config import SlamConfig
+from slam.frames import Detection, RadarFrame
+
 Array = NDArray[np.float64]
+
+POSE_SIZE = 3
+LANDMARK_SIZE = 2
+_NIS_DOF = 2
+
+PoseAt = Callable[[int], Array]
+"""Odometry pose at a session time [ns]: shape (3,), [x m, y m, heading rad], odometry frame."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fix:
+    """One trilaterated point, seen once.
+
+    Attributes
+    ----------
+    pair
+        Index into ``Rig.pairs()``.
+    t_ns
+        Session time of the pose in whose body frame the position is given; the two detections
+        keep their own times.
+    x_m, y_m
+        Position in that body frame.
+    detections
+        The two ranges it was made of, first and second radar of the pair.
+    """
+
+    pair: int
+    t_ns: int
+    x_m: float
+    y_m: float
+    detections: tuple[Detection, Detection]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Observation:
+    """A confirmed point, as the filter gets it: range and bearing from the base footprint.
+
+    Attributes
+    ----------
+    x_m, y_m
+        Position in the body frame of the window's first pose.
+    n_fixes, n_poses
+        How many fixes, from how many poses, the confirming cluster holds.
+    fixes
+        The fixes whose mean this is.
+    """
+
+    x_m: float
+    y_m: float
+    n_fixes: int
+    n_poses: int
+    fixes: tuple[Fix, ...]
+
+    @property
+    def range_m(self) -> float:
+        return math.hypot(self.x_m, self.y_m)
+
+    @property
+    def bearing_rad(self) -> float:
+        return math.atan2(self.y_m, self.x_m)
+
+
+def landmark_slice(row: int) -> slice:
+    begin = POSE_SIZE + LANDMARK_SIZE * row
+    return slice(begin, begin + LANDMARK_SIZE)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Belief:
+    """What the filter knows: a Gaussian over pose and landmarks.
+
+    Attributes
+    ----------
+    mean
+        shape (3 + 2 n,), [m, m, rad, m, m, ...], map frame; the heading lies in [-pi, pi).
+    covariance
+        shape (3 + 2 n, 3 + 2 n), symmetric.
+    landmark_ids
+        n ids in the order of the rows.
+    next_id
+        The id the next new landmark gets; ids are never used twice.
+    """
+
+    mean: Array
+    covariance: Array
+    landmark_ids: tuple[int, ...] = ()
+    next_id: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the shapes and make the fields read-only views.
+
+        The arrays are not copied, a dense map's covariance is large: whoever passes them must not
+        write to them any more.
+        """
+        size = POSE_SIZE + LANDMARK_SIZE * len(self.landmark_ids)
+        if self.mean.shape != (size,) or self.covariance.shape != (size, size):
+            raise ValueError(
+                f"{len(self.landmark_ids)} landmarks need mean ({size},) and covariance "
+                f"({size}, {size}), got {self.mean.shape} and {self.covariance.shape}"
+            )
+        for name, array in (("mean", self.mean), ("covariance", self.covariance)):
+            view = array.view()
+            view.setflags(write=False)
+            object.__setattr__(self, name, view)
+
+    @property
+    def pose(self) -> Array:
+        """Return [x m, y m, heading rad], map frame, shape (3,)."""
+        return self.mean[:POSE_SIZE]
+
+    @property
+    def pose_covariance(self) -> Array:
+        return self.covariance[:POSE_SIZE, :POSE_SIZE]
+
+    @property
+    def landmarks(self) -> Array:
+        """Return the landmarks' positions, shape (n, 2) [m], map frame, in row order."""
+        return self.mean[POSE_SIZE:].reshape(-1, LANDMARK_SIZE)
+
+    def landmark_covariance(self, row: int) -> Array:
+        block = landmark_slice(row)
+        return self.covariance[block, block]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Association:
+    """What became of one observation.
+
+    Attributes
+    ----------
+    landmark_id
+        The landmark it updated, or the one born from it.
+    is_new
+        True if the landmark was born from this observation.
+    mahalanobis_sq
+        shape (n,): squared distance to every landmark of the map before this observation, before
+        any gate; inf for one under the robot's own position. Two degrees of freedom.
+    candidate_ids
+        n landmark ids belonging to ``mahalanobis_sq``.
+    """
+
+    landmark_id: int
+    is_new: bool
+    mahalanobis_sq: Array
+    candidate_ids: tuple[int, ...]
+
+    @property
+    def nis(self) -> float | None:
+        """Return the normalised innovation squared (2 dof), None for a new landmark."""
+        if self.is_new:
+            return None
+        return float(self.mahalanobis_sq[self.candidate_ids.index(self.landmark_id)])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -44,7 +202,7 @@ class MapWall:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ExpectedRange:
+class PredictedRange:
     """A range that could have continued a track, as predicted before any was looked at.
 
     Attributes
@@ -75,7 +233,7 @@ class UpdateReport:
     ----------
     continued
         (radar, index of the range in its scan, landmark id).
-    born, seen_again
+    initialised, seen_again
         Ids of landmarks that tracklets made, or were recognised as.
     merged
         (kept, gone) ids.
@@ -86,22 +244,96 @@ class UpdateReport:
         and its degrees of freedom.
     relinearised
         Whether all poses were solved for.
-    expected
+    predicted
         Every range of a landmark, not of walls, that took part, measured or not.
     carried, lost, relocated
-        Whether it was found now that the robot was carried away; whether its place on the map is
-        unknown, so that pose and covariance say nothing but that; whether it was found again now.
+        Whether a kidnapping was detected now; whether the place on the map is unknown, so that pose
+        and covariance say nothing but that; whether the place was found again now.
     """
 
     continued: tuple[tuple[int, int, int], ...]
-    born: tuple[int, ...]
+    initialised: tuple[int, ...]
     seen_again: tuple[int, ...]
     merged: tuple[tuple[int, int], ...]
     deleted: tuple[int, ...]
     nis: float
     dof: int
     relinearised: bool
-    expected: tuple[ExpectedRange, ...] = ()
+    predicted: tuple[PredictedRange, ...] = ()
     carried: bool = False
     lost: bool = False
     relocated: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StepResult:
+    """One estimated state, and all that led to it.
+
+    Attributes
+    ----------
+    t_ns
+        Session time of the state; under the paper's window - 1 states before the newest one.
+    odometry_pose
+        shape (3,), odometry frame.
+    belief
+        Pose and landmarks after this state's observations, map frame.
+    detections, fixes
+        Ranges and trilaterated points of this state.
+    observations, associations
+        Points that passed the outlier filter, and what became of each.
+    rejected
+        Fixes of this state that no cluster confirmed.
+    report
+        Of the robust back end, which has no fixes nor observations.
+    range_sigmas_m
+        Standard deviation of every detection in the robust back end; infinite for one left out.
+    """
+
+    t_ns: int
+    odometry_pose: Array
+    belief: Belief
+    detections: tuple[Detection, ...]
+    fixes: tuple[Fix, ...] = ()
+    observations: tuple[Observation, ...] = ()
+    associations: tuple[Association, ...] = ()
+    rejected: tuple[Fix, ...] = ()
+    report: UpdateReport | None = None
+    range_sigmas_m: tuple[float, ...] = ()
+
+    @property
+    def nis(self) -> tuple[float, ...]:
+        """Return the normalised innovation squared (2 dof) of each landmark seen again."""
+        return tuple(a.nis for a in self.associations if a.nis is not None)
+
+    @property
+    def nis_per_dof(self) -> tuple[float, ...]:
+        """Return the same over its dof; of a report, that of all ranges together."""
+        if self.report is not None:
+            return (self.report.nis / self.report.dof,) if self.report.dof else ()
+        return tuple(nis / _NIS_DOF for nis in self.nis)
+
+
+class Slam(Protocol):
+    """The paper's pipeline or the robust one."""
+
+    config: SlamConfig
+
+    def step(
+        self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
+    ) -> tuple[StepResult, ...]:
+        """Take in the frames and odometry around one time; return the states now ready."""
+        ...
+
+    def step_detections(
+        self, detections: Sequence[Detection], pose_at: PoseAt, t_ns: int
+    ) -> tuple[StepResult, ...]:
+        """Do what ``step`` does, from ranges that some other front end found."""
+        ...
+
+    def flush(self) -> tuple[StepResult, ...]:
+        """Return the states still held back at the end of a run."""
+        ...
+
+    def wall_spans_m(self) -> Array:
+        """Return the ends of the reported stretches of wall, (k, 2, 2) [m], map frame."""
+        ...

@@ -47,7 +47,7 @@ from slam.app.rig.emulated import (
 )
 from slam.app.run.runner import run_slam
 from slam.app.session.log import SessionLog
-from slam.robust.pipeline import make_slam
+from slam.pipelines import make_slam
 from xethru_protocol.driver.radar import X4M300
 
 ROOT = REPOSITORY

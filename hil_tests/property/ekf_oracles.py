@@ -7,8 +7,7 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from slam.paper import ekf as ekf_slam
-from slam.paper.ekf import Belief
+from slam.results import Belief, landmark_slice
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -91,7 +90,7 @@ def expected(belief: Belief, row: int) -> Array:
 
 
 def observation_matrix(belief: Belief, row: int) -> Array:
-    block = ekf_slam.landmark_slice(row)
+    block = landmark_slice(row)
     H = np.zeros((2, len(belief.mean)))
     pose, landmark = belief.pose, belief.landmarks[row]
     H[:, :3] = complex_step(lambda p: observe(p, landmark.astype(np.complex128)), pose)

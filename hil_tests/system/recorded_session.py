@@ -26,7 +26,7 @@ from slam.app.rig.emulated import (
 from slam.app.run.runner import RunRecord, run_slam
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import settings_text
-from slam.robust.pipeline import make_slam
+from slam.pipelines import make_slam
 
 STARTED_UNIX_NS = 1_790_000_000_000_000_000
 LOST_RADAR, LOST_COUNTER = 1, 40

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import RadarFrame
-from slam.paper.pipeline import StepResult
+from slam.results import StepResult
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

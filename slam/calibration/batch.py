@@ -37,7 +37,7 @@ class Term(Protocol):
 
     @property
     def kernel(self) -> Kernel:
-        """What a residual costs."""
+        """The cost of a residual."""
 
     def residuals(self, state: Array) -> Array:
         """Return the whitened residuals, shape (m,)."""
@@ -60,84 +60,54 @@ class Square:
     """Least squares: for Gaussian noise without outliers."""
 
     def costs(self, residuals: Array) -> Array:
-        """Return r^2 / 2."""
         return residuals**2 / 2
 
     def weights(self, residuals: Array) -> Array:
-        """Return ones."""
         return np.ones_like(residuals)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cauchy:
-    """Lorentzian cost: an outlier pulls the less the farther it is off.
+    """Lorentzian cost: an outlier pulls the less the farther it is off."""
 
-    Attributes
-    ----------
-    scale
-        Residual, in standard deviations, at which the weight is one half; 2.385 keeps 95 % of the
-        efficiency under Gaussian noise.
-    """
-
+    # Residual, in standard deviations, at which the weight is one half; 2.385 keeps 95 % of the
+    # efficiency under Gaussian noise
     scale: float = 2.385
 
     def costs(self, residuals: Array) -> Array:
-        """Return c^2 / 2 ln(1 + r^2 / c^2)."""
         result: Array = self.scale**2 / 2 * np.log1p((residuals / self.scale) ** 2)
         return result
 
     def weights(self, residuals: Array) -> Array:
-        """Return 1 / (1 + r^2 / c^2)."""
         return 1 / (1 + (residuals / self.scale) ** 2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Damping:
-    """When the iteration stops and how it is held back.
+    """When the iteration stops and how it is held back."""
 
-    Attributes
-    ----------
-    initial, least
-        Share of the diagonal that is added to the normal equations, at first and at least.
-    most_iterations
-        Linear solves, refused steps included.
-    relative_decrease
-        The iteration has converged once an accepted step lowers the cost by less than this share
-        of it.
-    """
-
+    # Share of the diagonal that is added to the normal equations, at first and at least
     initial: float = 1e-4
     least: float = 1e-12
-    most_iterations: int = 60
+    most_iterations: int = 60  # linear solves, refused steps included
+    # The iteration has converged once an accepted step lowers the cost by less than this share of
+    # it
     relative_decrease: float = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Solution:
-    """The most likely state and how well it is known.
+    """The most likely state and how well it is known."""
 
-    Attributes
-    ----------
-    state
-        Shape (n,).
-    cost
-        Sum over all residuals, and `costs` that of every accepted state, descending.
-    information
-        Shape (n, n), weighted normal matrix at `state`, without damping.
-    converged
-        False where `most_iterations` came first.
-    """
-
-    state: Array
-    cost: float
+    state: Array  # shape (n,)
+    cost: float  # sum over all residuals, and `costs` that of every accepted state, descending
     costs: tuple[float, ...]
+    # Shape (n, n), weighted normal matrix at `state`, without damping
     information: csc_array[np.float64]
-    converged: bool
+    converged: bool  # false where `most_iterations` came first
 
     def covariance(self, indices: Sequence[int] | NDArray[np.intp]) -> Array:
-        """Return the joint posterior covariance of some entries of the state.
-
-        Shape (k, k) for k indices: that block of the inverse of `information`, by k solves.
+        """Return the joint posterior covariance of some entries of the state, shape (k, k).
 
         Raises
         ------
@@ -154,19 +124,10 @@ class Solution:
 def minimise(start: Array, terms: Sequence[Term], damping: Damping | None = None) -> Solution:
     """Return the state of least cost near a start.
 
-    Parameters
-    ----------
-    start
-        Shape (n,).
-    terms
-        Together they must bound every direction of the state.
-    damping
-        Stopping rule.
-
     Raises
     ------
     SingularProblemError
-        Some direction has no bound.
+        The terms together do not bound every direction of the state.
     """
     rule = damping or Damping()
     state = np.array(start, dtype=np.float64)
@@ -240,10 +201,6 @@ def _factor(matrix: csc_array[np.float64]) -> SuperLU:
 
 Indices = NDArray[np.intp]
 
-# Wheels that do not turn still leave this much play [m], [rad]: the factor stays well scaled.
-_LEAST_STEP_M = 3e-6
-_LEAST_TURN_RAD = 1e-5
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
@@ -255,17 +212,14 @@ class Layout:
 
     @property
     def size(self) -> int:
-        """Return the length of the state vector."""
         return 3 * self.n_poses + 2 * self.n_landmarks + 3 + 3 * self.n_radars
 
     @property
     def poses(self) -> slice:
-        """Return where the poses are."""
         return slice(0, 3 * self.n_poses)
 
     @property
     def landmarks(self) -> slice:
-        """Return where the landmarks are."""
         return slice(3 * self.n_poses, 3 * self.n_poses + 2 * self.n_landmarks)
 
     @property
@@ -279,48 +233,9 @@ class Layout:
         return slice(self.wheels.stop, self.size)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WheelModel:
-    """How wheel odometry errs: standard deviations, constants per run and white per step.
-
-    Source: the project's odometry model; the constants' defaults are wide enough for a bad floor,
-    the white ones are the lab's.
-    """
-
-    scale_sigma: float = 0.03
-    turn_scale_sigma: float = 0.03
-    curvature_sigma_rad_per_m: float = 0.02
-    along_m_per_sqrt_m: float = 2e-3
-    across_m_per_sqrt_m: float = 6e-4
-    heading_rad_per_sqrt_m: float = 4.2e-3
-    heading_rad_per_rad: float = 0.01
-
-    def sigmas(self, steps: Array) -> Array:
-        """Return standard deviations along [m], across [m] and of the turn [rad], shape (n, 3).
-
-        ``steps`` of shape (n, 3): ux [m], uy [m], ua [rad], body frame at the start of each.
-        """
-        distance = np.sqrt(steps[:, 0] ** 2 + steps[:, 1] ** 2)
-        root = np.sqrt(distance)
-        turn = self.heading_rad_per_sqrt_m * root + self.heading_rad_per_rad * np.abs(steps[:, 2])
-        return np.column_stack(
-            [
-                np.maximum(self.along_m_per_sqrt_m * root, _LEAST_STEP_M),
-                np.maximum(self.across_m_per_sqrt_m * root, _LEAST_STEP_M),
-                np.maximum(turn, _LEAST_TURN_RAD),
-            ]
-        )
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PriorTerm:
-    """Entries of the state that are known beforehand, each by itself.
-
-    Attributes
-    ----------
-    indices, means, sigmas
-        Shape (m,) each.
-    """
+    """Entries of the state with independent priors; indices, means, sigmas of shape (m,)."""
 
     layout: Layout
     indices: Indices
@@ -329,39 +244,29 @@ class PriorTerm:
     kernel: Kernel = field(default_factory=Square)
 
     def residuals(self, state: Array) -> Array:
-        """Return (value - mean) / sigma, shape (m,)."""
         return (state[self.indices] - self.means) / self.sigmas
 
     def jacobian(self, state: Array) -> csr_array[np.float64]:
-        """Return the derivatives, shape (m, n)."""
         rows = np.arange(len(self.indices))
         return csr_array((1 / self.sigmas, (rows, self.indices)), shape=(len(rows), len(state)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OdometryTerm:
-    """What the wheels say of each step from one pose to the next.
+    """The reported steps of the wheels from one pose to the next.
 
     With d, a a true step in the body frame at its start, the wheels report (constants s, w,
     kappa)::
 
         u_xy = (1 + s) d + white        u_a = (1 + w) a + kappa |u_xy| / (1 + s) + white
-
-    Attributes
-    ----------
-    steps
-        Shape (n_poses - 1, 3): reported ux [m], uy [m], ua [rad].
-    sigmas
-        Shape (n_poses - 1, 3), standard deviations in the same units.
     """
 
     layout: Layout
-    steps: Array
-    sigmas: Array
+    steps: Array  # shape (n_poses - 1, 3): reported ux [m], uy [m], ua [rad]
+    sigmas: Array  # shape (n_poses - 1, 3), standard deviations in the same units
     kernel: Kernel = field(default_factory=Square)
 
     def residuals(self, state: Array) -> Array:
-        """Return three whitened residuals per step, shape (3 (n_poses - 1),)."""
         dx, dy, turn, *_ = self._motion(state)
         scale, turn_scale, curvature = state[self.layout.wheels]
         distance = np.sqrt(self.steps[:, 0] ** 2 + self.steps[:, 1] ** 2)
@@ -375,7 +280,6 @@ class OdometryTerm:
         return ((expected - self.steps) / self.sigmas).ravel()
 
     def jacobian(self, state: Array) -> csr_array[np.float64]:
-        """Return the derivatives, shape (3 (n_poses - 1), n)."""
         dx, dy, turn, cosine, sine = self._motion(state)
         scale, turn_scale, curvature = state[self.layout.wheels]
         distance = np.sqrt(self.steps[:, 0] ** 2 + self.steps[:, 1] ** 2)
@@ -428,34 +332,26 @@ class RangeTerm:
 
     z = |l - p - R m| + b + noise; the pose at the sample's own time lies between two poses,
     linear in position and in heading, which is exact on straights and for turns on the spot.
-
-    Attributes
-    ----------
-    pose, fraction
-        Shape (m,) each: index of the pose before the sample, and how far on to the next, [0, 1].
-    landmark, radar
-        Shape (m,), indices.
-    range_m, sigma_m
-        Shape (m,), true metres, no offset removed; and its standard deviation.
     """
 
     layout: Layout
+    # Shape (m,) each: index of the pose before the sample, and how far on to the next, [0, 1]
     pose: Indices
     fraction: Array
+    # Shape (m,), indices
     landmark: Indices
     radar: Indices
+    # Shape (m,), true metres, no offset removed; and its standard deviation
     range_m: Array
     sigma_m: Array
     kernel: Kernel = field(default_factory=Square)
 
     def residuals(self, state: Array) -> Array:
-        """Return (expected - measured) / sigma, shape (m,)."""
         _, _, distance, _, _ = self._sight(state)
         offset = state[self._radar_columns()]
         return (distance + offset - self.range_m) / self.sigma_m
 
     def jacobian(self, state: Array) -> csr_array[np.float64]:
-        """Return the derivatives, shape (m, n)."""
         ux, uy, _, (arm_x, arm_y), (cosine, sine) = self._sight(state)
         m = len(self.pose)
         one = np.ones(m)

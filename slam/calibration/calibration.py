@@ -2,16 +2,16 @@
 
 Batch maximum a posteriori over all poses, landmarks, wheel constants, range offsets and mount
 positions, from odometry steps and single ranges z = |l - p - R m| + b (`slam.calibration.batch`).
-Which range belongs to which reflector is found along the way: single ranges are followed and placed
-radar by radar (`slam.calibration.tracks`), then predicted ranges choose, with gates that narrow
-as the offsets become known, under a robust cost; the last round is least squares on what is left.
+Association is found along the way: single ranges are followed and placed radar by radar
+(`slam.calibration.tracks`), then predicted ranges choose, with gates that narrow as the offsets
+become known, under a robust cost; the last round is least squares on the ranges that are left.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -28,7 +28,6 @@ from slam.calibration.batch import (
     Solution,
     Square,
     Term,
-    WheelModel,
     minimise,
 )
 from slam.calibration.tracks import (
@@ -45,105 +44,68 @@ from slam.calibration.tracks import (
     strengths,
     well_seen,
 )
+from slam.config import WheelNoise
 from slam.geometry import Rig
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
+# Samples closer than this are joined into one step.
 _LEAST_STEP_NS = 100_000_000
-"""Samples closer than this are joined into one step."""
+# The lab's white noise; constants wide enough for a bad floor.
+UNKNOWN_WHEELS = WheelNoise(
+    scale_sigma=0.03, turn_scale_sigma=0.03, curvature_sigma_rad_per_m=0.02, floor_rad=1e-5
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrationPriors:
-    """What is known before the drive, standard deviations.
+    """Standard deviations before the drive."""
 
-    Attributes
-    ----------
-    offset_m
-        Range offset of a module.
-    mount_m
-        Mount position in x and in y: how well the rig was measured.
-    reflector_m
-        Survey of known reflectors.
-    start_m, start_rad
-        Start pose among known reflectors; without any, the start is the origin of the map.
-    wheels
-        The wheel model.
-    """
-
-    offset_m: float = 0.03
-    mount_m: float = 0.003
-    reflector_m: float = 0.001
+    offset_m: float = 0.03  # range offset of a module
+    mount_m: float = 0.003  # mount position in x and in y: how well the rig was measured
+    reflector_m: float = 0.001  # survey of known reflectors
+    # Start pose among known reflectors; without any, the start is the origin of the map
     start_m: float = 0.1
     start_rad: float = 0.1
-    wheels: WheelModel = field(default_factory=WheelModel)
+    wheels: WheelNoise = UNKNOWN_WHEELS  # constants and white noise of the wheels
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Drive:
-    """A recorded drive, ready for calibration.
+    """A recorded drive, ready for calibration."""
 
-    Attributes
-    ----------
-    rig
-        Nominal mounts; their range offsets are not removed from the ranges.
-    path
-        What the wheels said, odometry frame.
-    step_sigmas
-        Shape (n_nodes - 1, 3), standard deviation of each step's white noise in the body frame:
-        along [m], across [m], turn [rad].
-    ranges
-        All single ranges.
-    """
-
-    rig: Rig
-    path: PathNodes
+    rig: Rig  # nominal mounts; their range offsets are not removed from the ranges
+    path: PathNodes  # odometry, odometry frame
+    # Shape (n_nodes - 1, 3), standard deviation of each step's white noise in the body frame: along
+    # [m], across [m], turn [rad]
     step_sigmas: Array
-    ranges: RangeSet
+    ranges: RangeSet  # all single ranges
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Calibration:
-    """What the drive told.
+    """The result of a calibration."""
 
-    Attributes
-    ----------
-    offsets_m, mount_shifts_m
-        Shapes (r,) and (r, 2): offset of each radar, and how far its mount is from nominal, x and
-        y, body frame.
-    covariance_m2
-        Shape (3 r, 3 r), [m2]: for each radar its offset, mount x, mount y.
-    landmarks_m
-        Shape (k, 2), map frame: the body frame at the start, or the frame of known reflectors.
-    path
-        The most likely path, map frame.
-    wheels
-        Shape (3,): scale, turn scale, curvature [rad/m].
-    landmark
-        Shape (n_ranges,): the landmark each range was used for, or UNASSIGNED.
-    sigma_m
-        Standard deviation of a used range, as found.
-    """
-
+    # Shapes (r,) and (r, 2): offset of each radar, and how far its mount is from nominal, x and y,
+    # body frame
     offsets_m: Array
     mount_shifts_m: Array
-    covariance_m2: Array
+    covariance_m2: Array  # shape (3 r, 3 r), [m2]: for each radar its offset, mount x, mount y
+    # Shape (k, 2), map frame: the body frame at the start, or the frame of known reflectors
     landmarks_m: Array
-    path: PathNodes
-    wheels: Array
-    landmark: Indices
-    sigma_m: float
+    path: PathNodes  # the most likely path, map frame
+    wheels: Array  # shape (3,): scale, turn scale, curvature [rad/m]
+    landmark: Indices  # shape (n_ranges,): the landmark each range was used for, or UNASSIGNED
+    sigma_m: float  # standard deviation of a used range, as found
 
     @property
     def offset_sigmas_m(self) -> Array:
-        """Return the standard deviation of each offset, shape (r,)."""
         result: Array = np.sqrt(np.diag(self.covariance_m2)[0::3])
         return result
 
     @property
     def mount_sigmas_m(self) -> Array:
-        """Return the standard deviations of each mount's x and y, shape (r, 2)."""
         variances = np.diag(self.covariance_m2).reshape(-1, 3)
         result: Array = np.sqrt(variances[:, 1:])
         return result
@@ -155,26 +117,16 @@ def make_drive(
     poses: Array,
     ranges: RangeSet,
     *,
-    wheels: WheelModel | None = None,
+    wheels: WheelNoise = UNKNOWN_WHEELS,
 ) -> Drive:
     """Cut odometry into steps for the batch.
 
-    Parameters
-    ----------
-    rig
-        Nominal mounts.
-    stamps_ns, poses
-        Shapes (n,) and (n, 3): odometry samples, x [m], y [m], heading [rad] in any turn,
-        odometry frame.
-    ranges
-        All single ranges.
-    wheels
-        The white noise of each sample's step; it adds up over the samples of a node's step.
+    ``poses`` (n, 3) are odometry samples, x [m], y [m], heading [rad] in any turn, odometry frame.
+    The white noise of each sample's step adds up over the samples of a node's step.
     """
-    model = wheels or WheelModel()
     poses = poses.copy()
     poses[:, 2] = np.unwrap(poses[:, 2])
-    variances = np.vstack([np.zeros(3), model.sigmas(steps_of(poses)) ** 2]).cumsum(axis=0)
+    variances = np.vstack([np.zeros(3), wheels.step_sigmas(steps_of(poses)) ** 2]).cumsum(axis=0)
     chosen = [0]
     for index in range(1, len(stamps_ns)):
         if stamps_ns[index] - stamps_ns[chosen[-1]] >= _LEAST_STEP_NS:
@@ -218,17 +170,10 @@ _SOMEWHERE_M = 30.0
 def calibrate(
     drive: Drive, priors: CalibrationPriors | None = None, known_m: Array | None = None
 ) -> Calibration:
-    """Estimate offsets and mounts; what the drive does not tell stays at its prior.
+    """Estimate offsets and mounts; those that the drive does not determine stay at their priors.
 
-    Parameters
-    ----------
-    drive
-        Odometry and ranges.
-    priors
-        What is known beforehand.
-    known_m
-        Shape (k, 2): places of known reflectors, in a frame in which the robot starts near the
-        origin and looks along x.
+    ``known_m`` (k, 2) are places of known reflectors, in a frame in which the robot starts near the
+    origin and looks along x.
     """
     known = np.zeros((0, 2)) if known_m is None else known_m
     return _Estimator(drive, priors or CalibrationPriors(), known).run()
@@ -303,7 +248,6 @@ class _Estimator:
         return model, landmark
 
     def _tracks(self, model: _Model, followed: Sequence[tuple[int, Indices]]) -> tuple[Track, ...]:
-        """Place followed echoes from the path and the offsets as known by now."""
         sights, range_m = self._sights(model), self._drive.ranges.range_m
         tracks = []
         for radar, rows in followed:
@@ -320,7 +264,7 @@ class _Estimator:
         return np.hypot(own, self._bend_m)
 
     def _sights(self, model: _Model) -> Array:
-        """Return antenna position and boresight at each range, shape (n_ranges, 3), map frame."""
+        """Return antenna position and boresight at each range, (n_ranges, 3), map frame."""
         ranges = self._drive.ranges
         path = PathNodes(t_ns=self._drive.path.t_ns, poses=model.poses)
         yaws = np.array([mount.yaw_rad for mount in self._drive.rig.mounts])
@@ -434,18 +378,11 @@ class _Estimator:
         )
 
     def _fixed_terms(self, layout: Layout) -> Sequence[Term]:
-        """Return odometry and all that is known beforehand."""
         priors, known = self._priors, self._known_m
         if len(known):
             start = [priors.start_m, priors.start_m, priors.start_rad]
         else:
             start = [_MAP_ORIGIN_SIGMA] * 3
-        wheels = priors.wheels
-        constants = [
-            wheels.scale_sigma,
-            wheels.turn_scale_sigma,
-            wheels.curvature_sigma_rad_per_m,
-        ]
         n_radars = layout.n_radars
         radar_means = np.column_stack([np.zeros(n_radars), self._mounts]).ravel()
         radar_sigmas = np.tile([priors.offset_m, priors.mount_m, priors.mount_m], n_radars)
@@ -467,7 +404,7 @@ class _Estimator:
                         start,
                         np.full(known.size, priors.reflector_m),
                         found + _SOMEWHERE_M,
-                        constants,
+                        priors.wheels.calibration_sigmas,
                         radar_sigmas,
                     ]
                 ),

@@ -1,15 +1,15 @@
-"""What a drive cannot tell, in words: weak directions of a calibration and drives too poor.
+"""What a drive leaves open: weak directions of a calibration, gains, and drives too poor.
 
 The model of an amplitude, in logarithms, is linear::
 
     ln a = strength of landmark + gain of radar - n ln R + B ln cos(angle) + B tan(angle) yaw
 
 n lies between 1.5 (rod) and 2 (point), B is the exponent of the beam. A gain common to all radars
-cannot be told from louder reflectors, so gains are given relative to their mean; between radars
+cannot be told from stronger reflectors, so gains are given relative to their mean; between radars
 that never see one reflector in common not even that. Yaw acts through the beam alone, weakly.
 
-The covariance of all offsets and mounts is split into its principal directions. One whose
-standard deviation exceeds the limit is named by the unknowns that take part in it.
+The covariance of all offsets and mounts is split into its principal directions. One whose standard
+deviation exceeds the limit is named by the unknowns that take part in it.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _ROUNDS = 8
 class GainEstimate:
     """Gains relative to their mean, and boresight corrections; shapes (r,) each.
 
-    What no echo tells has the standard deviation of its prior: 6 dB less the mean, 5 degrees.
+    Without echoes the standard deviations are the prior's: 6 dB less the mean, 5 degrees.
     """
 
     gains_db: Array
@@ -51,7 +51,6 @@ class GainEstimate:
 
 
 def estimate_gains(drive: Drive, calibration: Calibration) -> GainEstimate:
-    """Estimate gains and boresights from the ranges that a calibration used."""
     rows, law, tangent, ranges_m = _sights(drive, calibration)
     n_radars, n_landmarks = len(drive.rig.mounts), len(calibration.landmarks_m)
     radar, landmark = drive.ranges.radar[rows], calibration.landmark[rows]
@@ -100,7 +99,7 @@ def _sights(drive: Drive, calibration: Calibration) -> tuple[NDArray[np.intp], A
 
 
 def _robust(design: Array, measured: Array, means: Array, sigmas: Array) -> tuple[Array, Array]:
-    """Return the answer of a linear problem with priors and its covariance, outliers held down."""
+    """Return the solution of a linear problem with priors, Huber-weighted, and its covariance."""
     weights, noise = np.ones(len(measured)), 0.1
     answer = means
     for _ in range(_ROUNDS):
@@ -129,24 +128,12 @@ _REMEDY = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class WeakDirection:
-    """A combination of offsets and mounts that the drive leaves open.
+    """A combination of offsets and mounts that the drive leaves open."""
 
-    Attributes
-    ----------
-    sigma_m
-        Standard deviation along the direction.
-    direction
-        Shape (3 r,), unit vector: offset, mount x, mount y of each radar.
-    words
-        What cannot be told from what, in one sentence.
-    remedy
-        A drive that would tell it.
-    """
-
-    sigma_m: float
-    direction: Array
-    words: str
-    remedy: str
+    sigma_m: float  # standard deviation along the direction
+    direction: Array  # shape (3 r,), unit vector: offset, mount x, mount y of each radar
+    words: str  # which unknowns cannot be told apart, in one sentence
+    remedy: str  # A drive that would determine it
 
 
 def weak_directions(
@@ -191,7 +178,7 @@ def _joined(words: Sequence[str]) -> str:
 
 
 def poor_drive(drive: Drive, calibration: Calibration) -> tuple[str, ...]:
-    """Say why a drive is too poor for a calibration; empty where it is not."""
+    """Return why a drive is too poor for a calibration; empty where it is not."""
     said = []
     spread = np.ptp(drive.path.poses, axis=0)
     if max(spread[0], spread[1]) < _STANDS_M and spread[2] < _STANDS_RAD:
@@ -212,7 +199,7 @@ def poor_drive(drive: Drive, calibration: Calibration) -> tuple[str, ...]:
 
 
 def unseen_reflectors(calibration: Calibration, n_known: int) -> tuple[str, ...]:
-    """Return what is wrong with known reflectors, the first ``n_known`` landmarks, in words."""
+    """Return what is wrong with known reflectors, the first ``n_known`` landmarks."""
     seen = len(set(calibration.landmark.tolist()) & set(range(n_known)))
     if 2 * seen >= n_known:
         return ()

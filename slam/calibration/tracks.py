@@ -1,8 +1,8 @@
-"""Which range belongs to which reflector, before and while the offsets become known.
+"""Which range is of which reflector, before and while the offsets become known.
 
 One radar that moves sees a still reflector at ranges that bend: the track of one radar already
 places it, up to the radar's unknown offset. So no two radars need to agree before the offsets are
-known, which pairs of ranges would demand (20 mm between two radars turn a bearing by 5 degrees).
+known, as pairs of ranges would require (20 mm between two radars turn a bearing by 5 degrees).
 """
 
 from __future__ import annotations
@@ -37,26 +37,18 @@ _OFFSET_SIGMA_M = 0.03
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RangeSet:
-    """All single ranges of a recording, in time order.
+    """All single ranges of a recording, in time order."""
 
-    Attributes
-    ----------
-    radar, t_ns
-        Shape (n,): mount index and session time.
-    range_m, amplitude, sigma_m
-        Shape (n,), true metres without any offset removed; sigma is NaN where the front end does
-        not tell.
-    """
-
+    # Shape (n,): mount index and session time
     radar: Indices
     t_ns: NDArray[np.int64]
+    # Shape (n,), true metres without any offset removed; sigma is NaN where the front end has none
     range_m: Array
     amplitude: Array
     sigma_m: Array
 
     @classmethod
     def of(cls, detections: Sequence[Detection]) -> RangeSet:
-        """Stack detections; they may come in any order."""
         ordered = sorted(detections, key=lambda d: (d.t_ns, d.radar, d.range_m))
         return cls(
             radar=np.array([d.radar for d in ordered], dtype=np.intp),
@@ -67,24 +59,16 @@ class RangeSet:
         )
 
     def __len__(self) -> int:
-        """Return the number of ranges."""
         return len(self.range_m)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PathNodes:
-    """The robot's path as poses at some times; between two of them it is linear.
+    """The robot's path as poses at some times; between two of them it is linear."""
 
-    Attributes
-    ----------
-    t_ns
-        Shape (n,), ascending, int64.
-    poses
-        Shape (n, 3), x [m], y [m], heading [rad], continuous; odometry frame as measured, map frame
-        as estimated.
-    """
-
-    t_ns: NDArray[np.int64]
+    t_ns: NDArray[np.int64]  # shape (n,), ascending, int64
+    # Shape (n, 3), x [m], y [m], heading [rad], continuous; odometry frame as measured, map frame
+    # as estimated
     poses: Array
 
     def between(self, t_ns: NDArray[np.int64]) -> tuple[Indices, Array]:
@@ -96,7 +80,6 @@ class PathNodes:
         return node, np.clip((t_ns - self.t_ns[node]) / gap, 0.0, 1.0)
 
     def at(self, t_ns: NDArray[np.int64]) -> Array:
-        """Return the poses at some times, shape (m, 3)."""
         node, fraction = self.between(t_ns)
         following = np.minimum(node + 1, len(self.t_ns) - 1)
         part = fraction[:, np.newaxis]
@@ -106,21 +89,12 @@ class PathNodes:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Track:
-    """One echo followed by one radar, and the still point that explains its ranges.
+    """One echo followed by one radar, and the still point that explains its ranges."""
 
-    Attributes
-    ----------
-    radar
-        Mount index.
-    rows
-        Shape (m,), rows of the RangeSet.
-    point_m, covariance_m2
-        Shapes (2,) [m] and (2, 2) [m2], frame of the path; the radar's unknown offset is in
-        the covariance.
-    """
-
-    radar: int
-    rows: Indices
+    radar: int  # mount index
+    rows: Indices  # shape (m,), rows of the RangeSet
+    # Shapes (2,) [m] and (2, 2) [m2], frame of the path; the radar's unknown offset is in the
+    # covariance
     point_m: Array
     covariance_m2: Array
 
@@ -128,14 +102,7 @@ class Track:
 def radar_poses(path: PathNodes, mounts: Array, t_ns: NDArray[np.int64]) -> Array:
     """Return where antennas were and looked: x, y [m], boresight [rad], shape (m, 3).
 
-    Parameters
-    ----------
-    path
-        The robot.
-    mounts
-        Shape (m, 3): x, y [m] and yaw [rad] of the radar asked for at each time, body frame.
-    t_ns
-        Shape (m,).
+    ``mounts`` (m, 3): x, y [m] and yaw [rad] of the radar asked for at each time, body frame.
     """
     x, y, heading = path.at(t_ns).T
     cosine, sine = np.cos(heading), np.sin(heading)
@@ -280,18 +247,9 @@ def group_tracks(
 ) -> tuple[Array, Indices]:
     """Gather tracks of one reflector, the best placed first.
 
-    Parameters
-    ----------
-    tracks
-        What was followed.
-    ranges
-        The ranges the tracks are made of.
-    known_m
-        Shape (k, 2): reflectors whose places are known; they are the first of the result.
-
-    Returns
-    -------
-    Landmarks, shape (n, 2), and for every range its landmark or UNASSIGNED, shape (n_ranges,).
+    ``known_m`` (k, 2) are reflectors whose places are known; they are the first of the result.
+    Returns landmarks, shape (n, 2), and for every range its landmark or UNASSIGNED, shape
+    (n_ranges,).
     """
     points: list[Array] = [*known_m]
     members: list[list[Track]] = [[] for _ in points]
@@ -325,14 +283,10 @@ def _seen_together(first: Track, second: Track, ranges: RangeSet) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Assignment:
-    """Which landmark each range belongs to, and what its neighbours do to it.
+    """Which landmark each range belongs to, and the effect of its neighbours.
 
-    Attributes
-    ----------
-    landmark
-        Shape (n,): index, or UNASSIGNED.
-    bend_m
-        Shape (n,): standard deviation that echoes of other landmarks add.
+    ``landmark`` (n,): index, or UNASSIGNED; ``bend_m`` (n,): standard deviation that echoes of
+    other landmarks add.
     """
 
     landmark: Indices
@@ -400,7 +354,7 @@ def echo_law(distance_m: Array, cosine: Array) -> Array:
 
 
 def strengths(ranges: RangeSet, sights: Array, landmarks_m: Array, landmark: Indices) -> Array:
-    """Return how loud each landmark answers, reduced by `echo_law` to 1 m; shape (k,).
+    """Return the amplitude of each landmark, reduced by `echo_law` to 1 m; shape (k,).
 
     The median over its ranges; 0 where it has none.
     """

@@ -4,8 +4,8 @@ A frame x is correlated with the analytic pulse p of :mod:`slam.front_end.pulse`
 
     y[n] = (2 / E) sum_m x[m] conj(p(m - n)),   E = sum_m |p(m)|**2
 
-at every second bin n: y has no negative frequencies, so half its samples hold all of it. It is such
-that an echo A Re{p(n - u) exp(j phi)} alone gives, with s the envelope's sigma in bins,
+at every second bin n: y has no negative frequencies, so half its samples hold all of it. An echo
+A Re{p(n - u) exp(j phi)} alone gives, with s the envelope's sigma in bins,
 
     y[n] = A rho(n - u) exp(j (kappa (n - u) + phi)),   rho(d) = exp(-d**2 / (4 s**2))
 
@@ -20,17 +20,11 @@ Threshold
     t = r**2 / 2 becomes (1 + t / K)**-K (cell-averaging CFAR; Richards 2014, chapter 6). A mean of
     all powers has K = N / (sqrt(2 pi) s), since they correlate by rho**2; a median has the part
     ``_MEDIAN_EFFICIENCY`` of that.
-
-Groups of such peaks are fitted with all other echoes of the frame subtracted: behind the filter, by
-:mod:`slam.front_end.overlapping`, where every sample around them is known; sample by sample, by
-:mod:`slam.front_end.overlapping`, where some are not.
-
-Echoes are the local maxima of the magnitude of y, the frame correlated with the pulse
-(:mod:`slam.front_end.matched_filter`), above its threshold. The logarithm of the magnitude is a
-parabola around an echo: the vertex through three of its values is the position, and its scatter is
-the Cramer-Rao bound of the position with unknown amplitude and phase
-(``PulseModel.position_bound_bins``).
-
+Echoes
+    The local maxima of the magnitude of y above the threshold. The logarithm of the magnitude is a
+    parabola around an echo: the vertex through three of its values is the position, and its scatter
+    is the Cramer-Rao bound of the position with unknown amplitude and phase
+    (``PulseModel.position_bound_bins``).
 Misfit
     Energy of y minus the fitted pulse at nine points within 2 s of the peak (s the envelope's
     sigma), over what noise leaves there when amplitude, phase and position are fitted: per point
@@ -38,7 +32,7 @@ Misfit
 Joint
     Where peaks overlap or one is not one pulse, and the misfit is more than the pulse's own
     uncertain shape leaves, :mod:`slam.front_end.overlapping` decides how many echoes there are and
-    where.
+    where, with all other echoes of the frame subtracted.
 Cut pulses
     Where samples within 3 s of a peak are missing - saturated, or beyond an end of the frame - the
     echo is fitted to those that are left, likewise.
@@ -83,20 +77,10 @@ _LEAST_QUIET = 8
 
 
 class PulseFilter:
-    """Correlation of frames of one length with one pulse, everything worked out once.
+    """Correlation of frames of one length with one pulse.
 
-    Parameters
-    ----------
-    pulse
-        What an echo looks like.
-    n_bins
-        Length of the frames.
-    bin_length_m
-        Spacing of their samples.
-    false_alarms
-        Mean number of peaks in a frame of noise.
-    noise_is_told
-        Whether sigma is known, so that the threshold needs no allowance for its scatter.
+    ``false_alarms`` is the mean number of peaks in a frame of noise; with ``noise_is_told``, sigma
+    is known, and the threshold needs no allowance for its scatter.
     """
 
     def __init__(
@@ -170,16 +154,10 @@ class PulseFilter:
 
 
 def threshold_sigmas(length_sigmas: float, false_alarms: float, *, noise_is_told: bool) -> float:
-    """Return the level, in sigma_y, that noise passes so often in one frame.
+    """Return the level, in sigma_y, with ``false_alarms`` local maxima of noise above it per frame.
 
-    Parameters
-    ----------
-    length_sigmas
-        Length of the frame in envelope sigmas.
-    false_alarms
-        Mean number of local maxima of noise above the level.
-    noise_is_told
-        Whether sigma_y is known or estimated from the frame itself.
+    ``length_sigmas`` is the length of the frame in envelope sigmas; ``noise_is_told`` says that
+    sigma_y is known and not estimated from the frame itself.
     """
     rate = length_sigmas / (2 * math.sqrt(math.pi))
     cells = _MEDIAN_EFFICIENCY * length_sigmas / math.sqrt(math.tau)
@@ -218,57 +196,26 @@ _POSITION, _AMPLITUDE, _PHASE, _SIGMA = range(4)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Peaks:
-    """Echoes of one frame, k of them, nearest first; every array has shape (k,).
+    """Echoes of one frame, k of them, nearest first; every array has shape (k,)."""
 
-    Attributes
-    ----------
-    position_bins
-        From sample 0.
-    amplitude
-        Of the pulse, in the unit of the samples.
-    phase_rad
-        Of the carrier at the position, up to whole turns.
-    sigma_bins
-        Predicted standard deviation of the position.
-    misfit
-        Unexplained over expected energy near the peak.
-    saturated
-        Whether samples within reach of the peak were missing inside the frame.
-    """
-
-    position_bins: Array
-    amplitude: Array
-    phase_rad: Array
-    sigma_bins: Array
-    misfit: Array
-    saturated: BoolArray
+    position_bins: Array  # from sample 0
+    amplitude: Array  # of the pulse, in the unit of the samples
+    phase_rad: Array  # of the carrier at the position, up to whole turns
+    sigma_bins: Array  # predicted standard deviation of the position
+    misfit: Array  # unexplained over expected energy near the peak
+    saturated: BoolArray  # whether samples within reach of the peak were missing inside the frame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Filtered:
-    """One frame behind the filter.
+    """One frame behind the filter."""
 
-    Attributes
-    ----------
-    samples
-        shape (n_bins,): mean removed, unknown samples zero.
-    usable
-        shape (n_bins,): samples that are known and not at a limit of the sampler; None: all.
-    y
-        shape (n_steps,), complex: correlation with the pulse, at every second bin.
-    power
-        shape (n_steps,): squared magnitude of y.
-    sigma_y
-        Standard deviation of its noise, per quadrature.
-    pulse_filter
-        What made it.
-    """
-
-    samples: Array
+    samples: Array  # shape (n_bins,): mean removed, unknown samples zero
+    # shape (n_bins,): samples that are known and not at a limit of the sampler; None: all
     usable: BoolArray | None
-    y: ComplexArray
-    power: Array
-    sigma_y: float
+    y: ComplexArray  # shape (n_steps,), complex: correlation with the pulse, at every second bin
+    power: Array  # shape (n_steps,): squared magnitude of y
+    sigma_y: float  # standard deviation of its noise, per quadrature
     pulse_filter: PulseFilter
 
 
@@ -303,11 +250,11 @@ def refit(peaks: Peaks, again: BoolArray, filtered: Filtered, split: SplitTest) 
     peaks
         As if each were a single pulse.
     again
-        shape (k,), which of them need the second look.
+        shape (k,), which of them are fitted anew.
     filtered
         The frame they come from.
     split
-        When one more echo is believed; ``max_echoes`` 1 leaves each peak one echo.
+        When one more echo is accepted; ``max_echoes`` 1 leaves each peak one echo.
     """
     pulse_filter = filtered.pulse_filter
     table = np.column_stack(
@@ -337,7 +284,7 @@ def refit(peaks: Peaks, again: BoolArray, filtered: Filtered, split: SplitTest) 
 
 
 def _fitted(group: Array, others: Array, filtered: Filtered, split: SplitTest) -> Array:
-    """Return the echoes of a frame near a group of peaks; the group where nothing is to be seen."""
+    """Return the echoes near a group of peaks; the group where no sample is usable."""
     pulse_filter = filtered.pulse_filter
     margin = _MARGIN * pulse_filter.sigma_bins
     first = int(np.floor(group[0, _POSITION] - margin))
@@ -375,7 +322,6 @@ def _fitted(group: Array, others: Array, filtered: Filtered, split: SplitTest) -
 
 
 def _fitted_whole(group: Array, others: Array, filtered: Filtered, split: SplitTest) -> Array:
-    """Return the echoes near a group of peaks around which every sample is known."""
     pulse_filter = filtered.pulse_filter
     search = _SEARCH * pulse_filter.sigma_bins
     # one step more than z is interpolated from, rounding included
@@ -403,7 +349,7 @@ def _fitted_whole(group: Array, others: Array, filtered: Filtered, split: SplitT
 
 
 def _correlated(table: Array, steps: NDArray[np.intp], pulse_filter: PulseFilter) -> ComplexArray:
-    """Return what whole echoes are behind the filter, at steps of y; the shape of the steps."""
+    """Return whole echoes behind the filter, at steps of y; the shape of the steps."""
     reach = _FILTERED_REACH * pulse_filter.sigma_bins
     begin, end = BINS_PER_STEP * steps[0] - reach, BINS_PER_STEP * steps[-1] + reach
     near = table[(table[:, _POSITION] > begin) & (table[:, _POSITION] < end)]
@@ -460,13 +406,7 @@ _RESOLUTION = float(np.finfo(np.float32).eps)
 
 
 class MatchedFilterDetector:
-    """Echoes by correlation with the pulse; under ``joint``, those that overlap fitted together.
-
-    Parameters
-    ----------
-    config
-        Range limits, pulse, false alarms.
-    """
+    """Echoes by correlation; under ``joint``, overlapping ones fitted together."""
 
     def __init__(self, config: SlamConfig) -> None:
         settings = config.matched_filter
@@ -479,7 +419,6 @@ class MatchedFilterDetector:
         self._filters: dict[tuple[int, float], PulseFilter] = {}
 
     def detect(self, frame: RadarFrame, range_offset_m: float = 0.0) -> tuple[Detection, ...]:
-        """Return the echoes of one frame inside the range limits; see ``Detector``."""
         limits = self.config.detection
         start_m = frame.range_start_m - range_offset_m
         peaks = self.peaks(frame, (limits.min_range_m - start_m, limits.max_range_m - start_m))
@@ -511,15 +450,13 @@ class MatchedFilterDetector:
     def detect_many(
         self, frames: Sequence[RadarFrame], offsets_m: Sequence[float]
     ) -> list[tuple[Detection, ...]]:
-        """Return the echoes of each frame; see ``Detector``."""
         return [self.detect(*each) for each in zip(frames, offsets_m, strict=True)]
 
     def peaks(self, frame: RadarFrame, within_m: tuple[float, float]) -> Peaks:
         """Return every echo of a frame, whatever its range.
 
-        Samples that are NaN or lie at one of the frame's limits are not used. A second look is
-        taken only at echoes that lie ``within_m``, from the first bin on [m], or overlap with one
-        that may.
+        Samples that are NaN or lie at one of the frame's limits are not used. Only echoes that lie
+        ``within_m``, from the first bin on [m], or overlap with one that may, are fitted anew.
         """
         filtered = self._filtered(frame)
         found, unexplained = _single_pulses(filtered)
@@ -579,7 +516,7 @@ class MatchedFilterDetector:
 
 
 def _single_pulses(filtered: Filtered) -> tuple[Peaks, Array]:
-    """Return every peak as if it were one pulse, and the part of its energy that is none."""
+    """Return every peak as one pulse, and the part of its energy that the pulse leaves."""
     y, power, sigma_y = filtered.y, filtered.power, filtered.sigma_y
     pulse_filter = filtered.pulse_filter
     at = (power[1:-1] > (pulse_filter.threshold * sigma_y) ** 2).nonzero()[0] + 1

@@ -1,44 +1,40 @@
 """Echoes that overlap, told apart by joint maximum likelihood.
 
-The model and its literature are in `slam.front_end.overlapping`, which decides how many pulses
-there are. Everything is batched: a row is one window with one start.
-
 A window of a raw frame is modelled as K pulses of known shape and white noise,
 
     x[n] = sum_k g(n - u_k) (b_k cos(w n) + d_k sin(w n)) + sigma w[n],
 
-g the Gaussian envelope, w the carrier. Whatever the reflection and the carrier do to the phase is
-in the linear b and d, so the carrier's 20 mm ambiguity never enters: only the envelope is asked
-where an echo lies. For given positions b and d are a linear least-squares solution; the positions
-are found by Levenberg-Marquardt on what is left, the Jacobian projected off the linear part
-(variable projection; Golub and Pereyra 1973, in Kaufman's form). Two echoes start at
-the best pair of a grid over the whole window, so no first guess can lock the search; each further
-echo starts where it explains most of what the others leave, and as a half of each of them.
+g the Gaussian envelope, w the carrier. The effect of reflection and carrier on the phase is in the
+linear b and d, so the carrier's 20 mm ambiguity never enters: only the envelope tells where an echo
+lies. For given positions b and d are a linear least-squares solution; the positions are found by
+Levenberg-Marquardt on the residual, the Jacobian projected off the linear part (variable
+projection; Golub and Pereyra 1973, in Kaufman's form). Two echoes start at the best pair of a grid
+over the whole window, so no first guess can lock the search; each further echo starts where it
+explains most of the residual of the others, and as a half of each of them.
 
-How many echoes: one more is believed if it raises twice the log-likelihood by more than
+How many echoes: one more is accepted if it raises twice the log-likelihood by more than
 
     (sqrt(h) + model_error sqrt(E) / sigma)**2,    E = energy of the echoes so far.
 
 h is exceeded by noise alone, anywhere in the window, with probability ``false_split`` (upcrossings
 of a chi-square process with 2 degrees of freedom; Davies 1987). The other term keeps a pulse that
-is not quite ours one echo, however strong: what the pulse model leaves of it grows with the signal,
-and the noise adds to its root. Its price: of two echoes in phase, closer than the bandwidth can be
-trusted to tell from one wide pulse, or one far weaker than the other, only one is reported.
+differs from the model one echo, however strong: the residual of the pulse model grows with the
+signal, and the noise adds to its root. Its price: of two echoes in phase, closer than the bandwidth
+can tell from one wide pulse, or one far weaker than the other, only one is reported.
 
-All arithmetic is batched over windows of one length.
-
-The same maximum likelihood as in :mod:`slam.front_end.overlapping`, in closed form. Behind the
-filter (:mod:`slam.front_end.matched_filter`), with the carrier turned back, K pulses are
+`fit_echoes` does so sample by sample, where some samples are unknown. Where all are known,
+`fit_whole_echoes` does it in closed form behind the filter (:mod:`slam.front_end.matched_filter`):
+with the carrier turned back, K pulses are
 
     z(n) = y(n) exp(-j kappa n) = sum_k a_k rho(n - u_k) + noise,   rho(d) = exp(-d**2 / (4 s**2))
 
-and the noise is correlated by rho too, so that all a window of samples tells about the positions u
-lies in the K values z(u_k). With R_kl = rho(u_k - u_l), what the echoes explain at their best is
+and the noise is correlated by rho too, so that all information of a window of samples about the
+positions u is in the K values z(u_k). With R_kl = rho(u_k - u_l), the energy that the echoes
+explain is
 
     G(u) = z^H R^-1 z,   a = R^-1 z,   twice the log-likelihood = G / sigma_y**2
 
-and with D_kl = d rho(u_k - u_l) / d u_k and H_kl = d2 rho(u_k - u_l) / (d u_k d u_l), variable
-projection (Golub and Pereyra 1973, in Kaufman's form) gives
+and with D_kl = d rho(u_k - u_l) / d u_k and H_kl = d2 rho(u_k - u_l) / (d u_k d u_l),
 
     1/2 dG/du_k = Re conj(a_k) (z'(u_k) - sum_l D_kl a_l)
     Fisher information of u = Re(conj(a_k) a_l) (H - D R^-1 D^T)_kl / sigma_y**2
@@ -66,69 +62,26 @@ from slam.front_end.pulse import ComplexArray
 Array = NDArray[np.float64]
 
 _MAX_STEPS = 30
+# Of the envelope's sigma.
 _LARGEST_STEP = 0.5
-"""Of the envelope's sigma."""
+# Damping at which the search ends: it presses against a limit.
 _HOPELESS = 1e3
-"""Damping at which the search ends: it presses against a limit."""
+# Added to what may be zero where no sample is usable.
 TINY = 1e-200
-"""Added to what may be zero where no sample is usable."""
 
 
-class Windows(NamedTuple):
-    """Rows to be fitted, zero where a sample is not usable.
+class Window(NamedTuple):
+    """One window to be fitted, its carrier and its samples zero where a sample is not usable."""
 
-    Attributes
-    ----------
-    samples
-        Shape (r, n).
-    cosine, sine
-        Shape (r, n), or (1, n) for all: the carrier.
-    weight
-        Shape (r, n), or (1, n) for all: 1 where a sample is usable.
-    noise_sigma
-        Shape (r,): standard deviation of a sample's noise.
-    """
-
-    samples: Array
-    cosine: Array
-    sine: Array
-    weight: Array
-    noise_sigma: Array
-
-    @staticmethod
-    def of(
-        samples: Array,
-        usable: NDArray[np.bool_] | None,
-        noise_sigma: Array,
-        carrier_rad_per_bin: float,
-    ) -> Windows:
-        """Return windows of raw samples; ``usable`` has their shape, all of them if None."""
-        angle = carrier_rad_per_bin * np.arange(samples.shape[1])
-        cosine, sine = np.cos(angle)[np.newaxis], np.sin(angle)[np.newaxis]
-        if usable is None:
-            return Windows(samples, cosine, sine, np.ones_like(cosine), noise_sigma)
-        weight = usable.astype(np.float64)
-        return Windows(
-            np.where(usable, samples, 0.0), cosine * weight, sine * weight, weight, noise_sigma
-        )
-
-    def rows(self, chosen: NDArray[np.intp]) -> Windows:
-        """Return some of the rows."""
-
-        def pick(table: Array) -> Array:
-            return table if len(table) == 1 else table[chosen]
-
-        return Windows(
-            self.samples[chosen],
-            pick(self.cosine),
-            pick(self.sine),
-            pick(self.weight),
-            self.noise_sigma[chosen],
-        )
+    samples: Array  # (1, n)
+    cosine: Array  # (1, n)
+    sine: Array  # (1, n)
+    weight: Array  # (1, n): 1 where a sample is usable
+    noise_sigma: Array  # (1,)
 
 
 class State(NamedTuple):
-    """Everything known at given positions, K per row."""
+    """The fits at given positions, K echoes per row; a row is one start."""
 
     positions: Array  # (r, K)
     linear: Array  # (r, 2 K): b of every echo, then d
@@ -137,7 +90,6 @@ class State(NamedTuple):
     information: Array  # (r, K, K): sigma**2 times the Fisher matrix of the positions
 
     def rows(self, chosen: NDArray[np.intp]) -> State:
-        """Return some of the rows, copied."""
         return State(*(table[chosen] for table in self))
 
 
@@ -160,37 +112,34 @@ class Solver:
         self._first = first
         self._last = last
 
-    def fit(self, data: Windows, starts: Array, tolerance: float) -> State:
-        """Return the best fit of each window over its starts.
+    def fit(self, data: Window, starts: Array, tolerance: float) -> State:
+        """Return the best fit over some starts, one row.
 
-        A row whose positions are never apart enough has an infinite ``sse``.
+        Its ``sse`` is infinite if the positions are never apart enough.
 
         Parameters
         ----------
         data
-            r windows.
+            The window.
         starts
-            Shape (r, n_starts, K): ascending positions.
+            Shape (n_starts, K): ascending positions.
         tolerance
             A gain of twice the log-likelihood too small to go on.
         """
-        n_rows, n_starts, n_echoes = starts.shape
-        data = data.rows(np.repeat(np.arange(n_rows), n_starts))
-        fitted = evaluate(data, starts.reshape(-1, n_echoes), self.sigma)
+        fitted = evaluate(data, starts, self.sigma)
         fitted.sse[~self._apart(fitted.positions)] = math.inf
         fitted = self.polish(data, fitted, tolerance)
-        best = fitted.sse.reshape(n_rows, n_starts).argmin(axis=1)
-        return fitted.rows(best + n_starts * np.arange(n_rows))
+        return fitted.rows(fitted.sse.argmin(axis=0, keepdims=True))
 
-    def polish(self, data: Windows, begun: State, tolerance: float) -> State:
-        """Return the fit a search that began earlier ends at; parameters as in `fit`."""
+    def polish(self, data: Window, begun: State, tolerance: float) -> State:
+        """Return the fits at which searches from some fits end; parameters as in `fit`."""
         state = begun.rows(np.arange(len(begun.sse)))
         damping = np.full(len(state.sse), 1e-3)
         going = np.arange(len(state.sse))
         diagonal = np.arange(state.positions.shape[1])
         largest = _LARGEST_STEP * self.sigma
         for _ in range(_MAX_STEPS):
-            at, data_at = state.rows(going), data.rows(going)
+            at = state.rows(going)
             damped = at.information
             scale = damped[:, diagonal, diagonal]
             floor = 1e-12 * scale.max(axis=1, keepdims=True) + TINY
@@ -198,7 +147,7 @@ class Solver:
             step = np.linalg.solve(damped, at.gradient[..., np.newaxis])[..., 0]
             wanted = at.positions + np.clip(step, -largest, largest)
             wanted = np.sort(np.clip(wanted, self._first, self._last), axis=1)
-            tried = evaluate(data_at, wanted, self.sigma)
+            tried = evaluate(data, wanted, self.sigma)
             better = (tried.sse < at.sse) & self._apart(wanted)
             for table, values in zip(state, tried, strict=True):
                 table[going[better]] = values[better]
@@ -206,7 +155,7 @@ class Solver:
             # the model's own forecast of the gain, for a step that was not taken
             promised = np.einsum("rk,rk->r", step, at.gradient)
             gained = np.where(better, at.sse - tried.sse, promised)
-            open_ends = (gained > tolerance * data_at.noise_sigma**2) & (damping[going] < _HOPELESS)
+            open_ends = (gained > tolerance * data.noise_sigma**2) & (damping[going] < _HOPELESS)
             going = going[open_ends]
             if not going.size:
                 break
@@ -218,7 +167,7 @@ class Solver:
         return apart
 
 
-def evaluate(data: Windows, positions: Array, sigma: float) -> State:
+def evaluate(data: Window, positions: Array, sigma: float) -> State:
     """Solve for the linear part and project the Jacobian of the positions off it."""
     n_echoes = positions.shape[1]
     offsets = np.arange(data.samples.shape[1]) - positions[..., np.newaxis]
@@ -249,15 +198,11 @@ def evaluate(data: Windows, positions: Array, sigma: float) -> State:
     )
 
 
-def _on_grid(data: Windows, samples: Array, envelopes: Array) -> tuple[Array, Array]:
-    """Return what the starts need of pulses on a grid, edges and gaps of the window included.
+def _on_grid(data: Window, samples: Array, envelopes: Array) -> tuple[Array, Array]:
+    """Return the correlation of samples with pulses on a grid, complex, and their squared norms.
 
-    Cosine and sine columns are taken as orthogonal, which they are but for cut pulses.
-
-    Returns
-    -------
-    Shape (r, n_grid), complex128: correlation of the samples with a pulse; and shape
-    (r or 1, n_grid): its squared norm.
+    Shapes (1, n_grid), edges and gaps of the window included. Cosine and sine columns are taken as
+    orthogonal, which they are but for cut pulses.
     """
     matched = (samples * data.cosine) @ envelopes.T + 1j * ((samples * data.sine) @ envelopes.T)
     norm = 0.5 * data.weight @ (envelopes**2).T
@@ -265,25 +210,24 @@ def _on_grid(data: Windows, samples: Array, envelopes: Array) -> tuple[Array, Ar
 
 
 def _envelopes(positions: Array, n_bins: int, sigma: float) -> Array:
-    """Return envelopes centred at positions, shape (..., n_bins)."""
     envelopes: Array = np.exp(
         -0.5 * ((np.arange(n_bins) - positions[..., np.newaxis]) / sigma) ** 2
     )
     return envelopes
 
 
-def best_single(data: Windows, grid: Array, sigma: float) -> Array:
-    """Return the place of the grid where one echo explains most; shape (r, 1, 1)."""
+def best_single(data: Window, grid: Array, sigma: float) -> Array:
+    """Return the place of the grid where one echo explains most; shape (1, 1)."""
     matched, norm = _on_grid(data, data.samples, _envelopes(grid, data.samples.shape[1], sigma))
     best: Array = grid[np.argmax(np.abs(matched) ** 2 / norm, axis=1)]
-    return best[:, np.newaxis, np.newaxis]
+    return best[:, np.newaxis]
 
 
-def best_pair(data: Windows, grid: Array, sigma: float, separation: float) -> Array:
-    """Return the pair of the grid that explains most; shape (r, 1, 2)."""
+def best_pair(data: Window, grid: Array, sigma: float, separation: float) -> Array:
+    """Return the pair of the grid that explains most; shape (1, 2)."""
     one, other = np.triu_indices(len(grid), k=math.ceil(separation / (grid[1] - grid[0])))
     if not one.size:  # a search interval shorter than two echoes' distance
-        return np.broadcast_to(grid[[0, -1]], (len(data.samples), 1, 2))
+        return grid[np.newaxis, [0, -1]]
     envelopes = _envelopes(grid, data.samples.shape[1], sigma)
     matched, norm = _on_grid(data, data.samples, envelopes)
     overlaps = 0.5 * (data.weight[:, np.newaxis] * envelopes) @ envelopes.T
@@ -293,11 +237,11 @@ def best_pair(data: Windows, grid: Array, sigma: float, separation: float) -> Ar
     joint -= 2 * overlap * (matched[:, one] * matched[:, other].conj()).real
     joint /= norm[:, one] * norm[:, other] - overlap**2 + TINY
     best = joint.argmax(axis=1)
-    return np.stack([grid[one[best]], grid[other[best]]], axis=1)[:, np.newaxis]
+    return np.stack([grid[one[best]], grid[other[best]]], axis=1)
 
 
-def one_more(data: Windows, state: State, grid: Array, sigma: float, separation: float) -> Array:
-    """Return starts with one more echo: where it explains most, or as a split of one; (r, s, K)."""
+def one_more(data: Window, state: State, grid: Array, sigma: float, separation: float) -> Array:
+    """Return starts with one more echo: where it explains most, or as a split of one; (s, K)."""
     n_bins = data.samples.shape[1]
     weight = data.weight
     mine, theirs = _envelopes(state.positions, n_bins, sigma), _envelopes(grid, n_bins, sigma)
@@ -316,80 +260,46 @@ def one_more(data: Windows, state: State, grid: Array, sigma: float, separation:
         split = np.insert(state.positions, k, state.positions[:, k] - 0.5 * sigma, axis=1)
         split[:, k + 1] += 0.5 * sigma
         starts.append(split)
-    together: Array = np.sort(np.stack(starts, axis=1), axis=2)
+    together: Array = np.sort(np.concatenate(starts), axis=1)
     return together.clip(grid[0], grid[-1])
 
 
+# Of the envelope's sigma: spacing of the start grid. The likelihood is smooth on that scale.
 _GRID_STEP = 0.2
-"""Of the envelope's sigma: spacing of the start grid. The likelihood is smooth on that scale."""
-_COARSE = 1.0
-"""Of twice the log-likelihood: what does not decide between one echo more or less."""
-_FINE = 1e-4
-"""Likewise: a hundredth of a standard deviation of a position."""
+# Gains of twice the log-likelihood too small to go on: while echoes are counted, and at last, where
+# it is a hundredth of a standard deviation of a position.
+_COARSE, _FINE = 1.0, 1e-4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EchoFit:
-    """One echo of a window.
+    """One echo of a window."""
 
-    Attributes
-    ----------
-    position_bins
-        Centre of the pulse, in bins from the window's first sample.
-    amplitude
-        Peak of the envelope, in the unit of the samples.
-    phase_rad
-        Phase of the carrier at the pulse's centre, in (-pi, pi].
-    sigma_bins
-        Standard deviation of the position: the Cramer-Rao bound at this fit, the amplitudes and
-        phases of all echoes and the other positions unknown.
-    misfit
-        Of the whole window: root of the residual's energy above noise over the echoes' energy.
-    """
-
-    position_bins: float
-    amplitude: float
-    phase_rad: float
+    position_bins: float  # centre of the pulse, in bins from the window's first sample
+    amplitude: float  # peak of the envelope, in the unit of the samples
+    phase_rad: float  # phase of the carrier at the pulse's centre, in (-pi, pi]
+    # Standard deviation of the position: the Cramer-Rao bound at this fit, the amplitudes and
+    # phases of all echoes and the other positions unknown
     sigma_bins: float
-    misfit: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KnownPulse:
-    """What the fit knows of the pulse.
+    """What the fit knows of the pulse."""
 
-    Attributes
-    ----------
-    envelope_sigma_bins
-        Standard deviation of the Gaussian envelope, in bins.
-    carrier_rad_per_bin
-        Advance of the carrier's phase per bin.
-    """
-
-    envelope_sigma_bins: float
-    carrier_rad_per_bin: float
+    envelope_sigma_bins: float  # standard deviation of the Gaussian envelope, in bins
+    carrier_rad_per_bin: float  # advance of the carrier's phase per bin
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SplitTest:
-    """When one more echo is believed.
+    """When one more echo is accepted."""
 
-    Attributes
-    ----------
-    max_echoes
-        No window gets more.
-    false_split
-        Probability that noise alone makes one more echo in a window.
-    model_error
-        Amplitude error of the pulse model, relative. 0.08 covers a bandwidth wrong by 10 %.
-    min_separation
-        Closest echoes told apart, in standard deviations of the envelope.
-    """
-
-    max_echoes: int = 4
-    false_split: float = 1e-3
+    max_echoes: int = 4  # most echoes of a window
+    false_split: float = 1e-3  # probability that noise alone makes one more echo in a window
+    # Amplitude error of the pulse model, relative. 0.08 covers a bandwidth wrong by 10 %.
     model_error: float = 0.08
-    min_separation: float = 0.5
+    min_separation: float = 0.5  # closest echoes told apart, in standard deviations of the envelope
 
 
 def fit_echoes(
@@ -401,135 +311,71 @@ def fit_echoes(
     search_bins: tuple[float, float] | None = None,
     split: SplitTest | None = None,
 ) -> tuple[EchoFit, ...]:
-    """Return the echoes of one window, nearest first; see `fit_many`."""
-    return fit_many(
-        samples[np.newaxis],
-        pulse=pulse,
-        noise_sigma=np.array([noise_sigma]),
-        usable=None if usable is None else usable[np.newaxis],
-        search_bins=search_bins,
-        split=split,
-    )[0]
-
-
-def fit_many(
-    windows: Array,
-    *,
-    pulse: KnownPulse,
-    noise_sigma: Array,
-    usable: NDArray[np.bool_] | None = None,
-    search_bins: tuple[float, float] | None = None,
-    split: SplitTest | None = None,
-) -> tuple[tuple[EchoFit, ...], ...]:
-    """Return the echoes of windows, at least one and at most ``split.max_echoes`` each.
+    """Return the echoes of a window, nearest first, between one and ``split.max_echoes``.
 
     Parameters
     ----------
-    windows
-        Shape (b, n), float64: raw samples. About 3.5 envelope sigmas either side of the cluster.
+    samples
+        Shape (n,), float64: raw samples. About 3.5 envelope sigmas either side of the cluster.
     pulse
         The pulse.
     noise_sigma
-        Shape (b,): standard deviation of a sample's noise, > 0.
+        Standard deviation of a sample's noise, > 0.
     usable
-        Shape (b, n): false where a sample says nothing (clipped, outside the frame). All, if None.
+        Shape (n,): false where a sample is unknown (clipped, outside the frame). All, if None.
     search_bins
         Least and largest position of an echo, in bins; 1.5 envelope sigmas off the ends, if None.
     split
-        When one more echo is believed; `SplitTest()`, if None.
-
-    Returns
-    -------
-    One tuple per window, nearest echo first.
+        When one more echo is accepted; `SplitTest()`, if None.
     """
     split = split or SplitTest()
-    n_bins = windows.shape[1]
+    n_bins = len(samples)
     sigma = pulse.envelope_sigma_bins
     first, last = search_bins or (1.5 * sigma, n_bins - 1 - 1.5 * sigma)
     if not 0 <= first <= last <= n_bins - 1:
         raise ValueError(f"echoes cannot be searched in bins {first} ... {last} of {n_bins}")
-    if not (noise_sigma > 0).all():
+    if not noise_sigma > 0:
         raise ValueError("the noise of a window must be more than 0")
-    data = Windows.of(windows, usable, noise_sigma, pulse.carrier_rad_per_bin)
+    angle = pulse.carrier_rad_per_bin * np.arange(n_bins)
+    weight = np.ones(n_bins) if usable is None else usable.astype(np.float64)
+    data = Window(
+        np.where(weight > 0.0, samples, 0.0)[np.newaxis],
+        (np.cos(angle) * weight)[np.newaxis],
+        (np.sin(angle) * weight)[np.newaxis],
+        weight[np.newaxis],
+        np.array([noise_sigma]),
+    )
     grid = np.linspace(first, last, max(2, math.ceil((last - first) / (_GRID_STEP * sigma)) + 1))
     solver = Solver(sigma, first, last, split.min_separation * sigma)
     threshold = split_threshold(split.false_split, (last - first) / sigma)
     energy = np.einsum("rn,rn->r", data.samples, data.samples)
 
-    found: list[tuple[EchoFit, ...]] = [()] * len(windows)
-    active = np.arange(len(windows))
     state = solver.fit(data, best_single(data, grid, sigma), _COARSE)
-    while active.size:
-        more, believed = _try_one_more(
-            data.rows(active),
-            state,
-            grid=grid,
-            solver=solver,
-            split=split,
-            threshold=threshold,
-            energy=energy[active],
-        )
-        settled = ~believed
-        final = solver.polish(
-            data.rows(active[settled]), state.rows(np.flatnonzero(settled)), _FINE
-        )
-        for place, row in enumerate(active[settled]):
-            found[row] = _echoes(
-                data,
-                final,
-                place=place,
-                row=row,
-                energy=energy[row],
-                carrier_rad_per_bin=pulse.carrier_rad_per_bin,
-            )
-        active, state = active[believed], more
-    return tuple(found)
-
-
-def _try_one_more(
-    data: Windows,
-    state: State,
-    *,
-    grid: Array,
-    solver: Solver,
-    split: SplitTest,
-    threshold: float,
-    energy: Array,
-) -> tuple[State, NDArray[np.bool_]]:
-    """Return the fits with one more echo that are believed, and of which rows, shape (r,)."""
-    n_echoes = state.positions.shape[1] + 1
-    signal = np.sqrt(np.maximum(energy - state.sse, 0.0))
-    needed = (math.sqrt(threshold) * data.noise_sigma + split.model_error * signal) ** 2
-    # no echo can explain more than all that is left
-    believed = (state.sse > needed) & (n_echoes <= split.max_echoes)
-    hopeful = np.flatnonzero(believed)
-    if not hopeful.size:
-        return state.rows(hopeful), believed
-    rows, fewer = data.rows(hopeful), state.rows(hopeful)
-    if n_echoes == 2:
-        starts = best_pair(rows, grid, solver.sigma, solver.separation)
-    else:
-        starts = one_more(rows, fewer, grid, solver.sigma, solver.separation)
-    more = solver.fit(rows, starts, _COARSE)
-    enough = fewer.sse - more.sse > needed[hopeful]
-    believed[hopeful] = enough
-    return more.rows(np.flatnonzero(enough)), believed
+    while (n_echoes := state.positions.shape[1]) < split.max_echoes:
+        signal = np.sqrt(np.maximum(energy - state.sse, 0.0))
+        needed = (math.sqrt(threshold) * data.noise_sigma + split.model_error * signal) ** 2
+        if not state.sse > needed:  # no echo can explain more than all that is left
+            break
+        if n_echoes == 1:
+            starts = best_pair(data, grid, sigma, solver.separation)
+        else:
+            starts = one_more(data, state, grid, sigma, solver.separation)
+        more = solver.fit(data, starts, _COARSE)
+        if not state.sse - more.sse > needed:
+            break
+        state = more
+    state = solver.polish(data, state, _FINE)
+    return _echoes(state, noise_sigma, pulse.carrier_rad_per_bin)
 
 
 @lru_cache
 def split_threshold(false_split: float, search_sigmas: float) -> float:
     """Return the rise of twice the log-likelihood that noise exceeds with a given probability.
 
-    Along the position, what one more echo explains is a chi-square process of 2 degrees, whose
-    correlation is that of the pulse; the probability that it exceeds h anywhere is at most that
-    of its first point plus its upcrossings, ``exp(-h/2) (1 + L sqrt(h / (4 pi)))``.
-
-    Parameters
-    ----------
-    false_split
-        The probability, 0 ... 1.
-    search_sigmas
-        Length L of the interval searched, in standard deviations of the envelope.
+    Along the position, the energy that one more echo explains is a chi-square process of 2 degrees,
+    whose correlation is that of the pulse; the probability that it exceeds h anywhere is at most
+    that of its first point plus its upcrossings, ``exp(-h/2) (1 + L sqrt(h / (4 pi)))``, with L =
+    ``search_sigmas`` the interval searched, in standard deviations of the envelope.
     """
 
     def excess(h: float) -> float:
@@ -538,31 +384,14 @@ def split_threshold(false_split: float, search_sigmas: float) -> float:
     return float(brentq(lambda h: excess(h) - math.log(false_split), 0.0, 200.0))
 
 
-def _echoes(
-    data: Windows,
-    fit: State,
-    *,
-    place: int,
-    row: int,
-    energy: float,
-    carrier_rad_per_bin: float,
-) -> tuple[EchoFit, ...]:
-    """Return the echoes of window ``row``, whose fit is row ``place`` of ``fit``."""
-    positions = fit.positions[place]
+def _echoes(fit: State, noise_sigma: float, carrier_rad_per_bin: float) -> tuple[EchoFit, ...]:
+    positions, information = fit.positions[0], fit.information[0]
     n_echoes = len(positions)
-    noise_sigma = data.noise_sigma[row]
-    information = fit.information[place]
     if np.linalg.eigvalsh(information)[0] > TINY:
         sigma_bins = noise_sigma * np.sqrt(np.diag(np.linalg.inv(information)))
     else:
         sigma_bins = np.full(n_echoes, math.inf)
-
-    weight = data.weight[min(row, len(data.weight) - 1)]
-    freedom = max(0.0, weight.sum() - 3 * n_echoes)
-    above_noise = max(0.0, fit.sse[place] - freedom * noise_sigma**2)
-    misfit = math.sqrt(above_noise / max(energy - fit.sse[place], TINY))
-
-    b, d = fit.linear[place, :n_echoes], fit.linear[place, n_echoes:]
+    b, d = fit.linear[0, :n_echoes], fit.linear[0, n_echoes:]
     # A cos(w (n - u) + phase) = b cos(w n) + d sin(w n)
     phases = np.angle((b - 1j * d) * np.exp(1j * carrier_rad_per_bin * positions))
     return tuple(
@@ -571,7 +400,6 @@ def _echoes(
             amplitude=amplitude,
             phase_rad=phase,
             sigma_bins=spread,
-            misfit=misfit,
         )
         for position, amplitude, phase, spread in zip(
             positions.tolist(),
@@ -586,17 +414,13 @@ def _echoes(
 Matrix = list[list[float]]
 T = TypeVar("T")
 
-"""Of s."""
-"""Damping at which the search ends: it presses against a limit."""
+# How many times its forecast a search may gain, at most.
 _OPTIMISM = 10.0
-"""How many times what it forecasts a search may gain, at most."""
-_COARSE_BINS, _FINE_BINS = 1.0, 1e-4
-"""Gains of twice the log-likelihood too small to go on: while echoes are counted, and at last."""
+# On either side of a step, how many it takes to interpolate there.
 REACH_STEPS = 4
-"""On either side of a step, how many it takes to interpolate there."""
 _WINDOW = np.arange(2 * REACH_STEPS + 1)
+# From nine values of z to the polynomial through them; z is smooth over ten steps.
 _TAYLOR = np.linalg.inv(np.vander(_WINDOW - REACH_STEPS, increasing=True)).T + 0j
-"""From nine values of z to the polynomial through them; z is smooth over ten steps."""
 
 
 class Correlation:
@@ -645,7 +469,7 @@ class Correlation:
 
 
 class _Search(NamedTuple):
-    """Where echoes are looked for: limits of their positions, least distance, steps, z there."""
+    """Limits of the positions, least distance, steps, and z there."""
 
     first: float
     last: float
@@ -655,18 +479,10 @@ class _Search(NamedTuple):
 
 
 class _Fit:
-    """Everything known at given positions.
+    """The echoes at given positions.
 
-    Attributes
-    ----------
-    positions, amplitudes
-        u and a, one each per echo.
-    inverse
-        R^-1.
-    explained
-        G.
-    gradient, information
-        Half of dG/du, and the Fisher matrix times sigma_y**2.
+    ``positions``, ``amplitudes``: u and a; ``inverse``: R^-1; ``explained``: G; ``gradient`` and
+    ``information``: half of dG/du, and the Fisher matrix times sigma_y**2.
     """
 
     __slots__ = ("amplitudes", "explained", "gradient", "information", "inverse", "positions")
@@ -703,22 +519,22 @@ def fit_whole_echoes(
     Parameters
     ----------
     data
-        z around them, all other echoes of the frame taken away.
+        z around them, all other echoes of the frame subtracted.
     first, last
         Least and largest position [bins].
     split
-        When one more echo is believed.
+        When one more echo is accepted.
 
     Returns
     -------
     Nearest first, positions counted in bins from ``z[0]``, phases at the positions with the carrier
-    turned back; ``misfit`` is not known here (NaN).
+    turned back.
     """
     s = data.sigma_bins
     grid, z = data.on_steps(first, last)
     search = _Search(first, last, split.min_separation * s, grid, z)
     threshold = split_threshold(split.false_split, math.ceil((last - first) / s))
-    fit = _polished(data, _Fit(data, [float(grid[np.argmax(np.abs(z))])]), search, _COARSE_BINS)
+    fit = _polished(data, _Fit(data, [float(grid[np.argmax(np.abs(z))])]), search, _COARSE)
     while len(fit.positions) < split.max_echoes:
         signal = math.sqrt(max(fit.explained, 0.0))
         needed = (math.sqrt(threshold) * data.sigma_y + split.model_error * signal) ** 2
@@ -727,7 +543,7 @@ def fit_whole_echoes(
         else:
             starts = _one_more(fit, search, s, needed)
         tried = [
-            _polished(data, _Fit(data, start), search, _COARSE_BINS, fit.explained + needed)
+            _polished(data, _Fit(data, start), search, _COARSE, fit.explained + needed)
             for start in starts
             if _apart(start, search.separation)
         ]
@@ -735,7 +551,7 @@ def fit_whole_echoes(
         if more.explained - fit.explained <= needed:
             break
         fit = more
-    return _fitted_echoes(_polished(data, fit, search, _FINE_BINS), data.sigma_y)
+    return _fitted_echoes(_polished(data, fit, search, _FINE), data.sigma_y)
 
 
 def _polished(
@@ -747,8 +563,7 @@ def _polished(
 ) -> _Fit:
     """Return the best fit by Levenberg-Marquardt, kept between limits and apart.
 
-    A search is given up when its own forecast, however often missed, stays short of what G is
-    wanted to be.
+    A search is given up when its own forecast, many times over, stays short of ``at_least``.
     """
     first, last, separation = search[:3]
     largest = _LARGEST_STEP * data.sigma_bins
@@ -837,7 +652,7 @@ def _pairs(size: int, step_bins: float, s: float, separation: float) -> tuple[Ar
 def _one_more(fit: _Fit, search: _Search, s: float, needed: float) -> list[list[float]]:
     """Return starts with one more echo: where it explains most, or as a split of one.
 
-    None, where what is left is far from explaining what is needed.
+    None, where the residual is far from explaining what is needed.
     """
     first, last, separation, grid, z = search
     positions = np.array(fit.positions)
@@ -892,7 +707,6 @@ def _fitted_echoes(fit: _Fit, sigma_y: float) -> tuple[EchoFit, ...]:
             amplitude=abs(a),
             phase_rad=math.atan2(a.imag, a.real),
             sigma_bins=sigma,
-            misfit=math.nan,
         )
         for position, a, sigma in zip(fit.positions, fit.amplitudes, spread, strict=True)
     )

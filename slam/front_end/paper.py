@@ -13,30 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
-from slam.config import BackgroundFilter, DetectionConfig, FrontEnd, PeakPosition, SlamConfig
-from slam.frames import Detection, Detector, RadarFrame
-from slam.front_end.matched_filter import MatchedFilterDetector
-
-__all__ = ["Detection", "Detector", "PaperDetector", "SavitzkyGolay", "make_detector"]
+from slam.config import BackgroundFilter, DetectionConfig, PeakPosition
+from slam.frames import Detection, RadarFrame
 
 Array = NDArray[np.float64]
 
 
-def make_detector(config: SlamConfig) -> Detector:
-    """Return the front end that ``config`` names."""
-    if config.detection.front_end is FrontEnd.PAPER:
-        return PaperDetector(config.detection)
-    return MatchedFilterDetector(config)
-
-
 class PaperDetector:
-    """The paper's front end with its filters worked out once.
-
-    Parameters
-    ----------
-    config
-        Filter lengths, peak thresholds, range limits.
-    """
+    """The paper's front end."""
 
     def __init__(self, config: DetectionConfig) -> None:
         self.config = config
@@ -46,13 +30,7 @@ class PaperDetector:
         """Return the echoes of one frame inside the range limits, nearest first.
 
         Peaks are searched in the whole frame, so an echo's prominence never depends on the limits.
-
-        Parameters
-        ----------
-        frame
-            The raw frame, longer than the smoothing filter. Samples that are NaN count as zero.
-        range_offset_m
-            What this module measures too long (``Mount.range_offset_m``).
+        The frame must be longer than the smoothing filter; samples that are NaN count as zero.
         """
         bins, beyond, heights = self._peaks(self.smooth(frame.samples))
         return self._in_range(frame, bins + beyond, heights, range_offset_m)
@@ -60,7 +38,6 @@ class PaperDetector:
     def detect_many(
         self, frames: Sequence[RadarFrame], offsets_m: Sequence[float]
     ) -> list[tuple[Detection, ...]]:
-        """Return the echoes of each frame; see ``Detector``."""
         results: list[tuple[Detection, ...]] = [()] * len(frames)
         for n_bins in {frame.samples.size for frame in frames}:
             chosen = [index for index, frame in enumerate(frames) if frame.samples.size == n_bins]
@@ -122,16 +99,9 @@ class PaperDetector:
 class SavitzkyGolay:
     """Least-squares polynomial smoothing of equally spaced samples, as one FIR filter.
 
-    Equal to ``scipy.signal.savgol_filter`` with ``mode="interp"``: in the middle a fixed kernel,
-    at each end the polynomial fitted to the last ``length`` samples. Both are worked out once
-    instead of once per frame.
-
-    Parameters
-    ----------
-    length
-        Number of samples fitted, odd.
-    order
-        Order of the polynomial, less than ``length``.
+    Equal to ``scipy.signal.savgol_filter`` with ``mode="interp"``: in the middle a fixed kernel, at
+    each end the polynomial fitted to the last ``length`` samples, an odd number. Both are computed
+    once instead of once per frame.
     """
 
     def __init__(self, length: int, order: int) -> None:
@@ -166,7 +136,7 @@ class SavitzkyGolay:
 
 
 def _vertex_offsets(smoothed: Array, peaks: NDArray[np.intp]) -> Array:
-    """Return how far, in bins, the parabola through each peak and its neighbours peaks off it."""
+    """Return the bins from each peak to the vertex through it and its neighbours."""
     before, at, after = smoothed[peaks - 1], smoothed[peaks], smoothed[peaks + 1]
     curvature = before - 2 * at + after
     # A plateau has no curvature and its middle bin is the answer already.

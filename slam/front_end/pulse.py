@@ -39,18 +39,10 @@ _HALF_LENGTH_SIGMAS = 6.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PulseModel:
-    """Gaussian envelope on a carrier.
+    """Gaussian envelope on a carrier."""
 
-    Attributes
-    ----------
-    carrier_hz
-        Centre frequency.
-    bandwidth_hz
-        Full width of the power spectrum at -10 dB.
-    """
-
-    carrier_hz: float = 7.29e9
-    bandwidth_hz: float = 1.4e9
+    carrier_hz: float = 7.29e9  # centre frequency
+    bandwidth_hz: float = 1.4e9  # full width of the power spectrum at -10 dB
 
     @property
     def sigma_m(self) -> float:
@@ -74,15 +66,13 @@ class PulseModel:
         return _SPEED_OF_LIGHT_MPS / (2 * self.carrier_hz)
 
     def sigma_bins(self, bin_length_m: float) -> float:
-        """Return s: the envelope's standard deviation in bins."""
         return self.sigma_m / bin_length_m
 
     def carrier_rad(self, bin_length_m: float) -> float:
-        """Return kappa: the carrier's phase per bin."""
         return math.tau * bin_length_m / self.wavelength_m
 
     def half_length(self, bin_length_m: float) -> int:
-        """Return how many samples a sampled pulse has on either side of its middle one."""
+        """Return how many samples a sampled pulse has on either side of its middle."""
         return math.ceil(_HALF_LENGTH_SIGMAS * self.sigma_bins(bin_length_m))
 
     def samples(self, offset_bins: Array, bin_length_m: float) -> ComplexArray:
@@ -109,12 +99,8 @@ class PulseModel:
     def position_bound_bins(self, snr: float, bin_length_m: float) -> float:
         """Return the least standard deviation of a position, amplitude and phase unknown.
 
-        Parameters
-        ----------
-        snr
-            A / sigma, amplitude over the standard deviation of the white noise per RF sample.
-        bin_length_m
-            Spacing of the samples, true metres.
+        ``snr`` is A / sigma, amplitude over the standard deviation of the white noise per RF
+        sample.
 
         >>> bin_m = 299_792_458 / (2 * 23.328e9)
         >>> round(1e3 * bin_m * PulseModel().position_bound_bins(30.0, bin_m), 2)

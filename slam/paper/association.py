@@ -3,76 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from slam.config import Assignment, AssociationConfig
-from slam.paper.ekf import (
-    LANDMARK_SIZE,
-    POSE_SIZE,
-    Belief,
-    augment,
-    expected_observations,
-    innovation,
-    observation_jacobians,
-    update,
-)
+from slam.paper.ekf import augment, expected_observations, innovation, observation_jacobians, update
+from slam.results import LANDMARK_SIZE, POSE_SIZE, Association, Belief
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Association:
-    """What became of one observation.
-
-    Attributes
-    ----------
-    landmark_id
-        The landmark it updated, or the one born from it.
-    is_new
-        True if the landmark was born from this observation.
-    mahalanobis_sq
-        shape (n,): squared distance to every landmark of the map before this observation, before
-        any gate; inf for one under the robot's own position. Two degrees of freedom.
-    candidate_ids
-        n landmark ids belonging to ``mahalanobis_sq``.
-    """
-
-    landmark_id: int
-    is_new: bool
-    mahalanobis_sq: Array
-    candidate_ids: tuple[int, ...]
-
-    @property
-    def nis(self) -> float | None:
-        """Return the normalised innovation squared (2 dof), None for a new landmark."""
-        if self.is_new:
-            return None
-        return float(self.mahalanobis_sq[self.candidate_ids.index(self.landmark_id)])
-
-
 def mahalanobis_sq(belief: Belief, observed: Array, Q: Array) -> Array:
-    """Return nu^T S^-1 nu of one observation against every landmark.
+    """Return nu^T S^-1 nu of one observation against every landmark, shape (n,).
 
-    S = H P H^T + Q per landmark, nu the innovation with its angle wrapped.
-
-    Parameters
-    ----------
-    belief
-        Pose and n landmarks.
-    observed
-        shape (2,), range [m] and bearing [rad].
-    Q
-        shape (2, 2), observation noise.
-
-    Returns
-    -------
-    distances
-        shape (n,), squared Mahalanobis distances; inf where a landmark coincides with the pose,
-        because a bearing to it does not exist.
+    S = H P H^T + Q per landmark, nu the innovation with its angle wrapped; inf where a landmark
+    coincides with the pose, because a bearing to it does not exist. ``observed`` is (range [m],
+    bearing [rad]), Q its noise, shape (2, 2).
     """
     n = len(belief.landmark_ids)
     distances = np.full(n, np.inf)
@@ -107,15 +55,8 @@ def nearest(distances: Array, gate_threshold: float) -> int | None:
 def one_to_one(distances: Array, gate_threshold: float) -> list[int | None]:
     """Return for each observation its landmark's row, or None, no landmark twice.
 
-    Among all such assignments the one of least total squared distance is chosen, where leaving
-    an observation unmatched costs the gate.
-
-    Parameters
-    ----------
-    distances
-        shape (n_observations, n_landmarks).
-    gate_threshold
-        Bound on the squared distance of a match.
+    Among all such assignments the one of least total squared distance is chosen, where leaving an
+    observation unmatched costs the gate. ``distances`` has shape (n_observations, n_landmarks).
     """
     n_observations, n_landmarks = distances.shape
     cost = np.full((n_observations, n_landmarks + n_observations), gate_threshold)
@@ -137,21 +78,8 @@ def update_map(
     distance given all before it, or becomes a landmark if none lies within the gate. With
     ``one_to_one`` all are assigned jointly against the belief before any of them.
 
-    Parameters
-    ----------
-    belief
-        Predicted belief.
-    observations
-        shape (2,) each, range [m] and bearing [rad] from the base footprint.
-    Q
-        shape (2, 2), observation noise.
-    config
-        Gate and assignment rule.
-
-    Returns
-    -------
-    belief, associations
-        Belief after all observations, and what became of each, in their order.
+    Returns the belief after all observations, (range [m], bearing [rad]) each with noise Q, and
+    what became of each, in their order.
     """
     planned: list[int | None] | None = None
     if config.assignment is Assignment.ONE_TO_ONE and observations:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,113 +9,41 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from slam.config import ClusterCount, ClusteringConfig, Emission, Evidence, WindowConfig
+from slam.config import ClusterCount, ClusteringConfig, Emission, Evidence
 from slam.frames import Detection
-from slam.geometry import between, transform, wrap_angle
-from slam.paper.trilateration import Fix
+from slam.geometry import between, transform
+from slam.results import Fix, Observation
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CollectedState:
-    """One entry of Odom[] and Obs[] of Algorithm 1.
+    """One entry of Odom[] and Obs[] of Algorithm 1."""
 
-    Attributes
-    ----------
-    t_ns
-        Session time.
-    odometry_pose
-        shape (3,), [x m, y m, heading rad], odometry frame.
-    detections
-        Ranges of all radars at this pose.
-    fixes
-        Trilaterated points, body frame of this pose.
-    """
-
-    t_ns: int
-    odometry_pose: Array
-    detections: tuple[Detection, ...]
-    fixes: tuple[Fix, ...]
-
-
-def has_moved(previous: Array, pose: Array, config: WindowConfig) -> bool:
-    """Tell whether a pose is far enough from the last collected one, by distance or by turn.
-
-    Both poses have shape (3,). The turn is wrapped, so a heading that passes pi is no motion.
-    """
-    distance_m = math.hypot(pose[0] - previous[0], pose[1] - previous[1])
-    turn_rad = abs(wrap_angle(pose[2] - previous[2]))
-    return distance_m >= config.min_distance_m or turn_rad >= config.min_turn_rad
+    t_ns: int  # session time
+    odometry_pose: Array  # shape (3,), [x m, y m, heading rad], odometry frame
+    detections: tuple[Detection, ...]  # ranges of all radars at this pose
+    fixes: tuple[Fix, ...]  # trilaterated points, body frame of this pose
 
 
 NOISE = -1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Observation:
-    """A confirmed point, as the filter gets it: range and bearing from the base footprint.
-
-    Attributes
-    ----------
-    x_m, y_m
-        Position in the body frame of the window's first pose.
-    n_fixes, n_poses
-        How many fixes, from how many poses, the confirming cluster holds.
-    fixes
-        The fixes whose mean this is.
-    """
-
-    x_m: float
-    y_m: float
-    n_fixes: int
-    n_poses: int
-    fixes: tuple[Fix, ...]
-
-    @property
-    def range_m(self) -> float:
-        """Return the distance from the base footprint."""
-        return math.hypot(self.x_m, self.y_m)
-
-    @property
-    def bearing_rad(self) -> float:
-        """Return the direction from the base footprint, in [-pi, pi]."""
-        return math.atan2(self.y_m, self.x_m)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class FilteredWindow:
-    """What DBSCAN makes of one window.
+    """What DBSCAN makes of one window."""
 
-    Attributes
-    ----------
-    observations
-        One per emitted cluster, in the order of first appearance.
-    rejected
-        Fixes of the window's first pose that belong to no cluster.
-    """
-
+    # One per emitted cluster, in the order of first appearance
     observations: tuple[Observation, ...]
-    rejected: tuple[Fix, ...]
+    rejected: tuple[Fix, ...]  # fixes of the window's first pose that belong to no cluster
 
 
 def cluster_labels(points: Array, config: ClusteringConfig) -> NDArray[np.int64]:
-    """Return the DBSCAN cluster of each point; -1 means noise.
+    """Return the DBSCAN cluster of each point, shape (n,), by first appearance; -1 is noise.
 
-    ``min_observations`` points within ``search_radius_m``, the point itself among them, make a
-    core point (scikit-learn's convention).
-
-    Parameters
-    ----------
-    points
-        shape (n, 2) [m], any frame. Memory grows with n^2; a window holds tens.
-    config
-        Radius and count.
-
-    Returns
-    -------
-    labels
-        shape (n,), clusters numbered from 0 by first appearance.
+    ``min_observations`` points within ``search_radius_m``, the point itself among them, make a core
+    point (scikit-learn's convention). ``points`` has shape (n, 2) [m]; memory grows with n^2.
     """
     # Here, since it takes a second, for which every command would wait.
     from sklearn import config_context
@@ -138,15 +65,9 @@ def cluster_labels(points: Array, config: ClusteringConfig) -> NDArray[np.int64]
 def filter_window(window: Sequence[CollectedState], config: ClusteringConfig) -> FilteredWindow:
     """Return the observations of the window's first pose, confirmed by the poses after it.
 
-    All fixes are expressed, through odometry, in the frame of the first pose and clustered there.
-    A cluster that holds a fix of the first pose becomes one observation of that pose.
-
-    Parameters
-    ----------
-    window
-        States in time order, at least one; the first is the one to estimate.
-    config
-        Which clusters count and what they send; see ClusteringConfig.
+    All fixes are expressed, through odometry, in the frame of the first pose and clustered there. A
+    cluster that holds a fix of the first pose becomes one observation of that pose. ``window`` is
+    in time order and not empty.
     """
     fixes = [fix for state in window for fix in state.fixes]
     state_of_fix = np.repeat(np.arange(len(window)), [len(state.fixes) for state in window])

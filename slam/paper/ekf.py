@@ -10,77 +10,15 @@ with it for good.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.config import MotionConfig, MotionNoise
 from slam.geometry import compose, wrap_angle, wrap_angles
+from slam.results import LANDMARK_SIZE, POSE_SIZE, Belief, landmark_slice
 
 Array = NDArray[np.float64]
-
-POSE_SIZE = 3
-LANDMARK_SIZE = 2
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Belief:
-    """What the filter knows: a Gaussian over pose and landmarks.
-
-    Attributes
-    ----------
-    mean
-        shape (3 + 2 n,), [m, m, rad, m, m, ...], map frame; the heading lies in [-pi, pi).
-    covariance
-        shape (3 + 2 n, 3 + 2 n), symmetric.
-    landmark_ids
-        n ids in the order of the rows.
-    next_id
-        The id the next new landmark gets; ids are never used twice.
-    """
-
-    mean: Array
-    covariance: Array
-    landmark_ids: tuple[int, ...] = ()
-    next_id: int = 0
-
-    def __post_init__(self) -> None:
-        """Check that the shapes belong together and make the fields read-only views.
-
-        The arrays are not copied, a dense map's covariance is large: who hands them over may
-        still write to them, and must not.
-        """
-        size = POSE_SIZE + LANDMARK_SIZE * len(self.landmark_ids)
-        if self.mean.shape != (size,) or self.covariance.shape != (size, size):
-            raise ValueError(
-                f"{len(self.landmark_ids)} landmarks need mean ({size},) and covariance "
-                f"({size}, {size}), got {self.mean.shape} and {self.covariance.shape}"
-            )
-        for name, array in (("mean", self.mean), ("covariance", self.covariance)):
-            view = array.view()
-            view.setflags(write=False)
-            object.__setattr__(self, name, view)
-
-    @property
-    def pose(self) -> Array:
-        """Return the pose, shape (3,), [x m, y m, heading rad], map frame."""
-        return self.mean[:POSE_SIZE]
-
-    @property
-    def pose_covariance(self) -> Array:
-        """Return the covariance of the pose, shape (3, 3)."""
-        return self.covariance[:POSE_SIZE, :POSE_SIZE]
-
-    @property
-    def landmarks(self) -> Array:
-        """Return the landmarks' positions, shape (n, 2) [m], map frame, in row order."""
-        return self.mean[POSE_SIZE:].reshape(-1, LANDMARK_SIZE)
-
-    def landmark_covariance(self, row: int) -> Array:
-        """Return the covariance of one landmark's position, shape (2, 2) [m^2]."""
-        block = landmark_slice(row)
-        return self.covariance[block, block]
 
 
 def start() -> Belief:
@@ -88,43 +26,26 @@ def start() -> Belief:
     return Belief(mean=np.zeros(POSE_SIZE), covariance=np.zeros((POSE_SIZE, POSE_SIZE)))
 
 
-def landmark_slice(row: int) -> slice:
-    """Return where one landmark lies in the state."""
-    begin = POSE_SIZE + LANDMARK_SIZE * row
-    return slice(begin, begin + LANDMARK_SIZE)
-
-
 def motion_noise(increment: Array, heading_rad: float, config: MotionConfig) -> Array:
     """Return the covariance R that one motion adds to the pose, shape (3, 3), map axes.
 
-    ``per_step_world`` is the paper's diagonal, the same for every step. ``proportional`` grows
-    with the distance D and the turn a of the step, along and across the robot's axis::
+    ``per_step_world`` is the paper's diagonal, the same for every step. ``proportional`` grows with
+    the distance D and the turn a of the step, along and across the robot's axis::
 
         diag(along^2 D, across^2 D), turned into the map;  (h sqrt(D) + h_turn |a|)^2
 
-    Parameters
-    ----------
-    increment
-        shape (3,), the motion in the body frame before it.
-    heading_rad
-        Heading before the motion, map frame.
-    config
-        Which rule, and its numbers.
+    ``increment`` (3,) is the motion in the body frame before it, ``heading_rad`` that before it.
     """
     if config.noise is MotionNoise.PER_STEP_WORLD:
         return np.diag([config.sigma_xy_m**2, config.sigma_xy_m**2, config.sigma_heading_rad**2])
     distance_m = math.hypot(increment[0], increment[1])
-    along = config.along_m_per_sqrt_m**2 * distance_m
-    across = config.across_m_per_sqrt_m**2 * distance_m
-    sigma_heading = config.heading_rad_per_sqrt_m * math.sqrt(
-        distance_m
-    ) + config.heading_rad_per_rad * abs(increment[2])
+    along, across, heading = config.wheels.step_variances(distance_m, increment[2])
     cosine, sine = math.cos(heading_rad), math.sin(heading_rad)
     R = np.zeros((POSE_SIZE, POSE_SIZE))
     R[0, 0] = cosine**2 * along + sine**2 * across
     R[1, 1] = sine**2 * along + cosine**2 * across
     R[0, 1] = R[1, 0] = cosine * sine * (along - across)
-    R[2, 2] = sigma_heading**2
+    R[2, 2] = heading
     return R
 
 
@@ -140,16 +61,9 @@ def motion_jacobian(heading_rad: float, increment: Array) -> Array:
 def predict(belief: Belief, increment: Array, R: Array) -> Belief:
     """Move the pose by an odometry increment.
 
-    ``x_r' = x_r (+) u``, ``P_rr' = G P_rr G^T + R``, ``P_rl' = G P_rl``; landmarks stay.
-
-    Parameters
-    ----------
-    belief
-        Belief before the motion.
-    increment
-        shape (3,), u: the motion in the body frame before it, [m, m, rad].
-    R
-        shape (3, 3), motion noise in map axes.
+    ``x_r' = x_r (+) u``, ``P_rr' = G P_rr G^T + R``, ``P_rl' = G P_rl``; landmarks stay. u has
+    shape (3,), the motion in the body frame before it, [m, m, rad]; R (3, 3) is its noise in map
+    axes.
     """
     pose = slice(0, POSE_SIZE)
     G = motion_jacobian(float(belief.mean[2]), increment)
@@ -173,7 +87,7 @@ def expected_observations(pose: Array, landmarks: Array) -> Array:
 
 
 def observation_jacobians(pose: Array, landmarks: Array) -> tuple[Array, Array]:
-    """Return d(range, bearing) / d(pose) and / d(landmark) for landmarks off the pose.
+    """Return d(range, bearing) / d(pose), (n, 2, 3), and / d(landmark), (n, 2, 2), off the pose.
 
     With (dx, dy) from pose to landmark and q = dx^2 + dy^2::
 
@@ -181,18 +95,6 @@ def observation_jacobians(pose: Array, landmarks: Array) -> tuple[Array, Array]:
         H_landmark = [[ dx/sqrt(q),  dy/sqrt(q)   ], [-dy/q,  dx/q    ]]
 
     The bearing falls by exactly as much as the heading rises: the last entry is -1, not -1/q.
-
-    Parameters
-    ----------
-    pose
-        shape (3,).
-    landmarks
-        shape (n, 2) [m].
-
-    Returns
-    -------
-    H_pose, H_landmark
-        shapes (n, 2, 3) and (n, 2, 2).
     """
     dx, dy = landmarks[:, 0] - pose[0], landmarks[:, 1] - pose[1]
     q = dx**2 + dy**2
@@ -216,7 +118,7 @@ def innovation(observed: Array, expected: Array) -> Array:
 
 
 def update(belief: Belief, row: int, observed: Array, Q: Array) -> Belief:
-    """Correct the belief with one range and bearing of a known landmark.
+    """Correct the belief with one range [m] and bearing [rad] of the landmark in a row, noise Q.
 
     With the innovation nu, S = H P H^T + Q = L L^T and W = L^-1 H P::
 
@@ -224,17 +126,6 @@ def update(belief: Belief, row: int, observed: Array, Q: Array) -> Belief:
 
     Equal to the Joseph form ``(I - K H) P (I - K H)^T + K Q K^T`` with K = P H^T S^-1, at the cost
     of one symmetric rank-2 downdate; W^T W is computed symmetric, so P stays so.
-
-    Parameters
-    ----------
-    belief
-        Belief before the observation.
-    row
-        Row of the landmark.
-    observed
-        shape (2,), range [m] and bearing [rad] from the base footprint.
-    Q
-        shape (2, 2), observation noise.
     """
     landmark = belief.landmarks[row : row + 1]
     expected = expected_observations(belief.pose, landmark)[0]
@@ -267,23 +158,14 @@ def whiten(L: NDArray[np.floating], rows: Array) -> Array:
 
 
 def augment(belief: Belief, observed: Array, Q: Array) -> Belief:
-    """Add a landmark where one range and bearing put it, correlated with everything else.
+    """Add a landmark where one range [m] and bearing [rad] put it, correlated with everything else.
 
     ``l = p + r [cos(heading + phi), sin(heading + phi)]`` with Jacobians G_pose (2, 3) and G_obs
     (2, 2)::
 
         P_ll = G_pose P_rr G_pose^T + G_obs Q G_obs^T          P_lx = G_pose P_rx
 
-    It is what an update of a landmark with boundless prior covariance tends to.
-
-    Parameters
-    ----------
-    belief
-        Belief before.
-    observed
-        shape (2,), range [m] and bearing [rad] from the base footprint.
-    Q
-        shape (2, 2), observation noise.
+    It is the limit of an update of a landmark with boundless prior covariance.
     """
     r, direction = float(observed[0]), float(observed[1] + belief.mean[2])
     cosine, sine = math.cos(direction), math.sin(direction)

@@ -4,118 +4,28 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.config import EndOfRun, SampleTime, SlamConfig
-from slam.frames import Detection, Detector, RadarFrame
-from slam.front_end.paper import make_detector
-from slam.geometry import Rig, between
-from slam.paper.association import Association, update_map
-from slam.paper.clustering import CollectedState, Observation, filter_window, has_moved
-from slam.paper.ekf import Belief, motion_noise, predict, start
-from slam.paper.trilateration import NO_MOTIONS, Fix, Trilaterator
-from slam.results import UpdateReport
+from slam.frames import Detection, Detector, RadarFrame, detect_all
+from slam.front_end import make_detector
+from slam.geometry import Rig, between, has_moved
+from slam.paper.association import update_map
+from slam.paper.clustering import CollectedState, filter_window
+from slam.paper.ekf import motion_noise, predict, start
+from slam.paper.trilateration import NO_MOTIONS, Trilaterator
+from slam.results import Belief, PoseAt, StepResult
 
 Array = NDArray[np.float64]
-
-_NIS_DOF = 2
-
-PoseAt = Callable[[int], Array]
-"""Odometry pose at a session time [ns]: shape (3,), [x m, y m, heading rad], odometry frame."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class StepResult:
-    """One estimated state, everything that led to it included.
-
-    Attributes
-    ----------
-    t_ns
-        Session time of the state; under the paper's window - 1 states before the newest one.
-    odometry_pose
-        shape (3,), what odometry said there, odometry frame.
-    belief
-        Pose and landmarks after this state's observations, map frame.
-    detections, fixes
-        Ranges and trilaterated points of this state.
-    observations, associations
-        What the outlier filter let through, and what became of each.
-    rejected
-        Fixes of this state that no cluster confirmed.
-    report
-        What the robust back end made of the detections; it has no fixes nor observations.
-    range_sigmas_m
-        Standard deviation of every detection as the robust back end was told it; infinite for one
-        that it was not given.
-    """
-
-    t_ns: int
-    odometry_pose: Array
-    belief: Belief
-    detections: tuple[Detection, ...]
-    fixes: tuple[Fix, ...] = ()
-    observations: tuple[Observation, ...] = ()
-    associations: tuple[Association, ...] = ()
-    rejected: tuple[Fix, ...] = ()
-    report: UpdateReport | None = None
-    range_sigmas_m: tuple[float, ...] = ()
-
-    @property
-    def nis(self) -> tuple[float, ...]:
-        """Return the normalised innovation squared (2 dof) of each landmark seen again."""
-        return tuple(a.nis for a in self.associations if a.nis is not None)
-
-    @property
-    def nis_per_dof(self) -> tuple[float, ...]:
-        """Return the same over its degrees of freedom; of a report, that of all ranges together."""
-        if self.report is not None:
-            return (self.report.nis / self.report.dof,) if self.report.dof else ()
-        return tuple(nis / _NIS_DOF for nis in self.nis)
-
-
-class Slam(Protocol):
-    """What runs a session: the paper's pipeline or the robust one."""
-
-    config: SlamConfig
-
-    def step(
-        self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
-    ) -> tuple[StepResult, ...]:
-        """Take in what sensors say around one time; return the states that became ready."""
-        ...
-
-    def step_detections(
-        self, detections: Sequence[Detection], pose_at: PoseAt, t_ns: int
-    ) -> tuple[StepResult, ...]:
-        """Do what ``step`` does, from ranges that some other front end found."""
-        ...
-
-    def flush(self) -> tuple[StepResult, ...]:
-        """Return the states still held back at the end of a run."""
-        ...
-
-    def wall_spans_m(self) -> Array:
-        """Return the ends of the stretches of wall that answered, (k, 2, 2) [m], map frame."""
-        ...
 
 
 class UwbRadarSlam:
     """UWB radar SLAM as in the paper: fixes of two radars, DBSCAN over a window, EKF SLAM.
 
     The map frame is the body frame at the first odometry pose.
-
-    Parameters
-    ----------
-    config
-        Table I and the options around it.
-    rig
-        Where the radars sit.
-    detector
-        The front end, if not the one that the configuration names.
     """
 
     def __init__(self, config: SlamConfig, rig: Rig, detector: Detector | None = None) -> None:
@@ -134,29 +44,28 @@ class UwbRadarSlam:
     def step(
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
-        """Take in what sensors say around one time; return the state that became ready, if any.
+        """Take in the frames and odometry around one time; return the state now ready, if any.
 
         Parameters
         ----------
         frames
-            At most one frame per radar, each with the time it was taken at; a radar whose frame
-            was lost is simply absent.
+            At most one frame per radar, each with the time it was taken at; a radar whose frame was
+            lost is absent.
         pose_at
             Odometry; asked for the pose at ``t_ns`` and, where ``trilateration.sample_time`` is
             "own", at the time of every frame with an echo.
         t_ns
             Session time of the state.
         """
-        return self._take(lambda: self._detect(frames), pose_at, t_ns)
+        detect = partial(detect_all, self._detector, frames, self.rig)
+        return self._take(detect, pose_at, t_ns)
 
     def step_detections(
         self, detections: Sequence[Detection], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
-        """Do what ``step`` does, from ranges that some other front end found."""
         return self._take(lambda: tuple(detections), pose_at, t_ns)
 
     def flush(self) -> tuple[StepResult, ...]:
-        """Return the states still in the window at the end of a run, if the preset wants them."""
         if self.config.window.end_of_run is EndOfRun.DROP:
             self._window.clear()
         return tuple(self._estimate() for _ in range(len(self._window)))
@@ -173,7 +82,8 @@ class UwbRadarSlam:
         if self._collected_pose is None:  # Odom[0] <- origin
             self._collected_pose = self._estimated_pose = pose
             return ()
-        if not has_moved(self._collected_pose, pose, self.config.window):
+        window = self.config.window
+        if not has_moved(self._collected_pose, pose, window.min_distance_m, window.min_turn_rad):
             return ()
         self._collected_pose = pose
         detections = detect()
@@ -213,7 +123,7 @@ class UwbRadarSlam:
     def _motions(
         self, detections: Sequence[Detection], pose: Array, pose_at: PoseAt, t_ns: int
     ) -> Mapping[int, Array]:
-        """Return how the robot moved from the state to each detection's own time, if it counts."""
+        """Return the motion from the state to each detection's own time."""
         if self.config.trilateration.sample_time is SampleTime.NOMINAL:
             return NO_MOTIONS
         stamps_ns = {detection.t_ns for detection in detections} - {t_ns}
@@ -221,8 +131,3 @@ class UwbRadarSlam:
 
     def _is_update_due(self) -> bool:
         return self._n_estimated % self.config.window.stride == 0
-
-    def _detect(self, frames: Sequence[RadarFrame]) -> tuple[Detection, ...]:
-        offsets_m = [self.rig.mounts[frame.radar].range_offset_m for frame in frames]
-        found = self._detector.detect_many(frames, offsets_m)
-        return tuple(detection for of_frame in found for detection in of_frame)

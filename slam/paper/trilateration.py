@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
@@ -18,6 +17,7 @@ from scipy.optimize import linear_sum_assignment
 from slam.config import Pairing, TrilaterationConfig
 from slam.frames import Detection
 from slam.geometry import RadarPair, Rig, mount_at, pair_of
+from slam.results import Fix
 
 Array = NDArray[np.float64]
 
@@ -30,30 +30,6 @@ _AMPLITUDES = (1e-12, 1e12)
 NO_MOTIONS: Mapping[int, Array] = MappingProxyType({})
 """All radars sampled at one time, or are taken to have."""
 _STANDING: Array = np.zeros(3)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Fix:
-    """One trilaterated point, seen once.
-
-    Attributes
-    ----------
-    pair
-        Index into ``Rig.pairs()``.
-    t_ns
-        Session time of the pose in whose body frame the position is given; the two detections
-        keep their own times.
-    x_m, y_m
-        Position in that body frame.
-    detections
-        The two ranges it was made of, first and second radar of the pair.
-    """
-
-    pair: int
-    t_ns: int
-    x_m: float
-    y_m: float
-    detections: tuple[Detection, Detection]
 
 
 def bilaterate(
@@ -114,15 +90,8 @@ class Trilaterator:
     """Pairs the detections of one pose, those of one radar with those of the other.
 
     K echoes seen by both radars give up to K^2 fixes. As printed, all that pass the geometry are
-    kept, and the ghosts among them are left to the outlier filter. With ``Pairing.ONE_TO_ONE``
-    each detection takes part in at most one fix of a pair of radars, see ``one_to_one``.
-
-    Parameters
-    ----------
-    config
-        Field of view, stamp tolerance and pairing rule.
-    rig
-        The mounts; its pairs are worked out once.
+    kept, and the ghosts among them are left to the outlier filter. With ``Pairing.ONE_TO_ONE`` each
+    detection takes part in at most one fix of a pair of radars, see ``one_to_one``.
     """
 
     def __init__(self, config: TrilaterationConfig, rig: Rig) -> None:
@@ -136,20 +105,12 @@ class Trilaterator:
         t_ns: int,
         motions: Mapping[int, Array] = NO_MOTIONS,
     ) -> tuple[Fix, ...]:
-        """Return the fixes of one pose from the detections of all radars.
+        """Return the fixes of one pose, at ``t_ns`` and in its body frame, from all detections.
 
-        Which radars are a pair follows from the rig; the triangle of two detections has its base
-        between the mounts at the detections' own times, and their own two boresights.
-
-        Parameters
-        ----------
-        detections
-            Ranges of all radars.
-        t_ns
-            Session time of the pose, in whose body frame the fixes are.
-        motions
-            By session time: pose of the robot then, seen from the pose at ``t_ns``, shape (3,).
-            Detections of a time without entry were made at ``t_ns``.
+        The radars of a pair follow from the rig; the triangle of two detections has its base
+        between the mounts at the detections' own times, and their own two boresights. ``motions``
+        has, by session time, the pose of the robot then as seen from the pose at ``t_ns``, shape
+        (3,); detections of a time without entry were made at ``t_ns``.
         """
         by_radar: dict[int, list[Detection]] = {}
         for detection in detections:

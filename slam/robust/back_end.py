@@ -10,31 +10,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.geometry import Rig
-from slam.results import ExpectedRange, MapLandmark, MapWall, UpdateReport
+from slam.results import MapLandmark, MapWall, PredictedRange, UpdateReport
 from slam.robust.initialisation import (
-    Leftovers,
     Member,
     RangeBearing,
     Tracker,
     Tracklet,
+    UnassignedRanges,
     assign,
     find_tracklets,
-    give_birth,
     guesses_of,
+    initialise_landmark,
     match,
     named_rows,
     range_bearing_rows,
     update_with_point,
 )
-from slam.robust.kidnapping import Trial, Whereabouts, forget, merge_landmarks, trials
+from slam.robust.kidnapping import Evidence, Localisation, evidence, forget, merge_landmarks
 from slam.robust.map import Existence, Roundness
 from slam.robust.matching import (
     Continuation,
     SureLandmarks,
     continue_tracks,
-    expected_ranges,
     labelled,
     landmarks_in_view,
+    predicted_ranges,
 )
 from slam.robust.parameters import BackEndParameters, PointRule
 from slam.robust.ranges import Antennas, RangeScan, View, antennas_of, rows_of, sides_of, view
@@ -63,80 +63,48 @@ def huber_weighted_sigmas_m(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Heard:
-    """What the radars of a side heard of known landmarks.
+class Matches:
+    """Ranges of known landmarks among the scans of one side."""
 
-    Attributes
-    ----------
-    continued
-        Their ranges that continue tracks.
-    expected
-        The ranges that could have, as predicted before any was looked at.
-    trials
-        Landmarks looked for, for judging the pose.
-    """
-
-    continued: Sequence[Continuation] = ()
-    expected: Sequence[ExpectedRange] = ()
-    trials: Sequence[Trial] = ()
+    continued: Sequence[Continuation] = ()  # which range is of which landmark
+    # The ranges of every landmark that took part, measured or not
+    predicted: Sequence[PredictedRange] = ()
+    evidence: Sequence[Evidence] = ()  # for or against the present pose, by landmark
 
 
-def listen(  # noqa: PLR0917 - the scans, where they were taken, and what is believed
+def match_known_landmarks(  # noqa: PLR0917 - scans, where they were taken, and the belief
     scans: Sequence[RangeScan],
     seen: View,
     antennas: Antennas,
     state: State,
     existence: Existence,
     parameters: BackEndParameters,
-) -> Heard:
-    """Find the ranges of known landmarks on one side; count hits and misses.
-
-    Parameters
-    ----------
-    scans
-        Of the radars of one side; those without a frame are absent.
-    seen
-        Landmarks and walls as all radars see them.
-    antennas
-        Where the radars were, body frame.
-    state
-        Pose and map, not changed.
-    existence
-        Takes the hits and misses.
-    parameters
-        Noise and rules.
-    """
+) -> Matches:
+    """Find the ranges of known landmarks on one side; count hits and misses."""
     noise, rule, limits = parameters.ranges, parameters.continuation, parameters.map
     radars = [scan.radar for scan in scans]
     near = landmarks_in_view(state, seen, radars, noise, rule) if radars else None
     if near is None:
-        return Heard()
+        return Matches()
     sure = near.surer_than(rule.tight_sigmas * noise.sigma_m)
-    doubts_m = state.feature_doubts_m
-    near = near.doubted(doubts_m)
-    tried = trials(near, seen, scans, state, parameters)
+    shape_sigmas_m = state.feature_shape_sigmas_m
+    near = near.with_added_sigma(shape_sigmas_m)
+    found_evidence = evidence(near, seen, scans, state, parameters)
     inside = seen.inside(noise, -limits.view_inset_rad, -limits.view_inset_m)[radars]
     known = () if sure is None else sure.landmarks
-    silent = np.setdiff1d(near.unanswered(scans, noise, limits.view_inset_m), known)
-    _miss_unsure(silent, inside, state, existence)
-    if sure is None:
-        return Heard(trials=tried)
-    expected = expected_ranges(state, sure, antennas)
-    found = continue_tracks(sure.doubted(doubts_m), scans, noise, rule)
-    _count_sure(found, sure, scans, seen, inside, state, existence)
-    return Heard(continued=found, expected=expected, trials=tried)
-
-
-def _miss_unsure(
-    silent: NDArray[np.intp], inside: NDArray[np.bool_], state: State, existence: Existence
-) -> None:
-    """Count a miss of landmarks too unsure for single ranges, where nothing at all is heard."""
-    for row in silent.tolist():
+    # Too unsure for single ranges: a miss only where no echo at all is near the prediction.
+    for row in np.setdiff1d(near.unanswered(scans, noise, limits.view_inset_m), known).tolist():
         if inside[:, row].all():
             existence.miss(state.feature_ids[row])
+    if sure is None:
+        return Matches(evidence=found_evidence)
+    predicted = predicted_ranges(state, sure, antennas)
+    found = continue_tracks(sure.with_added_sigma(shape_sigmas_m), scans, noise, rule)
+    _count(found, sure, scans, seen, inside, state, existence)
+    return Matches(continued=found, predicted=predicted, evidence=found_evidence)
 
 
-def _count_sure(  # noqa: PLR0917 - what was found, and what could have been
+def _count(  # noqa: PLR0917 - what was found, and what could have been
     found: Sequence[Continuation],
     sure: SureLandmarks,
     scans: Sequence[RangeScan],
@@ -150,8 +118,8 @@ def _count_sure(  # noqa: PLR0917 - what was found, and what could have been
     count = Counter(continuation.row for continuation in found)
     for row in count:
         existence.hit(ids[row])
-    expected = inside[:, sure.landmarks].all(axis=0)
-    for row in sure.landmarks[expected].tolist():
+    in_all_views = inside[:, sure.landmarks].all(axis=0)
+    for row in sure.landmarks[in_all_views].tolist():
         hidden = any(scan.may_hide(float(seen.ranges_m[scan.radar, row])) for scan in scans)
         if row not in count and not hidden:
             existence.miss(ids[row])
@@ -160,17 +128,10 @@ def _count_sure(  # noqa: PLR0917 - what was found, and what could have been
 
 
 class RobustBackEnd:
-    """Range SLAM that keeps track of how sure it is.
+    """Range SLAM with a consistent covariance.
 
     ``predict`` and ``update`` alternate: one motion, then what the radars saw at its end. The map
     frame is the body frame at the start.
-
-    Parameters
-    ----------
-    rig
-        Where the radars sit.
-    parameters
-        Noise and rules.
     """
 
     def __init__(self, rig: Rig, parameters: BackEndParameters) -> None:
@@ -181,14 +142,11 @@ class RobustBackEnd:
         self._sides = sides_of(rig)
         rule = parameters.tracklets
         scale = rule.drift_share * parameters.wheels.scale_sigma
-        self._leftovers = Leftovers(
-            max(rule.window, rule.single_window),
-            parameters.ranges.sigma_m,
-            scale,
-            scale * rule.lever_m,
+        window = max(rule.window, rule.single_window)
+        self._unassigned = UnassignedRanges(
+            window, parameters.ranges.sigma_m, scale, scale * rule.lever_m
         )
         self._existence = Existence(parameters.map)
-        window = max(rule.window, rule.single_window)
         self._log = RunLog(parameters.wheels, None if parameters.relinearisation else window)
         self._motion = at_rest()
         self._walls = WallKeeper(self.state, parameters)
@@ -197,24 +155,20 @@ class RobustBackEnd:
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
         self._landmark_of_label: dict[int, int] = {}
         self._n_updates = 0
-        self._expected: list[ExpectedRange] = []
-        self._trials: list[Trial] = []
-        self._whereabouts = Whereabouts(parameters)
+        self._localisation = Localisation(parameters)
 
     @property
     def pose(self) -> Array:
-        """Return [x m, y m, heading rad], map frame, shape (3,)."""
+        """Return [x m, y m, heading rad], map frame."""
         return self.state.pose
 
     @property
     def pose_covariance(self) -> Array:
-        """Return the covariance of the pose, shape (3, 3)."""
-        if self._whereabouts.is_lost:
-            return self._whereabouts.lost_covariance
+        if self._localisation.is_lost:
+            return self._localisation.lost_covariance
         return self.state.pose_covariance()
 
     def landmarks(self) -> tuple[MapLandmark, ...]:
-        """Return the landmarks hit often enough to be reported."""
         state, rows = self.state, self.reported_rows()
         return tuple(
             MapLandmark(
@@ -227,16 +181,15 @@ class RobustBackEnd:
         )
 
     def reported_rows(self) -> list[int]:
-        """Return the rows of landmarks hit often enough to be reported; of an island, none."""
-        elsewhere, lost = self._whereabouts.elsewhere, self._whereabouts.is_lost
+        """Return the rows of landmarks hit often enough; of a submap, none."""
+        old_map, lost = self._localisation.old_map, self._localisation.is_lost
         return [
             row
             for row, id_ in enumerate(self.state.landmark_ids)
-            if self._existence.is_reported(id_) and (id_ in elsewhere or not lost)
+            if self._existence.is_reported(id_) and (id_ in old_map or not lost)
         ]
 
     def walls(self) -> tuple[MapWall, ...]:
-        """Return the walls hit often enough to be reported."""
         return tuple(
             self._walls.reported(row, self._existence.hits(id_))
             for row, id_ in enumerate(self.state.wall_ids)
@@ -251,7 +204,7 @@ class RobustBackEnd:
         increment
             shape (3,): dx, dy [m], turn [rad] in the body frame before it, as reported.
         covariance
-            Its noise, shape (3, 3), if it is known better than the wheels' model tells.
+            Its noise, shape (3, 3), where that is known better than from the wheels' model.
         """
         wheels = self.parameters.wheels
         motion = calibrated_motion(increment, self.state.calibration, wheels, covariance)
@@ -259,42 +212,38 @@ class RobustBackEnd:
             increment, motion.covariance, motion.walk_variance, self.state.calibration
         )
         predict(self.state, motion, wheels)
-        self._leftovers.move(motion)
+        self._unassigned.move(motion)
         self._motion = motion
 
     def update(self, scans: Sequence[RangeScan]) -> UpdateReport:
-        """Take in what the radars saw; a radar without a frame is absent, not empty."""
+        """Take in the scans of one time; a radar without a frame is absent, not empty."""
         antennas = antennas_of(self.rig, scans, self._motion, self.state.calibration)
-        self._silent = np.where(antennas.heard, 0, self._silent + 1)
-        self._expected, self._trials = [], []
-        was_lost = self._whereabouts.is_lost
-        doubted = [scan.doubted(self.parameters.ranges.doubt_m) for scan in scans]
-        continued, nis = self._continue_tracks(scans, doubted, antennas)
-        carried = self._whereabouts.is_carried
-        if carried:
-            self._whereabouts.set_down(self.state, self._existence, self._log)
-            self._leftovers.clear()
+        self._silent = np.where(antennas.has_frame, 0, self._silent + 1)
+        was_lost = self._localisation.is_lost
+        widened = [
+            scan.with_added_sigma(self.parameters.ranges.association_sigma_m) for scan in scans
+        ]
+        matches, seen = self._associate(scans, widened, antennas)
+        continued, nis = self._correct(matches.continued, seen, scans, antennas)
+        carried = self._begin_submap_if_carried()
         used = {(radar, index) for radar, index, _ in continued}
-        self._leftovers.keep(self._log.n_poses - 1, antennas, doubted, used)
-        born, seen_again = self._raise_tracklets()
-        deleted = self._delete_lost()
-        self._n_updates += 1
+        self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
+        initialised, seen_again = self._initialise_landmarks()
+        deleted = self._delete_vanished()
         merged = self._merge()
-        lost = self._whereabouts.is_lost
-        relinearised = self._give_radii()
-        if relinearised or is_due(self._log, self.state, self.parameters):
-            relinearised |= self.relinearise()
+        lost = self._localisation.is_lost
+        relinearised = self._smooth_if_due()
         self._log.set_causal(self.state.pose)
         return UpdateReport(
             continued=continued,
-            born=born,
+            initialised=initialised,
             seen_again=seen_again,
             merged=merged,
             deleted=deleted,
             nis=nis,
             dof=len(continued),
             relinearised=relinearised,
-            expected=tuple(self._expected),
+            predicted=tuple(matches.predicted),
             carried=carried,
             lost=lost,
             relocated=was_lost and not lost,
@@ -305,13 +254,9 @@ class RobustBackEnd:
     ) -> tuple[int | None, ...]:
         """Take in ranges and bearings of points seen from the newest pose.
 
-        Labelled points are of the landmark of that label, and new where it is. The others are
-        assigned by distance.
-
-        Returns
-        -------
-        landmark_ids
-            One per point; None where it was in doubt and left out.
+        A labelled point is of the landmark with that label, and new if there is none. The others
+        are assigned by distance. Returns one landmark id per point, None for an ambiguous one left
+        out.
         """
         rule = rule or PointRule()
         state = self.state
@@ -328,10 +273,10 @@ class RobustBackEnd:
         return tuple(found)
 
     def _see_point(self, point: RangeBearing, row: int) -> int:
-        """Update the landmark in a row with a point, or give birth to it (row -1)."""
+        """Update the landmark in a row with a point, or add one (row -1)."""
         state = self.state
         if row < 0:
-            landmark_id = give_birth(state, point.body_point(len(state.offsets_m)))
+            landmark_id = initialise_landmark(state, point.body_point(len(state.offsets_m)))
             if point.label is not None:
                 self._landmark_of_label[point.label] = landmark_id
         else:
@@ -345,46 +290,70 @@ class RobustBackEnd:
     def relinearise(self) -> bool:
         """Solve for all poses and replace the belief; tell whether that worked.
 
-        Not while the robot is lost or something speaks against its pose: a wrong measurement
-        would be spread over the whole run.
+        Not while the robot is lost or evidence speaks against its pose: a wrong measurement would
+        be spread over the whole run.
         """
-        if self._whereabouts.is_lost or self._whereabouts.is_suspicious:
+        if not self._is_located():
             return False
         return relinearise(self._log, self.state, self.parameters)
 
-    def _give_radii(self) -> bool:
-        """Give landmarks the radii that are evident; tell whether all poses were solved for."""
-        if self._roundness is None or self._whereabouts.is_lost or self._whereabouts.is_suspicious:
-            return False
-        hits = self._existence.hits
-        return self._roundness.give(self.state, self._log, self.parameters, hits)
+    def _is_located(self) -> bool:
+        return not (self._localisation.is_lost or self._localisation.surprise.is_suspicious)
 
-    def _continue_tracks(
-        self, scans: Sequence[RangeScan], doubted: Sequence[RangeScan], antennas: Antennas
-    ) -> tuple[tuple[tuple[int, int, int], ...], float]:
-        """Find the ranges of known landmarks and correct the state with all of them at once.
+    def _smooth_if_due(self) -> bool:
+        """Give landmarks their radii and solve for all poses; tell whether they were solved for."""
+        relinearised = False
+        if self._roundness is not None and self._is_located():
+            hits = self._existence.hits
+            relinearised = self._roundness.give(self.state, self._log, self.parameters, hits)
+        if relinearised or is_due(self._log, self.state, self.parameters):
+            relinearised |= self.relinearise()
+        return relinearised
 
-        They are found among the ``doubted``, and weigh as ``scans`` tell and Huber allows.
-        """
+    def _associate(
+        self, scans: Sequence[RangeScan], widened: Sequence[RangeScan], antennas: Antennas
+    ) -> tuple[Matches, View]:
+        """Find the ranges of known landmarks among the ``widened`` scans, and judge the pose."""
         state = self.state
+        seen = view(state, antennas)
         if not state.feature_ids:
-            return (), 0.0
-        seen = self._walls.look(view(state, antennas), antennas)
-        seen = self._whereabouts.seen_from_here(seen, state)
-        found: list[Continuation] = []
-        for side in self._sides:
-            of_side = [scan for scan in doubted if scan.radar in side]
-            heard = listen(of_side, seen, antennas, state, self._existence, self.parameters)
-            found += heard.continued
-            self._expected += heard.expected
-            self._trials += heard.trials
+            return Matches(), seen
+        seen = self._walls.look(seen, antennas)
+        seen = self._localisation.without_old_map(seen, state)
+        of_sides = [
+            match_known_landmarks(
+                [scan for scan in widened if scan.radar in side],
+                seen,
+                antennas,
+                state,
+                self._existence,
+                self.parameters,
+            )
+            for side in self._sides
+        ]
+        found = [each for matches in of_sides for each in matches.continued]
+        for_pose = [each for matches in of_sides for each in matches.evidence]
         if any(scan.labels is not None for scan in scans):
             found = labelled(scans, state, self._landmark_of_label)
         else:
-            self._whereabouts.look(self._trials, state, self._log)
-        if not found or self._whereabouts.is_carried:
+            self._localisation.look(for_pose, state, self._log)
+        predicted = [each for matches in of_sides for each in matches.predicted]
+        return Matches(continued=found, predicted=predicted, evidence=for_pose), seen
+
+    def _correct(
+        self,
+        found: Sequence[Continuation],
+        seen: View,
+        scans: Sequence[RangeScan],
+        antennas: Antennas,
+    ) -> tuple[tuple[tuple[int, int, int], ...], float]:
+        """Correct the state with all ranges found at once, weighted by Huber; log them.
+
+        Returns (radar, index, landmark id) of each range, and the NIS before the weights.
+        """
+        if not found or self._localisation.surprise.is_carried:
             return (), 0.0
-        ids = state.feature_ids
+        state, ids = self.state, self.state.feature_ids
         continued = tuple((c.radar, c.index, ids[c.row]) for c in found)
         of_radar, noise = {scan.radar: scan for scan in scans}, self.parameters.ranges
         z = np.array([of_radar[c.radar].ranges_m[c.index] for c in found])
@@ -396,11 +365,11 @@ class RobustBackEnd:
         )
         innovations_m = z - rows.predicted_m
         sigmas = np.array([of_radar[c.radar].sigma(c.index, noise.sigma_m) for c in found])
-        doubts_m = state.feature_doubts_m[[c.row for c in found]]
+        shape_sigmas_m = state.feature_shape_sigmas_m[[c.row for c in found]]
         by_state = rows.H @ state.P.block(rows.at)
-        S = by_state @ rows.H.T + np.diag(np.square(sigmas) + np.square(doubts_m))
+        S = by_state @ rows.H.T + np.diag(np.square(sigmas) + np.square(shape_sigmas_m))
         nis = float(innovations_m @ np.linalg.solve(S, innovations_m))
-        prior = np.vecdot(by_state, rows.H) + np.square(doubts_m)
+        prior = np.vecdot(by_state, rows.H) + np.square(shape_sigmas_m)
         sigmas = huber_weighted_sigmas_m(innovations_m, prior, sigmas, noise.huber_sigmas)
         for (radar, at, landmark_id), range_m, sigma_m in zip(continued, z, sigmas, strict=True):
             x, y = antennas.position_m[radar].tolist()
@@ -413,32 +382,43 @@ class RobustBackEnd:
                 sigma_m=float(sigma_m),
                 alone=of_radar[radar].is_alone(at),
             )
-        variances = np.square(sigmas) + np.square(doubts_m)
+        variances = np.square(sigmas) + np.square(shape_sigmas_m)
         state.update(rows.at, rows.H, innovations_m, variances)
         return continued, nis
 
-    def _raise_tracklets(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Make tracklets of what is left over; each updates a landmark or becomes one."""
+    def _begin_submap_if_carried(self) -> bool:
+        carried = self._localisation.surprise.is_carried
+        if carried:
+            self._localisation.begin_submap(self.state, self._existence, self._log)
+            self._unassigned.clear()
+        return carried
+
+    def _initialise_landmarks(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Make tracklets of unassigned ranges; each becomes a landmark or updates one.
+
+        Returns the ids of new landmarks and walls, and of those seen again.
+        """
         state, rule = self.state, self.parameters.tracklets
-        newest = self._leftovers.newest()
-        born: list[int] = []
+        newest = self._unassigned.newest()
+        new: list[int] = []
         again: list[int] = []
         for side in self._sides:
-            radars = self._alive(side)
+            # A radar without frames for long takes no part.
+            radars = [radar for radar in side if self._silent[radar] <= rule.partner_silence]
             if not radars or not all(newest.unused[radar] for radar in radars):
                 continue
             window = rule.window if len(radars) > 1 else rule.single_window
-            frames = self._leftovers.slots(radars, window)
+            frames = self._unassigned.slots(radars, window)
             noise = self.parameters.ranges
             guesses = guesses_of(frames[0], radars, noise, rule)
             if not guesses:
                 continue
-            lost = self._whereabouts.is_lost
-            for wall in () if lost else self._walls.find(self._leftovers, radars):
+            lost = self._localisation.is_lost
+            for wall in () if lost else self._walls.find(self._unassigned, radars):
                 placed = self._walls.place(wall)
                 if placed is not None:
                     self._use(placed[0], wall.members)
-                    (born if placed[1] else again).append(placed[0])
+                    (new if placed[1] else again).append(placed[0])
             offsets = np.arange(state.offsets.start, state.offsets.stop)
             tracker = Tracker(noise, rule, state.offsets_m, state.P.block(offsets))
             n_radars = min(len(radars), 2)
@@ -447,13 +427,8 @@ class RobustBackEnd:
                 tracker, guesses, frames, n_radars, rule, is_point=is_point
             ):
                 landmark_id, is_new = self._place(tracklet)
-                (born if is_new else again).append(landmark_id)
-        return tuple(born), tuple(again)
-
-    def _alive(self, side: Sequence[int]) -> list[int]:
-        """Return the radars of a side that may make tracklets: those heard lately."""
-        limit = self.parameters.tracklets.partner_silence
-        return [radar for radar in side if self._silent[radar] <= limit]
+                (new if is_new else again).append(landmark_id)
+        return tuple(new), tuple(again)
 
     def _place(self, tracklet: Tracklet) -> tuple[int, bool]:
         """Bring a tracklet into the map; return the landmark's id and whether it is new."""
@@ -463,9 +438,9 @@ class RobustBackEnd:
             known = self._landmark_of_label.get(tracklet.label)
             row = None if known is None else state.landmark_ids.index(known)
         else:
-            row = match(state, point, self.parameters.map, self._whereabouts.elsewhere)
+            row = match(state, point, self.parameters.map, self._localisation.old_map)
         if row is None:
-            landmark_id = give_birth(state, point)
+            landmark_id = initialise_landmark(state, point)
             if tracklet.label is not None:
                 self._landmark_of_label[tracklet.label] = landmark_id
         else:
@@ -480,35 +455,37 @@ class RobustBackEnd:
         for member in members:
             slot = member.slot
             self._log.add_range(
-                self._leftovers.pose_index(slot.back),
+                self._unassigned.pose_index(slot.back),
                 slot.radar,
                 landmark_id,
                 antenna=slot.antenna_then,
-                range_m=member.leftover.range_m,
-                sigma_m=member.leftover.sigma_m,
-                alone=member.leftover.alone,
+                range_m=member.measured.range_m,
+                sigma_m=member.measured.sigma_m,
+                alone=member.measured.alone,
             )
 
-    def _delete_lost(self) -> tuple[int, ...]:
-        if self._whereabouts.is_suspicious:
+    def _delete_vanished(self) -> tuple[int, ...]:
+        if self._localisation.surprise.is_suspicious:
             return ()
-        lost = self._existence.lost()
-        for landmark_id in lost:
+        vanished = self._existence.lost()
+        for landmark_id in vanished:
             self._walls.cells.forget(landmark_id)
             forget(landmark_id, self.state, self._existence, self._log)
-        if lost:
+        if vanished:
             kept = self._landmark_of_label.items()
-            self._landmark_of_label = {label: id_ for label, id_ in kept if id_ not in lost}
-        return tuple(lost)
+            self._landmark_of_label = {label: id_ for label, id_ in kept if id_ not in vanished}
+        return tuple(vanished)
 
     def _merge(self) -> tuple[tuple[int, int], ...]:
+        """Merge landmarks, or a submap with the old map, where that is certain; (kept, gone)."""
+        self._n_updates += 1
         rule = self.parameters.map
         if self._landmark_of_label or self._n_updates % rule.merge_every:
             return ()
-        whereabouts = self._whereabouts
-        if whereabouts.is_lost and (
-            joined := whereabouts.find(self.state, self._existence, self._log)
+        localisation = self._localisation
+        if localisation.is_lost and (
+            joined := localisation.find(self.state, self._existence, self._log)
         ):
             self.relinearise()
             return joined
-        return merge_landmarks(self.state, self._existence, self._log, rule, whereabouts.elsewhere)
+        return merge_landmarks(self.state, self._existence, self._log, rule, localisation.old_map)

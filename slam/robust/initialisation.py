@@ -1,7 +1,13 @@
 """New landmarks: ranges of the last frames that one point at rest explains.
 
-A range is evidence once. What continues a track never comes here, and what a tracklet takes is
-gone for every later one.
+A range is used once. One that continues a track never comes here, and one that a tracklet takes is
+gone for every later tracklet.
+
+A point is guessed from ranges of the newest frame and followed back through the frames along
+odometry by a small Kalman filter on its position in the newest body frame; each frame gives the
+unused range nearest to the prediction, if it passes the gate. The guess is accepted if enough
+frames hold it and its residuals are as small as those of a point at rest: clutter has no past, and
+a ghost, the fix of two ranges of different targets, does not stay at rest while the robot moves.
 
 A point b with noise n and known dependence D_b on the radars' range offsets measures
 
@@ -10,39 +16,31 @@ A point b with noise n and known dependence D_b on the radars' range offsets mea
 and a new landmark is l = p + R b with e_l = e_p + R D_b e_b + R n: correlated with all that the
 pose is correlated with. (In right-invariant errors the heading enters neither.)
 
-A point is guessed from ranges of now and followed back through the frames in odometry by a small
-Kalman filter on its position in the body frame of now; each frame gives the unused range nearest
-to the prediction, if it is near enough. The guess is believed if enough frames hold it and its
-residuals are as small as those of a point at rest: clutter has no past, and a ghost, the fix of
-two ranges of different targets, does not stay at rest while the robot moves.
-
-With b = R^T (l - p) in the body frame, z = (|b|, atan2(b_y, b_x)) and G = dz / db::
-
-    H = [e_p: -G R^T, e_l: G R^T]
-
-A point is matched to the landmark of least Mahalanobis distance, all points of one time together
-and no landmark twice, or named by whoever knows.
+Points measured with range and bearing, b = R^T (l - p) in the body frame, z = (|b|, atan2(b_y,
+b_x)) and G = dz / db, have ``H = [e_p: -G R^T, e_l: G R^T]``. They are matched to the landmarks of
+least Mahalanobis distance, all points of one time together and no landmark twice, or by label.
 """
 
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from slam.geometry import compose, wrap_angle
-from slam.robust.parameters import MapRule, RangeNoise, TrackletRule
+from slam.robust.parameters import MapRule, RangeNoise, TrackletRule, chi_square_limit
 from slam.robust.ranges import LONGEST_M, Antennas, RangeScan, fix_of_pair
 from slam.robust.state import POSITION, Array, Indices, Motion, State, rotation
 
 
 @dataclass(frozen=True, slots=True)
-class Leftover:
+class UnassignedRange:
     """One unused range: as measured, its target's label where known, its standard deviation.
 
     ``alone`` tells whether no other echo overlaps its own.
@@ -56,35 +54,22 @@ class Leftover:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SeenFrame:
-    """One frame: where the antennas were in the odometry frame, and the ranges still unused.
+    """One frame: where the antennas were in the odometry frame, and the ranges still unused."""
 
-    Attributes
-    ----------
-    pose_index
-        Which pose of the run it belongs to.
-    pose
-        shape (3,), odometry frame.
-    path_m, turned_rad
-        Way and turn so far, always growing.
-    antennas
-        In the odometry frame.
-    unused
-        One list per radar; what is taken is removed.
-    """
-
-    pose_index: int
-    pose: Array
+    pose_index: int  # index of its pose in the run
+    pose: Array  # shape (3,), odometry frame
+    # Way and turn since the start, always growing
     path_m: float
     turned_rad: float
-    antennas: Antennas
-    unused: tuple[list[Leftover], ...]
+    antennas: Antennas  # in the odometry frame
+    unused: tuple[list[UnassignedRange], ...]  # one list per radar; a range that is used is removed
 
 
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """One radar's share of one earlier frame, in the body frame of now.
+    """One radar's share of one earlier frame, in the newest body frame.
 
-    ``x_m, y_m, yaw_rad`` is the antenna then, ``drift`` the variance [m^2] that the way back
+    ``x_m, y_m, yaw_rad`` is the antenna then, ``drift`` the variance [m^2] that odometry since then
     adds to a range, ``back`` how many frames ago, ``radar`` the radar's index.
     """
 
@@ -94,19 +79,19 @@ class Slot:
     y_m: float
     yaw_rad: float
     drift: float
-    unused: list[Leftover]
+    unused: list[UnassignedRange]
     antenna_then: tuple[float, float]
 
 
-class Leftovers:
-    """The unused ranges of the last frames, and the way the robot went between them.
+class UnassignedRanges:
+    """The unused ranges of the last frames, and the way of the robot between them.
 
     Parameters
     ----------
     capacity
         Number of frames kept.
     sigma_m
-        Standard deviation of a range whose scan tells none.
+        Standard deviation of a range whose scan has none.
     drift_per_m, drift_per_rad_m
         Standard deviation a range gains per metre of way back, and per radian of turn.
     """
@@ -124,14 +109,13 @@ class Leftovers:
         self._turned_rad = 0.0
 
     def move(self, motion: Motion) -> None:
-        """Go on by one step of odometry."""
         step = np.array([motion.step_m[0], motion.step_m[1], motion.turn_rad])
         self._pose = compose(self._pose, step)
         self._path_m += motion.distance_m
         self._turned_rad += abs(motion.turn_rad)
 
     def clear(self) -> None:
-        """Forget all frames: what they held was seen from another place."""
+        """Forget all frames: they were taken at another place."""
         self._frames.clear()
         self._bodies.clear()
 
@@ -143,10 +127,10 @@ class Leftovers:
         used: set[tuple[int, int]],
     ) -> None:
         """Store a frame without the ranges used, given as (radar, index)."""
-        unused: tuple[list[Leftover], ...] = tuple([] for _ in antennas.yaw_rad)
+        unused: tuple[list[UnassignedRange], ...] = tuple([] for _ in antennas.yaw_rad)
         for scan in scans:
             unused[scan.radar].extend(
-                Leftover(
+                UnassignedRange(
                     range_m,
                     scan.label(index),
                     scan.sigma(index, self._sigma_m),
@@ -166,18 +150,17 @@ class Leftovers:
                 antennas=Antennas(
                     position_m=antennas.position_m @ turn.T + self._pose[:2],
                     yaw_rad=antennas.yaw_rad + self._pose[2],
-                    heard=antennas.heard,
+                    has_frame=antennas.has_frame,
                 ),
                 unused=unused,
             )
         )
 
     def newest(self) -> SeenFrame:
-        """Return the last frame stored."""
         return self._frames[-1]
 
     def pose_index(self, back: int) -> int:
-        """Return the pose that the frame ``back`` frames ago belongs to."""
+        """Return the index of the pose ``back`` frames ago."""
         return self._frames[-1 - back].pose_index
 
     def slots(self, radars: Sequence[int], window: int) -> list[list[Slot]]:
@@ -205,7 +188,7 @@ class Leftovers:
                         (then[radar][0], then[radar][1]),
                     )
                     for radar in radars
-                    if frame.antennas.heard[radar]
+                    if frame.antennas.has_frame[radar]
                 ]
             )
         return frames
@@ -213,7 +196,7 @@ class Leftovers:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BodyPoint:
-    """A point in the body frame of now.
+    """A point in the newest body frame.
 
     ``point_m`` (2,), ``covariance`` (2, 2), ``by_offsets`` (2, r): d(point) / d(range offsets);
     ``outward`` (2,): away from where it was seen from, where the axis of a round target lies.
@@ -227,7 +210,7 @@ class BodyPoint:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FeatureRows:
-    """What is seen against one of the map: residual (2,), H (2, c) on columns ``at``, S (2, 2)."""
+    """A measured feature against a mapped one: residual (2,), H (2, c) on columns ``at``, S."""
 
     residual: Array
     at: Indices
@@ -236,17 +219,14 @@ class FeatureRows:
 
     @property
     def mahalanobis_sq(self) -> float:
-        """Return the squared Mahalanobis distance (2 dof)."""
         return float(self.residual @ np.linalg.solve(self.S, self.residual))
 
     @property
     def log_det(self) -> float:
-        """Return ln det S."""
         return math.log(float(np.linalg.det(self.S)))
 
 
 def point_rows(state: State, row: int, point: BodyPoint) -> FeatureRows:
-    """Return residual, H and S of a point that would be the landmark in ``row``."""
     R = rotation(state.heading_rad)
     offsets = np.arange(state.offsets.start, state.offsets.stop)
     at = np.concatenate([np.array([1, 2]), offsets, state.landmark_columns(np.array([row]))])
@@ -271,41 +251,48 @@ def near_rows(state: State, point: BodyPoint, reach_m: float) -> NDArray[np.intp
 
 
 def match(
-    state: State, point: BodyPoint, rule: MapRule, elsewhere: Collection[int] = ()
+    state: State, point: BodyPoint, rule: MapRule, old_map: Collection[int] = ()
 ) -> int | None:
-    """Return the row of the landmark that a point is, or None where none stands out.
+    """Return the row of the landmark that a point is, or None where no match is clear.
 
     A match must pass the gate, be likelier than a landmark not yet in the map,
-    ``N(residual; 0, S) > beta``, and beat the next best in ``d^2 + ln det S``. Landmarks whose ids
-    are ``elsewhere`` are out of reach.
+    ``N(residual; 0, S) > beta``, and beat the next best in ``d^2 + ln det S``. Landmarks of the
+    ``old_map``, by id, are not considered.
     """
     scored = []
     for row in near_rows(state, point, rule.merge_reach_m):
-        if state.landmark_ids[row] in elsewhere:
+        if state.landmark_ids[row] in old_map:
             continue
         rows = point_rows(state, int(row), point)
         scored.append((rows.mahalanobis_sq + rows.log_det, rows.mahalanobis_sq, int(row)))
+    return clear_match(scored, rule.match_gate, rule.unmapped_per_m2, rule.match_margin)
+
+
+def clear_match(
+    scored: list[tuple[float, float, int]], gate: float, density: float, margin: float
+) -> int | None:
+    """Return the row of the best (d^2 + ln det S, d^2, row), or None where no match is clear."""
     if not scored:
         return None
     scored.sort()
     score, distance, best = scored[0]
-    if distance > rule.match_gate:
+    if distance > gate:
         return None
-    if -0.5 * score - math.log(math.tau) <= math.log(rule.unmapped_per_m2):
+    if -0.5 * score - math.log(math.tau) <= math.log(density):
         return None
-    if len(scored) > 1 and scored[1][0] - score < rule.match_lead:
+    if len(scored) > 1 and scored[1][0] - score < margin:
         return None
     return best
 
 
 def update_with_point(state: State, row: int, point: BodyPoint) -> float:
-    """Correct the state with a point that is the landmark in ``row``; return the NIS (2 dof)."""
+    """Correct the state with a point that is the landmark in ``row``; return the NIS."""
     rows = point_rows(state, row, point)
     nis, _ = state.update(rows.at, rows.H, rows.residual, point.covariance)
     return nis
 
 
-def give_birth(state: State, point: BodyPoint) -> int:
+def initialise_landmark(state: State, point: BodyPoint) -> int:
     """Append a point to the map; return the new landmark's id."""
     R = rotation(state.heading_rad)
     at = np.arange(state.offsets.stop)
@@ -327,15 +314,15 @@ _SINGLE_RANGE_SIGMA_M = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """One range of a tracklet, and where its slot is."""
+    """One range of a tracklet and its slot."""
 
     slot: Slot
-    leftover: Leftover
+    measured: UnassignedRange
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Guess:
-    """Where a point may be, in the body frame of now: mean (2,) and covariance (2, 2)."""
+    """Where a point may be, in the newest body frame: mean (2,) and covariance (2, 2)."""
 
     point_m: Array
     covariance: Array
@@ -343,34 +330,31 @@ class Guess:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Tracklet:
-    """A point at rest, and the ranges that say so.
+class Followed:
+    """A target at rest in the newest body frame, and the ranges that it explains."""
 
-    Attributes
-    ----------
-    point_m, covariance
-        In the body frame of now, shapes (2,) and (2, 2), for the range offsets given.
-    by_offsets
-        shape (2, r), d(point) / d(offsets).
-    members
-        Newest first.
-    chi_square, dof
-        Of the residuals.
-    share
-        Part of the frames with the point in view that hold a member.
-    """
-
-    point_m: Array
-    covariance: Array
-    by_offsets: Array
-    members: tuple[Member, ...]
+    covariance: Array  # shape (2, 2), for the range offsets of the state
+    by_offsets: Array  # shape (2, r), d(target) / d(offsets)
+    members: tuple[Member, ...]  # newest first
+    # Of the residuals
     chi_square: float
     dof: int
-    share: float
+    share: float  # part of the frames with the target in view that hold a member
+
+    @property
+    def score(self) -> float:
+        """Return 4 dof - chi-square, by which tracklets compete for ranges."""
+        return 4.0 * self.dof - self.chi_square
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Tracklet(Followed):
+    """A point at rest."""
+
+    point_m: Array  # shape (2,)
     label: int | None
 
     def body_point(self) -> BodyPoint:
-        """Return it as a point seen from the body of now."""
         antennas = [(member.slot.x_m, member.slot.y_m) for member in self.members]
         away = self.point_m - np.mean(antennas, axis=0)
         return BodyPoint(
@@ -380,21 +364,19 @@ class Tracklet:
             outward=away / max(math.hypot(away[0], away[1]), 1e-6),
         )
 
-    @property
-    def score(self) -> float:
-        """Return 4 dof - chi-square, by which tracklets compete for ranges."""
-        return 4.0 * self.dof - self.chi_square
+
+F = TypeVar("F", bound=Followed)
+G = TypeVar("G")
 
 
 def guesses_of(
     newest: Sequence[Slot], radars: Sequence[int], noise: RangeNoise, rule: TrackletRule
 ) -> list[Guess]:
-    """Return the guesses of what radars of one side saw in the newest frame."""
     return single_guesses(newest) if len(radars) == 1 else pair_guesses(newest, noise, rule)
 
 
 def pair_guesses(newest: Sequence[Slot], noise: RangeNoise, rule: TrackletRule) -> list[Guess]:
-    """Return the fixes of all pairs of unused ranges of now inside both fields of view."""
+    """Return the fixes of all pairs of unused ranges inside both fields of view."""
     guesses = []
     for place, first in enumerate(newest):
         for second in newest[place + 1 :]:
@@ -415,19 +397,19 @@ def pair_guesses(newest: Sequence[Slot], noise: RangeNoise, rule: TrackletRule) 
 
 
 def single_guesses(newest: Sequence[Slot]) -> list[Guess]:
-    """Return, for each unused range of a radar alone, points on its arc."""
+    """Return, for each unused range of a radar without partner, points on its arc."""
     guesses = []
     for slot in newest:
-        for leftover in slot.unused:
+        for measured in slot.unused:
             for off in _SINGLE_BEARINGS_RAD:
                 u = np.array([math.cos(slot.yaw_rad + off), math.sin(slot.yaw_rad + off)])
-                across = (_SINGLE_SPREAD_RAD * leftover.range_m) ** 2
+                across = (_SINGLE_SPREAD_RAD * measured.range_m) ** 2
                 along = _SINGLE_RANGE_SIGMA_M**2
                 guesses.append(
                     Guess(
-                        point_m=np.array([slot.x_m, slot.y_m]) + leftover.range_m * u,
+                        point_m=np.array([slot.x_m, slot.y_m]) + measured.range_m * u,
                         covariance=across * np.eye(2) + (along - across) * np.outer(u, u),
-                        label=leftover.label,
+                        label=measured.label,
                     )
                 )
     return guesses
@@ -442,12 +424,7 @@ def _in_view(point: Array, slot: Slot, noise: RangeNoise) -> bool:
 class Tracker:
     """Follows guesses back in time.
 
-    Parameters
-    ----------
-    noise, rule
-        Of the radars, and of what is believed.
-    offsets_m, offset_covariance
-        What the state knows of the radars' range offsets, shapes (r,) and (r, r).
+    ``offsets_m`` (r,) and ``offset_covariance`` (r, r) are the radars' range offsets in the state.
     """
 
     def __init__(
@@ -460,7 +437,7 @@ class Tracker:
         self._offsets_known = max(self._doubt, default=0.0) <= (0.1 * noise.sigma_m) ** 2
 
     def follow(self, guess: Guess, frames: Sequence[Sequence[Slot]]) -> Tracklet:
-        """Return what the last frames hold of a guess; twice, from the result of the first."""
+        """Return the ranges that follow a guess; twice, the second time from the first result."""
         first = self._walk(guess, frames)
         again = Guess(point_m=first.point_m, covariance=guess.covariance, label=guess.label)
         second = self._walk(again, frames)
@@ -491,10 +468,10 @@ class Tracker:
                 radar = slot.radar
                 expected = distance + self._offsets[radar]
                 nearest, nu = None, math.inf
-                for leftover in slot.unused:
-                    miss = leftover.range_m - expected
-                    if abs(miss) < abs(nu) and leftover.label == guess.label:
-                        nearest, nu = leftover, miss
+                for measured in slot.unused:
+                    miss = measured.range_m - expected
+                    if abs(miss) < abs(nu) and measured.label == guess.label:
+                        nearest, nu = measured, miss
                 if nearest is None:
                     continue
                 ux, uy = dx / distance, dy / distance
@@ -530,16 +507,16 @@ class Tracker:
         """Judge the members by a point *and* the radars' common offsets, which are uncertain.
 
         Least squares over point and offset errors o ~ N(0, offset covariance). The point is
-        returned for the offsets the state has, moved along d(point) / d(offsets) from where the
-        residuals are least: there the linearisation is right.
+        returned for the offsets of the state, moved along d(point) / d(offsets) from the
+        least-squares solution, where the linearisation is right.
         """
         if walked.dof < 1:
             return walked
         radars = sorted({member.slot.radar for member in walked.members})
         place = np.array([radars.index(member.slot.radar) for member in walked.members])
         antennas = np.array([[m.slot.x_m, m.slot.y_m] for m in walked.members])
-        z = np.array([m.leftover.range_m - self._offsets[m.slot.radar] for m in walked.members])
-        variance = np.array([m.leftover.sigma_m**2 + m.slot.drift for m in walked.members])
+        z = np.array([m.measured.range_m - self._offsets[m.slot.radar] for m in walked.members])
+        variance = np.array([m.measured.sigma_m**2 + m.slot.drift for m in walked.members])
         offset_part = np.zeros((len(z), len(radars)))
         offset_part[np.arange(len(z)), place] = 1.0
         prior = self._offset_covariance[np.ix_(radars, radars)]
@@ -578,25 +555,42 @@ def is_believable(tracklet: Tracklet, n_radars: int, rule: TrackletRule) -> bool
     alone = n_radars == 1
     if len(frames) < (rule.single_min_frames if alone else rule.min_frames):
         return False
-    hits: dict[int, int] = {}
-    for member in tracklet.members:
-        hits[member.slot.radar] = hits.get(member.slot.radar, 0) + 1
-    if len(hits) < n_radars or min(hits.values()) < rule.min_hits_per_radar:
-        return False
-    if tracklet.share < rule.min_share:
+    if not is_consistent(tracklet, n_radars, rule):
         return False
     if alone:
         spread = float(np.linalg.eigvalsh(tracklet.covariance)[-1])
         if spread > rule.single_max_sigma_m**2:
             return False
-    limit = tracklet.dof + rule.excess_sigmas * math.sqrt(2.0 * max(tracklet.dof, 0))
-    return tracklet.chi_square <= limit
+    return True
 
 
-def take(members: Iterable[Member]) -> None:
-    """Remove the ranges of a tracklet from what is unused."""
-    for member in members:
-        member.slot.unused.remove(member.leftover)
+def is_consistent(followed: Followed, n_radars: int, rule: TrackletRule) -> bool:
+    """Tell whether enough radars and frames hold it, with residuals as small as their noise."""
+    hits = Counter(member.slot.radar for member in followed.members)
+    if len(hits) < n_radars or min(hits.values()) < rule.min_hits_per_radar:
+        return False
+    limit = chi_square_limit(followed.dof, rule.excess_sigmas)
+    return followed.share >= rule.min_share and followed.chi_square <= limit
+
+
+def best_first(
+    guesses: Sequence[G], follow: Callable[[G], F], accepts: Callable[[F], bool]
+) -> list[F]:
+    """Return what guesses lead to, best first; the ranges are taken out of the frames."""
+    found: list[F] = []
+    waiting = list(guesses)
+    while waiting:
+        followed = [(follow(guess), guess) for guess in waiting]
+        accepted = [pair for pair in followed if accepts(pair[0])]
+        if not accepted:
+            break
+        best, chosen = max(accepted, key=lambda pair: pair[0].score)
+        for member in best.members:
+            member.slot.unused.remove(member.measured)
+        found.append(best)
+        # What is left may have lost its ranges: follow it again.
+        waiting = [guess for _, guess in accepted if guess is not chosen]
+    return found
 
 
 def find_tracklets(
@@ -608,9 +602,9 @@ def find_tracklets(
     *,
     is_point: Callable[[Tracklet], bool] | None = None,
 ) -> list[Tracklet]:
-    """Return the believable tracklets, best first; their ranges are taken out of the frames.
+    """Return the accepted tracklets, best first; their ranges are taken out of the frames.
 
-    ``is_point`` may have doubts about a tracklet that is of a point at rest in all else.
+    ``is_point`` may reject a tracklet that passes all other tests.
     """
     available: dict[int, int] = {}
     for slots in frames:
@@ -618,21 +612,13 @@ def find_tracklets(
             available[slot.radar] = available.get(slot.radar, 0) + bool(slot.unused)
     if len(available) < n_radars or min(available.values()) < rule.min_hits_per_radar:
         return []
-    found: list[Tracklet] = []
-    waiting = list(guesses)
-    while waiting:
-        followed = [(tracker.follow(guess, frames), guess) for guess in waiting]
-        believed = [pair for pair in followed if is_believable(pair[0], n_radars, rule)]
-        if is_point is not None:
-            believed = [pair for pair in believed if pair[0].label is not None or is_point(pair[0])]
-        if not believed:
-            break
-        best, chosen = max(believed, key=lambda pair: pair[0].score)
-        take(best.members)
-        found.append(best)
-        # What is left may have lost its ranges: follow it again.
-        waiting = [guess for _, guess in believed if guess is not chosen]
-    return found
+
+    def accepts(tracklet: Tracklet) -> bool:
+        if not is_believable(tracklet, n_radars, rule):
+            return False
+        return is_point is None or tracklet.label is not None or is_point(tracklet)
+
+    return best_first(guesses, lambda guess: tracker.follow(guess, frames), accepts)
 
 
 _FORBIDDEN = 1e9
@@ -640,7 +626,7 @@ _FORBIDDEN = 1e9
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RangeBearing:
-    """One point seen: range [m] and bearing [rad] in the body frame, covariance (2, 2).
+    """One point: range [m] and bearing [rad] in the body frame, covariance (2, 2).
 
     ``label`` names the target where that is known.
     """
@@ -652,7 +638,7 @@ class RangeBearing:
 
     @property
     def values(self) -> Array:
-        """Return [range m, bearing rad], shape (2,)."""
+        """Return [range m, bearing rad]."""
         return np.array([self.range_m, self.bearing_rad])
 
     def body_point(self, n_radars: int) -> BodyPoint:
@@ -667,7 +653,6 @@ class RangeBearing:
 
 
 def range_bearing_rows(state: State, row: int, seen: RangeBearing) -> FeatureRows:
-    """Return residual, H and S of a point that would be the landmark in ``row``."""
     R = rotation(state.heading_rad)
     b = R.T @ (state.landmarks_m[row] - state.position_m)
     q = float(b @ b)
@@ -684,7 +669,7 @@ def range_bearing_rows(state: State, row: int, seen: RangeBearing) -> FeatureRow
 def named_rows(
     state: State, points: Sequence[RangeBearing], landmark_of_label: Mapping[int, int]
 ) -> list[int | None] | None:
-    """Return the rows that labels name, -1 for new ones; None if not every point has a label."""
+    """Return the rows of labelled points, -1 for new ones; None if a point has no label."""
     labels = [point.label for point in points if point.label is not None]
     if len(labels) < len(points):
         return None
@@ -695,10 +680,10 @@ def named_rows(
 def assign(
     state: State, points: Sequence[RangeBearing], gate: float, new_gate: float, reach_m: float
 ) -> list[int | None]:
-    """Return for each point the row of its landmark, -1 for a new one, None where in doubt.
+    """Return for each point the row of its landmark, -1 for a new one, None if ambiguous.
 
-    A point farther than ``new_gate`` (squared Mahalanobis distance) from every landmark is new;
-    one that is nearer but not assigned is in doubt.
+    A point farther than ``new_gate`` (squared Mahalanobis distance) from every landmark is new; one
+    that is nearer but not assigned is ambiguous.
     """
     if not points:
         return []

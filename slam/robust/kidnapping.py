@@ -1,31 +1,29 @@
-"""Whether the robot is where the map has it, and what to do when it was carried away.
+"""Kidnap detection, submaps, and relocation on the old map.
 
-Each landmark that a radar should see is a trial. Where the pose is right, a range lies near its
+Each landmark that a radar should see gives evidence. Where the pose is right, a range lies near its
 prediction with the detection probability; where it is not, by chance only: with n ranges over a
 span L, with 1 - exp(-n w / L) for a gate of width w. The log likelihood ratios are summed from each
 of several moments at which the robot may have been carried, and the largest sum counts (a
 cumulative sum test, Page, Biometrika 41, 1954, with few moments). Landmarks mapped after that
-moment were put where the robot thought it was: they are no witnesses. One landmark that was taken
-away is no proof about the robot: what each may say is bounded, so that several must be missing.
+moment were put where the robot was believed to be: they are no witnesses. One landmark that was
+taken away proves nothing about the robot: the evidence of each is bounded, so that several must be
+missing.
 
-Where it was set down, a new *island* begins: the error of the pose is zero by definition, what is
-seen becomes landmarks of the island, and those of the old map stay in the state, elsewhere. All
-errors keep their correlations, the wheels' calibration and the range offsets are shared.
+Once the evidence suffices, all measurements since the robot was carried are forgotten, perhaps
+being of other landmarks than they were assigned to, and a new *submap* begins: the error of the
+pose is zero by definition, new landmarks belong to the submap, and those of the old map stay in the
+state. All errors keep their correlations; wheels' calibration and range offsets are shared.
 
-An island and the old map are joined by a motion T that lays landmarks of one on those of the
-other. Two pairs of landmarks with equal distances give a T, all pairs that then lie together test
-it. Its evidence is the likelihood of their residuals r with T integrated out, uniform over the
-map's surroundings of area A and all headings (S covariance of r, N derivative of r by T)::
+A submap and the old map are joined by a motion T that lays landmarks of one on those of the other.
+Two pairs of landmarks with equal distances give a T, all pairs that then lie together test it. Its
+evidence is the likelihood of their residuals r with T integrated out, uniform over the map's
+surroundings of area A and all headings (S covariance of r, N derivative of r by T)::
 
     ln p = -(r^T S^-1 r + ln det(2 pi S) + ln det(N^T S^-1 N / 2 pi)) / 2 - ln(2 pi A)
 
-against ln beta for each landmark that would be new, and against every other T. Islands are joined
+against ln beta for each landmark that would be new, and against every other T. The maps are joined
 when one T stands out. In right-invariant errors, T = Exp(e_T) T^ adds the same e_T to pose and
-island: exact however little is known of T, so that the join is a merge (module ``merging``).
-
-When the evidence has grown until the robot must be elsewhere (module ``surprise``), what was
-measured since it was carried, perhaps of other landmarks than it was taken for, is forgotten. An
-island begins, and ends when its landmarks are found on the map (module ``relocation``).
+submap: exact however little is known of T, so that the join is a merge (`slam.robust.map`).
 """
 
 from __future__ import annotations
@@ -57,32 +55,23 @@ from slam.robust.state import (
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
-    """What a landmark says, in nats: positive if the robot is not where the map has it."""
+class Evidence:
+    """Evidence of a landmark in nats: positive if the robot is not where the map has it."""
 
     landmark_id: int
     evidence: float
 
 
-def trials(
+def evidence(
     near: SureLandmarks,
     seen: View,
     scans: Sequence[RangeScan],
     state: State,
     parameters: BackEndParameters,
-) -> list[Trial]:
-    """Return one trial for each range that should be among those of some scans.
+) -> list[Evidence]:
+    """Return the evidence of each range that should be among those of the scans of one side.
 
-    Parameters
-    ----------
-    near, seen
-        Landmarks that may be in view, all landmarks in view.
-    scans
-        Of the radars of one side.
-    state
-        Tells the ids of all rows, and which are points.
-    parameters
-        Noise of a range, detection probability; what counts.
+    ``near`` are the landmarks that may be in view, ``seen`` all of them.
     """
     noise, rule = parameters.ranges, parameters.surprise
     rows, ids, n_points = near.rows, state.landmark_ids, len(state.landmark_ids)
@@ -106,13 +95,13 @@ def trials(
             evidence = math.log(chance / detection)
         else:
             evidence = math.log((1.0 - chance) / (1.0 - detection))
-        found.append(Trial(ids[int(rows.landmarks[k])], evidence))
+        found.append(Evidence(ids[int(rows.landmarks[k])], evidence))
     return found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Hypothesis:
-    """The robot was carried away before a pose: who knew its place before, and what they say."""
+    """The robot was carried away before a pose: landmarks known before it, and their votes."""
 
     first_pose: int
     witnesses: frozenset[int]
@@ -122,18 +111,12 @@ class _Hypothesis:
         return sum(self.votes.values())
 
     def score_without_one(self) -> float:
-        """Return the score without the landmark that says most against the pose."""
+        """Return the score without the largest vote."""
         return self.score() - max(self.votes.values(), default=0.0)
 
 
 class Surprise:
-    """The running evidence that the robot is not where the map has it.
-
-    Parameters
-    ----------
-    rule
-        Bounds.
-    """
+    """The running evidence that the robot is not where the map has it."""
 
     def __init__(self, rule: SurpriseRule) -> None:
         self._rule = rule
@@ -156,21 +139,20 @@ class Surprise:
 
     @property
     def is_suspicious(self) -> bool:
-        """Tell whether more than one landmark speaks against the pose.
+        """Tell whether more than one landmark gives evidence against the pose.
 
-        One alone may hide behind a box or be of another shape than a point: were that enough, it
-        could neither be deleted nor solved for again, and would speak on.
+        One alone may be hidden or not be a point: were that enough, it could neither be deleted nor
+        solved for again, and would count on.
         """
         scores = (one.score_without_one() for one in self._hypotheses)
         return max(scores, default=0.0) > self._rule.suspicious
 
     @property
     def is_carried(self) -> bool:
-        """Tell whether the robot must be elsewhere."""
         return self.score > self._rule.carried
 
-    def look(self, frame: Sequence[Trial], pose: int, ids: Iterable[int]) -> None:
-        """Take in the trials of one frame, given its pose and the landmarks known before."""
+    def look(self, frame: Sequence[Evidence], pose: int, ids: Iterable[int]) -> None:
+        """Take in the evidence of one frame, given its pose and the landmarks known before."""
         last = self._hypotheses[-1].first_pose if self._hypotheses else -math.inf
         if frame and pose - last >= self._rule.every:
             self._hypotheses.append(_Hypothesis(pose, frozenset(ids), {}))
@@ -183,7 +165,6 @@ class Surprise:
                     one.votes[trial.landmark_id] = vote
 
     def reset(self) -> None:
-        """Begin anew, without suspicion."""
         self._hypotheses.clear()
 
 
@@ -194,10 +175,10 @@ _SURROUNDINGS_M = 1.5
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Join:
-    """A motion that lays an island on the map.
+    """A motion that lays a submap on the old map.
 
-    ``motion`` (3,) is applied from the left to all of the island; ``pairs`` are rows (landmark
-    elsewhere, landmark of the island); ``evidence`` is in nats over that all of them are new.
+    ``motion`` (3,) is applied from the left to all of the submap; ``pairs`` are rows (landmark of
+    the old map, landmark of the submap); ``evidence`` is in nats over that all of them are new.
     """
 
     motion: Array
@@ -205,8 +186,8 @@ class Join:
     evidence: float
 
 
-def set_down(state: State, pose: Array) -> None:
-    """Begin an island: the pose becomes one without doubt, in place; nothing else is forgotten."""
+def begin_submap(state: State, pose: Array) -> None:
+    """Make the pose free of uncertainty, in place; nothing else is forgotten."""
     T = state.additive_transform()
     P = T @ state.P.full() @ T.T
     P[:3, :] = 0.0
@@ -219,31 +200,21 @@ def set_down(state: State, pose: Array) -> None:
 
 def find_join(
     state: State,
-    island: Sequence[int],
-    elsewhere: Sequence[int],
+    submap: Sequence[int],
+    old_map: Sequence[int],
     map_rule: MapRule,
     rule: RelocationRule,
 ) -> Join | None:
-    """Return the join that stands out, or None.
-
-    Parameters
-    ----------
-    state
-        With an island.
-    island, elsewhere
-        Rows of landmarks believed in.
-    map_rule, rule
-        Density of unmapped landmarks; when a join stands out.
-    """
-    if len(island) < rule.least_landmarks or len(elsewhere) < rule.least_landmarks:
+    """Return the join of two sets of rows, all reported landmarks, that stands out, or None."""
+    if len(submap) < rule.least_landmarks or len(old_map) < rule.least_landmarks:
         return None
     joins: dict[tuple[tuple[int, int], ...], Join] = {}
     tried: set[tuple[tuple[int, int], ...]] = set()
-    for pairs in _constellations(state, island, elsewhere, rule):
+    for pairs in _constellations(state, submap, old_map, rule):
         if pairs in tried:
             continue
         tried.add(pairs)
-        join = _judged(state, pairs, elsewhere, map_rule)
+        join = _judged(state, pairs, old_map, map_rule)
         if join is not None and len(join.pairs) >= rule.least_landmarks:
             joins[join.pairs] = join
     ranked = sorted(joins.values(), key=lambda join: -join.evidence)
@@ -251,7 +222,7 @@ def find_join(
         return None
     best = ranked[0]
     rivals = [join for join in ranked[1:] if _differ(state, join, best, rule)]
-    if rivals and best.evidence - rivals[0].evidence < rule.lead:
+    if rivals and best.evidence - rivals[0].evidence < rule.margin:
         return None
     return best
 
@@ -263,10 +234,10 @@ def _differ(state: State, one: Join, other: Join, rule: RelocationRule) -> bool:
 
 
 def _constellations(
-    state: State, island: Sequence[int], elsewhere: Sequence[int], rule: RelocationRule
+    state: State, submap: Sequence[int], old_map: Sequence[int], rule: RelocationRule
 ) -> list[tuple[tuple[int, int], ...]]:
-    """Return the pairings that two landmarks of the island with two elsewhere lead to."""
-    here, there = np.array(island), np.array(elsewhere)
+    """Return the pairings that two landmarks of either map lead to."""
+    here, there = np.array(submap), np.array(old_map)
     points, targets = state.landmarks_m[here], state.landmarks_m[there]
     gaps = targets[None, :] - targets[:, None]
     lengths = np.hypot(gaps[..., 0], gaps[..., 1])
@@ -303,9 +274,9 @@ def _nearest(away: Array, reach_m: float) -> list[tuple[int, int]]:
 
 
 def _judged(
-    state: State, pairs: tuple[tuple[int, int], ...], elsewhere: Sequence[int], rule: MapRule
+    state: State, pairs: tuple[tuple[int, int], ...], old_map: Sequence[int], rule: MapRule
 ) -> Join | None:
-    """Return the best join of some pairs, the worst left out until all fit; None below two."""
+    """Return the join of the pairs, the worst left out until all fit; None below two."""
     while len(pairs) >= 2:
         motion, residual, S, N = _aligned(state, pairs)
         S_inverse = np.linalg.inv(S)
@@ -314,7 +285,7 @@ def _judged(
             information = N.T @ S_inverse @ N
             log_det = float(np.linalg.slogdet(math.tau * S)[1])
             log_det += float(np.linalg.slogdet(information / math.tau)[1])
-            targets = state.landmarks_m[np.array(elsewhere)]
+            targets = state.landmarks_m[np.array(old_map)]
             area = float(np.prod(np.ptp(targets, axis=0) + 2 * _SURROUNDINGS_M))
             evidence = -0.5 * (distance + log_det) - math.log(math.tau * area)
             evidence -= len(pairs) * math.log(rule.unmapped_per_m2)
@@ -330,8 +301,8 @@ def _judged(
 def _aligned(state: State, pairs: tuple[tuple[int, int], ...]) -> tuple[Array, Array, Array, Array]:
     """Return the motion of least squares, residual (2 k,), its covariance and derivative (2 k, 3).
 
-    residual = T l_island - l_elsewhere. While there is an island, errors of landmarks are added to
-    T (module docstring), so their additive errors are what counts.
+    residual = T l_submap - l_old. While there is a submap, errors of landmarks are added to T (see
+    above), so their additive errors are used.
     """
     there = np.array([pair[0] for pair in pairs])
     here = np.array([pair[1] for pair in pairs])
@@ -367,19 +338,19 @@ def _additive_block(state: State, rows: Indices) -> Array:
 
 
 def _first_alignment(points: Array, targets: Array) -> Array:
-    """Return the motion of unweighted least squares (Umeyama without scale), shape (3,)."""
+    """Return the motion of unweighted least squares (Umeyama without scale), (3,)."""
     p, t = points - points.mean(axis=0), targets - targets.mean(axis=0)
     turn = math.atan2(float(np.sum(p[:, 0] * t[:, 1] - p[:, 1] * t[:, 0])), float(np.sum(p * t)))
     shift = targets.mean(axis=0) - rotation(turn) @ points.mean(axis=0)
     return np.array([shift[0], shift[1], turn])
 
 
-def apply_join(state: State, join: Join, island: Collection[int], sigma_m: float) -> None:
-    """Lay the island, rows of its landmarks given, on the map, and merge the pairs."""
+def apply_join(state: State, join: Join, submap: Collection[int], sigma_m: float) -> None:
+    """Move the submap, given by rows, onto the old map, and merge the pairs."""
     motion = join.motion
-    R, rows = rotation(float(motion[2])), np.array(sorted(island), dtype=np.intp)
+    R, rows = rotation(float(motion[2])), np.array(sorted(submap), dtype=np.intp)
     blocks = [np.array([1, 2]), *state.landmark_columns(rows).reshape(-1, 2)]
-    # Old landmarks do not turn with the island: their invariant errors follow the heading's alone.
+    # Old landmarks do not turn with the submap: their invariant errors follow the heading's alone.
     A = np.eye(state.P.size)
     for block in blocks:
         A[np.ix_(block, block)] = R
@@ -401,111 +372,97 @@ def apply_join(state: State, join: Join, island: Collection[int], sigma_m: float
     apply_merge(state, join.pairs, sigma_m)
 
 
-class Whereabouts:
-    """Keeps watch over the pose.
+class Localisation:
+    """Whether the robot is where the map has it; submaps and relocation.
 
-    Parameters
+    Attributes
     ----------
-    parameters
-        Noise and rules.
+    surprise
+        The evidence against the pose.
+    is_lost
+        Whether the place of the robot on the map is unknown. It stays so where nothing of the map
+        is left: then there is no way back.
+    old_map
+        Ids of the old map's landmarks while there is a submap; else empty.
     """
 
     def __init__(self, parameters: BackEndParameters) -> None:
         self.parameters = parameters
-        self._surprise = Surprise(parameters.surprise)
+        self.surprise = Surprise(parameters.surprise)
         self._first_pose = 0
-        self._is_lost = False
-        self.elsewhere: frozenset[int] = frozenset()
-
-    @property
-    def is_lost(self) -> bool:
-        """Tell whether the place of the robot on the map is unknown.
-
-        It stays so where nothing of the map is left: then there is no way back.
-        """
-        return self._is_lost
-
-    @property
-    def is_suspicious(self) -> bool:
-        """Tell whether something speaks against the pose."""
-        return self._surprise.is_suspicious
-
-    @property
-    def is_carried(self) -> bool:
-        """Tell whether the robot must be elsewhere."""
-        return self._surprise.is_carried
+        self.is_lost = False
+        self.old_map: frozenset[int] = frozenset()
 
     @property
     def lost_covariance(self) -> Array:
-        """Return the covariance of a pose of which nothing is known, shape (3, 3)."""
+        """Return the covariance of an unknown pose, shape (3, 3)."""
         sigma_m = self.parameters.relocation.lost_position_m
         return np.diag([sigma_m**2, sigma_m**2, math.pi**2 / 3.0])
 
-    def seen_from_here(self, seen: View, state: State) -> View:
-        """Return a view without what is elsewhere."""
+    def without_old_map(self, seen: View, state: State) -> View:
         ids = enumerate(state.feature_ids)
-        return seen.without([row for row, id_ in ids if id_ in self.elsewhere])
+        return seen.without([row for row, id_ in ids if id_ in self.old_map])
 
-    def look(self, trials: Sequence[Trial], state: State, log: RunLog) -> None:
+    def look(self, evidence: Sequence[Evidence], state: State, log: RunLog) -> None:
         """Judge one frame; to be called before anything is learned from it."""
-        self._surprise.look(trials, log.n_poses - 1, state.feature_ids)
+        self.surprise.look(evidence, log.n_poses - 1, state.feature_ids)
 
-    def set_down(self, state: State, existence: Existence, log: RunLog) -> None:
-        """Begin an island at the present pose, and forget what was measured since it was wrong.
+    def begin_submap(self, state: State, existence: Existence, log: RunLog) -> None:
+        """Begin a submap at the present pose, and forget all measurements since the pose was wrong.
 
-        What came into the map since is taken out again; the rest is solved for without the ranges
-        since then. Where there is an island already it is given up: what is left is the old map.
+        Landmarks mapped since are removed; the rest is solved for without the ranges since then. A
+        submap that exists already is given up: what is left is the old map.
         """
-        first = self._surprise.first_pose
+        first = self.surprise.first_pose
         log.forget_from(first)
-        known = self.elsewhere if self._is_lost else self._surprise.witnesses
+        known = self.old_map if self.is_lost else self.surprise.witnesses
         for id_ in state.feature_ids:
             if id_ not in known:
                 forget(id_, state, existence, log)
         pose = state.pose
         if not self.is_lost:
             relinearise(log, state, self.parameters)
-        set_down(state, pose)
-        log.carried(pose)
-        self.elsewhere = frozenset(state.feature_ids)
-        self._is_lost = True
+        begin_submap(state, pose)
+        log.break_odometry(pose)
+        self.old_map = frozenset(state.feature_ids)
+        self.is_lost = True
         self._first_pose = log.n_poses - 1
-        self._surprise.reset()
+        self.surprise.reset()
 
     def find(self, state: State, existence: Existence, log: RunLog) -> tuple[tuple[int, int], ...]:
-        """Join the island with the map if it is certain how; return (kept, gone) ids."""
+        """Join the submap with the old map if one join stands out; return (kept, gone) ids."""
         rules = self.parameters
         rows = [r for r, id_ in enumerate(state.landmark_ids) if existence.is_reported(id_)]
-        island = [r for r in rows if state.landmark_ids[r] not in self.elsewhere]
-        old = [r for r in rows if state.landmark_ids[r] in self.elsewhere]
-        join = find_join(state, island, old, rules.map, rules.relocation)
+        submap = [r for r in rows if state.landmark_ids[r] not in self.old_map]
+        old = [r for r in rows if state.landmark_ids[r] in self.old_map]
+        join = find_join(state, submap, old, rules.map, rules.relocation)
         if join is None:
             return ()
         ids = [(state.landmark_ids[kept], state.landmark_ids[gone]) for kept, gone in join.pairs]
-        whole = [r for r, id_ in enumerate(state.landmark_ids) if id_ not in self.elsewhere]
+        whole = [r for r, id_ in enumerate(state.landmark_ids) if id_ not in self.old_map]
         apply_join(state, join, whole, rules.map.merge_sigma_m)
-        log.lay(self._first_pose, join.motion)
+        log.move_poses(self._first_pose, join.motion)
         for kept, gone in ids:
             existence.merge(kept, gone)
             log.rename(gone, kept)
-        self.elsewhere = frozenset()
-        self._is_lost = False
-        self._surprise.reset()
+        self.old_map = frozenset()
+        self.is_lost = False
+        self.surprise.reset()
         return tuple(ids)
 
 
 def forget(id_: int, state: State, existence: Existence, log: RunLog) -> None:
-    """Take a landmark or a wall out of the belief and all that was measured of it."""
+    """Remove a landmark or a wall, and all its measurements."""
     state.remove(state.feature_ids.index(id_))
     existence.forget(id_)
     log.drop(id_)
 
 
 def merge_landmarks(
-    state: State, existence: Existence, log: RunLog, rule: MapRule, elsewhere: frozenset[int]
+    state: State, existence: Existence, log: RunLog, rule: MapRule, old_map: frozenset[int]
 ) -> tuple[tuple[int, int], ...]:
     """Make the merge that is certain enough now, if any; return (kept, gone) ids."""
-    merge = find_merge(state, existence, rule, elsewhere)
+    merge = find_merge(state, existence, rule, old_map)
     if merge is None:
         return ()
     ids = tuple((state.landmark_ids[kept], state.landmark_ids[gone]) for kept, gone in merge.pairs)

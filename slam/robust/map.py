@@ -1,34 +1,33 @@
-"""The map kept tidy: existence, merging, points and walls and round targets told apart.
+"""Map management: existence, merging, and whether a target is a point, a wall or round.
 
-The statement ``l_i - l_j = 0`` is a measurement of the whole state, H = [e_li: I, e_lj: -I]:
-merging after a loop bends the trajectory back, and everything that is correlated with it. It is
-made late, when one merge, or two disjoint ones together, stand out from all competitors.
+Merging
+    The statement ``l_i - l_j = 0`` is a measurement of the whole state, H = [e_li: I, e_lj: -I]:
+    merging after a loop bends the trajectory back, and everything correlated with it. It is made
+    late, when one merge, or two disjoint ones together, stand out from all competitors.
+Points and walls
+    The specular echo of a wall comes from wherever the wall is nearest, so its range is *linear* in
+    the antenna's position a; a point's is a hyperbola::
 
-The specular echo of a wall comes from wherever the wall is nearest, so its range is *linear* in
-the antenna's position a; a point's is a hyperbola::
+        point at b:     r = |b - a|
+        wall (phi, d):  r = d - n . a,   n = [cos phi, sin phi]
 
-    point at b:     r = |b - a|
-    wall (phi, d):  r = d - n . a,   n = [cos phi, sin phi]
-
-A corner of two walls sends the pulse back to where it came from by way of both, and the length of
-that way is twice the distance to the apex: a corner is a point, for ranges. Both laws have two
-unknowns, so the difference of their chi-squares is twice the logarithm of the likelihood ratio
-(and that of their BIC). Over a short displacement, or at a great distance, it is near zero, and
-nothing is decided. Source of the laws: Leonard and Durrant-Whyte, "Directed Sonar Sensing for
-Mobile Robot Navigation", 1992, chapter 2.
-
-Its range is r = |c - a| - R, with c its axis and R its radius: a law between a point's (R = 0) and
-a wall's. Over a few frames no radius is seen, and the point that fits lies on the surface; the
-farther the robot drives, the more ranges miss it. So points whose ranges tell a radius get one.
-
-The ranges of the last frames are laid along odometry alone, for poses that the ranges have
-corrected already have given way to the wrong law. Odometry errs so that it looks like a radius:
-a scale error s stretches the way, x^2 / 2 r, by as much as R = 2 s r does, and a curvature kappa
-bends it by kappa x^2 / 2. Both are unknowns of the fit, with the radars' offsets and the wheels'
-white noise, each with what is known of it before. Turns are left out: there wheels err most.
-
-That makes a radius likely. It is believed if a solution over all poses is likelier with it. It is
-no unknown of the state: what is not known of it counts as noise of the landmark's ranges.
+    A corner of two walls returns the pulse by way of both, and the length of that way is twice the
+    distance to the apex: for ranges, a corner is a point. Both laws have two unknowns, so the
+    difference of their chi-squares is twice the logarithm of the likelihood ratio (and that of
+    their BIC). Over a short displacement, or at a great distance, it is near zero, and nothing is
+    decided. Source: Leonard and Durrant-Whyte, "Directed Sonar Sensing for Mobile Robot
+    Navigation", 1992, chapter 2.
+Round targets
+    The range is r = |c - a| - R, with c the axis and R the radius: a law between a point's (R = 0)
+    and a wall's. Over a few frames no radius shows, and the point that fits lies on the surface;
+    the farther the robot drives, the more ranges miss it. The ranges of the last frames are laid
+    along odometry alone, for poses that the ranges have corrected already follow the wrong law.
+    Odometry errs so that it looks like a radius: a scale error s stretches the way, x^2 / 2 r, by
+    as much as R = 2 s r does, and a curvature kappa bends it by kappa x^2 / 2. Both are unknowns of
+    the fit, with the radars' offsets and the wheels' white noise, each with its prior. Turns are
+    left out: there wheels err most. The radius is accepted if a solution over all poses is likelier
+    with it. It is no unknown of the state: its uncertainty counts as noise of the landmark's
+    ranges.
 """
 
 from __future__ import annotations
@@ -41,8 +40,9 @@ from enum import Enum
 import numpy as np
 from scipy.spatial import cKDTree
 
+from slam.config import WheelNoise
 from slam.geometry import between, transform
-from slam.robust.parameters import BackEndParameters, MapRule, RoundnessRule, WheelNoise
+from slam.robust.parameters import BackEndParameters, MapRule, RoundnessRule, chi_square_limit
 from slam.robust.run_log import LoggedSightings, RunLog
 from slam.robust.smoother import give_radius
 from slam.robust.state import Array, Indices, State, quarter_turn
@@ -55,13 +55,7 @@ class _Record:
 
 
 class Existence:
-    """Scores of all landmarks by id, and which pairs were seen whole in common frames.
-
-    Parameters
-    ----------
-    rule
-        Steps and limits.
-    """
+    """Scores of all landmarks by id, and which pairs were seen whole in common frames."""
 
     def __init__(self, rule: MapRule) -> None:
         self._rule = rule
@@ -79,25 +73,22 @@ class Existence:
         self._records[landmark_id].score -= self._rule.miss
 
     def lost(self) -> list[int]:
-        """Return the ids of landmarks that are believed in no longer."""
+        """Return the ids of landmarks whose score is below the floor."""
         return [id_ for id_, record in self._records.items() if record.score < self._rule.least]
 
     def hits(self, landmark_id: int) -> int:
-        """Return the number of frames that hit a landmark."""
         return self._records[landmark_id].hits
 
     def is_reported(self, landmark_id: int) -> bool:
-        """Tell whether a landmark was hit often enough to be shown."""
         return self._records[landmark_id].hits >= self._rule.report_hits
 
     def forget(self, landmark_id: int) -> None:
-        """Drop all that is known of a landmark."""
         self._records.pop(landmark_id, None)
         for pair in [pair for pair in self._together if landmark_id in pair]:
             del self._together[pair]
 
     def seen_whole(self, landmark_ids: Iterable[int]) -> None:
-        """Count a frame in which each of these was seen by both radars of a pair."""
+        """Count a frame in which both radars of a pair saw each of these landmarks."""
         ids = sorted(landmark_ids)
         for place, first in enumerate(ids):
             for second in ids[place + 1 :]:
@@ -114,7 +105,6 @@ class Existence:
         return self._together.get(key, 0) >= self._rule.apart_frames
 
     def merge(self, kept: int, gone: int) -> None:
-        """Let one landmark take over what is known of another."""
         into, other = self._records[kept], self._records[gone]
         into.score = min(max(into.score, 0.0) + max(other.score, 0.0), self._rule.most)
         into.hits += other.hits
@@ -152,7 +142,6 @@ def merge_rows(
 
 
 def judge(state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float) -> Merge:
-    """Return the likelihood of a merge, or of several together."""
     at, H, residual, R = merge_rows(state, pairs, sigma_m)
     S = H @ state.P.block(at) @ H.T + R
     distance = float(residual @ np.linalg.solve(S, residual))
@@ -181,19 +170,16 @@ def apply_merge(state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float
     for kept, gone in pairs:
         if ids[gone] in state.radii_m:
             state.radii_m.setdefault(ids[kept], state.radii_m[ids[gone]])
-            state.range_doubts_m.setdefault(ids[kept], state.range_doubts_m.get(ids[gone], 0.0))
+            state.shape_sigmas_m.setdefault(ids[kept], state.shape_sigmas_m.get(ids[gone], 0.0))
     for row in sorted((second for _, second in pairs), reverse=True):
         state.remove(row)
 
 
 def find_merge(
-    state: State, existence: Existence, rule: MapRule, elsewhere: Set[int] = frozenset()
+    state: State, existence: Existence, rule: MapRule, old_map: Set[int] = frozenset()
 ) -> Merge | None:
-    """Return the merge to be made now, one or two disjoint ones, or None.
-
-    A landmark whose id is ``elsewhere`` is merged with none.
-    """
-    candidates = _candidates(state, existence, rule, elsewhere)
+    """Return the merge to be made now, one or two disjoint ones, or None."""
+    candidates = _candidates(state, existence, rule, old_map)
     floor = math.log(rule.unmapped_per_m2)
     fair = [merge for merge in candidates if merge.log_likelihood > floor]
     best: Merge | None = None
@@ -203,7 +189,7 @@ def find_merge(
             for other in candidates
             if other is not merge and _share_landmark(other, merge)
         ]
-        stands_out = merge.log_likelihood - max(rivals, default=-math.inf) > rule.merge_lead
+        stands_out = merge.log_likelihood - max(rivals, default=-math.inf) > rule.merge_margin
         if stands_out and (best is None or merge.log_likelihood > best.log_likelihood):
             best = merge
     if best is not None:
@@ -212,9 +198,9 @@ def find_merge(
 
 
 def _candidates(
-    state: State, existence: Existence, rule: MapRule, elsewhere: Set[int]
+    state: State, existence: Existence, rule: MapRule, old_map: Set[int]
 ) -> list[Merge]:
-    """Return all merges of two landmarks within reach that pass the gate.
+    """Return all merges of two landmarks within reach that pass the gate, none of the old map.
 
     Only pairs that are near touch the covariance, all of them at once.
     """
@@ -227,7 +213,7 @@ def _candidates(
     found = []
     for first, second in near[distances <= (1.0 + 1e-6) * rule.merge_gate].tolist():
         ids = state.landmark_ids[first], state.landmark_ids[second]
-        if existence.are_apart(*ids) or not elsewhere.isdisjoint(ids):
+        if existence.are_apart(*ids) or not old_map.isdisjoint(ids):
             continue
         merge = judge(state, ((first, second),), rule.merge_sigma_m)
         if merge.mahalanobis_sq <= rule.merge_gate:
@@ -275,7 +261,7 @@ def _joint_merge(state: State, fair: list[Merge], floor: float, rule: MapRule) -
             for mine in best.pairs
             for theirs in rival.pairs
         )
-        if contradicts and best.log_likelihood - rival.log_likelihood <= rule.merge_lead:
+        if contradicts and best.log_likelihood - rival.log_likelihood <= rule.merge_margin:
             return None
     return best
 
@@ -290,7 +276,7 @@ _DAMPING = 1e-6
 
 
 class Law(Enum):
-    """What ranges over displacement say of a reflector."""
+    """The law that the ranges of a reflector follow."""
 
     POINT = "point"
     WALL = "wall"
@@ -299,47 +285,27 @@ class Law(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sightings:
-    """Ranges of one reflector from several places.
+    """Ranges of one reflector from several places."""
 
-    Attributes
-    ----------
-    antennas_m
-        shape (k, 2), in one frame.
-    ranges_m, variances
-        shape (k,): measured, without the offsets known, and their variances [m^2].
-    radars
-        shape (k,): index into the offsets.
-    offset_covariance
-        shape (r, r), of what is not known of the radars' offsets; None where they are known.
-    """
-
-    antennas_m: Array
+    antennas_m: Array  # shape (k, 2), in one frame
+    # shape (k,): measured, the offsets of the state removed, and their variances [m^2]
     ranges_m: Array
     variances: Array
-    radars: Array
+    radars: Array  # shape (k,): index into the offsets
+    # shape (r, r), of the radars' offsets; None where they are known
     offset_covariance: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fit:
-    """A law at its best.
+    """A law of least chi-square."""
 
-    Attributes
-    ----------
-    unknown
-        shape (2,): the law's own two.
-    offsets_m, radars
-        shape (q,): what the offsets of these radars are off by.
-    chi_square
-        Of the residuals and of the offsets.
-    by_law, extra
-        d(range) / d(unknown), shape (k, 2), and d(range) / d(offset), shape (k, q).
-    """
-
-    unknown: Array
+    unknown: Array  # shape (2,): the law's own two
+    # shape (q,): errors of the offsets of these radars
     offsets_m: Array
     radars: tuple[int, ...]
-    chi_square: float
+    chi_square: float  # of the residuals and of the offsets
+    # d(range) / d(unknown), shape (k, 2), and d(range) / d(offset), shape (k, q)
     by_law: Array
     extra: Array
 
@@ -351,22 +317,16 @@ class Verdict:
     point: float
     wall: float
 
-    def law(self, lead: float) -> Law:
-        """Return the law whose chi-square is less by ``lead``, if one is."""
-        if self.wall - self.point >= lead:
+    def law(self, margin: float) -> Law:
+        if self.wall - self.point >= margin:
             return Law.POINT
-        return Law.WALL if self.point - self.wall >= lead else Law.UNDECIDED
+        return Law.WALL if self.point - self.wall >= margin else Law.UNDECIDED
 
 
 def compare(sightings: Sightings, toward_rad: float) -> Verdict:
     """Fit both laws to the same ranges.
 
-    Parameters
-    ----------
-    sightings
-        What was measured.
-    toward_rad
-        Roughly the direction of the reflector, in the frame of the antennas.
+    ``toward_rad`` is roughly the direction of the reflector, in the frame of the antennas.
     """
     middle = sightings.antennas_m.mean(axis=0)
     range_m = float(sightings.ranges_m.mean())
@@ -440,7 +400,7 @@ def _least(
 
 
 def _offset_part(sightings: Sightings) -> tuple[Array, Array, tuple[int, ...]]:
-    """Return d(range) / d(offset), (k, q), the offsets' information, (q, q), and whose, (q,)."""
+    """Return d(range) / d(offset), (k, q), the offsets' information, (q, q), and the radars."""
     k = len(sightings.ranges_m)
     if sightings.offset_covariance is None:
         return np.zeros((k, 0)), np.zeros((0, 0)), ()
@@ -452,36 +412,24 @@ def _offset_part(sightings: Sightings) -> tuple[Array, Array, tuple[int, ...]]:
 
 # A radius off by e misses ranges up to 30 degrees from the middle one by e (1 - cos 30 deg), all
 # alike: to the hundred of one passage that is as noise ten times as large.
-_DOUBT_PER_SIGMA = 1.3
+_SHAPE_SIGMA_PER_RADIUS_SIGMA = 1.3
 _RADIUS_STEPS = 6
 _KNOTS = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Arc:
-    """Ranges of one target along one piece of way, in the odometry frame of its first pose.
+    """Ranges of one target along one piece of way, in the odometry frame of its first pose."""
 
-    Attributes
-    ----------
-    antennas_m, ranges_m, variances
-        shapes (k, 2), (k,), (k,); ranges without the offsets known.
-    nuisance
-        shape (k, 2, q): d(antenna) / d(scale, curvature, offsets, wheel noise in steps).
-    by_offset
-        shape (k, q): d(range) / d(the same), of the offsets alone.
-    prior
-        shape (q, q): information about all q.
-    start_m
-        shape (2,): where the landmark is believed to be.
-    """
-
+    # shapes (k, 2), (k,), (k,); ranges without the offsets known
     antennas_m: Array
     ranges_m: Array
     variances: Array
+    # shape (k, 2, q): d(antenna) / d(scale, curvature, offsets, wheel noise in steps)
     nuisance: Array
-    by_offset: Array
-    prior: Array
-    start_m: Array
+    by_offset: Array  # shape (k, q): d(range) / d(the same), of the offsets alone
+    prior: Array  # shape (q, q): information about all q
+    start_m: Array  # shape (2,): where the landmark is believed to be
 
 
 @dataclass(frozen=True, slots=True)
@@ -497,7 +445,7 @@ class Radius:
 def arc_of(
     log: RunLog, state: State, landmark_id: int, wheels: WheelNoise, rule: RoundnessRule
 ) -> Arc | None:
-    """Return what the last frames say of a landmark; None where that is too little."""
+    """Return the last ranges of a landmark; None if they are too few."""
     seen = log.sightings(landmark_id, rule.window, state.calibration, rule.most_turn_rad)
     k = len(seen.ranges_m)
     if k < rule.min_ranges:
@@ -556,7 +504,7 @@ def _moved_by_steps(seen: LoggedSightings, step_m: float) -> Array:
 
 
 def radius_of(arc: Arc) -> Radius | None:
-    """Return the radius that ranges tell; None where the fit fails."""
+    """Return the radius that fits best; None where the fit fails."""
     unknown = np.concatenate([arc.start_m, np.zeros(1 + len(arc.prior))])
     for _ in range(_RADIUS_STEPS):
         q = unknown[3:]
@@ -587,13 +535,7 @@ def radius_of(arc: Arc) -> Radius | None:
 
 
 class Roundness:
-    """Gives landmarks their radii.
-
-    Parameters
-    ----------
-    rule
-        When a radius is believed.
-    """
+    """Gives round landmarks their radii."""
 
     def __init__(self, rule: RoundnessRule) -> None:
         self._rule = rule
@@ -609,12 +551,7 @@ class Roundness:
     ) -> bool:
         """Give landmarks the radii that are evident; tell whether all poses were solved for.
 
-        Parameters
-        ----------
-        state, log, parameters
-            The belief, what was measured, and its noise.
-        hits
-            Returns the frames that hit a landmark so far.
+        ``hits`` returns how many frames hit a landmark so far.
         """
         solved = False
         rule = self._rule
@@ -628,20 +565,22 @@ class Roundness:
             if radius is None or not self._is_news(id_, radius):
                 continue
             self._sigmas_m[id_] = radius.sigma_m
-            told_m = radius.radius_m if self._is_likely(radius) else 0.0
+            radius_m = radius.radius_m if self._is_likely(radius) else 0.0
             known_m = state.radii_m.get(id_, 0.0)
-            if told_m == known_m:
+            if radius_m == known_m:
                 continue
             # Being round takes evidence; of two radii the likelier one is right.
-            lead = 0.0 if known_m else rule.lead
-            if give_radius(log, state, parameters, (row, told_m), lead):
+            margin = 0.0 if known_m else rule.margin
+            if give_radius(log, state, parameters, (row, radius_m), margin):
                 solved = True
-                state.range_doubts_m[id_] = _DOUBT_PER_SIGMA * radius.sigma_m if told_m else 0.0
+                state.shape_sigmas_m[id_] = (
+                    _SHAPE_SIGMA_PER_RADIUS_SIGMA * radius.sigma_m if radius_m else 0.0
+                )
         return solved
 
     def _is_news(self, id_: int, radius: Radius) -> bool:
-        """Tell whether a radius is worth a look at all that was measured."""
-        limit = radius.dof + self._rule.excess_sigmas * math.sqrt(2.0 * max(radius.dof, 0))
+        """Tell whether a radius is worth a solution over all poses."""
+        limit = chi_square_limit(radius.dof, self._rule.excess_sigmas)
         before_m = self._sigmas_m.get(id_)
         if radius.chi_square > limit:
             return False

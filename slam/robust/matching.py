@@ -1,13 +1,13 @@
 """Which range is of which landmark: known landmarks first, one to one.
 
 A landmark takes part if it may be in view and if the prior alone, without the noise of a range,
-predicts its ranges more surely than a range measures them. Where the map is less sure than that,
-a single range proves nothing, and only tracklets decide. For each landmark one option is chosen,
-a range of some of the radars of the side, or of none, at the cost
+predicts its ranges more surely than a range measures them. Where the map is less sure than that, a
+single range proves nothing, and only tracklets decide. For each landmark one option is chosen, a
+range of some of the radars of the side, or of none, at the cost
 
     nu^T S^-1 nu + ln det(2 pi S) + 2 m ln(clutter density) - 2 m ln(Pd / (1 - Pd))
 
-for m ranges with joint innovation covariance S; none costs nothing. No range serves twice. The
+for m ranges with joint innovation covariance S; none costs nothing. No range is used twice. The
 least sum is found by branch and bound, as joint compatibility is (Neira and Tardos, IEEE TRA
 17(6), 2001), with likelihoods for counts.
 """
@@ -21,7 +21,7 @@ from itertools import product
 
 import numpy as np
 
-from slam.results import ExpectedRange
+from slam.results import PredictedRange
 from slam.robust.parameters import ContinuationRule, RangeNoise
 from slam.robust.ranges import Antennas, RangeScan, Rows, View, rows_of
 from slam.robust.state import Array, Indices, State, rotation
@@ -49,34 +49,24 @@ NOTHING = Option((), 0.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SureLandmarks:
-    """Landmarks that one side of the robot may see, or those of them that may be continued.
+    """Landmarks that one side of the robot may see, or those of them that may be continued."""
 
-    Attributes
-    ----------
-    landmarks
-        Rows of the landmarks, shape (c,).
-    rows
-        Their predicted ranges: landmark by landmark, radar by radar.
-    prior
-        H P H^T of those rows, shape (k, k).
-    """
-
-    landmarks: Indices
-    rows: Rows
-    prior: Array
+    landmarks: Indices  # rows of the landmarks, shape (c,)
+    rows: Rows  # their predicted ranges: landmark by landmark, radar by radar
+    prior: Array  # H P H^T of those rows, shape (k, k)
 
     def surer_than(self, limit_m: float) -> SureLandmarks | None:
-        """Return those all of whose ranges have a smaller standard deviation; None without any."""
+        """Return those with more certain ranges of all radars; None without any."""
         per_landmark = len(self.rows.radars) // len(self.landmarks)
         variances = self.prior.diagonal().reshape(-1, per_landmark)
         sure = (variances <= limit_m**2).all(axis=1)
         if not sure.any():
             return None
         keep = np.flatnonzero(np.repeat(sure, per_landmark))
-        rows = Rows(
+        rows = replace(
+            self.rows,
             radars=self.rows.radars[keep],
             landmarks=self.rows.landmarks[keep],
-            at=self.rows.at,
             H=self.rows.H[keep],
             predicted_m=self.rows.predicted_m[keep],
         )
@@ -84,16 +74,16 @@ class SureLandmarks:
             landmarks=self.landmarks[sure], rows=rows, prior=self.prior[np.ix_(keep, keep)]
         )
 
-    def doubted(self, doubts_m: Array) -> SureLandmarks:
-        """Return the same with doubts, one standard deviation per row of the map, added."""
-        added = np.square(doubts_m[self.rows.landmarks])
+    def with_added_sigma(self, shape_sigmas_m: Array) -> SureLandmarks:
+        """Add a standard deviation per row of the map to the predictions."""
+        added = np.square(shape_sigmas_m[self.rows.landmarks])
         return self if not added.any() else replace(self, prior=self.prior + np.diag(added))
 
     def unanswered(self, scans: Sequence[RangeScan], noise: RangeNoise, within_m: float) -> Indices:
-        """Return the rows of those of which no radar hears anything where they would answer.
+        """Return the rows of those near whose predicted ranges no radar has an echo.
 
-        That is within four standard deviations, or ``BLUR_M`` more from a blurred echo. Those whose
-        ranges are less sure than ``within_m`` are left out: they may be out of view.
+        Near is within four standard deviations, or ``BLUR_M`` more from a blurred echo. Those whose
+        ranges are less certain than ``within_m`` are left out: they may be out of view.
         """
         scan_of = {scan.radar: scan for scan in scans}
         per_landmark = len(self.rows.radars) // len(self.landmarks)
@@ -113,7 +103,7 @@ def landmarks_in_view(
     noise: RangeNoise,
     rule: ContinuationRule,
 ) -> SureLandmarks | None:
-    """Return the landmarks that any of some radars, all heard, may see; None without any."""
+    """Return the landmarks that any of some radars, all with frames, may see, or None."""
     looking = np.array(radars, dtype=np.intp)
     margin_m = 5.0 * noise.sigma_m
     inside = seen.inside(noise, rule.view_margin_rad, margin_m)[looking]
@@ -134,7 +124,7 @@ def sure_landmarks(
     noise: RangeNoise,
     rule: ContinuationRule,
 ) -> SureLandmarks | None:
-    """Return the landmarks that radars of one side, all heard, may continue; None without any."""
+    """Return those of them that single ranges may continue; None without any."""
     near = landmarks_in_view(state, seen, radars, noise, rule)
     return None if near is None else near.surer_than(rule.tight_sigmas * noise.sigma_m)
 
@@ -167,7 +157,7 @@ def continue_tracks(
 def labelled(
     scans: Sequence[RangeScan], state: State, landmark_of_label: Mapping[int, int]
 ) -> list[Continuation]:
-    """Return the associations that labels tell; ids of landmarks by label are given."""
+    """Return the associations by label; ids of landmarks by label are given."""
     rows = {id_: row for row, id_ in enumerate(state.landmark_ids)}
     return [
         Continuation(row=rows[landmark_of_label[label]], radar=scan.radar, index=index)
@@ -184,7 +174,7 @@ def options_of(
     noise: RangeNoise,
     rule: ContinuationRule,
 ) -> list[Option]:
-    """Return the options of one landmark that beat none, cheapest first, none last."""
+    """Return the options of one landmark that cost less than none, cheapest first, none last."""
     near: list[list[tuple[int, float, float] | None]] = []
     for place, scan in enumerate(scans):
         centre, spread = float(predicted_m[place]), float(prior[place, place])
@@ -268,11 +258,10 @@ def cheapest(options: Sequence[Sequence[Option]]) -> list[Option]:
     return best
 
 
-def expected_ranges(state: State, sure: SureLandmarks, antennas: Antennas) -> list[ExpectedRange]:
+def predicted_ranges(state: State, sure: SureLandmarks, antennas: Antennas) -> list[PredictedRange]:
     """Return the ranges of landmarks that could continue a track, before any is looked at.
 
-    Those of walls are left out: where their echoes come from is no place that could be compared
-    with a true landmark's.
+    Those of walls are left out: their echoes have no fixed place to compare with a true landmark's.
     """
     rows = sure.rows
     of_point = np.flatnonzero(rows.landmarks < len(state.landmark_ids))
@@ -280,7 +269,7 @@ def expected_ranges(state: State, sure: SureLandmarks, antennas: Antennas) -> li
     places = antennas.position_m[radars].tolist()
     points = state.landmarks_m[landmarks] - state.position_m
     return [
-        ExpectedRange(
+        PredictedRange(
             radar=radar,
             landmark_id=state.landmark_ids[row],
             range_m=range_m,

@@ -1,7 +1,7 @@
-"""What the robust back end is told: noise of wheels and radars, and the rules of its decisions.
+"""Parameters of the robust back end: noise of wheels and radars, and the rules of its decisions.
 
-The noise numbers come from specifications of the robot and of the front end; the rules are the
-same for every scene. Lengths in metres, angles in radians.
+The noise comes from specifications of the robot and of the front end; the rules are the same for
+every scene. Lengths in metres, angles in radians.
 """
 
 from __future__ import annotations
@@ -9,97 +9,30 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+from slam.config import WheelNoise
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WheelNoise:
-    """Errors of wheel odometry: three calibration errors and white noise.
 
-    A step of true body increment (dx, dy) of length D and turn a is reported as
-    ``(1 + s) (dx, dy) + white`` and ``(1 + w) a + kappa D + white``.
-
-    Attributes
-    ----------
-    along_m_per_sqrt_m, across_m_per_sqrt_m, heading_rad_per_sqrt_m
-        White noise of a step, in proportion to the square root of its length.
-    heading_rad_per_rad
-        White noise of a turn, in proportion to its angle.
-    scale_sigma, turn_scale_sigma, curvature_sigma_rad_per_m
-        Standard deviations of s (mean wheel radius), w (track width) and kappa (difference of
-        the radii) at the start.
-    walk_per_sqrt_m
-        How far each of the three wanders per square root of a metre travelled, as a share of its
-        standard deviation; a radian turned counts as ``walk_lever_m``. Zero: constants.
-    walk_lever_m
-        See above.
-    floor_m, floor_rad
-        Smallest standard deviation of one step.
-    """
-
-    along_m_per_sqrt_m: float = 2e-3
-    across_m_per_sqrt_m: float = 6e-4
-    heading_rad_per_sqrt_m: float = 4.2e-3
-    heading_rad_per_rad: float = 0.01
-    scale_sigma: float = 0.007
-    turn_scale_sigma: float = 0.007
-    curvature_sigma_rad_per_m: float = 0.0042
-    walk_per_sqrt_m: float = 0.0
-    walk_lever_m: float = 0.3
-    floor_m: float = 3e-6
-    floor_rad: float = 1e-6
-
-    @property
-    def calibration_sigmas(self) -> tuple[float, float, float]:
-        """Return the standard deviations of s, w and kappa."""
-        return (self.scale_sigma, self.turn_scale_sigma, self.curvature_sigma_rad_per_m)
-
-    def step_variances(self, distance_m: float, turn_rad: float) -> tuple[float, float, float]:
-        """Return the variances of one step: along [m^2], across [m^2], heading [rad^2]."""
-        floor = self.floor_m**2
-        heading = self.heading_rad_per_sqrt_m * math.sqrt(distance_m)
-        heading += self.heading_rad_per_rad * abs(turn_rad)
-        return (
-            self.along_m_per_sqrt_m**2 * distance_m + floor,
-            self.across_m_per_sqrt_m**2 * distance_m + floor,
-            heading**2 + self.floor_rad**2,
-        )
-
-    def walk_variance(self, distance_m: float, turn_rad: float) -> float:
-        """Return the variance one step adds to a calibration error, in units of its own."""
-        return self.walk_per_sqrt_m**2 * (distance_m + self.walk_lever_m * abs(turn_rad))
+def chi_square_limit(dof: int, excess_sigmas: float) -> float:
+    """Return the limit that lies some standard deviations of chi-square above its mean."""
+    return dof + excess_sigmas * math.sqrt(2.0 * max(dof, 0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RangeNoise:
-    """How one radar of the rig measures.
+    """How one radar of the rig measures."""
 
-    Attributes
-    ----------
-    sigma_m
-        Standard deviation of a range.
-    doubt_m
-        Added in squares to what a front end tells of each range, wherever it is decided whose the
-        range is: a neighbour's echo may shift it by so much. The ranges of a tracklet keep it.
-    huber_sigmas
-        Innovations of more standard deviations weigh less, as in Huber's estimator.
-    offset_sigma_m
-        Standard deviation of each radar's unknown constant range offset; zero if calibrated.
-    detection_probability
-        That a target in view is detected in a frame.
-    clutter_per_m
-        False ranges per radar, frame and metre of range.
-    field_of_view_rad
-        Full opening angle.
-    min_range_m, max_range_m
-        Where targets are detected.
-    """
-
-    sigma_m: float = 7.4e-3
-    doubt_m: float = 0.0
+    sigma_m: float = 7.4e-3  # standard deviation of a range
+    # Added in squares to the front end's sigma of each range, wherever ranges are assigned: a
+    # neighbour's echo may shift it by so much. The ranges of a tracklet keep it.
+    association_sigma_m: float = 0.0
+    # Innovations of more standard deviations weigh less, as in Huber's estimator
     huber_sigmas: float = math.inf
+    # Standard deviation of each radar's unknown constant range offset; zero if calibrated
     offset_sigma_m: float = 0.0
-    detection_probability: float = 0.92
-    clutter_per_m: float = 0.15 / 1.3
-    field_of_view_rad: float = math.radians(65.0)
+    detection_probability: float = 0.92  # that a target in view is detected in a frame
+    clutter_per_m: float = 0.15 / 1.3  # false ranges per radar, frame and metre of range
+    field_of_view_rad: float = math.radians(65.0)  # full opening angle
+    # Where targets are detected
     min_range_m: float = 0.2
     max_range_m: float = 1.5
 
@@ -110,7 +43,7 @@ class ContinuationRule:
 
     ``view_margin_rad`` widens the field of view. A landmark takes part while its predicted ranges
     are surer than ``tight_sigmas`` range standard deviations. ``gates`` bounds the squared
-    Mahalanobis distance by the number of ranges, the last one holding for more.
+    Mahalanobis distance by the number of ranges, the last one for all higher numbers.
     """
 
     view_margin_rad: float = 0.25
@@ -120,254 +53,169 @@ class ContinuationRule:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackletRule:
-    """When ranges that continue nothing are evidence of one point at rest.
+    """When ranges that continue nothing are evidence of one point at rest."""
 
-    Attributes
-    ----------
-    window
-        Frames looked back.
-    min_frames, min_hits_per_radar, min_share
-        Fewest distinct frames, fewest ranges of each radar, and the least share of the frames
-        with the point in view that hit it.
-    prior_sigma_m, gate_sigmas
-        Spread about the first fix, and how far a member may lie from its prediction.
-    drift_share
-        Share of the wheels' scale error by which a frame grows uncertain with the way back to it.
-    lever_m
-        Lever by which turning back does.
-    excess_sigmas
-        How far chi-square may exceed its degrees of freedom, in its standard deviations.
-    single_window, single_min_frames, single_max_sigma_m
-        For a radar without a partner: frames looked back, fewest that hit, and the largest
-        standard deviation in any direction with which a point is used.
-    partner_silence
-        After how many frames without its partner a radar counts as alone.
-    """
-
-    window: int = 15
+    window: int = 15  # frames looked back
+    # Fewest distinct frames, fewest ranges of each radar, and the least share of the frames with
+    # the point in view that hit it
     min_frames: int = 9
     min_hits_per_radar: int = 4
     min_share: float = 0.6
+    # Spread about the first fix, and how far a member may lie from its prediction
     prior_sigma_m: float = 0.3
     gate_sigmas: float = 3.0
+    # Share of the wheels' scale error by which a frame grows uncertain with the way back to it
     drift_share: float = 0.7
-    lever_m: float = 0.3
+    lever_m: float = 0.3  # lever by which turning back does
+    # How far chi-square may exceed its degrees of freedom, in its standard deviations
     excess_sigmas: float = 3.1
+    # For a radar without a partner: frames looked back, fewest that hit, and the largest standard
+    # deviation in any direction with which a point is used
     single_window: int = 40
     single_min_frames: int = 20
     single_max_sigma_m: float = 0.1
-    partner_silence: int = 20
+    partner_silence: int = 20  # after how many frames without its partner a radar counts as alone
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapRule:
-    """When a point is a known landmark, two landmarks are one, or a landmark is none.
+    """When a point is a known landmark, two landmarks are one, or a landmark is none."""
 
-    Attributes
-    ----------
-    unmapped_per_m2
-        Density beta of landmarks not yet in the map: the likelihood of a match must exceed it.
-    match_gate, match_lead
-        Bound on d^2 of a point and a landmark (2 dof), and by how much ``d^2 + ln det S`` must
-        beat the next.
-    merge_every, merge_reach_m, merge_gate, merge_gate_joint, merge_lead
-        Frames between looks, largest distance, bounds on d^2 of one merge and of two together
-        (2 and 4 dof), and by how many nats a merge must beat its competitors.
-    merge_sigma_m
-        Noise of the statement that two landmarks are one.
-    apart_frames
-        Two landmarks seen whole in this many common frames are two.
-    hit, miss, most, least
-        Steps, ceiling and floor of a landmark's existence score.
-    view_inset_rad, view_inset_m
-        How far inside its limits a landmark must lie to be missed.
-    report_hits
-        Frames a landmark must have been hit in to be reported.
-    """
-
+    # Density beta of landmarks not yet in the map: the likelihood of a match must exceed it
     unmapped_per_m2: float = 1.0
+    # Bound on d^2 of a point and a landmark (2 dof), and by how much ``d^2 + ln det S`` must beat
+    # the next
     match_gate: float = 13.8
-    match_lead: float = 6.0
+    match_margin: float = 6.0
+    # Frames between looks, largest distance, bounds on d^2 of one merge and of two together (2 and
+    # 4 dof), and by how many nats a merge must beat its competitors
     merge_every: int = 5
     merge_reach_m: float = 1.5
     merge_gate: float = 11.8
     merge_gate_joint: float = 18.5
-    merge_lead: float = 3.0
-    merge_sigma_m: float = 1e-5
-    apart_frames: int = 3
+    merge_margin: float = 3.0
+    merge_sigma_m: float = 1e-5  # noise of the statement that two landmarks are one
+    apart_frames: int = 3  # two landmarks seen whole in this many common frames are two
+    # Steps, ceiling and floor of a landmark's existence score
     hit: float = 1.0
     miss: float = 1.5
     most: float = 20.0
     least: float = -8.0
+    # How far inside its limits a landmark must lie to be missed
     view_inset_rad: float = 0.1
     view_inset_m: float = 0.05
-    report_hits: int = 9
+    report_hits: int = 9  # frames a landmark must have been hit in to be reported
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WallRule:
-    """When ranges are a wall's, and when a wall is a known one.
+    """When ranges are a wall's, and when a wall is a known one."""
 
-    Attributes
-    ----------
-    window, min_frames, min_way_m
-        Frames looked back, fewest that hit, and how far the echo must have moved along the wall.
-    wall_lead, point_lead
-        By how much chi-square must be less under a law for a wall, or a point, to be believed.
-    match_gate, match_lead
-        Bound on d^2 of a wall seen and one mapped (2 dof), and by how much ``d^2 + ln det S`` must
-        beat the next.
-    unmapped_per_rad_m
-        Density of walls not yet in the map: the likelihood of a match must exceed it.
-    cell_m, reach_m
-        Walls are known in cells of this length; how far from one of them what looks like the
-        same wall may be that.
-    resolution_m, resolution_rad
-        A wall as near as this to a mapped one, and not it, is its echo merged with another: a
-        pulse is longer than that.
-    roughness_m
-        Added in squares to the standard deviation of a known wall's single ranges: none is a mirror
-        to a fraction of a millimetre, and within a Fresnel zone of its end the edge answers, too.
-    """
-
+    # Frames looked back, fewest that hit, and how far the echo must have moved along the wall
     window: int = 40
     min_frames: int = 25
     min_way_m: float = 0.25
-    wall_lead: float = 30.0
-    point_lead: float = 0.0
+    # By how much chi-square must be less under a law for a wall, or a point, to be believed
+    wall_margin: float = 30.0
+    point_margin: float = 0.0
+    # Bound on d^2 of a wall seen and one mapped (2 dof), and by how much ``d^2 + ln det S`` must
+    # beat the next
     match_gate: float = 13.8
-    match_lead: float = 6.0
+    match_margin: float = 6.0
+    # Density of walls not yet in the map: the likelihood of a match must exceed it
     unmapped_per_rad_m: float = 0.3
+    # Walls are known in cells of this length; how far from one of them what looks like the same
+    # wall may be that
     cell_m: float = 0.1
     reach_m: float = 1.0
+    # A wall as near as this to a mapped one, and not it, is its echo merged with another: a pulse
+    # is longer than that
     resolution_m: float = 0.05
     resolution_rad: float = 0.1
+    # Added in squares to the standard deviation of a known wall's single ranges: none is a mirror
+    # to a fraction of a millimetre, and within a Fresnel zone of its end the edge answers, too
     roughness_m: float = 3e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RoundnessRule:
-    """When a landmark is a round target and no point.
+    """When a landmark is a round target and no point."""
 
-    Attributes
-    ----------
-    window, most_turn_rad
-        Frames looked back, fewer if the robot turned by more than that since.
-    min_ranges, min_way_m
-        Fewest ranges, and least way between the first and the last.
-    every
-        Frames that hit a landmark between two looks at it.
-    sigmas, largest_m
-        How many standard deviations a radius must be from zero to be likely, and what none exceeds.
-    lead
-        By how much the cost of the solution over all poses must fall for it to be believed.
-    sharper
-        Share of the standard deviation at the last look that is worth another one.
-    excess_sigmas
-        How far chi-square may exceed its degrees of freedom, in its standard deviations.
-    """
-
+    # Frames looked back, fewer if the robot turned by more than that since
     window: int = 120
     most_turn_rad: float = 0.1
+    # Fewest ranges, and least way between the first and the last
     min_ranges: int = 60
     min_way_m: float = 0.4
-    every: int = 10
+    every: int = 10  # frames that hit a landmark between two looks at it
+    # How many standard deviations a radius must be from zero to be likely, and what none exceeds
     sigmas: float = 3.0
     largest_m: float = 0.5
-    lead: float = 9.0
+    # By how much the cost of the solution over all poses must fall for it to be believed
+    margin: float = 9.0
+    # Share of the standard deviation at the last look that is worth another one
     sharper: float = 0.9
+    # How far chi-square may exceed its degrees of freedom, in its standard deviations
     excess_sigmas: float = 3.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RelinearisationRule:
-    """When all poses that are kept are solved for again, and how.
+    """When all poses that are kept are solved for again, and how."""
 
-    Attributes
-    ----------
-    most_poses, kept_share
-        When more poses than this are kept, all but this share of it are condensed into a prior.
-    turn_rad, shift_m
-        How far the filter's pose may part from the stored trajectory.
-    every
-        Fewest frames between two solutions.
-    iterations
-        Most steps of one solution.
-    outlier_sigmas, outliers_from
-        Ranges further off than this are left out from that iteration on.
-    """
-
+    # When more poses than this are kept, all but this share of it are condensed into a prior
     most_poses: int = 3000
     kept_share: float = 0.67
+    # How far the filter's pose may part from the stored trajectory
     turn_rad: float = 0.02
     shift_m: float = 0.04
-    every: int = 20
-    iterations: int = 10
+    every: int = 20  # fewest frames between two solutions
+    iterations: int = 10  # most steps of one solution
+    # Ranges further off than this are left out from that iteration on
     outlier_sigmas: float = 4.0
     outliers_from: int = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurpriseRule:
-    """When the robot is not where the map has it.
+    """When the robot is not where the map has it."""
 
-    Attributes
-    ----------
-    gate_sigmas, most_sigma_m
-        A range is near a prediction within so many standard deviations; predictions less sure than
-        that are no trials.
-    view_inset_rad, view_inset_m
-        How far inside a radar's limits a landmark must lie to be a trial.
-    least_chance
-        Least probability that a range lies near a prediction it has nothing to do with.
-    most_against, most_for
-        Most evidence [nats] that one landmark gives against the pose (it may have been taken away)
-        and for it (other ranges may lie near its prediction for long).
-    every, hypotheses
-        Frames between two moments at which the robot may have been carried; how many are tested.
-    suspicious, carried
-        Evidence from which on nothing is undone for good, and from which on the robot is elsewhere.
-    """
-
+    # A range is near a prediction within so many standard deviations; predictions less sure than
+    # that are no evidence
     gate_sigmas: float = 3.0
     most_sigma_m: float = 0.05
+    # How far inside a radar's limits a landmark must lie to be a trial
     view_inset_rad: float = 0.15
     view_inset_m: float = 0.1
+    # Least probability that a range lies near a prediction it has nothing to do with
     least_chance: float = 0.05
+    # Most evidence [nats] that one landmark gives against the pose (it may have been taken away)
+    # and for it (other ranges may lie near its prediction for long)
     most_against: float = 12.0
     most_for: float = 8.0
+    # Frames between two moments at which the robot may have been carried; how many are tested
     every: int = 10
     hypotheses: int = 40
+    # Evidence from which on nothing is undone for good, and from which on the robot is old_map
     suspicious: float = 2.0
     carried: float = 25.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RelocationRule:
-    """When a constellation of landmarks tells where on the map a robot was set down.
+    """When a constellation of landmarks tells where on the map a robot was set down."""
 
-    Attributes
-    ----------
-    least_landmarks
-        Fewest landmarks a join rests on.
-    evidence, lead
-        Least evidence [nats] of a join against all new landmarks, and over every other join.
-    least_base_m, reach_m, turn_rad
-        Least distance of two landmarks that a guess is made from, how far lengths and places may
-        differ in a guess, and by how much two joins differ at least.
-    most_tried
-        Most guesses judged at a time.
-    lost_position_m
-        Standard deviation that is stated of the position while it is not known.
-    """
-
-    least_landmarks: int = 3
+    least_landmarks: int = 3  # fewest landmarks a join rests on
+    # Least evidence [nats] of a join against all new landmarks, and over every other join
     evidence: float = 8.0
-    lead: float = 8.0
+    margin: float = 8.0
+    # Least distance of two landmarks that a guess is made from, how far lengths and places may
+    # differ in a guess, and by how much two joins differ at least
     least_base_m: float = 0.3
     reach_m: float = 0.2
     turn_rad: float = 0.2
-    most_tried: int = 200
+    most_tried: int = 200  # most guesses judged at a time
+    # Standard deviation that is stated of the position while it is not known
     lost_position_m: float = 5.0
 
 
@@ -386,7 +234,7 @@ class PointRule:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BackEndParameters:
-    """Everything the back end is told."""
+    """All parameters of the back end."""
 
     wheels: WheelNoise = field(default_factory=WheelNoise)
     ranges: RangeNoise = field(default_factory=RangeNoise)

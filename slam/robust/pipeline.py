@@ -5,53 +5,29 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config import BackEnd, SlamConfig
-from slam.frames import Detection, Detector, RadarFrame
-from slam.front_end.paper import make_detector
-from slam.geometry import Rig, between
-from slam.paper.clustering import has_moved
-from slam.paper.ekf import Belief
-from slam.paper.pipeline import PoseAt, Slam, StepResult, UwbRadarSlam
+from slam.config import SlamConfig, WheelNoise
+from slam.frames import Detection, Detector, RadarFrame, detect_all
+from slam.front_end import make_detector
+from slam.geometry import Rig, between, has_moved
+from slam.results import Belief, PoseAt, StepResult
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.parameters import BackEndParameters, RangeNoise, WheelNoise
+from slam.robust.parameters import BackEndParameters, RangeNoise
 from slam.robust.ranges import RangeScan
 from slam.robust.state import quarter_turn
 
 Array = NDArray[np.float64]
 
 
-def make_slam(
-    config: SlamConfig, rig: Rig, wheels: WheelNoise, detector: Detector | None = None
-) -> Slam:
-    """Return the pipeline that a configuration names.
-
-    Parameters
-    ----------
-    config
-        ``back_end`` decides.
-    rig
-        Where the radars sit.
-    wheels
-        How the robot's odometry errs, as its specification says; preset ``paper`` has numbers of
-        its own.
-    detector
-        The front end, if not the one that the configuration names.
-    """
-    if config.back_end is BackEnd.ROBUST:
-        return RobustSlam(config, rig, wheels, detector)
-    return UwbRadarSlam(config, rig, detector)
-
-
 class RobustSlam:
     """Ranges of all radars, each at its own time, into the robust back end; nothing is delayed.
 
-    The map frame is the body frame at the first odometry pose. The belief's errors are additive,
-    as everywhere outside ``slam.robust``; it holds the landmarks that are believed in, and their
-    ids stay.
+    The map frame is the body frame at the first odometry pose. The belief's errors are additive, as
+    everywhere outside ``slam.robust``; it holds the reported landmarks, and their ids stay.
 
     Parameters
     ----------
@@ -77,41 +53,38 @@ class RobustSlam:
     def step(
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
-        """Take in what sensors say around one time; return the state if the robot has moved.
+        """Take in the frames and odometry around one time; return the state if the robot has moved.
 
         Parameters
         ----------
         frames
-            At most one frame per radar, each with the time it was taken at; a radar whose frame
-            was lost is simply absent, and none at all leaves odometry alone.
+            At most one frame per radar, each with the time it was taken at; a radar whose frame was
+            lost is absent, and none at all leaves odometry alone.
         pose_at
             Odometry, asked for the pose at ``t_ns`` and at the time of every frame.
         t_ns
             Session time of the state.
         """
         stamps_ns = {frame.radar: frame.t_ns for frame in frames}
-        return self._take(lambda: self._detect(frames), stamps_ns, pose_at, t_ns)
+        detect = partial(detect_all, self._detector, frames, self.rig)
+        return self._take(detect, stamps_ns, pose_at, t_ns)
 
     def step_detections(
         self, detections: Sequence[Detection], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
         """Do what ``step`` does, from ranges that some other front end found.
 
-        Every radar counts as heard; one without a detection looked at ``t_ns`` and saw nothing.
+        Every radar counts as one with a frame; without a detection it looked at ``t_ns`` and saw
+        nothing.
         """
         stamps_ns = dict.fromkeys(range(len(self.rig.mounts)), t_ns)
         stamps_ns |= {detection.radar: detection.t_ns for detection in detections}
         return self._take(lambda: tuple(detections), stamps_ns, pose_at, t_ns)
 
     def flush(self) -> tuple[StepResult, ...]:
-        """Return the states not yet returned: none, for nothing is delayed."""
         return ()
 
     def wall_spans_m(self) -> Array:
-        """Return the ends of the stretches of wall that answered, shape (k, 2, 2) [m], map frame.
-
-        Of walls hit often enough to be reported.
-        """
         walls = self.back_end.walls()
         return np.concatenate([np.empty((0, 2, 2)), *(wall.spans_m for wall in walls)])
 
@@ -127,7 +100,8 @@ class RobustSlam:
             self._pose = pose
             return ()
         # What is seen again from one place is no new evidence: clutter and aspect stay the same.
-        if not has_moved(self._pose, pose, self.config.window):
+        window = self.config.window
+        if not has_moved(self._pose, pose, window.min_distance_m, window.min_turn_rad):
             return ()
         detections = detect()
         sigmas_m = tuple(self._sigma_m(detection) for detection in detections)
@@ -153,17 +127,17 @@ class RobustSlam:
     def _sigma_m(self, detection: Detection) -> float:
         """Return the standard deviation of a range; infinite for one to be left out.
 
-        A front end that predicts nothing is taken to be as good as ``range_sigma_m``.
+        A front end that predicts none is taken to be as good as ``range_sigma_m``.
         """
-        told = self.config.robust
+        config = self.config.robust
         if math.isnan(detection.sigma_m):
-            return told.range_sigma_m
-        if detection.misfit > told.max_misfit or detection.sigma_m > told.max_predicted_sigma_m:
+            return config.range_sigma_m
+        if detection.misfit > config.max_misfit or detection.sigma_m > config.max_predicted_sigma_m:
             return math.inf
-        variance = told.predicted_share
+        variance = config.predicted_share
         if not math.isnan(detection.misfit):
-            variance += told.misfit_share * detection.misfit**2
-        return math.hypot(told.range_floor_m, math.sqrt(variance) * detection.sigma_m)
+            variance += config.misfit_share * detection.misfit**2
+        return math.hypot(config.range_floor_m, math.sqrt(variance) * detection.sigma_m)
 
     def _scans(
         self,
@@ -171,9 +145,9 @@ class RobustSlam:
         sigmas_m: Sequence[float],
         moved: Mapping[int, Array | None],
     ) -> list[RangeScan]:
-        """Return the scan of every radar heard, the ranges that are unfit as blurred.
+        """Return the scan of every radar with a frame, the ranges that are unfit as blurred.
 
-        ``moved`` tells how the robot moved from the state to each radar's own sample.
+        ``moved`` has the motion of the robot from the state to each radar's own sample.
         """
         fit: dict[int, list[tuple[float, float]]] = {radar: [] for radar in moved}
         blurred: dict[int, list[float]] = {radar: [] for radar in moved}
@@ -193,26 +167,20 @@ class RobustSlam:
             for radar, motion in moved.items()
         ]
 
-    def _detect(self, frames: Sequence[RadarFrame]) -> tuple[Detection, ...]:
-        offsets_m = [self.rig.mounts[frame.radar].range_offset_m for frame in frames]
-        found = self._detector.detect_many(frames, offsets_m)
-        return tuple(detection for of_frame in found for detection in of_frame)
-
 
 def back_end_parameters(config: SlamConfig, wheels: WheelNoise) -> BackEndParameters:
-    """Return what the back end is told, from the configuration and the robot's specification."""
-    told, limits = config.robust, config.detection
+    robust, limits = config.robust, config.detection
     reach_m = limits.max_range_m - limits.min_range_m
     return BackEndParameters(
-        wheels=replace(wheels, walk_per_sqrt_m=told.wheel_walk_per_sqrt_m),
+        wheels=replace(wheels, walk_per_sqrt_m=robust.wheel_walk_per_sqrt_m),
         ranges=RangeNoise(
-            sigma_m=told.range_sigma_m,
-            doubt_m=told.association_doubt_m,
-            huber_sigmas=told.huber_sigmas,
-            offset_sigma_m=told.offset_sigma_m,
-            detection_probability=told.detection_probability,
-            clutter_per_m=told.false_ranges_per_frame / reach_m,
-            field_of_view_rad=told.field_of_view_rad,
+            sigma_m=robust.range_sigma_m,
+            association_sigma_m=robust.association_doubt_m,
+            huber_sigmas=robust.huber_sigmas,
+            offset_sigma_m=robust.offset_sigma_m,
+            detection_probability=robust.detection_probability,
+            clutter_per_m=robust.false_ranges_per_frame / reach_m,
+            field_of_view_rad=robust.field_of_view_rad,
             min_range_m=limits.min_range_m,
             max_range_m=limits.max_range_m,
         ),

@@ -33,49 +33,35 @@ BLUR_M = 0.12
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RangeScan:
-    """What one radar detected in one frame; an empty scan says that it looked and saw nothing.
+    """Detections of one radar in one frame; an empty scan means that nothing was seen."""
 
-    Attributes
-    ----------
-    radar
-        Index of the mount in the rig.
-    ranges_m
-        Ranges in true metres.
-    sampled_after
-        When it sampled, in steps after the pose: 0 with it, -0.5 half a step before it.
-    labels
-        Which target each range is of, where that is known; then nothing is left to association.
-    sigmas_m
-        Standard deviation of each range, where the front end tells it.
-    moved
-        Reported motion from the pose to the sample, (dx, dy) [m] and turn [rad] in the body frame
-        of the pose. Where given it is used instead of ``sampled_after``, which knows one step only.
-    blurred_m
-        Ranges of echoes that several targets may share: no evidence of where anything is, nor that
-        nothing is there.
-    """
-
-    radar: int
-    ranges_m: tuple[float, ...]
+    radar: int  # index of the mount in the rig
+    ranges_m: tuple[float, ...]  # ranges in true metres
+    # When it sampled, in steps after the pose: 0 with it, -0.5 half a step before it
     sampled_after: float = 0.0
+    # Which target each range is of, where that is known; it replaces association
     labels: tuple[int, ...] | None = None
+    # Standard deviation of each range, where the front end predicts it
     sigmas_m: tuple[float, ...] | None = None
+    # Reported motion from the pose to the sample, (dx, dy) [m] and turn [rad] in the body frame of
+    # the pose. It replaces ``sampled_after``, which is limited to one step.
     moved: tuple[float, float, float] | None = None
+    # Ranges of echoes that several targets may share: no evidence of where anything is, nor that
+    # nothing is there
     blurred_m: tuple[float, ...] = ()
 
     def label(self, index: int) -> int | None:
-        """Return the label of one range, None where unknown."""
         return None if self.labels is None else self.labels[index]
 
     def sigma(self, index: int, otherwise_m: float) -> float:
-        """Return the standard deviation [m] of one range, if it is not told the other one."""
+        """Return the standard deviation [m] of one range; ``otherwise_m`` if there is none."""
         return otherwise_m if self.sigmas_m is None else self.sigmas_m[index]
 
-    def doubted(self, doubt_m: float) -> RangeScan:
-        """Return the scan with a doubt added to what the front end tells of each range."""
-        if self.sigmas_m is None or not doubt_m:
+    def with_added_sigma(self, sigma_m: float) -> RangeScan:
+        """Return the scan with a standard deviation added to each range's."""
+        if self.sigmas_m is None or not sigma_m:
             return self
-        return replace(self, sigmas_m=tuple(math.hypot(s, doubt_m) for s in self.sigmas_m))
+        return replace(self, sigmas_m=tuple(math.hypot(s, sigma_m) for s in self.sigmas_m))
 
     def is_alone(self, index: int) -> bool:
         """Tell whether no other echo overlaps that of a range."""
@@ -87,8 +73,8 @@ class RangeScan:
         return any(abs(blurred_m - range_m) <= BLUR_M for blurred_m in self.blurred_m)
 
     def answers(self, range_m: float, reach_m: float) -> bool:
-        """Tell whether any echo, blurred ones too, may be that of a target at an unsure range."""
-        return any(abs(heard_m - range_m) <= reach_m for heard_m in self.ranges_m) or any(
+        """Tell whether any echo, blurred or not, may be that of a target at a range."""
+        return any(abs(detected_m - range_m) <= reach_m for detected_m in self.ranges_m) or any(
             abs(blurred_m - range_m) <= BLUR_M + reach_m for blurred_m in self.blurred_m
         )
 
@@ -97,29 +83,29 @@ class RangeScan:
 class Antennas:
     """Where the radars were when they sampled, in the body frame of the pose.
 
-    ``position_m`` has shape (r, 2), ``yaw_rad`` (r,), ``heard`` (r,) tells which sent a frame.
+    ``position_m`` has shape (r, 2), ``yaw_rad`` (r,), ``has_frame`` (r,).
     """
 
     position_m: Array
     yaw_rad: Array
-    heard: NDArray[np.bool_]
+    has_frame: NDArray[np.bool_]
 
 
 def antennas_of(
     rig: Rig, scans: Sequence[RangeScan], motion: Motion, calibration: Array | None = None
 ) -> Antennas:
-    """Return where the antennas were; a radar without a scan stays at its mount, unheard.
+    """Return where the antennas were; a radar without a scan stays at its mount.
 
-    ``calibration`` (3,), s, w and kappa, frees reported motions of the wheels' scale; over less
-    than a step the curvature is nothing.
+    ``calibration`` (3,), s, w and kappa, corrects reported motions; over less than a step the
+    curvature has no effect.
     """
     s, w = (0.0, 0.0) if calibration is None else calibration[:2].tolist()
     mounts = rig.mounts
     position = np.array([[mount.x_m, mount.y_m] for mount in mounts])
     yaw = np.array([mount.yaw_rad for mount in mounts])
-    heard = np.zeros(len(mounts), dtype=bool)
+    has_frame = np.zeros(len(mounts), dtype=bool)
     for scan in scans:
-        heard[scan.radar] = True
+        has_frame[scan.radar] = True
         f = scan.sampled_after
         if scan.moved is not None:
             turn = scan.moved[2] / (1.0 + w)
@@ -132,29 +118,17 @@ def antennas_of(
             forward = motion.step_m if f > 0 else rotation(-motion.turn_rad) @ motion.step_m
             position[scan.radar] = f * forward + rotation(turn) @ position[scan.radar]
             yaw[scan.radar] += turn
-    return Antennas(position_m=position, yaw_rad=yaw, heard=heard)
+    return Antennas(position_m=position, yaw_rad=yaw, has_frame=has_frame)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class View:
-    """All n landmarks and behind them all w walls as all radars should see them.
+    """All n landmarks and behind them all w walls as all radars should see them."""
 
-    Attributes
-    ----------
-    ranges_m
-        shape (r, n + w), offsets included; negative behind a wall.
-    off_boresight_rad
-        shape (r, n + w), in [-pi, pi).
-    directions
-        shape (r, n + w, 2), unit vectors u or n in the map frame.
-    by_feature
-        shape (r, n + w, 2), d(range) / d(error of the landmark or wall).
-    """
-
-    ranges_m: Array
-    off_boresight_rad: Array
-    directions: Array
-    by_feature: Array
+    ranges_m: Array  # shape (r, n + w), offsets included; negative behind a wall
+    off_boresight_rad: Array  # shape (r, n + w), in [-pi, pi)
+    directions: Array  # shape (r, n + w, 2), unit vectors u or n in the map frame
+    by_feature: Array  # shape (r, n + w, 2), d(range) / d(error of the landmark or wall)
 
     def inside(
         self, noise: RangeNoise, widen_rad: float = 0.0, widen_m: float = 0.0
@@ -167,7 +141,7 @@ class View:
         )
 
     def without(self, rows: Sequence[int]) -> View:
-        """Return a view in which some landmarks are out of everyone's reach."""
+        """Return a view in which the landmarks in some rows are out of reach."""
         if not rows:
             return self
         ranges = self.ranges_m.copy()
@@ -176,7 +150,7 @@ class View:
 
 
 def view(state: State, antennas: Antennas) -> View:
-    """Return the view of everything mapped; O(n + w), nothing of the covariance is touched."""
+    """Return the view of everything mapped; O(n + w), the covariance is not touched."""
     R = rotation(state.heading_rad)
     body = (state.landmarks_m - state.position_m) @ R
     offsets = body[None, :, :] - antennas.position_m[:, None, :]
@@ -207,25 +181,14 @@ def view(state: State, antennas: Antennas) -> View:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Rows:
-    """Range measurements that could be made: row i is of radar ``radars[i]``, one landmark each.
+    """Range measurements that could be made: row i is of radar ``radars[i]``, one landmark each."""
 
-    Attributes
-    ----------
-    radars, landmarks
-        shape (k,): index of the radar, row of the landmark; walls are the rows from n on.
-    at
-        Columns of the error that H has entries for, shape (c,).
-    H
-        shape (k, c).
-    predicted_m
-        shape (k,).
-    """
-
+    # shape (k,): index of the radar, row of the landmark; walls are the rows from n on
     radars: Indices
     landmarks: Indices
-    at: Indices
-    H: Array
-    predicted_m: Array
+    at: Indices  # columns of the error that H has entries for, shape (c,)
+    H: Array  # shape (k, c)
+    predicted_m: Array  # shape (k,)
 
 
 def rows_of(state: State, seen: View, radars: Indices, landmarks: Indices) -> Rows:

@@ -1,19 +1,19 @@
-"""What was measured and used so far: the material of a solution over all poses.
+"""The log of one run: the measurements of a solution over all poses.
 
-Of a long run the last poses are kept; what the older ones told is a prior on the first pose kept,
-the calibration, the offsets and the landmarks (module ``condensed``).
+Of a long run the last poses are kept one by one; the measurements of older ones are condensed into
+a prior on the first pose kept, the calibration, the offsets and the landmarks.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
+from slam.config import WheelNoise
 from slam.geometry import compose, wrap_angle
-from slam.robust.parameters import WheelNoise
 from slam.robust.state import Array, Indices, State, calibrated_motion, rotation
 
 # Standard deviations below these are taken as these, so that information stays finite.
@@ -23,30 +23,21 @@ _LEAST_OFFSET_M = 1e-7
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Estimate:
-    """Values of all unknowns.
+    """Values of all unknowns."""
 
-    Attributes
-    ----------
-    poses
-        shape (k + 1, 3): x, y, heading.
-    calibration
-        shape (k + 1, 3) if it walks, else (1, 3): s, w, kappa.
-    offsets_m, landmarks_m
-        shapes (r,) and (n, 2); the last of the landmarks may be walls, (phi, d).
-    """
-
-    poses: Array
-    calibration: Array
+    poses: Array  # shape (k + 1, 3): x, y, heading
+    calibration: Array  # shape (k + 1, 3) if it walks, else (1, 3): s, w, kappa
+    # shapes (r,) and (n, 2); the last of the landmarks may be walls, (phi, d)
     offsets_m: Array
     landmarks_m: Array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Prior:
-    """What is known beforehand of the first pose, its calibration, the offsets and landmarks.
+    """Prior knowledge of the first pose, its calibration, the offsets and landmarks.
 
     A quadratic ``e^T information e + 2 gradient^T e`` in right-invariant errors e from ``mean``
-    (module ``prior``), all of size 6 + r + 2 n in that order; the last ``n_walls`` of the n
+    (`slam.robust.smoother`), all of size 6 + r + 2 n in that order; the last ``n_walls`` of the n
     landmarks are walls.
     """
 
@@ -58,44 +49,29 @@ class Prior:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Problem:
-    """All that was measured.
+    """All that was measured."""
 
-    Attributes
-    ----------
-    increments, covariances
-        shapes (k, 3) and (k, 3, 3): reported steps from pose to pose, and their noise.
-    walks
-        shape (k, 3): variance each calibration error gains per step; all zero: constants.
-    prior
-        Of the first pose and everything that does not move.
-    range_poses, range_radars, range_landmarks
-        shape (m,) each: which pose, radar and landmark a range belongs to.
-    range_antennas, ranges_m
-        shapes (m, 2) and (m,): antenna in the body frame of the pose.
-    range_sigmas_m
-        shape (m,), noise of the ranges.
-    point_poses, point_landmarks, points, point_roots
-        shapes (q,), (q,), (q, 2), (q, 2, 2): range and bearing seen from the body's origin,
-        and a matrix that makes their noise white.
-    n_walls
-        How many of the landmarks, the last ones, are walls.
-    """
-
+    # shapes (k, 3) and (k, 3, 3): reported steps from pose to pose, and their noise
     increments: Array
     covariances: Array
+    # shape (k, 3): variance each calibration error gains per step; all zero: constants
     walks: Array
-    prior: Prior
+    prior: Prior  # of the first pose and everything that does not move
+    # shape (m,) each: which pose, radar and landmark a range belongs to
     range_poses: Indices
     range_radars: Indices
     range_landmarks: Indices
+    # shapes (m, 2) and (m,): antenna in the body frame of the pose
     range_antennas: Array
     ranges_m: Array
-    range_sigmas_m: Array
+    range_sigmas_m: Array  # shape (m,), noise of the ranges
+    # shapes (q,), (q,), (q, 2), (q, 2, 2): range and bearing seen from the body's origin, and a
+    # matrix that makes their noise white
     point_poses: Indices
     point_landmarks: Indices
     points: Array
     point_roots: Array
-    n_walls: int = 0
+    n_walls: int = 0  # how many of the landmarks, the last ones, are walls
 
     @property
     def is_walking(self) -> bool:
@@ -103,14 +79,14 @@ class Problem:
         return bool(np.any(self.walks > 0.0))
 
     def beginning(self, n_steps: int) -> Problem:
-        """Return what was measured before pose ``n_steps``, and the steps up to it."""
+        """Return the steps up to pose ``n_steps`` and the measurements before it."""
         ranges = self.range_poses < n_steps
         points = self.point_poses < n_steps
-        return Problem(
+        return replace(
+            self,
             increments=self.increments[:n_steps],
             covariances=self.covariances[:n_steps],
             walks=self.walks[:n_steps],
-            prior=self.prior,
             range_poses=self.range_poses[ranges],
             range_radars=self.range_radars[ranges],
             range_landmarks=self.range_landmarks[ranges],
@@ -121,7 +97,6 @@ class Problem:
             point_landmarks=self.point_landmarks[points],
             points=self.points[points],
             point_roots=self.point_roots[points],
-            n_walls=self.n_walls,
         )
 
 
@@ -142,15 +117,7 @@ def start_prior(
 
 
 class Condensed:
-    """A prior whose landmarks have ids, so that the map may change under it.
-
-    Parameters
-    ----------
-    prior
-        Of the first pose kept, its calibration, the offsets and the landmarks.
-    landmark_ids
-        Of its landmarks, in order.
-    """
+    """A prior whose landmarks have ids, in the order of the prior, so that the map may change."""
 
     def __init__(self, prior: Prior, landmark_ids: Sequence[int]) -> None:
         self._prior = prior
@@ -158,7 +125,6 @@ class Condensed:
 
     @property
     def landmark_ids(self) -> tuple[int, ...]:
-        """Return the ids of the landmarks it tells something of."""
         return tuple(self._ids)
 
     def of(self, landmark_ids: Sequence[int], n_walls: int = 0) -> Prior:
@@ -184,7 +150,7 @@ class Condensed:
         return Prior(information=information, gradient=gradient, mean=mean, n_walls=n_walls)
 
     def rename(self, gone: int, kept: int) -> None:
-        """Let what is known of one landmark be of another, to which it is the same point.
+        """Use all information about one landmark for another, which is the same point.
 
         With l_gone = l_kept their errors differ by a constant: e_gone = e_kept + d,
         d = mean_kept - mean_gone.
@@ -253,16 +219,6 @@ class _Ranges:
     sigmas_m: list[float] = field(default_factory=list)
     alone: list[bool] = field(default_factory=list)
 
-    def keep(self, at: Sequence[int]) -> None:
-        """Drop all rows but some."""
-        self.poses = [self.poses[i] for i in at]
-        self.radars = [self.radars[i] for i in at]
-        self.landmarks = [self.landmarks[i] for i in at]
-        self.antennas = [self.antennas[i] for i in at]
-        self.ranges_m = [self.ranges_m[i] for i in at]
-        self.sigmas_m = [self.sigmas_m[i] for i in at]
-        self.alone = [self.alone[i] for i in at]
-
 
 @dataclass(slots=True)
 class _Points:
@@ -271,51 +227,35 @@ class _Points:
     points: list[Array] = field(default_factory=list)
     roots: list[Array] = field(default_factory=list)
 
-    def keep(self, at: Sequence[int]) -> None:
-        """Drop all rows but some."""
-        self.poses = [self.poses[i] for i in at]
-        self.landmarks = [self.landmarks[i] for i in at]
-        self.points = [self.points[i] for i in at]
-        self.roots = [self.roots[i] for i in at]
+
+def _keep(table: _Ranges | _Points, at: Sequence[int]) -> None:
+    """Drop all rows of a table but some."""
+    for name in (column.name for column in fields(table)):
+        values = getattr(table, name)
+        setattr(table, name, [values[i] for i in at])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LoggedSightings:
-    """Ranges of one landmark over the last frames, where odometry alone has the antennas.
+    """Ranges of one landmark over the last frames, where odometry alone has the antennas."""
 
-    Attributes
-    ----------
-    antennas_m
-        shape (k, 2), in the frame of the first pose looked back to.
-    places_m, headings_rad, way_m
-        shapes (k, 2), (k,), (k,): of the robot, and its way since that pose.
-    ranges_m, sigmas_m, radars
-        shape (k,).
-    newest
-        shape (3,): the newest pose in that frame.
-    """
-
-    antennas_m: Array
+    antennas_m: Array  # shape (k, 2), in the frame of the first pose looked back to
+    # shapes (k, 2), (k,), (k,): of the robot, and its way since that pose
     places_m: Array
     headings_rad: Array
     way_m: Array
+    # shape (k,)
     ranges_m: Array
     sigmas_m: Array
     radars: Indices
-    newest: Array
+    newest: Array  # shape (3,): the newest pose in that frame
 
 
 class RunLog:
     """Increments, used ranges and points, with the trajectory they were last solved for.
 
-    Landmarks are named by id; merges rename, deletions drop what belonged to the landmark.
-
-    Parameters
-    ----------
-    wheels
-        Noise of the increments.
-    most_unsolved
-        Where nobody solves for the poses, only the last so many are kept; None: all.
+    Landmarks are named by id; merges rename, deletions drop what belonged to the landmark. With
+    ``most_unsolved``, for runs whose poses are never solved for, only the last so many are kept.
     """
 
     def __init__(self, wheels: WheelNoise, most_unsolved: int | None = None) -> None:
@@ -340,13 +280,12 @@ class RunLog:
 
     @property
     def n_kept(self) -> int:
-        """Return the number of poses that are still kept one by one."""
         return len(self._causal)
 
     def add_motion(
         self, increment: Array, covariance: Array, walk_variance: float, calibration: Array
     ) -> None:
-        """Append a step as reported; the stored trajectory goes on by it."""
+        """Append a step as reported; it extends the stored trajectory."""
         self._increments.append(np.array(increment, dtype=np.float64))
         self._covariances.append(covariance)
         self._walks.append(walk_variance)
@@ -358,7 +297,7 @@ class RunLog:
             self._names.clear()
 
     def set_causal(self, pose: Array) -> None:
-        """Note what the filter thinks of the newest pose, its measurements included."""
+        """Store the filter's newest pose, its measurements included."""
         self._causal[-1] = pose
 
     def parted(self, pose: Array) -> tuple[float, float]:
@@ -372,21 +311,20 @@ class RunLog:
         return self._since_solved
 
     def tried(self) -> None:
-        """Start counting anew without a solution."""
         self._since_solved = 0
 
     def forget_from(self, pose: int) -> None:
-        """Forget what was measured from a pose on; the steps stay."""
+        """Forget all measurements from a pose on; the steps stay."""
         for table in (self._ranges, self._points):
-            table.keep(np.flatnonzero(np.array(table.poses) < pose).tolist())
+            _keep(table, np.flatnonzero(np.array(table.poses) < pose).tolist())
 
-    def carried(self, pose: Array) -> None:
-        """Say that the last step tells nothing, and that the newest pose is another one."""
+    def break_odometry(self, pose: Array) -> None:
+        """Make the last step uninformative, and set the newest pose."""
         self._covariances[-1] = np.diag([_CARRIED_M**2, _CARRIED_M**2, _CARRIED_RAD**2])
         self._causal[-1] = pose
         self._stored_pose = pose
 
-    def lay(self, first: int, motion: Array) -> None:
+    def move_poses(self, first: int, motion: Array) -> None:
         """Apply a motion (3,) from the left to all poses from one on."""
         for k in range(max(first - self._first, 0), len(self._causal)):
             self._causal[k] = compose(motion, self._causal[k])
@@ -405,8 +343,8 @@ class RunLog:
     ) -> None:
         """Append a range used; ``antenna`` is in the body frame of the pose.
 
-        ``sigma_m`` is what it weighed in the filter, with doubt and Huber's weight; ``alone`` tells
-        whether no other echo overlaps its own.
+        ``sigma_m`` is that used in the filter, with association sigma and Huber's weight; ``alone``
+        tells whether no other echo overlaps its own.
 
         Raises
         ------
@@ -433,22 +371,20 @@ class RunLog:
         points.roots.append(np.linalg.inv(np.linalg.cholesky(covariance)))
 
     def rename(self, gone: int, kept: int) -> None:
-        """Let all of one landmark's measurements be of another."""
         self._names[gone] = kept
         if self._condensed is not None:
             self._condensed.rename(gone, kept)
 
     def drop(self, landmark_id: int) -> None:
-        """Leave all of a landmark's measurements out from now on.
+        """Leave out all of a landmark's measurements from now on.
 
-        What condensed poses measured of it cannot be told apart any more: it is marginalised.
+        Those of condensed poses cannot be told apart any more: the landmark is marginalised there.
         """
         self._names[landmark_id] = None
         if self._condensed is not None:
             self._condensed.drop(landmark_id)
 
     def is_condensed(self, landmark_id: int) -> bool:
-        """Tell whether condensed poses told of a landmark."""
         return self._condensed is not None and landmark_id in self._condensed.landmark_ids
 
     def sightings(
@@ -490,9 +426,9 @@ class RunLog:
         )
 
     def problem(self, state: State, prior: Prior) -> Problem:
-        """Return all that was measured of the landmarks the state has now.
+        """Return all measurements of the landmarks the state has now.
 
-        ``prior`` is that of the start, which condensed poses have in them already.
+        ``prior`` is that of the start; condensed poses include it already.
         """
         if self._condensed is not None:
             prior = self._condensed.of(state.feature_ids, len(state.wall_ids))
@@ -503,8 +439,8 @@ class RunLog:
         used, used_points = np.flatnonzero(of_range >= 0), np.flatnonzero(of_point >= 0)
         sigmas = np.square(self._wheels.calibration_sigmas)
         sigmas_m = np.array(ranges.sigmas_m)[used]
-        if state.range_doubts_m:
-            sigmas_m = np.hypot(sigmas_m, state.feature_doubts_m[of_range[used]])
+        if state.shape_sigmas_m:
+            sigmas_m = np.hypot(sigmas_m, state.feature_shape_sigmas_m[of_range[used]])
         # What lies on a round target's surface is nearer than its axis, which is the landmark.
         ranges_m = np.array(ranges.ranges_m)[used] + state.feature_radii_m[of_range[used]]
         return Problem(
@@ -528,7 +464,7 @@ class RunLog:
     def starts(self, state: State, problem: Problem) -> list[Estimate]:
         """Return values to start from.
 
-        One chains all increments with the calibration of now, which a closed loop has put right
+        One chains all increments with the present calibration, which a closed loop has corrected
         for the whole run; the other keeps the filter's own past.
         """
         shape = (len(self._causal), 3) if problem.is_walking else (1, 3)
@@ -541,21 +477,17 @@ class RunLog:
         }
         causal = np.array(self._causal)
         causal[-1] = state.pose
-        return [
-            Estimate(poses=causal, **common),
-            Estimate(poses=chained, **common),
-        ]
+        return [Estimate(poses=causal, **common), Estimate(poses=chained, **common)]
 
     def solved(self, estimate: Estimate) -> None:
-        """Store a solution's trajectory."""
         self._causal = list(estimate.poses)
         self._stored_pose = estimate.poses[-1].copy()
         self._since_solved = 0
 
     def condense(self, prior: Prior, landmark_ids: Sequence[int], n_steps: int) -> None:
-        """Forget the first ``n_steps`` poses kept; ``prior`` is all they told.
+        """Forget the first ``n_steps`` poses kept; ``prior`` replaces their measurements.
 
-        Its landmarks are those of ``landmark_ids``, the map of now. Measurements of landmarks that
+        Its landmarks are those of ``landmark_ids``, the present map. Measurements of landmarks that
         are gone go with it, and so do old names.
         """
         self._condensed = Condensed(prior, landmark_ids)
@@ -563,17 +495,16 @@ class RunLog:
         for table in (self._ranges, self._points):
             names = self._rows_of(table.landmarks, rows)
             table.landmarks = names.tolist()
-            table.keep(np.flatnonzero(names >= 0).tolist())
+            _keep(table, np.flatnonzero(names >= 0).tolist())
         self._names.clear()
         self._forget_to(self._first + n_steps)
 
     def _forget_to(self, pose: int) -> None:
-        """Let a pose be the first one kept."""
         for kept in (self._increments, self._covariances, self._walks, self._causal):
             del kept[: pose - self._first]
         self._first = pose
         for table in (self._ranges, self._points):
-            table.keep(np.flatnonzero(np.array(table.poses) >= pose).tolist())
+            _keep(table, np.flatnonzero(np.array(table.poses) >= pose).tolist())
 
     def _rows_of(
         self, ids: list[int], rows: dict[int, int]

@@ -1,34 +1,31 @@
-"""When the filter has come far from where it linearised, all poses are solved for again.
-
-What poses measured that are kept no longer is a quadratic about where they were linearised. In
-additive errors it would fix the direction of the map a little more at every such point, although
-no range can see it, and the estimate would become too sure. In right-invariant errors
-
-    e_th = theta - theta0,   e_p = Rot(-e_th) p - p0,   e_l = Rot(-e_th) l - l0
-    e_phi = phi - e_th - phi0,   e_d = d - d0 (a wall's)
-
-it does not: turning and shifting robot and map together changes what ranges tell by nothing, and
-exactly so. Hence first estimates (FEJ: Huang, Mourikis, Roumeliotis, IJRR 29(5), 2010) need not be
-kept for the measurements that stay. Calibration and offsets have additive errors.
-
-The border holds the last pose, its calibration, the range offsets and the landmarks. A band
-Cholesky eliminates all earlier poses in O(poses); what is left on the border, the Schur
-complement, is the information of the belief about now.
+"""Solution over all poses, when the filter has come far from where it linearised.
 
 Unknown are the poses, the calibration errors of the wheels (constant, or one set per pose that
 walks), the range offsets and the landmarks. The normal equations are a band along time with a
 border: the last pose, its calibration, the offsets and the landmarks. A band Cholesky in time
 order eliminates all earlier poses in O(poses); the Schur complement left on the border is the
-information of the belief that takes the filter's place, so no measurement counts twice.
-Errors are additive here. Step lengths are halved until the cost falls. Source: square root
-smoothing, Dellaert and Kaess, IJRR 25(12), 2006, with time order instead of a search for one.
+information of the belief that replaces the filter's, so no measurement counts twice. Errors are
+additive here. Step lengths are halved until the cost falls. Source: square root smoothing, Dellaert
+and Kaess, IJRR 25(12), 2006, with time order instead of a search for one.
+
+The measurements of poses that are kept no longer become a prior, a quadratic about where they were
+linearised. In additive errors it would fix the direction of the map a little more at every such
+point, although no range can see it, and the estimate would become too sure. In right-invariant
+errors
+
+    e_th = theta - theta0,   e_p = Rot(-e_th) p - p0,   e_l = Rot(-e_th) l - l0
+    e_phi = phi - e_th - phi0,   e_d = d - d0 (a wall's)
+
+it does not: turning and shifting robot and map together changes no range, and exactly so. Hence
+first estimates (FEJ: Huang, Mourikis, Roumeliotis, IJRR 29(5), 2010) need not be kept for the
+measurements that stay. Calibration and offsets have additive errors.
 """
 
 from __future__ import annotations
 
 import math
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,10 +49,7 @@ X, POSE_HEADING, AFTER_POSE = slice(0, 2), 2, 3
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PriorTerms:
-    """Half of the derivatives of a prior's cost at an estimate, in additive errors.
-
-    ``information`` has shape (m, m), ``gradient`` (m,).
-    """
+    """Half the derivatives of a prior's cost, additive errors: shapes (m, m) and (m,)."""
 
     information: Array
     gradient: Array
@@ -74,13 +68,11 @@ def first_values(estimate: Estimate) -> Array:
 
 
 def prior_cost(prior: Prior, values: Array, n_offsets: int) -> float:
-    """Return the cost of some values, shape (m,)."""
     e, _ = _errors(prior, values, n_offsets)
     return float(e @ (prior.information @ e + 2.0 * prior.gradient))
 
 
 def prior_terms(prior: Prior, values: Array, n_offsets: int) -> PriorTerms:
-    """Return information and gradient at some values, shape (m,)."""
     e, turned = _errors(prior, values, n_offsets)
     pulled = prior.information @ e
     back = rotation(-wrap_angle(float(values[POSE_HEADING] - prior.mean[POSE_HEADING])))
@@ -98,7 +90,7 @@ def prior_terms(prior: Prior, values: Array, n_offsets: int) -> PriorTerms:
 def prior_about(
     information: Array, gradient: Array, values: Array, n_offsets: int, n_walls: int = 0
 ) -> Prior:
-    """Return the prior that has this information and gradient of additive errors at values."""
+    """Return the prior with this information and gradient of additive errors at values."""
     points = _points(len(values), n_offsets, n_walls)
     by_heading = _swept(values, points)
     stay = np.eye(2)
@@ -126,7 +118,6 @@ def _errors(prior: Prior, values: Array, n_offsets: int) -> tuple[Array, Array]:
 
 
 def _points(size: int, n_offsets: int, n_walls: int) -> slice:
-    """Return where the landmarks that are no walls lie."""
     return slice(6 + n_offsets, size - 2 * n_walls)
 
 
@@ -173,7 +164,7 @@ class Steps:
 
 
 def motion_residuals(problem: Problem, estimate: Estimate, roots: Array) -> Steps:
-    """Return the white residuals of all motions; ``roots`` (k, 3, 3) makes their noise white."""
+    """Return the residuals of all motions, whitened by ``roots`` (k, 3, 3)."""
     poses = estimate.poses
     k = len(problem.increments)
     calibration = estimate.calibration[:k] if problem.is_walking else estimate.calibration
@@ -220,14 +211,9 @@ def measurement_residuals(problem: Problem, estimate: Estimate) -> Rows:
     if not len(problem.points):
         return ranges
     points = _point_rows(problem, estimate)
+    names = [column.name for column in fields(Rows)]
     return Rows(
-        poses=np.concatenate([ranges.poses, points.poses]),
-        landmarks=np.concatenate([ranges.landmarks, points.landmarks]),
-        residual=np.concatenate([ranges.residual, points.residual]),
-        by_pose=np.vstack([ranges.by_pose, points.by_pose]),
-        by_landmark=np.vstack([ranges.by_landmark, points.by_landmark]),
-        radars=np.concatenate([ranges.radars, points.radars]),
-        by_offset=np.concatenate([ranges.by_offset, points.by_offset]),
+        **{name: np.concatenate([getattr(ranges, name), getattr(points, name)]) for name in names}
     )
 
 
@@ -321,7 +307,7 @@ class NormalEquations:
         self.h[CALIBRATION] += np.einsum("kij,kj->i", transposed, steps.residual)
 
     def add_walking_steps(self, steps: Steps, walk_roots: Array, walks: Array) -> None:
-        """Add motions whose calibration belongs to each pose, and its walk from pose to pose."""
+        """Add motions with the calibration of each pose, and its walk."""
         k = self.n_chain
         before, after = np.zeros((k, 6, 6)), np.zeros((k, 6, 6))
         before[:, :3, :3], before[:, :3, 3:] = steps.by_before, steps.by_calibration
@@ -367,7 +353,6 @@ class NormalEquations:
             np.add.at(self.C.reshape(-1), flat, by_border[:, j, None] * by_border)
 
     def add_prior(self, information: Array, gradient: Array) -> None:
-        """Add what is known of the first pose, its calibration, the offsets and landmarks."""
         pose, rest = slice(0, 3), slice(BORDER_HEAD, None)
         self.g[0, :3] += gradient[:3]
         self.diagonal[0, :3, :3] += information[pose, pose]
@@ -407,7 +392,7 @@ class NormalEquations:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Eliminated:
-    """What is left on the border, and what gives the poses back."""
+    """The border after elimination, and what gives the poses back."""
 
     information: Array
     gradient: Array
@@ -459,7 +444,7 @@ _LEAST_WALK_SHARE = 1e-5
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Solution:
-    """The least-squares estimate and what is left to know.
+    """The least-squares estimate and its information.
 
     ``information`` is the Schur complement on (last pose, its calibration, offsets, landmarks),
     additive errors, shape (6 + r + 2 n,) squared; ``cost`` the sum of squared white residuals,
@@ -472,15 +457,7 @@ class Solution:
 
 
 class Smoother:
-    """Solves one problem.
-
-    Parameters
-    ----------
-    problem
-        What was measured.
-    rule
-        How many steps, and when ranges are left out.
-    """
+    """Solves one problem by Gauss-Newton."""
 
     def __init__(self, problem: Problem, rule: RelinearisationRule) -> None:
         self._problem, self._rule = problem, rule
@@ -491,7 +468,7 @@ class Smoother:
     def solve(self, start: Estimate, tolerance: float = 1e-2) -> Solution | None:
         """Return the least-squares solution reached from a start, or None if it failed.
 
-        ``tolerance`` is the decrease of the cost below which the search ends.
+        The search ends when the cost decreases by less than ``tolerance``.
         """
         estimate, limit = start, math.inf
         cost = self.cost(estimate, limit)
@@ -536,9 +513,9 @@ class Smoother:
         return total + prior_cost(self._problem.prior, first_values(estimate), n_offsets)
 
     def condensed(self, estimate: Estimate, n_steps: int, limit: float) -> Prior:
-        """Return all that the poses before pose ``n_steps`` tell, as a prior on what is left.
+        """Return all measurements before pose ``n_steps`` as a prior on what is left.
 
-        What lies beyond ``limit`` is left out. With the prior in place of the first ``n_steps``
+        Residuals beyond ``limit`` are left out. With the prior in place of the first ``n_steps``
         steps and of the measurements from their poses, the normal equations at this estimate have
         the same Schur complement: nothing is lost there, and nothing counts twice.
         """
@@ -625,7 +602,7 @@ _UNKNOWN = 100.0
 
 
 def is_due(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
-    """Tell whether the pose has parted too far from the stored trajectory, or that is too long."""
+    """Tell whether the pose is too far from the stored trajectory, or that is too long."""
     rule = parameters.relinearisation
     if rule is None:
         return False
@@ -640,7 +617,7 @@ def is_due(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
 
 
 def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
-    """Solve for all poses and let the result take the belief's place; tell whether it worked."""
+    """Solve for all poses and replace the belief by the result; tell whether it worked."""
     rule = parameters.relinearisation
     if rule is None:
         return False
@@ -667,12 +644,12 @@ def give_radius(
     state: State,
     parameters: BackEndParameters,
     candidate: tuple[int, float],
-    lead: float,
+    margin: float,
 ) -> bool:
-    """Give the landmark in a row a radius if all that was measured is likelier so; tell if it is.
+    """Give the landmark in a row a radius if a solution with it is likelier; tell whether it is.
 
-    ``lead`` is by how much the cost of the solution over all poses must fall. Then that solution
-    takes the belief's place.
+    The cost of the solution over all poses must fall by ``margin``. Then that solution replaces the
+    belief.
     """
     rule = parameters.relinearisation
     if rule is None:
@@ -682,7 +659,7 @@ def give_radius(
     solution = smoother.solve(start)
     if solution is None:
         return False
-    least = solution.cost - lead
+    least = solution.cost - margin
     id_, point_m = state.landmark_ids[row], state.landmarks_m[row].copy()
     before_m = state.radii_m.pop(id_, 0.0)
     away = point_m - state.position_m
@@ -728,7 +705,6 @@ def _all_poses(
 
 
 def _replace(state: State, solution: Solution) -> None:
-    """Let a solution take the place of the belief."""
     estimate = solution.estimate
     pose = estimate.poses[-1]
     state.position_m = pose[:2].copy()

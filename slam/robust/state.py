@@ -45,8 +45,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.blas import dsyr2, dsyr2k, dsyrk
 
+from slam.config import WheelNoise
 from slam.geometry import wrap_angle
-from slam.robust.parameters import WheelNoise
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -63,13 +63,8 @@ _SPARE, _ODD = 128, 8
 class SymmetricMatrix:
     """A symmetric matrix of which the lower triangle is stored, columns first.
 
-    A rank-k change costs one pass over the triangle (BLAS ``dsyrk``, ``dsyr2``), or a share of
-    one; nothing is copied, and symmetry cannot be lost because there is no second triangle.
-
-    Parameters
-    ----------
-    full
-        shape (m, m); only its lower triangle is read.
+    A rank-k change costs one pass over the triangle (BLAS ``dsyrk``, ``dsyr2``), or a share of one;
+    nothing is copied, and symmetry cannot be lost because there is no second triangle.
     """
 
     __slots__ = ("_first", "_grams", "_lower", "_n_grams", "_n_pairs", "_second", "_size")
@@ -78,7 +73,7 @@ class SymmetricMatrix:
         self._store(np.asarray(full, dtype=np.float64), len(full))
 
     def _store(self, part: Array, size: int) -> None:
-        """Take a square part for the first rows and columns of ``size`` ones; nothing put off."""
+        """Store a square part as the first rows and columns of ``size`` ones."""
         room = size if size <= _PROMPT_SIZE else _room(size)
         self._lower: Array = np.zeros((room, room), order="F")
         self._lower[: len(part), : len(part)] = part
@@ -95,7 +90,6 @@ class SymmetricMatrix:
 
     @property
     def size(self) -> int:
-        """Return m."""
         return self._size
 
     def columns(self, at: Indices) -> Array:
@@ -144,7 +138,6 @@ class SymmetricMatrix:
             self._put_off_pairs(a, b)
 
     def subtract_gram(self, W: Array) -> None:
-        """Subtract ``W W^T``, W of shape (m, k)."""
         k = W.shape[1]
         if self._is_prompt:
             self._subtract_now(np.asfortranarray(W))
@@ -173,7 +166,6 @@ class SymmetricMatrix:
                 self._put_off_pairs(-K[:, column], other[:, column])
 
     def add_diagonal(self, at: slice, values: Sequence[float]) -> None:
-        """Add variances to neighbouring diagonal entries."""
         for index, value in zip(range(at.start, at.stop), values, strict=True):
             self._lower[index, index] += value
 
@@ -202,7 +194,7 @@ class SymmetricMatrix:
         self._store(self._lower[np.ix_(at, at)], len(at))
 
     def _put_off(self, rows: Indices | slice, at: Indices) -> Array:
-        """Return rows and columns of the changes put off."""
+        """Return rows and columns of the changes not yet carried out."""
         first, second = self._first[:, : self._n_pairs], self._second[:, : self._n_pairs]
         grams = self._grams[:, : self._n_grams]
         products = first[rows] @ second[at].T + second[rows] @ first[at].T
@@ -216,7 +208,6 @@ class SymmetricMatrix:
         self._n_pairs += 1
 
     def _carry_out(self) -> None:
-        """Make the stored triangle the matrix."""
         self._carry_out_grams()
         self._carry_out_pairs()
 
@@ -238,7 +229,6 @@ class SymmetricMatrix:
 
 
 def _room(size: int) -> int:
-    """Return how many rows are stored for a large matrix."""
     return _SPARE * (size // _SPARE + 1) + _ODD
 
 
@@ -274,13 +264,6 @@ def quarter_turn(points: Array) -> Array:
 class State:
     """Mean and covariance of the filter; changed in place by the functions of this package.
 
-    Parameters
-    ----------
-    calibration_sigmas
-        Of s, w and kappa.
-    offset_sigmas_m
-        Of each radar's range offset, one per radar.
-
     Attributes
     ----------
     heading_rad, position_m
@@ -296,10 +279,10 @@ class State:
     walls
         shape (w, 2): phi [rad], not wrapped, and d [m], map frame.
     wall_ids
-        w ids in row order, of the same numbers as the landmarks'.
-    radii_m, range_doubts_m
-        Radius of each landmark known to be round, by id, whose axis is the landmark; and what is
-        added in squares to the ranges of a feature: not knowing its radius better, a wall's
+        w ids in row order, from the same sequence as the landmarks'.
+    radii_m, shape_sigmas_m
+        By id: radius of each landmark known to be round, whose axis is the landmark; and what is
+        added in squares to the sigmas of a feature's ranges: a radius's uncertainty, a wall's
         roughness.
     P
         Covariance of the errors, size 6 + r + 2 (n + w).
@@ -315,7 +298,7 @@ class State:
         "offsets_m",
         "position_m",
         "radii_m",
-        "range_doubts_m",
+        "shape_sigmas_m",
         "wall_ids",
         "walls",
     )
@@ -332,19 +315,18 @@ class State:
         self.walls: Array = np.zeros((0, 2))
         self.wall_ids: list[int] = []
         self.radii_m: dict[int, float] = {}
-        self.range_doubts_m: dict[int, float] = {}
+        self.shape_sigmas_m: dict[int, float] = {}
         self.next_id = 0
         sigmas = [0.0, 0.0, 0.0, *calibration_sigmas, *offset_sigmas_m]
         self.P = SymmetricMatrix(np.diag(np.square(sigmas)))
 
     @property
     def pose(self) -> Array:
-        """Return [x m, y m, heading rad], map frame, shape (3,)."""
+        """Return [x m, y m, heading rad], map frame."""
         return np.array([self.position_m[0], self.position_m[1], self.heading_rad])
 
     @property
     def offsets(self) -> slice:
-        """Return where the range offsets lie in the error."""
         return slice(HEAD_SIZE, HEAD_SIZE + len(self.offsets_m))
 
     @property
@@ -359,13 +341,12 @@ class State:
 
     @property
     def feature_radii_m(self) -> Array:
-        """Return the radii of landmarks and walls in the order of their columns, (n + w,)."""
+        """Return radii in the order of their columns, (n + w,)."""
         return np.array([self.radii_m.get(id_, 0.0) for id_ in self.feature_ids])
 
     @property
-    def feature_doubts_m(self) -> Array:
-        """Return what doubt adds to the ranges of landmarks and walls, (n + w,)."""
-        return np.array([self.range_doubts_m.get(id_, 0.0) for id_ in self.feature_ids])
+    def feature_shape_sigmas_m(self) -> Array:
+        return np.array([self.shape_sigmas_m.get(id_, 0.0) for id_ in self.feature_ids])
 
     def landmark_columns(self, rows: NDArray[np.intp]) -> Indices:
         """Return where landmarks lie in the error, shape (2 k,); walls are the rows from n on."""
@@ -450,7 +431,7 @@ class State:
         self.P.keep(np.delete(np.arange(self.P.size), [first, first + 1]))
         n = len(self.landmark_ids)
         self.radii_m.pop(self.feature_ids[row], None)
-        self.range_doubts_m.pop(self.feature_ids[row], None)
+        self.shape_sigmas_m.pop(self.feature_ids[row], None)
         if row < n:
             self.landmarks_m = np.delete(self.landmarks_m, row, axis=0)
             del self.landmark_ids[row]
@@ -469,7 +450,7 @@ class State:
         return np.asarray(T @ P @ T.T)
 
     def landmark_covariance(self, row: int) -> Array:
-        """Return the covariance of one landmark's position in the map frame, shape (2, 2)."""
+        """Return the covariance of one landmark's position, map frame, (2, 2)."""
         first = self.offsets.stop + 2 * row
         P = self.P.block(np.array([0, first, first + 1]))
         T = np.column_stack([quarter_turn(self.landmarks_m[row]), np.eye(2)])
@@ -491,7 +472,7 @@ class State:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Motion:
-    """One increment of the body frame before it, freed of the calibration errors.
+    """One increment of the body frame before it, corrected for the calibration errors.
 
     ``step_m`` has shape (2,), d above; ``covariance`` of (d, a), shape (3, 3).
     """
@@ -503,12 +484,10 @@ class Motion:
 
     @property
     def distance_m(self) -> float:
-        """Return the length of the step."""
         return math.hypot(self.step_m[0], self.step_m[1])
 
 
 def at_rest() -> Motion:
-    """Return no motion at all."""
     return Motion(step_m=np.zeros(2), turn_rad=0.0, covariance=np.zeros((3, 3)), walk_variance=0.0)
 
 
@@ -524,9 +503,9 @@ def calibrated_motion(
     calibration
         shape (3,): s, w, kappa.
     wheels
-        Gives the noise of the step ...
+        Model of the step's noise ...
     covariance
-        ... unless it is known, shape (3, 3).
+        ... unless it is given, shape (3, 3).
     """
     s, w, kappa = (float(value) for value in calibration)
     step = np.asarray(increment[:2]) / (1.0 + s)
@@ -543,7 +522,6 @@ def calibrated_motion(
 
 
 def predict(state: State, motion: Motion, wheels: WheelNoise) -> None:
-    """Move mean and covariance of the state by one motion, in place."""
     s, w, kappa = (float(value) for value in state.calibration)
     P, R = state.P, rotation(state.heading_rad)
     moved = R @ motion.step_m

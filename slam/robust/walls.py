@@ -1,8 +1,8 @@
-"""The walls of one run: found, recognised, looked for where they are known to be.
+"""Walls: found among unassigned ranges, recognised, and predicted where they are known to be.
 
 As in :mod:`slam.robust.initialisation`, a small Kalman filter follows a guess back through the
-frames; here its state is a line (phi, d) in the body frame of now, whose range is d - n . a. What
-it gathers must follow the wall's law, and the point's clearly less well.
+frames; here its state is a line (phi, d) in the newest body frame, whose range is d - n . a. The
+ranges must follow the wall's law, and the point's clearly less well.
 
 A wall in the body frame, (phi_b, d_b) with noise n and known dependence D on the radars' range
 offsets, measures
@@ -11,8 +11,8 @@ offsets, measures
     H = [e_p: (0; -n), e_phi: (1; -(J n) . p), e_d: (0; 1), e_b: -D],   S = H P H^T + C,
 
 with no entry for the heading, and a new wall has e_phi = D_phi e_b + n_phi,
-e_d = n . e_p + (J n) . p e_phi + D_d e_b + n_d. A wall ends somewhere: the parts of it that
-answered are kept in cells along it.
+e_d = n . e_p + (J n) . p e_phi + D_d e_b + n_d. Walls end: the stretches that gave echoes are kept
+in cells along the wall.
 """
 
 from __future__ import annotations
@@ -25,7 +25,17 @@ import numpy as np
 
 from slam.geometry import wrap_angle
 from slam.results import MapWall
-from slam.robust.initialisation import FeatureRows, Leftovers, Member, Slot, Tracklet
+from slam.robust.initialisation import (
+    FeatureRows,
+    Followed,
+    Member,
+    Slot,
+    Tracklet,
+    UnassignedRanges,
+    best_first,
+    clear_match,
+    is_consistent,
+)
 from slam.robust.map import Law, Sightings, compare, fit_wall
 from slam.robust.parameters import BackEndParameters, RangeNoise, WallRule
 from slam.robust.ranges import Antennas, View
@@ -36,39 +46,14 @@ _MARGIN_RAD = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class WallTracklet:
-    """A wall in the body frame of now, and the ranges that say so.
-
-    Attributes
-    ----------
-    wall, covariance
-        phi [rad] and d [m], shapes (2,) and (2, 2), for the range offsets given.
-    by_offsets
-        shape (2, r), d(phi, d) / d(offsets).
-    members
-        Newest first.
-    chi_square, dof
-        Of the residuals.
-    share
-        Part of the frames with the wall in view that hold a member.
-    """
+class WallTracklet(Followed):
+    """A wall; ``wall`` (2,) and its covariance are of phi [rad] and d [m]."""
 
     wall: Array
-    covariance: Array
-    by_offsets: Array
-    members: tuple[Member, ...]
-    chi_square: float
-    dof: int
-    share: float
-
-    @property
-    def score(self) -> float:
-        """Return 4 dof - chi-square, by which tracklets compete for ranges."""
-        return 4.0 * self.dof - self.chi_square
 
 
 def wall_guesses(newest: Sequence[Slot], noise: RangeNoise) -> list[Array]:
-    """Return the lines (phi, d) that touch both circles of every pair of unused ranges of now."""
+    """Return the lines (phi, d) that touch both circles of every pair of unused ranges."""
     guesses = []
     for place, first in enumerate(newest):
         for second in newest[place + 1 :]:
@@ -93,15 +78,7 @@ def wall_guesses(newest: Sequence[Slot], noise: RangeNoise) -> list[Array]:
 
 
 class WallTracker:
-    """Follows guesses of walls back in time.
-
-    Parameters
-    ----------
-    parameters, rule
-        Noise of radars and wheels, and rules.
-    offsets_m, offset_covariance
-        What the state knows of the radars' range offsets, shapes (r,) and (r, r).
-    """
+    """Follows guesses of walls back in time; offsets as in ``Tracker``."""
 
     def __init__(
         self,
@@ -118,7 +95,7 @@ class WallTracker:
         self._heading_rad_per_sqrt_m = parameters.wheels.heading_rad_per_sqrt_m
 
     def follow(self, guess: Array, frames: Sequence[Sequence[Slot]]) -> WallTracklet:
-        """Return what the last frames hold of a guess; twice, from the result of the first."""
+        """Return the ranges that follow a guess; twice, as ``Tracker.follow`` does."""
         first = self._walk(float(guess[0]), float(guess[1]), frames)
         second = self._walk(float(first.wall[0]), float(first.wall[1]), frames)
         return second if self._offset_covariance is None else self._with_free_offsets(second)
@@ -179,8 +156,8 @@ class WallTracker:
     def _with_free_offsets(self, walked: WallTracklet) -> WallTracklet:
         """Judge the members by a wall *and* the radars' common offsets, which are uncertain.
 
-        While walking, the doubt about an offset is noise of each range, and a wall would be
-        allowed to miss every range by it. It is one number: a wall may miss them all alike.
+        While walking, an offset's uncertainty is noise of each range, and a wall would be allowed
+        to miss every range by it. It is one number: a wall may miss them all alike.
         """
         if walked.dof < 1:
             return walked
@@ -201,7 +178,7 @@ class WallTracker:
         )
 
     def _turned(self, members: Sequence[Member]) -> float:
-        """Return the variance of the heading over the way of the members, about its mean."""
+        """Return the variance of the heading over the way of the members."""
         if not members:
             return 0.0
         first, last = members[-1].slot, members[0].slot
@@ -219,67 +196,41 @@ class WallTracker:
 
     def is_wall(self, tracklet: WallTracklet) -> bool:
         """Tell whether a tracklet is evidence of a wall and not of a point."""
-        rule, members = self._rule, tracklet.members
+        members = tracklet.members
         if len({member.slot.back for member in members}) < self._walls.min_frames:
             return False
         if self._way_m(tracklet) < self._walls.min_way_m:
             return False
-        hits: dict[int, int] = {}
-        for member in members:
-            hits[member.slot.radar] = hits.get(member.slot.radar, 0) + 1
-        if len(hits) < 2 or min(hits.values()) < rule.min_hits_per_radar:
-            return False
-        limit = tracklet.dof + rule.excess_sigmas * math.sqrt(2.0 * max(tracklet.dof, 0))
-        if tracklet.share < rule.min_share or tracklet.chi_square > limit:
+        if not is_consistent(tracklet, 2, self._rule):
             return False
         verdict = compare(self.sightings(members), float(tracklet.wall[0]))
-        return verdict.law(self._walls.wall_lead) is Law.WALL
+        return verdict.law(self._walls.wall_margin) is Law.WALL
 
     def is_point(self, tracklet: Tracklet) -> bool:
-        """Tell whether the ranges of a tracklet follow a point's law rather than a wall's."""
+        """Tell whether the ranges of a tracklet follow a point's law, not a wall's."""
         members = tracklet.members
         middle = np.mean([(m.slot.x_m, m.slot.y_m) for m in members], axis=0)
         x, y = tracklet.point_m - middle
         verdict = compare(self.sightings(members), math.atan2(y, x))
-        return verdict.law(self._walls.point_lead) is Law.POINT
+        return verdict.law(self._walls.point_margin) is Law.POINT
 
     def sightings(self, members: Sequence[Member]) -> Sightings:
-        """Return members as ranges from places in the body frame of now."""
         offsets = np.array([self._offsets[member.slot.radar] for member in members])
         return Sightings(
             antennas_m=np.array([(m.slot.x_m, m.slot.y_m) for m in members]),
-            ranges_m=np.array([m.leftover.range_m for m in members]) - offsets,
-            variances=np.array([m.leftover.sigma_m**2 + m.slot.drift for m in members]),
+            ranges_m=np.array([m.measured.range_m for m in members]) - offsets,
+            variances=np.array([m.measured.sigma_m**2 + m.slot.drift for m in members]),
             radars=np.array([m.slot.radar for m in members]),
             offset_covariance=self._offset_covariance,
         )
 
 
-def find_wall_tracklets(
-    tracker: WallTracker, guesses: Sequence[Array], frames: Sequence[Sequence[Slot]]
-) -> list[WallTracklet]:
-    """Return the wall tracklets, best first; their ranges are taken out of the frames."""
-    found: list[WallTracklet] = []
-    waiting = list(guesses)
-    while waiting:
-        followed = [(tracker.follow(guess, frames), guess) for guess in waiting]
-        walls = [pair for pair in followed if tracker.is_wall(pair[0])]
-        if not walls:
-            break
-        best, chosen = max(walls, key=lambda pair: pair[0].score)
-        for member in best.members:
-            member.slot.unused.remove(member.leftover)
-        found.append(best)
-        waiting = [guess for _, guess in walls if guess is not chosen]
-    return found
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BodyWall:
-    """A wall in the body frame of now.
+    """A wall in the newest body frame.
 
     ``wall`` (2,): phi [rad], d [m]; ``covariance`` (2, 2); ``by_offsets`` (2, r): d(phi, d) /
-    d(range offsets); ``feet_m`` (k, 2): places on it that answered.
+    d(range offsets); ``feet_m`` (k, 2): where its echoes came from.
     """
 
     wall: Array
@@ -288,30 +239,24 @@ class BodyWall:
     feet_m: Array
 
     def in_map(self, state: State) -> Array:
-        """Return the places that answered in the map frame, shape (k, 2)."""
+        """Return where its echoes came from in the map frame, shape (k, 2)."""
         return np.asarray(state.position_m + self.feet_m @ rotation(state.heading_rad).T)
 
 
 class WallCells:
-    """Which parts of which walls have answered, by id, in cells along the wall.
-
-    Parameters
-    ----------
-    cell_m
-        Length of a cell.
-    """
+    """Which stretches of which walls gave echoes, by id, in cells of ``cell_m`` along the wall."""
 
     def __init__(self, cell_m: float) -> None:
         self._cell_m = cell_m
         self._cells: dict[int, set[int]] = {}
 
     def add(self, wall_id: int, along_m: Array) -> None:
-        """Note that a wall answered at these places, shape (k,)."""
+        """Record echoes of a wall at these places, shape (k,)."""
         cells = np.floor(along_m / self._cell_m).astype(np.intp).tolist()
         self._cells.setdefault(wall_id, set()).update(cells)
 
     def distance_m(self, wall_id: int, along_m: float) -> float:
-        """Return how far a place is from the nearest cell that answered."""
+        """Return how far a place is from the nearest cell with an echo."""
         cells = self._cells.get(wall_id)
         if not cells:
             return math.inf
@@ -319,13 +264,13 @@ class WallCells:
         return self._cell_m * min(abs(here - cell) for cell in cells)
 
     def surrounds(self, wall_id: int, along_m: float) -> bool:
-        """Tell whether the cell of a place and both its neighbours answered."""
+        """Tell whether the cell of a place and both its neighbours gave echoes."""
         cells = self._cells.get(wall_id, set())
         here = math.floor(along_m / self._cell_m)
         return {here - 1, here, here + 1} <= cells
 
     def spans_m(self, wall_id: int) -> list[tuple[float, float]]:
-        """Return the stretches that answered, as (from, to) along the wall."""
+        """Return the stretches that gave echoes, as (from, to) along the wall."""
         spans: list[tuple[float, float]] = []
         for cell in sorted(self._cells.get(wall_id, ())):
             begin, end = cell * self._cell_m, (cell + 1) * self._cell_m
@@ -336,11 +281,9 @@ class WallCells:
         return spans
 
     def merge(self, kept: int, gone: int) -> None:
-        """Let one wall take over the cells of another."""
         self._cells.setdefault(kept, set()).update(self._cells.pop(gone, set()))
 
     def forget(self, wall_id: int) -> None:
-        """Drop a wall."""
         self._cells.pop(wall_id, None)
 
 
@@ -351,7 +294,6 @@ def along_wall(state: State, wall_row: int, places_m: Array) -> Array:
 
 
 def wall_rows(state: State, wall_row: int, seen: BodyWall) -> FeatureRows:
-    """Return residual, H and S of a wall seen that would be the mapped one."""
     phi, d = (float(value) for value in state.walls[wall_row])
     n = np.array([math.cos(phi), math.sin(phi)])
     along = float(state.position_m @ np.array([-n[1], n[0]]))
@@ -369,7 +311,7 @@ def wall_rows(state: State, wall_row: int, seen: BodyWall) -> FeatureRows:
 
 
 def match_wall(state: State, seen: BodyWall, cells: WallCells, rule: WallRule) -> int | None:
-    """Return the row of the wall that a wall seen is, or None where none stands out.
+    """Return the row of the wall that a wall seen is, or None where no match is clear.
 
     As for points: the match must pass the gate, be likelier than a wall not yet in the map, and
     beat the next best; and the two must come within reach of each other along the line.
@@ -382,17 +324,7 @@ def match_wall(state: State, seen: BodyWall, cells: WallCells, rule: WallRule) -
             continue
         rows = wall_rows(state, row, seen)
         scored.append((rows.mahalanobis_sq + rows.log_det, rows.mahalanobis_sq, row))
-    if not scored:
-        return None
-    scored.sort()
-    score, distance, best = scored[0]
-    if distance > rule.match_gate:
-        return None
-    if -0.5 * score - math.log(math.tau) <= math.log(rule.unmapped_per_rad_m):
-        return None
-    if len(scored) > 1 and scored[1][0] - score < rule.match_lead:
-        return None
-    return best
+    return clear_match(scored, rule.match_gate, rule.unmapped_per_rad_m, rule.match_margin)
 
 
 def is_unresolved(state: State, seen: BodyWall, cells: WallCells, rule: WallRule) -> bool:
@@ -412,14 +344,13 @@ def is_unresolved(state: State, seen: BodyWall, cells: WallCells, rule: WallRule
 
 
 def update_with_wall(state: State, wall_row: int, seen: BodyWall) -> float:
-    """Correct the state with a wall seen that is a mapped one; return the NIS (2 dof)."""
+    """Correct the state with a measurement of a mapped wall; return the NIS (2 dof)."""
     rows = wall_rows(state, wall_row, seen)
     nis, _ = state.update(rows.at, rows.H, rows.residual, seen.covariance)
     return nis
 
 
-def give_birth_to_wall(state: State, seen: BodyWall) -> int:
-    """Append a wall seen to the map; return its id."""
+def initialise_wall(state: State, seen: BodyWall) -> int:
     phi = state.heading_rad + float(seen.wall[0])
     n = np.array([math.cos(phi), math.sin(phi)])
     along = float(state.position_m @ np.array([-n[1], n[0]]))
@@ -443,10 +374,10 @@ def foot_points(state: State, wall_row: int, antennas: Antennas) -> Array:
 
 
 def hide_unknown(state: State, seen: View, feet_m: Array, cells: WallCells) -> View:
-    """Turn walls out of view where no wall tracklet has shown them.
+    """Move walls out of view where no wall tracklet has shown them.
 
-    The end of a wall answers, too, from farther on: its edge's range leaves the wall's by
-    x^2 / 2 r only, within the gates of single ranges for long, and would turn wall and pose.
+    The end of a wall reflects, too, from farther on: its edge's range leaves the wall's by x^2 / 2
+    r only, within the gates of single ranges for long, and would turn wall and pose.
 
     ``feet_m`` has shape (r, w, 2): where echoes come from.
     """
@@ -460,19 +391,12 @@ def hide_unknown(state: State, seen: View, feet_m: Array, cells: WallCells) -> V
 
 
 class WallKeeper:
-    """Keeps the walls of a state.
-
-    Parameters
-    ----------
-    state
-        Holds them.
-    parameters
-        Noise, and what is believed; without a rule for walls there are none.
+    """The walls of a state; without a rule for walls there are none.
 
     Attributes
     ----------
     cells
-        Which parts of them have answered.
+        Which stretches of them gave echoes.
     """
 
     def __init__(self, state: State, parameters: BackEndParameters) -> None:
@@ -481,7 +405,7 @@ class WallKeeper:
         self.cells = WallCells(self._rule.cell_m)
 
     def look(self, seen: View, antennas: Antennas) -> View:
-        """Return a view without the walls that are not known where they would answer."""
+        """Return a view without the walls that are not known where they would reflect."""
         state = self._state
         feet = [foot_points(state, row, antennas) for row in range(len(state.wall_ids))]
         by_radar = np.array(feet).reshape(-1, len(antennas.yaw_rad), 2).transpose(1, 0, 2)
@@ -490,8 +414,8 @@ class WallKeeper:
     def is_point(self, tracklet: Tracklet) -> bool:
         """Tell whether the ranges of a tracklet follow a point's law rather than a wall's.
 
-        What goes on where a mapped wall does is not known to be a point yet: over a few frames
-        both laws fit.
+        What goes on where a mapped wall does is not known to be a point yet: over a few frames both
+        laws fit.
         """
         if self._parameters.walls is None:
             return True
@@ -499,7 +423,7 @@ class WallKeeper:
         return tracker.is_point(tracklet) and not self._is_on_a_wall(tracklet, tracker)
 
     def _is_on_a_wall(self, tracklet: Tracklet, tracker: WallTracker) -> bool:
-        """Tell whether a mapped wall nearby explains the ranges of a tracklet, too."""
+        """Tell whether a mapped wall nearby explains the ranges, too."""
         state, rule = self._state, self._rule
         if not state.wall_ids:
             return False
@@ -524,13 +448,16 @@ class WallKeeper:
         offsets = np.arange(state.offsets.start, state.offsets.stop)
         return WallTracker(self._parameters, self._rule, state.offsets_m, state.P.block(offsets))
 
-    def find(self, leftovers: Leftovers, radars: Sequence[int]) -> list[WallTracklet]:
-        """Return the walls in what some radars of a side have not used, and use that up."""
+    def find(self, unassigned: UnassignedRanges, radars: Sequence[int]) -> list[WallTracklet]:
+        """Return the walls among the unassigned ranges of one side, and use these up."""
         if self._parameters.walls is None or len(radars) < 2:
             return []
-        frames = leftovers.slots(radars, self._rule.window)
+        frames = unassigned.slots(radars, self._rule.window)
         guesses = wall_guesses(frames[0], self._parameters.ranges)
-        return find_wall_tracklets(self._tracker(), guesses, frames) if guesses else []
+        if not guesses:
+            return []
+        tracker = self._tracker()
+        return best_first(guesses, lambda guess: tracker.follow(guess, frames), tracker.is_wall)
 
     def place(self, tracklet: WallTracklet) -> tuple[int, bool] | None:
         """Bring a wall into the map; return its id and whether it is new.
@@ -552,8 +479,8 @@ class WallKeeper:
         if row is None and is_unresolved(state, seen, self.cells, self._rule):
             return None
         if row is None:
-            wall_id = give_birth_to_wall(state, seen)
-            state.range_doubts_m[wall_id] = self._rule.roughness_m
+            wall_id = initialise_wall(state, seen)
+            state.shape_sigmas_m[wall_id] = self._rule.roughness_m
             row = len(state.wall_ids) - 1
         else:
             wall_id = state.wall_ids[row]
@@ -562,7 +489,6 @@ class WallKeeper:
         return wall_id, is_new
 
     def reported(self, row: int, hits: int) -> MapWall:
-        """Return a wall as the map reports it."""
         state, wall_id = self._state, self._state.wall_ids[row]
         phi, d = (float(value) for value in state.walls[row])
         n, t = np.array([np.cos(phi), np.sin(phi)]), np.array([-np.sin(phi), np.cos(phi)])

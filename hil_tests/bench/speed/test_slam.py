@@ -17,12 +17,14 @@ from slam.config import (
     TrilaterationConfig,
 )
 from slam.frames import RadarFrame
-from slam.front_end.paper import PaperDetector, make_detector
+from slam.front_end import make_detector
+from slam.front_end.paper import PaperDetector
 from slam.geometry import paper_rig
 from slam.paper.association import update_map
 from slam.paper.clustering import CollectedState, filter_window
-from slam.paper.ekf import Belief, predict, update
-from slam.paper.trilateration import Fix, Trilaterator
+from slam.paper.ekf import predict, update
+from slam.paper.trilateration import Trilaterator
+from slam.results import Belief, Fix
 
 Array = NDArray[np.float64]
 BIN_LENGTH_M = 299_792_458 / (2 * 23.328e9)

@@ -16,7 +16,7 @@ from slam.app.records import Scan, Snapshot
 from slam.app.view.panels import RerunView
 from slam.frames import Detection
 from slam.paper.ekf import start
-from slam.paper.pipeline import StepResult
+from slam.results import StepResult
 
 N_RADARS = 4
 FRAME_RATE_HZ = 400

@@ -29,7 +29,8 @@ from slam.app.rig.emulated import (
 )
 from slam.app.run.runner import run_slam
 from slam.config import FrontEnd, SampleTime, load_preset, override
-from slam.paper.pipeline import StepResult, UwbRadarSlam
+from slam.paper.pipeline import UwbRadarSlam
+from slam.results import StepResult
 
 NO_SKEW_MS = (0.0, 0.0, 0.0, 0.0)
 RECIPE_MS = (0.0, 190.0, 100.0, 150.0)

@@ -10,11 +10,8 @@ from numpy.typing import NDArray
 from slam.evaluation import ECHO_LENGTH_M, TrueAssociationNis, observable_landmarks, true_range_nis
 from slam.frames import Detection
 from slam.geometry import paper_rig
-from slam.paper.association import Association
-from slam.paper.clustering import Observation
 from slam.paper.ekf import start
-from slam.paper.pipeline import StepResult
-from slam.results import ExpectedRange, UpdateReport
+from slam.results import Association, Observation, PredictedRange, StepResult, UpdateReport
 
 Array = NDArray[np.float64]
 TRUE = np.array([[0.0, 1.0], [0.0, -1.0]])
@@ -131,9 +128,9 @@ POSE = np.array([1.0, 2.0, math.pi / 2])
 """Body x is world y."""
 
 
-def expected(landmark_id: int, x_m: float, y_m: float, *, radar: int = 0) -> ExpectedRange:
+def expected(landmark_id: int, x_m: float, y_m: float, *, radar: int = 0) -> PredictedRange:
     """Return a landmark believed at (x, y) in the body, seen by an antenna at the body's origin."""
-    return ExpectedRange(
+    return PredictedRange(
         radar=radar,
         landmark_id=landmark_id,
         range_m=math.hypot(x_m, y_m),
@@ -143,17 +140,17 @@ def expected(landmark_id: int, x_m: float, y_m: float, *, radar: int = 0) -> Exp
     )
 
 
-def ranged(ranges: list[tuple[int, float]], *told: ExpectedRange) -> StepResult:
+def ranged(ranges: list[tuple[int, float]], *told: PredictedRange) -> StepResult:
     report = UpdateReport(
         continued=(),
-        born=(),
+        initialised=(),
         seen_again=(),
         merged=(),
         deleted=(),
         nis=0.0,
         dof=0,
         relinearised=False,
-        expected=told,
+        predicted=told,
     )
     seen = [Detection(radar=r, t_ns=0, range_m=z, amplitude=0.01) for r, z in ranges]
     return StepResult(
@@ -167,7 +164,6 @@ def ranged(ranges: list[tuple[int, float]], *told: ExpectedRange) -> StepResult:
 
 
 def world(x_m: float, y_m: float) -> list[float]:
-    """Return a point of the body in the world."""
     return [1.0 - y_m, 2.0 + x_m]
 
 
@@ -195,7 +191,7 @@ def test_a_surprising_range_of_the_landmark_counts_however_far_outside_any_gate(
     ],
 )
 def test_what_is_no_true_association_is_not_counted(
-    ranges: list[tuple[int, float]], told: ExpectedRange
+    ranges: list[tuple[int, float]], told: PredictedRange
 ) -> None:
     assert true_range_nis(ranged(ranges, told), POSE, np.array([world(0.0, 1.0)])) == ()
 

@@ -35,7 +35,7 @@ from slam.calibration.observability import (
 from slam.calibration.tracks import UNASSIGNED, RangeSet
 from slam.config import FrontEnd, SlamConfig, override
 from slam.frames import Detection, RadarFrame
-from slam.front_end.paper import make_detector
+from slam.front_end import make_detector
 from slam.geometry import Rig
 from xethru_protocol.system import StopFlag, read_bounded
 

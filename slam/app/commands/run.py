@@ -35,7 +35,7 @@ from slam.app.session.log import SessionLog
 from slam.app.session.messages import settings_text
 from slam.app.view.viewer import LiveView
 from slam.config import ConfigError, load_preset
-from slam.robust.pipeline import make_slam
+from slam.pipelines import make_slam
 from xethru_protocol.system import StopFlag
 
 _SESSION = "session.mcap"

@@ -16,8 +16,7 @@ from slam.app.rig.files import load_rig
 from slam.app.run.replay import recorded_config
 from slam.app.session.messages import SlamSettings, settings_text
 from slam.app.session.reader import RecordedSession, open_session
-from slam.config import ConfigError, SlamConfig, load_preset
-from slam.robust.parameters import WheelNoise
+from slam.config import ConfigError, SlamConfig, WheelNoise, load_preset
 from xethru_protocol.recordings import RecordingError, WireCapture
 from xethru_protocol.system import StopFlag
 

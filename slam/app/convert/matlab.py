@@ -44,7 +44,7 @@ from slam.app.session.messages import SlamSettings, imported_info, imported_rada
 from slam.app.session.reader import RecordedSession
 from slam.config import SlamConfig
 from slam.frames import RadarFrame
-from slam.front_end.paper import make_detector
+from slam.front_end import make_detector
 from slam.geometry import Mount, RadarPair, Rig
 from slam.paper.trilateration import Trilaterator
 

@@ -19,7 +19,8 @@ from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, open_loopback
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label
 from slam.config import DetectionConfig, FrontEnd, SlamConfig, load_preset
 from slam.frames import Detection, RadarFrame
-from slam.front_end.paper import PaperDetector, make_detector
+from slam.front_end import make_detector
+from slam.front_end.paper import PaperDetector
 from xethru_protocol.system import StopFlag
 
 Array = NDArray[np.float64]

@@ -28,7 +28,7 @@ from slam.config import ClusteringConfig, SlamConfig, load_preset
 from slam.geometry import Rig, transform
 from slam.paper.clustering import CollectedState, filter_window
 from slam.paper.pipeline import UwbRadarSlam
-from slam.paper.trilateration import Fix
+from slam.results import Fix
 from xethru_protocol.system import StopFlag
 
 Array = NDArray[np.float64]

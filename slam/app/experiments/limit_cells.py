@@ -40,9 +40,9 @@ from emulator.scene.scene import LeakageSpec, NoiseSpec, RadarSpec, Scene
 from slam.app.rig.sources import sampler_limits
 from slam.config import FrontEnd, MatchedFilterConfig, SlamConfig, override
 from slam.frames import Detector, RadarFrame
+from slam.front_end import make_detector
 from slam.front_end.matched_filter import threshold_sigmas
 from slam.front_end.overlapping import KnownPulse, SplitTest, split_threshold
-from slam.front_end.paper import make_detector
 from slam.front_end.pulse import PulseModel
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.wire.x4 import Normalisation

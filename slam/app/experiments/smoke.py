@@ -32,9 +32,8 @@ from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, TRUTH, labe
 from slam.app.run.runner import RunRecord
 from slam.app.sweep.run import drive_in_process
 from slam.geometry import transform
-from slam.paper.clustering import Observation
-from slam.paper.pipeline import StepResult, UwbRadarSlam
-from slam.paper.trilateration import Fix
+from slam.paper.pipeline import UwbRadarSlam
+from slam.results import Fix, Observation, StepResult
 from xethru_protocol.system import StopFlag
 
 Array = NDArray[np.float64]

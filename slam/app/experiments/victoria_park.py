@@ -32,11 +32,12 @@ from slam.app.experiments import Result
 from slam.app.run.output import share_text
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, TRUTH, label
 from slam.app.sweep.bound import load_gtsam
+from slam.config import WheelNoise
 from slam.evaluation import ate_rmse_m
 from slam.geometry import Rig, compose, wrap_angle
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import RangeBearing
-from slam.robust.parameters import BackEndParameters, RelinearisationRule, WheelNoise
+from slam.robust.parameters import BackEndParameters, RelinearisationRule
 from slam.robust.state import CALIBRATION
 from xethru_protocol.system import StopFlag
 

@@ -33,9 +33,8 @@ from emulator.scene.scene import Scene, SceneError, UnknownSceneError, load_scen
 from slam.app.errors import AppError, EmulatorError, UsageError
 from slam.app.odometry.tum import NS_PER_S
 from slam.app.rig.sources import RadarLink, RigSource
-from slam.config import ConfigError, SlamConfig, load_preset
+from slam.config import ConfigError, SlamConfig, WheelNoise, load_preset
 from slam.geometry import Mount, Rig, transform
-from slam.robust.parameters import WheelNoise
 from xethru_protocol.driver.conversation import ProtocolRecord
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300

@@ -26,8 +26,8 @@ from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, Valid
 
 from slam.app.errors import AppError, naming
 from slam.app.rig.sources import RadarLink
+from slam.config import WheelNoise
 from slam.geometry import Mount, Rig
-from slam.robust.parameters import WheelNoise
 from xethru_protocol.driver.conversation import ProtocolRecord
 from xethru_protocol.driver.radar import X4M300, known_ports
 from xethru_protocol.system import read_bounded

@@ -25,7 +25,7 @@ from slam.app.records import SessionInfo
 from slam.app.run.evaluation import Summary
 from slam.app.run.runner import RunRecord
 from slam.geometry import between, compose, transform
-from slam.paper.ekf import Belief
+from slam.results import Belief
 
 TRUTH, ODOMETRY, ESTIMATE, LANDMARK = "#8a8f98", "#e08a2c", "#1f6fd0", "#c2255c"
 INK, PALE_INK, GRID = "#20242a", "#6a707a", "#eceef1"

@@ -27,11 +27,10 @@ from slam.app.run.results import RESULTS, finish, prepare_folder, saying_what_is
 from slam.app.run.runner import LinkLog, RunSource, execute
 from slam.app.session.messages import state_row
 from slam.app.session.reader import RecordedSession, open_session
-from slam.config import ConfigError, SlamConfig, without_removed_keys
+from slam.config import ConfigError, SlamConfig, WheelNoise, without_removed_keys
 from slam.frames import Detection, RadarFrame
-from slam.paper.pipeline import PoseAt, Slam, StepResult
-from slam.robust.parameters import WheelNoise
-from slam.robust.pipeline import make_slam
+from slam.pipelines import make_slam
+from slam.results import PoseAt, Slam, StepResult
 from xethru_protocol.system import StopFlag
 
 

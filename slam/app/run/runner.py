@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.frames import RadarFrame
 from slam.geometry import Rig
-from slam.paper.pipeline import Slam, StepResult
+from slam.results import Slam, StepResult
 from xethru_protocol.driver.conversation import ProtocolRecord
 
 TruthAt = Callable[[NDArray[np.int64]], NDArray[np.float64]]

@@ -40,11 +40,10 @@ from slam.app.odometry.tum import NS_PER_S
 from slam.app.rig.emulated import rig_of, true_landmarks_m, wheels_of
 from slam.app.run.evaluation import NEES_AT
 from slam.app.run.runner import RunRecord
-from slam.config import BackEnd, SlamConfig
+from slam.config import BackEnd, SlamConfig, WheelNoise
 from slam.evaluation import ate_rmse_m, nees_pose
 from slam.frames import Detection
 from slam.geometry import Mount, Rig, between, mount_at, pair_of, transform, wrap_angle, wrap_angles
-from slam.robust.parameters import WheelNoise
 from slam.robust.ranges import fix_of_pair
 from slam.robust.state import calibrated_motion, rotation
 

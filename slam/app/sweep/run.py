@@ -44,10 +44,10 @@ from slam.app.sweep.stress import CLEAN, STRESSES, Stress
 from slam.config import ConfigError, SlamConfig, override
 from slam.evaluation import LANDMARK_MATCH_M
 from slam.frames import Detection, Detector, RadarFrame
-from slam.front_end.paper import make_detector
+from slam.front_end import make_detector
 from slam.geometry import transform
-from slam.paper.pipeline import Slam
-from slam.robust.pipeline import make_slam
+from slam.pipelines import make_slam
+from slam.results import Slam
 
 # Streams of their own beside the radars' (serial numbers and purposes, below 2**51) and the
 # odometry's, 2**63.

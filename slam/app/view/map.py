@@ -38,9 +38,7 @@ from slam.app.view.rerun_recording import (
 )
 from slam.app.view.rerun_sdk import rr
 from slam.geometry import compose, transform
-from slam.paper.clustering import Observation
-from slam.paper.pipeline import StepResult
-from slam.paper.trilateration import Fix
+from slam.results import Fix, Observation, StepResult
 
 _PAPERS_FIELD_OF_VIEW_DEG = 65.0
 _PAPERS_REACH_M = 1.5

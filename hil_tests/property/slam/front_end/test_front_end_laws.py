@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hil_tests.property.slam.front_end.test_detection import BIN_LENGTH_M, N_BINS, frame, pulse
 from slam.config import DetectionConfig, FrontEnd, MatchedFilterConfig, PeakPosition, SlamConfig
 from slam.frames import Detector, RadarFrame
-from slam.front_end.paper import make_detector
+from slam.front_end import make_detector
 
 Array = NDArray[np.float64]
 

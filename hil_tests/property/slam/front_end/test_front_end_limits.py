@@ -24,9 +24,9 @@ from slam.app.experiments.limit_cells import (
 )
 from slam.config import SlamConfig, override
 from slam.frames import RadarFrame
+from slam.front_end import make_detector
 from slam.front_end.matched_filter import _MEDIAN_EFFICIENCY
 from slam.front_end.overlapping import SplitTest
-from slam.front_end.paper import make_detector
 
 Array = NDArray[np.float64]
 
@@ -68,7 +68,6 @@ def frames_of(
 def detect(
     frames: list[RadarFrame], front_end: str, *, rate: float = 1e-3, told_sigma: float = 0.0
 ) -> list[Array]:
-    """Return the detected ranges of each frame."""
     config = override(
         SlamConfig(),
         {
@@ -95,7 +94,6 @@ def by_trial(found: list[Array]) -> list[Array]:
 
 
 def share_error(share: float) -> float:
-    """Return the standard error of a share of the trials."""
     return math.sqrt(share * (1 - share) / TRIALS)
 
 

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from slam.config import SampleTime, SlamConfig, TrilaterationConfig, WindowConfig
 from slam.frames import Detection
 from slam.geometry import Mount, Rig, mount_at, paper_rig
-from slam.paper.pipeline import StepResult, UwbRadarSlam
+from slam.paper.pipeline import UwbRadarSlam
 from slam.paper.trilateration import Trilaterator
+from slam.results import StepResult
 
 Array = NDArray[np.float64]
 
@@ -34,7 +35,6 @@ def plane(pose: Array) -> tuple[complex, complex]:
 
 
 def antenna(pose: Array, mount: Mount) -> tuple[complex, complex]:
-    """Return position and boresight of a radar in the world."""
     at, heading = plane(pose)
     where = at + heading * complex(mount.x_m, mount.y_m)
     return where, heading * cmath.rect(1.0, mount.yaw_rad)

@@ -13,7 +13,8 @@ from scipy.stats import chi2
 
 from slam.config import Assignment, AssociationConfig, GateRule
 from slam.paper.association import mahalanobis_sq, nearest, one_to_one, update_map
-from slam.paper.ekf import Belief, augment, expected_observations, start
+from slam.paper.ekf import augment, expected_observations, start
+from slam.results import Belief
 
 Array = NDArray[np.float64]
 Q = np.diag([0.02**2, 0.03**2])

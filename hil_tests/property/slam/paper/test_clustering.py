@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as npst
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
-from hil_tests.unit.slam.pose_tracks import at_rest
+from hil_tests.unit.slam.simulation import at_rest
 from slam.config import (
     ClusterCount,
     ClusteringConfig,
@@ -24,9 +24,9 @@ from slam.config import (
 )
 from slam.frames import Detection
 from slam.geometry import between, compose, paper_rig, transform
-from slam.paper.clustering import NOISE, CollectedState, Observation, cluster_labels, filter_window
-from slam.paper.pipeline import StepResult, UwbRadarSlam
-from slam.paper.trilateration import Fix
+from slam.paper.clustering import NOISE, CollectedState, cluster_labels, filter_window
+from slam.paper.pipeline import UwbRadarSlam
+from slam.results import Fix, Observation, StepResult
 
 Array = NDArray[np.float64]
 PAPER = ClusteringConfig()

@@ -30,7 +30,7 @@ from slam.config import Assignment, AssociationConfig
 from slam.geometry import compose
 from slam.paper import ekf as ekf_slam
 from slam.paper.association import mahalanobis_sq, update_map
-from slam.paper.ekf import Belief
+from slam.results import Belief, landmark_slice
 
 Check = Callable[..., None]
 
@@ -62,7 +62,7 @@ def check_observation_jacobians(filter_: Filter, law: settings = thorough) -> No
         for row in range(len(belief.landmark_ids)):
             H = observation_matrix(belief, row)
             assert np.abs(H_pose[row] - H[:, :3]).max() <= 1e-10
-            assert np.abs(H_landmark[row] - H[:, ekf_slam.landmark_slice(row)]).max() <= 1e-10
+            assert np.abs(H_landmark[row] - H[:, landmark_slice(row)]).max() <= 1e-10
             assert H_pose[row, 1, 2] == -1.0
 
     jacobians()
@@ -423,7 +423,7 @@ def test_turning_the_world_turns_the_estimate_and_keeps_the_innovations(
         T = np.eye(len(b.mean))
         T[:2, :2] = rotation
         for row in range(n):
-            block = ekf_slam.landmark_slice(row)
+            block = landmark_slice(row)
             T[block, block] = rotation
         return Belief(
             mean=np.concatenate(

@@ -22,7 +22,8 @@ from hil_tests.property.trilateration_oracles import (
 from slam.config import Pairing, TrilaterationConfig
 from slam.frames import Detection
 from slam.geometry import Mount, RadarPair, Rig, paper_rig
-from slam.paper.trilateration import Fix, Trilaterator, bilaterate
+from slam.paper.trilateration import Trilaterator, bilaterate
+from slam.results import Fix
 
 Check = Callable[..., None]
 Bilaterate = Callable[[Array, Array, RadarPair, float], tuple[Array, NDArray[np.bool_]]]

@@ -25,7 +25,7 @@ from slam.evaluation import nees_pose
 from slam.geometry import compose, paper_rig
 from slam.paper import ekf as ekf_slam
 from slam.paper.association import mahalanobis_sq
-from slam.paper.ekf import Belief
+from slam.results import Belief
 from slam.robust.back_end import RobustBackEnd
 
 Array = NDArray[np.float64]

@@ -18,18 +18,16 @@ from numpy.typing import NDArray
 
 from hil_tests.property.slam.front_end.test_detection import N_BINS, frame, pulse
 from hil_tests.system.short_scene import write_short_scene
-from hil_tests.unit.slam.pose_tracks import at_rest
 from hil_tests.unit.slam.robust.range_world import LAB
-from hil_tests.unit.slam.simulation import FRAME_NS, World, integrate, simulate
+from hil_tests.unit.slam.simulation import FRAME_NS, World, at_rest, integrate, simulate
 from slam.app.sweep.run import run_in_process
-from slam.config import load_preset, override
+from slam.config import WheelNoise, load_preset, override
 from slam.evaluation import align_se2, ate_rmse_m
 from slam.frames import Detection, RadarFrame
-from slam.front_end.paper import make_detector
+from slam.front_end import make_detector
 from slam.geometry import paper_rig, transform
-from slam.paper.pipeline import PoseAt, StepResult
-from slam.robust.parameters import WheelNoise
-from slam.robust.pipeline import make_slam
+from slam.pipelines import make_slam
+from slam.results import PoseAt, StepResult
 
 Array = NDArray[np.float64]
 

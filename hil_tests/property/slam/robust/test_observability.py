@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from hil_tests.property.ekf_oracles import random_belief
 from hil_tests.property.robust_oracles import N_RADARS, random_covariance, random_state, seeds
+from slam.config import WheelNoise
 from slam.geometry import paper_rig
 from slam.paper import ekf as ekf_slam
-from slam.paper.ekf import Belief
-from slam.robust.parameters import WheelNoise
+from slam.results import Belief, landmark_slice
 from slam.robust.ranges import antennas_of, rows_of, view
 from slam.robust.state import State, SymmetricMatrix, calibrated_motion, predict, quarter_turn
 
@@ -72,7 +72,7 @@ def ekf_rows(pose: Array, landmarks: Array) -> Array:
     H = np.zeros((len(landmarks), 2, 3 + 2 * len(landmarks)))
     H[:, :, :3] = H_pose
     for row in range(len(landmarks)):
-        H[row, :, ekf_slam.landmark_slice(row)] = H_landmark[row]
+        H[row, :, landmark_slice(row)] = H_landmark[row]
     return H.reshape(2 * len(landmarks), -1)
 
 

@@ -16,6 +16,7 @@ from scipy.stats import chi2
 
 from hil_tests.property.robust_oracles import N_RADARS, random_state, seeds, values
 from hil_tests.property.trilateration_oracles import NO_RANGES
+from slam.config import WheelNoise
 from slam.geometry import paper_rig
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import (
@@ -39,7 +40,6 @@ from slam.robust.parameters import (
     MapRule,
     PointRule,
     RangeNoise,
-    WheelNoise,
 )
 from slam.robust.ranges import RangeScan, antennas_of, fix_of_pair, view
 from slam.robust.state import State, SymmetricMatrix, calibrated_motion, rotation
@@ -289,7 +289,7 @@ def test_a_point_is_matched_by_the_rule_written_out(seed: int, n: int) -> None:
         scores.append((squared + math.log(np.linalg.det(rows.S)), squared, density, row))
     scores.sort()
     _, squared, density, best = scores[0]
-    clear = len(scores) == 1 or scores[1][0] - scores[0][0] >= rule.match_lead
+    clear = len(scores) == 1 or scores[1][0] - scores[0][0] >= rule.match_margin
     wanted = squared <= rule.match_gate and density > rule.unmapped_per_m2 and clear
     assert match(state, point, rule) == (best if wanted else None)
 
@@ -318,14 +318,13 @@ def test_a_point_that_is_likelier_new_is_no_match(sigma_m: float, row: int | Non
 def test_a_point_between_two_landmarks_is_neither(apart_m: float, row: int | None) -> None:
     """(0.245 m / 0.1 m)^2 = 6 is the likelihood margin."""
     state, point = sure_point(0.1, (1.0, apart_m), (1.0, 0.0))
-    assert match(state, point, MapRule(match_lead=6.0)) == row
+    assert match(state, point, MapRule(match_margin=6.0)) == row
 
 
 # --- what is left alone ---------------------------------------------------------------------------
 
 
 def lone_landmark() -> RobustBackEnd:
-    """Return a back end that knows one landmark, ahead of the left radars."""
     back_end = RobustBackEnd(paper_rig(), BackEndParameters())
     point = BodyPoint(
         point_m=np.array([0.0, 1.0]), covariance=1e-6 * np.eye(2), by_offsets=np.zeros((2, 4))
@@ -351,7 +350,7 @@ LONE = lone_landmark()
 def test_ranges_of_nothing_known_alter_no_landmark(ranges: list[float], left: bool) -> None:
     back_end = deepcopy(LONE)
     report = back_end.update([RangeScan(radar=0 if left else 2, ranges_m=tuple(ranges))])
-    assert len(report.continued) == len(report.born) == len(report.seen_again) == 0
+    assert len(report.continued) == len(report.initialised) == len(report.seen_again) == 0
     assert np.array_equal(values(back_end.state), values(LONE.state))
     assert np.array_equal(back_end.state.P.full(), LONE.state.P.full())
 

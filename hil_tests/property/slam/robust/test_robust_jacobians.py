@@ -1,6 +1,7 @@
 """Every derivative of the robust back end against complex steps on formulas written again."""
 
 import math
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -22,18 +23,17 @@ from hil_tests.property.robust_oracles import (
     range_to,
     seeds,
     turn,
-    twin,
     values,
 )
+from slam.config import WheelNoise
 from slam.geometry import paper_rig
 from slam.robust.initialisation import (
     BodyPoint,
     RangeBearing,
-    give_birth,
+    initialise_landmark,
     point_rows,
     range_bearing_rows,
 )
-from slam.robust.parameters import WheelNoise
 from slam.robust.ranges import RangeScan, antennas_of, rows_of, view
 from slam.robust.run_log import Estimate, Problem, start_prior
 from slam.robust.smoother import measurement_residuals, motion_residuals
@@ -51,7 +51,7 @@ def test_prediction_is_the_derivative_of_the_motion(
     seed: int, heading: float, increment: Array
 ) -> None:
     state = random_state(seed, 3, heading)
-    before = twin(state)
+    before = deepcopy(state)
     rng = np.random.default_rng(seed)
     root = 0.01 * rng.standard_normal((3, 3))
     motion = calibrated_motion(increment, state.calibration, WHEELS, root @ root.T)
@@ -146,11 +146,11 @@ def test_range_and_bearing_rows_are_derivatives(seed: int, heading: float) -> No
 @given(seeds, near_a_half_turn())
 def test_a_new_landmark_is_correlated_as_its_formula_says(seed: int, heading: float) -> None:
     state = random_state(seed, 1, heading)
-    before = twin(state)
+    before = deepcopy(state)
     rng = np.random.default_rng(seed)
     b, D = rng.uniform(-1, 1, 2), rng.standard_normal((2, N_RADARS))
     C = 1e-4 * np.diag([1.0, 2.0])
-    give_birth(state, BodyPoint(point_m=b, covariance=C, by_offsets=D))
+    initialise_landmark(state, BodyPoint(point_m=b, covariance=C, by_offsets=D))
     mean = values(before).astype(np.complex128)
     born = mean[1:3] + turn(mean[0]) @ b
 

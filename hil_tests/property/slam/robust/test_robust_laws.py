@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -13,12 +14,11 @@ from hil_tests.property.robust_oracles import (
     Array,
     random_state,
     seeds,
-    twin,
 )
-from slam.robust.initialisation import BodyPoint, give_birth, update_with_point
+from slam.config import WheelNoise
+from slam.robust.initialisation import BodyPoint, initialise_landmark, update_with_point
 from slam.robust.map import apply_merge, merge_rows
 from slam.robust.matching import NOTHING, Option, cheapest
-from slam.robust.parameters import WheelNoise
 from slam.robust.ranges import Antennas, rows_of, view
 from slam.robust.state import Indices, State, SymmetricMatrix, calibrated_motion, predict
 
@@ -26,7 +26,7 @@ WHEELS = WheelNoise(walk_per_sqrt_m=0.1)
 ANTENNAS = Antennas(
     position_m=np.array([[-0.1, 0.2], [0.1, 0.2], [0.1, -0.2], [-0.1, -0.2]]),
     yaw_rad=np.array([1.0, 1.0, -1.0, -1.0]) * math.pi / 2,
-    heard=np.ones(4, dtype=bool),
+    has_frame=np.ones(4, dtype=bool),
 )
 few = settings(max_examples=30, deadline=None)
 
@@ -59,7 +59,7 @@ def test_covariance_stays_symmetric_and_positive_over_ten_thousand_operations() 
                 covariance=1e-4 * np.eye(2),
                 by_offsets=rng.standard_normal((2, N_RADARS)),
             )
-            give_birth(state, place)
+            initialise_landmark(state, place)
         elif choice < 0.98:
             state.remove(int(rng.integers(0, n)))
         elif choice < 0.985 and n > 3:
@@ -106,9 +106,9 @@ def test_a_merge_is_the_statement_that_the_difference_is_zero(seed: int) -> None
     K = P @ dense.T @ np.linalg.inv(dense @ P @ dense.T + R)
     rest = np.eye(len(P)) - K @ dense
     wanted = rest @ P @ rest.T + K @ R @ K.T
-    moved = twin(state)
+    moved = deepcopy(state)
     moved.correct(K @ residual)
-    merged = twin(state)
+    merged = deepcopy(state)
     apply_merge(merged, ((0, 2),), 1e-3)
     gone = [state.offsets.stop + 4, state.offsets.stop + 5]
     keep = np.delete(np.arange(len(P)), gone)
@@ -159,7 +159,7 @@ def test_with_a_known_heading_the_filter_is_weighted_least_squares() -> None:
             y = np.array([1.0, mark]) + 0.01 * rng.standard_normal(2)
             point = BodyPoint(point_m=y, covariance=C, by_offsets=nothing)
             if k == 0:
-                give_birth(state, point)
+                initialise_landmark(state, point)
             else:
                 update_with_point(state, mark, point)
             observe(pick(n_steps + mark) - pick(k), y, C)

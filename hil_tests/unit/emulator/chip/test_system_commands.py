@@ -21,11 +21,6 @@ def host_of(options: DeviceOptions | None = None) -> BareHost:
 
 
 @pytest.fixture
-def host() -> BareHost:
-    return host_of()
-
-
-@pytest.fixture
 def bare() -> BareHost:
     return host_of(DeviceOptions(firmware="xep"))
 

@@ -18,9 +18,9 @@ from slam.calibration.batch import (
     SingularProblemError,
     Square,
     Term,
-    WheelModel,
     minimise,
 )
+from slam.calibration.calibration import UNKNOWN_WHEELS
 
 Array = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ def some_state(seed: int) -> Array:
 
 def odometry_term(seed: int) -> OdometryTerm:
     steps = np.random.default_rng(seed).normal(0.0, 0.3, (5, 3))
-    return OdometryTerm(layout=LAYOUT, steps=steps, sigmas=WheelModel().sigmas(steps))
+    return OdometryTerm(layout=LAYOUT, steps=steps, sigmas=UNKNOWN_WHEELS.step_sigmas(steps))
 
 
 def range_term(seed: int, kernel: Kernel | None = None) -> RangeTerm:

@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.calibration.batch import WheelModel
 from slam.calibration.calibration import (
+    UNKNOWN_WHEELS,
     Calibration,
     CalibrationPriors,
     Drive,
@@ -143,7 +143,7 @@ def test_exact_ranges_and_odometry_give_the_exact_offsets() -> None:
 
 
 def test_a_scale_that_is_known_stays_and_a_turn_scale_that_is_not_is_found() -> None:
-    priors = CalibrationPriors(wheels=WheelModel(scale_sigma=1e-9, turn_scale_sigma=0.03))
+    priors = CalibrationPriors(wheels=replace(UNKNOWN_WHEELS, scale_sigma=1e-9))
     found = calibrate(drive(World(wheel_noise=1.0)), priors)
     assert abs(found.wheels[0]) < 1e-7
     assert abs(found.wheels[1]) > 1e-4

@@ -12,12 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.config import WheelNoise
 from slam.geometry import Mount, paper_rig
-from slam.robust.parameters import (
-    BackEndParameters,
-    RangeNoise,
-    WheelNoise,
-)
+from slam.robust.parameters import BackEndParameters, RangeNoise
 from slam.robust.ranges import RangeScan
 
 Array = NDArray[np.float64]

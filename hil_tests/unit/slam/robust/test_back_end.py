@@ -93,7 +93,7 @@ def test_a_doubtful_range_is_taken_for_what_it_may_be_and_weighs_less() -> None:
     run = cut(simulate(LAB, 1, sigma_m), 150)
     parameters = parameters_for(LAB, sigma_m)
     parameters = replace(
-        parameters, ranges=replace(parameters.ranges, doubt_m=2e-3, huber_sigmas=2.0)
+        parameters, ranges=replace(parameters.ranges, association_sigma_m=2e-3, huber_sigmas=2.0)
     )
     back_end = RobustBackEnd(rig, parameters)
     for increment, scans in zip(run.increments, run.scans, strict=True):
@@ -121,7 +121,7 @@ def test_a_doubtful_range_is_taken_for_what_it_may_be_and_weighs_less() -> None:
     assert in_full[0]
     assert moved_m < 0.7 * in_full[1]
     assert nis == pytest.approx(in_full[2])  # what is reported is before Huber's weight
-    assert not after(doubt_m=0.0)[0]
+    assert not after(association_sigma_m=0.0)[0]
 
 
 def test_points_with_names_make_a_map() -> None:

@@ -13,19 +13,20 @@ from hil_tests.unit.slam.robust.range_world import (
     scans_of,
     true_path,
 )
+from slam.config import WheelNoise
 from slam.geometry import paper_rig
 from slam.robust.back_end import RobustBackEnd, huber_weighted_sigmas_m
 from slam.robust.initialisation import (
     BodyPoint,
-    Leftovers,
     Tracker,
     Tracklet,
+    UnassignedRanges,
     find_tracklets,
-    give_birth,
+    initialise_landmark,
     pair_guesses,
 )
 from slam.robust.map import Existence, find_merge
-from slam.robust.parameters import MapRule, RangeNoise, TrackletRule, WheelNoise
+from slam.robust.parameters import MapRule, RangeNoise, TrackletRule
 from slam.robust.ranges import RangeScan, antennas_of
 from slam.robust.state import Array, State, SymmetricMatrix, calibrated_motion
 
@@ -35,14 +36,14 @@ RULE = TrackletRule()
 LEFT = (0, 1)
 
 
-def driven(targets: Array, offsets_m: Array, *, moving: bool = False) -> Leftovers:
+def driven(targets: Array, offsets_m: Array, *, moving: bool = False) -> UnassignedRanges:
     """Return 15 frames of 2 cm past targets on the left; moving ones go with the robot."""
     rng = np.random.default_rng(1)
-    leftovers = Leftovers(15, SIGMA_M, 0.005, 0.0015)
+    unassigned = UnassignedRanges(15, SIGMA_M, 0.005, 0.0015)
     step = calibrated_motion(np.array([0.02, 0.0, 0.0]), np.zeros(3), WheelNoise())
     mounts = np.array([(mount.x_m, mount.y_m) for mount in paper_rig().mounts])
     for k in range(15):
-        leftovers.move(step)
+        unassigned.move(step)
         body = targets - [0.0 if moving else 0.02 * k, 0.0]
         scans = [
             RangeScan(
@@ -56,25 +57,25 @@ def driven(targets: Array, offsets_m: Array, *, moving: bool = False) -> Leftove
             )
             for radar in LEFT
         ]
-        leftovers.keep(k, antennas_of(paper_rig(), scans, step), scans, set())
-    return leftovers
+        unassigned.keep(k, antennas_of(paper_rig(), scans, step), scans, set())
+    return unassigned
 
 
-def tracklets(leftovers: Leftovers, offset_sigma_m: float = 0.0) -> list[Tracklet]:
-    frames = leftovers.slots(LEFT, 15)
+def tracklets(unassigned: UnassignedRanges, offset_sigma_m: float = 0.0) -> list[Tracklet]:
+    frames = unassigned.slots(LEFT, 15)
     tracker = Tracker(NOISE, RULE, np.zeros(4), offset_sigma_m**2 * np.eye(4))
     return find_tracklets(tracker, pair_guesses(frames[0], NOISE, RULE), frames, 2, RULE)
 
 
 def test_a_tracklet_is_a_point_at_rest_and_uses_its_ranges_up() -> None:
     target = np.array([[0.15, 0.9]])
-    leftovers = driven(target, np.zeros(4))
-    (found,) = tracklets(leftovers)
+    unassigned = driven(target, np.zeros(4))
+    (found,) = tracklets(unassigned)
     miss = found.point_m - (target[0] - [0.28, 0.0])
     assert miss @ np.linalg.solve(found.covariance, miss) < 13.8
     assert len(found.members) == 30
-    assert all(not slot.unused for slots in leftovers.slots(LEFT, 15) for slot in slots)
-    assert tracklets(leftovers) == []
+    assert all(not slot.unused for slots in unassigned.slots(LEFT, 15) for slot in slots)
+    assert tracklets(unassigned) == []
 
 
 def test_what_goes_with_the_robot_is_no_tracklet() -> None:
@@ -85,10 +86,10 @@ def test_what_goes_with_the_robot_is_no_tracklet() -> None:
 
 def test_of_two_points_four_fixes_and_two_tracklets() -> None:
     targets = np.array([[0.1, 0.8], [0.25, 0.9]])
-    leftovers = driven(targets, np.zeros(4))
-    frames = leftovers.slots(LEFT, 15)
+    unassigned = driven(targets, np.zeros(4))
+    frames = unassigned.slots(LEFT, 15)
     assert len(pair_guesses(frames[0], NOISE, RULE)) > 2
-    found = sorted(tracklets(leftovers), key=lambda tracklet: float(tracklet.point_m[1]))
+    found = sorted(tracklets(unassigned), key=lambda tracklet: float(tracklet.point_m[1]))
     assert len(found) == 2
     for tracklet, target in zip(found, targets, strict=True):
         assert tracklet.point_m == pytest.approx(target - [0.28, 0.0], abs=0.03)
@@ -128,7 +129,7 @@ def mapped(places: Array, sigma_m: float = 0.02) -> tuple[State, Existence]:
         point = BodyPoint(
             point_m=place, covariance=sigma_m**2 * np.eye(2), by_offsets=np.zeros((2, 4))
         )
-        existence.hit(give_birth(state, point), 9)
+        existence.hit(initialise_landmark(state, point), 9)
     return state, existence
 
 
@@ -234,7 +235,7 @@ def test_without_a_bound_every_range_counts_in_full() -> None:
 
 def test_a_doubt_is_added_to_what_the_front_end_tells_and_to_nothing_else() -> None:
     told = RangeScan(radar=0, ranges_m=(1.0, 2.0), sigmas_m=(3e-3, 4e-3))
-    assert told.doubted(4e-3).sigmas_m == pytest.approx((5e-3, np.sqrt(32) * 1e-3))
-    assert told.doubted(0.0) is told
+    assert told.with_added_sigma(4e-3).sigmas_m == pytest.approx((5e-3, np.sqrt(32) * 1e-3))
+    assert told.with_added_sigma(0.0) is told
     untold = RangeScan(radar=0, ranges_m=(1.0,))
-    assert untold.doubted(4e-3) is untold
+    assert untold.with_added_sigma(4e-3) is untold

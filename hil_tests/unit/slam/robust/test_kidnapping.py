@@ -13,19 +13,21 @@ from hil_tests.unit.slam.robust.range_world import (
     reported,
     scans_of,
 )
+from slam.config import WheelNoise
 from slam.evaluation import nees_pose
 from slam.geometry import between, compose, paper_rig, transform
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.initialisation import BodyPoint, give_birth
-from slam.robust.kidnapping import Surprise, Trial, Whereabouts, apply_join, find_join, set_down
-from slam.robust.map import Existence
-from slam.robust.parameters import (
-    BackEndParameters,
-    MapRule,
-    RelocationRule,
-    SurpriseRule,
-    WheelNoise,
+from slam.robust.initialisation import BodyPoint, initialise_landmark
+from slam.robust.kidnapping import (
+    Evidence,
+    Localisation,
+    Surprise,
+    apply_join,
+    begin_submap,
+    find_join,
 )
+from slam.robust.map import Existence
+from slam.robust.parameters import BackEndParameters, MapRule, RelocationRule, SurpriseRule
 from slam.robust.run_log import RunLog
 from slam.robust.state import Array, State, calibrated_motion, predict
 
@@ -44,9 +46,8 @@ def mapped(places: Array) -> State:
 
 
 def see(state: State, places: Array) -> None:
-    """Give birth to places, in the body frame."""
     for place in places:
-        give_birth(
+        initialise_landmark(
             state,
             BodyPoint(point_m=place, covariance=2.5e-5 * np.eye(2), by_offsets=np.zeros((2, 4))),
         )
@@ -55,7 +56,7 @@ def see(state: State, places: Array) -> None:
 def on_an_island(places: Array, seen: Array, pose: Array, apart: Array) -> State:
     """Return a map of places, and an island begun at a pose that sees some, in truth ``apart``."""
     state = mapped(places)
-    set_down(state, pose)
+    begin_submap(state, pose)
     see(state, transform(between(apart, np.zeros(3)), seen))
     return state
 
@@ -65,7 +66,7 @@ def test_an_island_forgets_the_pose_and_nothing_else() -> None:
     state.P.add_products(np.eye(state.P.size)[0], 0.01 * np.eye(state.P.size)[0])  # heading
     before = [state.landmark_covariance(row) for row in range(len(PLACES))]
     calibration = state.P.block(np.arange(3, 6))
-    set_down(state, np.array([3.0, 1.0, 2.0]))
+    begin_submap(state, np.array([3.0, 1.0, 2.0]))
     assert np.abs(state.pose_covariance()).max() == 0.0
     assert state.pose == pytest.approx([3.0, 1.0, 2.0])
     assert np.array_equal(state.P.block(np.arange(3, 6)), calibration)
@@ -112,7 +113,7 @@ def test_two_landmarks_or_a_strange_place_tell_nothing() -> None:
 def looked(frames: int, missing: tuple[int, ...], seen: tuple[int, ...]) -> Surprise:
     surprise = Surprise(SurpriseRule())
     for pose in range(frames):
-        frame = [Trial(id_, MISSED) for id_ in missing] + [Trial(id_, SEEN) for id_ in seen]
+        frame = [Evidence(id_, MISSED) for id_ in missing] + [Evidence(id_, SEEN) for id_ in seen]
         surprise.look(frame, pose, (*missing, *seen))
     return surprise
 
@@ -127,30 +128,32 @@ def test_several_must_be_missing_and_nothing_speak_for_the_map() -> None:
 
 def test_a_robot_carried_away_from_a_map_of_which_nothing_is_left_stays_lost() -> None:
     """Else its pose, free of doubt on an island of its own, would pass for one on the map."""
-    where, log = Whereabouts(BackEndParameters()), RunLog(WheelNoise())
+    where, log = Localisation(BackEndParameters()), RunLog(WheelNoise())
     state, existence = mapped(PLACES[:2]), Existence(MapRule())
     log.add_motion(np.array([0.1, 0.0, 0.0]), 1e-6 * np.eye(3), 0.0, np.zeros(3))
-    where.look([Trial(7, MISSED)], state, log)
+    where.look([Evidence(7, MISSED)], state, log)
     while state.landmark_ids:
         state.remove(0)
-    where.set_down(state, existence, log)
+    where.begin_submap(state, existence, log)
     assert np.abs(state.pose_covariance()).max() == 0.0
     assert where.is_lost
     assert where.lost_covariance[0, 0] >= 1.0
     see(state, PLACES[:3])
-    where.look([Trial(id_, MISSED) for id_ in state.landmark_ids], state, log)
+    where.look([Evidence(id_, MISSED) for id_ in state.landmark_ids], state, log)
     for id_ in state.landmark_ids:
         existence.hit(id_, 20)
     assert where.find(state, existence, log) == ()
-    where.set_down(state, existence, log)
+    where.begin_submap(state, existence, log)
     assert where.is_lost
-    assert where.elsewhere == frozenset()
+    assert where.old_map == frozenset()
 
 
 def test_what_was_mapped_after_the_robot_was_carried_is_no_witness() -> None:
     surprise = looked(100, (), (1, 2, 3, 4))
     for pose in range(100, 140):
-        frame = [Trial(id_, MISSED) for id_ in (2, 3, 4)] + [Trial(id_, SEEN) for id_ in (8, 9)]
+        frame = [Evidence(id_, MISSED) for id_ in (2, 3, 4)] + [
+            Evidence(id_, SEEN) for id_ in (8, 9)
+        ]
         surprise.look(frame, pose, (1, 2, 3, 4) if pose < 115 else (1, 2, 3, 4, 8, 9))
     assert surprise.is_carried
     assert 100 <= surprise.first_pose <= 110
@@ -220,7 +223,7 @@ def test_where_the_island_was_begun_does_not_matter() -> None:
     after = []
     for begun in (np.zeros(3), np.array([3.0, -2.0, 2.5])):
         state = mapped(PLACES)
-        set_down(state, begun)
+        begin_submap(state, begun)
         for _ in range(5):
             step = calibrated_motion(np.array([0.1, 0.0, 0.2]), state.calibration, wheels)
             predict(state, step, wheels)

@@ -9,14 +9,14 @@ import pytest
 from numpy.typing import NDArray
 
 from slam.app.rig.emulated import scene_and_config, wheels_of
-from slam.config import RobustConfig, SlamConfig, load_preset, override
+from slam.config import RobustConfig, SlamConfig, WheelNoise, load_preset, override
 from slam.evaluation import nees_pose
 from slam.frames import Detection, RadarFrame
 from slam.geometry import between, compose, paper_rig, transform
-from slam.paper.ekf import Belief
-from slam.paper.pipeline import PoseAt, UwbRadarSlam
-from slam.robust.parameters import WheelNoise
-from slam.robust.pipeline import RobustSlam, back_end_parameters, belief_of, make_slam
+from slam.paper.pipeline import UwbRadarSlam
+from slam.pipelines import make_slam
+from slam.results import Belief, PoseAt
+from slam.robust.pipeline import RobustSlam, back_end_parameters, belief_of
 
 Array = NDArray[np.float64]
 
@@ -287,7 +287,7 @@ def test_every_key_of_the_table_reaches_the_back_end() -> None:
     assert ranges.field_of_view_rad == math.radians(50.0)
     assert (ranges.sigma_m, ranges.offset_sigma_m) == (4e-3, 0.02)
     assert ranges.detection_probability == 0.7
-    assert (ranges.doubt_m, ranges.huber_sigmas) == (3e-3, 2.5)
+    assert (ranges.association_sigma_m, ranges.huber_sigmas) == (3e-3, 2.5)
     assert ranges.clutter_per_m == pytest.approx(0.2)
     assert (ranges.min_range_m, ranges.max_range_m) == (0.2, 1.5)
     assert (told.wheels.scale_sigma, told.wheels.walk_per_sqrt_m) == (0.01, 0.15)

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from hil_tests.unit.slam.robust.test_walls import antennas, state_with_map
+from slam.config import WheelNoise
 from slam.evaluation import nees_pose
 from slam.geometry import paper_rig
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.initialisation import Leftovers
-from slam.robust.kidnapping import Surprise, Trial
+from slam.robust.initialisation import UnassignedRanges
+from slam.robust.kidnapping import Evidence, Surprise
 from slam.robust.map import arc_of, radius_of
 from slam.robust.matching import landmarks_in_view
 from slam.robust.parameters import (
@@ -20,7 +21,6 @@ from slam.robust.parameters import (
     RangeNoise,
     RoundnessRule,
     SurpriseRule,
-    WheelNoise,
 )
 from slam.robust.ranges import RangeScan, antennas_of, view
 from slam.robust.run_log import RunLog, start_prior
@@ -133,18 +133,18 @@ def test_a_radius_shortens_ranges_and_lengthens_them_back_for_the_smoother() -> 
     problem = log.problem(state, start_prior((0.1, 0.1, 0.1), (0.01,) * 4, 4))
     assert problem.ranges_m == pytest.approx([1.0, 1.07])
     assert problem.range_sigmas_m == pytest.approx([SIGMA_M, SIGMA_M])
-    state.range_doubts_m[2] = 3e-3
+    state.shape_sigmas_m[2] = 3e-3
     problem = log.problem(state, start_prior((0.1, 0.1, 0.1), (0.01,) * 4, 4))
     assert problem.range_sigmas_m == pytest.approx([SIGMA_M, math.hypot(SIGMA_M, 3e-3)])
     near = landmarks_in_view(
         state, view(state, antennas()), [0, 1], WIDE, ContinuationRule(view_margin_rad=math.pi)
     )
     assert near is not None
-    added = near.doubted(state.feature_doubts_m).prior - near.prior
+    added = near.with_added_sigma(state.feature_shape_sigmas_m).prior - near.prior
     assert added == pytest.approx(np.diag(np.where(near.rows.landmarks == 1, 9e-6, 0.0)))
     state.remove(1)
     assert state.radii_m == {}
-    assert state.range_doubts_m == {}
+    assert state.shape_sigmas_m == {}
 
 
 def test_a_radius_that_the_whole_run_contradicts_is_not_given() -> None:
@@ -160,17 +160,17 @@ def test_a_radius_that_the_whole_run_contradicts_is_not_given() -> None:
 def test_echoes_that_overlap_tell_no_radius() -> None:
     scan = RangeScan(radar=0, ranges_m=(0.5, 0.58, 0.9, 1.2), blurred_m=(1.25,))
     assert [scan.is_alone(i) for i in range(4)] == [False, False, True, False]
-    leftovers = Leftovers(3, SIGMA_M, 0.0, 0.0)
-    leftovers.keep(0, antennas_of(paper_rig(), [scan], at_rest()), [scan], {(0, 1)})
-    assert [left.alone for left in leftovers.newest().unused[0]] == [False, True, False]
+    unassigned = UnassignedRanges(3, SIGMA_M, 0.0, 0.0)
+    unassigned.keep(0, antennas_of(paper_rig(), [scan], at_rest()), [scan], {(0, 1)})
+    assert [left.alone for left in unassigned.newest().unused[0]] == [False, True, False]
 
 
 def test_one_landmark_that_is_not_seen_is_no_reason_for_suspicion() -> None:
     """A box may hide it; that two are missing is one."""
     surprise = Surprise(SurpriseRule())
     for pose in range(40):
-        surprise.look([Trial(0, 1.0), Trial(1, -0.5)], pose, (0, 1, 2))
+        surprise.look([Evidence(0, 1.0), Evidence(1, -0.5)], pose, (0, 1, 2))
     assert not surprise.is_suspicious
     for pose in range(40, 80):
-        surprise.look([Trial(0, 1.0), Trial(2, 1.0)], pose, (0, 1, 2))
+        surprise.look([Evidence(0, 1.0), Evidence(2, 1.0)], pose, (0, 1, 2))
     assert surprise.is_suspicious

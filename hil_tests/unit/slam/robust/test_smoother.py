@@ -13,12 +13,13 @@ from scipy.optimize import least_squares
 from hil_tests.property.robust_oracles import derivative
 from hil_tests.unit.slam.robust.range_world import LAB, parameters_for, simulate
 from hil_tests.unit.slam.robust.test_roundness import RODS, SIGMA_M, drive
+from slam.config import WheelNoise
 from slam.geometry import paper_rig
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import RangeBearing
-from slam.robust.parameters import RelinearisationRule, WheelNoise
+from slam.robust.parameters import RelinearisationRule
 from slam.robust.ranges import RangeScan
-from slam.robust.run_log import Condensed, Estimate, Prior, Problem, RunLog, start_prior
+from slam.robust.run_log import Condensed, Estimate, Prior, Problem, RunLog, _keep, start_prior
 from slam.robust.smoother import (
     Smoother,
     first_values,
@@ -199,15 +200,10 @@ def test_the_smoother_is_least_squares_and_its_complement_the_marginal(walk: flo
     def residuals(y: Complex) -> Complex:
         return white_residuals(problem, N_STEPS, N_STEPS + 1, n_cal, y)
 
-    oracle = least_squares(
-        lambda x: residuals(x.astype(np.complex128)).real,
-        packed(start),
-        jac=lambda x: derivative(residuals, x),
-        xtol=1e-15,
-        ftol=1e-15,
-        gtol=1e-12,
-        x_scale="jac",
-    )
+    def real(x: Array) -> Array:
+        return residuals(x.astype(np.complex128)).real
+
+    oracle = least_squares(real, packed(start), xtol=1e-15, ftol=1e-15, gtol=1e-12, x_scale="jac")
     assert np.abs(packed(solution.estimate) - oracle.x).max() <= 1e-6
     J = derivative(residuals, oracle.x)
     keep = newest(N_STEPS + 1, n_cal, len(oracle.x))
@@ -516,7 +512,7 @@ def test_a_range_beyond_the_limit_is_no_part_of_what_is_condensed() -> None:
         if is_measured:
             ranges.ranges_m[5] += 50 * SIGMA_M
         else:
-            ranges.keep([row for row in range(len(ranges.poses)) if row != 5])
+            _keep(ranges, [row for row in range(len(ranges.poses)) if row != 5])
         assert relinearise(log, state, parameters)
         assert log.n_kept < 60
         unused = start_prior((1.0,) * 3, (1.0,) * 4, len(state.feature_ids))

@@ -1,18 +1,20 @@
 """Walls, corners and round objects in the robust filter: derivatives, birth, ends."""
 
 import math
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from hil_tests.unit.slam.robust.range_world import LAB, odometry_path, reported, true_path
+from slam.config import WheelNoise
 from slam.evaluation import nees_pose
 from slam.geometry import paper_rig
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.initialisation import Leftover, Slot
+from slam.robust.initialisation import Slot, UnassignedRange
 from slam.robust.map import Law, Sightings, compare
-from slam.robust.parameters import BackEndParameters, RangeNoise, WallRule, WheelNoise
+from slam.robust.parameters import BackEndParameters, RangeNoise, WallRule
 from slam.robust.ranges import Antennas, RangeScan, antennas_of, rows_of, view
 from slam.robust.run_log import Estimate, RunLog, start_prior
 from slam.robust.smoother import measurement_residuals, prior_about, prior_cost, prior_terms
@@ -22,7 +24,7 @@ from slam.robust.walls import (
     WallCells,
     WallTracker,
     WallTracklet,
-    give_birth_to_wall,
+    initialise_wall,
     is_unresolved,
     match_wall,
     update_with_wall,
@@ -46,16 +48,6 @@ def state_with_map(seed: int = 0) -> State:
     return state
 
 
-def copy_of(state: State) -> State:
-    other = State((0.01, 0.01, 0.005), OFFSETS)
-    for name in ("heading_rad", "position_m", "calibration", "offsets_m", "landmarks_m", "walls"):
-        setattr(other, name, np.copy(getattr(state, name)))
-    other.heading_rad = state.heading_rad
-    other.landmark_ids, other.wall_ids = state.landmark_ids.copy(), state.wall_ids.copy()
-    other.next_id, other.P = state.next_id, SymmetricMatrix(state.P.full())
-    return other
-
-
 def antennas() -> Antennas:
     rest = calibrated_motion(np.zeros(3), np.zeros(3), WheelNoise())
     return antennas_of(paper_rig(), [RangeScan(radar=r, ranges_m=()) for r in range(4)], rest)
@@ -70,7 +62,7 @@ def test_range_rows_of_walls_are_derivatives_of_the_range() -> None:
     for column in range(state.P.size):
         step = np.zeros(state.P.size)
         step[column] = 1e-6
-        ahead, behind = copy_of(state), copy_of(state)
+        ahead, behind = deepcopy(state), deepcopy(state)
         ahead.correct(step)
         behind.correct(-step)
         difference = (
@@ -98,7 +90,7 @@ def test_prediction_carries_errors_of_walls_as_two_motions_do() -> None:
     state = state_with_map()
     error = 1e-6 * np.random.default_rng(1).standard_normal(state.P.size)
     state.P = SymmetricMatrix(np.outer(error, error))
-    truth = copy_of(state)
+    truth = deepcopy(state)
     truth.correct(error)
     for increment in np.array([[0.1, 0.02, 0.3], [0.2, -0.01, -0.5], [0.0, 0.0, 0.4]]):
         for each in (state, truth):
@@ -127,8 +119,8 @@ def seen_wall() -> BodyWall:
 def test_birth_of_a_wall_is_the_limit_of_an_unknown_wall_seen() -> None:
     born, seen = state_with_map(), seen_wall()
     born.remove(3)
-    other = copy_of(born)
-    wall_id = give_birth_to_wall(born, seen)
+    other = deepcopy(born)
+    wall_id = initialise_wall(born, seen)
     assert born.feature_ids[-1] == wall_id
     other.augment_wall(born.walls[-1], np.zeros((other.P.size, 2)), 1e6 * np.eye(2))
     update_with_wall(other, 1, seen)
@@ -154,7 +146,7 @@ def test_a_landmark_born_later_goes_before_the_walls() -> None:
 
 def test_walls_match_only_where_they_were_seen() -> None:
     state, seen, cells, rule = state_with_map(), seen_wall(), WallCells(0.1), WallRule()
-    wall_id = give_birth_to_wall(state, seen)
+    wall_id = initialise_wall(state, seen)
     row = state.wall_ids.index(wall_id)
     along = seen.in_map(state) @ np.array([-math.sin(1.9), math.cos(1.9)])
     cells.add(wall_id, along)
@@ -292,7 +284,7 @@ def test_four_bare_walls_hold_the_robot_and_become_no_points() -> None:
         back_end.update(scans)
     assert back_end.landmarks() == ()
     rough = dict.fromkeys(back_end.state.wall_ids, WallRule().roughness_m)
-    assert back_end.state.range_doubts_m == rough
+    assert back_end.state.shape_sigmas_m == rough
     true_d_m = {0: 3.0, 1: 3.0, 2: 1.0, 3: 1.0}
     for wall in back_end.walls():
         quarter = round(wall.phi_rad / (math.pi / 2))
@@ -357,7 +349,7 @@ def tracklet_of(shape: Array, offset_sigma_m: float) -> tuple[WallTracker, WallT
         for radar, mount in enumerate(paper_rig().mounts[:2]):
             range_m = WALL_Y_M - mount.y_m + OFFSET_M + miss
             x = mount.x_m - back * STEP_M
-            heard = [Leftover(range_m, None, SIGMA_M)]
+            heard = [UnassignedRange(range_m, None, SIGMA_M)]
             slots.append(
                 Slot(back, radar, x, mount.y_m, mount.yaw_rad, 0.0, heard, (mount.x_m, mount.y_m))
             )

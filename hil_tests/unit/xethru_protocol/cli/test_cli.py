@@ -4,7 +4,6 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +15,6 @@ from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import SensorMode, X4Setting
 
 XETHRU = [sys.executable, "-m", "xethru_protocol.cli"]
-
-
-@pytest.fixture
-def module() -> Iterator[PtyModule]:
-    with PtyModule() as module:
-        yield module
 
 
 def stopped(module: PtyModule) -> bool:

@@ -24,13 +24,10 @@ from slam.app.session.reader import open_session
 
 
 class Heard(SessionObserver):
-    """Keeps the lines that a user would see."""
-
     def __init__(self) -> None:
         self.lines: list[LogLine] = []
 
     def on_log(self, line: LogLine) -> None:
-        """Keep it."""
         self.lines.append(line)
 
 

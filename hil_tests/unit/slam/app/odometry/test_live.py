@@ -163,7 +163,6 @@ TEXT = "\n".join(LINES).encode()
 
 
 def lines_of(source: LineSource, count: int | None = None) -> list[str]:
-    """Read to the end, or until `count` lines came."""
     got: list[str] = []
     for text, arrival_ns in read_lines(source, lambda: False):
         assert arrival_ns > 0

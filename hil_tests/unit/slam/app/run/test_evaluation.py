@@ -16,10 +16,7 @@ from slam.app.run.output import summary_rows, table_text
 from slam.app.run.results import evaluate
 from slam.app.run.runner import RunRecord
 from slam.geometry import Mount, Rig
-from slam.paper.association import Association
-from slam.paper.clustering import Observation
-from slam.paper.ekf import Belief
-from slam.paper.pipeline import StepResult
+from slam.results import Association, Belief, Observation, StepResult
 
 N = 201
 PERIOD_NS = 200_000_000

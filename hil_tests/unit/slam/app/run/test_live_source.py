@@ -49,7 +49,7 @@ from slam.config import load_preset
 from slam.evaluation import ate_rmse_m
 from slam.frames import RadarFrame
 from slam.geometry import Mount
-from slam.robust.pipeline import make_slam
+from slam.pipelines import make_slam
 from xethru_protocol.driver.frames import Frame, FrameGeometry
 from xethru_protocol.system import StopFlag
 from xethru_protocol.wire.errors import Disconnected, ResponseTimeout
@@ -386,8 +386,6 @@ class Drive:
 
 @dataclass
 class Heard(SessionObserver):
-    """What an observer of a run was told."""
-
     scans: list[Scan] = field(default_factory=list)
 
     def on_scan(self, scan: Scan) -> None:

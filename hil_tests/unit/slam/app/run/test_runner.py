@@ -16,8 +16,8 @@ from slam.app.records import LogLine, Scan, SessionObserver, Snapshot
 from slam.app.run.output import Progress
 from slam.app.run.runner import LinkStates, run_slam, unknown_truth
 from slam.frames import RadarFrame
-from slam.paper.ekf import Belief
-from slam.paper.pipeline import PoseAt, StepResult, UwbRadarSlam
+from slam.paper.pipeline import UwbRadarSlam
+from slam.results import Belief, PoseAt, StepResult
 
 COUNTERS = (5, 6, 8, 11, 12)
 LAG = 2

@@ -35,11 +35,12 @@ from slam.app.sweep.bound import (
     wheel_derivatives,
     wheel_residual,
 )
+from slam.config import WheelNoise
 from slam.frames import Detection
 from slam.geometry import Mount, Rig, between, compose, mount_at, paper_rig
 from slam.paper.ekf import start
-from slam.paper.pipeline import StepResult
-from slam.robust.parameters import RelinearisationRule, WheelNoise
+from slam.results import StepResult
+from slam.robust.parameters import RelinearisationRule
 from slam.robust.run_log import Estimate, Problem, start_prior
 from slam.robust.smoother import Smoother, Solution
 

@@ -22,8 +22,7 @@ from slam.app.sweep.statistics import (
     summarise_groups,
     times_clean,
 )
-from slam.paper.ekf import Belief
-from slam.paper.pipeline import StepResult
+from slam.results import Belief, StepResult
 
 RUN = dataclasses.replace(
     run_of(make_case("lab", "paper", 0)),

@@ -17,11 +17,8 @@ from slam.app.view.panels import RerunView
 from slam.app.view.rerun_recording import count_rows
 from slam.frames import Detection
 from slam.geometry import compose, transform
-from slam.paper.clustering import Observation
 from slam.paper.ekf import start
-from slam.paper.pipeline import StepResult
-from slam.paper.trilateration import Fix
-from slam.results import UpdateReport
+from slam.results import Fix, Observation, StepResult, UpdateReport
 
 N_SCANS = 150  # more than a block, and not a multiple of it
 
@@ -303,7 +300,7 @@ def step(*, robust: bool) -> StepResult:
     observation = Observation(x_m=0.3, y_m=0.9, n_fixes=5, n_poses=5, fixes=(fix,))
     report = UpdateReport(
         continued=((0, 0, 7),),  # the first of those given: the other one was unfit
-        born=(),
+        initialised=(),
         seen_again=(),
         merged=(),
         deleted=(),
