@@ -131,10 +131,6 @@ class CombinedStream(MessageStream):
         self._profile = profile
         self._active = self._choice()
 
-    @property
-    def profile(self) -> ProfileStream:
-        return self._profile
-
     def next_due_ns(self) -> int | None:
         return self._active.next_due_ns()
 

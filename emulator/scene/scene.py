@@ -24,7 +24,7 @@ from pydantic import (
 
 from emulator.chip.chip import ModuleClock
 from emulator.scene.motion import AMPLITUDE_OF_1_M2, PersonSpec, Trajectory, carried, drive
-from emulator.scene.tables import Number, Table, load_table, shipped_names
+from emulator.scene.tables import Number, Table, load_table
 
 MIRROR_AMPLITUDE_1M = AMPLITUDE_OF_1_M2 * math.sqrt(math.pi)
 """Echo of a large perfect mirror on boresight at 1 m: 0.106, as strong as pi R**2 at R."""
@@ -367,10 +367,6 @@ def empty_room(count: int = 1) -> Scene:
             for index in range(count)
         ),
     )
-
-
-def scene_names() -> tuple[str, ...]:
-    return shipped_names("scenes")
 
 
 def load_scene(path_or_name: str | Path) -> Scene:
