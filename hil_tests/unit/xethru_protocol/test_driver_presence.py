@@ -176,7 +176,7 @@ def test_messages_that_came_are_heard_without_waiting(driver_on: DriverOn) -> No
         next(radar.presence.messages(timeout_s=0.0))
 
 
-def test_messages_nobody_asked_for_are_not_kept(driver_on: DriverOn) -> None:
+def test_messages_are_kept_only_if_they_are_asked_for(driver_on: DriverOn) -> None:
     radar, line = driver_on()
     radar.configure_raw()
     line.say(*(presence(k, PRESENCE) for k in range(9)), frame(1))

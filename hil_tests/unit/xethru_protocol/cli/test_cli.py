@@ -64,7 +64,7 @@ def test_stream_ends_cleanly_by_a_signal(
     assert stopped(module)
 
 
-def test_stream_ends_cleanly_when_nobody_reads_it(module: PtyModule) -> None:
+def test_stream_ends_cleanly_when_its_reader_leaves(module: PtyModule) -> None:
     command = [*XETHRU, "stream", "--port", module.path]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout is not None

@@ -54,7 +54,7 @@ def test_output_that_takes_nothing(redirection: str, code: int, out: str, err: s
     assert (result.returncode, result.stdout, result.stderr) == (code, out, err)
 
 
-def test_errors_that_nobody_can_see_are_still_errors(tmp_path: Path) -> None:
+def test_errors_that_cannot_be_printed_are_still_errors(tmp_path: Path) -> None:
     for redirection in ("2>&-", "2>/dev/full"):
         result = shell(f"{XETHRU} ping --port {tmp_path}/none {redirection}")
         assert (result.returncode, result.stdout, result.stderr) == (1, "", "")
@@ -170,7 +170,7 @@ def test_the_cause_comes_first_and_in_one_line(
     assert capsys.readouterr().err == ""
 
 
-def test_of_a_port_that_went_only_that_is_said(
+def test_of_a_vanished_port_only_that_is_reported(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(Disconnected, match=r"^unplugged$"), opened(Driver(), monkeypatch):

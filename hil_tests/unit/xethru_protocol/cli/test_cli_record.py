@@ -61,7 +61,7 @@ def test_duration_ends_it(
     assert b"first try" in (out / "xethru_recording_meta.dat").read_bytes()
 
 
-def test_a_recording_is_not_overwritten_unless_told(
+def test_a_recording_is_overwritten_only_with_force(
     module: PtyModule, tmp_path: Path, capsys: Capture
 ) -> None:
     out, wire = tmp_path / "recording", tmp_path / "port.xtwire"

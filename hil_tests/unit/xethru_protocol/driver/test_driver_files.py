@@ -37,7 +37,7 @@ def test_file_is_written_in_chunks_and_read_back(driver_on: DriverOn) -> None:
     ]
 
 
-def test_progress_is_told_at_the_start_and_after_each_chunk(driver_on: DriverOn) -> None:
+def test_progress_is_reported_at_the_start_and_after_each_chunk(driver_on: DriverOn) -> None:
     radar, _ = driver_on(EmulatedModule())
     told: list[tuple[int, int]] = []
     radar.files.write(USER, 1, CONTENT, on_progress=lambda *at: told.append(at))

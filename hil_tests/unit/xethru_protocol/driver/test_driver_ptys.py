@@ -115,7 +115,7 @@ async def test_frames_are_read_while_another_task_asks(machine: PtyMachine) -> N
 
 
 @in_loop
-async def test_waiting_task_can_be_cancelled_and_stops_nobody_else(machine: PtyMachine) -> None:
+async def test_waiting_task_can_be_cancelled_and_stops_no_other(machine: PtyMachine) -> None:
     async with AsyncX4M300.open(machine.path("home"), clock=patient_ns) as radar:
         waiting = asyncio.create_task(radar.read_frame(60.0))
         await asyncio.sleep(0.02)
@@ -191,7 +191,7 @@ async def test_closing_wakes_the_task_that_reads(machine: PtyMachine) -> None:
 
 
 @in_loop
-async def test_command_that_was_cancelled_leaves_its_answer_to_nobody(machine: PtyMachine) -> None:
+async def test_answer_to_a_cancelled_command_is_dropped(machine: PtyMachine) -> None:
     async with AsyncX4M300.open(machine.path("home"), clock=patient_ns) as radar:
         asking = asyncio.create_task(radar.info())
         await asyncio.sleep(0)

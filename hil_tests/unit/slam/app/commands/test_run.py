@@ -136,4 +136,4 @@ def test_a_unix_clock_shows_the_seconds_since_1970(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(time, "time_ns", lambda: 1_700_000_100_000_000_007)
     clock = parse_clock("unix", parse_source("-"))
     assert clock is not None
-    assert clock.session_ns(105_000_000_000) == 1_700_000_105_000_000_007
+    assert clock.nominal_ns(105_000_000_000) == 1_700_000_105_000_000_007
