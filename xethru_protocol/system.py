@@ -128,7 +128,6 @@ class StopFlag:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Put the previous handlers back."""
         for which, handler in self._previous.items():
             signal.signal(which, handler)
 
@@ -155,7 +154,6 @@ class StopFlag:
             end()
 
     def detach(self) -> None:
-        """Call nothing at requests any more."""
         self._end = None
 
     def request(self) -> None:

@@ -88,7 +88,6 @@ class SerialTransport:
         self._writable.register(self._fd, select.POLLOUT)
 
     def read(self, timeout_s: float) -> bytes:
-        """See `Transport.read`."""
         try:
             # A line under load has data already, and one call is faster than two.
             data = self._take()
@@ -111,7 +110,6 @@ class SerialTransport:
             return None
 
     def write(self, data: bytes) -> None:
-        """See `Transport.write`."""
         deadline = time.monotonic() + _WRITE_TIMEOUT_S
         rest = memoryview(data)
         while rest:
@@ -154,7 +152,6 @@ class SerialTransport:
             raise Disconnected(f"{self.name} cannot be set to {baudrate} baud: {error}") from error
 
     def close(self) -> None:
-        """See `Transport.close`."""
         self._fd = -1
         try:
             self._port.close()
@@ -169,7 +166,7 @@ class SerialTransport:
 
 
 def capacity_bytes_per_s(line: object) -> float:
-    """Return what a line says that it carries at most; infinite if it says nothing."""
+    """Return the highest rate of a line; infinite if it has no known limit."""
     return float(getattr(line, "bytes_per_s", math.inf))
 
 
@@ -220,7 +217,7 @@ def _why(path: str, error: Exception) -> str:
     if number in reasons:
         return reasons[number]
     text = str(error)
-    if "exclusively lock" in text:  # pyserial tells this one by its text only
+    if "exclusively lock" in text:  # pyserial marks this one by its text only
         return reasons[errno.EAGAIN]
     if "Could not configure port" in text:
         return reasons[errno.ENOTTY]
@@ -260,20 +257,16 @@ class AsyncSerialTransport:
 
     @property
     def name(self) -> str:
-        """See `AsyncTransport.name`."""
         return self._port.name
 
     @property
     def bytes_per_s(self) -> float:
-        """See `SerialTransport.bytes_per_s`."""
         return self._port.bytes_per_s
 
     def set_baudrate(self, baudrate: int) -> None:
-        """See `SerialTransport.set_baudrate`."""
         self._port.set_baudrate(baudrate)
 
     async def read(self, timeout_s: float) -> bytes:
-        """See `AsyncTransport.read`."""
         loop = asyncio.get_running_loop()
         if loop.time() > self._turn_ends_s:  # a line that never pauses: now the other tasks
             await asyncio.sleep(0)  # before reading: a task cancelled here must lose no bytes
@@ -286,7 +279,6 @@ class AsyncSerialTransport:
         return self._port.read(0.0) if ready else b""
 
     async def write(self, data: bytes) -> None:
-        """See `AsyncTransport.write`."""
         loop = asyncio.get_running_loop()
         rest = memoryview(data)
         deadline_s = loop.time() + _WRITE_TIMEOUT_S
@@ -296,7 +288,6 @@ class AsyncSerialTransport:
                 raise Disconnected(f"{self.name} takes no data any more; is the module hanging?")
 
     def close(self) -> None:
-        """See `AsyncTransport.close`."""
         for waiting in tuple(self._waiting):
             waiting.unwatch()
             if not waiting.ready.done():
@@ -370,7 +361,7 @@ def find_ports() -> tuple[PortInfo, ...]:
 
 
 def run_directory() -> Path:
-    """Folder in which running emulators leave word; it may not exist."""
+    """Folder in which running emulators are registered; it may not exist."""
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     if runtime and Path(runtime).is_dir():
         return Path(runtime) / "xethru"
@@ -396,7 +387,7 @@ def _emulated_ports(folder: Path) -> Iterator[PortInfo]:
                 (str(one["path"]), str(one["name"]), one["serial"]) for one in word["devices"]
             ]
         except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
-            continue  # not an emulator's word, or one that is just being written
+            continue  # not an emulator's entry, or one that is being written
         for path, name, serial_number in devices:
             if os.path.exists(path):  # False, too, for what can be no path
                 yield PortInfo(

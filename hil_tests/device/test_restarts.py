@@ -65,7 +65,7 @@ def test_the_driver_goes_on_after_an_unplug(
 
 
 @pytest.mark.requires("unplug")
-def test_an_unplugged_module_is_said_to_be_gone(radar: X4M300, radar_place: RadarUnderTest) -> None:
+def test_an_unplugged_module_is_disconnected(radar: X4M300, radar_place: RadarUnderTest) -> None:
     radar.configure_raw(SHORT)
     radar.start(17.0)
     radar.read_frame()

@@ -178,10 +178,7 @@ def _keep(item: pytest.Item, findings: Findings, report: pytest.TestReport) -> N
         "outcome": report.outcome,
         "repeat": "pytest "
         + " ".join(
-            [
-                f"'{item.nodeid}'",
-                *(f"--radar '{radar.spec.text}'" for radar in findings.radars),
-            ]
+            [f"'{item.nodeid}'", *(f"--radar '{radar.spec.text}'" for radar in findings.radars)]
         ),
     }
     try:

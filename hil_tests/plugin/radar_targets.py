@@ -177,8 +177,7 @@ class InProcessTarget(RadarTarget):
             f"emulated in this process, virtual time, {spec.target or 'an empty room'}",
         )
         self._scene = _scene(spec)
-        names = [radar.name for radar in self._scene.radars]
-        self._index = _index_of(spec, names)
+        self._index = _index_of(spec, [radar.name for radar in self._scene.radars])
         self.begin_test()
 
     @property
@@ -268,9 +267,7 @@ class PortTarget(RadarTarget):
     """A module at a port of this machine, named or found by its serial number."""
 
     def __init__(self, spec: RadarSpec) -> None:
-        path = spec.target
-        if spec.kind is Kind.SERIAL_NUMBER:
-            path = _port_of(spec.target)
+        path = _port_of(spec.target) if spec.kind is Kind.SERIAL_NUMBER else spec.target
         super().__init__(spec, frozenset({"settings", "profiles", "files"}), f"module at {path}")
         self._path = path
 

@@ -32,8 +32,6 @@ class Settings:
 
 
 class ModuleModel:
-    """One module."""
-
     def __init__(self) -> None:
         self.mode = RUN
         self.loaded = True

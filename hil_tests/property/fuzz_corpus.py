@@ -71,7 +71,6 @@ STREAMS: dict[str, bytes] = {
 
 
 def corpus() -> list[Path]:
-    """Return the committed files, sorted."""
     return sorted(FOLDER.glob("*.bin"))
 
 

@@ -31,7 +31,6 @@ def messages(kinds: type[Message] | None = None) -> st.SearchStrategy[Any]:
 
 @st.composite
 def of_type(draw: st.DrawFn, cls: type[Message]) -> Any:  # noqa: ANN401 - any row
-    """Draw a message of one type."""
     row = ROWS[cls]
     sizes = {name: draw(st.integers(0, 9)) for name in sorted(row.wire_only)}
     fields: dict[str, Any] = {}

@@ -121,20 +121,6 @@ def random_state(seed: int, n_landmarks: int, heading_rad: float) -> State:
     return state
 
 
-def twin(state: State) -> State:
-    """Return an independent copy."""
-    copy = State((0.0, 0.0, 0.0), (0.0,) * len(state.offsets_m))
-    copy.heading_rad = state.heading_rad
-    copy.position_m = state.position_m.copy()
-    copy.calibration = state.calibration.copy()
-    copy.offsets_m = state.offsets_m.copy()
-    copy.landmarks_m = state.landmarks_m.copy()
-    copy.landmark_ids = list(state.landmark_ids)
-    copy.next_id = state.next_id
-    copy.P = SymmetricMatrix(state.P.full())
-    return copy
-
-
 def near_a_half_turn() -> st.SearchStrategy[float]:
     """Return headings, those around +-pi often."""
     return st.one_of(

@@ -25,7 +25,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
     except StopRequestedError as stopped:
         return stopped.exit_code
-    except BrokenPipeError:  # whoever read our output has enough
+    except BrokenPipeError:  # the reader of our output has ended
         return 0
 
 

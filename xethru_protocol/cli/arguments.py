@@ -94,7 +94,6 @@ def _add_command(
 
 
 def _add_port(parser: argparse.ArgumentParser) -> None:
-    """Add ``--port`` and ``--baudrate``."""
     parser.add_argument(
         "--port", type=not_empty, required=True, help="serial port, for example /dev/ttyACM0"
     )

@@ -16,8 +16,8 @@ from xethru_protocol.cli.output import (
     print_json,
     print_line,
     print_text,
+    print_warnings,
     rewriting,
-    say_warnings,
     warn,
 )
 from xethru_protocol.driver.frames import Frame
@@ -104,7 +104,7 @@ def stream(arguments: Namespace) -> int:
     with module_at(arguments.port, arguments.baudrate) as radar:
         radar.configure_raw(config)
         rate = radar.start(arguments.fps)
-        say_warnings(radar)
+        print_warnings(radar)
         as_json = arguments.json or arguments.samples or not is_terminal(sys.stdout)
         live = None if as_json else _Live(radar)
         try:
@@ -145,7 +145,6 @@ class _Live:
         self._began_ns = 0  # arrival of the first
 
     def show(self, frame: Frame) -> None:
-        """Count a frame, and say so a few times a second."""
         if self._newest is None:
             self._began_ns = time.monotonic_ns()
         self._frames += 1
@@ -156,7 +155,6 @@ class _Live:
             self._write(frame, now_ns)
 
     def finish(self) -> None:
-        """Bring the line up to date and leave it."""
         if self._newest is not None:
             self._write(self._newest, time.monotonic_ns())
         warn("")

@@ -46,14 +46,14 @@ def print_json(value: dict[str, Any]) -> None:
 
 
 def print_line(text: str) -> None:
-    """Write a result line, at once: whoever reads a pipe gets each as it comes.
+    """Write a result line at once, so that the reader of a pipe gets it immediately.
 
     Raises
     ------
     OutputError
         If it cannot be written.
     BrokenPipeError
-        If whoever read it has left.
+        If its reader has ended.
     """
     print_text(text + "\n")
 
@@ -75,12 +75,11 @@ def print_text(text: str) -> None:
 
 
 def warn(text: str) -> None:
-    """Write a line for people."""
     show(text + "\n")
 
 
 def show(text: str) -> None:
-    """Write something for people; that nobody can see it is no reason to fail."""
+    """Write a text to standard error; a closed one is no failure."""
     if sys.stderr is None:
         return
     try:
@@ -91,7 +90,7 @@ def show(text: str) -> None:
 
 
 def is_terminal(stream: TextIO | None) -> bool:
-    """Whether people see a stream as it comes; a closed one nobody sees."""
+    """Whether a stream is a terminal; a closed one is not."""
     return stream is not None and stream.isatty()
 
 
@@ -138,7 +137,6 @@ class Progress:
         self._is_open = False  # a line is there that ends in no line end
 
     def show(self, state: Callable[[], str]) -> None:
-        """Show ``state()`` if it is time to."""
         now_s = self._clock()
         if now_s - self._shown_s < (_REWRITE_S if self._rewrites else _LINE_S):
             return
@@ -160,7 +158,7 @@ def rewriting(line: str, terminal: TextIO) -> str:
     """Text that replaces the line of a terminal, cut to fit: a longer one would scroll."""
     try:
         columns = os.get_terminal_size(terminal.fileno()).columns
-    except (OSError, ValueError):  # it does not tell
+    except (OSError, ValueError):  # unknown
         columns = 0
     return f"\r{line[: columns - 1] if columns else line}\x1b[K"
 
@@ -192,7 +190,7 @@ _MOST = 10  # lines; a damaged text file has as many faults as lines
 
 
 def warn_of(command: str, faults: Sequence[RecordingFault]) -> None:
-    """Say the first faults one by one, and how many more there are."""
+    """Print the first faults one by one, and the number of the others."""
     for fault in faults[:_MOST]:
         warn(
             f"xethru {command}: {one_line(fault.file)}: {one_line(fault.reason)} "
@@ -210,7 +208,7 @@ class CommandFailed(XeThruError):  # noqa: N818 - reads as the event it is
 def module_at(port: str, baudrate: int) -> Iterator[X4M300]:
     """Open a module, and close it however the block ends.
 
-    What could not be undone at the end is said in one line with the cause of the end; after a
+    A failure to stop the module is part of the error that ended the block; after a
     good end, or a signal, it is a warning.
 
     Raises
@@ -228,7 +226,7 @@ def module_at(port: str, baudrate: int) -> Iterator[X4M300]:
                 yield radar
             finally:
                 losses = _losses(radar)  # what is skipped to stop the module is no loss
-                say_warnings(radar)
+                print_warnings(radar)
     except Disconnected:  # that it could not be stopped goes without saying
         raise
     except XeThruError as error:
@@ -236,13 +234,13 @@ def module_at(port: str, baudrate: int) -> Iterator[X4M300]:
             raise CommandFailed(f"{error} (and it could not be stopped)") from error
         raise
     except BaseException:
-        _say_end(radar, losses)
+        _print_end(radar, losses)
         raise
-    _say_end(radar, losses)
+    _print_end(radar, losses)
 
 
-def say_warnings(radar: X4M300) -> None:
-    """Tell people what the driver warns of, once."""
+def print_warnings(radar: X4M300) -> None:
+    """Print the driver's warnings, each once."""
     for text in radar.warnings:
         warn(f"xethru: {one_line(text)}")
     radar.warnings.clear()
@@ -257,7 +255,7 @@ def _losses(radar: X4M300) -> str:
     )
 
 
-def _say_end(radar: X4M300, losses: str) -> None:
-    say_warnings(radar)
+def _print_end(radar: X4M300, losses: str) -> None:
+    print_warnings(radar)
     if losses:
         warn(f"xethru: {losses}")

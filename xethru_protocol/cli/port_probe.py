@@ -143,7 +143,6 @@ class PortUser:
     name: str
 
     def __str__(self) -> str:
-        """Name and process id, for messages."""
         return f"{self.name!r} (pid {self.pid})"
 
 
@@ -289,7 +288,6 @@ class PortProbe:
         self._transport: Transport | None = None
 
     def close(self) -> None:
-        """Release the port, if it was opened."""
         if self._transport is not None:
             self._transport.close()
 
@@ -302,17 +300,15 @@ class PortProbe:
 
     @property
     def is_stale_link(self) -> bool:
-        """Whether the path is a link to something that is gone."""
         return os.path.islink(self.path) and not os.path.exists(self.path)
 
     @property
     def exists(self) -> bool:
-        """Whether there is anything of that name."""
         return os.path.exists(self.path)
 
     @property
     def is_serial_port(self) -> bool:
-        """Whether it is a device, and, where the system tells (Linux), one of a serial driver."""
+        """Whether it is a device, and of a serial driver where the system lists them (Linux)."""
         status = os.stat(self.path)
         if not stat.S_ISCHR(status.st_mode):
             return False
@@ -324,12 +320,10 @@ class PortProbe:
 
     @property
     def may_be_opened(self) -> bool:
-        """Whether this user may read and write it."""
         return os.access(self.path, os.R_OK | os.W_OK)
 
     @property
     def group(self) -> str:
-        """Group the device belongs to."""
         number = os.stat(self.path).st_gid
         try:
             return grp.getgrgid(number).gr_name
@@ -343,7 +337,6 @@ class PortProbe:
 
     @property
     def user(self) -> str:
-        """Name of this user."""
         try:
             return getpass.getuser()
         except (KeyError, OSError):
@@ -351,14 +344,13 @@ class PortProbe:
 
     @cached_property
     def users(self) -> tuple[PortUser, ...]:
-        """Programs that have the port open."""
         return port_users(self.path)
 
     # --- having opened it -----------------------------------------------------------------------
 
     @cached_property
     def opens(self) -> bool:
-        """Open the port; if that fails, `refusal` says why."""
+        """Open the port; if that fails, `refusal` holds the reason."""
         try:
             self._transport = SerialTransport(self.path)
         except PortUnavailable as error:
@@ -385,13 +377,11 @@ class PortProbe:
 
     @cached_property
     def module(self) -> X4M300:
-        """The driver of a module that answers."""
         assert self._transport is not None, "the checks open the port first"
         return X4M300(self._transport)
 
     @cached_property
     def info(self) -> ModuleInfo:
-        """What the module reports about itself."""
         return self.module.info()
 
     @property

@@ -24,7 +24,7 @@ from xethru_protocol.cli.output import (
     one_line,
     print_json,
     print_line,
-    say_warnings,
+    print_warnings,
     warn,
 )
 from xethru_protocol.driver.link import RawConfig
@@ -153,7 +153,7 @@ class RecordingMode(Protocol):
 
     @property
     def profile_id(self) -> int | None:
-        """Profile that runs then; None if that is none, or not known."""
+        """Profile that runs then; None if there is none, or it is not known."""
 
     def prepare(self, radar: X4M300) -> None:
         """Bring the module to where it sends nothing yet; what comes meanwhile is old."""
@@ -174,15 +174,12 @@ class RawFrames:
     profile_id: int | None = None
 
     def prepare(self, radar: X4M300) -> None:
-        """Configure the chip."""
         radar.configure_raw(self.config)
 
     def start(self, radar: X4M300) -> float:
-        """Start frames."""
         return max(2.0, 3.0 / radar.start(self.fps))
 
     def wait(self, radar: X4M300, timeout_s: float) -> None:
-        """Take a frame."""
         _wait_for_frame(radar, timeout_s)
 
 
@@ -193,11 +190,9 @@ class Presence:
     profile_id: int | None = ProfileId.XTS_ID_APP_PRESENCE_2
 
     def prepare(self, radar: X4M300) -> None:
-        """Load the profile."""
         radar.presence.load()
 
     def start(self, radar: X4M300) -> float:
-        """Run it."""
         radar.presence.run()
         return 10.0
 
@@ -220,7 +215,6 @@ class Listen:
         """Send nothing."""
 
     def start(self, radar: X4M300) -> float:
-        """Wait for ever."""
         return float("inf")
 
     def wait(self, radar: X4M300, timeout_s: float) -> None:
@@ -265,7 +259,6 @@ class Targets:
 
     @property
     def text(self) -> str:
-        """Both names, for people."""
         return " and ".join(one_line(str(path)) for path in self.paths)
 
     @property
@@ -283,12 +276,12 @@ class Targets:
 
 
 class Recorder:
-    """Writes down what a driver hears.
+    """Writes what a driver receives to files.
 
     Files are made, and older ones removed, only by `open`: a module that does not answer must
-    cost nobody an older recording. Bytes that come before that are kept until then.
+    not cost an older recording. Bytes that come before that are kept until then.
 
-    An error of a file is kept, not raised: whoever calls is in the middle of receiving.
+    An error of a file is kept, not raised: the caller is in the middle of receiving.
 
     Parameters
     ----------
@@ -319,7 +312,6 @@ class Recorder:
         self._wire: WireCapture | None = None
 
     def __enter__(self) -> Self:
-        """Return the recorder itself."""
         return self
 
     def __exit__(
@@ -360,8 +352,8 @@ class Recorder:
         if targets.wire is not None:
             self._wire = WireCapture(targets.wire, {"port": targets.port})
         early, self._early = self._early or [], None
-        for heard in early:
-            self.take_bytes(*heard)
+        for received in early:
+            self.take_bytes(*received)
 
     def listen_to(self, radar: X4M300) -> None:
         """Take the module's messages from now on; the time of the recording begins."""
@@ -370,7 +362,7 @@ class Recorder:
         radar.listener = self.take
 
     def stop_listening(self, radar: X4M300) -> None:
-        """Take nothing more; what the module says while it is stopped counts for nothing."""
+        """Take nothing more; what the module sends while it is stopped is not recorded."""
         radar.listener = None
         self._statistics = deepcopy(radar.statistics)
 
@@ -392,7 +384,6 @@ class Recorder:
             self.fail(error)
 
     def take_bytes(self, direction: Literal["rx", "tx"], data: bytes, t_ns: int) -> None:
-        """Write bytes of the line."""
         if self._early is not None and self._targets.wire is not None:
             self._early.append((direction, bytes(data), t_ns))
         if self._wire is None or self.failure is not None:
@@ -411,16 +402,13 @@ class Recorder:
 
     @property
     def elapsed_s(self) -> float:
-        """Time since the recording began."""
         return (time.monotonic_ns() - self._began_ns) * 1e-9
 
     @property
     def silent_s(self) -> float:
-        """Time since the newest message."""
         return (time.monotonic_ns() - self._newest_ns) * 1e-9
 
     def numbers(self) -> str:
-        """Say what was recorded so far, for people."""
         span_s = (self._newest_ns - self._began_ns) * 1e-9
         rate = f", {self.messages / span_s:.1f}/s" if span_s > 0 else ""
         return (
@@ -429,7 +417,6 @@ class Recorder:
         )
 
     def summary(self) -> dict[str, Any]:
-        """Say what was recorded, as JSON."""
         directory, wire = self._targets.directory, self._targets.wire
         return {
             "directory": None if directory is None else str(directory),
@@ -470,7 +457,7 @@ def record(arguments: Namespace) -> int:
             with module_at(arguments.port, arguments.baudrate) as radar:
                 radar.raw_listener = recorder.take_bytes
                 mode.prepare(radar)
-                say_warnings(radar)
+                print_warnings(radar)
                 recorder.open(replace=replace)
                 with stop:
                     _record_from(radar, recorder, mode, arguments.duration, stop)
@@ -503,7 +490,7 @@ def _record_from(
     recorder.listen_to(radar)
     try:
         silence_s = mode.start(radar)
-        say_warnings(radar)
+        print_warnings(radar)
         while not (stop.requested or recorder.is_enough):
             if duration_s is not None and recorder.elapsed_s >= duration_s:
                 if not recorder.messages:
@@ -515,7 +502,7 @@ def _record_from(
                     f"the module sent nothing to record for {silence_s:g} s; {likely}"
                 )
             left_s = _GLANCE_S if duration_s is None else duration_s - recorder.elapsed_s
-            mode.wait(radar, min(_GLANCE_S, left_s))  # the recorder hears what comes
+            mode.wait(radar, min(_GLANCE_S, left_s))  # the recorder gets what comes
             progress.show(recorder.numbers)
     finally:
         recorder.stop_listening(radar)

@@ -50,7 +50,7 @@ _CHUNK_BYTES = 65536
 
 
 class DecodeError(XeThruError):
-    """The input cannot be read as what it was said to be."""
+    """The input is not of the format that was named."""
 
 
 def decode(arguments: Namespace) -> int:
@@ -81,7 +81,7 @@ def decode(arguments: Namespace) -> int:
 def found_in(
     chunks: Iterable[bytes], sender: str, statistics: LinkStatistics
 ) -> Iterator[Packet | FramingFault]:
-    """Packets and faults of a stream that comes in chunks, each as soon as it can be told."""
+    """Packets and faults of a stream that comes in chunks, each as soon as it is complete."""
     direction = Direction.FROM_HOST if sender == "host" else Direction.FROM_MODULE
     reader = PacketReader(direction, statistics)
     for chunk in chunks:

@@ -73,16 +73,13 @@ class AsyncX4M300(RadarState):
         sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
     ) -> None:
         super().__init__(
-            Link(
-                transport.name,
-                clock=clock,
-                observer=observer,
-                queue_frames=queue_frames,
-                reconnect_s=reconnect_s,
-                candidates=candidates,
-            )
+            transport,
+            clock=clock,
+            observer=observer,
+            queue_frames=queue_frames,
+            reconnect_s=reconnect_s,
+            candidates=candidates,
         )
-        self._link.bytes_per_s = capacity_bytes_per_s(transport)
         self._transport = transport
         self._open_port = open_port
         self._sleep = sleep

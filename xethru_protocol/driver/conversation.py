@@ -2,7 +2,7 @@
 
 The module answers commands in order and without sequence numbers, and sends frames and SYSTEM
 messages whenever it likes (Protocol reference 3). What arrives is sorted at once: answers go to
-the one outstanding request, everything else to whoever wants the stream, faults are counted.
+the one outstanding request, all else to the reader of the stream; faults are counted.
 """
 
 from collections import deque
@@ -69,7 +69,7 @@ class _Request:
 
 
 class Conversation:
-    """What was said to one module and by it.
+    """Commands to one module and what comes from it.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ class Conversation:
     clock
         Monotonic time [ns].
     observer
-        Called with every command, answer, SYSTEM message, fault and warning; None: nobody.
+        Called with every command, answer, SYSTEM message, fault and warning; may be None.
     take_data
         Called with every message that is no answer, and the time its last byte was read [ns].
 
@@ -159,7 +159,7 @@ class Conversation:
         else:
             self._answer_owed = True  # also if this is left by an interrupt
         if self._observer is not None:
-            self.tell("tx", summary(command))
+            self.report("tx", summary(command))
         return data
 
     def answer(self) -> Response | None:
@@ -194,7 +194,7 @@ class Conversation:
         return found
 
     def give_up(self) -> None:
-        """Ask for nothing any more; the answer may still come and belongs to nobody then."""
+        """Drop the outstanding request; its answer may still come and is dropped then."""
         self._request = None
 
     def wait_s(self) -> float:
@@ -220,10 +220,10 @@ class Conversation:
         return None
 
     def _find_pong(self, request: _Request) -> Response | None:
-        """Return the last PONG that is owed: one that was late says nothing about now.
+        """Return the last PONG that is due: a late one describes an earlier state.
 
-        PONGs do not echo the seed. So the PONGs owed are counted, and one is taken for the last
-        if no other follows soon, since a module that was off owes nothing for its time off.
+        PONGs do not echo the seed. So the PONGs due are counted, and one is taken for the last
+        if no other follows soon, since a module that was off does not answer PINGs of that time.
         """
         while self._answers:
             answer = self._answers.popleft()
@@ -238,10 +238,9 @@ class Conversation:
         )
         return request.pong if last else None
 
-    # --- hearing --------------------------------------------------------------------------------
+    # --- receiving --------------------------------------------------------------------------------
 
     def receive(self, data: bytes, arrival_ns: int) -> None:
-        """Sort what came."""
         connection = self._connection
         try:
             connection.receive_data(data)
@@ -251,7 +250,7 @@ class Conversation:
                 elif isinstance(event, FramingFault) and not self._winding_down:
                     self.fault_count += 1
                     self._damaged_since = True
-                    self.tell("fault", f"{event.kind.value} at byte {event.offset}")
+                    self.report("fault", f"{event.kind.value} at byte {event.offset}")
         except Exception:  # of a listener or an observer
             raise
         except BaseException:  # an interrupt, perhaps while the receiver moved its bytes
@@ -268,7 +267,7 @@ class Conversation:
         if self._is_answer(message):
             self._sign_of_life()
             if self._request is None:
-                self.stray_count += 1  # not kept: a sick module may never stop sending them
+                self.stray_count += 1  # not kept: a faulty module may never stop sending them
             else:
                 self._answers.append(message)
             if isinstance(message, Pong):
@@ -278,7 +277,7 @@ class Conversation:
         else:
             self._take_data(message, arrival_ns)
         if self._observer is not None and not _is_bulk(message):
-            self.tell("rx", summary(message))
+            self.report("rx", summary(message))
 
     def _is_answer(self, message: Response) -> bool:
         # some firmware answers with a message that others send of their own accord
@@ -297,7 +296,7 @@ class Conversation:
     # --- the line -------------------------------------------------------------------------------
 
     def new_line(self, name: str) -> None:
-        """Begin anew on a line that was just opened: nothing is owed and nothing half-read."""
+        """Begin anew on a line that was just opened: no answer is due and no packet half-read."""
         self.name = name
         self.statistics.junk_bytes += self._connection.buffered  # the rest of them never came
         self._connection = Connection(Role.HOST, self.statistics)
@@ -317,7 +316,7 @@ class Conversation:
         self._connection = Connection(Role.HOST)
         self._answers.clear()
 
-    # --- telling --------------------------------------------------------------------------------
+    # --- reporting --------------------------------------------------------------------------------
 
     def deadline_ns(self, timeout_s: float) -> int:
         """Time of the clock [ns] at which a timeout is over; an infinite one takes 30 years."""
@@ -332,7 +331,7 @@ class Conversation:
         """Error for something that did not come, with the likeliest reason and remedy.
 
         Judged by what came since the last frame or answer: what was before that explains nothing.
-        ``likely`` is said when nothing came at all.
+        ``likely`` is the reason given when nothing came at all.
         """
         missing = f"no {what} from {self.name} within {timeout_s:g} s"
         if self._rebooted_since:
@@ -346,8 +345,7 @@ class Conversation:
             )
         return ResponseTimeout(f"{missing}; {likely}")
 
-    def tell(self, direction: Literal["tx", "rx", "fault", "warning"], text: str) -> None:
-        """Tell the observer."""
+    def report(self, direction: Literal["tx", "rx", "fault", "warning"], text: str) -> None:
         if self._observer is not None:
             self._observer(ProtocolRecord(t_ns=self._clock(), direction=direction, summary=text))
 

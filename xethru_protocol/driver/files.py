@@ -55,7 +55,7 @@ def length(link: Link, file_type: int, identifier: int) -> Steps[int]:
     command = m.GetFileLength(file_type=file_type, identifier=identifier)
     values = (yield from link.request(command)).values
     if len(values) != 1 or values[0] < 0:
-        raise RemoteProtocolError(f"{link.path} tells a file's length as {values}")
+        raise RemoteProtocolError(f"{link.path} reports a file's length as {values}")
     return values[0]
 
 
@@ -107,7 +107,7 @@ def format_all(link: Link, key: int) -> Steps[None]:
 def crash_dump(link: Link, on_progress: OnProgress | None = None) -> Steps[bytes]:
     values = (yield from link.request(m.GetCrashDumpLength())).values
     if len(values) != 1 or values[0] < 0:
-        raise RemoteProtocolError(f"{link.path} tells its crash dump's length as {values}")
+        raise RemoteProtocolError(f"{link.path} reports its crash dump's length as {values}")
 
     def chunk(offset: int, count: int) -> m.GetCrashDump:
         return m.GetCrashDump(offset=offset, length=count)
@@ -172,7 +172,7 @@ def _then_close(link: Link, file_type: int, identifier: int, body: Steps[T]) -> 
     close = link.request(m.CloseFile(file_type=file_type, identifier=identifier))
     try:
         result = yield from body
-    except GeneratorExit:  # nobody carries steps out any more
+    except GeneratorExit:  # the steps are not carried out any more
         raise
     except BaseException:  # also an interrupt: the module has room for ten open files
         yield from _quietly(link, close)

@@ -2,7 +2,7 @@
 
 A radar frame carries float32 values, but the chip counts in integers and the firmware multiplies
 each count by one quantum. So only few of all float32 values can be true, and a damaged sample is
-nearly always none of them (Protocol reference 9.7). That holds for radar frames as the chip's
+nearly always not among them (Protocol reference 9.7). That holds for radar frames as the chip's
 driver sends them; what a profile filters before it sends it (BASEBAND_IQ of a real recording) is
 on no lattice.
 """
@@ -120,7 +120,7 @@ class Lattice:
             Values as sent, shape (n,), float32.
         """
         # Nearly every frame is whole: one rounding to the lattice and back proves it. Bytes take
-        # a fourth of array_equal's time; a -0.0, which they tell from 0.0, is judged below.
+        # a fourth of array_equal's time; a -0.0, which differs from 0.0 there, is judged below.
         if samples.size == 0 or (
             np.minimum.reduce(samples) >= self.lowest
             and np.maximum.reduce(samples) <= self.highest
@@ -250,7 +250,7 @@ class Frame:
 
 
 def rf_or_baseband(message: DataFloat, geometry: FrameGeometry) -> Samples | None:
-    """Return the samples of a radar frame, or None if the message is none of this geometry.
+    """Return the samples of a radar frame, or None if the message has another geometry.
 
     Radar frames have content id 0 (Protocol reference 6.1).
     """
@@ -324,11 +324,9 @@ class FrameQueue:
         self._baseband_geometry: FrameGeometry | None = None
 
     def __len__(self) -> int:
-        """Count the frames that wait."""
         return len(self._frames)
 
     def pop(self) -> Frame:
-        """Take the oldest frame."""
         frame = self._frames.popleft()
         if not self._frames:
             self._in_burst = False

@@ -327,7 +327,7 @@ class Link:
         if len(self.warnings) >= _WARNINGS:
             del self.warnings[0]
         self.warnings.append(text)
-        self.conversation.tell("warning", text)
+        self.conversation.report("warning", text)
 
     def left_s(self, deadline_ns: int) -> float:
         """Time until a deadline [s], negative when it is over."""
@@ -448,7 +448,7 @@ class Link:
         try:
             yield from self.request(SetMode(mode=mode), SLOW_TIMEOUT_S)
         except DeviceError:
-            self.conversation.tell("warning", f"the module does not know mode {mode.label}")
+            self.conversation.report("warning", f"the module does not know mode {mode.label}")
 
     def set_baud_rate(self, baudrate: int, *, force: bool = False) -> Steps[None]:
         if baudrate not in BAUD_RATES and not force:

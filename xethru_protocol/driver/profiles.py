@@ -80,7 +80,7 @@ def load(link: Link, profile_id: int = ProfileId.XTS_ID_APP_PRESENCE_2) -> Steps
     yield from link.wait_until_ready()
     yield from _load(link, profile_id)
     link.plan = ProfilePlan(profile_id=profile_id, loaded=True)
-    hear_messages(link).clear()  # those that wait are of what ran before
+    keep_messages(link).clear()  # those that wait are of what ran before
 
 
 def _load(link: Link, profile_id: int) -> Steps[None]:
@@ -101,7 +101,7 @@ def zone_limits(link: Link) -> Steps[ZoneLimits]:
     yield from _need_profile(link)
     values = (yield from link.request(m.GetDetectionZoneLimits())).values
     if len(values) != 3:
-        raise RemoteProtocolError(f"{link.path} tells zone limits {values}, not three numbers")
+        raise RemoteProtocolError(f"{link.path} reports zone limits {values}, not three numbers")
     return ZoneLimits(min_m=values[0], max_m=values[1], step_m=values[2])
 
 
@@ -124,7 +124,7 @@ def zone(link: Link) -> Steps[tuple[float, float]]:
     yield from _need_profile(link)
     values = (yield from link.request(m.GetDetectionZone())).values
     if len(values) != 2:
-        raise RemoteProtocolError(f"{link.path} tells detection zone {values}, not two numbers")
+        raise RemoteProtocolError(f"{link.path} reports detection zone {values}, not two numbers")
     return values[0], values[1]
 
 
@@ -160,7 +160,9 @@ def led(link: Link) -> Steps[LedMode]:
     try:
         return LedMode(value)
     except ValueError:
-        raise RemoteProtocolError(f"{link.path} tells LED mode {value}; there is none") from None
+        raise RemoteProtocolError(
+            f"{link.path} reports LED mode {value}, which does not exist"
+        ) from None
 
 
 def set_noise_map(link: Link, control: NoiseMapControl) -> Steps[None]:
@@ -227,7 +229,7 @@ def stop(link: Link) -> Steps[None]:
 
 
 def wait_for_message(link: Link, timeout_s: float) -> Steps[m.Response]:
-    waiting = hear_messages(link)
+    waiting = keep_messages(link)
     if not waiting and not (yield from link.listen(lambda: bool(waiting), timeout_s)):
         raise _no_message(link, timeout_s)
     return waiting.popleft()
@@ -236,7 +238,7 @@ def wait_for_message(link: Link, timeout_s: float) -> Steps[m.Response]:
 def wait_until_initialized(link: Link, timeout_s: float | None = None) -> Steps[m.Response]:
     limit_s = _starting_time_s(link) if timeout_s is None else timeout_s
     deadline_ns = link.conversation.deadline_ns(limit_s)
-    waiting = hear_messages(link)
+    waiting = keep_messages(link)
     while (left_s := link.left_s(deadline_ns)) > 0:
         wait_s = min(left_s, MESSAGE_TIMEOUT_S)
         if not waiting and not (yield from link.listen(lambda: bool(waiting), wait_s)):
@@ -253,8 +255,8 @@ def wait_until_initialized(link: Link, timeout_s: float | None = None) -> Steps[
     )
 
 
-def hear_messages(link: Link) -> deque[m.Response]:
-    """From now on keep what the profile says, and return where."""
+def keep_messages(link: Link) -> deque[m.Response]:
+    """From now on keep what the profile sends, and return where."""
     if link.messages is None:
         link.messages = deque()
     return link.messages
@@ -313,7 +315,7 @@ def _need_profile(link: Link) -> Steps[None]:
 
 def _first(link: Link, values: bytes | tuple[int, ...], what: str) -> int:
     if not values:
-        raise RemoteProtocolError(f"{link.path} tells its {what} as nothing")
+        raise RemoteProtocolError(f"{link.path} reports no value as its {what}")
     return values[0]
 
 
@@ -349,7 +351,7 @@ class Presence:
         Raises
         ------
         LocalProtocolError
-            If it leaves the limits the module tells, or is smaller than 0.20 m.
+            If it is outside the limits the module reports, or smaller than 0.20 m.
         """
         return self._call(set_zone, start_m, end_m)
 
@@ -436,7 +438,7 @@ class Presence:
         self._call(stop)
 
     def wait_until_initialized(self, timeout_s: float | None = None) -> m.Response:
-        """Wait until the profile says more than that it is starting; returns that first message.
+        """Wait until the profile reports more than that it is starting; returns that message.
 
         Messages of other kinds that come meanwhile are dropped.
 
@@ -448,7 +450,7 @@ class Presence:
         Raises
         ------
         ResponseTimeout
-            If it is still starting then, or says nothing for seconds.
+            If it is still starting then, or sends nothing for seconds.
         """
         return self._call(wait_until_initialized, timeout_s)
 

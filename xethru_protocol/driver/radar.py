@@ -31,6 +31,7 @@ from xethru_protocol.driver.link import (
 )
 from xethru_protocol.driver.profiles import Presence
 from xethru_protocol.transport import (
+    AsyncTransport,
     SerialTransport,
     Transport,
     capacity_bytes_per_s,
@@ -50,12 +51,29 @@ class RadarState:
     ----------
     raw_listener
         Called with ``"rx"`` or ``"tx"``, the bytes as they went over the line, and the driver's
-        time [ns]; None: nobody.
+        time [ns]; may be None.
     """
 
-    def __init__(self, link: Link) -> None:
+    def __init__(
+        self,
+        transport: Transport | AsyncTransport,
+        *,
+        clock: Callable[[], int],
+        observer: Observer | None,
+        queue_frames: int,
+        reconnect_s: float,
+        candidates: Callable[[], Sequence[str]],
+    ) -> None:
         self.raw_listener: RawListener | None = None
-        self._link = link
+        self._link = Link(
+            transport.name,
+            clock=clock,
+            observer=observer,
+            queue_frames=queue_frames,
+            reconnect_s=reconnect_s,
+            candidates=candidates,
+        )
+        self._link.bytes_per_s = capacity_bytes_per_s(transport)
 
     @property
     def port(self) -> str:
@@ -186,16 +204,13 @@ class X4M300(RadarState):
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         super().__init__(
-            Link(
-                transport.name,
-                clock=clock,
-                observer=observer,
-                queue_frames=queue_frames,
-                reconnect_s=reconnect_s,
-                candidates=candidates,
-            )
+            transport,
+            clock=clock,
+            observer=observer,
+            queue_frames=queue_frames,
+            reconnect_s=reconnect_s,
+            candidates=candidates,
         )
-        self._link.bytes_per_s = capacity_bytes_per_s(transport)
         self._transport = transport
         self._open_port = open_port
         self._sleep = sleep

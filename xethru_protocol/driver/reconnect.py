@@ -29,8 +29,8 @@ from xethru_protocol.wire.errors import (
 from xethru_protocol.wire.messages import ModReset
 
 RESTART_S = 15.0  # a restart takes 2 ... 9 s; the reference asks for at least 10
-_BOOT_S = 3.0  # a module that keeps its port says READY by then
-_ASK_S = 0.5  # one PING to a port that may be deaf yet
+_BOOT_S = 3.0  # a module that keeps its port sends READY by then
+_ASK_S = 0.5  # one PING to a port that may not answer yet
 _LOOK_AGAIN_S = 0.2
 _FOREIGN_NS = 3_000_000_000  # how long a port is left alone that was another module's
 RECONNECTS_PER_CALL = 3  # then the module is in a restart loop, and the user should know
@@ -234,7 +234,7 @@ def _note_return(link: Link, lost: str, path: str) -> None:
     link.path = path
     link.reconnects += 1
     moved = "" if path == lost else f", formerly at {lost}"
-    link.conversation.tell("warning", f"the module is back at {path}{moved}")
+    link.conversation.report("warning", f"the module is back at {path}{moved}")
 
 
 def _answers(link: Link) -> Steps[bool]:

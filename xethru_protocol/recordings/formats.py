@@ -80,7 +80,7 @@ _MAGICS: dict[bytes, RecordingFormat] = {
 
 
 def recording_format(path: Path | str) -> RecordingFormat:
-    """Return the format of a recording, told by what it begins with.
+    """Return the format of a recording, by its first bytes.
 
     Raises
     ------
@@ -168,7 +168,7 @@ def recording_radars(path: Path | str) -> tuple[RadarFacts, ...]:
 
 
 def recording_facts(path: Path | str) -> RecordingFacts:
-    """Return what a recording says about itself; RecordingError if it cannot be read."""
+    """Return the facts of a recording; RecordingError if it cannot be read."""
     path = Path(path)
     match recording_format(path):
         case "wire":
@@ -184,7 +184,7 @@ def recording_facts(path: Path | str) -> RecordingFacts:
 
 
 def describe_recording(path: Path | str, *, radar: str | None = None) -> RecordingSummary:
-    """Read a whole recording and say what it holds; RecordingError if it holds nothing.
+    """Read a whole recording and summarise it; RecordingError if it holds nothing.
 
     Of a session of several radars, only the named one, as in `read_recording`.
     """

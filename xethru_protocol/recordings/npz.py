@@ -12,7 +12,7 @@ one flat array, cut by the sum of ``frame_bins`` (for pairs: all of the first, t
 
 Everything else is ragged: ``message_payload`` u1, cut at ``message_end``, with ``message_t_ns``,
 ``message_index``, ``message_name`` and ``message_fields``, the fields as JSON for reading (the
-payload decides). ``facts`` is what the recording says about itself, as JSON.
+payload decides). ``facts`` are those of the recording, as JSON.
 
 An archive that was cut cannot be read at all: it is for finished recordings. Samples are written
 and read a message at a time; only headers and what is no bulk message are held in memory.
@@ -220,7 +220,7 @@ def read_npz(path: Path) -> TimedMessages:
 
 
 def npz_facts(path: Path) -> RecordingFacts:
-    """Return what an archive says about itself; RecordingError if it cannot be read."""
+    """Return the facts of an archive; RecordingError if it cannot be read."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             _check_format(path, archive)
@@ -228,7 +228,7 @@ def npz_facts(path: Path) -> RecordingFacts:
     except OSError as error:
         raise unreadable(path, error) from None
     except _DAMAGED as error:
-        raise RecordingError(f"{path}: what it says about itself is damaged: {error}") from None
+        raise RecordingError(f"{path}: its description is damaged: {error}") from None
 
 
 _Found = Iterator[tuple[int, int, bytes]]  # place, time, payload

@@ -17,7 +17,7 @@ class RecordingError(XeThruError):
 class RecordingFault:
     """A damaged part: what could not be read of ``file`` at byte ``offset``, and why.
 
-    ``minor`` says that no message is lost, only its time or the order among several files.
+    ``minor``: no message is lost, only its time or the order among several files.
     """
 
     file: str
@@ -38,12 +38,12 @@ def report(fault: RecordingFault, on_fault: FaultHandler | None) -> None:
 
 
 def unreadable(path: object, error: OSError) -> RecordingError:
-    """Return the error that says why the operating system refused to read ``path``."""
+    """Return an error with the reason why ``path`` cannot be read."""
     return RecordingError(f"{path} cannot be read: {error.strerror or error}")
 
 
 def unwritable(path: object, error: OSError) -> RecordingError:
-    """Return the error that says why the operating system refused to write ``path``."""
+    """Return an error with the reason why ``path`` cannot be written."""
     return RecordingError(f"{path} cannot be written: {error.strerror or error}")
 
 
@@ -59,7 +59,7 @@ TimedMessages = Iterator[Timed]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RadarFacts:
-    """What a recording says of one of its radars besides the messages.
+    """Facts about one radar of a recording.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class RadarFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingFacts:
-    """What a recording says about itself besides its messages.
+    """Facts about a recording, beside its messages.
 
     Attributes
     ----------

@@ -75,7 +75,7 @@ class WireCapture:
     path
         A new file.
     note
-        What to say about the capture, as JSON-able values.
+        Note about the capture, as JSON-able values.
 
     Raises
     ------
@@ -94,7 +94,6 @@ class WireCapture:
         self._append(_HEAD.pack(MAGIC, VERSION, len(text)) + text)
 
     def __enter__(self) -> Self:
-        """Return the capture itself."""
         return self
 
     def __exit__(
@@ -103,7 +102,6 @@ class WireCapture:
         value: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Close the file."""
         self.close()
 
     def write(self, direction: Way, data: bytes, t_ns: int | None) -> None:
@@ -179,7 +177,7 @@ def read_chunks(path: Path | str, on_fault: FaultHandler | None = None) -> Itera
 
 
 def read_note(path: Path | str) -> dict[str, Any]:
-    """Return the note of a wire capture; RecordingError if it is none."""
+    """Return the note of a wire capture; RecordingError if the file is not one."""
     path = Path(path)
     try:
         with path.open("rb") as stream:
@@ -189,11 +187,11 @@ def read_note(path: Path | str) -> dict[str, Any]:
 
 
 def wire_facts(path: Path) -> RecordingFacts:
-    """Return what the note says of the recording; defaults where it says nothing."""
+    """Return the facts in the note; defaults for those that it lacks."""
     try:
         return RecordingFacts.from_json(read_note(path).get("facts", {}))
     except (ValueError, TypeError, AttributeError) as error:
-        raise RecordingError(f"{path}: what it says about itself is damaged: {error}") from None
+        raise RecordingError(f"{path}: its description is damaged: {error}") from None
 
 
 def read_wire(path: Path, on_fault: FaultHandler | None) -> TimedMessages:

@@ -1,6 +1,6 @@
 """Numbers of the wire under the vendor's own names.
 
-First the numbers that tell messages apart, then the values of their fields, then error codes.
+First the numbers that identify messages, then the values of their fields, then error codes.
 
 Source: Protocol reference 2, 4 to 7, 16. Vendor's prefixes: ``XTS_SPC_*`` command, ``XTS_SPCA_*``
 profile sub-command, ``XTS_SPCX_*`` X4 driver sub-command, ``XTS_SDC_*`` system command,
@@ -621,7 +621,7 @@ class FileError(IntEnum):
     ALREADY_OPEN = 2
     ALREADY_EXISTS = 3
     BUSY = 4
-    NOT_FOUND = 5  # also what DELETE_FILE says after its timeout
+    NOT_FOUND = 5  # also the answer to DELETE_FILE after its timeout
     NOT_OPEN = 6
     OUT_OF_MEMORY = 7
     NOT_INITIALIZED = 8
@@ -667,7 +667,7 @@ def error_name(code: int, space: ErrorSpace = ErrorSpace.PROTOCOL) -> str:
     code
         0 ... 2**32 - 1.
     space
-        The failed command's ``Row.errors``. An ERROR does not say which command failed: without
+        The failed command's ``Row.errors``. An ERROR does not name the command that failed: without
         that knowledge the protocol's own names win and the rest is read as the X4 driver's.
 
     >>> error_name(1), error_name(17), error_name(1, ErrorSpace.X4_DRIVER)

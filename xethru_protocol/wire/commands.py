@@ -311,7 +311,7 @@ class DebugOutputGetControl(Command[ReplyInt]):
     errors=ErrorSpace.IO_PINS,
 )
 class IoPinSetControl(Command[Ack]):
-    """Say what a pin does: `IoPinSetup` bits and an `IoPinFeature`. 4.8.
+    """Set what a pin does: `IoPinSetup` bits and an `IoPinFeature`. 4.8.
 
     ``pin_id``: an `IoPin`.
     """
@@ -437,7 +437,7 @@ class FormatFilesystem(Command[Ack]):
 
 @command(_DIR, DirCode.XTS_SDC_SYSTEM_TEST, name="DIR SYSTEM_TEST")
 class SystemTest(Command[ReplyByte | Ack]):
-    """Run a `TestCode`; 256 bytes, of which the first says if it passed, or an ACK. 4.10."""
+    """Run a `TestCode`; 256 bytes, of which the first tells whether it passed, or an ACK. 4.10."""
 
     code: Annotated[int, fields.Number("B", "test_code")]
 

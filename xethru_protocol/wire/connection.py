@@ -1,6 +1,6 @@
 """Messages over a byte stream, without I/O and without a clock.
 
-Three verbs: ``receive_data`` takes bytes from the peer, ``next_event`` tells what they mean,
+``receive_data`` takes bytes from the peer, ``next_event`` returns what they mean,
 ``send`` gives the bytes for a message. What one side sends is what the other's events are.
 """
 
@@ -60,11 +60,10 @@ class Connection:
         self._next_span = self._reader.next_span
 
     def receive_data(self, data: bytes) -> None:
-        """Take bytes from the peer, in chunks of any size."""
         self._reader.receive_data(data)
 
     def next_event(self) -> Event:
-        """Next message or `FramingFault`; NEED_DATA if nothing more can be told yet.
+        """Next message or `FramingFault`; NEED_DATA if more bytes are needed.
 
         Unknown and malformed payloads come as `UnknownMessage`. Never raises on what was
         received.
@@ -93,7 +92,7 @@ class Connection:
         Parameters
         ----------
         message
-            What to say.
+            Any message.
         framing
             None: as a real module or host frames this message (Protocol reference 1.3).
 

@@ -1,11 +1,11 @@
-"""Exceptions of the package, as one tree that says whose fault it was.
+"""Exceptions of the package, as one tree, by whose fault it was.
 
 ::
 
     XeThruError
     ├── ProtocolError
-    │   ├── LocalProtocolError    we asked for something the protocol cannot say
-    │   └── RemoteProtocolError   the peer said something the protocol does not allow
+    │   ├── LocalProtocolError    we asked for something the protocol cannot express
+    │   └── RemoteProtocolError   the peer sent something the protocol does not allow
     ├── DeviceError               the module answered ERROR
     └── TransportError
         ├── ResponseTimeout       nothing came in time (also a TimeoutError)

@@ -1,8 +1,8 @@
-"""Kinds of wire fields: what ``Annotated[type, KIND]`` in a message may say.
+"""Kinds of wire fields: what ``KIND`` in ``Annotated[type, KIND]`` of a message may be.
 
 A kind knows how one field is packed, unpacked and shown. The codec walks a message's fields in
-order; the layouts themselves stand in the rows. All numbers are little-endian, unpadded
-(Protocol reference, head). Lists with a count of their own stand in ``wire_lists``. A kind raises
+order; the layouts themselves are in the rows. All numbers are little-endian, unpadded
+(Protocol reference, head). A kind raises
 ``struct.error`` or ``ValueError`` when the bytes do not fit; the codec turns that into
 `UnknownMessage`.
 
@@ -31,7 +31,7 @@ class Kind(Protocol):
     """One way to put a field on the wire."""
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
-        """Bytes of ``value``; ``bulk`` says that the packet travels in NoEscape framing."""
+        """Bytes of ``value``; ``bulk``: the packet travels in NoEscape framing."""
 
     def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
         """Value at ``start`` and the offset behind it."""
@@ -69,16 +69,13 @@ class Number:
     order: str = "<"
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
-        """Pack the scalar."""
         return struct.pack(self.order + self.code, value)
 
     def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
-        """Unpack the scalar."""
         (value,) = struct.unpack_from(self.order + self.code, data, start)
         return value, start + struct.calcsize(self.order + self.code)
 
     def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
-        """Show it under its label, as the golden vectors name it."""
         return {self.label or name: self.shown(value)}
 
 
@@ -96,16 +93,13 @@ class Member:
     label: str
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
-        """Pack the number behind the member; ``ValueError`` if it is none."""
         return struct.pack("<I", self.enum(value))
 
     def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
-        """Unpack the member; ``ValueError`` if the number is none."""
         (value,) = struct.unpack_from("<I", data, start)
         return self.enum(value), start + 4
 
     def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
-        """Show the member's name."""
         return {self.label: self.enum(value).name}
 
 
@@ -121,13 +115,11 @@ class Spelling:
     usual: int | None = None
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
-        """Pack the code; ``ValueError`` if it is not one of this message's."""
         if value not in self.codes:
             raise ValueError("this code is another message's")
         return bytes((value,))
 
     def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
-        """Unpack the code."""
         return data[start], start + 1
 
     def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
@@ -144,13 +136,11 @@ class OptionalByte:
     shown_if_absent: bool = False
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
-        """Pack the byte, or nothing; ``ValueError`` if this message needs one."""
         if value is None and self.required and self.wanted(fields):
             raise ValueError("the address is missing")
         return b"" if value is None else bytes((value,))
 
     def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
-        """Unpack the byte where this message has one."""
         if not self.wanted(fields):
             return None, start
         if start < len(data):
@@ -160,7 +150,6 @@ class OptionalByte:
         return None, start
 
     def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
-        """Show the byte; an absent one only where the vectors list it as null."""
         return {} if value is None and not self.shown_if_absent else {name: value}
 
 
@@ -180,7 +169,6 @@ class ByDiscriminator:
     width_field: str = ""
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
-        """Pack in the layout of the discriminator."""
         key = fields[self.field]
         if key not in self.layouts:
             raise ValueError("this setting cannot be set")
@@ -190,7 +178,6 @@ class ByDiscriminator:
         return struct.pack("<" + codes, *(value if len(names) > 1 else (value,)))
 
     def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
-        """Unpack in the layout of the discriminator."""
         key = fields[self.field]
         codes, names = self.layouts[key]
         if key in self.short and fields[self.width_field] == 1:
@@ -199,7 +186,6 @@ class ByDiscriminator:
         return (values if len(names) > 1 else values[0]), start + struct.calcsize("<" + codes)
 
     def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
-        """Show each scalar under its own name."""
         names = self.layouts[fields[self.field]][1]
         return dict(zip(names, value if len(names) > 1 else (value,), strict=True))
 
@@ -212,13 +198,12 @@ class ShortForm:
     short: frozenset[int]
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
-        """Nothing."""
         if value not in (None, 1):
             raise ValueError("a value is one byte wide or as the firmware parses it (None)")
         return b""
 
     def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
-        """Tell the form by the bytes that are left."""
+        """Determine the form by the bytes that are left."""
         return (1 if fields[self.field] in self.short and len(data) - start == 1 else None), start
 
     def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
@@ -242,7 +227,6 @@ class Elements:
     trailer_shown: bool = False
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
-        """Pack count, elements and trailer."""
         body = self._bytes(value)
         count = b"" if not body and not bulk else struct.pack("<I", len(body) // self.size)
         return count + body + (b"" if self.trailer is None else bytes((self.trailer,)))
@@ -260,7 +244,6 @@ class Elements:
         return self._value(data[begin:end]), end
 
     def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
-        """Show count, elements and trailer as the golden vectors do."""
         shown: dict[str, Any] = {}
         if self.count_label:
             shown[self.count_label] = len(self._bytes(value)) // self.size
@@ -303,7 +286,6 @@ class Bins:
     label: str = ""
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
-        """Pack the array."""
         array: npt.NDArray[np.float32] = np.ascontiguousarray(value, dtype=FLOAT32)
         if array.shape != (fields[self.count_field],):
             raise ValueError(f"{array.shape} values for {fields[self.count_field]} bins")
@@ -317,7 +299,6 @@ class Bins:
         return np.frombuffer(data[start:end], dtype=FLOAT32), end
 
     def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
-        """Show the values."""
         return {self.label or name: value.tolist()}
 
 
@@ -329,15 +310,12 @@ class RestBytes:
     label: str = ""
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
-        """Pack the bytes."""
         return bytes(value)
 
     def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
-        """Take everything."""
         return data[start:], len(data)
 
     def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
-        """Show the bytes."""
         return {self.label or name: self.shown(value)}
 
 
@@ -367,16 +345,13 @@ class Count:
     size: Callable[[Any], int] = len
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
-        """Pack the count; ``ValueError`` if the lists differ in length."""
         return struct.pack("<I", self._count(fields))
 
     def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
-        """Unpack the count."""
         (count,) = struct.unpack_from("<I", data, start)
         return count, start + 4
 
     def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
-        """Show the count, where the vectors do."""
         return {self.label: self._count(fields)} if self.label else {}
 
     def _count(self, fields: Fields) -> int:
@@ -396,16 +371,13 @@ class Floats:
     empty_shown: bool = False
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
-        """Pack the values."""
         return struct.pack(f"<{len(value)}f", *value)
 
     def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
-        """Unpack the values; ``struct.error`` if there are fewer than announced."""
         size = fields[self.count] * self.per
         return struct.unpack_from(f"<{size}f", data, start), start + 4 * size
 
     def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
-        """Show the values; an empty list is not shown."""
         return {self.label or name: list(value)} if value or self.empty_shown else {}
 
 
@@ -424,14 +396,12 @@ class Block:
         return bytes(value)
 
     def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
-        """Unpack the bytes; ``ValueError`` if there are fewer than announced."""
         end = start + fields[self.count]
         if end > len(data):
             raise ValueError("fewer bytes than announced")
         return data[start:end], end
 
     def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
-        """Show the bytes."""
         return {self.label or name: self.shown(value)}
 
 
@@ -446,39 +416,33 @@ class Text:
     label: str = ""
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
-        """Pack the text and its NUL."""
         return text_bytes(value)
 
     def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
-        """Unpack the text; ``ValueError`` if it is shorter than announced."""
         end = start + fields[self.count]
         if end > len(data):
             raise ValueError("a shorter text than announced")
         return data[start:end].removesuffix(b"\x00").decode("latin-1"), end
 
     def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
-        """Show the text."""
         text = value.decode("latin-1") if isinstance(value, bytes) else value
         return {self.label or name: text}
 
 
 @dataclass(frozen=True, slots=True)
 class TypedElements:
-    """An element list whose type an earlier field tells."""
+    """An element list whose type an earlier field gives."""
 
     field: str
     types: Mapping[int, Elements]
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
-        """Pack as that type's list; ``ValueError`` if there is no such type."""
         return self._elements(fields).pack(value, fields, bulk)
 
     def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
-        """Unpack that type's list."""
         return self._elements(fields).unpack(data, start, fields)
 
     def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
-        """Show that type's list."""
         return self._elements(fields).show(name, value, fields)
 
     def _elements(self, fields: Fields) -> Elements:

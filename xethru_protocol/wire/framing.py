@@ -299,7 +299,6 @@ class LinkStatistics:
 
     @property
     def clean(self) -> bool:
-        """Whether nothing was wrong so far."""
         return not (
             self.faults
             or self.junk_bytes
@@ -470,7 +469,7 @@ class PacketReader:
     Parameters
     ----------
     direction
-        Who sends the bytes: it tells which NoEscape headers can be true.
+        Who sends the bytes: it decides which NoEscape headers are plausible.
     statistics
         Where to count; None: in new ones.
 
@@ -514,7 +513,7 @@ class PacketReader:
             self.statistics.bytes += len(data)
 
     def end_data(self) -> None:
-        """Tell that no more bytes will come: what is incomplete now will be a fault."""
+        """No more bytes will come: what is incomplete now becomes a fault."""
         self._ended = True
 
     @property
@@ -523,7 +522,6 @@ class PacketReader:
         return len(self._buffer) - self._pos + self._queued
 
     def next_packet(self) -> Packet | FramingFault | NeedData:
-        """Next packet or fault, or NEED_DATA."""
         span = self.next_span()
         if isinstance(span, tuple):
             framing, buffer, start, end, offset = span
@@ -531,9 +529,9 @@ class PacketReader:
         return span
 
     def next_span(self) -> Span | FramingFault | NeedData:
-        """Like ``next_packet``, but tells where the payload lies instead of copying it."""
+        """Like ``next_packet``, but returns where the payload lies instead of copying it."""
         while True:
-            if self._missing and not self._refill():  # parsing would tell nothing new
+            if self._missing and not self._refill():  # parsing would give nothing new
                 if not self._ended or not self.buffered:
                     return NEED_DATA
                 fault = self._reject_last_start()
@@ -614,7 +612,6 @@ class PacketReader:
         return FramingFault(kind=kind, offset=offset)
 
     def _skip_to(self, offset: int) -> None:
-        """Go on at ``offset``; the bytes before it belong to no packet."""
         self.statistics.junk_bytes += offset - self._base - self._pos
         self._pos = offset - self._base
 

@@ -51,7 +51,7 @@ class Pong(Response):
     },
 )
 class System(Response):
-    """The module tells its state unasked: a `SystemCode`. 5."""
+    """The module reports its state unasked: a `SystemCode`. 5."""
 
     code: Annotated[int, fields.U32]
 
@@ -122,7 +122,7 @@ class DataFloat(Response):
     """A radar frame. 6.1.
 
     ``info`` is the frame counter. ``values``, shape (n,), float32, read-only: RF amplitudes by
-    increasing range, or all I then all Q of a downconverted frame; the message does not say
+    increasing range, or all I then all Q of a downconverted frame; the message does not show
     which.
     """
 
@@ -181,7 +181,7 @@ def _type_name(code: int) -> str:
 class HilReply(Response):
     """Hardware-in-the-loop traffic, not used by an X4M300: a `HilCommand` and elements. 5.4.
 
-    ``values`` are bytes, text, or a tuple of numbers, as ``datatype`` (`ElementType`) says.
+    ``values`` are bytes, text, or a tuple of numbers, by ``datatype`` (`ElementType`).
     """
 
     datatype: Annotated[int, fields.Number("B", shown=_type_name)]
@@ -214,13 +214,11 @@ class _Bulk(Response):
     __slots__ = ()
 
     def __eq__(self, other: object) -> bool:
-        """Equal if every bit of every field is."""
         if not isinstance(other, _Bulk) or type(other) is not type(self):
             return NotImplemented
         return self._identity() == other._identity()
 
     def __hash__(self) -> int:
-        """Hash of all bits."""
         return hash(self._identity())
 
     def _identity(self) -> tuple[bytes, ...]:

@@ -139,7 +139,6 @@ def response(
 
 
 def id32(number: int) -> tuple[int, ...]:
-    """Prefix bytes of a 32-bit id."""
     return tuple(number.to_bytes(4, "little"))
 
 

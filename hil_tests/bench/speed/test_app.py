@@ -23,9 +23,9 @@ from slam.app.rig.emulated import (
     rig_of,
     scene_and_config,
 )
-from slam.app.run.runner import run_slam
+from slam.app.run.runner import execute, run_slam
 from slam.app.session.log import SessionLog
-from slam.app.sweep.run import run_in_process
+from slam.app.sweep.run import make_case, source_of
 from slam.app.view.panels import RerunView
 from slam.paper.pipeline import UwbRadarSlam
 
@@ -43,7 +43,7 @@ def repeat(benchmark: BenchmarkFixture, run: Callable[[], Result]) -> Result:
 
 def test_whole_pipeline_with_synthesis(benchmark: BenchmarkFixture, tmp_path: Path) -> None:
     scene = str(write_short_scene(tmp_path))
-    record = repeat(benchmark, lambda: run_in_process(scene, "paper", 0))
+    record = repeat(benchmark, lambda: execute(source_of(make_case(scene, "paper", 0))))
     benchmark.extra_info["times_real_time"] = record.duration_ns / 1e9 / record.wall_s
 
 

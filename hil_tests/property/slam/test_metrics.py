@@ -33,7 +33,6 @@ def path(seed: int, n: int = 80) -> Array:
 
 
 def drifted(xy: Array, seed: int) -> Array:
-    """Return the path with a growing error and some noise."""
     rng = np.random.default_rng(seed + 1)
     drift = np.linspace(0, 1, len(xy))[:, None] * rng.uniform(-0.1, 0.1, 2)
     return xy + drift + 0.01 * rng.standard_normal(xy.shape)

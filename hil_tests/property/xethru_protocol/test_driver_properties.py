@@ -136,8 +136,6 @@ MODES = st.sampled_from([RUN, RUN, RUN, IDLE, IDLE, MANUAL, STOP, REG, 0x10])
 
 
 class DeviceMachine(RuleBasedStateMachine):
-    """Sends commands to a device and to the model, and compares the answers."""
-
     @initialize()
     def power_up(self) -> None:
         self.host = BareHost(ramp_device())
@@ -300,8 +298,6 @@ UNKNOWN = PAYLOADS.map(lambda payload: m.UnknownMessage(code=0xB7, payload=paylo
 
 @dataclass(slots=True, kw_only=True)
 class Sent:
-    """A packet on its way."""
-
     message: Any
     payload: bytes
     touched: bool = False

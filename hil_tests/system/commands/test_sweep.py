@@ -120,7 +120,6 @@ QUIET = ("--no-dashboard", "--host", "127.0.0.1")
 
 @contextmanager
 def dask(*arguments: str) -> Iterator[subprocess.Popen[str]]:
-    """Run `dask ...` until the block ends."""
     command = [sys.executable, "-m", "dask", *arguments]
     with subprocess.Popen(
         command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True

@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,19 +15,11 @@ from rosbags.highlevel import AnyReader
 
 from hil_tests.system.short_scene import write_short_scene
 from slam.app.odometry.tum import read_tum
-from slam.app.records import Scan
-from slam.app.rig.emulated import (
-    FRAME_RATE_HZ,
-    RAW_CONFIG,
-    end_counter,
-    open_loopback,
-    scene_and_config,
-)
-from slam.app.run.results import evaluate
+from slam.app.run.results import evaluate, summary_of
+from slam.app.run.runner import RunRecord, RunSource, execute
 from slam.app.session import messages as ros
-from slam.app.sweep.run import run_in_process, run_one
+from slam.app.sweep.run import make_case, source_of
 from slam.app.view.rerun_recording import count_rows
-from xethru_protocol.recordings.mcap import FLOAT_ARRAY, unpack_array
 
 pytestmark = pytest.mark.slow
 
@@ -140,39 +131,21 @@ def test_the_link_log_tells_how_the_radars_were_set_up(demo: Finished) -> None:
         assert any("FRAMEAREA" in text for text in said)
 
 
-def loopback_scans(scene: Path) -> Iterator[Scan]:
-    loaded, _ = scene_and_config(str(scene), "robust")
-    with open_loopback(loaded, SEED) as source:
-        source.start(RAW_CONFIG, FRAME_RATE_HZ)
-        yield from source.scans(end_counter(loaded.trajectory().duration_ns), lambda: None)
-
-
-def test_frames_through_ports_and_in_process_are_bit_identical(demo: Finished) -> None:
-    with (demo.out / "session.mcap").open("rb") as stream:
-        topics = [f"/radar/{name}/frame" for name in RADARS]
-        recorded = {
-            (channel.topic, message.sequence): (message.log_time, message.data)
-            for _, channel, message in make_reader(stream).iter_messages(topics=topics)
-        }
-    n_compared = 0
-    for scan in loopback_scans(demo.scene):
-        for frame in scan.frames:
-            t_ns, data = recorded[f"/radar/{RADARS[frame.radar]}/frame", frame.counter]
-            assert t_ns == frame.t_ns
-            samples = unpack_array(FLOAT_ARRAY, data)
-            assert samples.tobytes() == frame.samples.tobytes()
-            n_compared += 1
-    assert n_compared == len(recorded)
+def run_in_process(scene: Path, seed: int) -> tuple[RunSource, RunRecord]:
+    source = source_of(make_case(str(scene), "robust", seed))
+    return source, execute(source)
 
 
 def test_ports_and_in_process_give_the_same_belief_bit_for_bit(demo: Finished) -> None:
-    record = run_in_process(str(demo.scene), "robust", SEED)
+    source, record = run_in_process(demo.scene, SEED)
     estimate = read_tum(demo.out / "estimate.tum")
     np.testing.assert_array_equal(estimate.stamps_ns, [row.t_ns for row in record.results])
     positions = np.array([row.belief.pose[:2] for row in record.results])
     assert estimate.poses[:, :2].tobytes() == positions.tobytes()
     summary = json.loads((demo.out / "summary.json").read_text())
-    again = json.loads(run_one(str(demo.scene), "robust", SEED).to_json())
+    in_process = summary_of(source, record)
+    assert in_process is not None
+    again = json.loads(in_process.to_json())
     # covariances, landmarks and innovations all enter here
     for numbers in (summary, again):
         del numbers["realtime_factor"]
@@ -181,7 +154,7 @@ def test_ports_and_in_process_give_the_same_belief_bit_for_bit(demo: Finished) -
 
 @pytest.mark.thorough
 def test_seeds_differ(demo: Finished) -> None:
-    other = run_in_process(str(demo.scene), "robust", SEED + 1)
+    _, other = run_in_process(demo.scene, SEED + 1)
     assert (
         other.results[-1].belief.pose.tolist()
         != read_tum(demo.out / "estimate.tum").poses[-1].tolist()

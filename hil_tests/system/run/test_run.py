@@ -101,7 +101,6 @@ def test_a_run_from_stdin_ends_when_it_is_told_to_and_replays_to_the_last_bit(
     summary = json.loads((out / "summary.json").read_text())
     assert summary["ate_rmse_m"] is None
     assert summary["seed"] is None
-    assert summary["frames"] > 30
     assert (out / "map.png").stat().st_size > 10_000
 
     replayed(out, tmp_path / "again", capsys)
@@ -112,6 +111,8 @@ def test_a_run_from_stdin_ends_when_it_is_told_to_and_replays_to_the_last_bit(
             out / f"{name}.tum"
         ).read_bytes()
     session = open_session(out / "session.mcap")
+    used = [scan for scan, _ in session.scans() if scan.used]
+    assert summary["frames"] == sum(len(scan.frames) for scan in used) > 0
     assert session.info.time_base == "arrival"
     assert {row.radar for row in session.wire()} == {m.name for m in session.rig.mounts}
 

@@ -59,7 +59,7 @@ def test_a_full_disk_is_one_line() -> None:
     assert (run.returncode, run.stderr) == (1, said)
 
 
-def test_ctrl_c_ends_a_question_that_nobody_answers(tmp_path: Path) -> None:
+def test_ctrl_c_ends_a_request_without_answer(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX) as silent:
         silent.bind(str(tmp_path / "s"))
         silent.listen()

@@ -19,11 +19,6 @@ SECOND = 1_000_000_000
 PRESENCE_2 = 0x014D4AB8
 
 
-@pytest.fixture
-def host() -> BareHost:
-    return BareHost(ramp_device())
-
-
 def mode_of(host: BareHost) -> int:
     reply = host.ask(m.GetMode())
     assert isinstance(reply, m.ReplyByte)

@@ -142,7 +142,7 @@ def test_a_host_that_wants_baseband_gets_half_as_many_bins() -> None:
     assert bin_m == pytest.approx(8 * 1.5e8 / 23.328e9, rel=1e-5)
 
 
-def test_it_says_when_nobody_knows_where_the_frames_lie() -> None:
+def test_a_warning_is_printed_if_the_place_of_the_frames_is_unknown() -> None:
     warnings: list[str] = []
     device_of(RECORDINGS / "float", warnings=warnings)
     assert len(warnings) == 1
@@ -170,7 +170,7 @@ def raw_capture(tmp_path: Path) -> Path:
     return path
 
 
-def test_recorded_answers_are_not_played_but_their_area_is_told(raw_capture: Path) -> None:
+def test_recorded_answers_are_not_played_but_their_area_is_read_back(raw_capture: Path) -> None:
     warnings: list[str] = []
     host = BareHost(device_of(raw_capture, warnings=warnings))
     assert warnings == []
@@ -217,7 +217,7 @@ def test_a_recording_is_not_held_in_memory(tmp_path: Path) -> None:
     assert peak < played / 4
 
 
-def test_a_recording_that_is_gone_is_told_and_the_module_answers_on(tmp_path: Path) -> None:
+def test_a_recording_that_is_gone_is_a_warning_and_the_module_answers_on(tmp_path: Path) -> None:
     recording = copy_of_the_vendors_recording(tmp_path)
     warnings: list[str] = []
     device = device_of(recording, warnings=warnings)

@@ -76,5 +76,5 @@ def test_specs_that_name_nothing_are_one_line(text: str) -> None:
     assert "\n" not in str(refusal.value)
 
 
-def test_a_user_whom_nobody_knows_has_no_port() -> None:
+def test_the_home_of_an_unknown_user_is_a_plain_path() -> None:
     assert one("~nobody-of-this-name/port").target == "~nobody-of-this-name/port"

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from hil_tests.unit.slam.robust.range_world import STEP_M, TURN_STEPS, Room
 from slam.frames import Detection
 from slam.geometry import Rig
+from slam.results import PoseAt
 
 Array = NDArray[np.float64]
 
@@ -123,3 +124,8 @@ def _wheels(increments: Array, room: Room, rng: np.random.Generator, amount: flo
         increments[:, 2] * (1 + turn_scale) + curvature * distance + heading_sigma * noise[:, 2]
     )
     return measured
+
+
+def at_rest(pose: Array) -> PoseAt:
+    """Return odometry that gives one pose, whatever the time: all radars sample at once."""
+    return lambda t_ns: pose

@@ -164,7 +164,6 @@ def ranged(ranges: list[tuple[int, float]], *told: PredictedRange) -> StepResult
 
 
 def world(x_m: float, y_m: float) -> list[float]:
-    """Return a point of the body in the world."""
     return [1.0 - y_m, 2.0 + x_m]
 
 

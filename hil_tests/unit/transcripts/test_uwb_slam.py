@@ -15,7 +15,7 @@ from mcap.writer import Writer
 from scipy.io import savemat
 
 from hil_tests.unit.slam.app.authors_bag import authors_bag
-from hil_tests.unit.slam.app.sessions import feed, session_info
+from hil_tests.unit.slam.app.sessions import session_info, write_session
 from hil_tests.unit.transcripts.test_transcripts import check_transcript
 from slam.app.odometry.track import OdometryTrack
 from slam.app.odometry.tum import TumSample
@@ -49,7 +49,7 @@ RIGS = {
     "syntax": "[[radars\n",
     "deep": "a=" + "[" * 5000,
 }
-TRAJECTORIES = {
+TRAJECTORIES: dict[str, str | bytes] = {
     "drive": "1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n3 1 1 0 0 0 0 1\n",
     "late": "1000001 0 0 0 0 0 0 1\n1000002 1 0 0 0 0 0 1\n",
     "empty": "",
@@ -91,7 +91,7 @@ BAGS: dict[str, dict[str, Any]] = {
 }
 FORMATS = ("3", "two", "1", None)
 STATES = 6
-AUTHORS = {
+AUTHORS: dict[str, object] = {
     "odom": np.zeros((STATES, 3)),
     "obsLHS": np.zeros((STATES, 5, 2)),
     "obsRHS": np.zeros((STATES, 5, 2)),
@@ -112,7 +112,7 @@ TABLES: dict[str, dict[str, object]] = {
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Fill a folder with what the command lines name."""
     place = tmp_path_factory.mktemp("place")
-    texts = {f"{name}.toml": text for name, text in RIGS.items()}
+    texts: dict[str, str | bytes] = {f"{name}.toml": text for name, text in RIGS.items()}
     texts |= {f"{name}.tum": text for name, text in TRAJECTORIES.items()}
     for name, content in (texts | FOREIGN).items():
         data = content.encode() if isinstance(content, str) else content
@@ -123,9 +123,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     SessionLog(place / "session.mcap", session_info(), start).close()
     tomorrow = replace(session_info(4), config_json='{"tomorrow": 1}', wheels={"scale_sigma": 0.1})
     for name, info in (("full", session_info()), ("tomorrow", tomorrow)):
-        log = SessionLog(place / f"{name}.mcap", info, start)
-        feed(log, 2)
-        log.close()
+        write_session(place / f"{name}.mcap", 2, start, info)
     for number in FORMATS:
         write_format(place / f"format_{number}.mcap", number)
     with (place / "chatter.mcap").open("wb") as stream:

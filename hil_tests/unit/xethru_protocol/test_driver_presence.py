@@ -4,24 +4,25 @@ import numpy as np
 import pytest
 
 from hil_tests.unit.xethru_protocol.both_drivers import DriverOn
+from hil_tests.unit.xethru_protocol.emulated import EmulatedModule
 from hil_tests.unit.xethru_protocol.scripted import frame
-from hil_tests.unit.xethru_protocol.scripted_profile import (
-    IDLE,
-    RUN,
-    STEP_M,
-    STOP,
-    ProfileModule,
-    presence,
-)
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import LedMode, NoiseMapControl, OutputFeature
 from xethru_protocol.wire.errors import DeviceError, LocalProtocolError, ResponseTimeout
 
 NO_PRESENCE, PRESENCE, INITIALIZING = 0, 1, 2
+STEP_M = 0.0514403  # grid of zones
+STOP, RUN, IDLE = 0x13, 0x01, 0x11
+
+
+def presence(counter: int, state: int) -> m.PresenceSingle:
+    return m.PresenceSingle(
+        counter=counter, state=state, distance_m=1.5, direction=1, signal_quality=4
+    )
 
 
 def test_profile_is_set_up_and_run_by_the_recipe(driver_on: DriverOn) -> None:
-    module = ProfileModule()
+    module = EmulatedModule()
     radar, _ = driver_on(module)
     radar.presence.load()
     radar.presence.set_sensitivity(8)
@@ -42,7 +43,7 @@ def test_profile_is_set_up_and_run_by_the_recipe(driver_on: DriverOn) -> None:
 
 
 def test_settings_are_read_as_they_were_set(driver_on: DriverOn) -> None:
-    radar, _ = driver_on(ProfileModule())
+    radar, _ = driver_on(EmulatedModule())
     radar.presence.load()
     radar.presence.set_sensitivity(2)
     radar.presence.set_band(4)
@@ -61,7 +62,7 @@ def test_settings_are_read_as_they_were_set(driver_on: DriverOn) -> None:
 def test_zone_is_checked_against_the_modules_limits_and_read_back_snapped(
     driver_on: DriverOn,
 ) -> None:
-    module = ProfileModule()
+    module = EmulatedModule()
     radar, _ = driver_on(module)
     radar.presence.load()
     limits = radar.presence.zone_limits()
@@ -87,7 +88,7 @@ def test_zone_is_checked_against_the_modules_limits_and_read_back_snapped(
     ("verb", "value"), [("set_sensitivity", 10), ("set_sensitivity", -1), ("set_band", 5)]
 )
 def test_values_no_module_has_are_not_sent(driver_on: DriverOn, verb: str, value: int) -> None:
-    module = ProfileModule()
+    module = EmulatedModule()
     radar, _ = driver_on(module)
     radar.presence.load()
     sent = len(module.received)
@@ -97,7 +98,7 @@ def test_values_no_module_has_are_not_sent(driver_on: DriverOn, verb: str, value
 
 
 def test_without_a_profile_nothing_is_asked_that_gets_no_answer(driver_on: DriverOn) -> None:
-    module = ProfileModule()
+    module = EmulatedModule()
     radar, line = driver_on(module)
     for verb in ("zone", "zone_limits", "sensitivity", "led", "noise_map", "run", "idle"):
         with pytest.raises(LocalProtocolError, match=r"no profile is loaded; load\(\) one first"):
@@ -106,8 +107,7 @@ def test_without_a_profile_nothing_is_asked_that_gets_no_answer(driver_on: Drive
 
 
 def test_profile_that_was_found_running_is_used_as_it_is(driver_on: DriverOn) -> None:
-    module = ProfileModule()
-    module.profile, module.mode = 0x014D4AB8, RUN  # as a stock module powers up
+    module = EmulatedModule(stopped=False)  # as a stock module powers up
     radar, line = driver_on(module)
     assert radar.presence.sensitivity() == 5
     line.say(presence(1, NO_PRESENCE))
@@ -118,7 +118,7 @@ def test_profile_that_was_found_running_is_used_as_it_is(driver_on: DriverOn) ->
 
 
 def test_refusals_are_the_modules_own(driver_on: DriverOn) -> None:
-    radar, _ = driver_on(ProfileModule())
+    radar, _ = driver_on(EmulatedModule())
     with pytest.raises(DeviceError, match="APP_INVALID"):
         radar.presence.load(0x064E57AD)
     radar.presence.load()
@@ -128,7 +128,7 @@ def test_refusals_are_the_modules_own(driver_on: DriverOn) -> None:
 
 
 def test_messages_come_typed_and_in_order_and_frames_stay_frames(driver_on: DriverOn) -> None:
-    module = ProfileModule()
+    module = EmulatedModule()
     radar, line = driver_on(module)
     radar.presence.load()
     radar.presence.run()
@@ -159,7 +159,7 @@ def test_messages_come_typed_and_in_order_and_frames_stay_frames(driver_on: Driv
 
 
 def test_messages_of_what_ran_before_are_not_the_loaded_profiles(driver_on: DriverOn) -> None:
-    radar, line = driver_on(ProfileModule())
+    radar, line = driver_on(EmulatedModule())
     radar.presence.load()
     line.say(presence(1, PRESENCE))
     radar.presence.load()
@@ -168,7 +168,7 @@ def test_messages_of_what_ran_before_are_not_the_loaded_profiles(driver_on: Driv
 
 
 def test_messages_that_came_are_heard_without_waiting(driver_on: DriverOn) -> None:
-    radar, line = driver_on(ProfileModule())
+    radar, line = driver_on(EmulatedModule())
     radar.presence.load()
     line.say(presence(2, PRESENCE))
     assert next(radar.presence.messages(timeout_s=0.0)) == presence(2, PRESENCE)
@@ -176,7 +176,7 @@ def test_messages_that_came_are_heard_without_waiting(driver_on: DriverOn) -> No
         next(radar.presence.messages(timeout_s=0.0))
 
 
-def test_messages_nobody_asked_for_are_not_kept(driver_on: DriverOn) -> None:
+def test_messages_are_kept_only_if_they_are_asked_for(driver_on: DriverOn) -> None:
     radar, line = driver_on()
     radar.configure_raw()
     line.say(*(presence(k, PRESENCE) for k in range(9)), frame(1))
@@ -185,7 +185,7 @@ def test_messages_nobody_asked_for_are_not_kept(driver_on: DriverOn) -> None:
 
 
 def test_messages_that_pile_up_are_dropped_and_told_of(driver_on: DriverOn) -> None:
-    radar, line = driver_on(ProfileModule())
+    radar, line = driver_on(EmulatedModule())
     radar.presence.load()
     said = presence(1, PRESENCE)
     for _ in range(4100):
@@ -200,7 +200,7 @@ def test_messages_that_pile_up_are_dropped_and_told_of(driver_on: DriverOn) -> N
 def test_start_is_waited_for_as_long_as_it_may_take(
     driver_on: DriverOn, control: int, limit_s: float
 ) -> None:
-    radar, line = driver_on(ProfileModule())
+    radar, line = driver_on(EmulatedModule())
     radar.presence.load()
     radar.presence.set_noise_map(NoiseMapControl(control))
     radar.presence.run()
@@ -212,7 +212,7 @@ def test_start_is_waited_for_as_long_as_it_may_take(
 
 
 def test_end_of_the_start_is_the_first_message_of_another_state(driver_on: DriverOn) -> None:
-    radar, line = driver_on(ProfileModule())
+    radar, line = driver_on(EmulatedModule())
     radar.presence.load()
     radar.presence.run()
     for second in range(1, 19):
@@ -225,7 +225,7 @@ def test_end_of_the_start_is_the_first_message_of_another_state(driver_on: Drive
 def test_module_that_falls_silent_while_it_starts_is_not_waited_for_all_the_time(
     driver_on: DriverOn,
 ) -> None:
-    radar, line = driver_on(ProfileModule())
+    radar, line = driver_on(EmulatedModule())
     radar.presence.load()
     radar.presence.run()
     with pytest.raises(ResponseTimeout, match="does it run, and is an output switched on"):
@@ -234,7 +234,7 @@ def test_module_that_falls_silent_while_it_starts_is_not_waited_for_all_the_time
 
 
 def test_module_that_restarts_to_change_its_profile_is_waited_for(driver_on: DriverOn) -> None:
-    module = ProfileModule()
+    module = EmulatedModule()
     module.run_errors = [0x22]
     radar, line = driver_on(module)
     radar.presence.load()
@@ -254,7 +254,7 @@ def test_module_that_restarts_to_change_its_profile_is_waited_for(driver_on: Dri
 
 
 def test_profile_pauses_goes_on_and_stops(driver_on: DriverOn) -> None:
-    module = ProfileModule()
+    module = EmulatedModule()
     radar, _ = driver_on(module)
     radar.presence.load()
     radar.presence.run()
@@ -268,17 +268,17 @@ def test_profile_pauses_goes_on_and_stops(driver_on: DriverOn) -> None:
 
 
 def test_running_profile_is_left_running_at_the_end(driver_on: DriverOn) -> None:
-    module = ProfileModule()
+    module = EmulatedModule()
     radar, line = driver_on(module)
     with radar:
         radar.presence.load()
         radar.presence.run()
-    assert module.mode == RUN
+    assert module.module.modes.mode == RUN
     assert line.closed
 
 
 def test_noise_map_and_factory_preset(driver_on: DriverOn) -> None:
-    module = ProfileModule()
+    module = EmulatedModule()
     radar, _ = driver_on(module)
     radar.presence.load()
     radar.presence.store_noise_map()

@@ -13,7 +13,8 @@ from queue import SimpleQueue
 import numpy as np
 
 from slam.app.errors import AppError, UsageError
-from slam.app.odometry.live import FixedClock, LineSource, LiveOdometry, parse_source
+from slam.app.odometry.arrival import ClockLine
+from slam.app.odometry.live import LineSource, LiveOdometry, parse_source
 from slam.app.odometry.tum import NS_PER_S
 from slam.app.records import RadarInfo, SessionInfo, SessionObserver
 from slam.app.rig.emulated import RAW_CONFIG, versions
@@ -152,7 +153,7 @@ def run_rig(
             view.keep_serving()
 
 
-def parse_clock(text: str, source: LineSource) -> FixedClock | None:
+def parse_clock(text: str, source: LineSource) -> ClockLine | None:
     """Return the odometry's clock; None if the arrival of its lines gives the time.
 
     Parameters
@@ -176,11 +177,11 @@ def parse_clock(text: str, source: LineSource) -> FixedClock | None:
             )
         return None
     if text == "unix":
-        return FixedClock(time.monotonic_ns() - time.time_ns())
+        return ClockLine(origin_ns=time.monotonic_ns() - time.time_ns())
     if text == "monotonic":
-        return FixedClock(0)
+        return ClockLine(origin_ns=0)
     if re.fullmatch(r"[0-9]{1,18}", text):  # of 63 bits
-        return FixedClock(int(text))
+        return ClockLine(origin_ns=int(text))
     raise UsageError(
         f"--odometry-clock {text}: must be arrival, unix, monotonic, or the monotonic "
         "nanoseconds at stamp 0"

@@ -8,9 +8,8 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
-from slam.app.convert import rosbag as layout
-from slam.app.convert.matlab import MatOptions, convert_mat, write_detections
-from slam.app.convert.rosbag import BagOptions, convert_bag, write_bag
+from slam.app.convert.matlab import convert_mat, write_detections
+from slam.app.convert.rosbag import AUTHORS_RIG, convert_bag, write_bag
 from slam.app.errors import AppError, UsageError
 from slam.app.rig.files import load_rig
 from slam.app.run.replay import recorded_config
@@ -103,16 +102,19 @@ def run_convert(
         given_rig = None if rig is None else load_rig(rig).rig
         with _removing(out):
             if is_mat:
-                of_mat = MatOptions(rig=given_rig, rate_hz=rate_hz, settings=settings)
-                result = convert_mat(source, out, of_mat, stop.check)
+                result = convert_mat(
+                    source, out, stop.check, settings=settings, rig=given_rig, rate_hz=rate_hz
+                )
             else:
-                of_bag = BagOptions(
-                    rig=given_rig or layout.AUTHORS_RIG,
+                result, warnings = convert_bag(
+                    source,
+                    out,
+                    stop.check,
+                    settings=settings,
+                    rig=given_rig or AUTHORS_RIG,
                     area_m=None if area_m is None else (area_m[0], area_m[1]),
                     truth_topic=truth_topic,
-                    settings=settings,
                 )
-                result, warnings = convert_bag(source, out, of_bag, stop.check)
     for line in warnings:
         print(f"uwb-slam: {source}: {line}", file=sys.stderr)  # noqa: T201 - a warning
     print(result)  # noqa: T201 - the result

@@ -217,20 +217,19 @@ _SAME_RANGE_M = 1e-4
 _STEP_M2, _STEP_RAD = 20e-6, 2e-3
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MatOptions:
-    """What such a file may lack: mounts, states per second, settings of SLAM.
-
-    Without ``rig`` the mounts are those in the file, or else those of the authors' robot.
-    """
-
-    rig: Rig | None = None
-    rate_hz: float = 5.0
-    settings: SlamSettings
-
-
-def convert_mat(mat: Path, out: Path, options: MatOptions, check: Callable[[], None]) -> str:
+def convert_mat(
+    mat: Path,
+    out: Path,
+    check: Callable[[], None],
+    *,
+    settings: SlamSettings,
+    rig: Rig | None = None,
+    rate_hz: float = 5.0,
+) -> str:
     """Write the detections and odometry of a file as a session; return a line about it.
+
+    Without ``rig`` the mounts are those in the file, or else those of the authors' robot;
+    ``rate_hz`` is of states, for a file without stamps.
 
     Raises
     ------
@@ -238,9 +237,9 @@ def convert_mat(mat: Path, out: Path, options: MatOptions, check: Callable[[], N
         The file makes no sense, or the rig has not one pair of radars on each side.
     """
     drive = read_mat(mat)
-    rig = options.rig or _rig_of(drive)
+    rig = rig or _rig_of(drive)
     pairs = _sides(mat, rig)
-    stamps_ns = _stamps_ns(drive, options.rate_hz)
+    stamps_ns = _stamps_ns(drive, rate_hz)
     radars = tuple(
         imported_radar(
             # whatever a module measures too long, it is in the fixes already
@@ -248,11 +247,11 @@ def convert_mat(mat: Path, out: Path, options: MatOptions, check: Callable[[], N
             range_start_m=0.0,
             bin_length_m=_BIN_M,
             n_bins=drive.frames[number].shape[1] if number in drive.frames else 0,
-            rate_hz=options.rate_hz,
+            rate_hz=rate_hz,
         )
         for number, mount in enumerate(rig.mounts, start=1)
     )
-    info = imported_info(mat, radars, options.settings, time_base="states", has_detections=True)
+    info = imported_info(mat, radars, settings, time_base="states", has_detections=True)
     poses = [
         TumSample(t_ns=t_ns, x_m=x, y_m=y, qz=math.sin(turn / 2), qw=math.cos(turn / 2))
         for t_ns, (x, y, turn) in zip(stamps_ns, drive.odometry.tolist(), strict=True)
@@ -273,7 +272,7 @@ def convert_mat(mat: Path, out: Path, options: MatOptions, check: Callable[[], N
         log.close()
     result = f"{out}: {len(poses)} states with {n_fixes} fixes, made of {n_ranges} ranges"
     if drive.stamps_s is None:
-        result += f"; the file has no stamps, {options.rate_hz:g} states/s are assumed"
+        result += f"; the file has no stamps, {rate_hz:g} states/s are assumed"
     return result
 
 

@@ -115,28 +115,6 @@ _TRUTH_TYPES = (ros.POSE, "geometry_msgs/msg/PoseWithCovarianceStamped", ros.ODO
 _PAPER_BINS, _PAPER_AREA_M = 1431, (0.2, 9.4)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BagOptions:
-    """What a bag does not contain.
-
-    Attributes
-    ----------
-    rig
-        Mounts under the names of the topics (UWBradar1, ...); ignored if the bag has them.
-    area_m
-        Frame area that the modules were asked for, module metres; None: the paper's.
-    truth_topic
-        Of geometry_msgs/PoseStamped or PoseWithCovarianceStamped or nav_msgs/Odometry.
-    settings
-        For bags that no session of this program became.
-    """
-
-    rig: Rig = AUTHORS_RIG
-    area_m: tuple[float, float] | None = None
-    truth_topic: str = TRUTH_TOPIC
-    settings: SlamSettings
-
-
 @dataclass(slots=True, kw_only=True)
 class _Stream:
     """The frames of one topic, as far as one look shows."""
@@ -160,9 +138,31 @@ class _Contents:
 
 
 def convert_bag(
-    bag: Path, out: Path, options: BagOptions, check: Callable[[], None]
+    bag: Path,
+    out: Path,
+    check: Callable[[], None],
+    *,
+    settings: SlamSettings,
+    rig: Rig = AUTHORS_RIG,
+    area_m: tuple[float, float] | None = None,
+    truth_topic: str = TRUTH_TOPIC,
 ) -> tuple[str, list[str]]:
     """Write a bag as a session; return a line about it, and warnings.
+
+    Parameters
+    ----------
+    bag, out
+        The files.
+    check
+        Called for every message; may raise to stop.
+    settings
+        For bags that were not made of a session of this program.
+    rig
+        Mounts under the names of the topics (UWBradar1, ...); ignored if the bag has them.
+    area_m
+        Frame area that the modules were asked for, module metres; None: the paper's.
+    truth_topic
+        Of geometry_msgs/PoseStamped or PoseWithCovarianceStamped or nav_msgs/Odometry.
 
     Raises
     ------
@@ -170,24 +170,24 @@ def convert_bag(
         No bag, a damaged one, one without radars or odometry, or frames that do not fit the frame
         area; one line.
     """
-    contents = _look_through(bag, options.truth_topic, check)
-    odd = []
+    contents = _look_through(bag, truth_topic, check)
+    warnings = []
     if contents.left_out:
-        odd.append(f"poses that went back in time and are left out: {contents.left_out}")
+        warnings.append(f"poses that went back in time and are left out: {contents.left_out}")
     names = sorted(contents.streams, key=radar_order)
-    radars = tuple(_radar_info(bag, name, contents, options) for name in names)
+    radars = tuple(_radar_info(bag, name, contents, rig, area_m) for name in names)
     try:
         odometry = OdometryTrack(contents.odometry)
     except OdometryError:
         raise AppError(f"{bag}: holds no pose on {ODOMETRY_TOPIC}, nav_msgs/Odometry") from None
     truth = OdometryTrack(contents.truth) if contents.truth else None
     if truth is None:
-        odd.append(f"no truth on {options.truth_topic}: numbers that need it will be null")
+        warnings.append(f"no truth on {truth_topic}: numbers that need it will be null")
     period_ns = float(np.median([1e9 / radar.rate_hz for radar in radars]))
     start_ns = min(stream.stamps_ns[0] for stream in contents.streams.values())
     log = SessionLog(
         out,
-        _session_info(bag, contents, radars, options),
+        _session_info(bag, contents, radars, settings),
         odometry,
         truth_at=None if truth is None else _poses_of(truth),
         start_ns=min(start_ns, odometry.first_ns),
@@ -203,12 +203,12 @@ def convert_bag(
     finally:
         log.close()
     if unused:
-        odd.append(f"{unused} scans lie outside the odometry and are marked as not to be used")
+        warnings.append(f"{unused} scans lie outside the odometry and are marked as not to be used")
     n_frames = sum(len(stream.stamps_ns) for stream in contents.streams.values())
     return (
         f"{out}: {n_frames} frames of {len(radars)} radars in {n_scans} scans, "
         f"{len(odometry.samples)} poses of the wheels, {len(contents.truth)} true poses",
-        odd,
+        warnings,
     )
 
 
@@ -299,20 +299,26 @@ def _sample(message: ros.Message, t_ns: int) -> TumSample:
     )
 
 
-def _radar_info(bag: Path, name: str, contents: _Contents, options: BagOptions) -> RadarInfo:
+def _radar_info(
+    bag: Path,
+    name: str,
+    contents: _Contents,
+    rig: Rig,
+    area_m: tuple[float, float] | None,
+) -> RadarInfo:
     stream = contents.streams[name]
     if name in contents.infos:
         return read_radar_text(bag, f"/{name}/info", contents.infos[name])
-    mount = next((mount for mount in options.rig.mounts if mount.name == name), None)
+    mount = next((mount for mount in rig.mounts if mount.name == name), None)
     if mount is None:
-        known = ", ".join(mount.name for mount in options.rig.mounts)
+        known = ", ".join(mount.name for mount in rig.mounts)
         raise AppError(f"{bag}: radar {name} is not in the rig ({known}); give --rig")
-    if options.area_m is None and stream.n_bins != _PAPER_BINS:
+    if area_m is None and stream.n_bins != _PAPER_BINS:
         raise AppError(
             f"{bag}: frames of {stream.n_bins} bins, not the paper's {_PAPER_BINS}; "
             "say --frame-area START END, in metres, as the modules were asked for"
         )
-    area_m = options.area_m or _PAPER_AREA_M
+    area_m = area_m or _PAPER_AREA_M
     try:
         area = frame_area(*area_m)
     except XeThruError as error:
@@ -339,7 +345,7 @@ def _rate_hz(stream: _Stream) -> float:
 
 
 def _session_info(
-    bag: Path, contents: _Contents, radars: tuple[RadarInfo, ...], options: BagOptions
+    bag: Path, contents: _Contents, radars: tuple[RadarInfo, ...], settings: SlamSettings
 ) -> SessionInfo:
     if contents.session is not None:
         try:
@@ -347,7 +353,7 @@ def _session_info(
         except ValueError as error:
             raise AppError(f"{bag}: {SESSION_TOPIC} cannot be read: {error}") from None
         return read_session_table(bag, table, radars)
-    return imported_info(bag, radars, options.settings, time_base="recording")
+    return imported_info(bag, radars, settings, time_base="recording")
 
 
 def _poses_of(track: OdometryTrack) -> Callable[[NDArray[np.int64]], NDArray[np.float64]]:

@@ -23,7 +23,8 @@ from slam.app.odometry.tum import NS_PER_S
 from slam.app.rig.emulated import rig_of, scene_and_config, true_landmarks_m
 from slam.app.run.output import share_text
 from slam.app.run.pictures import ESTIMATE, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label
-from slam.app.sweep.run import drive_in_process
+from slam.app.run.runner import execute
+from slam.app.sweep.run import loopback_source
 from slam.config import ClusteringConfig, SlamConfig, load_preset
 from slam.geometry import Rig, transform
 from slam.paper.clustering import CollectedState, filter_window
@@ -150,7 +151,7 @@ def drive(scene: str, *, seed: int, check: Callable[[], None] = lambda: None) ->
     rig = rig_of(lap)
     # With a window of one state each comes out as it is collected.
     alone = config.model_copy(update={"window": config.window.model_copy(update={"size": 1})})
-    record = drive_in_process(lap, UwbRadarSlam(alone, rig), seed, check=check)
+    record = execute(loopback_source(lap, "paper", UwbRadarSlam(alone, rig), seed, check=check))
     return Seen(
         scene=lap.name,
         states=tuple(

@@ -29,8 +29,8 @@ from slam.app.experiments import Result
 from slam.app.rig.emulated import rig_of, scene_and_config, true_landmarks_m
 from slam.app.run.output import mm_text
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, TRUTH, label
-from slam.app.run.runner import RunRecord
-from slam.app.sweep.run import drive_in_process
+from slam.app.run.runner import RunRecord, execute
+from slam.app.sweep.run import loopback_source
 from slam.geometry import transform
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import Fix, Observation, StepResult
@@ -141,7 +141,9 @@ def drive_in_clear_air_and_smoke(
     runs: list[ObservedRun] = []
     for name, scene, settings, noise_seed in cells:
         slam = UwbRadarSlam(settings, rig_of(scene))
-        record = drive_in_process(scene, slam, seed, noise_seed=noise_seed, check=check)
+        record = execute(
+            loopback_source(scene, "paper", slam, seed, noise_seed=noise_seed, check=check)
+        )
         if not runs:
             reference = record
         runs.append(_observed(name, scene, record, reference if scene is not lab else None))

@@ -48,16 +48,6 @@ MOST_M = 1e8
 _COMPLAINTS = 5
 
 
-class FixedClock:
-    """A clock known beforehand: `origin_ns` is the host's time at session time 0."""
-
-    def __init__(self, origin_ns: int) -> None:
-        self._line = ClockLine(origin_ns=origin_ns)
-
-    def session_ns(self, host_ns: int) -> int:
-        return self._line.nominal_ns(host_ns)
-
-
 class LiveOdometry:
     """Turns lines into poses, and reports what is wrong with them.
 
@@ -66,7 +56,7 @@ class LiveOdometry:
     name
         What to call the source in messages to people.
     clock
-        Host time of session time 0, if known; None: from when lines arrive.
+        Its clock against the host's, if known; None: from when lines arrive.
 
     Attributes
     ----------
@@ -78,7 +68,7 @@ class LiveOdometry:
         Why they will not; "" where the source just ended.
     """
 
-    def __init__(self, name: str, clock: FixedClock | None = None) -> None:
+    def __init__(self, name: str, clock: ClockLine | None = None) -> None:
         self._name = name
         self._fixed = clock
         self._envelope = LowerEnvelope()
@@ -109,7 +99,7 @@ class LiveOdometry:
 
     def session_ns(self, host_ns: int) -> int:
         if self._fixed is not None:
-            return self._fixed.session_ns(host_ns)
+            return self._fixed.nominal_ns(host_ns)
         return self._envelope.line.nominal_ns(host_ns)
 
     def take(self, line: str, arrival_ns: int) -> tuple[TumSample | None, str]:

@@ -24,7 +24,7 @@ from emulator.scene.wheels import scene_odometry
 from slam.app.errors import AppError, UsageError
 from slam.app.odometry.track import OdometryTrack
 from slam.app.odometry.tum import NS_PER_S
-from slam.app.records import Scan
+from slam.app.records import Scan, SessionInfo
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,
@@ -37,8 +37,9 @@ from slam.app.rig.emulated import (
     versions,
     wheels_of,
 )
-from slam.app.run.evaluation import Summary, summarise
-from slam.app.run.runner import RunRecord, run_slam
+from slam.app.run.evaluation import Summary
+from slam.app.run.results import summary_of
+from slam.app.run.runner import RunRecord, RunSource, execute
 from slam.app.sweep.bound import BoundSummary, bound_of
 from slam.app.sweep.stress import CLEAN, STRESSES, Stress
 from slam.config import ConfigError, SlamConfig, override
@@ -334,60 +335,52 @@ def make_case(
     )
 
 
-def run_in_process(
-    scene: str,
-    preset: str,
-    seed: int,
-    *,
-    stress: str = CLEAN,
-    settings: Mapping[str, str] | None = None,
-    check: Callable[[], None] = never,
-) -> RunRecord:
-    """Do what the demo does without ports and processes: same driver, device, odometry text."""
-    return record_of(make_case(scene, preset, seed, settings=settings, stress=stress), check=check)
-
-
-def run_one(scene: str, preset: str, seed: int, *, check: Callable[[], None] = never) -> Summary:
-    """Run a scene with a preset and return its numbers.
-
-    Raises
-    ------
-    AppError
-        The scene is too short for a single state.
-    """
-    case = make_case(scene, preset, seed)
-    return _summary(case, record_of(case, check=check))
-
-
-def drive_in_process(
+def loopback_source(
     scene: Scene,
+    preset: str,
     slam: Slam,
     seed: int,
     *,
     noise_seed: int | None = None,
     stress: Stress = STRESSES[CLEAN],
     check: Callable[[], None] = never,
-) -> RunRecord:
-    """Drive the emulated robot through a scene in this process; ``noise_seed`` is ``seed`` if None.
+) -> RunSource:
+    """Return the emulated robot in this process: same driver, device and odometry text as the demo.
 
-    ``seed`` is that of the odometry and of the stress, ``noise_seed`` that of the receivers.
+    ``seed`` is that of odometry and stress, and of the receivers' noise unless ``noise_seed`` is.
+    ``check`` is called once per scan; may raise to stop.
     """
     trajectory = scene.trajectory()
     duration_ns = trajectory.duration_ns
-    odometry = OdometryTrack.from_lines(scene_odometry(scene, seed))
-    with open_loopback(scene, seed if noise_seed is None else noise_seed) as source:
-        source.start(RAW_CONFIG, FRAME_RATE_HZ)
-        scans = stressed_scans(
-            source.scans(end_counter(duration_ns), check), stress, seed, duration_ns
-        )
-        return run_slam(scans, odometry, slam, trajectory.poses)
+    radars = open_loopback(scene, seed if noise_seed is None else noise_seed)
+    radars.start(RAW_CONFIG, FRAME_RATE_HZ)
+    scans = radars.scans(end_counter(duration_ns), check)
+    return RunSource(
+        info=SessionInfo(
+            scene=scene.name,
+            preset=preset,
+            seed=seed,
+            radars=radars.radars,
+            true_landmarks_m=true_landmarks_m(scene),
+            versions={},
+        ),
+        rig=rig_of(scene),
+        slam=slam,
+        scans=stressed_scans(scans, stress, seed, duration_ns),
+        odometry=OdometryTrack.from_lines(scene_odometry(scene, seed)),
+        truth_at=trajectory.poses,
+        close=radars.close,
+    )
 
 
-def record_of(case: Case, *, check: Callable[[], None] = never) -> RunRecord:
-    """Drive the robot through a case; SLAM gets the scene's own rig and wheels, no stress."""
+def source_of(case: Case, *, check: Callable[[], None] = never) -> RunSource:
+    """Return the source of a case; SLAM gets the scene's own rig and wheels, no stress."""
     stress = STRESSES[case.stress]
     scene = stressed_scene(case.scene, stress, case.seed)
-    return drive_in_process(scene, _slam(case, stress), case.seed, stress=stress, check=check)
+    slam = make_slam(
+        case.config, rig_of(case.scene), wheels_of(case.scene), _front_end(case, stress)
+    )
+    return loopback_source(scene, case.preset, slam, case.seed, stress=stress, check=check)
 
 
 def run_case(
@@ -414,8 +407,11 @@ def run_case(
             "a worker has another version of xethru-hil or its libraries than this machine; "
             "install the same on both"
         )
-    record = record_of(case, check=check)
-    summary = _summary(case, record)
+    source = source_of(case, check=check)
+    record = execute(source)
+    summary = summary_of(source, record)
+    if summary is None:
+        raise AppError(f"{case.scene.name}: too short for SLAM, no state was estimated")
     false, confident = false_landmarks(record, case.scene)
     run = SweepRun(
         **{row.name: getattr(summary, row.name) for row in fields(summary)},
@@ -472,11 +468,6 @@ def program_version() -> str:
     return digest.hexdigest()
 
 
-def _slam(case: Case, stress: Stress) -> Slam:
-    rig, wheels = rig_of(case.scene), wheels_of(case.scene)
-    return make_slam(case.config, rig, wheels, _front_end(case, stress))
-
-
 def _front_end(case: Case, stress: Stress) -> OutlierDetector | None:
     if not stress.outlier_share:
         return None
@@ -488,17 +479,3 @@ def _front_end(case: Case, stress: Stress) -> OutlierDetector | None:
         max_range_m=limits.max_range_m,
         seed=case.seed,
     )
-
-
-def _summary(case: Case, record: RunRecord) -> Summary:
-    summary = summarise(
-        record,
-        scene=case.scene.name,
-        preset=case.preset,
-        seed=case.seed,
-        rig=rig_of(case.scene),
-        true_landmarks_m=true_landmarks_m(case.scene),
-    )
-    if summary is None:
-        raise AppError(f"{case.scene.name}: too short for SLAM, no state was estimated")
-    return summary

@@ -3,10 +3,10 @@
 A data file holds records without separators: a message's payload without its leading codes
 (Protocol reference 12). Data type bits: [OBS] seen in recordings of known content; [HDR] taken
 from the public header of the vendor's library, no sample at hand. File names: [FMT] Protocol
-reference 12, [OBS] seen. The kinds that are text stand in ``csv_kinds``.
+reference 12, [OBS] seen. The kinds that are text are in `CSV_KINDS`.
 
 A line is an ISO time stamp and the message's fields, separated by ``;``; the first line names the
-columns. Lists stand in square brackets, separated by commas. Known from a recording [OBS]:
+columns. Lists are in square brackets, separated by commas. Known from a recording [OBS]:
 PRESENCE_SINGLE with its header, bit and name. Bits [HDR] as in ``layouts``. Everything else is
 inferred [INF] from the message's fields in the same manner, or from what others report of such
 files; a line of another column count or order is reported, not guessed at.
@@ -43,7 +43,7 @@ Index, 33 bytes per entry::
 
 After the index: u32 duration, u8 3, u32 number of files; of each u32 length and name, with NUL.
 
-The file number and the two different origins of begin and end cannot be told from our samples,
+The file number and the two different origins of begin and end do not follow from our samples,
 which have one file each; they are what others report of split recordings in the same format.
 """
 
@@ -95,11 +95,9 @@ class Layout:
 
     @property
     def element_bytes(self) -> int:
-        """Bytes per element."""
         return self.columns * np.dtype(self.values).itemsize
 
     def record_size(self, header: bytes) -> int:
-        """Bytes of the record that begins with ``header``."""
         count = int(np.frombuffer(header, self.header, 1)[self.count][0])
         return self.header.itemsize + count * self.element_bytes
 
@@ -322,7 +320,7 @@ class CsvKind:
         Raises
         ------
         ValueError, OverflowError, LocalProtocolError
-            If the line is none of this kind.
+            If the line is of another kind.
         """
         cells = line.rstrip("\r\n").split(";")
         if len(cells) != len(self.columns) + 1:
@@ -350,7 +348,7 @@ def _stamp(time_ms: int, zone: tzinfo | None) -> str:
 def _time_ns(stamp: str) -> int:
     time = datetime.fromisoformat(stamp)
     if time.tzinfo is None:
-        time = time.astimezone()  # the zone it was written in is not told: this machine's
+        time = time.astimezone()  # the zone it was written in is not stored: this machine's
     time_ms = (time - _UNIX) // timedelta(milliseconds=1)
     if not EARLIEST_MS <= time_ms <= LATEST_MS:
         raise ValueError(f"{stamp} is beyond what 64 bits of nanoseconds hold")
@@ -534,7 +532,6 @@ class Entry:
     end: int
 
     def pack(self) -> bytes:
-        """Bytes of the entry."""
         kind = _CLOSED if self.closed else _RECORD
         return _ENTRY.pack(
             self.since_start_ms, kind, self.data_type, self.size, self.file, self.begin, self.end
@@ -587,7 +584,6 @@ class MetaHead:
     session_id: bytes = b""
 
     def pack(self) -> bytes:
-        """Bytes of the head."""
         text = self.session_id + b"\0"
         return (
             _HEAD.pack(
@@ -611,7 +607,7 @@ class MetaHead:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Meta:
-    """A meta file as read; ``complete`` says that it was closed and nothing is missing."""
+    """A meta file as read; ``complete``: it was closed and nothing is missing."""
 
     head: MetaHead
     entries: Index
@@ -664,7 +660,6 @@ def parse_meta(data: bytes) -> Meta:
 
 
 def _parse_entries(data: bytes, index: int, index_end: int) -> tuple[Index, int]:
-    """Return the entries from ``index`` on and where they end."""
     stop = min(index_end, len(data)) if index_end else len(data)
     count = max(stop - index, 0) // _ENTRY.size
     rows = np.frombuffer(data, _ROW, count, index) if count else np.empty(0, _ROW)

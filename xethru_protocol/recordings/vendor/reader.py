@@ -1,7 +1,7 @@
 """Reads recording directories of the vendor's ModuleConnector: what was received, and when.
 
 The data files alone give every message (`vendor_files`); the index of the meta file adds the
-times and the order among several files. What the index says wrong costs times, never messages.
+times and the order among several files. An error in the index costs times, never messages.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ from xethru_protocol.wire.table import Response
 _KINDS: tuple[Layout | CsvKind, ...] = (*LAYOUTS, *CSV_KINDS)
 _BY_TYPE: dict[int, Layout | CsvKind] = {kind.data_type: kind for kind in _KINDS}
 _BY_LENGTH = sorted(_KINDS, key=lambda kind: -len(kind.file_prefix))
-_LONGEST_USER_HEADER = 4096  # bytes; looked for where no index tells how long it is
+_LONGEST_USER_HEADER = 4096  # bytes; looked for where no index gives its length
 _LARGEST_PLAUSIBLE_RECORD = 1 << 16
 _LAST_CONTENT_ID = 14  # Protocol reference 6.1
 
 
 def kind_of(file_or_type: str | int) -> Layout | CsvKind | None:
-    """Kind of a data file by its name or its data type bit; None if it is none we know."""
+    """Kind of a data file by its name or its data type bit; None if it is not known."""
     if isinstance(file_or_type, int):
         return _BY_TYPE.get(file_or_type)
     for kind in _BY_LENGTH:
@@ -67,7 +67,7 @@ class DataFile:
     Parameters
     ----------
     path
-        The file; its name tells its kind.
+        The file; its name determines its kind.
     on_fault
         Called with what could not be read; None: that raises.
 
@@ -102,11 +102,10 @@ class DataFile:
             raise unreadable(path, error) from None
 
     def close(self) -> None:
-        """Close the file."""
         self._stream.close()
 
     def skip_user_header(self) -> None:
-        """Leave out a user header whose length nobody tells.
+        """Leave out a user header of unknown length.
 
         Raises
         ------
@@ -200,7 +199,7 @@ class DataFile:
 
 
 def _user_header_bytes(start: bytes, size: int, kind: Layout | CsvKind) -> int:
-    """Length of what stands before the first record, as far as the records themselves tell.
+    """Length of what precedes the first record, as far as the records themselves show.
 
     ``start`` is the beginning of the file of ``size`` bytes. 0 where records begin at once, and
     where no place is better.
@@ -248,7 +247,7 @@ def read_vendor(path: Path, on_fault: FaultHandler | None) -> TimedMessages:
 
 
 def vendor_facts(path: Path) -> RecordingFacts:
-    """Return what a recording says about itself; next to nothing without a meta file.
+    """Return the facts about a recording; almost none without a meta file.
 
     Raises
     ------
@@ -280,7 +279,6 @@ def vendor_facts(path: Path) -> RecordingFacts:
 
 
 def is_vendor_file(path: Path) -> bool:
-    """Whether a file's name is one that ModuleConnector gives."""
     return path.name == META_NAME or kind_of(path.name) is not None
 
 
@@ -330,7 +328,7 @@ def _data_files(directory: Path) -> list[Path]:
 def _split_directories(path: Path) -> list[tuple[Path, list[Path]]]:
     names = sorted(child for child in path.iterdir() if child.name.startswith(_DIRECTORY_PREFIX))
     parts = [(child, files) for child in names if child.is_dir() and (files := _data_files(child))]
-    # Without a session id, nothing says that two directories are of one radar.
+    # Without a session id, two directories cannot be assigned to one radar.
     sessions = {_session(directory) or directory for directory, _ in parts}
     if len(sessions) > 1:
         raise RecordingError(
@@ -349,7 +347,7 @@ def _session(directory: Path) -> bytes | None:
 
 
 def _read_meta(directory: Path) -> Meta | None:
-    """Meta file of a directory; None if there is none, RecordingError if it is of no use."""
+    """Meta file of a directory; None if there is none, RecordingError if it is unusable."""
     path = directory / META_NAME
     try:
         data = path.read_bytes() if path.is_file() else None
@@ -429,7 +427,7 @@ class _Part:
 
     def _rest(self, reading: _Reading) -> Iterator[Timed]:
         """Read what lies behind the index: recorded last, or with no index at all."""
-        if reading.file.position == 0:  # no index told of a user header
+        if reading.file.position == 0:  # no index gave the length of a user header
             reading.file.skip_user_header()
         while (found := reading.file.take()) is not None:
             message, stamp_ns = found
@@ -439,7 +437,7 @@ class _Part:
     def _file_numbers(
         self, meta: Meta, readings: list[_Reading]
     ) -> Callable[[Entry], _Reading | None]:
-        """Tell which open file an entry means: by the list of files, else by type and order."""
+        """Return what finds the file of an entry: by the list of files, else by type and order."""
         by_name = {reading.file.path.name: reading for reading in readings}
         by_number: dict[tuple[int, int], _Reading | None] = {}
         unlisted = [path.name for path in _data_files(self._directory)]

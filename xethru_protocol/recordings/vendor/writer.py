@@ -44,7 +44,6 @@ class Split:
     seconds: float | None = None
 
     def __post_init__(self) -> None:
-        """Check that every limit leaves room for a record."""
         for limit in (self.records, self.bytes, self.seconds):
             if limit is not None and not limit > 0:
                 raise RecordingError(f"a limit of a data file must be positive, not {limit}")
@@ -63,7 +62,6 @@ class _DataFile:
         self.records = 0
 
     def is_full(self, split: Split, since_ms: int) -> bool:
-        """Whether the next record belongs into another file."""
         return (
             (split.records is not None and self.records >= split.records)
             or (split.bytes is not None and self.size >= split.bytes)
@@ -143,7 +141,6 @@ class RecordingWriter:
                 _append(stream, self.directory / PARAMETER_FILE_NAME, content, 0)
 
     def __enter__(self) -> Self:
-        """Return the writer itself."""
         return self
 
     def __exit__(
@@ -152,11 +149,10 @@ class RecordingWriter:
         value: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Close the recording."""
         try:
             self.close()
         except RecordingError:
-            if value is None:  # else what went wrong first says why
+            if value is None:  # the first error is raised
                 raise
 
     def write(self, message: Response, t_ns: int) -> bool:

@@ -41,7 +41,6 @@ def frame(samples: Array, range_start_m: float = 0.2) -> RadarFrame:
 
 @st.composite
 def scenes(draw: st.DrawFn) -> Array:
-    """Draw a noisy frame of up to four echoes."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     samples = draw(st.sampled_from([0.0, 2e-4, 5e-4])) * rng.standard_normal(N_BINS)
     for _ in range(draw(st.integers(0, 4))):

@@ -68,7 +68,6 @@ def frames_of(
 def detect(
     frames: list[RadarFrame], front_end: str, *, rate: float = 1e-3, told_sigma: float = 0.0
 ) -> list[Array]:
-    """Return the detected ranges of each frame."""
     config = override(
         SlamConfig(),
         {
@@ -95,7 +94,6 @@ def by_trial(found: list[Array]) -> list[Array]:
 
 
 def share_error(share: float) -> float:
-    """Return the standard error of a share of the trials."""
     return math.sqrt(share * (1 - share) / TRIALS)
 
 

@@ -35,7 +35,6 @@ def plane(pose: Array) -> tuple[complex, complex]:
 
 
 def antenna(pose: Array, mount: Mount) -> tuple[complex, complex]:
-    """Return position and boresight of a radar in the world."""
     at, heading = plane(pose)
     where = at + heading * complex(mount.x_m, mount.y_m)
     return where, heading * cmath.rect(1.0, mount.yaw_rad)

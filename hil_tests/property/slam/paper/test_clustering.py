@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as npst
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
-from hil_tests.unit.slam.pose_tracks import at_rest
+from hil_tests.unit.slam.simulation import at_rest
 from slam.config import (
     ClusterCount,
     ClusteringConfig,

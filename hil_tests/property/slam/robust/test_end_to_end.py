@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from hil_tests.property.slam.front_end.test_detection import N_BINS, frame, pulse
 from hil_tests.system.short_scene import write_short_scene
-from hil_tests.unit.slam.pose_tracks import at_rest
 from hil_tests.unit.slam.robust.range_world import LAB
-from hil_tests.unit.slam.simulation import FRAME_NS, World, integrate, simulate
-from slam.app.sweep.run import run_in_process
+from hil_tests.unit.slam.simulation import FRAME_NS, World, at_rest, integrate, simulate
+from slam.app.run.runner import execute
+from slam.app.sweep.run import make_case, source_of
 from slam.config import WheelNoise, load_preset, override
 from slam.evaluation import align_se2, ate_rmse_m
 from slam.frames import Detection, RadarFrame
@@ -204,7 +204,8 @@ def test_through_echoes_the_floor_is_that_of_the_front_end(
     record_property: Callable[[str, object], None],
 ) -> None:
     """Bounds: a fix of ranges that are 7.4 mm rms off is 59 mm off; a fifth of a bin is 1.3 mm."""
-    record = run_in_process(str(silent_scene(tmp_path)), preset, 0, settings=TOLD_NOISE)
+    case = make_case(str(silent_scene(tmp_path)), preset, 0, settings=TOLD_NOISE)
+    record = execute(source_of(case))
     estimate = np.array([result.belief.pose[:2] for result in record.results])
     ate_m = ate_rmse_m(estimate, record.truth[:, :2])
     landmarks = transform(

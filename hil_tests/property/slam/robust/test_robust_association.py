@@ -328,7 +328,6 @@ def test_a_point_between_two_landmarks_is_neither(apart_m: float, row: int | Non
 
 
 def lone_landmark() -> RobustBackEnd:
-    """Return a back end that knows one landmark, ahead of the left radars."""
     back_end = RobustBackEnd(paper_rig(), BackEndParameters())
     point = BodyPoint(
         point_m=np.array([0.0, 1.0]), covariance=1e-6 * np.eye(2), by_offsets=np.zeros((2, 4))

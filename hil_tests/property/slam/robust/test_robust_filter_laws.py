@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -16,7 +17,6 @@ from hil_tests.property.robust_oracles import (
     random_state,
     seeds,
     turn,
-    twin,
     values,
 )
 from slam.config import WheelNoise
@@ -53,7 +53,6 @@ def dense(rows: Rows, size: int) -> Array:
 
 
 def see(state: State, radar: int, landmark: int, range_m: float, sigma_m: float = SIGMA_M) -> float:
-    """Update with one range and return its NIS."""
     rows = rows_for(state, [radar], [landmark])
     residual = np.array([range_m]) - rows.predicted_m
     return state.update(rows.at, rows.H, residual, np.array([sigma_m**2]))[0]
@@ -87,7 +86,7 @@ def test_update_is_joseph_s_and_the_information_form(seed: int) -> None:
     S = H @ P @ H.T + R
     K = P @ H.T @ np.linalg.inv(S)
     rest = np.eye(len(P)) - K @ H
-    wanted = twin(state)
+    wanted = deepcopy(state)
     wanted.correct(K @ residual)
     nis, _ = state.update(rows.at, rows.H, residual, variances)
     after = state.P.full()
@@ -147,7 +146,7 @@ def test_no_landmark_becomes_surer_than_the_start(seed: int, n_steps: int) -> No
 @given(seeds)
 def test_observation_without_information_changes_nothing(seed: int) -> None:
     state = surrounded(seed, 2)
-    before = twin(state)
+    before = deepcopy(state)
     see(state, 1, 0, foreseen(state, 1, 0) + 0.1, sigma_m=1e8)
     assert apart(state, before) <= 1e-9
     assert relative_error(state.P.full(), before.P.full()) <= 1e-9
@@ -173,7 +172,7 @@ def test_order_of_independent_ranges_does_not_matter_to_first_order(seed: int) -
     expected = [foreseen(state, 0, 0), foreseen(state, 3, 1)]
 
     def difference(size_m: float) -> float:
-        one, two = twin(state), twin(state)
+        one, two = deepcopy(state), deepcopy(state)
         z = np.array(expected) + size_m * surprise
         see(one, 0, 0, z[0])
         see(one, 3, 1, z[1])
@@ -215,7 +214,7 @@ def test_landmark_without_correlation_is_not_touched(seed: int) -> None:
 def test_motion_without_noise_leaves_landmarks_alone(seed: int, increment: Array) -> None:
     """Right-invariant errors of landmarks change with the heading's, their places' do not."""
     state = surrounded(seed, 3)
-    before, T = twin(state), state.additive_transform()
+    before, T = deepcopy(state), state.additive_transform()
     motion = calibrated_motion(increment, state.calibration, WHEELS, np.zeros((3, 3)))
     predict(state, motion, WHEELS)
     assert np.array_equal(values(state)[3:], values(before)[3:])
@@ -306,7 +305,7 @@ def test_moving_the_world_moves_the_estimate_and_keeps_the_innovations(
         for first in (1, *range(state.offsets.stop, state.P.size, 2)):
             A[first : first + 2, first : first + 2] = R
             A[first : first + 2, 0] = -quarter_turn(t)
-        there = twin(state)
+        there = deepcopy(state)
         there.heading_rad = math.remainder(state.heading_rad + angle, math.tau)
         there.position_m = R @ state.position_m + t
         there.landmarks_m = state.landmarks_m @ R.T + t
@@ -332,7 +331,7 @@ def test_moving_the_world_moves_the_estimate_and_keeps_the_innovations(
 @given(seeds, st.permutations(range(4)))
 def test_other_names_permute_the_state_and_nothing_else(seed: int, order: list[int]) -> None:
     def renamed(state: State) -> State:
-        other = twin(state)
+        other = deepcopy(state)
         other.landmarks_m = state.landmarks_m[order]
         at = np.concatenate(
             [np.arange(state.offsets.stop), state.landmark_columns(np.array(order))]
@@ -365,7 +364,7 @@ def test_merging_exact_copies_changes_nothing(seed: int, n_copies: int) -> None:
     state = surrounded(seed, 3)
     state.landmarks_m[2] = state.landmarks_m[0] + 0.01
     apply_merge(state, ((0, 2),), 1e-5)
-    before = twin(state)
+    before = deepcopy(state)
     for _ in range(n_copies):
         own = state.landmark_columns(np.array([0]))
         state.augment(state.landmarks_m[0], state.P.columns(own), state.P.block(own))

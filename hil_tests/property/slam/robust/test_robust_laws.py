@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -13,7 +14,6 @@ from hil_tests.property.robust_oracles import (
     Array,
     random_state,
     seeds,
-    twin,
 )
 from slam.config import WheelNoise
 from slam.robust.association import NOTHING, Antennas, Option, cheapest, rows_of, view
@@ -105,9 +105,9 @@ def test_a_merge_is_the_statement_that_the_difference_is_zero(seed: int) -> None
     K = P @ dense.T @ np.linalg.inv(dense @ P @ dense.T + R)
     rest = np.eye(len(P)) - K @ dense
     wanted = rest @ P @ rest.T + K @ R @ K.T
-    moved = twin(state)
+    moved = deepcopy(state)
     moved.correct(K @ residual)
-    merged = twin(state)
+    merged = deepcopy(state)
     apply_merge(merged, ((0, 2),), 1e-3)
     gone = [state.offsets.stop + 4, state.offsets.stop + 5]
     keep = np.delete(np.arange(len(P)), gone)

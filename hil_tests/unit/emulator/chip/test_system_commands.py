@@ -21,11 +21,6 @@ def host_of(options: DeviceOptions | None = None) -> BareHost:
 
 
 @pytest.fixture
-def host() -> BareHost:
-    return host_of()
-
-
-@pytest.fixture
 def bare() -> BareHost:
     return host_of(DeviceOptions(firmware="xep"))
 
@@ -121,7 +116,7 @@ def test_injected_frames_are_acknowledged(host: BareHost, bare: BareHost) -> Non
     assert [bare.ask(command) for command in (prepare, inject)] == [m.Error(code=1)] * 2
 
 
-def test_the_wrong_bootloader_key_is_told_in_words_first(host: BareHost) -> None:
+def test_the_wrong_bootloader_key_gets_a_text_before_the_error(host: BareHost) -> None:
     """4.1; 11 row 19: the old key is refused."""
     for key in (0xA2B95EF0, 0):
         host.send(m.StartBootloader(key=key))
@@ -204,7 +199,7 @@ def test_a_host_reset_clears_the_count(host: BareHost) -> None:
     assert host.ask(m.Ping()) == READY
 
 
-def test_a_fault_wakes_whoever_keeps_the_time(host: BareHost) -> None:
+def test_a_fault_wakes_the_loop(host: BareHost) -> None:
     host.now_ns = 5 * SECOND
     host.device.advance(host.now_ns)
     host.device.module.crash("out of memory", host.now_ns)

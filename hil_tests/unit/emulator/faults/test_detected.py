@@ -409,7 +409,7 @@ def test_a_stopped_stream_shows_when_its_rate_is_asked_for(faulty_line: FaultyLi
     assert radar.stray_count == 0
 
 
-def test_a_silent_radar_loses_what_it_would_have_said(faulty_line: FaultyLine) -> None:
+def test_a_silent_radar_loses_its_messages(faulty_line: FaultyLine) -> None:
     radar = faulty_line.streaming(FPS)
     list(radar.frames(5))
     with fault(faulty_line.device, "silent", seconds=1.0):

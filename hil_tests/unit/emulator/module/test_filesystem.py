@@ -9,18 +9,13 @@ from emulator.chip.chip import Refusal
 from emulator.device import radar_device
 from emulator.module.memory import FileSystem
 from emulator.module.settings import DeviceOptions
-from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource, ramp_device
+from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource
 from xethru_protocol.wire import messages as m
 
 SECOND = 1_000_000_000
 USER = 0x80000000
 KEY = {"file_type": USER, "identifier": 1}
 MISSING = {"file_type": USER, "identifier": 2}
-
-
-@pytest.fixture
-def host() -> BareHost:
-    return BareHost(ramp_device())
 
 
 def with_file(host: BareHost, *, is_open: bool) -> None:

@@ -5,16 +5,11 @@ from __future__ import annotations
 import pytest
 
 from emulator.module.outbox import MessageKind
-from hil_tests.unit.emulator.doubles import BareHost, ramp_device
+from hil_tests.unit.emulator.doubles import BareHost
 from xethru_protocol.wire import messages as m
 
 OUTPUT, PUSH_PULL, ACTIVE_LOW, PULL_UP = 1, 2, 4, 8
 DISABLE, DEFAULT, PASSIVE, PRESENCE, MOVEMENT, BREATHING, NO_PRESENCE = range(7)
-
-
-@pytest.fixture
-def host() -> BareHost:
-    return BareHost(ramp_device())
 
 
 def control(host: BareHost, pin: int, setup: int, feature: int) -> m.Message:

@@ -121,7 +121,7 @@ def test_what_fell_due_more_than_a_second_ago_is_lost() -> None:
     assert numbers(outbox, 10 * SECOND)[0] == 900
 
 
-def test_replies_that_nobody_reads_leave_no_room_for_more() -> None:
+def test_unread_replies_leave_no_room_for_more() -> None:
     assert filled(50, FRAME).takes_replies, "a reply displaces a frame"
     assert filled(49, REPLY).takes_replies
     outbox = filled(50, REPLY)

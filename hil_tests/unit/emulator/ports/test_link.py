@@ -50,7 +50,7 @@ def test_the_line_stays_raw_over_reopening(tmp_path: Path) -> None:
             assert not local_modes & (termios.ECHO | termios.ICANON)
 
 
-def test_a_full_line_takes_nothing_and_blocks_nobody(tmp_path: Path) -> None:
+def test_a_full_line_takes_nothing_and_does_not_block(tmp_path: Path) -> None:
     with PtyLink(tmp_path / "radar") as link:
         block, taken = memoryview(bytes(65536)), 0
         # the kernel moves bytes on between its buffers: room may appear once more, not for ever

@@ -82,7 +82,7 @@ def test_realtime_gives_each_line_when_due(folder: Path) -> None:
     feed.close()
 
 
-def test_a_client_that_hangs_up_or_never_reads_disturbs_nobody(folder: Path) -> None:
+def test_a_client_that_hangs_up_or_never_reads_disturbs_no_other(folder: Path) -> None:
     many = tuple(f"{index}.000000000 {'0' * 100} 0 0 0 0 0 1" for index in range(20_000))
     feed = OdometryFeed(folder / "o", many, Pace.ASAP)
     loop = Loop(feed)

@@ -50,7 +50,7 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
     made.watch.close()
 
 
-def test_the_first_open_and_the_last_close_are_told(bench: Bench) -> None:
+def test_the_first_open_and_the_last_close_are_reported(bench: Bench) -> None:
     assert bench.told() == []
     first = bench.open()
     assert bench.told() == [("opened", NOW_NS)]
@@ -62,7 +62,7 @@ def test_the_first_open_and_the_last_close_are_told(bench: Bench) -> None:
     assert bench.told() == [("closed", NOW_NS)]
 
 
-def test_a_host_between_two_looks_is_told_in_order(bench: Bench) -> None:
+def test_a_host_between_two_looks_is_reported_in_order(bench: Bench) -> None:
     os.close(bench.open())
     assert bench.told() == [("opened", NOW_NS), ("closed", NOW_NS)]
 

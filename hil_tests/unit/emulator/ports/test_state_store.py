@@ -118,7 +118,7 @@ def test_a_broken_state_gives_one_line_and_a_fresh_module(tmp_path: Path, damage
     assert len(warnings) == 1, "the broken state was replaced"
 
 
-def test_a_directory_that_takes_no_files_is_told_and_survived(tmp_path: Path) -> None:
+def test_a_directory_that_takes_no_files_is_a_warning(tmp_path: Path) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("")
     warnings: list[str] = []

@@ -213,7 +213,7 @@ def test_nothing_is_lost_when_the_clock_waits_for_the_line() -> None:
     assert len(counters) == pytest.approx(20, abs=1)  # Protocol reference 10: 2.0 per second
 
 
-def test_a_uart_talks_on_when_nobody_listens() -> None:
+def test_a_uart_sends_on_without_a_reader() -> None:
     bench = uart_bench(115200)
     bench.stream(17.0)
     bench.run(bench.now_ns + 5 * SECOND)
@@ -267,7 +267,7 @@ def test_the_speed_of_the_hosts_terminal_is_known(link: PtyLink) -> None:
     os.close(host)
 
 
-def test_bytes_pass_whole_and_a_flush_of_output_is_told(link: PtyLink) -> None:
+def test_bytes_pass_whole_and_a_flush_of_output_is_reported(link: PtyLink) -> None:
     host = os.open(link.path, os.O_RDWR | os.O_NOCTTY)
     os.write(host, bytes(range(256)))
     data = b""

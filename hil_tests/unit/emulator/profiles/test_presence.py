@@ -110,7 +110,7 @@ def test_presence_ends_when_the_person_has_left() -> None:
 
 
 @pytest.mark.parametrize("range_m", [2.4, 4.0])
-def test_nobody_outside_the_zone_is_found(range_m: float) -> None:
+def test_people_outside_the_zone_are_not_found(range_m: float) -> None:
     stream, _ = profile(room(standing(range_m)), zone_m=(0.18 + 8 * BIN_M, 0.18 + 36 * BIN_M))
     heard = [message.state for time_s, message in presence_until(stream, 30) if time_s > 20]
     assert set(heard) == {PresenceState.NO_PRESENCE}

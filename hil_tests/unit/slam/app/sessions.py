@@ -6,7 +6,10 @@ import numpy as np
 from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader
 
+from slam.app.odometry.track import OdometryTrack
+from slam.app.odometry.tum import format_tum_line
 from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, SessionObserver, Snapshot
+from slam.app.session.log import SessionLog
 from slam.frames import RadarFrame
 
 FRAME_NS = 199_261_498
@@ -81,6 +84,24 @@ def feed(observer: SessionObserver, n_scans: int) -> None:
         observer.on_scan(scan(counter))
         observer.on_snapshot(snapshot(counter))
     observer.on_log(LogLine(t_ns=5, radar="radar1", warning=True, text="CRC fault"))
+
+
+def odometry(n_poses: int) -> OdometryTrack:
+    """Return odometry at almost the times of frames, its numbers no short decimals."""
+    poses = [np.array([k / 3, k / 7, k / 11]) for k in range(n_poses)]
+    return OdometryTrack.from_lines(
+        [format_tum_line(k * 200_000_000 + k, pose) for k, pose in enumerate(poses)]
+    )
+
+
+def write_session(
+    path: Path, n_scans: int, track: OdometryTrack | None = None, info: SessionInfo | None = None
+) -> Path:
+    """Write a whole session file, by default of two radars, and return its path."""
+    log = SessionLog(path, info or session_info(), track)
+    feed(log, n_scans)
+    log.close()
+    return path
 
 
 def surviving_counters(path: Path, topic: str) -> list[int]:

@@ -69,8 +69,6 @@ class VirtualInbox:
 
 
 class Words(LiveLog):
-    """Keeps what is logged."""
-
     def __init__(self) -> None:
         super().__init__()
         self.said: list[tuple[str, str]] = []

@@ -8,9 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from hil_tests.property.ekf_oracles import complex_step, move, observe, place
-from hil_tests.unit.slam.pose_tracks import at_rest
 from hil_tests.unit.slam.robust.range_world import CLASSROOM, LAB, Room
-from hil_tests.unit.slam.simulation import FRAME_NS, World, simulate
+from hil_tests.unit.slam.simulation import FRAME_NS, World, at_rest, simulate
 from slam.config import (
     AssociationConfig,
     ClusteringConfig,
@@ -163,24 +162,6 @@ def test_stride_updates_only_every_nth_state_and_predicts_the_others() -> None:
     ]
     assert [k for k, result in enumerate(results) if result.observations] == [0, 5, 10, 15]
     assert all(result.belief.pose[0] > 0 for result in results)
-
-
-def test_without_noise_the_path_is_exact() -> None:
-    """Drive one lap among well-spaced landmarks with perfect odometry and ranges."""
-    room = Room(side_m=2.0, n_landmarks=5, min_spacing_m=1.5, scale_sigma=0.0, curvature_sigma=0.0)
-    world = simulate(
-        room,
-        paper_rig(),
-        3,
-        laps=1,
-        range_sigma_m=0.0,
-        detection_probability=1.0,
-        clutter_per_frame=0.0,
-        odometry_noise=0.0,
-    )
-    results = run(world, load_preset("paper"))
-    assert len(results[-1].belief.landmark_ids) >= 3
-    assert ate_rmse_m(*trajectories(results, world)) < 1e-6
 
 
 def bytes_of(results: list[StepResult]) -> list[bytes]:

@@ -46,7 +46,6 @@ def mapped(places: Array) -> State:
 
 
 def see(state: State, places: Array) -> None:
-    """Give birth to places, in the body frame."""
     for place in places:
         initialise_landmark(
             state,

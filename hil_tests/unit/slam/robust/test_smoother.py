@@ -200,15 +200,10 @@ def test_the_smoother_is_least_squares_and_its_complement_the_marginal(walk: flo
     def residuals(y: Complex) -> Complex:
         return white_residuals(problem, N_STEPS, N_STEPS + 1, n_cal, y)
 
-    oracle = least_squares(
-        lambda x: residuals(x.astype(np.complex128)).real,
-        packed(start),
-        jac=lambda x: derivative(residuals, x),
-        xtol=1e-15,
-        ftol=1e-15,
-        gtol=1e-12,
-        x_scale="jac",
-    )
+    def real(x: Array) -> Array:
+        return residuals(x.astype(np.complex128)).real
+
+    oracle = least_squares(real, packed(start), xtol=1e-15, ftol=1e-15, gtol=1e-12, x_scale="jac")
     assert np.abs(packed(solution.estimate) - oracle.x).max() <= 1e-6
     J = derivative(residuals, oracle.x)
     keep = newest(N_STEPS + 1, n_cal, len(oracle.x))

@@ -1,6 +1,7 @@
 """Walls, corners and round objects in the robust filter: derivatives, birth, ends."""
 
 import math
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -47,16 +48,6 @@ def state_with_map(seed: int = 0) -> State:
     return state
 
 
-def copy_of(state: State) -> State:
-    other = State((0.01, 0.01, 0.005), OFFSETS)
-    for name in ("heading_rad", "position_m", "calibration", "offsets_m", "landmarks_m", "walls"):
-        setattr(other, name, np.copy(getattr(state, name)))
-    other.heading_rad = state.heading_rad
-    other.landmark_ids, other.wall_ids = state.landmark_ids.copy(), state.wall_ids.copy()
-    other.next_id, other.P = state.next_id, SymmetricMatrix(state.P.full())
-    return other
-
-
 def antennas() -> Antennas:
     rest = calibrated_motion(np.zeros(3), np.zeros(3), WheelNoise())
     return antennas_of(paper_rig(), [RangeScan(radar=r, ranges_m=()) for r in range(4)], rest)
@@ -71,7 +62,7 @@ def test_range_rows_of_walls_are_derivatives_of_the_range() -> None:
     for column in range(state.P.size):
         step = np.zeros(state.P.size)
         step[column] = 1e-6
-        ahead, behind = copy_of(state), copy_of(state)
+        ahead, behind = deepcopy(state), deepcopy(state)
         ahead.correct(step)
         behind.correct(-step)
         difference = (
@@ -99,7 +90,7 @@ def test_prediction_carries_errors_of_walls_as_two_motions_do() -> None:
     state = state_with_map()
     error = 1e-6 * np.random.default_rng(1).standard_normal(state.P.size)
     state.P = SymmetricMatrix(np.outer(error, error))
-    truth = copy_of(state)
+    truth = deepcopy(state)
     truth.correct(error)
     for increment in np.array([[0.1, 0.02, 0.3], [0.2, -0.01, -0.5], [0.0, 0.0, 0.4]]):
         for each in (state, truth):
@@ -128,7 +119,7 @@ def seen_wall() -> BodyWall:
 def test_birth_of_a_wall_is_the_limit_of_an_unknown_wall_seen() -> None:
     born, seen = state_with_map(), seen_wall()
     born.remove(3)
-    other = copy_of(born)
+    other = deepcopy(born)
     wall_id = initialise_wall(born, seen)
     assert born.feature_ids[-1] == wall_id
     other.augment_wall(born.walls[-1], np.zeros((other.P.size, 2)), 1e6 * np.eye(2))

@@ -4,7 +4,6 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +15,6 @@ from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import SensorMode, X4Setting
 
 XETHRU = [sys.executable, "-m", "xethru_protocol.cli"]
-
-
-@pytest.fixture
-def module() -> Iterator[PtyModule]:
-    with PtyModule() as module:
-        yield module
 
 
 def stopped(module: PtyModule) -> bool:
@@ -71,7 +64,7 @@ def test_stream_ends_cleanly_by_a_signal(
     assert stopped(module)
 
 
-def test_stream_ends_cleanly_when_nobody_reads_it(module: PtyModule) -> None:
+def test_stream_ends_cleanly_when_its_reader_leaves(module: PtyModule) -> None:
     command = [*XETHRU, "stream", "--port", module.path]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout is not None

@@ -287,7 +287,7 @@ def test_two_programs_that_split_the_stream(capsys: Capture) -> None:
 
 
 @needs_proc
-def test_whoever_serves_a_port_is_no_user_of_it() -> None:
+def test_the_process_that_serves_a_port_is_not_its_user() -> None:
     with PtyModule(stock()) as module:
         assert port_users(module.path) == ()
         with reader(module.path) as pid:
@@ -363,26 +363,6 @@ def test_all_found_ports_are_examined(
 
 
 # --- the report -------------------------------------------------------------------------------
-
-
-def test_the_report_for_people(capsys: Capture, tmp_path: Path) -> None:
-    missing = str(tmp_path / "radar")
-    with PtyModule(stock(pong=SAFE_MODE)) as module:
-        assert main(["doctor", "--port", module.path, "--port", missing]) == 1
-    assert capsys.readouterr().out == (
-        f"{module.path}\n"
-        "  ok     17 checks\n"
-        "  fault  it is in safe mode: ten faults in a row made it start without its profiles\n"
-        f"      -> xethru reset --port {module.path}, or take the module's power away for some "
-        "seconds\n"
-        "\n"
-        f"{missing}\n"
-        "  ok     1 check\n"
-        "  fault  there is no such port\n"
-        "      -> plug the module in; 'xethru list' shows the ports there are\n"
-        "\n"
-        "2 faults\n"
-    )
 
 
 def test_every_row_says_what_it_needs_to() -> None:

@@ -143,7 +143,7 @@ def test_every_format_gives_the_same_messages_back(
     assert dumped(capsys, target) == dumped(capsys, RECORDINGS / source)
 
 
-def test_a_target_is_not_overwritten_unless_told(tmp_path: Path, capsys: Capture) -> None:
+def test_a_target_is_overwritten_only_with_force(tmp_path: Path, capsys: Capture) -> None:
     for name in ("c.npz", "c"):
         target = tmp_path / name
         assert main(["convert", str(IQ), str(target)]) == 0
@@ -165,7 +165,9 @@ def test_a_recording_is_not_converted_into_itself(tmp_path: Path, capsys: Captur
     assert len(dumped(capsys, source)) == 40
 
 
-def test_what_was_left_out_and_what_was_damaged_is_said(tmp_path: Path, capsys: Capture) -> None:
+def test_what_was_left_out_and_what_was_damaged_is_reported(
+    tmp_path: Path, capsys: Capture
+) -> None:
     wire = tmp_path / "port.xtwire"
     module = Connection(Role.MODULE)
     frame = module.send(m.DataFloat(info=1, values=np.zeros(8, np.float32)))
@@ -194,7 +196,7 @@ def test_a_conversion_that_fails_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_faults_by_the_hundred_are_not_all_told(tmp_path: Path, capsys: Capture) -> None:
+def test_of_hundreds_of_faults_some_are_reported(tmp_path: Path, capsys: Capture) -> None:
     (tmp_path / "xethru_sleep_20261121_003557.csv").write_bytes(b"no;such;row\n" * 200)
     for command in (["dump", str(tmp_path)], ["convert", str(tmp_path), f"{tmp_path}.mcap"]):
         assert main(command) == 1

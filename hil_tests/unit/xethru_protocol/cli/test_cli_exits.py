@@ -54,7 +54,7 @@ def test_output_that_takes_nothing(redirection: str, code: int, out: str, err: s
     assert (result.returncode, result.stdout, result.stderr) == (code, out, err)
 
 
-def test_errors_that_nobody_can_see_are_still_errors(tmp_path: Path) -> None:
+def test_errors_that_cannot_be_printed_are_still_errors(tmp_path: Path) -> None:
     for redirection in ("2>&-", "2>/dev/full"):
         result = shell(f"{XETHRU} ping --port {tmp_path}/none {redirection}")
         assert (result.returncode, result.stdout, result.stderr) == (1, "", "")
@@ -135,30 +135,25 @@ def test_results_that_the_terminal_has_no_letters_for(monkeypatch: pytest.Monkey
 # --- a module that hangs ------------------------------------------------------------------------
 
 
-class Hanging:
-    """A driver whose module can no longer be stopped."""
+class Driver:
+    """A driver whose module can be stopped at the end, or not."""
 
-    def __init__(self) -> None:
-        self.warnings: list[str] = []
+    def __init__(self, *warnings: str, stops: bool = False) -> None:
+        self.warnings = list(warnings)
         self.frames_lost = 2
         self.fault_count = 1
+        self._stops = stops
 
-    def __enter__(self) -> "Hanging":
+    def __enter__(self) -> "Driver":
         return self
 
     def __exit__(self, *reason: object) -> None:
-        self.warnings.append("the module was not stopped: no answer")
-
-
-class Stoppable(Hanging):
-    """A driver whose module is stopped at the end."""
-
-    def __exit__(self, *reason: object) -> None:
-        """Stop it."""
+        if not self._stops:
+            self.warnings.append("the module was not stopped: no answer")
 
 
 @contextmanager
-def opened(driver: Hanging, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def opened(driver: Driver, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(X4M300, "open", lambda port, baudrate: driver)
     with session.module_at("port", 115200):
         yield
@@ -169,16 +164,16 @@ def test_the_cause_comes_first_and_in_one_line(
 ) -> None:
     with (
         pytest.raises(session.CommandFailed, match=r"^no frame came \(and it could not be stopp"),
-        opened(Hanging(), monkeypatch),
+        opened(Driver(), monkeypatch),
     ):
         raise ResponseTimeout("no frame came")
     assert capsys.readouterr().err == ""
 
 
-def test_of_a_port_that_went_only_that_is_said(
+def test_of_a_vanished_port_only_that_is_reported(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(Disconnected, match=r"^unplugged$"), opened(Hanging(), monkeypatch):
+    with pytest.raises(Disconnected, match=r"^unplugged$"), opened(Driver(), monkeypatch):
         raise Disconnected("unplugged")
     assert capsys.readouterr().err == ""
 
@@ -186,8 +181,7 @@ def test_of_a_port_that_went_only_that_is_said(
 def test_a_warning_of_before_is_no_failure_to_stop(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    radar = Stoppable()
-    radar.warnings.append("30 frames/s are many")
+    radar = Driver("30 frames/s are many", stops=True)
     with (
         pytest.raises(ResponseTimeout, match=r"^no frame came$"),
         opened(radar, monkeypatch),
@@ -199,7 +193,7 @@ def test_a_warning_of_before_is_no_failure_to_stop(
 def test_after_a_signal_it_is_a_warning(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(KeyboardInterrupt), opened(Hanging(), monkeypatch):
+    with pytest.raises(KeyboardInterrupt), opened(Driver(), monkeypatch):
         raise KeyboardInterrupt
     assert capsys.readouterr().err == (
         "xethru: the module was not stopped: no answer\n"

@@ -5,7 +5,7 @@ import json
 import resource
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -21,12 +21,6 @@ from xethru_protocol.wire.codes import ProfileId, SensorMode, X4Setting
 
 Capture = pytest.CaptureFixture[str]
 PRESENCE = m.PresenceSingle(counter=3, state=1, distance_m=1.5, direction=0, signal_quality=7)
-
-
-@pytest.fixture
-def module() -> Iterator[PtyModule]:
-    with PtyModule() as module:
-        yield module
 
 
 def counters(path: Path) -> list[int]:
@@ -67,7 +61,7 @@ def test_duration_ends_it(
     assert b"first try" in (out / "xethru_recording_meta.dat").read_bytes()
 
 
-def test_a_recording_is_not_overwritten_unless_told(
+def test_a_recording_is_overwritten_only_with_force(
     module: PtyModule, tmp_path: Path, capsys: Capture
 ) -> None:
     out, wire = tmp_path / "recording", tmp_path / "port.xtwire"

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import pytest
 
 from hil_tests.unit.xethru_protocol.both_drivers import DriverOn
-from hil_tests.unit.xethru_protocol.scripted_files import FileModule
+from hil_tests.unit.xethru_protocol.emulated import EmulatedModule
 from xethru_protocol.driver.files import FileName
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import FORMAT_KEY, FileType
@@ -16,7 +16,7 @@ CONTENT = bytes(range(256)) * 2 + b"the end"
 
 
 def test_file_is_written_in_chunks_and_read_back(driver_on: DriverOn) -> None:
-    module = FileModule()
+    module = EmulatedModule()
     radar, _ = driver_on(module)
     radar.files.write(USER, 7, CONTENT)
     assert module.files[USER, 7] == CONTENT
@@ -37,8 +37,8 @@ def test_file_is_written_in_chunks_and_read_back(driver_on: DriverOn) -> None:
     ]
 
 
-def test_progress_is_told_at_the_start_and_after_each_chunk(driver_on: DriverOn) -> None:
-    radar, _ = driver_on(FileModule())
+def test_progress_is_reported_at_the_start_and_after_each_chunk(driver_on: DriverOn) -> None:
+    radar, _ = driver_on(EmulatedModule())
     told: list[tuple[int, int]] = []
     radar.files.write(USER, 1, CONTENT, on_progress=lambda *at: told.append(at))
     radar.files.read(USER, 1, on_progress=lambda *at: told.append(at))
@@ -46,14 +46,14 @@ def test_progress_is_told_at_the_start_and_after_each_chunk(driver_on: DriverOn)
 
 
 def test_empty_files_are_files(driver_on: DriverOn) -> None:
-    radar, _ = driver_on(FileModule())
+    radar, _ = driver_on(EmulatedModule())
     radar.files.write(USER, 1, b"")
     assert radar.files.length(USER, 1) == 0
     assert radar.files.read(USER, 1) == b""
 
 
 def test_files_are_listed_found_and_deleted(driver_on: DriverOn) -> None:
-    radar, _ = driver_on(FileModule())
+    radar, _ = driver_on(EmulatedModule())
     assert radar.files.find_all() == ()
     radar.files.write(USER, 1, b"a")
     radar.files.write(FileType.PARAMETER_FILE, 0, b"b")
@@ -87,7 +87,7 @@ def test_files_are_listed_found_and_deleted(driver_on: DriverOn) -> None:
 def test_refusals_have_the_file_systems_own_meaning(
     driver_on: DriverOn, verb: str, arguments: tuple[object, ...], code: int, meaning: str
 ) -> None:
-    module = FileModule()
+    module = EmulatedModule()
     radar, _ = driver_on(module)
     radar.files.write(USER, 1, b"there")
     with pytest.raises(DeviceError, match=meaning) as caught:
@@ -99,7 +99,7 @@ def test_refusals_have_the_file_systems_own_meaning(
 
 @pytest.mark.parametrize("verb", ["read", "write"])
 def test_file_is_closed_after_a_chunk_failed(driver_on: DriverOn, verb: str) -> None:
-    module = FileModule()
+    module = EmulatedModule()
     radar, _ = driver_on(module)
     radar.files.write(USER, 1, CONTENT)
     module.fail_at = 256
@@ -112,7 +112,7 @@ def test_file_is_closed_after_a_chunk_failed(driver_on: DriverOn, verb: str) -> 
 
 
 def test_file_is_closed_after_the_users_own_exception(driver_on: DriverOn) -> None:
-    module = FileModule()
+    module = EmulatedModule()
     radar, _ = driver_on(module)
 
     def impatient(done: int, total: int) -> None:
@@ -125,16 +125,17 @@ def test_file_is_closed_after_the_users_own_exception(driver_on: DriverOn) -> No
 
 
 def test_file_another_host_left_open_is_read(driver_on: DriverOn) -> None:
-    module = FileModule()
-    module.files[USER, 3] = bytearray(b"left")
-    module.open.add((USER, 3))
+    module = EmulatedModule()
     radar, _ = driver_on(module)
+    key = {"file_type": USER, "identifier": 3}
+    for command in (m.CreateFile(**key, length=4), m.SetFileData(**key, offset=0, data=b"left")):
+        assert module(command) == [m.Ack()]
     assert radar.files.read(USER, 3) == b"left"
     assert module.open == set()
 
 
 def test_short_chunk_is_the_modules_fault_and_the_file_is_closed(driver_on: DriverOn) -> None:
-    module = FileModule()
+    module = EmulatedModule()
     radar, line = driver_on(module)
     radar.files.write(USER, 1, CONTENT)
 
@@ -149,7 +150,7 @@ def test_short_chunk_is_the_modules_fault_and_the_file_is_closed(driver_on: Driv
 
 
 def test_transfer_is_not_repeated_on_a_new_line(driver_on: DriverOn) -> None:
-    module = FileModule()
+    module = EmulatedModule()
     radar, line = driver_on(module, reconnect_s=5.0)
     line.gone = True
     with pytest.raises(Disconnected):
@@ -157,7 +158,7 @@ def test_transfer_is_not_repeated_on_a_new_line(driver_on: DriverOn) -> None:
 
 
 def test_format_needs_its_key(driver_on: DriverOn) -> None:
-    module = FileModule()
+    module = EmulatedModule()
     radar, _ = driver_on(module)
     radar.files.write(USER, 1, b"x")
     radar.files.format_all(FORMAT_KEY)
@@ -165,10 +166,10 @@ def test_format_needs_its_key(driver_on: DriverOn) -> None:
 
 
 def test_crash_dump_is_read_in_chunks_and_cleared(driver_on: DriverOn) -> None:
-    module = FileModule()
+    module = EmulatedModule()
     radar, _ = driver_on(module)
     assert radar.files.crash_dump() == b""
-    module.crash_dump = CONTENT
+    module.leave_crash_dump(CONTENT)
     told: list[tuple[int, int]] = []
     assert radar.files.crash_dump(lambda *at: told.append(at)) == CONTENT
     assert told[-1] == (519, 519)

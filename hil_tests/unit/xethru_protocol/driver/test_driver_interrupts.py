@@ -1,4 +1,4 @@
-"""What interrupts and sick modules leave behind, and how the methods of drivers are documented."""
+"""What interrupts and faulty modules leave behind, and how drivers are documented."""
 
 import inspect
 from collections.abc import Sequence

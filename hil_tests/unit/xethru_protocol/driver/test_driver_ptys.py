@@ -1,12 +1,13 @@
 """Both drivers on real ports: modules that vanish and return, and several asyncio tasks."""
 
 import asyncio
+import functools
 import os
 import pty
 import termios
 import threading
 import tty
-from collections.abc import Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,16 @@ from xethru_protocol.wire.codes import X4Setting
 from xethru_protocol.wire.errors import Disconnected, ResponseTimeout
 
 OURS, ANOTHER = "123456789012", "999999999999"
+
+
+def in_loop(test: Callable[..., Coroutine[None, None, None]]) -> Callable[..., None]:
+    """Run a test's coroutine in an event loop."""
+
+    @functools.wraps(test)
+    def run(*arguments: Any, **named: Any) -> None:  # noqa: ANN401 - fixtures
+        asyncio.run(test(*arguments, **named))
+
+    return run
 
 
 @pytest.fixture
@@ -60,150 +71,135 @@ def test_radar_goes_on_at_the_port_its_module_returned_to(machine: PtyMachine, n
 
 
 @pytest.mark.parametrize("name", ["home", "elsewhere"])
-def test_asynchronous_radar_does_too_while_two_tasks_use_it(machine: PtyMachine, name: str) -> None:
-    async def use() -> None:
-        async with AsyncX4M300.open(
-            machine.path("home"), clock=patient_ns, reconnect_s=10.0
-        ) as radar:
-            await radar.configure_raw()
-            await radar.start(17.0)
-            assert (await radar.read_frame()).counter == 0
-            machine.unplug("home")
-            timer = return_as(machine, name)
+@in_loop
+async def test_asynchronous_radar_does_too_while_two_tasks_use_it(
+    machine: PtyMachine, name: str
+) -> None:
+    async with AsyncX4M300.open(machine.path("home"), clock=patient_ns, reconnect_s=10.0) as radar:
+        await radar.configure_raw()
+        await radar.start(17.0)
+        assert (await radar.read_frame()).counter == 0
+        machine.unplug("home")
+        timer = return_as(machine, name)
 
-            async def read() -> None:
-                while radar.reconnects == 0:
-                    await radar.read_frame()
-                await radar.read_frame()
-
-            reading = asyncio.create_task(read())
+        async def read() -> None:
             while radar.reconnects == 0:
-                await radar.ping()
-            await reading
-            timer.join()
-            assert (radar.port, radar.reconnects) == (machine.path(name), 1)
+                await radar.read_frame()
+            await radar.read_frame()
 
-    asyncio.run(use())
-
-
-def test_frames_are_read_while_another_task_asks(machine: PtyMachine) -> None:
-    async def use() -> None:
-        async with AsyncX4M300.open(machine.path("home"), clock=patient_ns) as radar:
-            await radar.configure_raw()
-            await radar.start(17.0)
-            counters: list[int] = []
-
-            async def read() -> None:
-                counters.extend([got.counter async for got in radar.frames(20)])
-
-            async def ask() -> None:
-                for _ in range(20):
-                    await radar.ping()
-
-            await asyncio.gather(read(), ask(), ask())
-            assert counters == list(range(20))
-            assert (radar.stray_count, radar.frames_lost) == (0, 0)
-
-    asyncio.run(use())
-
-
-def test_waiting_task_can_be_cancelled_and_stops_nobody_else(machine: PtyMachine) -> None:
-    async def use() -> None:
-        async with AsyncX4M300.open(machine.path("home"), clock=patient_ns) as radar:
-            waiting = asyncio.create_task(radar.read_frame(60.0))
-            await asyncio.sleep(0.02)
-            await radar.ping()  # heard by the task that reads
-            waiting.cancel()
-            with pytest.raises(asyncio.CancelledError):
-                await waiting
+        reading = asyncio.create_task(read())
+        while radar.reconnects == 0:
             await radar.ping()
-            with pytest.raises(ResponseTimeout):
-                await radar.read_frame(0.05)
+        await reading
+        timer.join()
+        assert (radar.port, radar.reconnects) == (machine.path(name), 1)
 
-    asyncio.run(use())
+
+@in_loop
+async def test_frames_are_read_while_another_task_asks(machine: PtyMachine) -> None:
+    async with AsyncX4M300.open(machine.path("home"), clock=patient_ns) as radar:
+        await radar.configure_raw()
+        await radar.start(17.0)
+        counters: list[int] = []
+
+        async def read() -> None:
+            counters.extend([got.counter async for got in radar.frames(20)])
+
+        async def ask() -> None:
+            for _ in range(20):
+                await radar.ping()
+
+        await asyncio.gather(read(), ask(), ask())
+        assert counters == list(range(20))
+        assert (radar.stray_count, radar.frames_lost) == (0, 0)
 
 
-def test_cancelled_read_loses_no_bytes() -> None:
+@in_loop
+async def test_waiting_task_can_be_cancelled_and_stops_no_other(machine: PtyMachine) -> None:
+    async with AsyncX4M300.open(machine.path("home"), clock=patient_ns) as radar:
+        waiting = asyncio.create_task(radar.read_frame(60.0))
+        await asyncio.sleep(0.02)
+        await radar.ping()  # heard by the task that reads
+        waiting.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await waiting
+        await radar.ping()
+        with pytest.raises(ResponseTimeout):
+            await radar.read_frame(0.05)
+
+
+@in_loop
+async def test_cancelled_read_loses_no_bytes() -> None:
     """Also on a line that never pauses, where a read lets other tasks have their turn."""
-
-    async def use() -> None:
-        master, slave = pty.openpty()
-        line = AsyncSerialTransport(os.ttyname(slave))
-        try:
-            os.write(master, b"first")
-            reading = asyncio.create_task(line.read(60.0))
-            await asyncio.sleep(0)  # it lets us have our turn
-            reading.cancel()
-            with pytest.raises(asyncio.CancelledError):
-                await reading
-            assert await line.read(seconds(1)) == b"first"
-        finally:
-            line.close()
-            os.close(master)
-            os.close(slave)
-
-    asyncio.run(use())
+    master, slave = pty.openpty()
+    line = AsyncSerialTransport(os.ttyname(slave))
+    try:
+        os.write(master, b"first")
+        reading = asyncio.create_task(line.read(60.0))
+        await asyncio.sleep(0)  # it lets us have our turn
+        reading.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await reading
+        assert await line.read(seconds(1)) == b"first"
+    finally:
+        line.close()
+        os.close(master)
+        os.close(slave)
 
 
 @pytest.mark.parametrize("cancel", [False, True])
-def test_no_timer_outlives_the_read_that_set_it(cancel: bool) -> None:
-    async def use() -> None:
-        master, slave = pty.openpty()
-        line = AsyncSerialTransport(os.ttyname(slave))
-        loop = asyncio.get_running_loop()
-        set_timer = loop.call_later
-        timers: list[asyncio.TimerHandle] = []
+@in_loop
+async def test_no_timer_outlives_the_read_that_set_it(cancel: bool) -> None:
+    master, slave = pty.openpty()
+    line = AsyncSerialTransport(os.ttyname(slave))
+    loop = asyncio.get_running_loop()
+    set_timer = loop.call_later
+    timers: list[asyncio.TimerHandle] = []
 
-        def call_later(delay_s: float, *what: Any) -> asyncio.TimerHandle:  # noqa: ANN401 - any
-            timers.append(set_timer(delay_s, *what))
-            return timers[-1]
+    def call_later(delay_s: float, *what: Any) -> asyncio.TimerHandle:  # noqa: ANN401 - any
+        timers.append(set_timer(delay_s, *what))
+        return timers[-1]
 
-        loop.call_later = call_later  # type: ignore[method-assign, assignment]
-        try:
-            reading = asyncio.create_task(line.read(60.0))
-            while not timers:
-                await asyncio.sleep(0)
-            if cancel:
-                reading.cancel()
-                with pytest.raises(asyncio.CancelledError):
-                    await reading
-            else:
-                os.write(master, b"!")
-                assert await reading == b"!"
-            assert [timer.cancelled() for timer in timers] == [True]
-        finally:
-            line.close()
-            os.close(master)
-            os.close(slave)
-
-    asyncio.run(use())
-
-
-def test_closing_wakes_the_task_that_reads(machine: PtyMachine) -> None:
-    async def use() -> None:
-        radar = AsyncX4M300.open(machine.path("home"), clock=patient_ns, reconnect_s=10.0)
-        await radar.ping()
-        waiting = asyncio.create_task(radar.read_frame(60.0))
-        await asyncio.sleep(0.02)
-        await radar.close()
-        with pytest.raises(Disconnected):
-            await waiting
-
-    asyncio.run(use())
-
-
-def test_command_that_was_cancelled_leaves_its_answer_to_nobody(machine: PtyMachine) -> None:
-    async def use() -> None:
-        async with AsyncX4M300.open(machine.path("home"), clock=patient_ns) as radar:
-            asking = asyncio.create_task(radar.info())
+    loop.call_later = call_later  # type: ignore[method-assign, assignment]
+    try:
+        reading = asyncio.create_task(line.read(60.0))
+        while not timers:
             await asyncio.sleep(0)
-            await asyncio.sleep(0)
-            asking.cancel()
+        if cancel:
+            reading.cancel()
             with pytest.raises(asyncio.CancelledError):
-                await asking
-            assert (await radar.request(m.SystemGetInfo(item=6))).text == OURS
+                await reading
+        else:
+            os.write(master, b"!")
+            assert await reading == b"!"
+        assert [timer.cancelled() for timer in timers] == [True]
+    finally:
+        line.close()
+        os.close(master)
+        os.close(slave)
 
-    asyncio.run(use())
+
+@in_loop
+async def test_closing_wakes_the_task_that_reads(machine: PtyMachine) -> None:
+    radar = AsyncX4M300.open(machine.path("home"), clock=patient_ns, reconnect_s=10.0)
+    await radar.ping()
+    waiting = asyncio.create_task(radar.read_frame(60.0))
+    await asyncio.sleep(0.02)
+    await radar.close()
+    with pytest.raises(Disconnected):
+        await waiting
+
+
+@in_loop
+async def test_answer_to_a_cancelled_command_is_dropped(machine: PtyMachine) -> None:
+    async with AsyncX4M300.open(machine.path("home"), clock=patient_ns) as radar:
+        asking = asyncio.create_task(radar.info())
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+        asking.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await asking
+        assert (await radar.request(m.SystemGetInfo(item=6))).text == OURS
 
 
 def test_asynchronous_line_that_takes_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,13 +1,15 @@
 """Modules that restart, vanish and come back, on a virtual clock. Protocol reference 8.1, 10."""
 
 from collections.abc import Sequence
+from typing import Any, cast
 
 import pytest
 
 from hil_tests.unit.xethru_protocol.both_drivers import DriverOn
 from hil_tests.unit.xethru_protocol.machine import Machine, UartModule
-from hil_tests.unit.xethru_protocol.scripted import PlainModule, ScriptedTransport, frame
+from hil_tests.unit.xethru_protocol.scripted import Answer, PlainModule, ScriptedTransport, frame
 from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import OutputFeature, PongCode, SensorMode, X4Setting
 from xethru_protocol.wire.errors import DeviceError, Disconnected, ResponseTimeout
@@ -23,6 +25,18 @@ def machine() -> Machine:
     machine = Machine(DECOY, ELSEWHERE, HOME)
     machine.plug(DECOY, PlainModule("999999999999"))
     return machine
+
+
+@pytest.fixture
+def plugged(driver_on: DriverOn, machine: Machine) -> DriverOn:
+    """Maker of drivers whose module is at the port HOME of the machine."""
+
+    def at_home(answer: Answer | None = None, **options: Any) -> tuple[X4M300, ScriptedTransport]:  # noqa: ANN401 - those of drivers
+        radar, line = driver_on(answer, ports=machine.ports, name=HOME, **options)
+        machine.runs_on(line)
+        return radar, line
+
+    return cast(DriverOn, at_home)
 
 
 def unplug(line: ScriptedTransport) -> None:
@@ -92,9 +106,7 @@ def test_reset_gives_up_in_time(driver_on: DriverOn) -> None:
 
 
 @pytest.mark.parametrize("path", [HOME, ELSEWHERE])
-def test_reset_follows_a_port_that_vanishes(
-    driver_on: DriverOn, machine: Machine, path: str
-) -> None:
+def test_reset_follows_a_port_that_vanishes(plugged: DriverOn, machine: Machine, path: str) -> None:
     plain = PlainModule()
     machine.plug(path, plain, from_s=3.0)
 
@@ -103,8 +115,7 @@ def test_reset_follows_a_port_that_vanishes(
             line.vanish_later(0.5)
         return plain(command)
 
-    radar, line = driver_on(module, ports=machine.ports, name=HOME)
-    machine.runs_on(line)
+    radar, line = plugged(module)
     radar.reset(wait=True)
     assert 3.0e9 <= line.now_ns < 4.0e9
     assert radar.port == path
@@ -115,10 +126,9 @@ def test_reset_follows_a_port_that_vanishes(
 
 
 def test_module_that_does_not_come_back_is_disconnected(
-    driver_on: DriverOn, machine: Machine
+    plugged: DriverOn, machine: Machine
 ) -> None:
-    radar, line = driver_on(ports=machine.ports, name=HOME)
-    machine.runs_on(line)
+    radar, line = plugged()
     line.vanish_later(0.5)
     with pytest.raises(
         Disconnected, match=f"module of {HOME} did not come back within 15 s: there is no port"
@@ -142,13 +152,12 @@ def test_vanished_module_is_disconnected_unless_asked_otherwise(driver_on: Drive
 
 
 def test_stream_goes_on_after_an_unplug_under_another_name(
-    driver_on: DriverOn, machine: Machine
+    plugged: DriverOn, machine: Machine
 ) -> None:
     back = PlainModule()
     back.stream = (frame(0), frame(1))
     machine.plug(ELSEWHERE, back, from_s=5.0)
-    radar, line = driver_on(ports=machine.ports, name=HOME, reconnect_s=20.0)
-    machine.runs_on(line)
+    radar, line = plugged(reconnect_s=20.0)
     radar.configure_raw(RawConfig(iterations=8, dac_step=1))
     radar.start(17.0)
     line.say(frame(40), frame(41))
@@ -162,14 +171,13 @@ def test_stream_goes_on_after_an_unplug_under_another_name(
 
 
 def test_counters_on_either_side_of_an_outage_make_no_gap(
-    driver_on: DriverOn, machine: Machine
+    plugged: DriverOn, machine: Machine
 ) -> None:
     """Whether the counter restarts is an open question of the reference (15, 5)."""
     back = PlainModule()
     back.stream = (frame(900),)
     machine.plug(HOME, lambda c: [frame(500), *back(c)] if isinstance(c, m.Ping) else back(c))
-    radar, line = driver_on(ports=machine.ports, name=HOME, reconnect_s=9.0)
-    machine.runs_on(line)
+    radar, line = plugged(reconnect_s=9.0)
     radar.configure_raw()
     radar.start(17.0)
     line.say(frame(40))
@@ -181,10 +189,9 @@ def test_counters_on_either_side_of_an_outage_make_no_gap(
     assert radar.frames_lost == 0
 
 
-def test_packet_cut_by_an_outage_is_counted_as_junk(driver_on: DriverOn, machine: Machine) -> None:
+def test_packet_cut_by_an_outage_is_counted_as_junk(plugged: DriverOn, machine: Machine) -> None:
     machine.plug(HOME, PlainModule(), from_s=2.0)
-    radar, line = driver_on(ports=machine.ports, name=HOME, reconnect_s=10.0)
-    machine.runs_on(line)
+    radar, line = plugged(reconnect_s=10.0)
     radar.configure_raw()
     line.say(line._bytes(frame(7))[:100])
     radar._pump(0.0)
@@ -194,12 +201,11 @@ def test_packet_cut_by_an_outage_is_counted_as_junk(driver_on: DriverOn, machine
 
 
 def test_request_is_repeated_on_the_new_line_and_waiting_frames_are_kept(
-    driver_on: DriverOn, machine: Machine
+    plugged: DriverOn, machine: Machine
 ) -> None:
     back = PlainModule()
     machine.plug(HOME, back, from_s=2.0)
-    radar, line = driver_on(ports=machine.ports, name=HOME, reconnect_s=10.0)
-    machine.runs_on(line)
+    radar, line = plugged(reconnect_s=10.0)
     radar.configure_raw()
     line.say(frame(7))
     radar.ping()  # takes the frame in
@@ -211,10 +217,9 @@ def test_request_is_repeated_on_the_new_line_and_waiting_frames_are_kept(
     assert radar.reconnects == 1
 
 
-def test_stopped_radar_is_not_started_by_a_reconnect(driver_on: DriverOn, machine: Machine) -> None:
+def test_stopped_radar_is_not_started_by_a_reconnect(plugged: DriverOn, machine: Machine) -> None:
     machine.plug(HOME, PlainModule())
-    radar, line = driver_on(ports=machine.ports, name=HOME)
-    machine.runs_on(line)
+    radar, line = plugged()
     radar.configure_raw()
     radar.start(17.0)
     radar.stop()
@@ -224,23 +229,21 @@ def test_stopped_radar_is_not_started_by_a_reconnect(driver_on: DriverOn, machin
 
 
 def test_module_of_another_number_at_the_same_port_is_not_taken(
-    driver_on: DriverOn, machine: Machine
+    plugged: DriverOn, machine: Machine
 ) -> None:
     machine.plug(HOME, PlainModule("888888888888"))
-    radar, line = driver_on(ports=machine.ports, name=HOME)
-    machine.runs_on(line)
+    radar, line = plugged()
     line.vanish_later(0.5)
     with pytest.raises(Disconnected, match="is another module"):
         radar.reset(wait=True)
 
 
 def test_module_without_a_number_is_known_by_its_port_only(
-    driver_on: DriverOn, machine: Machine
+    plugged: DriverOn, machine: Machine
 ) -> None:
     machine.plug(HOME, PlainModule(None), from_s=3.0)
     machine.plug(ELSEWHERE, PlainModule(None))
-    radar, line = driver_on(PlainModule(None), ports=machine.ports, name=HOME, reconnect_s=9.0)
-    machine.runs_on(line)
+    radar, line = plugged(PlainModule(None), reconnect_s=9.0)
     radar.configure_raw()
     assert "does not report its serial number" in radar.warnings[0]
     unplug(line)
@@ -251,7 +254,7 @@ def test_module_without_a_number_is_known_by_its_port_only(
 
 
 def test_module_that_came_back_in_safe_mode_is_taken_and_told_of(
-    driver_on: DriverOn, machine: Machine
+    plugged: DriverOn, machine: Machine
 ) -> None:
     broken = PlainModule(None)  # the profile layer, which knows the number, is not started
 
@@ -261,8 +264,7 @@ def test_module_that_came_back_in_safe_mode_is_taken_and_told_of(
         return broken(command)
 
     machine.plug(HOME, safe_mode)
-    radar, line = driver_on(ports=machine.ports, name=HOME, reconnect_s=9.0)
-    machine.runs_on(line)
+    radar, line = plugged(reconnect_s=9.0)
     radar.configure_raw()
     unplug(line)
     assert radar.ping() is PongCode.XTS_SPRP_SAFEMODE
@@ -270,7 +272,7 @@ def test_module_that_came_back_in_safe_mode_is_taken_and_told_of(
 
 
 def test_module_that_vanishes_again_while_it_is_set_up_is_waited_for(
-    driver_on: DriverOn, machine: Machine
+    plugged: DriverOn, machine: Machine
 ) -> None:
     back = PlainModule()
 
@@ -282,8 +284,7 @@ def test_module_that_vanishes_again_while_it_is_set_up_is_waited_for(
 
     rate = m.X4DriverSet(setting=X4Setting.FPS, value=17.0)
     machine.plug(HOME, brown_out)
-    radar, line = driver_on(ports=machine.ports, name=HOME, reconnect_s=9.0)
-    machine.runs_on(line)
+    radar, line = plugged(reconnect_s=9.0)
     radar.configure_raw()
     radar.start(17.0)
     unplug(line)
@@ -293,7 +294,7 @@ def test_module_that_vanishes_again_while_it_is_set_up_is_waited_for(
     assert rate in machine.lines[-1].received  # what was wanted is not forgotten midway
 
 
-def test_module_in_a_restart_loop_is_given_up(driver_on: DriverOn, machine: Machine) -> None:
+def test_module_in_a_restart_loop_is_given_up(plugged: DriverOn, machine: Machine) -> None:
     plain = PlainModule()
 
     def loop(command: m.Message) -> Said:
@@ -303,8 +304,7 @@ def test_module_in_a_restart_loop_is_given_up(driver_on: DriverOn, machine: Mach
         return plain(command)
 
     machine.plug(HOME, loop)
-    radar, line = driver_on(ports=machine.ports, name=HOME, reconnect_s=9.0)
-    machine.runs_on(line)
+    radar, line = plugged(reconnect_s=9.0)
     radar.ping()
     unplug(line)
     with pytest.raises(Disconnected):
@@ -313,25 +313,23 @@ def test_module_in_a_restart_loop_is_given_up(driver_on: DriverOn, machine: Mach
 
 
 def test_module_that_refuses_its_settings_after_a_return_says_so(
-    driver_on: DriverOn, machine: Machine
+    plugged: DriverOn, machine: Machine
 ) -> None:
     plain = PlainModule()
     machine.plug(
         HOME,
         lambda c: [m.Error(code=5)] if isinstance(c, m.X4DriverInit) else plain(c),
     )
-    radar, line = driver_on(ports=machine.ports, name=HOME, reconnect_s=9.0)
-    machine.runs_on(line)
+    radar, line = plugged(reconnect_s=9.0)
     radar.configure_raw()
     unplug(line)
     with pytest.raises(DeviceError, match="OSCILLATOR_LOCK_FAILED"):
         radar.ping()
 
 
-def test_profile_is_set_up_again_after_a_return(driver_on: DriverOn, machine: Machine) -> None:
+def test_profile_is_set_up_again_after_a_return(plugged: DriverOn, machine: Machine) -> None:
     machine.plug(HOME, PlainModule())
-    radar, line = driver_on(ports=machine.ports, name=HOME, reconnect_s=9.0)
-    machine.runs_on(line)
+    radar, line = plugged(reconnect_s=9.0)
     radar.presence.load()
     radar.presence.set_output(OutputFeature.PULSEDOPPLER_BYTE, 1)
     radar.presence.set_sensitivity(3)
@@ -364,14 +362,11 @@ def test_uart_is_talked_to_at_its_own_rate_again_after_a_reset(driver_on: Driver
 
 
 @pytest.mark.parametrize("rate", [115200, 921600], ids=["restarted", "kept its power"])
-def test_uart_is_found_again_at_either_rate(
-    driver_on: DriverOn, machine: Machine, rate: int
-) -> None:
+def test_uart_is_found_again_at_either_rate(plugged: DriverOn, machine: Machine, rate: int) -> None:
     uart, back = UartModule(), UartModule()
     back.baudrate = rate
     machine.plug(HOME, back)
-    radar, line = driver_on(uart, ports=machine.ports, name=HOME, reconnect_s=9.0)
-    machine.runs_on(line)
+    radar, line = plugged(uart, reconnect_s=9.0)
     uart.connect(line, 115200)
     radar._link.bytes_per_s = line.bytes_per_s
     radar.set_baud_rate(921600)
@@ -383,10 +378,9 @@ def test_uart_is_found_again_at_either_rate(
 
 
 def test_closing_after_the_module_vanished_does_not_look_for_it(
-    driver_on: DriverOn, machine: Machine
+    plugged: DriverOn, machine: Machine
 ) -> None:
-    radar, line = driver_on(ports=machine.ports, name=HOME, reconnect_s=9.0)
-    machine.runs_on(line)
+    radar, line = plugged(reconnect_s=9.0)
     with radar:
         radar.configure_raw()
         began_ns = line.now_ns

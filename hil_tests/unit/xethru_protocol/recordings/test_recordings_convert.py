@@ -351,7 +351,7 @@ def test_a_source_that_is_none_leaves_no_target(tmp_path: Path, target: str) -> 
     assert not (tmp_path / target).exists()
 
 
-def test_progress_is_told(tmp_path: Path) -> None:
+def test_progress_is_reported(tmp_path: Path) -> None:
     told: list[int] = []
     convert(RECORDINGS / "iq", tmp_path / "x.npz", told.append)
     assert told == [40]

@@ -131,7 +131,7 @@ def test_replies_are_read_without_their_trailer(vector: Vector) -> None:
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_what_does_not_fit_the_wire_is_said(message: m.Message, reason: str) -> None:
+def test_what_does_not_fit_the_wire_is_refused(message: m.Message, reason: str) -> None:
     with pytest.raises(LocalProtocolError, match=reason):
         encode(message)
 

@@ -24,13 +24,10 @@ from slam.app.session.reader import open_session
 
 
 class Heard(SessionObserver):
-    """Keeps the lines that a user would see."""
-
     def __init__(self) -> None:
         self.lines: list[LogLine] = []
 
     def on_log(self, line: LogLine) -> None:
-        """Keep it."""
         self.lines.append(line)
 
 
@@ -139,4 +136,4 @@ def test_a_unix_clock_shows_the_seconds_since_1970(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(time, "time_ns", lambda: 1_700_000_100_000_000_007)
     clock = parse_clock("unix", parse_source("-"))
     assert clock is not None
-    assert clock.session_ns(105_000_000_000) == 1_700_000_105_000_000_007
+    assert clock.nominal_ns(105_000_000_000) == 1_700_000_105_000_000_007

@@ -208,10 +208,7 @@ def test_a_file_that_cannot_be_written_says_why(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("sigma_m", "code"), [(0.0, 0), (1e-3, 1)])
 def test_a_removed_setting_of_a_session_is_read_at_its_default_only(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    sigma_m: float,
-    code: int,
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], sigma_m: float, code: int
 ) -> None:
     stored = json.loads(settings_text(SlamConfig()))
     stored["robust"]["calibrated_offset_sigma_m"] = sigma_m

@@ -21,7 +21,7 @@ from hil_tests.unit.slam.app.authors_bag import (
 )
 from hil_tests.unit.slam.app.sessions import FRAME_NS, feed, scan, session_info, snapshot
 from slam.app.cli import main
-from slam.app.convert.rosbag import BagOptions, convert_bag, write_bag
+from slam.app.convert.rosbag import convert_bag, write_bag
 from slam.app.odometry.track import OdometryTrack
 from slam.app.odometry.tum import format_tum_line
 from slam.app.records import Scan
@@ -225,7 +225,7 @@ def test_a_signal_stops_a_conversion_and_leaves_nothing(recorded: Path, tmp_path
         raise StopRequestedError(signal.SIGINT)
 
     with pytest.raises(StopRequestedError):
-        convert_bag(bag, tmp_path / "s.mcap", BagOptions(settings=SlamSettings()), stop)
+        convert_bag(bag, tmp_path / "s.mcap", stop, settings=SlamSettings())
     with pytest.raises(StopRequestedError):
         write_bag(open_session(recorded), tmp_path / "out", stop)
     assert not (tmp_path / "out").exists()

@@ -14,8 +14,8 @@ import pytest
 from hil_tests.patience import seconds
 from hil_tests.unit.slam.app.virtual_rig import straight_odometry
 from slam.app.errors import OdometryError, UsageError
+from slam.app.odometry.arrival import ClockLine
 from slam.app.odometry.live import (
-    FixedClock,
     LineSource,
     LiveOdometry,
     SourceKind,
@@ -115,7 +115,7 @@ def test_its_clock_is_told_by_arrivals_through_a_burst_and_jitter() -> None:
 
 
 def test_a_clock_that_is_known_needs_no_arrivals() -> None:
-    odometry = LiveOdometry("a file", FixedClock(5 * NS_PER_S))
+    odometry = LiveOdometry("a file", ClockLine(origin_ns=5 * NS_PER_S))
     assert odometry.session_ns(7 * NS_PER_S) == 2 * NS_PER_S
     odometry.take(line(1.0), 0)
     assert odometry.drift_ppm is None
@@ -151,7 +151,7 @@ def test_a_source_that_ends_without_a_pose_says_what_was_wrong_with_its_lines() 
 def test_stamps_of_another_clock_than_the_one_named_are_told(
     origin_s: int, now_s: int, fits: bool
 ) -> None:
-    odometry = LiveOdometry("a test", FixedClock(origin_s * NS_PER_S))
+    odometry = LiveOdometry("a test", ClockLine(origin_ns=origin_s * NS_PER_S))
     odometry.take(line(100.0), 0)
     said = odometry.is_elsewhere(now_s * NS_PER_S)
     assert (said == "") is fits
@@ -163,7 +163,6 @@ TEXT = "\n".join(LINES).encode()
 
 
 def lines_of(source: LineSource, count: int | None = None) -> list[str]:
-    """Read to the end, or until `count` lines came."""
     got: list[str] = []
     for text, arrival_ns in read_lines(source, lambda: False):
         assert arrival_ns > 0

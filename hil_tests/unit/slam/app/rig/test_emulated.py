@@ -50,10 +50,7 @@ def never() -> None:
         'echo "{}"; sleep 5',
     ],
 )
-def test_a_bad_start_is_one_line(
-    fake_emulator: Path,
-    does: str,
-) -> None:
+def test_a_bad_start_is_one_line(fake_emulator: Path, does: str) -> None:
     fake_emulator.write_text(f"#!/bin/sh\n{does}\n")
     with EmulatorProcess("lab", 0) as emulator, pytest.raises(EmulatorError) as caught:
         emulator.wait_until_ready(never)

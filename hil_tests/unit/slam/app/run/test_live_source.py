@@ -25,7 +25,8 @@ from hil_tests.unit.slam.app.virtual_rig import (
     radar_events,
 )
 from slam.app.errors import AppError
-from slam.app.odometry.live import FixedClock, LiveOdometry, parse_source
+from slam.app.odometry.arrival import ClockLine
+from slam.app.odometry.live import LiveOdometry, parse_source
 from slam.app.records import RadarInfo, Scan, SessionObserver
 from slam.app.rig.emulated import RAW_CONFIG, rig_of, wheels_of
 from slam.app.rig.sources import RadarLink, sampler_limits
@@ -173,7 +174,7 @@ def frame(radar: int, t_ns: int, counter: int = 0) -> ReceivedFrame:
 
 
 def odometry_until(end_s: float) -> LiveOdometry:
-    odometry = LiveOdometry("a test", FixedClock(0))
+    odometry = LiveOdometry("a test", ClockLine(origin_ns=0))
     for number in range(int(end_s * 10) + 1):
         odometry.take(f"{number / 10:.9f} 0 0 0 0 0 0 1", 0)
     return odometry
@@ -386,8 +387,6 @@ class Drive:
 
 @dataclass
 class Heard(SessionObserver):
-    """What an observer of a run was told."""
-
     scans: list[Scan] = field(default_factory=list)
 
     def on_scan(self, scan: Scan) -> None:
@@ -413,7 +412,7 @@ def source_of(
 
 
 def source_on(
-    drive: Drive, inbox: VirtualInbox, clock: FixedClock | None = None
+    drive: Drive, inbox: VirtualInbox, clock: ClockLine | None = None
 ) -> tuple[LiveSource, LiveOdometry, Words]:
     odometry, words = LiveOdometry("the test", clock), Words()
     source = LiveSource(
@@ -598,7 +597,7 @@ def test_odometry_whose_clock_is_set_while_it_is_trusted_is_told(drive: Drive) -
             events.append(replace(row, event=late))
         else:
             events.append(row)
-    source, _, words = source_on(drive, VirtualInbox(events), FixedClock(0))
+    source, _, words = source_on(drive, VirtualInbox(events), ClockLine(origin_ns=0))
     source.settle()
     assert {scan.used for scan in source.scans()} == {True, False}
     assert "SLAM got no scan for 5 s" in words.about("run")

@@ -16,13 +16,13 @@ from rosbags.highlevel import AnyReader
 
 from hil_tests.unit.slam.app.sessions import (
     feed,
+    odometry,
     scan,
     session_info,
     snapshot,
     surviving_counters,
+    write_session,
 )
-from slam.app.odometry.track import OdometryTrack
-from slam.app.odometry.tum import format_tum_line
 from slam.app.session import messages as ros
 from slam.app.session.log import SessionLog
 from slam.app.session.mcap import CannotWriteError
@@ -34,18 +34,7 @@ N_SCANS = 300
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("log") / "session.mcap"
-    log = SessionLog(path, session_info(), odometry())
-    feed(log, N_SCANS)
-    log.close()
-    return path
-
-
-def odometry() -> OdometryTrack:
-    poses = [np.array([k / 3, k / 7, k / 11]) for k in range(20)]
-    return OdometryTrack.from_lines(
-        [format_tum_line(k * 200_000_000 + k, pose) for k, pose in enumerate(poses)]
-    )
+    return write_session(tmp_path_factory.mktemp("log") / "session.mcap", N_SCANS, odometry(20))
 
 
 def messages(path: Path, topic: str) -> list[tuple[int, int, Any]]:
@@ -71,14 +60,11 @@ def test_counters_stamps_and_samples_come_back_identical(finished: Path) -> None
 
 def test_odometry_comes_back_as_the_same_floats(finished: Path) -> None:
     samples = tuple(ros.odometry_sample(row[2]) for row in messages(finished, "/odom"))
-    assert samples == odometry().samples
+    assert samples == odometry(20).samples
 
 
 def test_odometry_is_written_as_far_as_the_scans_need_it(tmp_path: Path) -> None:
-    path = tmp_path / "session.mcap"
-    log = SessionLog(path, session_info(), odometry())
-    feed(log, 4)
-    log.close()
+    path = write_session(tmp_path / "session.mcap", 4, odometry(20))
     last_scan_ns = scan(3).t_ns
     stamps = [t_ns for _, t_ns, _ in messages(path, "/odom")]
     # up to the sample that closes the last interval, and nothing of the future beyond it
@@ -88,7 +74,7 @@ def test_odometry_is_written_as_far_as_the_scans_need_it(tmp_path: Path) -> None
 def test_frames_keep_their_own_stamps_and_the_odometry_they_need(tmp_path: Path) -> None:
     """Radars of one scan sample at different times, up to a frame after the scan's own."""
     path = tmp_path / "session.mcap"
-    log = SessionLog(path, session_info(), odometry())
+    log = SessionLog(path, session_info(), odometry(20))
     skews_ns = (0, 190_000_000)
     for counter in range(4):
         one = scan(counter)
@@ -166,7 +152,7 @@ def test_transforms_chain_to_the_estimate(finished: Path) -> None:
 
 def test_the_newest_static_message_holds_every_static_transform(tmp_path: Path) -> None:
     path = tmp_path / "s.mcap"
-    log = SessionLog(path, session_info(), odometry())
+    log = SessionLog(path, session_info(), odometry(20))
     place = np.array([3.0, -2.0, 0.7])
     for counter in range(3):
         log.on_snapshot(dataclasses.replace(snapshot(counter), world_from_map=place))
@@ -233,7 +219,7 @@ def test_chunks_stay_below_the_limit(finished: Path) -> None:
 def test_a_chunk_is_cut_after_a_second_even_if_small(tmp_path: Path) -> None:
     now = [0]
     path = tmp_path / "s.mcap"
-    log = SessionLog(path, session_info(), odometry(), clock_ns=lambda: now[0])
+    log = SessionLog(path, session_info(), odometry(20), clock_ns=lambda: now[0])
     before = path.stat().st_size
     log.on_scan(scan(0))
     assert path.stat().st_size == before
@@ -245,7 +231,7 @@ def test_a_chunk_is_cut_after_a_second_even_if_small(tmp_path: Path) -> None:
 
 def test_a_file_that_was_never_finished_lacks_its_last_chunk_only(tmp_path: Path) -> None:
     path = tmp_path / "s.mcap"
-    log = SessionLog(path, session_info(), odometry(), clock_ns=lambda: 0)
+    log = SessionLog(path, session_info(), odometry(20), clock_ns=lambda: 0)
     feed(log, N_SCANS)
     survived = tmp_path / "survived.mcap"
     survived.write_bytes(path.read_bytes())
@@ -257,7 +243,7 @@ def test_a_file_that_was_never_finished_lacks_its_last_chunk_only(tmp_path: Path
 
 
 def test_closing_twice_is_harmless(tmp_path: Path) -> None:
-    log = SessionLog(tmp_path / "s.mcap", session_info(), odometry())
+    log = SessionLog(tmp_path / "s.mcap", session_info(), odometry(20))
     log.close()
     size = (tmp_path / "s.mcap").stat().st_size
     log.close()
@@ -267,7 +253,7 @@ def test_closing_twice_is_harmless(tmp_path: Path) -> None:
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full (Linux)")
 def test_a_disk_that_is_full_from_the_start_is_one_line() -> None:
     with pytest.raises(CannotWriteError, match="/dev/full: cannot be written: No space") as caught:
-        SessionLog(Path("/dev/full"), session_info(), odometry())
+        SessionLog(Path("/dev/full"), session_info(), odometry(20))
     assert "nothing was recorded" in str(caught.value)
 
 

@@ -154,7 +154,6 @@ def test_only_the_managers_search_for_lost_work_is_silent(
 
 @pytest.fixture
 def port() -> Iterator[int]:
-    """Give a port that nobody listens on."""
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         yield taken.getsockname()[1]

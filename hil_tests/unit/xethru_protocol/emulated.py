@@ -1,0 +1,58 @@
+"""The emulated module's answers for a scripted line: no boot, no streams, no delays."""
+
+from collections.abc import Sequence
+
+from emulator.chip.chip import Chip
+from emulator.module.commands import answer
+from emulator.module.memory import FileKey, Identity
+from emulator.module.module import Module
+from emulator.module.settings import DeviceOptions
+from hil_tests.unit.emulator.doubles import RampSource
+from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.codes import FileType, SensorMode
+
+STORAGE = 0x18000
+
+
+class EmulatedModule:
+    """A stopped module that notes its commands.
+
+    Attributes
+    ----------
+    received
+        Commands, in order.
+    fail_at
+        Offset at which reading or writing a file fails with code 12.
+    run_errors
+        Codes with which it refuses the next RUN commands.
+    """
+
+    def __init__(self, *, stopped: bool = True) -> None:
+        options = DeviceOptions(storage_bytes=STORAGE)
+        self.module = Module(Identity(serial="123456789012"), Chip(RampSource()), options)
+        if stopped:
+            answer(self.module, m.SetMode(mode=SensorMode.XTID_SM_STOP))
+        self.received: list[m.Message] = []
+        self.fail_at: int | None = None
+        self.run_errors: list[int] = []
+
+    @property
+    def files(self) -> dict[FileKey, bytes]:
+        return self.module.files.contents
+
+    @property
+    def open(self) -> set[FileKey]:
+        return self.module.files._open
+
+    def leave_crash_dump(self, content: bytes) -> None:
+        self.module.files.replace((FileType.CRASH_DUMP, 0), content)
+
+    def __call__(self, command: m.Message) -> Sequence[m.Message | bytes]:
+        self.received.append(command)
+        match command:
+            case m.SetFileData(offset=at) | m.GetFileData(offset=at) if at == self.fail_at:
+                return [m.Error(code=12)]
+            case m.SetMode(mode=SensorMode.XTID_SM_RUN) if self.run_errors:
+                return [m.Error(code=self.run_errors.pop(0))]
+        reply = answer(self.module, command)
+        return [] if reply is None else [reply]
