@@ -9,26 +9,24 @@ last field.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from xethru_protocol.recordings import npz, wire_capture
-from xethru_protocol.recordings.npz import npz_facts, read_npz
 from xethru_protocol.recordings.records import (
     FaultHandler,
     RadarFacts,
     RecordingError,
     RecordingFacts,
     RecordingFault,
-    Timed,
-    unreadable,
+    TimedMessages,
+    reading,
 )
 from xethru_protocol.recordings.vendor.layouts import PARAMETER_FILE_NAME
 from xethru_protocol.recordings.vendor.reader import is_vendor_file, read_vendor, vendor_facts
 from xethru_protocol.recordings.vendor.writer import RecordingWriter
-from xethru_protocol.recordings.wire_capture import read_wire, wire_facts
 from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.table import ROWS, Response, UnknownMessage
 
@@ -80,7 +78,7 @@ _MAGICS: dict[bytes, RecordingFormat] = {
 
 
 def recording_format(path: Path | str) -> RecordingFormat:
-    """Return the format of a recording, by its first bytes.
+    """Return the format of a recording by the bytes it begins with.
 
     Raises
     ------
@@ -88,7 +86,7 @@ def recording_format(path: Path | str) -> RecordingFormat:
         If there is nothing, or nothing that this can read.
     """
     path = Path(path)
-    try:
+    with reading(path):
         if not path.exists():
             raise RecordingError(f"there is no recording {path}")
         if path.is_dir() or is_vendor_file(path):
@@ -97,8 +95,6 @@ def recording_format(path: Path | str) -> RecordingFormat:
             raise RecordingError(f"{path} is no file; a recording is read from files only")
         with path.open("rb") as stream:
             start = stream.read(8)
-    except OSError as error:
-        raise unreadable(path, error) from None
     for magic, found in _MAGICS.items():
         if start.startswith(magic):
             return found
@@ -110,7 +106,7 @@ def recording_format(path: Path | str) -> RecordingFormat:
 
 def read_recording(
     path: Path | str, on_fault: FaultHandler | None = None, *, radar: str | None = None
-) -> Iterator[Timed]:
+) -> TimedMessages:
     """Messages of a recording with their times, whatever its format.
 
     Parameters
@@ -140,9 +136,9 @@ def read_recording(
         raise RecordingError(f"{path} is of one radar and names none; leave the name out")
     match found:
         case "wire":
-            yield from read_wire(path, on_fault)
+            yield from wire_capture.read_wire(path, on_fault)
         case "npz":
-            yield from read_npz(path)
+            yield from npz.read_npz(path)
         case "mcap":
             from xethru_protocol.recordings.mcap import read_mcap
 
@@ -172,9 +168,9 @@ def recording_facts(path: Path | str) -> RecordingFacts:
     path = Path(path)
     match recording_format(path):
         case "wire":
-            return wire_facts(path)
+            return wire_capture.wire_facts(path)
         case "npz":
-            return npz_facts(path)
+            return npz.npz_facts(path)
         case "mcap":
             from xethru_protocol.recordings.mcap import mcap_facts
 
@@ -198,28 +194,23 @@ def describe_recording(path: Path | str, *, radar: str | None = None) -> Recordi
             first_ns = t_ns if first_ns is None else min(first_ns, t_ns)
             last_ns = t_ns if last_ns is None else max(last_ns, t_ns)
     facts = recording_facts(path)
+    with reading(path):
+        files: Iterable[Path] = [path]
+        if path.is_dir() or is_vendor_file(path):
+            files = (path if path.is_dir() else path.parent).rglob("xethru_*")
+        size_bytes = sum(file.stat().st_size for file in files if file.is_file())
     return RecordingSummary(
         path=path,
         format=recording_format(path),
         start_ns=first_ns,
         duration_ns=None if first_ns is None or last_ns is None else last_ns - first_ns,
         messages=dict(counts),
-        size_bytes=_size(path),
+        size_bytes=size_bytes,
         session_id=facts.session_id,
         profile_id=facts.profile_id,
         parameter_file=None if facts.parameter_file is None else PARAMETER_FILE_NAME,
         faults=tuple(faults),
     )
-
-
-def _size(path: Path) -> int:
-    try:
-        if path.is_file() and not is_vendor_file(path):
-            return path.stat().st_size
-        directory = path if path.is_dir() else path.parent
-        return sum(file.stat().st_size for file in directory.rglob("xethru_*") if file.is_file())
-    except OSError as error:
-        raise unreadable(path, error) from None
 
 
 _PROGRESS_EVERY = 1000
@@ -275,43 +266,35 @@ def convert(
     write = _writer(target)
     faults: list[RecordingFault] = []
     facts = recording_facts(source)
-    counted = _Counted(read_recording(source, faults.append, radar=radar), on_progress)
-    skipped = write(target, iter(counted), facts)
+    n_messages = 0
+
+    def counted() -> TimedMessages:
+        nonlocal n_messages
+        for timed in read_recording(source, faults.append, radar=radar):
+            yield timed
+            n_messages += 1
+            if on_progress is not None and n_messages % _PROGRESS_EVERY == 0:
+                on_progress(n_messages)
+
+    skipped = write(target, counted(), facts) or {}
     if on_progress is not None:
-        on_progress(counted.messages)
+        on_progress(n_messages)
     return Conversion(
-        messages=counted.messages - sum(skipped.values()),
-        skipped=dict(skipped),
-        faults=tuple(faults),
+        messages=n_messages - sum(skipped.values()), skipped=skipped, faults=tuple(faults)
     )
 
 
-@dataclass(slots=True)
-class _Counted:
-    """Counts the messages that pass."""
-
-    source: Iterator[Timed]
-    on_progress: Callable[[int], None] | None
-    messages: int = 0
-
-    def __iter__(self) -> Iterator[Timed]:
-        for timed in self.source:
-            yield timed
-            self.messages += 1
-            if self.on_progress is not None and self.messages % _PROGRESS_EVERY == 0:
-                self.on_progress(self.messages)
-
-
-_Writer = Callable[[Path, Iterator[Timed], RecordingFacts], Counter[str]]
+_Writer = Callable[[Path, TimedMessages, RecordingFacts], dict[str, int] | None]
 
 
 def _writer(target: Path) -> _Writer:
+    """Return what writes ``target``; it returns by name how many messages it left out, if any."""
     if target.is_dir() or not target.suffix:
-        return _to_vendor
+        return _write_vendor
     writers: dict[str, _Writer] = {
-        ".mcap": _to_mcap,
-        npz.SUFFIX: _to_npz,
-        wire_capture.SUFFIX: _to_wire,
+        ".mcap": _write_mcap,
+        npz.SUFFIX: npz.write_npz,
+        wire_capture.SUFFIX: _write_wire,
     }
     writer = writers.get(target.suffix)
     if writer is None:
@@ -325,7 +308,7 @@ def _writer(target: Path) -> _Writer:
     return writer
 
 
-def _to_vendor(target: Path, messages: Iterator[Timed], facts: RecordingFacts) -> Counter[str]:
+def _write_vendor(target: Path, messages: TimedMessages, facts: RecordingFacts) -> dict[str, int]:
     skipped: Counter[str] = Counter()
     last_ns = 0
     with RecordingWriter(
@@ -340,24 +323,17 @@ def _to_vendor(target: Path, messages: Iterator[Timed], facts: RecordingFacts) -
             if not writer.write(message, last_ns):
                 skipped[message_name(message)] += 1
         writer.close(stopped_ns=facts.stopped_ns, closed_ns=facts.closed_ns)
-    return skipped
+    return dict(skipped)
 
 
-def _to_npz(target: Path, messages: Iterator[Timed], facts: RecordingFacts) -> Counter[str]:
-    npz.write_npz(target, messages, facts)
-    return Counter()
-
-
-def _to_mcap(target: Path, messages: Iterator[Timed], facts: RecordingFacts) -> Counter[str]:
+def _write_mcap(target: Path, messages: TimedMessages, facts: RecordingFacts) -> None:
     from xethru_protocol.recordings.mcap import write_mcap
 
     write_mcap(target, messages, facts)
-    return Counter()
 
 
-def _to_wire(target: Path, messages: Iterator[Timed], facts: RecordingFacts) -> Counter[str]:
+def _write_wire(target: Path, messages: TimedMessages, facts: RecordingFacts) -> None:
     module = Connection(Role.MODULE)
     with wire_capture.WireCapture(target, {"facts": facts.as_json()}) as capture:
         for message, t_ns in messages:
             capture.write("rx", module.send(message), t_ns)
-    return Counter()

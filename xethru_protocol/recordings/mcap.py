@@ -51,9 +51,9 @@ from xethru_protocol.recordings.records import (
     RecordingFault,
     Timed,
     TimedMessages,
+    reading,
     report,
-    unreadable,
-    unwritable,
+    writing,
 )
 from xethru_protocol.wire.codec import decode_response, describe, encode
 from xethru_protocol.wire.codes import X4Setting
@@ -724,14 +724,11 @@ def write_mcap(
     RecordingError
         If the file exists or cannot be written. What was written before stays.
     """
-    try:
-        with path.open("xb") as stream:
-            writer = _RecordingWriter(stream, radar, facts)
-            for message, t_ns in messages:
-                writer.write(message, t_ns)
-            writer.finish()
-    except OSError as error:
-        raise unwritable(path, error) from None
+    with writing(path), path.open("xb") as stream:
+        writer = _RecordingWriter(stream, radar, facts)
+        for message, t_ns in messages:
+            writer.write(message, t_ns)
+        writer.finish()
 
 
 def read_mcap(path: Path, on_fault: FaultHandler | None, radar: str | None = None) -> TimedMessages:
@@ -840,19 +837,16 @@ def _radar_topic(topic: str) -> tuple[str, str]:
 
 def _entries_of(path: Path, on_fault: FaultHandler | None) -> Iterator[Entry]:
     """Yield what a file holds before it is cut or damaged, which is reported."""
-    try:
-        with path.open("rb") as stream:
-            fault: Cut | Damage | None = None
-            if stream.read(len(MAGIC)) != MAGIC:
-                fault = Damage(0, 0, "it does not begin as an MCAP file")
-            else:
-                for found in read_entries(stream, os.fstat(stream.fileno()).st_size):
-                    if isinstance(found, Cut | Damage):
-                        fault = found
-                        break
-                    yield found
-    except OSError as error:
-        raise unreadable(path, error) from None
+    fault: Cut | Damage | None = None
+    with reading(path), path.open("rb") as stream:
+        if stream.read(len(MAGIC)) != MAGIC:
+            fault = Damage(0, 0, "it does not begin as an MCAP file")
+        else:
+            for found in read_entries(stream, os.fstat(stream.fileno()).st_size):
+                if isinstance(found, Cut | Damage):
+                    fault = found
+                    break
+                yield found
     if fault is not None:
         reason = "it ends too early" if isinstance(fault, Cut) else fault.reason
         reason = f"it is cut or damaged: {reason}"

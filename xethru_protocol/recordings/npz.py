@@ -42,10 +42,10 @@ from xethru_protocol.recordings.records import (
     RecordingFacts,
     Timed,
     TimedMessages,
-    unreadable,
-    unwritable,
+    reading,
+    writing,
 )
-from xethru_protocol.recordings.vendor.layouts import LAYOUTS, Layout, layout_of
+from xethru_protocol.recordings.vendor.layouts import BINARY_KINDS, KIND_OF_MESSAGE, BinaryKind
 from xethru_protocol.wire.codec import decode_response, describe, encode
 from xethru_protocol.wire.table import Response
 
@@ -67,50 +67,57 @@ _DAMAGED = (
     RuntimeError,  # JSON too deep, a zip of another kind
     MemoryError,
 )
-_FRAME_NAMES = {"info": "counter", "length": "bins"}
+_GROUPS = {"datafloat": "frame", "databyte": "data_byte"}
+# Names of arrays that are not those of the header's fields: units left out, and a frame's own.
+_ARRAYS = {
+    "byte_step_start_db": "byte_step_start",
+    "byte_step_size_db": "byte_step_size",
+    "frequency_start_hz": "frequency_start",
+    "frequency_step_hz": "frequency_step",
+}
+_FRAME_ARRAYS = {"info": "counter", "length": "bins"}
 
 
-def _kind_name(layout: Layout) -> str:
-    name = layout.file_prefix.removeprefix("xethru_").removesuffix("_")
-    return {"datafloat": "frame", "databyte": "data_byte"}.get(name, name)
+def _group(kind: BinaryKind) -> str:
+    return _GROUPS.get(kind.name, kind.name)
 
 
-def _field_name(layout: Layout, name: str) -> str:
-    names = _FRAME_NAMES if _kind_name(layout) == "frame" else {}
-    return f"{_kind_name(layout)}_{names.get(name, name)}"
+def _header_arrays(kind: BinaryKind) -> dict[str, str]:
+    """Return the fields of a kind's header with the names of their arrays."""
+    names = _FRAME_ARRAYS if kind.name == "datafloat" else _ARRAYS
+    return {part: f"{_group(kind)}_{names.get(part, part)}" for part in kind.header.names or ()}
 
 
-class _Gathered:
+class _Bulk:
     """Bulk messages of one kind while they are gathered; their samples wait on the disk."""
 
-    def __init__(self, layout: Layout, folder: Path) -> None:
-        self.layout = layout
+    def __init__(self, kind: BinaryKind, folder: Path) -> None:
+        self.kind = kind
         self.index = array("q")
         self.t_ns = array("q")
         self.headers = bytearray()
         self.samples = TemporaryFile(dir=folder)  # noqa: SIM115 - `write_npz` closes it
 
-    def add(self, index: int, t_ns: int | None, record: bytes) -> None:
-        self.index.append(index)
-        self.t_ns.append(NO_TIME if t_ns is None else t_ns)
-        self.headers += record[: self.layout.header.itemsize]
-        self.samples.write(record[self.layout.header.itemsize :])
+    def add(self, message: Response) -> None:
+        record = encode(message, bulk=True)[len(self.kind.prefix) :]
+        self.headers += record[: self.kind.header.itemsize]
+        self.samples.write(record[self.kind.header.itemsize :])
 
     def save(self, archive: zipfile.ZipFile) -> None:
-        headers = np.frombuffer(self.headers, self.layout.header)
-        name = _kind_name(self.layout)
-        _add(archive, f"{name}_index", np.array(self.index, np.int64))
-        _add(archive, f"{name}_t_ns", np.array(self.t_ns, np.int64))
-        for part in self.layout.header.names or ():
-            _add(archive, _field_name(self.layout, part), headers[part])
-        counts = headers[self.layout.count].astype(np.int64)
-        shape: tuple[int, ...] = (int(counts.sum()) * self.layout.columns,)
+        kind, group = self.kind, _group(self.kind)
+        headers = np.frombuffer(self.headers, kind.header)
+        _add(archive, f"{group}_index", np.array(self.index, np.int64))
+        _add(archive, f"{group}_t_ns", np.array(self.t_ns, np.int64))
+        for part, name in _header_arrays(kind).items():
+            _add(archive, name, headers[part])
+        counts = headers[kind.count].astype(np.int64)
+        shape: tuple[int, ...] = (int(counts.sum()) * kind.columns,)
         if np.ptp(counts) == 0:
-            columns = (self.layout.columns,) if self.layout.columns > 1 else ()
+            columns = (kind.columns,) if kind.columns > 1 else ()
             shape = (len(headers), *columns, int(counts[0]))
-        about = {"descr": self.layout.values, "fortran_order": False, "shape": shape}
+        about = {"descr": kind.values, "fortran_order": False, "shape": shape}
         self.samples.seek(0)
-        with _member(archive, f"{name}_samples", "w") as stream:
+        with _member(archive, f"{group}_samples", "w") as stream:
             write_array_header_1_0(stream, about)
             shutil.copyfileobj(self.samples, stream, _AT_ONCE)
 
@@ -126,9 +133,7 @@ class _Others:
         self.names: list[str] = []
         self.fields: list[str] = []
 
-    def add(self, index: int, t_ns: int | None, message: Response) -> None:
-        self.index.append(index)
-        self.t_ns.append(NO_TIME if t_ns is None else t_ns)
+    def add(self, message: Response) -> None:
         self.payload += encode(message)
         self.end.append(len(self.payload))
         name, shown = describe(message)
@@ -154,31 +159,29 @@ def write_npz(path: Path, messages: Iterable[Timed], facts: RecordingFacts) -> N
     """
     if path.exists():
         raise RecordingError(f"{path} exists already")
-    bulk: dict[int, _Gathered] = {}
+    bulk: dict[int, _Bulk] = {}
     others = _Others()
     partial = path.with_name(path.name + ".part")
-    try:
-        with contextlib.ExitStack() as cleanup:
-            for index, (message, t_ns) in enumerate(messages):
-                payload = encode(message, bulk=True)
-                layout = layout_of(payload)
-                if layout is None:
-                    others.add(index, t_ns, message)
-                    continue
-                if layout.data_type not in bulk:
-                    gathered = bulk[layout.data_type] = _Gathered(layout, path.parent)
-                    cleanup.callback(gathered.samples.close)
-                bulk[layout.data_type].add(index, t_ns, payload[len(layout.prefix) :])
-            cleanup.callback(partial.unlink, missing_ok=True)
-            with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
-                _add(archive, "format", np.array(FORMAT))
-                _add(archive, "facts", np.array(json.dumps(facts.as_json())))
-                others.save(archive)
-                for gathered in bulk.values():
-                    gathered.save(archive)
-            os.replace(partial, path)
-    except OSError as error:
-        raise unwritable(path, error) from None
+    with writing(path), contextlib.ExitStack() as cleanup:
+        for index, (message, t_ns) in enumerate(messages):
+            kind = KIND_OF_MESSAGE.get(type(message))
+            group: _Bulk | _Others = others
+            if isinstance(kind, BinaryKind):
+                if kind.data_type not in bulk:
+                    bulk[kind.data_type] = _Bulk(kind, path.parent)
+                    cleanup.callback(bulk[kind.data_type].samples.close)
+                group = bulk[kind.data_type]
+            group.add(message)
+            group.index.append(index)
+            group.t_ns.append(NO_TIME if t_ns is None else t_ns)
+        cleanup.callback(partial.unlink, missing_ok=True)
+        with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
+            _add(archive, "format", np.array(FORMAT))
+            _add(archive, "facts", np.array(json.dumps(facts.as_json())))
+            others.save(archive)
+            for part in bulk.values():
+                part.save(archive)
+        os.replace(partial, path)
 
 
 def _member(archive: zipfile.ZipFile, name: str, mode: Literal["r", "w"]) -> IO[bytes]:
@@ -198,37 +201,36 @@ def read_npz(path: Path) -> TimedMessages:
     RecordingError
         If the file is cut, damaged or not of this kind.
     """
-    try:
-        with contextlib.ExitStack() as cleanup:
-            archive = cleanup.enter_context(np.load(path, allow_pickle=False))
-            _check_format(path, archive)
-            # Checksums stand for whole arrays: without this, damaged samples would come out first.
-            if (damaged := archive.zip.testzip()) is not None:
-                raise ValueError(f"the checksum of {damaged} is wrong")
-            found = [_other_messages(archive)]
-            found += [
-                _bulk_messages(layout, archive, cleanup)
-                for layout in LAYOUTS
-                if f"{_kind_name(layout)}_index" in archive
-            ]
-            for _, t_ns, payload in heapq.merge(*found, key=itemgetter(0)):
-                yield decode_response(payload), None if t_ns == NO_TIME else t_ns
-    except OSError as error:
-        raise unreadable(path, error) from None
-    except _DAMAGED as error:
-        raise RecordingError(f"{path} is cut or damaged: {error}") from None
+    with _open(path, " is cut or damaged") as archive, contextlib.ExitStack() as cleanup:
+        # Checksums are of whole arrays: without this, damaged samples would come out first.
+        if (damaged := archive.zip.testzip()) is not None:
+            raise ValueError(f"the checksum of {damaged} is wrong")
+        found = [_other_messages(archive)]
+        found += [
+            _bulk_messages(kind, archive, cleanup)
+            for kind in BINARY_KINDS
+            if f"{_group(kind)}_index" in archive
+        ]
+        for _, t_ns, payload in heapq.merge(*found, key=itemgetter(0)):
+            yield decode_response(payload), None if t_ns == NO_TIME else t_ns
 
 
 def npz_facts(path: Path) -> RecordingFacts:
     """Return the facts of an archive; RecordingError if it cannot be read."""
+    with _open(path, ": its description is damaged") as archive:
+        return RecordingFacts.from_json(json.loads(str(archive["facts"])))
+
+
+@contextlib.contextmanager
+def _open(path: Path, problem: str) -> Iterator[_Archive]:
+    """Open an archive of this module; every error of damage becomes one with ``problem``."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            _check_format(path, archive)
-            return RecordingFacts.from_json(json.loads(str(archive["facts"])))
-    except OSError as error:
-        raise unreadable(path, error) from None
+        with reading(path), np.load(path, allow_pickle=False) as archive:
+            if "format" not in archive or str(archive["format"]) != FORMAT:
+                raise RecordingError(f"{path} is a numpy archive, and no recording of this program")
+            yield archive
     except _DAMAGED as error:
-        raise RecordingError(f"{path}: its description is damaged: {error}") from None
+        raise RecordingError(f"{path}{problem}: {error}") from None
 
 
 _Found = Iterator[tuple[int, int, bytes]]  # place, time, payload
@@ -243,35 +245,30 @@ def _other_messages(archive: _Archive) -> _Found:
         begin = end
 
 
-def _bulk_messages(layout: Layout, archive: _Archive, cleanup: contextlib.ExitStack) -> _Found:
-    name = _kind_name(layout)
-    index = archive[f"{name}_index"]
-    headers = np.zeros(len(index), layout.header)
-    for part in layout.header.names or ():
-        headers[part] = archive[_field_name(layout, part)]
-    sizes = headers[layout.count].astype(np.int64) * layout.element_bytes
-    samples = cleanup.enter_context(_member(archive.zip, f"{name}_samples", "r"))
-    held = _samples_bytes(samples, layout)
+def _bulk_messages(kind: BinaryKind, archive: _Archive, cleanup: contextlib.ExitStack) -> _Found:
+    group = _group(kind)
+    index = archive[f"{group}_index"]
+    headers = np.zeros(len(index), kind.header)
+    for part, name in _header_arrays(kind).items():
+        headers[part] = archive[name]
+    sizes = headers[kind.count].astype(np.int64) * kind.element_bytes
+    samples = cleanup.enter_context(_member(archive.zip, f"{group}_samples", "r"))
+    held = _samples_bytes(samples, kind)
     if int(sizes.sum()) != held:
-        raise ValueError(f"{name}_samples holds {held} bytes, not {int(sizes.sum())}")
-    stamps_ns = archive[f"{name}_t_ns"]
+        raise ValueError(f"{group}_samples holds {held} bytes, not {int(sizes.sum())}")
+    stamps_ns = archive[f"{group}_t_ns"]
     for place, t_ns, size, header in zip(index, stamps_ns, sizes.tolist(), headers, strict=True):
         data = samples.read(size)
         if len(data) < size:
-            raise EOFError(f"{name}_samples ends too soon")
-        yield int(place), int(t_ns), layout.prefix + header.tobytes() + data
+            raise EOFError(f"{group}_samples ends too soon")
+        yield int(place), int(t_ns), kind.prefix + header.tobytes() + data
 
 
-def _samples_bytes(stream: IO[bytes], layout: Layout) -> int:
+def _samples_bytes(stream: IO[bytes], kind: BinaryKind) -> int:
     """Read an array's head and return how many bytes of values follow it."""
     if read_magic(stream) != (1, 0):
         raise ValueError("its samples are of an unknown version of numpy's format")
-    shape, column_major, kind = read_array_header_1_0(stream)
-    if kind != np.dtype(layout.values) or (column_major and len(shape) > 1):
-        raise ValueError(f"its samples are {kind}, not {layout.values} row by row")
-    return math.prod(shape) * kind.itemsize
-
-
-def _check_format(path: Path, archive: _Archive) -> None:
-    if "format" not in archive or str(archive["format"]) != FORMAT:
-        raise RecordingError(f"{path} is a numpy archive, and no recording of this program")
+    shape, column_major, found = read_array_header_1_0(stream)
+    if found != np.dtype(kind.values) or (column_major and len(shape) > 1):
+        raise ValueError(f"its samples are {found}, not {kind.values} row by row")
+    return math.prod(shape) * found.itemsize

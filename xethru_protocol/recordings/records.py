@@ -1,7 +1,11 @@
 """What every kind of recording holds: messages with their times, and facts about the whole."""
 
+import os
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
+from io import FileIO
+from pathlib import Path
 from types import NoneType
 from typing import Any, Self
 
@@ -37,14 +41,67 @@ def report(fault: RecordingFault, on_fault: FaultHandler | None) -> None:
         raise RecordingError(f"{fault.file}: {fault.reason} (at byte {fault.offset})")
 
 
-def unreadable(path: object, error: OSError) -> RecordingError:
-    """Return an error with the reason why ``path`` cannot be read."""
-    return RecordingError(f"{path} cannot be read: {error.strerror or error}")
+@contextmanager
+def reading(path: object) -> Iterator[None]:
+    """Turn an error of the operating system into one that names the file that is read."""
+    try:
+        yield
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read: {error.strerror or error}") from None
 
 
-def unwritable(path: object, error: OSError) -> RecordingError:
-    """Return an error with the reason why ``path`` cannot be written."""
-    return RecordingError(f"{path} cannot be written: {error.strerror or error}")
+@contextmanager
+def writing(path: object) -> Iterator[None]:
+    """Turn an error of the operating system into one that names the file that is written."""
+    try:
+        yield
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be written: {error.strerror or error}") from None
+
+
+class GrowingFile:
+    """A new file that grows by whole pieces, each handed to the operating system at once.
+
+    Raises
+    ------
+    RecordingError
+        If the file exists or cannot be made; of every method, if it cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.size = 0
+        with writing(path):
+            self._stream = FileIO(path, "x")
+
+    @property
+    def closed(self) -> bool:
+        """Whether `close` was called."""
+        return self._stream.closed
+
+    def append(self, data: bytes) -> None:
+        """Write all of ``data`` at the end, or leave the file as it was."""
+        view = memoryview(data)
+        with writing(self.path):
+            try:
+                while view:
+                    view = view[self._stream.write(view) :]
+            except OSError:
+                with suppress(OSError):  # the disk itself may be gone
+                    os.ftruncate(self._stream.fileno(), self.size)  # no part of a piece stays
+                    self._stream.seek(self.size)
+                raise
+        self.size += len(data)
+
+    def finish(self, head: bytes) -> None:
+        """Write ``head`` over the file's beginning and close it."""
+        with writing(self.path), self._stream:
+            self._stream.seek(0)
+            self._stream.write(head)
+
+    def close(self) -> None:
+        """Close the file; calling it again does nothing."""
+        self._stream.close()
 
 
 MS_NS = 1_000_000

@@ -23,22 +23,20 @@ import json
 import os
 import struct
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
-from io import FileIO
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Literal, Self
 
 from xethru_protocol.recordings.records import (
     FaultHandler,
+    GrowingFile,
     RecordingError,
     RecordingFacts,
     RecordingFault,
     TimedMessages,
+    reading,
     report,
-    unreadable,
-    unwritable,
 )
 from xethru_protocol.wire.codec import decode_response
 from xethru_protocol.wire.framing import Direction, FramingFault, NeedData, PacketReader
@@ -86,12 +84,8 @@ class WireCapture:
     def __init__(self, path: Path | str, note: Mapping[str, Any] | None = None) -> None:
         self.path = Path(path)
         text = json.dumps(dict(note or {})).encode()
-        try:
-            self._stream = FileIO(self.path, "x")
-        except OSError as error:
-            raise unwritable(self.path, error) from None
-        self._size = 0
-        self._append(_HEAD.pack(MAGIC, VERSION, len(text)) + text)
+        self._file = GrowingFile(self.path)
+        self._file.append(_HEAD.pack(MAGIC, VERSION, len(text)) + text)
 
     def __enter__(self) -> Self:
         return self
@@ -114,26 +108,14 @@ class WireCapture:
         """
         if not data:
             return
+        if self._file.closed:
+            raise RecordingError(f"{self.path}: the capture is closed")
         stamp_ns = _NO_TIME if t_ns is None else t_ns
-        self._append(_CHUNK.pack(_MARKS[direction], stamp_ns, len(data)) + data)
+        self._file.append(_CHUNK.pack(_MARKS[direction], stamp_ns, len(data)) + data)
 
     def close(self) -> None:
         """Close the file; calling it again does nothing."""
-        self._stream.close()
-
-    def _append(self, data: bytes) -> None:
-        if self._stream.closed:
-            raise RecordingError(f"{self.path}: the capture is closed")
-        view = memoryview(data)
-        try:
-            while view:
-                view = view[self._stream.write(view) :]
-        except OSError as error:
-            with suppress(OSError):  # the disk itself may be gone
-                os.ftruncate(self._stream.fileno(), self._size)  # no half chunk stays behind
-                self._stream.seek(self._size)
-            raise unwritable(self.path, error) from None
-        self._size += len(data)
+        self._file.close()
 
 
 def read_chunks(path: Path | str, on_fault: FaultHandler | None = None) -> Iterator[Chunk]:
@@ -148,42 +130,39 @@ def read_chunks(path: Path | str, on_fault: FaultHandler | None = None) -> Itera
         If the file is no wire capture, or is cut and ``on_fault`` is None.
     """
     path = Path(path)
-    try:
-        with path.open("rb") as stream:
-            size = os.fstat(stream.fileno()).st_size
-            _read_note(path, stream)
-            while head := stream.read(_CHUNK.size):
-                begin = stream.tell() - len(head)
-                if len(head) < _CHUNK.size:
-                    _report(path, begin, f"the last chunk is cut: {len(head)} bytes", on_fault)
-                    return
-                mark, stamp_ns, length = _CHUNK.unpack(head)
-                way = _WAYS.get(mark)
-                if way is None:
-                    _report(path, begin, f"no chunk begins with byte {mark:02X}", on_fault)
-                    return
-                t_ns = None if stamp_ns == _NO_TIME else stamp_ns
-                there = min(length, size - stream.tell())
-                left = there
-                while left and (data := stream.read(min(left, _LARGEST_PIECE))):
-                    left -= len(data)
-                    yield Chunk(way, data, t_ns)
-                if there < length:
-                    reason = f"the last chunk is cut: {there} of its {length} bytes are there"
-                    _report(path, begin, reason, on_fault)
-                    return
-    except OSError as error:
-        raise unreadable(path, error) from None
+
+    def report_at(offset: int, reason: str) -> None:
+        report(RecordingFault(file=path.name, offset=offset, reason=reason), on_fault)
+
+    with reading(path), path.open("rb") as stream:
+        size = os.fstat(stream.fileno()).st_size
+        _read_note(path, stream)
+        while head := stream.read(_CHUNK.size):
+            begin = stream.tell() - len(head)
+            if len(head) < _CHUNK.size:
+                report_at(begin, f"the last chunk is cut: {len(head)} bytes")
+                return
+            mark, stamp_ns, length = _CHUNK.unpack(head)
+            way = _WAYS.get(mark)
+            if way is None:
+                report_at(begin, f"no chunk begins with byte {mark:02X}")
+                return
+            t_ns = None if stamp_ns == _NO_TIME else stamp_ns
+            there = min(length, size - stream.tell())
+            left = there
+            while left and (data := stream.read(min(left, _LARGEST_PIECE))):
+                left -= len(data)
+                yield Chunk(way, data, t_ns)
+            if there < length:
+                report_at(begin, f"the last chunk is cut: {there} of its {length} bytes are there")
+                return
 
 
 def read_note(path: Path | str) -> dict[str, Any]:
     """Return the note of a wire capture; RecordingError if the file is not one."""
     path = Path(path)
-    try:
-        with path.open("rb") as stream:
-            return _read_note(path, stream)
-    except OSError as error:
-        raise unreadable(path, error) from None
+    with reading(path), path.open("rb") as stream:
+        return _read_note(path, stream)
 
 
 def wire_facts(path: Path) -> RecordingFacts:
@@ -202,27 +181,25 @@ def read_wire(path: Path, on_fault: FaultHandler | None) -> TimedMessages:
     reader = PacketReader(Direction.FROM_MODULE)
     cuts: list[RecordingFault] = []
     t_ns: int | None = None
+
+    def packets() -> TimedMessages:
+        while not isinstance(found := reader.next_packet(), NeedData):
+            if isinstance(found, FramingFault):
+                reason = f"on the line: {found.kind.value}"
+                report(RecordingFault(file=path.name, offset=found.offset, reason=reason), on_fault)
+            else:
+                yield decode_response(found.payload), t_ns
+
     for chunk in read_chunks(path, cuts.append):
         if chunk.way == "rx":
             t_ns = chunk.t_ns
             reader.receive_data(chunk.data)
-            yield from _packets(path, reader, t_ns, on_fault)
+            yield from packets()
     if not cuts:
         reader.end_data()
-        yield from _packets(path, reader, t_ns, on_fault)
+        yield from packets()
     for cut in cuts:
         report(cut, on_fault)
-
-
-def _packets(
-    path: Path, reader: PacketReader, t_ns: int | None, on_fault: FaultHandler | None
-) -> TimedMessages:
-    while not isinstance(found := reader.next_packet(), NeedData):
-        if isinstance(found, FramingFault):
-            reason = f"on the line: {found.kind.value}"
-            report(RecordingFault(file=path.name, offset=found.offset, reason=reason), on_fault)
-        else:
-            yield decode_response(found.payload), t_ns
 
 
 def _read_note(path: Path, stream: BinaryIO) -> dict[str, Any]:
@@ -242,7 +219,3 @@ def _read_note(path: Path, stream: BinaryIO) -> dict[str, Any]:
     if len(text) < length or not isinstance(note, dict):
         raise RecordingError(f"{path}: the head of the capture is cut or damaged")
     return note
-
-
-def _report(path: Path, offset: int, reason: str, on_fault: FaultHandler | None) -> None:
-    report(RecordingFault(file=path.name, offset=offset, reason=reason), on_fault)

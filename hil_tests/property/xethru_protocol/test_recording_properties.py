@@ -23,16 +23,13 @@ from xethru_protocol.recordings import (
 )
 from xethru_protocol.recordings.mcap import read_mcap, write_mcap
 from xethru_protocol.recordings.npz import read_npz, write_npz
-from xethru_protocol.recordings.vendor.layouts import BY_MESSAGE, CSV_KINDS, LAYOUTS
+from xethru_protocol.recordings.vendor.layouts import KINDS
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codec import encode
 from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.table import RESPONSES
 
-STORED = [
-    *(kind.message for kind in CSV_KINDS),
-    *(RESPONSES.types[layout.prefix] for layout in LAYOUTS),
-]
+STORED = [kind.message for kind in KINDS]
 """Message types that the vendor's format has a place for."""
 MS = 1_000_000
 TIMES_MS = st.integers(0, 2**31)
@@ -73,10 +70,9 @@ def test_vendor_directories_give_back_what_was_written(
 
 
 def test_every_stored_kind_is_a_response_of_the_table() -> None:
-    assert len(set(STORED)) == len(LAYOUTS) + len(CSV_KINDS)
-    bits = [layout.data_type for layout in LAYOUTS] + [kind.data_type for kind in CSV_KINDS]
-    assert len(set(bits)) == len(bits)
-    assert set(BY_MESSAGE) <= set(STORED)
+    assert len(set(STORED)) == len(KINDS)
+    assert set(STORED) <= set(RESPONSES.types.values())
+    assert len({kind.data_type for kind in KINDS}) == len(KINDS)
 
 
 @settings(deadline=None, max_examples=60)
