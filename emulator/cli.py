@@ -73,10 +73,10 @@ def _list(arguments: argparse.Namespace) -> int:
 def _text(kind: Kind, *, full: bool) -> str:
     from emulator.faults.plan import described
 
-    said = described(kind)
+    row = described(kind)
     parameters = ", ".join(
         name if parameter["default"] is None else f"{name}={parameter['default']}"
-        for name, parameter in said["parameters"].items()
+        for name, parameter in row["parameters"].items()
     )
     if not full:
         defaults = f"  [{parameters}]" if parameters else ""
@@ -84,7 +84,7 @@ def _text(kind: Kind, *, full: bool) -> str:
     lines = [f"{kind.name} ({kind.layer.value} layer)", kind.summary, ""]
     lines += [f"acts on:            {kind.target.value}", f"the driver counts:  {kind.counted}"]
     lines += [f"hidden:             {kind.hidden}"] if kind.hidden else []
-    for name, parameter in said["parameters"].items():
+    for name, parameter in row["parameters"].items():
         limits = ", ".join(
             f"{key.replace('_', ' ')} {value}"
             for key, value in parameter.items()
@@ -92,7 +92,7 @@ def _text(kind: Kind, *, full: bool) -> str:
         )
         default = "" if parameter["default"] is None else f" = {parameter['default']}"
         lines.append(f"  {name}{default}: {parameter['meaning']} ({limits})")
-    return "\n".join([*lines, "", said["example"]])
+    return "\n".join([*lines, "", row["example"]])
 
 
 # --- ctl ----------------------------------------------------------------------------------------
@@ -112,8 +112,8 @@ def _control(arguments: argparse.Namespace) -> int:
         reason = error.strerror or str(error) or type(error).__name__
         return _failed(f"{path}: no emulator answers: {reason}")
     try:
-        said = json.loads(answer)
-        refused = None if said["ok"] else str(said["error"])
+        reply = json.loads(answer)
+        refused = None if reply["ok"] else str(reply["error"])
     except (ValueError, KeyError, TypeError):
         return _failed(f"{path}: what answers there is no emulator")
     if refused is not None:
@@ -185,16 +185,16 @@ def _socket_of(path: Path) -> Path:
     """Return the control socket of the emulator that has a port; a socket is itself."""
     from xethru_protocol.transport import run_directory
 
-    with contextlib.suppress(OSError):  # a path that cannot be, too long for one; connecting tells
+    with contextlib.suppress(OSError):  # too long, for example: connecting reports it
         if path.is_socket():
             return path
     for entry in sorted(run_directory().glob("*.json")):
         try:
-            word = json.loads(entry.read_text())
-            ports = [Path(device["path"]) for device in word["devices"]]
-            control = word["control"]
+            announced = json.loads(entry.read_text())
+            ports = [Path(device["path"]) for device in announced["devices"]]
+            control = announced["control"]
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
-            continue  # not an emulator's word, or one that is just being written
+            continue  # no announcement, or one that is just being written
         if path.absolute() in ports and isinstance(control, str):
             return Path(control)
     return path
@@ -255,12 +255,12 @@ real module. pace asap: as fast as the host reads, nothing is lost.
 
 --tcp: each module on a TCP port, too, for one client at a time: a second one is hung up on, and so
 is one that comes while a host has the module's pseudo-terminal open. While a client is connected,
-the pseudo-terminal is deaf and dumb.
+the pseudo-terminal takes and sends nothing.
 
 --link usb: bytes pass at once; usb:MS: transfers of at most 512 bytes, MS milliseconds under way.
 --link uart: ten bits per byte at the speed that the host sets its terminal to; a host at another
-speed than the module's (115200 after power-up, then what SETBAUDRATE says) hears and sends
-garbage. uart:BAUD: the host's side runs at BAUD, whatever its terminal says.
+speed than the module's (115200 after power-up, then what SETBAUDRATE set) receives and sends
+garbage. uart:BAUD: the host's side runs at BAUD, whatever its terminal is set to.
 
 --port-on-reset vanish: a reset takes the port away for two seconds, as USB does: whoever has it
 open sees it hang up, its name is gone. rename: it returns as NAME-2, NAME-3 and so on; running
@@ -292,7 +292,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _list(arguments) if arguments.command == "faults" else _control(arguments)
     except KeyboardInterrupt:
         return _INTERRUPTED
-    except BrokenPipeError:  # whoever read our output has enough
+    except BrokenPipeError:  # the reader of our output has closed it
         _forget_output()
         return 0
     except OSError as error:
@@ -320,7 +320,7 @@ def _warn(text: str) -> None:
 
 
 def _say(text: str) -> None:
-    if sys.stderr is not None:  # started with stderr closed: nobody wants to know
+    if sys.stderr is not None:  # started with stderr closed
         line = " ".join(text.split())
         sys.stderr.write(f"xethru-emulator: {line}\n")
 

@@ -3,8 +3,8 @@
 `Device` joins the parts: the connection turns bytes into commands, `commands` answers them, a
 `MessageStream` makes messages of its own accord, an `Outbox` holds what waits for the line.
 
-A reset: ACK, half a second later the module restarts, is deaf for two seconds, then sends BOOTING
-and READY. Whoever owns the port asks `Device.port_present` whether it is there meanwhile.
+A reset: ACK, half a second later the module restarts, receives nothing for two seconds, then sends
+BOOTING and READY. Whatever owns the port asks `Device.port_present` whether it is there meanwhile.
 
 Source: protocol reference 8.
 """
@@ -57,17 +57,6 @@ class ChipStream(MessageStream):
     ``scene_time_zero_ns`` + the scene time at which the module's clock shows k's nominal time; a
     stream that starts late begins with the first counter still ahead, because the chip's counter
     runs on.
-
-    Parameters
-    ----------
-    module
-        The module whose chip makes the frames.
-    pace
-        Whether frames wait for their time.
-    clock
-        The module's own: its start skew and its rate error.
-    scene_time_zero_ns
-        Device time of scene time 0, ns.
     """
 
     def __init__(
@@ -135,24 +124,12 @@ class ChipStream(MessageStream):
 
 
 class CombinedStream(MessageStream):
-    """Messages of a module in any mode; at most one of its two streams has any.
-
-    Parameters
-    ----------
-    raw
-        Radar frames, in MANUAL.
-    profile
-        Output of the profile, in RUN.
-    """
+    """Messages of a module in any mode; at most one of its two streams has any."""
 
     def __init__(self, raw: ChipStream, profile: ProfileStream) -> None:
         self._raw = raw
         self._profile = profile
         self._active = self._choice()
-
-    @property
-    def profile(self) -> ProfileStream:
-        return self._profile
 
     def next_due_ns(self) -> int | None:
         return self._active.next_due_ns()
@@ -284,7 +261,7 @@ class Device:
 
     @property
     def listens(self) -> bool:
-        """Whether it hears the host: not while it starts or sleeps."""
+        """Whether it receives: not while it starts or sleeps."""
         return self._ready_ns is None and not self._module.asleep
 
     def crash(self, reason: str, now_ns: int) -> None:
@@ -428,10 +405,6 @@ def radar_device(
 
     Parameters
     ----------
-    identity
-        Serial number and version strings.
-    source
-        The world in front of the antennas.
     pace
         `Pace.ASAP`: nothing is dropped, frames are made as the line takes them.
         `Pace.REALTIME`: frames at absolute deadlines, firmware overflow.
@@ -439,10 +412,6 @@ def radar_device(
         Device time of scene time 0 (`Pace.REALTIME`), ns.
     clock
         The module's own, which the source must know, too; one without error if None.
-    boot
-        Timing of a restart; the documented one if None.
-    options
-        How it answers what the reference leaves open; the documented defaults if None.
     memory
         Where its flash is kept; None forgets it with the device.
     """

@@ -288,7 +288,7 @@ def schedule(
 class PlayStream(MessageStream):
     """The messages of a recording, due one after the other while a host has the port open.
 
-    Where nobody tells who opens the port, a host's first command shows that it is there.
+    Where the system does not report who opens the port, a host's first command counts as opening.
 
     What is being played can be controlled meanwhile. No control brings a message twice or out of
     order, or loses one, but for what a seek leaves out and a filter passes over; a message that
@@ -303,8 +303,6 @@ class PlayStream(MessageStream):
     loop_gap_ns
         Time of the recording between the last message and the first when playing in a loop; None
         to play once.
-    rate
-        Multiple of real time; 0 for as fast as the line takes it.
     from_ns
         Where every host and round begins, ns since the first message.
     kinds
@@ -500,7 +498,7 @@ def _starts_radar(command: Command[Response]) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlayedFrames:
-    """What a recording tells of its radar frames.
+    """What is known of the radar frames of a recording.
 
     Attributes
     ----------
@@ -556,12 +554,8 @@ class PlayOptions:
     ----------
     rate
         Multiple of real time; 0 for as fast as the port takes it.
-    loop
-        Whether to begin again at the end.
     from_ns
         Where every host and round begins, ns since the first message of the recording.
-    kinds
-        Which kinds of messages, as from `kinds`; None for all.
     """
 
     rate: float = 1.0
@@ -581,10 +575,6 @@ class PlayedRadar:
         names are plain ones, else ``player`` or ``radar0``, ``radar1`` and so on.
     serial
         Serial number it answers with: the recorded one where that is known.
-    device
-        The module.
-    stream
-        What it plays; takes the controls.
     """
 
     name: str
@@ -601,7 +591,7 @@ def played_radars(
     on_fault: Callable[[RecordingFault], None],
     warn: Callable[[str], None] = lambda line: None,
 ) -> tuple[PlayedRadar, ...]:
-    """Return one module per radar of a recording; each plays its own to whoever opens its port.
+    """Return one module per radar of a recording; each plays to the host that opens its port.
 
     The recording is read once per radar now and again for every host, so that it may be larger
     than the memory. Times of all radars count from the first message of any. Recorded answers are
@@ -612,7 +602,7 @@ def played_radars(
     recording
         Anything that `read_recording` takes, and sessions of several radars.
     identity
-        What every module says about itself; None: a stock one with the recorded serial number.
+        Identity of every module; None: a stock one with the recorded serial number.
     on_fault
         Called with what could not be read; the rest plays.
     warn
@@ -643,7 +633,7 @@ def played_radars(
 
 
 class _Survey:
-    """What one reading of a radar's recording tells, before anything is played."""
+    """What one reading of a radar's recording shows, before anything is played."""
 
     def __init__(
         self, recording: Path, facts: RadarFacts, on_fault: Callable[[RecordingFault], None]
@@ -678,7 +668,7 @@ class _Survey:
                 case DataFloat(content_id=0):
                     self._frame_sizes[message.values.size] += 1
                 case ReplyFloat(content_id=X4Setting.FRAMEAREA, values=(start_m, end_m)):
-                    self._area_m = start_m, end_m  # counts more than what is said of the radar
+                    self._area_m = start_m, end_m  # overrides the description of the radar
             if not is_answer(message):
                 if not self.plays:
                     self.first_ns = stamp_ns
@@ -759,7 +749,7 @@ class _Program:
             played = (item for item in records if not is_answer(item[0]))
             for item in schedule(played, rate=1.0):
                 yield TimedMessage(time_ns=item.time_ns + self.offset_ns, message=item.message)
-        except RecordingError as error:  # somebody moved it meanwhile
+        except RecordingError as error:  # it was moved or changed meanwhile
             self.warn(str(error))
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source
-from emulator.faults.faulty_device import FaultyDevice, wrap
+from emulator.faults.faulty_device import FaultyDevice
 from emulator.faults.kind import InnerDevice
 from emulator.faults.plan import FaultPlan, FaultPlanError, TruthLog, load_plan
 from emulator.module.memory import Identity, Memory
@@ -51,8 +51,6 @@ class FaultSession:
         Name or path; None: no faults until the control socket adds some.
     truth
         File of the truth log, made anew; None: kept in memory only.
-    cleanup
-        Closes what was opened.
     zero_ns
         Device time from which the scenario counts.
 
@@ -79,14 +77,14 @@ class FaultSession:
         self.truth = TruthLog()
         if truth is not None:
             try:
-                # by lines: whoever follows the file sees a fault when it is injected
+                # by lines: a fault is in the file as soon as it is injected
                 stream = cleanup.enter_context(truth.open("w", buffering=1, encoding="utf-8"))
             except OSError as error:
                 raise LinkError(f"{truth}: cannot write the truth log: {error.strerror}") from error
             self.truth = TruthLog(stream.write)
 
     def wrap(self, device: InnerDevice, name: str) -> FaultyDevice:
-        faulty = wrap(device, name, self._plan, self.truth, zero_ns=self._zero_ns)
+        faulty = FaultyDevice(device, name, self._plan, self.truth, zero_ns=self._zero_ns)
         self.devices[name] = faulty
         return faulty
 
@@ -295,7 +293,7 @@ def proxy(options: Namespace, stop: StopFlag, warn: Warn) -> None:
 
 def _link_options(options: Namespace, warn: Warn) -> LinkOptions:
     if options.tcp is not None and not is_loopback(options.tcp_host):
-        warn(f"--tcp-host {options.tcp_host}: whoever reaches this address can command the modules")
+        warn(f"--tcp-host {options.tcp_host}: everyone who reaches it can command the modules")
     kind, number = options.link
     return LinkOptions(
         kind=kind,
@@ -343,7 +341,7 @@ def _run(
     cleanup: contextlib.ExitStack,
 ) -> None:
     if stop.requested:
-        return  # nobody shall learn of ports that go away at once
+        return  # do not announce ports that go away at once
     server = Server(ports.ports, [*services, *ports.services])
     cleanup.callback(server.close)
     stop.attach(server.stop)
@@ -362,6 +360,6 @@ def _say_ready(ready: dict[str, object]) -> None:
         sys.stdout.write(json.dumps(ready, separators=(",", ":")) + "\n")
         sys.stdout.flush()
     except OSError as error:
-        # nobody will ever learn our ports; and the interpreter must not try to flush again
+        # nobody can use ports that were not announced; the interpreter must not flush again
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise CannotServeError(f"stdout: cannot write the ready line: {error.strerror}") from error

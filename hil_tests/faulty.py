@@ -18,7 +18,7 @@ from emulator.chip import Pace
 from emulator.chip.chip import EchoSource
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source
-from emulator.faults.faulty_device import FaultyDevice, fault, wrap
+from emulator.faults.faulty_device import FaultyDevice, fault
 from emulator.faults.kind import InnerDevice
 from emulator.faults.plan import FaultPlan, TruthLog
 from emulator.module.memory import Identity
@@ -98,7 +98,7 @@ class FaultyLine:
         if inner is None:
             echoes = echo_source(empty_room(), 0, 0) if source is None else source
             inner = radar_device(Identity(serial=SERIAL), echoes, Pace.REALTIME)
-        self.device: FaultyDevice = wrap(inner, "radar_1", plan, self.truth, zero_ns=0)
+        self.device: FaultyDevice = FaultyDevice(inner, "radar_1", plan, self.truth, zero_ns=0)
 
     def clock_ns(self) -> int:
         return self._now_ns

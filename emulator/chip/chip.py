@@ -156,18 +156,8 @@ class CaptureSettings:
         labels and not echoes.
     n_samples
         RF samples per frame at 23.328 GHz.
-    iterations
-        Sweeps summed per frame.
-    pulses_per_step
-        Pulses per DAC step.
-    dac_min
-        Lowest DAC level of the sweep, 0...2047.
-    dac_max
-        Highest DAC level of the sweep, 0...2047.
     dac_step
         Exponent of the DAC step size, 2**dac_step.
-    tx_power
-        Transmitter power setting, 0 (off)...3.
     tx_center_frequency
         3 (7.290 GHz) or 4 (8.748 GHz).
 
@@ -201,8 +191,6 @@ class EchoSource(Protocol):
 
         Parameters
         ----------
-        capture
-            Settings the frames are sampled with.
         frame_counters
             Shape (n_frames,), the frames' counters; they select the noise.
         scene_times_ns
@@ -259,14 +247,8 @@ class ChipSettings:
         Frame area offset, float32 value, module metres.
     dac_step
         Exponent of the DAC step, 0...3.
-    dac_min
-        Lowest DAC level.
     dac_max
         Highest DAC level; may lie below `dac_min`, as in the firmware.
-    tx_center_frequency
-        3 or 4.
-    tx_power
-        0 (off)...3.
     prf_div
         Divider of the 243 MHz clock, 4...255.
     """
@@ -413,7 +395,7 @@ def _with_low_3(value: int, byte: int) -> int:
 def _ignored(settings: ChipSettings, byte: int) -> ChipSettings:
     """Leave alone what follows from other settings: bytes per counter, and the receive delay.
 
-    Assumed: the reference says what they hold, not what writing them does to the frames.
+    Assumed: the reference gives what they hold, not what writing them does to the frames.
     """
     return settings
 
@@ -529,22 +511,17 @@ class Chip:
 
     Parameters
     ----------
-    source
-        What its sampler sees.
     largest_block
-        Most frames synthesised at once: many are cheap each, few disturb nobody's deadline.
+        Most frames synthesised at once: large blocks cost less per frame, small ones delay other
+        radars less.
     block_phase
         Blocks end with counters congruent to it modulo `largest_block`, so that of many radars
         in step only some synthesise at a time; None: each block is as long as it may be.
 
     Attributes
     ----------
-    settings
-        Current settings.
     timeline
         Which counter is next, and the scene time of each.
-    area
-        Quantised frame area.
     powered
         False after ENABLE 0, until INIT.
     """

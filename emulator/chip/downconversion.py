@@ -82,8 +82,6 @@ def downconvert(
     rf_counters
         Shape (n_frames, 8 * (n_lines - 1) + 32), int64; sample 0 lies
         ``LEAD_SAMPLES`` before the RF sample of the first line.
-    taps
-        The filter.
     first_line
         Index of the first line in the captured frame, or its parity: it selects the
         sign.

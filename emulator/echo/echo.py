@@ -1,4 +1,4 @@
-"""What a radar hears: from a scene and the robot's true pose to integer chip counters.
+"""What a radar receives: from a scene and the robot's true pose to integer chip counters.
 
 This is the page on the model: each term, its formula, its source, what it leaves out. The world is
 a floor plan seen from one phase centre per radar. In normalised units (full scale of the 11 bit

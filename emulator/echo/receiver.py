@@ -61,8 +61,8 @@ from emulator.chip.chip import CaptureSettings
 from emulator.echo.reflections import CARRIER_CYCLES_PER_SAMPLE, SIGMA_S
 from emulator.scene.philox import (
     UNITS_PER_SIGMA,
-    Dice,
     Purpose,
+    Rng,
     counter_normals,
     frame_noise_units,
     stream_of,
@@ -119,7 +119,7 @@ class SlowNoise:
         # the parts behind the grids' own: their offsets, and that of the instants
         periods_ns = [*(grid.spacing_ns for grid in grids), self._instant_ns]
         *self._offsets_ns, self._instants_offset_ns = (
-            Dice(seed, stream_of(serial, purpose, part)).below(period_ns)
+            Rng(seed, stream_of(serial, purpose, part)).below(period_ns)
             for part, period_ns in enumerate(periods_ns, len(grids))
         )
         self._knots = np.empty((len(grids) * _KNOTS, n_values))
@@ -180,15 +180,7 @@ _COUNTERS_AT_ONCE = 256
 
 
 class CarrierJitter:
-    """The jitter of one radar.
-
-    Parameters
-    ----------
-    spec
-        Standard deviations and correlation time.
-    seed, serial
-        The run's seed and the module's serial number: they select the jitter.
-    """
+    """The jitter of one radar."""
 
     def __init__(self, spec: JitterSpec, *, seed: int, serial: int) -> None:
         self._spec = spec
@@ -260,20 +252,12 @@ GRIDS = ((0.054, 0.16), (0.239, 0.24), (1.205, 0.60))
 _SCATTERER_SAMPLES = 8
 _SCATTERERS = 256
 _REACH = 4
-"""Scatterers on either side that a sample hears: 32 samples, four envelope deviations."""
+"""Scatterers on either side that a sample receives: 32 samples, four envelope deviations."""
 _CLUTTER_INSTANTS_PER_KNOT = 4
 
 
 class ClutterField:
-    """The clutter of one radar, as a function of scene time and range.
-
-    Parameters
-    ----------
-    spec
-        Strength and correlation time.
-    seed, serial
-        The run's seed and the module's serial number: they select the clutter.
-    """
+    """The clutter of one radar, as a function of scene time and range."""
 
     def __init__(self, spec: ClutterSpec, *, seed: int, serial: int) -> None:
         self._sigma = spec.sigma
@@ -310,8 +294,6 @@ class ClutterField:
             Shape (n_frames, capture.n_samples), float64, normalised units.
         scene_times_ns
             Shape (n_frames,), int64: when this radar truly took each frame.
-        capture
-            The chip's settings.
         gain
             Amplitude of the transmitter at its power setting times the receiver's gain.
         """
@@ -348,16 +330,12 @@ class ClutterField:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Row:
-    """The part of the row of scatterers that a frame hears.
+    """The part of the row of scatterers that a frame receives.
 
     Attributes
     ----------
     first_sample
         Number of the frame's first RF sample, counted from range label 0.
-    n_samples
-        Length of the frame.
-    tx_center_frequency
-        Which carrier.
     """
 
     first_sample: int
@@ -386,15 +364,15 @@ class _Row:
         """
         first_cell, lead = divmod(self.first_sample, _SCATTERER_SAMPLES)
         n_cells = -(-(lead + self.n_samples) // _SCATTERER_SAMPLES)
-        heard = np.take(scatterers, _heard(first_cell % _SCATTERERS, n_cells))
+        near = np.take(scatterers, _near_scatterers(first_cell % _SCATTERERS, n_cells))
         # einsum multiplies and adds in loops of its own, never by BLAS
-        answers = np.einsum("kc,kr->rc", heard, _KERNELS[self.tx_center_frequency])
+        answers = np.einsum("kc,kr->rc", near, _KERNELS[self.tx_center_frequency])
         frame: NDArray[np.float64] = answers.T.ravel()[lead : lead + self.n_samples]
         return frame
 
 
 @functools.cache
-def _heard(first_cell: int, n_cells: int) -> NDArray[np.int64]:
+def _near_scatterers(first_cell: int, n_cells: int) -> NDArray[np.int64]:
     """Return which normals the samples of each cell hear, shape (4 * _REACH, n_cells).
 
     Nearest range first; first of the scatterers' real, then of their imaginary parts.
@@ -471,8 +449,6 @@ class Receiver:
             Shape (n_frames,), int64; they select the noise.
         scene_times_ns
             Shape (n_frames,), int64: when this radar truly took each frame.
-        capture
-            The chip's settings.
         gain
             Amplitude of the transmitter at its power setting times the receiver's gain: the
             factor that the signal already has and the clutter needs. The noise has none.

@@ -279,15 +279,7 @@ def person_scatterer(person: PersonSpec, t_ns: NDArray[np.int64]) -> Scatterers:
 
 
 def direct_reflections(scatterers: Scatterers, view: Viewpoint) -> Reflections:
-    """Return the echoes by the straight way there and back; nothing stands in between.
-
-    Parameters
-    ----------
-    scatterers
-        Targets or a person, k of them.
-    view
-        The radar in n_frames frames.
-    """
+    """Return the echoes by the straight way there and back; nothing stands in between."""
     dx = scatterers.x_m - view.x_m
     dy = scatterers.y_m - view.y_m
     range_m = np.sqrt(dx * dx + dy * dy)
@@ -299,7 +291,7 @@ def direct_reflections(scatterers: Scatterers, view: Viewpoint) -> Reflections:
     if round_ones.any():
         radius_m = scatterers.radius_m
         surface_m = np.maximum(range_m - radius_m, NEAREST_M)
-        # Its mirror image is nearer the smaller the radius; inside it, nothing is heard.
+        # Its mirror image is nearer the smaller the radius; inside it, nothing is received.
         spread = np.sqrt((1 + radius_m) / (surface_m + radius_m)) * (range_m > radius_m)
         strength = strength * np.where(round_ones, spread, 1.0)
     return Reflections(

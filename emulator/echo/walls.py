@@ -57,8 +57,6 @@ def past_edge(
         How much longer the way over the edge is, >= 0.
     beyond
         Whether the straight way is on the open side of the edge, so that v is negative.
-    wavelength_m
-        Of the carrier.
     """
     v = _parameter(detour_m, wavelength_m)
     sine, cosine = fresnel(v)
@@ -83,7 +81,7 @@ def _auxiliary(v: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.
 Array = NDArray[np.float64]
 
 TOUCHING_M = 0.02
-"""Ends that come this near to another face meet it: nobody draws a plan to the millimetre."""
+"""Ends that come this near to another face meet it: plans are not drawn to the millimetre."""
 ON_THE_FACE_M = 1e-3
 """What is nearer to a face than this stands on it: neither before it nor behind."""
 _RIGHT_ANGLE_TOLERANCE = math.sin(math.radians(1.0))
@@ -95,7 +93,7 @@ class Closure:
     """An end of a face that stands on another one at a right angle.
 
     For a radar in the quarter between the two they are an inner corner: with the corner's mirror
-    image the field is complete, and there is no edge to be heard. From behind an L it is one.
+    image the field is complete, and no edge is seen. From behind an L it is one.
 
     Attributes
     ----------
@@ -271,8 +269,6 @@ def closed_ends(faces: Faces, height_m: Array) -> NDArray[np.bool_]:
 
     Parameters
     ----------
-    faces
-        The faces.
     height_m
         Shape (n_frames, n_faces): the radar's height over each of them.
     """
@@ -308,8 +304,6 @@ def passing(
         Shape (m,) each, world frame [m].
     but
         Bodies that do not count, shape (m,) each: those a leg was reflected by; -1 is none.
-    wavelength_m
-        Of the carrier.
     """
     share = np.ones(len(from_x))
     step = max(_LEGS_TIMES_FACES // max(len(faces), 1), 1)
@@ -354,13 +348,13 @@ def face_reflections(faces: Faces, view: Viewpoint, wavelength_m: float) -> Refl
     height = faces.height(view.x_m, view.y_m)
     along = faces.along(view.x_m, view.y_m)
     mirror_m = np.abs(height)
-    heard = MIRROR_AMPLITUDE_1M * faces.reflection * ((height > 0) | ~faces.outward_only)
+    seen = MIRROR_AMPLITUDE_1M * faces.reflection * ((height > 0) | ~faces.outward_only)
     closed = closed_ends(faces, height)
     foot_x, foot_y = faces.at(along)
     on_it = (along >= 0) & (along <= faces.length_m)
 
     range_m = [mirror_m]
-    amplitude = [heard * on_it / np.maximum(mirror_m, NEAREST_M)]
+    amplitude = [seen * on_it / np.maximum(mirror_m, NEAREST_M)]
     phase_rad = [np.full(height.shape, np.pi)]
     at_x, at_y = [foot_x], [foot_y]
     for end, end_x, end_y, beyond in (
@@ -372,7 +366,7 @@ def face_reflections(faces: Faces, view: Viewpoint, wavelength_m: float) -> Refl
         obliquity = mirror_m / np.maximum(end_m, NEAREST_M)
         range_m.append(end_m)
         amplitude.append(
-            heard * size * obliquity * ~closed[:, :, end] / np.maximum(end_m, NEAREST_M)
+            seen * size * obliquity * ~closed[:, :, end] / np.maximum(end_m, NEAREST_M)
         )
         # Within the face an edge takes away from the mirror, beyond it an edge stands for it.
         phase_rad.append(lag_rad + np.where(beyond, np.pi, 0.0))
@@ -581,16 +575,10 @@ def ghost_reflections(
 
     Parameters
     ----------
-    faces
-        The mirrors.
     scatterers
         Targets or a person, k of them.
-    view
-        The radar.
     share
         Shape (n_frames, k): of the straight leg, from `direct_share`.
-    wavelength_m
-        Of the carrier.
     """
     legs = _legs(faces, scatterers, view, share, wavelength_m)
     swell_m = np.broadcast_to(scatterers.swell_m, share.shape)
@@ -632,8 +620,6 @@ def spread(scatterers: Scatterers, out_m: Array, back_m: Array, half_cosine: Arr
 
     Parameters
     ----------
-    scatterers
-        k of them.
     out_m, back_m
         Shape (n_frames, k): lengths of the legs, to the scatterer's axis.
     half_cosine

@@ -30,7 +30,7 @@ from emulator.faults.kind import (
     Parameters,
     Piece,
     Restart,
-    SayToModule,
+    SendToModule,
     Target,
     Unplug,
     classify,
@@ -38,7 +38,7 @@ from emulator.faults.kind import (
 )
 from emulator.faults.line import LineQueue, Watch
 from emulator.faults.plan import FaultPlan, FaultSpec, Injected, TruthLog, fault_spec
-from emulator.scene.philox import Dice
+from emulator.scene.philox import Rng
 from xethru_protocol.wire.messages import Command, ModReset, Response
 from xethru_protocol.wire.table import ROWS, UnknownMessage
 
@@ -61,10 +61,6 @@ class Armed:
 
     Parameters
     ----------
-    number
-        By which it is cleared again.
-    spec
-        What it is.
     radar
         Name of the radar: every radar has its own chance.
     seed
@@ -72,8 +68,6 @@ class Armed:
 
     Attributes
     ----------
-    firings
-        How often it was injected.
     since_ns, first_counter, packets_since
         Time, frame counter and packets since it was injected last.
     """
@@ -84,7 +78,7 @@ class Armed:
         self.kind: Kind = spec.row
         self.parameters: Parameters = spec.kind_parameters()
         stream = zlib.crc32(radar.encode()) << 32 | number
-        self.dice = Dice(seed if spec.seed is None else spec.seed, stream)
+        self.rng = Rng(seed if spec.seed is None else spec.seed, stream)
         self.firings = 0
         self.since_ns = 0
         self.first_counter: int | None = None
@@ -145,7 +139,7 @@ class Armed:
         self._seen += 1
         if self._seen % spec.every:
             return False
-        return spec.probability >= 1 or self.dice.chance(spec.probability)
+        return spec.probability >= 1 or self.rng.chance(spec.probability)
 
     def fired(self, now_ns: int, counter: int | None) -> None:
         self.firings += 1
@@ -194,7 +188,7 @@ def spoiled_pieces(
     result: list[Piece] = []
     applied = False
     for piece in pieces:
-        spoiled = effect(piece.data, armed.parameters, armed.dice, context)
+        spoiled = effect(piece.data, armed.parameters, armed.rng, context)
         applied |= spoiled is not None
         result += [
             Piece(
@@ -211,27 +205,22 @@ def spoiled_pieces(
 class Power:
     """Power and watchdog of one module.
 
-    A module that is not emulated here, as one behind a proxy, can only be told to reset itself.
-
-    Parameters
-    ----------
-    module
-        The module.
+    A module that is not emulated here, as one behind a proxy, can only be asked to reset itself.
 
     Attributes
     ----------
-    deaf
-        Whether a module that was told to reset is to be taken for gone, until it says BOOTING.
+    restarting
+        Whether a module that was asked to reset has not sent BOOTING yet; its bytes are dropped.
     """
 
     def __init__(self, module: InnerDevice) -> None:
         self._module = module
         self._inside = module if isinstance(module, EmulatedInside) else None
-        self.deaf = False
+        self.restarting = False
 
     @property
-    def hears(self) -> bool:
-        return not self.deaf and (self._inside is None or self._inside.listens)
+    def listens(self) -> bool:
+        return not self.restarting and (self._inside is None or self._inside.listens)
 
     def crash(self, reason: str, now_ns: int) -> None:
         """Restart the module as by a fault, which it counts towards safe mode."""
@@ -248,7 +237,7 @@ class Power:
             self._inside.power_cycle(now_ns)
 
     def _reset(self, now_ns: int) -> None:
-        self.deaf = True
+        self.restarting = True
         self._module.receive_data(command_bytes(ModReset()), now_ns)
 
 
@@ -262,30 +251,29 @@ class FaultyDevice:
 
     Parameters
     ----------
-    inner
-        The module.
     name
         Of the radar, as scenarios and the truth log call it.
     plan
-        What to do to it.
+        None: no faults until some are added.
     truth
-        Where every injected fault is written down.
+        None: a log of its own, in memory.
     zero_ns
-        Device time from which the scenario counts; the first time it hears of if None.
+        Device time from which the scenario counts; its first call if None.
     """
 
     def __init__(
         self,
         inner: InnerDevice,
         name: str,
-        plan: FaultPlan,
-        truth: TruthLog,
+        plan: FaultPlan | None = None,
+        truth: TruthLog | None = None,
         *,
         zero_ns: int | None = None,
     ) -> None:
         self.inner = inner
         self.name = name
-        self.truth = truth
+        plan = plan or FaultPlan()
+        self.truth = TruthLog() if truth is None else truth
         self._seed = plan.seed
         self._zero_ns = zero_ns
         self._armed: list[Armed] = []
@@ -368,7 +356,7 @@ class FaultyDevice:
 
     def receive_data(self, data: bytes, now_ns: int) -> None:
         self.advance(now_ns)
-        if self._away or not self._power.hears:
+        if self._away or not self._power.listens:
             return
         holds = any(armed.target is Target.COMMAND for armed in self._armed)
         begun = self._passed
@@ -382,7 +370,7 @@ class FaultyDevice:
                 self._watch.command_sent(piece.command)
             if holds:
                 self.inner.receive_data(fresh, now_ns)
-        rest = self._watch.half_command
+        rest = self._watch.incomplete_command
         if not holds:
             self.inner.receive_data(data, now_ns)
             begun = len(rest)
@@ -403,7 +391,7 @@ class FaultyDevice:
                 continue
             effect = cast("CommandEffect", armed.kind.effect)
             context = Context(now_ns=now_ns, since_ns=now_ns, command=command)
-            handling = effect(data, armed.parameters, armed.dice, context)
+            handling = effect(data, armed.parameters, armed.rng, context)
             if handling is None:
                 continue
             self._note(armed, now_ns)
@@ -444,7 +432,7 @@ class FaultyDevice:
             if fresh is None:
                 return None
             packet = self._through(fresh, now_ns)
-            if self._power.deaf:
+            if self._power.restarting:
                 break
         if packet is not None:
             self._sent_bytes += len(packet)
@@ -473,10 +461,10 @@ class FaultyDevice:
         """Take one packet through the faults; return bytes to send at once."""
         packet_class = classify(packet)
         command: Command[Response] | None = None
-        if self._power.deaf:
+        if self._power.restarting:
             if not self._watch.is_booting(packet):
                 return None
-            self._power.deaf = False
+            self._power.restarting = False
         if packet_class is PacketClass.REPLY:
             command, silent = self._watch.answered()
             if silent:
@@ -537,7 +525,7 @@ class FaultyDevice:
     def _start(self, armed: Armed, now_ns: int) -> None:
         effect = cast("MomentEffect", armed.kind.effect)
         self._note(armed, now_ns)
-        for action in effect(armed.parameters, armed.dice):
+        for action in effect(armed.parameters, armed.rng):
             delay_ns = action.delay_ns if isinstance(action, Restart) else 0
             self._actions.append((now_ns + delay_ns, action))
 
@@ -549,7 +537,7 @@ class FaultyDevice:
                 self._cut_next = action
             case Unplug():
                 self.unplug(now_ns, action.away_ns)
-            case SayToModule(command):
+            case SendToModule(command):
                 self._watch.command_sent(command, silent=True)
                 self.inner.receive_data(command_bytes(command), now_ns)
 
@@ -573,33 +561,6 @@ class FaultyDevice:
         return now_ns - self._zero_ns
 
 
-def wrap(
-    device: InnerDevice,
-    name: str,
-    plan: FaultPlan | None = None,
-    truth: TruthLog | None = None,
-    *,
-    zero_ns: int | None = None,
-) -> FaultyDevice:
-    """Return a device with the faults of a plan.
-
-    Parameters
-    ----------
-    device
-        The module.
-    name
-        Of the radar, as scenarios and the truth log call it.
-    plan
-        None: no faults until some are added.
-    truth
-        None: a log of its own, in memory.
-    zero_ns
-        Device time from which the scenario counts; the first time it hears of if None.
-    """
-    truth = TruthLog() if truth is None else truth
-    return FaultyDevice(device, name, plan or FaultPlan(), truth, zero_ns=zero_ns)
-
-
 class Injection:
     """A fault that was armed within a block."""
 
@@ -617,10 +578,6 @@ def fault(device: FaultyDevice, kind: str, **keys: Any) -> Iterator[Injection]: 
 
     Parameters
     ----------
-    device
-        The module to spoil.
-    kind
-        See `xethru-emulator faults`.
     keys
         Those of a scenario file (``count``, ``every``, ``command`` ...); what is none of them is
         a parameter of the kind.

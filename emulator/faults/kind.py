@@ -1,12 +1,12 @@
 """What a kind of fault is: one row of the catalogue, and what its effect gets and returns.
 
-Effects are pure but for the `Dice` they are handed. There are three sorts, by what they touch:
+Effects are pure but for the `Rng` they are given. There are three sorts, by what they touch:
 
-- of a packet to the host: ``(packet, parameters, dice, context) -> pieces``;
-- of a command to the module: ``(packet, parameters, dice, context) -> Handling``;
-- of a moment: ``(parameters, dice) -> actions``.
+- of a packet to the host: ``(packet, parameters, rng, context) -> pieces``;
+- of a command to the module: ``(packet, parameters, rng, context) -> Handling``;
+- of a moment: ``(parameters, rng) -> actions``.
 
-None instead of a result says that there was nothing to spoil; the fault then waits for a packet
+None instead of a result means that there was nothing to spoil; the fault then waits for a packet
 that suits it, and nothing is written to the truth log.
 """
 
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.device import ByteDevice
-from emulator.scene.philox import Dice
+from emulator.scene.philox import Rng
 from emulator.scene.tables import Table
 from xethru_protocol.driver.frames import Lattice
 from xethru_protocol.wire.codes import ElementType, ResponseCode
@@ -149,7 +149,7 @@ class EmulatedInside(Protocol):
 
     @property
     def listens(self) -> bool:
-        """Whether it hears the host: not while it starts or sleeps."""
+        """Whether it receives: not while it starts or sleeps."""
         ...
 
     def crash(self, reason: str, now_ns: int) -> None:
@@ -193,8 +193,6 @@ class Piece:
 
     Attributes
     ----------
-    data
-        What to send.
     delay_ns
         How much later than without the fault. What comes after keeps its place behind it.
     aside
@@ -215,8 +213,6 @@ class Context:
 
     Attributes
     ----------
-    now_ns
-        Time, ns.
     since_ns
         When the fault fired last (now, if it fires with this packet), ns.
     firings
@@ -225,8 +221,6 @@ class Context:
         Packets it has seen since it fired; 0 for the one with which it fired.
     first_counter
         Counter of the frame with which it fired last; None if it was no frame.
-    packet_class
-        What the packet is.
     command
         The command itself, or the one that a reply answers; None if unknown.
     previous_frame
@@ -253,11 +247,11 @@ class Handling:
     Attributes
     ----------
     to_module
-        What the module gets to hear.
+        What the module gets.
     command
         The command that this is; None if the module will not answer it.
     to_host
-        What the host hears at once.
+        What the host gets at once.
     """
 
     to_module: bytes = b""
@@ -285,17 +279,17 @@ class Unplug:
 
 
 @dataclass(frozen=True, slots=True)
-class SayToModule:
+class SendToModule:
     """The module carries out a command that no host sent, and does not answer it."""
 
     command: Command[Response]
 
 
 Pieces = Sequence[Piece] | None
-Action = Restart | Unplug | SayToModule
-PacketEffect = Callable[[bytes, Any, Dice, Context], Pieces]
-CommandEffect = Callable[[bytes, Any, Dice, Context], Handling | None]
-MomentEffect = Callable[[Any, Dice], Sequence[Action]]
+Action = Restart | Unplug | SendToModule
+PacketEffect = Callable[[bytes, Any, Rng, Context], Pieces]
+CommandEffect = Callable[[bytes, Any, Rng, Context], Handling | None]
+MomentEffect = Callable[[Any, Rng], Sequence[Action]]
 
 
 Effect = PacketEffect | CommandEffect | MomentEffect
@@ -310,8 +304,6 @@ class Kind:
     ----------
     name
         In scenario files and in the truth log.
-    summary
-        What happens, in a sentence.
     counted
         What an X4M300 driver counts for each one injected.
     lasting

@@ -110,7 +110,7 @@ class _Pending(NamedTuple):
 
 
 class Watch:
-    """Reads along at one port.
+    """What passed one port so far.
 
     Attributes
     ----------
@@ -143,12 +143,12 @@ class Watch:
         return self._lattice
 
     @property
-    def half_command(self) -> bytes:
+    def incomplete_command(self) -> bytes:
         """Bytes from the host that are not judged yet."""
         return bytes(self._unjudged)
 
     def host_pieces(self, data: bytes) -> list[HostPiece]:
-        """Cut what the host says into commands and what is none; the rest waits for more."""
+        """Cut bytes of the host into commands and others; an incomplete command waits for more."""
         self._unjudged += data
         self._reader.receive_data(data)
         pieces = []

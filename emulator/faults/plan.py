@@ -48,8 +48,6 @@ from emulator.scene.tables import (
     finite,
     load_table,
     one_line,
-    parse_table,
-    shipped_names,
 )
 from xethru_protocol.wire.messages import Command
 from xethru_protocol.wire.table import ROWS
@@ -129,8 +127,6 @@ class TruthLog:
     ----------
     records
         The last 100 000.
-    counts
-        How often each kind was injected.
     """
 
     def __init__(self, write: Callable[[str], object] | None = None) -> None:
@@ -243,15 +239,6 @@ def parse_fault(table: object, source: str = "fault") -> FaultSpec:
         return FaultSpec.model_validate(table)
     except ValidationError as error:
         raise FaultPlanError(f"{source}: {one_line(error, FaultSpec)}") from None
-
-
-def parse_plan(text: str, source: str = "scenario") -> FaultPlan:
-    """Return a plan from TOML text; `FaultPlanError` naming the source otherwise."""
-    return parse_table(FaultPlan, text, source=source, error=FaultPlanError)
-
-
-def plan_names() -> tuple[str, ...]:
-    return shipped_names("faults")
 
 
 def load_plan(path: Path | str) -> FaultPlan:

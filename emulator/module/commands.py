@@ -2,7 +2,7 @@
 
 A handler is ``(module, command) -> response``; None stands for an ACK. It raises `Refusal` for an
 ERROR and `Silence` for no answer at all. Commands without a handler get ERROR 1, as the firmware
-does. `emulator.module.modes` says in which modes a command is taken.
+does. `emulator.module.modes` defines in which modes a command is taken.
 
 Source: protocol reference 3, 4, 5, 11 and 16.
 """
@@ -469,7 +469,7 @@ def _certification(on: bool) -> Callable[[Module], bytes]:
     def switch(module: Module) -> bytes:
         module.certification = on
         module.save()
-        return b"\x00"  # "not passed" although it worked, as the firmware says
+        return b"\x00"  # "not passed" although it worked, as the firmware answers
 
     return switch
 

@@ -30,14 +30,8 @@ class Identity:
     ----------
     serial
         Serial number, 12 digits.
-    order_code
-        Product name.
     item_number
         Novelda item number, form ``000ddd-ddd``.
-    firmware_id
-        Name of the firmware binary.
-    version
-        Firmware version.
     xep_version
         Version of the base firmware inside it.
     dsp_library
@@ -78,34 +72,26 @@ class Identity:
         >>> Identity(serial="202611210001").info(0x05) is None
         True
         """
-        if base_firmware:
-            return self._base_firmware_info(item)
+        name, version = (
+            ("XEP", self.xep_version) if base_firmware else (self.firmware_id, self.version)
+        )
+        parts = f"XEP:{self.xep_version};X4C51:2.1.0"
         texts: dict[int, str] = {
-            InfoItem.XTID_SSIC_ITEMNUMBER: self.item_number,
-            InfoItem.XTID_SSIC_ORDERCODE: self.order_code,
-            InfoItem.XTID_SSIC_FIRMWAREID: self.firmware_id,
-            InfoItem.XTID_SSIC_VERSION: self.version,
-            InfoItem.XTID_SSIC_BUILD: f"{self.version}+0.sha.{self.build}",
-            # the application id list is answered with an error by released firmware
-            InfoItem.XTID_SSIC_SERIALNUMBER: self.serial,
-            InfoItem.XTID_SSIC_VERSIONLIST: (
-                f"{self.firmware_id}:{self.version};XEP:{self.xep_version};X4C51:2.1.0"
-                f";{self.dsp_library}"
-            ),
+            InfoItem.XTID_SSIC_FIRMWAREID: name,
+            InfoItem.XTID_SSIC_VERSION: version,
+            InfoItem.XTID_SSIC_BUILD: f"{version}+0.sha.{self.build}",
+            InfoItem.XTID_SSIC_VERSIONLIST: parts,
             InfoItem.XTID_SSIC_SYSTEMCOREID: f"emulated-{self.serial}",
             InfoItem.XTID_SSIC_BOOTLOADER: "unknown",
         }
-        return texts.get(item)
-
-    def _base_firmware_info(self, item: int) -> str | None:
-        texts: dict[int, str] = {
-            InfoItem.XTID_SSIC_FIRMWAREID: "XEP",
-            InfoItem.XTID_SSIC_VERSION: self.xep_version,
-            InfoItem.XTID_SSIC_BUILD: f"{self.xep_version}+0.sha.{self.build}",
-            InfoItem.XTID_SSIC_VERSIONLIST: f"XEP:{self.xep_version};X4C51:2.1.0",
-            InfoItem.XTID_SSIC_SYSTEMCOREID: f"emulated-{self.serial}",
-            InfoItem.XTID_SSIC_BOOTLOADER: "unknown",
-        }
+        # the application id list is answered with an error by released firmware
+        if not base_firmware:
+            texts |= {
+                InfoItem.XTID_SSIC_ITEMNUMBER: self.item_number,
+                InfoItem.XTID_SSIC_ORDERCODE: self.order_code,
+                InfoItem.XTID_SSIC_SERIALNUMBER: self.serial,
+                InfoItem.XTID_SSIC_VERSIONLIST: f"{name}:{version};{parts};{self.dsp_library}",
+            }
         return texts.get(item)
 
 
@@ -244,8 +230,6 @@ class SavedState:
         Settings of each profile as of its last start, by profile id.
     files
         Content of the file system; noise maps and the crash dump are files.
-    parameter_file_name
-        Name of the parameter file, if there is one.
     certification
         Whether the module starts in certification mode.
     """
@@ -290,11 +274,6 @@ class FaultCounter:
     ----------
     memory_ns
         Time without fault after which the count begins anew.
-
-    Attributes
-    ----------
-    count
-        Faults in a row.
     """
 
     def __init__(self, memory_ns: int) -> None:
@@ -307,7 +286,7 @@ class FaultCounter:
         return self.count >= SAFE_MODE_FAULTS
 
     @property
-    def hopeless(self) -> bool:
+    def needs_bootloader(self) -> bool:
         return self.count > BOOTLOADER_FAULTS
 
     def fault(self, now_ns: int) -> None:

@@ -53,7 +53,7 @@ class Request(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """Where a request leads, and which options say no to it.
+    """Where a request leads, and which options refuse it.
 
     Attributes
     ----------
@@ -124,8 +124,6 @@ class Start:
     ----------
     state
         RUN, LOADED or STOPPED; what the next power-up enters.
-    profile_id
-        Profile that ran last.
     """
 
     state: State = State.RUN
@@ -137,12 +135,8 @@ class ModeMachine:
 
     Attributes
     ----------
-    state
-        Current state.
     profile_id
         Loaded profile, 0 for none.
-    start
-        What the next power-up enters.
     """
 
     def __init__(self, options: DeviceOptions | None = None, start: Start | None = None) -> None:
@@ -261,10 +255,10 @@ class Verdict(Enum):
     NO_PROFILE = "ERROR, option no_profile_error"
     QUIET = "option get_without_profile"
     RUNNING_OUTPUT = "option presence_output_while_running"
-    DEAF = "no answer"
+    NO_ANSWER = "no answer"
 
 
-_OK, _UNKNOWN, _DEAF = Verdict.TAKEN, Verdict.UNKNOWN, Verdict.DEAF
+_OK, _UNKNOWN, _NO_ANSWER = Verdict.TAKEN, Verdict.UNKNOWN, Verdict.NO_ANSWER
 _BUSY, _NONE, _QUIET = Verdict.BUSY_PROFILE, Verdict.NO_PROFILE, Verdict.QUIET
 _ORDER = (
     State.RUN,
@@ -277,9 +271,9 @@ _ORDER = (
     State.XEP,
     State.BOOTLOADER,
 )
-_FIRMWARE_LACKS = (_UNKNOWN, _UNKNOWN, _DEAF)
-_EVERYWHERE = (_OK,) * 8 + (_DEAF,)
-_NOWHERE = (_UNKNOWN,) * 8 + (_DEAF,)
+_FIRMWARE_LACKS = (_UNKNOWN, _UNKNOWN, _NO_ANSWER)
+_EVERYWHERE = (_OK,) * 8 + (_NO_ANSWER,)
+_NOWHERE = (_UNKNOWN,) * 8 + (_NO_ANSWER,)
 _SENSOR_ONLY = (_OK,) * 6 + _FIRMWARE_LACKS
 # fmt: off
 _ROWS: dict[Group, tuple[Verdict, ...]] = {
@@ -379,7 +373,7 @@ def check_permission(command: m.Message, state: State, options: DeviceOptions) -
     if verdict is Verdict.RUNNING_OUTPUT and options.presence_output_while_running:
         return
     silent = verdict is Verdict.QUIET and options.get_without_profile == "silence"
-    if verdict is Verdict.DEAF or silent:
+    if verdict is Verdict.NO_ANSWER or silent:
         raise Silence
     raise Refusal(_ERRORS[verdict](options))
 

@@ -64,10 +64,6 @@ class Module:
 
     Parameters
     ----------
-    identity
-        What it says about itself.
-    chip
-        Its radar chip.
     options
         How it answers what the reference leaves open; the documented defaults if None.
     memory
@@ -75,16 +71,8 @@ class Module:
 
     Attributes
     ----------
-    modes
-        Its mode machine.
     profile
         Settings of the profile loaded last.
-    files
-        Its file system.
-    pins
-        Its IO pins.
-    faults
-        Consecutive faults.
     postprocessing
         Frame post-processing settings by id; kept, without effect on frames.
     i2c
@@ -92,17 +80,13 @@ class Module:
     uart_baudrate
         Rate of its UART; a change takes effect half a second after its ACK.
     trace_level
-        How much it tells as DATA STRING.
+        How much it reports as DATA STRING.
     certification
         Whether it starts in certification mode.
-    parameter_file_name
-        Name of the parameter file.
     noise_maps
-        Returns the current noise maps, slow and fast, as bytes; whoever computes them sets it.
-    now_ns
-        Time of the current command.
+        Returns the current noise maps, slow and fast, as bytes; set by what computes them.
     restart
-        A restart asked for; whoever keeps the time carries it out.
+        A restart asked for; the owner of the clock carries it out.
     notices
         Messages to send before the reply.
     reply_delay_ns
@@ -197,8 +181,8 @@ class Module:
         with suppress(Refusal):  # no room for a dump: the firmware has nowhere else to put it
             self.files.replace(CRASH_DUMP, dump)
         self.save()
-        self.restart = Restart(into_bootloader=self.faults.hopeless, at_ns=now_ns)
-        if self.faults.hopeless:
+        self.restart = Restart(into_bootloader=self.faults.needs_bootloader, at_ns=now_ns)
+        if self.faults.needs_bootloader:
             self.faults.clear()
 
     def load_profile(self, profile_id: int) -> None:
@@ -233,7 +217,7 @@ class Module:
         )
 
     def trace(self, level: TraceLevel, text: str) -> None:
-        """Tell something as DATA STRING, if the host wants to know that much."""
+        """Send a DATA STRING if the trace level includes it."""
         if level <= self.trace_level:
             self.notices.append(m.DataString(text=text))
 

@@ -10,11 +10,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import deque
 from enum import Enum, auto
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from xethru_protocol.wire.messages import Command, Response
-
-__all__ = ["FirmwareOutbox", "LosslessOutbox", "MessageKind", "MessageStream", "Outbox"]
 
 NS_PER_S = 1_000_000_000
 
@@ -60,38 +58,48 @@ class MessageStream(ABC):
         """Learn that the last host closed the port."""
 
 
-class Outbox(Protocol):
+class _Queued(NamedTuple):
+    kind: MessageKind
+    message: Response
+
+
+class Outbox(ABC):
     """The queue between a module and its line."""
 
+    def __init__(self) -> None:
+        self._queue: deque[_Queued] = deque()
+
     @property
+    @abstractmethod
     def takes_replies(self) -> bool:
         """Whether there is room for the reply to another command; if not, none should be read."""
-        ...
 
+    @abstractmethod
     def put(self, kind: MessageKind, message: Response, now_ns: int) -> None:
-        """Queue one message, or lose one, as the queue's rule says."""
-        ...
+        """Queue one message, or lose one, as the queue's rule demands."""
 
-    def refill_on_time(self, stream: MessageStream, now_ns: int) -> None:
+    def refill_on_time(self, stream: MessageStream, now_ns: int) -> None:  # noqa: B027
         """Fetch what fell due, because time passed."""
-        ...
 
-    def refill_on_demand(self, stream: MessageStream, now_ns: int) -> None:
+    def refill_on_demand(self, stream: MessageStream, now_ns: int) -> None:  # noqa: B027
         """Fetch what is due, because the line takes more."""
-        ...
 
-    def take(self, now_ns: int) -> Response | None: ...
-
-    def clear(self) -> None: ...
-
+    @abstractmethod
     def wake_ns(self, stream: MessageStream, now_ns: int) -> int | None:
         """Return when time alone brings the next message; None when only the line's room does."""
-        ...
 
-    def __len__(self) -> int: ...
+    def take(self, now_ns: int) -> Response | None:
+        """Return the oldest message."""
+        return self._queue.popleft().message if self._queue else None
+
+    def clear(self) -> None:
+        self._queue.clear()
+
+    def __len__(self) -> int:
+        return len(self._queue)
 
 
-class LosslessOutbox:
+class LosslessOutbox(Outbox):
     """Queue of a device whose clock waits for the line: nothing is dropped.
 
     A stream message is fetched only when nothing else waits and it is due, so a reply stands
@@ -100,47 +108,27 @@ class LosslessOutbox:
 
     MOST_REPLIES = 50
 
-    def __init__(self) -> None:
-        self._messages: deque[Response] = deque()
-
     @property
     def takes_replies(self) -> bool:
-        return len(self._messages) < self.MOST_REPLIES
+        return len(self._queue) < self.MOST_REPLIES
 
     def put(self, kind: MessageKind, message: Response, now_ns: int) -> None:
-        self._messages.append(message)
-
-    def refill_on_time(self, stream: MessageStream, now_ns: int) -> None:
-        """Fetch nothing: what is due waits in the stream until the line takes more."""
+        self._queue.append(_Queued(kind, message))
 
     def refill_on_demand(self, stream: MessageStream, now_ns: int) -> None:
         """Fetch one due message if nothing waits."""
-        if not self._messages:
+        if not self._queue:
             due_ns = stream.next_due_ns()
             if due_ns is not None and due_ns <= now_ns:
-                self._messages.append(stream.take())
-
-    def take(self, now_ns: int) -> Response | None:
-        return self._messages.popleft() if self._messages else None
-
-    def clear(self) -> None:
-        self._messages.clear()
+                self._queue.append(_Queued(MessageKind.FRAME, stream.take()))
 
     def wake_ns(self, stream: MessageStream, now_ns: int) -> int | None:
         """Return the next due time if it lies ahead; what is already due waits for the line."""
         due_ns = stream.next_due_ns()
         return due_ns if due_ns is not None and due_ns > now_ns else None
 
-    def __len__(self) -> int:
-        return len(self._messages)
 
-
-class _Queued(NamedTuple):
-    kind: MessageKind
-    message: Response
-
-
-class FirmwareOutbox:
+class FirmwareOutbox(Outbox):
     """The firmware's message queue: 50 slots, and a rule for a host that stops reading.
 
     A host counts as stalled when messages have waited for a second and none was taken. Then every
@@ -164,13 +152,13 @@ class FirmwareOutbox:
     FRAMES_PER_REFILL = 8
 
     def __init__(self) -> None:
-        self._queue: deque[_Queued] = deque()
+        super().__init__()
         self._waiting_since_ns = 0
         self.frames_lost = 0
 
     @property
     def takes_replies(self) -> bool:
-        """Whether another reply displaces a frame at worst, and not a reply nobody has read."""
+        """Whether another reply displaces a frame at worst, and not an unread reply."""
         if len(self._queue) < self.SLOTS:
             return True
         return any(queued.kind is not MessageKind.REPLY for queued in self._queue)
@@ -186,9 +174,6 @@ class FirmwareOutbox:
         if not self._queue:
             self._waiting_since_ns = now_ns
         self._queue.append(_Queued(kind, message))
-
-    def refill_on_demand(self, stream: MessageStream, now_ns: int) -> None:
-        """Fetch nothing: frames come when they are due, whether the line takes them or not."""
 
     def refill_on_time(self, stream: MessageStream, now_ns: int) -> None:
         """Queue every frame due by now; without a free slot, lose it unsynthesised."""
@@ -206,20 +191,13 @@ class FirmwareOutbox:
 
     def take(self, now_ns: int) -> Response | None:
         """Return the oldest message; the host has proved that it reads."""
-        if not self._queue:
-            return None
-        self._waiting_since_ns = now_ns
-        return self._queue.popleft().message
-
-    def clear(self) -> None:
-        self._queue.clear()
+        if self._queue:
+            self._waiting_since_ns = now_ns
+        return super().take(now_ns)
 
     def wake_ns(self, stream: MessageStream, now_ns: int) -> int | None:
         """Return the next due time, which may be past when a refill was cut short."""
         return stream.next_due_ns()
-
-    def __len__(self) -> int:
-        return len(self._queue)
 
     def _purge(self) -> None:
         kept = (queued for queued in self._queue if queued.kind is not MessageKind.DEBUG)

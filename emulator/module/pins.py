@@ -33,15 +33,7 @@ _ALL_SETUP_BITS = sum(IoPinSetup)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PinControl:
-    """What a host asked of a pin.
-
-    Attributes
-    ----------
-    setup
-        `IoPinSetup` bits.
-    feature
-        `IoPinFeature`.
-    """
+    """What a host asked of a pin."""
 
     setup: int = 0
     feature: int = int(IoPinFeature.DISABLE)
@@ -67,8 +59,6 @@ class IoPins:
     ----------
     presence
         `PresenceState` of the running profile; it drives PRESENCE and NO_PRESENCE.
-    movement
-        Whether the running profile sees movement.
     """
 
     def __init__(self, *, base_firmware: bool = False) -> None:

@@ -188,7 +188,7 @@ def sampled(levels: bytes, sent_baud: int, read_baud: int) -> bytes:
     data_bits = itemgetter(*middles[1:9])
     start, stop = middles[0], middles[9]
     line = b"\x01" + levels + b"\x01" * (stop + 2)
-    heard = bytearray()
+    received = bytearray()
     at = line.find(_FALLING)
     while at >= 0:
         edge = at + 1
@@ -196,12 +196,12 @@ def sampled(levels: bytes, sent_baud: int, read_baud: int) -> bytes:
             at = line.find(_FALLING, edge)
             continue
         bits = data_bits(line[edge : edge + stop + 1])
-        heard.append(sum(level << place for place, level in enumerate(bits)))
+        received.append(sum(level << place for place, level in enumerate(bits)))
         at = line.find(_FALLING, edge + stop)
-    return bytes(heard)
+    return bytes(received)
 
 
-def what_is_heard(data: bytes, sent_baud: int, read_baud: int) -> bytes:
+def received_bytes(data: bytes, sent_baud: int, read_baud: int) -> bytes:
     """Return what arrives of bytes sent one right after the other; nothing at a rate of 0."""
     if sent_baud == read_baud:
         return data
@@ -298,7 +298,7 @@ def snapped_zone(start_m: float, end_m: float) -> tuple[float, float]:
 
 @dataclass(slots=True, kw_only=True)
 class ProfileSettings:
-    """What one profile is set to; as shipped unless told otherwise.
+    """What one profile is set to; as shipped unless changed.
 
     Attributes
     ----------
@@ -316,8 +316,6 @@ class ProfileSettings:
         Interval at which the noise map is stored, 0 for never [min].
     outputs
         Control bits by message id; what is off is absent.
-    debug_outputs
-        The same for the debug line.
     """
 
     zone_m: tuple[float, float] = snapped_zone(*ZONE_LIMITS_M)

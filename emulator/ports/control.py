@@ -44,15 +44,7 @@ class _RefusedError(Exception):
 
 
 class Control:
-    """Carries out what is asked.
-
-    Parameters
-    ----------
-    devices
-        The radars by name.
-    players
-        Playbacks by the names of their radars.
-    """
+    """Carries out what is asked."""
 
     def __init__(
         self,
@@ -65,10 +57,10 @@ class Control:
     def answer(self, line: bytes, now_ns: int) -> bytes:
         """Return the answer to a line, with its line end; never raises."""
         try:
-            said = {"ok": True, **self._carry_out(line, now_ns)}
+            answer = {"ok": True, **self._carry_out(line, now_ns)}
         except (_RefusedError, FaultPlanError, ValueError) as error:
-            said = {"ok": False, "error": " ".join(str(error).split())}
-        return json.dumps(said, separators=(",", ":")).encode() + b"\n"
+            answer = {"ok": False, "error": " ".join(str(error).split())}
+        return json.dumps(answer, separators=(",", ":")).encode() + b"\n"
 
     def _carry_out(self, line: bytes, now_ns: int) -> dict[str, Any]:
         try:
@@ -271,7 +263,7 @@ class ControlSocket(SocketService[_Client]):
             self._read(client, now_ns)
         if client.unsent and not self._send(client):
             return
-        if client.speaks or client.unsent:
+        if client.reads or client.unsent:
             self._watch(client)
         else:
             self._drop(client)
@@ -283,10 +275,10 @@ class ControlSocket(SocketService[_Client]):
             return
         except OSError:
             data = b""
-        client.speaks = bool(data)
+        client.reads = bool(data)
         *lines, client.asked = (client.asked + data).split(b"\n")
         for line in lines:
             if line.strip():
                 client.unsent += self._control.answer(line, now_ns)
         if len(client.asked) > LONGEST_LINE or len(client.unsent) > MOST_UNREAD:
-            client.speaks, client.unsent = False, b""
+            client.reads, client.unsent = False, b""

@@ -5,7 +5,7 @@ emulator: its ready line with a ``pid`` added; and the ports of those that were 
 What belongs to a process that is gone is stale, and removed by the next emulator that starts.
 
 A document is replaced as a whole, so that a crash of the emulator leaves the old one or the new
-one. What cannot be read is told in one line and left alone until the module saves; the module
+one. What cannot be read is reported in one line and left alone until the module saves; the module
 starts as shipped.
 """
 
@@ -20,7 +20,7 @@ import stat
 import tempfile
 from base64 import b64decode, b64encode
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -41,7 +41,7 @@ def fresh_port_folder() -> Path:
 
 
 def _private_run_directory() -> Path | None:
-    """Create the folder; None when it cannot be made or belongs to somebody else."""
+    """Create the folder; None when it cannot be made or belongs to another user."""
     folder = run_directory()
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
@@ -131,7 +131,7 @@ def link_folder(wanted: Path | None) -> Iterator[Path]:
             yield wanted.absolute()
         finally:
             if not existed:
-                with contextlib.suppress(OSError):  # somebody else uses it too
+                with contextlib.suppress(OSError):  # it is used otherwise, too
                     wanted.rmdir()
 
 
@@ -201,7 +201,7 @@ def make_state_directory(directory: Path) -> None:
     Raises
     ------
     OSError
-        When nothing could be kept there: told before the start, not at the first save.
+        When nothing could be kept there: better before the start than at the first save.
     """
     directory.mkdir(parents=True, exist_ok=True)
     if not os.access(directory, os.R_OK | os.W_OK | os.X_OK):
@@ -215,8 +215,6 @@ class DirectoryMemory:
     ----------
     directory
         Where the documents of all modules are; made if it is missing.
-    serial
-        Serial number of this module, the name of its document.
     warn
         Called with one line about what cannot be read or written.
     """
@@ -255,7 +253,7 @@ class DirectoryMemory:
             os.replace(unfinished, self._path)
         except OSError as error:
             self._warn(f"{self._path}: the state of the module is not kept: {error}")
-            with suppress(OSError):
+            with contextlib.suppress(OSError):
                 unfinished.unlink(missing_ok=True)
 
 
@@ -266,15 +264,13 @@ def _document(state: SavedState, serial: str) -> _State:
         profile_id=state.start.profile_id,
         profiles=[
             _Profile(
-                profile_id=profile_id,
-                zone_m=list(settings.zone_m),
-                sensitivity=settings.sensitivity,
-                tx_center_frequency=settings.tx_center_frequency,
-                led=settings.led,
-                noise_map_control=settings.noise_map_control,
-                noise_map_interval_min=settings.noise_map_interval_min,
-                outputs=list(settings.outputs.items()),
-                debug_outputs=list(settings.debug_outputs.items()),
+                **asdict(settings)
+                | {
+                    "profile_id": profile_id,
+                    "zone_m": list(settings.zone_m),
+                    "outputs": list(settings.outputs.items()),
+                    "debug_outputs": list(settings.debug_outputs.items()),
+                }
             )
             for profile_id, settings in state.profiles.items()
         ],
@@ -292,14 +288,12 @@ def _saved(state: _State) -> SavedState:
         start=Start(state=State[state.start], profile_id=state.profile_id),
         profiles={
             profile.profile_id: ProfileSettings(
-                zone_m=(profile.zone_m[0], profile.zone_m[1]),
-                sensitivity=profile.sensitivity,
-                tx_center_frequency=profile.tx_center_frequency,
-                led=profile.led,
-                noise_map_control=profile.noise_map_control,
-                noise_map_interval_min=profile.noise_map_interval_min,
-                outputs=dict(profile.outputs),
-                debug_outputs=dict(profile.debug_outputs),
+                **profile.model_dump(exclude={"profile_id"})
+                | {
+                    "zone_m": (profile.zone_m[0], profile.zone_m[1]),
+                    "outputs": dict(profile.outputs),
+                    "debug_outputs": dict(profile.debug_outputs),
+                }
             )
             for profile in state.profiles
         },

@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import ClassVar
 
-from emulator.module.settings import BITS_PER_BYTE, what_is_heard
+from emulator.module.settings import BITS_PER_BYTE, received_bytes
 
 NS_PER_S = 1_000_000_000
 
@@ -158,7 +158,7 @@ class UartLine(Line):
         Returns the host's, bit/s; None where it has none: then it is always the module's.
     """
 
-    waits_for_host = False  # without flow control the bits come whether anybody listens or not
+    waits_for_host = False  # without flow control the bits come whether they are read or not
 
     def __init__(self, module_baud: Callable[[], int], host_baud: Callable[[], int | None]) -> None:
         super().__init__()
@@ -203,7 +203,7 @@ def _send(flight: Flight, data: bytes, begin_ns: int, sent_baud: int, read_baud:
     if sent_baud <= 0:
         return begin_ns  # hung up: nothing is sent
     end_ns = begin_ns + -(-len(data) * BITS_PER_BYTE * NS_PER_S // sent_baud)
-    received = what_is_heard(data, sent_baud, read_baud)
+    received = received_bytes(data, sent_baud, read_baud)
     n_slices = max(-(-(end_ns - begin_ns) // SLICE_NS), 1)
     done = 0
     for index in range(1, n_slices + 1):

@@ -61,19 +61,13 @@ class Plug(Service):
 
     Parameters
     ----------
-    link
-        The module's pseudo-terminal.
     present
         Whether the module's own port is there at a time, ns.
     tcp
         Its TCP port; a client is hung up on, and none admitted before the module is back.
-    watch
-        Who has the terminal open.
     renames
         Whether it returns under another name every time: NAME-2, NAME-3 and so on, so that a host
         finds the module by its serial number only.
-    moved
-        Called when the port is back.
     """
 
     def __init__(
@@ -142,12 +136,8 @@ class NamedDevice:
 
     Attributes
     ----------
-    name, serial
-        For the ready line.
-    device
-        The module.
     start_skew_ns
-        Scene time at which it takes the frame of counter 0; None where nobody knows.
+        Scene time at which it takes the frame of counter 0; None where unknown.
     present
         Whether its own port is there at a time, ns; None if it always is.
     uart_baud
@@ -168,8 +158,6 @@ class LinkOptions:
 
     Attributes
     ----------
-    kind
-        What the module is connected by.
     usb_latency_ns
         How long USB transfers of at most 512 bytes are under way; None: bytes pass at once.
     host_baud
@@ -180,8 +168,6 @@ class LinkOptions:
         another name.
     tcp_base
         TCP port of the first module, the others' follow; 0: any that are free; None: no TCP.
-    tcp_host
-        Address to listen at.
     """
 
     kind: Literal["usb", "uart"] = "usb"
@@ -198,10 +184,6 @@ class DevicePorts:
 
     Attributes
     ----------
-    ports
-        For the server's loop.
-    services
-        Likewise.
     moved
         Called when a port came back, maybe under another name.
     """
@@ -209,7 +191,7 @@ class DevicePorts:
     ports: list[Port] = field(default_factory=list)
     services: list[Service] = field(default_factory=list)
     moved: Callable[[], None] = field(default=lambda: None)
-    _words: list[tuple[NamedDevice, PtyLink, TcpLink | None]] = field(default_factory=list)
+    _lines: list[tuple[NamedDevice, PtyLink, TcpLink | None]] = field(default_factory=list)
 
     def entries(self) -> list[dict[str, object]]:
         return [
@@ -220,7 +202,7 @@ class DevicePorts:
                 "start_skew_ns": named.start_skew_ns,
                 "tcp": None if tcp is None else tcp.port,
             }
-            for named, link, tcp in self._words
+            for named, link, tcp in self._lines
         ]
 
     def add(
@@ -264,7 +246,7 @@ class DevicePorts:
             moved=lambda: self.moved(),
         )
         self.services.append(plug)
-        self._words.append((named, link, tcp))
+        self._lines.append((named, link, tcp))
 
 
 def open_ports(

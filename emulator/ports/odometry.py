@@ -30,8 +30,6 @@ class OdometryFeed(SocketService[_Client]):
 
     Parameters
     ----------
-    path
-        Where the socket appears.
     lines
         TUM lines without line ends, in time order; the stamp is exact decimal seconds.
     pace
@@ -73,7 +71,7 @@ class OdometryFeed(SocketService[_Client]):
         if events & selectors.EVENT_READ:
             # one that closed only its own direction still listens; one that hung up is found out
             # by the next line sent to it
-            client.speaks = _still_speaks(client.connection)
+            client.reads = _may_send_more(client.connection)
         if events & selectors.EVENT_WRITE or not client.unsent:
             self._serve(client, now_ns)
         else:
@@ -116,7 +114,7 @@ def stamp_ns(line: str) -> int:
     return int(seconds) * NS_PER_S + int(fraction.ljust(9, "0")[:9] or 0)
 
 
-def _still_speaks(connection: socket.socket) -> bool:
+def _may_send_more(connection: socket.socket) -> bool:
     """Read and forget what a client sends; return False once it will send no more."""
     try:
         return bool(connection.recv(4096))

@@ -62,16 +62,16 @@ class PortWatch(Service):
 
     @property
     def works(self) -> bool:
-        """Whether this system tells who opens a port."""
+        """Whether this system reports who opens a port."""
         return self._fd >= 0
 
     @property
     def in_use(self) -> bool:
-        """Whether a host has the terminal open, as far as this system tells."""
+        """Whether a host has the terminal open, as far as this system reports it."""
         return self._hosts > 0
 
     def follow(self, terminal: str) -> bool:
-        """Watch another terminal, which nobody has open yet; return whether that is possible."""
+        """Watch another terminal, which no host has open yet; return whether that is possible."""
         self._hosts = 0
         mask = _IN_OPEN | _IN_CLOSE_WRITE | _IN_CLOSE_NOWRITE
         if self.works:  # the watch of a terminal that is gone went with it
@@ -109,7 +109,7 @@ class PortWatch(Service):
 
 
 def _inotify() -> int:
-    """Return a descriptor that tells of file events; -1 where there is no such thing."""
+    """Return a descriptor of file events; -1 where the system has none."""
     try:
         start = ctypes.CDLL(None, use_errno=True).inotify_init1
     except AttributeError:
@@ -136,14 +136,14 @@ class PtyLink:
 
     The slave side is raw from the start, because a client that does not set the line up itself
     would get its bytes echoed and translated; a slave descriptor kept open preserves that, and
-    spares the master the error state of a terminal nobody has open.
+    spares the master the error state of a terminal that no host has open.
 
     Parameters
     ----------
     path
         Where the link appears. A link left behind by a killed emulator is replaced.
     flushed
-        Called when the host flushes what it wrote and has not sent yet, where the system tells.
+        Called when the host discards its unsent output, where the system reports that.
 
     Raises
     ------
@@ -177,11 +177,6 @@ class PtyLink:
     def reopen(self, path: Path) -> None:
         """Appear with a fresh terminal after `close`, as a device that was plugged in again.
 
-        Parameters
-        ----------
-        path
-            Where the link appears; `path` is this from now on.
-
         Raises
         ------
         LinkError
@@ -205,7 +200,7 @@ class PtyLink:
             return data
         if data[0] & termios.TIOCPKT_FLUSHWRITE and self._flushed is not None:
             self._flushed()
-        return data[1:]  # of a packet that tells something, nothing is left
+        return data[1:]  # nothing is left of a packet that only reports a state
 
     def write(self, data: memoryview) -> int:
         try:
@@ -214,7 +209,7 @@ class PtyLink:
             return 0
 
     def host_baud(self) -> int | None:
-        """Return the speed the host set its side to, bit/s; None where nobody can tell."""
+        """Return the speed the host set its side to, bit/s; None where it is not reported."""
         if self._master_fd < 0:
             return None
         with contextlib.suppress(OSError):  # not Linux
@@ -236,7 +231,7 @@ class PtyLink:
             if os.readlink(self.path) == self.terminal:
                 self.path.unlink()
         except OSError:
-            pass  # somebody removed or replaced the link: then it is not ours to remove
+            pass  # removed or replaced by others: not ours to remove
         self._close_descriptors()
 
     def __enter__(self) -> PtyLink:

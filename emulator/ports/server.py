@@ -147,10 +147,6 @@ class Server:
 
     Parameters
     ----------
-    ports
-        Devices on their lines.
-    services
-        What else to serve.
     clock_ns
         Monotonic time in ns, the devices' time.
     """

@@ -23,11 +23,11 @@ _EXHAUSTED = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM}
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class SocketClient:
-    """A connection; ``speaks`` until the client closes its direction."""
+    """A connection; ``reads`` until the client closes its direction."""
 
     connection: socket.socket
     unsent: bytes = b""
-    speaks: bool = True
+    reads: bool = True
     watched: int = 0
 
 
@@ -41,8 +41,6 @@ class SocketService(Service, Generic[ClientT]):
     ----------
     path
         Where the socket appears; one left behind by a killed emulator is replaced.
-    name
-        What errors call it.
     most_clients
         Further ones are hung up on.
     private
@@ -136,7 +134,7 @@ class SocketService(Service, Generic[ClientT]):
 
     def _watch(self, client: ClientT) -> None:
         """Wait for room when something is unsent, and for bytes until there will be no more."""
-        wanted = selectors.EVENT_READ if client.speaks else 0
+        wanted = selectors.EVENT_READ if client.reads else 0
         wanted |= selectors.EVENT_WRITE if client.unsent else 0
         if self._selector is None or client.watched == wanted:
             return

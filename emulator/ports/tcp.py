@@ -43,8 +43,6 @@ class TcpLink(Service):
 
     Parameters
     ----------
-    host
-        Address to listen at.
     port
         Port number; 0 for any that is free.
     admits
@@ -159,7 +157,7 @@ class TcpLink(Service):
 
 
 def _reason(error: OSError | UnicodeError) -> str:
-    """Return what the system says, without the address that Python adds to it."""
+    """Return the message of the system without the address that Python adds to it."""
     if isinstance(error, OSError) and error.errno is not None and error.errno > 0:
         return os.strerror(error.errno)
     return str(error.args[-1])

@@ -21,7 +21,7 @@ Source: protocol reference 4.6 and 7.2.
 Noise map control chooses where the map of a starting profile comes from (`map_source`): a stored
 one, the default - the receiver noise of a nominal module, the same in every bin - or one created
 from the first 100 s after the matrices are full. Afterwards it follows the room with a time
-constant of ten minutes, but not in bins where somebody may be. The two last numbers of that
+constant of ten minutes, but not in bins where a person may be. The two last numbers of that
 sentence and the default map are ours; the reference names the 100 s only.
 
 Source: protocol reference 4.6.
@@ -66,14 +66,10 @@ class ProfileSweep:
 
     Parameters
     ----------
-    source
-        What the radar sees.
     zone_m
         Detection zone, start and end, on the grid of the bins [module metres].
     tx_center_frequency
         Band, 3 or 4.
-    largest_block
-        Most frames synthesised at once.
 
     Attributes
     ----------
@@ -81,8 +77,6 @@ class ProfileSweep:
         Shape (n_bins,), float64: range of each bin [module metres].
     in_zone
         Shape (n_bins,), bool: the bins inside the zone.
-    timeline
-        Scene times of the counters.
     """
 
     def __init__(
@@ -300,10 +294,6 @@ class StoredMap:
     ----------
     zone_m
         Detection zone it was made in [module metres].
-    tx_center_frequency
-        Band it was made in.
-    noise_map
-        The map.
     """
 
     zone_m: tuple[float, float]

@@ -4,11 +4,11 @@ Excess
     Per bin, the power at moving frequencies over the noise map's, 1 where nobody moves. A bin
     with an excess beyond the threshold, ``14 - sensitivity`` dB, in either matrix is occupied; so
     is one where the last three frames, less the mean of the fast window, lie 4 dB further above
-    the noise, because the matrices smear whoever walks.
+    the noise, because the matrices smear a person who walks.
 Detection
     A run of occupied bins, gaps of up to 0.4 m bridged. Its distance is where most moves in the
-    last three frames if they excite it, else that of the largest excess, as for somebody who only
-    breathes. A detection whose distance lies outside the zone is none. Whoever moves now comes
+    last three frames if they excite it, else that of the largest excess, as for a person who only
+    breathes. A detection whose distance lies outside the zone is dropped. One that moves now comes
     first, before an old trail in the slow matrix.
 Velocity
     From the phase between the newest frames: unambiguous within +-17.5 cm/s at 7.29 GHz and
@@ -69,9 +69,7 @@ class Detection:
     excess_db
         Largest excess of the run over the noise map.
     velocity_mps
-        Radial velocity, positive away; 0 for somebody who does not walk.
-    moving
-        Whether it moves right now.
+        Radial velocity, positive away; 0 for a person who does not walk.
     """
 
     distance_m: float
@@ -130,16 +128,10 @@ def detections(
 
     Parameters
     ----------
-    sweep
-        The geometry.
-    excess
-        Over the noise map.
     noise_map
-        The map itself: it tells the noise of a frame.
+        The map itself, from which the noise of a frame follows.
     frames
         Shape (n_frames, n_bins), the frames of the fast matrix, oldest first.
-    sensitivity
-        0...9.
     """
     threshold = 10 ** (threshold_db(sensitivity) / 10)
     residual = frames - frames.mean(axis=0)
@@ -263,7 +255,7 @@ class Presence:
     state
         Initialising until matrices and noise map are there, then presence or none.
     detections
-        Who is in the zone, whoever moves right now first.
+        Who is in the zone; those that move right now come first.
     movement_slow, movement_fast
         0...100 per interval of the zone, the average in front.
     """
@@ -279,8 +271,6 @@ class PresenceProcessing:
 
     Parameters
     ----------
-    sweep
-        The radar's geometry.
     noise_map
         The map to begin with; an incomplete one is created from the first matrices.
 

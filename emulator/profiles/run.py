@@ -12,9 +12,9 @@ A matrix is hundreds of messages, a range bin each; they are spread evenly over 
 the next one, so that the module's queue of 50 slots can take them. Pulse-Doppler matrices are sent
 from when they are full, noise maps from when they are in use.
 
-Frames nobody hears of are not synthesised: a run that must catch up with a long silence goes
-through the frames that fill the matrices (and those that make the noise map), which leaves the
-same state but for the noise map's adaptation.
+Frames without a message to the host are not synthesised: a run that must catch up with a long
+silence goes through the frames that fill the matrices (and those that make the noise map), which
+leaves the same state but for the noise map's adaptation.
 
 The radar runs on the emulator's clock under both paces: a presence message a second is what makes
 a profile useful to a host. Under `Pace.REALTIME` counter k is due at
@@ -163,10 +163,6 @@ def matrix_reports(
     ----------
     feature
         A key of `MATRIX_REPORTS`.
-    matrix
-        Which of the two.
-    sweep
-        Its ranges.
     power
         Shape (n_bins, matrix.pulses), of pulse-Doppler or noise map; a snapshot.
     counter
@@ -223,18 +219,10 @@ class ProfileRun:
 
     Parameters
     ----------
-    sweep
-        Its radar.
-    processing
-        What it makes of the frames.
     settings
         Called for what to send; it may change at any time.
-    first_counter
-        Of its first frame.
     zero_ns
         Device time of scene time 0, ns.
-    clock
-        The module's own.
     sampling_hz
         Sampling frequency that baseband messages claim.
     """
@@ -368,7 +356,7 @@ class ProfileRun:
                 self._ready.append(waiting.popleft())
 
     def _jump(self, time_ns: int) -> int:
-        """Leave out frames that nobody will hear of, if there are many; return their messages."""
+        """Leave out frames whose messages nobody gets, if many; return how many messages."""
         if not self.processing.noise_map.complete:
             return 0
         cycles = 0
@@ -396,18 +384,10 @@ class ProfileStream(MessageStream):
 
     Parameters
     ----------
-    module
-        Whose modes and settings to obey.
-    source
-        What its radar sees.
     pace
         Whether anything may be dropped.
-    clock
-        The module's own: its start skew and its rate error.
     scene_time_zero_ns
         Device time of scene time 0, and of power-up [ns].
-    largest_block
-        Most frames synthesised at once.
     """
 
     def __init__(
@@ -458,7 +438,7 @@ class ProfileStream(MessageStream):
         return skipped
 
     def command_done(self, command: Command[Response], now_ns: int) -> None:
-        """Start, pause, resume or end as the mode says; catch up when an output is switched on."""
+        """Start, pause, resume or end with the mode; catch up when an output is switched on."""
         mode = self._module.modes.mode
         if mode is SensorMode.XTID_SM_RUN:
             self._go_on(now_ns)

@@ -54,11 +54,6 @@ class Trajectory:
     def poses(self, t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the true pose at each time; before 0 and after the end the robot stands still.
 
-        Parameters
-        ----------
-        t_ns
-            Shape (n,), int64, scene time.
-
         Returns
         -------
         Shape (n, 3), float64: x [m], y [m], heading [rad, not wrapped], world frame.
@@ -132,8 +127,6 @@ def carried(path: Trajectory, *, at_ns: int, skips_ns: int, takes_ns: int) -> Tr
 
     Parameters
     ----------
-    path
-        The drive without the lift.
     at_ns, skips_ns
         When it is lifted, and how much of the drive is left out from there.
     takes_ns
@@ -181,7 +174,7 @@ class PersonSpec(Table):
     """One person, in the world frame.
 
     It is in the scene from ``enters_s`` to ``leaves_s`` (for ever if that is left out), and walks
-    from the moment it enters. ``walk`` says what happens at the last waypoint: ``once`` stays
+    from the moment it enters. ``walk`` selects what happens at the last waypoint: ``once`` stays
     there, ``to_and_fro`` turns back, ``round`` goes on to the first one. One waypoint: it stands.
     ``rcs_m2`` is its radar cross section; breathing is ``breaths_per_min`` and the amplitude of
     the chest (half of its travel). The reflection phase is fixed by the name.

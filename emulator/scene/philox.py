@@ -53,7 +53,7 @@ class Purpose(IntEnum):
 
 
 def stream_of(serial: int, purpose: Purpose, part: int = 0) -> int:
-    """Return the number of a module's stream; ``part``, 0 ... 255, tells several of one purpose.
+    """Return the number of a module's stream; ``part``, 0 ... 255, numbers those of one purpose.
 
     >>> stream_of(202305070101, Purpose.RECEIVER_NOISE)
     202305070101
@@ -151,7 +151,7 @@ def _half_words(words: NDArray[np.uint64]) -> NDArray[np.uint16]:
 _UNIFORMS_PER_NORMAL = 12  # their sum has variance 1
 
 
-class Dice:
+class Rng:
     """One stream of random numbers.
 
     Parameters

@@ -24,7 +24,7 @@ from pydantic import (
 
 from emulator.chip.chip import ModuleClock
 from emulator.scene.motion import AMPLITUDE_OF_1_M2, PersonSpec, Trajectory, carried, drive
-from emulator.scene.tables import Number, Table, load_table, shipped_names
+from emulator.scene.tables import Number, Table, load_table
 
 MIRROR_AMPLITUDE_1M = AMPLITUDE_OF_1_M2 * math.sqrt(math.pi)
 """Echo of a large perfect mirror on boresight at 1 m: 0.106, as strong as pi R**2 at R."""
@@ -149,7 +149,7 @@ class ObjectSpec(_Surface):
 
 
 class MultipathSpec(Table):
-    """Which paths of more than one reflection are heard, where there are walls or objects.
+    """Which paths of more than one reflection are received, where there are walls or objects.
 
     ``double_bounce`` is by way of a wall and a target or a person, ``corners`` of two walls.
     """
@@ -273,7 +273,7 @@ class SceneError(ValueError):
 
 
 class UnknownSceneError(SceneError):
-    """A name that is none of the shipped scenes: wrong usage, while a bad file is a failure."""
+    """A name of no shipped scene: wrong usage, while a bad file is a failure."""
 
 
 class Scene(Table):
@@ -311,7 +311,7 @@ class Scene(Table):
         return self
 
     @model_validator(mode="after")
-    def _ends_some_day(self) -> Scene:
+    def _is_not_too_long(self) -> Scene:
         try:
             duration_s = self.trajectory().duration_ns / 1e9
         except ValueError as error:
@@ -367,10 +367,6 @@ def empty_room(count: int = 1) -> Scene:
             for index in range(count)
         ),
     )
-
-
-def scene_names() -> tuple[str, ...]:
-    return shipped_names("scenes")
 
 
 def load_scene(path_or_name: str | Path) -> Scene:

@@ -10,11 +10,11 @@ frame at its start is (dx, dy) and a, with D = hypot(dx, dy), is reported as
 and the reported pose is the composition of the reported increments, starting at zero. White noise
 of a leg composes over steps (variance proportional to length), so it does not depend on the step;
 that of a turn is proportional to each step's angle, so it belongs to the scene's step rate. Where
-the scene says so, the three constants perform independent random walks from there. Wheel slip is
+the scene has it, the three constants perform independent random walks from there. Wheel slip is
 left out. While the robot is carried its wheels stand still and report so. Source: the project's
 odometry model for this robot class; the scene holds its standard deviations.
 
-The TUM lines are canonical: whoever parses them, live or later, computes with the same floats.
+The TUM lines are canonical: every reader, live or later, computes with the same floats.
 """
 
 from __future__ import annotations
@@ -62,8 +62,6 @@ def drift(
     ----------
     true_poses
         Shape (n, 3), float64: x [m], y [m], heading [rad, continuous], any frame.
-    model
-        Standard deviations.
     seed
         Selects the run.
     unseen

@@ -21,20 +21,12 @@ from typing import Generic, TypeVar
 from xethru_protocol.driver.link import ModuleInfo
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.transport import SerialTransport, Transport
+from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import X4Setting
 from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.errors import DeviceError, Disconnected, PortUnavailable, XeThruError
 from xethru_protocol.wire.framing import NEED_DATA, FramingFault
-from xethru_protocol.wire.messages import (
-    BootloaderGetDeviceInfo,
-    Command,
-    GetProfileId,
-    Message,
-    Ping,
-    Pong,
-    Response,
-    X4DriverGet,
-)
+from xethru_protocol.wire.table import Command, Message, Response
 
 SubjectT = TypeVar("SubjectT")
 
@@ -361,15 +353,15 @@ class PortProbe:
     @cached_property
     def contact(self) -> Contact:
         """Send PING, at other rates too, and a command of the bootloader."""
-        first = self._ask(Ping(), _PATIENCE_S)
+        first = self._ask(m.Ping(), _PATIENCE_S)
         if first.pong is not None or first.gone:
             return first
-        if self._ask(BootloaderGetDeviceInfo(), _GLANCE_S).talks and not first.talks:
+        if self._ask(m.BootloaderGetDeviceInfo(), _GLANCE_S).talks and not first.talks:
             return Contact(bootloader=True)
         if not ignores_baudrate(self.target):
             for baudrate in _OTHER_BAUDRATES:
                 if self._reopen(baudrate):
-                    contact = self._ask(Ping(), _GLANCE_S, baudrate)
+                    contact = self._ask(m.Ping(), _GLANCE_S, baudrate)
                     if contact.pong is not None:
                         return contact
             self._reopen(USUAL_BAUDRATE)
@@ -399,7 +391,7 @@ class PortProbe:
     def profile_id(self) -> int | None:
         """Loaded profile, 0 for none; None where the module refuses."""
         try:
-            values = self.module.request(GetProfileId()).values
+            values = self.module.request(m.GetProfileId()).values
         except DeviceError:
             return None
         return values[0] if values else None
@@ -408,7 +400,7 @@ class PortProbe:
     def tx_power(self) -> int | None:
         """Transmitter power, 0 for off; None where the module refuses."""
         try:
-            values = self.module.request(X4DriverGet(setting=X4Setting.TXPOWER)).values
+            values = self.module.request(m.X4DriverGet(setting=X4Setting.TXPOWER)).values
         except DeviceError:
             return None
         return int(values[0]) if values else None
@@ -438,7 +430,7 @@ class PortProbe:
             while (left_s := deadline_s - time.monotonic()) > 0:
                 connection.receive_data(self._transport.read(left_s))
                 while (event := connection.next_event()) is not NEED_DATA:
-                    if isinstance(event, Pong):
+                    if isinstance(event, m.Pong):
                         return Contact(pong=event.value, baudrate=baudrate)
                     damaged |= isinstance(event, FramingFault)
                     talks |= isinstance(event, Message)

@@ -12,7 +12,7 @@ from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Protocol, Self
+from typing import Any, Literal, Self
 
 from xethru_protocol.cli.arguments import raw_config
 from xethru_protocol.cli.output import (
@@ -31,22 +31,11 @@ from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings import RecordingError, RecordingWriter, WireCapture
 from xethru_protocol.system import StopFlag
+from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import ProfileId
 from xethru_protocol.wire.errors import ResponseTimeout, XeThruError
 from xethru_protocol.wire.framing import LinkStatistics
-from xethru_protocol.wire.messages import (
-    Ack,
-    Error,
-    Pong,
-    ReplyByte,
-    ReplyFloat,
-    ReplyInt,
-    ReplyNone,
-    ReplyString,
-    ReplyUser,
-    Response,
-    System,
-)
+from xethru_protocol.wire.table import Response
 
 
 def what_must_go(targets: Iterable[Path], *, replace: bool) -> list[Path]:
@@ -148,46 +137,45 @@ def _recording_files(target: Path) -> list[Path]:
 _FRAMES_AT_ONCE = 100
 
 
-class RecordingMode(Protocol):
-    """How to get a module to send what shall be recorded."""
+class Listen:
+    """How to get a module to send what is recorded: here, whatever it sends by itself.
 
-    @property
-    def profile_id(self) -> int | None:
-        """Profile that runs then; None if there is none, or it is not known."""
+    ``profile_id``: profile that runs then; None if there is none, or it is not known.
+    """
+
+    profile_id: int | None = None
 
     def prepare(self, radar: X4M300) -> None:
         """Bring the module to where it sends nothing yet; what comes meanwhile is old."""
 
     def start(self, radar: X4M300) -> float:
         """Let it send; returns after how much silence [s] something must be wrong."""
+        return float("inf")
 
     def wait(self, radar: X4M300, timeout_s: float) -> None:
-        """Receive, until something came or the time is over, and let go what the driver keeps."""
+        """Receive until a frame came or the time is over; other messages are not kept."""
+        with suppress(ResponseTimeout):
+            radar.read_frame(timeout_s)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RawFrames:
+class RawFrames(Listen):
     """Radar frames of raw mode."""
 
-    config: RawConfig
-    fps: float
-    profile_id: int | None = None
+    def __init__(self, config: RawConfig, fps: float) -> None:
+        self._config = config
+        self._fps = fps
 
     def prepare(self, radar: X4M300) -> None:
-        radar.configure_raw(self.config)
+        radar.configure_raw(self._config)
 
     def start(self, radar: X4M300) -> float:
-        return max(2.0, 3.0 / radar.start(self.fps))
-
-    def wait(self, radar: X4M300, timeout_s: float) -> None:
-        _wait_for_frame(radar, timeout_s)
+        return max(2.0, 3.0 / radar.start(self._fps))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Presence:
+class Presence(Listen):
     """Messages of the X4M300's own profile, about one a second."""
 
-    profile_id: int | None = ProfileId.XTS_ID_APP_PRESENCE_2
+    profile_id = ProfileId.XTS_ID_APP_PRESENCE_2
 
     def prepare(self, radar: X4M300) -> None:
         radar.presence.load()
@@ -205,31 +193,9 @@ class Presence:
                 pass
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Listen:
-    """Whatever the module sends by itself."""
-
-    profile_id: int | None = None
-
-    def prepare(self, radar: X4M300) -> None:
-        """Send nothing."""
-
-    def start(self, radar: X4M300) -> float:
-        return float("inf")
-
-    def wait(self, radar: X4M300, timeout_s: float) -> None:
-        """Take a frame; other messages the driver does not keep."""
-        _wait_for_frame(radar, timeout_s)
-
-
-def _wait_for_frame(radar: X4M300, timeout_s: float) -> None:
-    with suppress(ResponseTimeout):
-        radar.read_frame(timeout_s)
-
-
 _ANSWERS = (
-    *(Ack, Error, Pong, System),
-    *(ReplyByte, ReplyFloat, ReplyInt, ReplyNone, ReplyString, ReplyUser),
+    *(m.Ack, m.Error, m.Pong, m.System),
+    *(m.ReplyByte, m.ReplyFloat, m.ReplyInt, m.ReplyNone, m.ReplyString, m.ReplyUser),
 )
 
 
@@ -437,7 +403,7 @@ def record(arguments: Namespace) -> int:
         arguments.refuse("--out DIR is missing, or --wire FILE, or both")
     if arguments.out == arguments.wire:
         arguments.refuse("--out and --wire must not be the same")
-    mode: RecordingMode = Listen()
+    mode = Listen()
     if arguments.profile == "raw":
         mode = RawFrames(config=config, fps=arguments.fps)
     elif arguments.profile == "presence":
@@ -482,7 +448,7 @@ def record(arguments: Namespace) -> int:
 def _record_from(
     radar: X4M300,
     recorder: Recorder,
-    mode: RecordingMode,
+    mode: Listen,
     duration_s: float | None,
     stop: StopFlag,
 ) -> None:

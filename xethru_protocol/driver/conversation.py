@@ -10,32 +10,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codec import describe
 from xethru_protocol.wire.codes import SystemCode, error_name
 from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.errors import DeviceError, ResponseTimeout
 from xethru_protocol.wire.framing import NEED_DATA, FramingFault, LinkStatistics
-from xethru_protocol.wire.messages import (
-    Ack,
-    BasebandIq,
-    Command,
-    DataFloat,
-    Error,
-    Message,
-    Ping,
-    Pong,
-    ReplyByte,
-    ReplyFloat,
-    ReplyInt,
-    ReplyString,
-    Response,
-    System,
-)
-from xethru_protocol.wire.table import ROWS, Row
+from xethru_protocol.wire.table import ROWS, Command, Message, Response, Row
 
-FRAMES = (DataFloat, BasebandIq)  # a tuple is the faster argument of isinstance
+FRAMES = (m.DataFloat, m.BasebandIq)  # a tuple is the faster argument of isinstance
 _ENDLESS_S = 1e9
-_ANSWERS = (Ack, Error, Pong, ReplyByte, ReplyInt, ReplyFloat, ReplyString)
+_ANSWERS = (m.Ack, m.Error, m.Pong, m.ReplyByte, m.ReplyInt, m.ReplyFloat, m.ReplyString)
 # The module answers PINGs that waited for it one right after the other; a PONG that stays out
 # this long after the last one was never sent.
 _SETTLED_NS = 250_000_000
@@ -64,7 +49,7 @@ class _Request:
     content_id: int | None
     timeout_s: float
     deadline_ns: int
-    pong: Pong | None = None
+    pong: m.Pong | None = None
     settled_ns: int = 0  # when that PONG is taken for the last one
 
 
@@ -154,7 +139,7 @@ class Conversation:
             timeout_s=timeout_s,
             deadline_ns=self.deadline_ns(timeout_s),
         )
-        if isinstance(command, Ping):
+        if isinstance(command, m.Ping):
             self._pongs_owed += 1
         else:
             self._answer_owed = True  # also if this is left by an interrupt
@@ -175,7 +160,7 @@ class Conversation:
         request = self._request
         if request is None:
             return None
-        ping = isinstance(request.command, Ping)
+        ping = isinstance(request.command, m.Ping)
         found = self._find_pong(request) if ping else self._find_answer(request)
         if found is None and request.deadline_ns <= self._clock():
             found = request.pong
@@ -188,7 +173,7 @@ class Conversation:
         self._answer_owed = False
         if ping:
             self._pongs_owed = 0
-        elif isinstance(found, Error):
+        elif isinstance(found, m.Error):
             meaning = error_name(found.code, request.row.errors)
             raise DeviceError(found.code, summary(request.command), meaning)
         return found
@@ -209,7 +194,7 @@ class Conversation:
     def _find_answer(self, request: _Request) -> Response | None:
         while self._answers:
             answer = self._answers.popleft()
-            if isinstance(answer, Error):
+            if isinstance(answer, m.Error):
                 return answer
             if isinstance(answer, request.row.replies) and (
                 request.content_id is None
@@ -227,7 +212,7 @@ class Conversation:
         """
         while self._answers:
             answer = self._answers.popleft()
-            if isinstance(answer, Pong):
+            if isinstance(answer, m.Pong):
                 self.stray_count += request.pong is not None
                 request.pong = answer
                 request.settled_ns = self._clock() + _SETTLED_NS
@@ -270,9 +255,9 @@ class Conversation:
                 self.stray_count += 1  # not kept: a faulty module may never stop sending them
             else:
                 self._answers.append(message)
-            if isinstance(message, Pong):
+            if isinstance(message, m.Pong):
                 self._pongs_owed = max(self._pongs_owed - 1, 0)
-        elif isinstance(message, System):
+        elif isinstance(message, m.System):
             self._take_system(message)
         else:
             self._take_data(message, arrival_ns)
@@ -286,7 +271,7 @@ class Conversation:
             request is not None and isinstance(message, request.row.replies)
         )
 
-    def _take_system(self, message: System) -> None:
+    def _take_system(self, message: m.System) -> None:
         if message.code == SystemCode.XTS_SPRS_BOOTING:
             self.reboots += 1
             self._rebooted_since = True

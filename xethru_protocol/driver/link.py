@@ -13,6 +13,7 @@ from typing import Concatenate, NamedTuple, ParamSpec, Protocol, TypeAlias, Type
 
 from xethru_protocol.driver.conversation import FRAMES, Conversation, Observer
 from xethru_protocol.driver.frames import FrameQueue, Lattice
+from xethru_protocol.wire import messages as m
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import InfoItem, PongCode, SensorMode, X4Setting
 from xethru_protocol.wire.errors import (
@@ -21,18 +22,7 @@ from xethru_protocol.wire.errors import (
     RemoteProtocolError,
     ResponseTimeout,
 )
-from xethru_protocol.wire.messages import (
-    Command,
-    GetMode,
-    Ping,
-    ReplyFloat,
-    Response,
-    SetBaudRate,
-    SetMode,
-    SystemGetInfo,
-    X4DriverGet,
-    X4Value,
-)
+from xethru_protocol.wire.table import Command, Response
 
 
 class Read(NamedTuple):  # several per frame: twice as fast to make as a frozen dataclass
@@ -155,7 +145,7 @@ class RawConfig:
             if not smallest <= value <= largest:
                 raise LocalProtocolError(f"{name} must be {smallest} ... {largest}, not {value}")
 
-    def settings(self) -> tuple[tuple[X4Setting, X4Value], ...]:
+    def settings(self) -> tuple[tuple[X4Setting, m.X4Value], ...]:
         """X4 settings in the order in which the vendor's recipe sends them, and two more."""
         return (
             (X4Setting.DACMIN, self.dac_min),
@@ -336,9 +326,9 @@ class Link:
     # --- commands ---------------------------------------------------------------------------------
 
     def request(self, command: Command[ReplyT], timeout_s: float = TIMEOUT_S) -> Steps[ReplyT]:
-        if self.conversation.out_of_step and not isinstance(command, Ping):
+        if self.conversation.out_of_step and not isinstance(command, m.Ping):
             # the answer to an abandoned request may still come: all before this PONG is dropped
-            yield from self._exchange(Ping(), timeout_s)
+            yield from self._exchange(m.Ping(), timeout_s)
         reply = yield from self._exchange(command, timeout_s)
         # the conversation checked it: the row's replies are what ReplyT stands for
         return reply  # type: ignore[return-value]
@@ -374,7 +364,7 @@ class Link:
         return True
 
     def ping(self, timeout_s: float = TIMEOUT_S) -> Steps[PongCode]:
-        value = (yield from self.request(Ping(), timeout_s)).value
+        value = (yield from self.request(m.Ping(), timeout_s)).value
         try:
             return PongCode(value)
         except ValueError:
@@ -404,8 +394,10 @@ class Link:
         for item in InfoItem:
             texts.append((yield from self.info_text(item)))  # noqa: PERF401 - comprehensions cannot yield
         try:
-            values = (yield from self.request(GetMode())).values
-            mode = next((m.label for m in SensorMode if values and m == values[0]), values.hex())
+            values = (yield from self.request(m.GetMode())).values
+            mode = next(
+                (mode.label for mode in SensorMode if values and mode == values[0]), values.hex()
+            )
         except DeviceError:  # bare XEP firmware has no modes
             mode = None
         names = [field.name for field in fields(ModuleInfo)]
@@ -413,18 +405,18 @@ class Link:
 
     def info_text(self, item: InfoItem) -> Steps[str | None]:
         try:
-            return (yield from self.request(SystemGetInfo(item=item))).text
+            return (yield from self.request(m.SystemGetInfo(item=item))).text
         except DeviceError:
             return None
 
-    def x4_settings(self) -> Steps[dict[X4Setting, X4Value | None]]:
+    def x4_settings(self) -> Steps[dict[X4Setting, m.X4Value | None]]:
         without_getter = {
             X4Setting.ENABLE,
             X4Setting.SPIREGISTER,
             X4Setting.PIFREGISTER,
             X4Setting.XIFREGISTER,
         }
-        values: dict[X4Setting, X4Value | None] = {}
+        values: dict[X4Setting, m.X4Value | None] = {}
         for setting in X4Setting:
             if setting not in without_getter:
                 try:
@@ -433,20 +425,20 @@ class Link:
                     values[setting] = None
         return values
 
-    def x4_get(self, setting: X4Setting) -> Steps[X4Value]:
+    def x4_get(self, setting: X4Setting) -> Steps[m.X4Value]:
         """Read one X4 setting: a number, or the two ends of the frame area."""
-        reply = yield from self.request(X4DriverGet(setting=setting))
+        reply = yield from self.request(m.X4DriverGet(setting=setting))
         values = reply.values
         if not values:
             raise RemoteProtocolError(f"{self.name} reads back {setting.name} as nothing")
-        if len(values) == 2 and isinstance(reply, ReplyFloat):
+        if len(values) == 2 and isinstance(reply, m.ReplyFloat):
             return reply.values[0], reply.values[1]
         return values[0]
 
     def set_mode_if_known(self, mode: SensorMode) -> Steps[None]:
         """Change the mode; firmware without modes is always as in MANUAL."""
         try:
-            yield from self.request(SetMode(mode=mode), SLOW_TIMEOUT_S)
+            yield from self.request(m.SetMode(mode=mode), SLOW_TIMEOUT_S)
         except DeviceError:
             self.conversation.report("warning", f"the module does not know mode {mode.label}")
 
@@ -455,7 +447,7 @@ class Link:
             raise LocalProtocolError(
                 f"{baudrate} baud is no rate of a module; it has {', '.join(map(str, BAUD_RATES))}"
             )
-        yield from self.request(SetBaudRate(baudrate=baudrate))
+        yield from self.request(m.SetBaudRate(baudrate=baudrate))
         before_s, after_s = _BAUD_SETTLE_S
         yield from self.listen(lambda: False, before_s)
         yield SetLineRate(baudrate)

@@ -7,8 +7,8 @@ from typing import Annotated
 from pydantic import Field
 
 from emulator.faults.kind import Context, Layer, Parameters, Piece, Pieces, Target, kind
-from emulator.module.settings import what_is_heard
-from emulator.scene.philox import Dice
+from emulator.module.settings import received_bytes
+from emulator.scene.philox import Rng
 from xethru_protocol.wire.framing import ESCAPE, START
 
 _FLOW_CONTROL = b"\x11\x13"
@@ -20,8 +20,8 @@ class _At(Parameters):
         int | None, Field(ge=0, le=65_535, description="byte of the packet; random if not given")
     ] = None
 
-    def place(self, data: bytes, dice: Dice) -> int:
-        return dice.below(len(data)) if self.at is None else min(self.at, len(data) - 1)
+    def place(self, data: bytes, rng: Rng) -> int:
+        return rng.below(len(data)) if self.at is None else min(self.at, len(data) - 1)
 
 
 class _Several(_At):
@@ -67,61 +67,61 @@ _SAME_BYTES = "The bytes are the same; a receiver that depended on how they are 
 
 
 @kind(Layer.BYTE, Target.PACKET, _DAMAGE, _Several)
-def drop_bytes(data: bytes, wanted: _Several, dice: Dice, context: Context) -> Pieces:
+def drop_bytes(data: bytes, wanted: _Several, rng: Rng, context: Context) -> Pieces:
     """Bytes of a packet are lost."""
-    at = wanted.place(data, dice)
+    at = wanted.place(data, rng)
     return [Piece(data[:at] + data[at + wanted.bytes :])]
 
 
 @kind(Layer.BYTE, Target.PACKET, _DAMAGE, _Several)
-def duplicate_bytes(data: bytes, wanted: _Several, dice: Dice, context: Context) -> Pieces:
+def duplicate_bytes(data: bytes, wanted: _Several, rng: Rng, context: Context) -> Pieces:
     """Bytes of a packet come twice."""
-    end = wanted.place(data, dice) + 1
+    end = wanted.place(data, rng) + 1
     return [Piece(data[:end] + data[max(end - wanted.bytes, 0) : end] + data[end:])]
 
 
 @kind(Layer.BYTE, Target.PACKET, f"{_DAMAGE}; in a frame's samples off_lattice_samples", _Flip)
-def flip_bits(data: bytes, wanted: _Flip, dice: Dice, context: Context) -> Pieces:
+def flip_bits(data: bytes, wanted: _Flip, rng: Rng, context: Context) -> Pieces:
     """Bits of a packet are inverted."""
     flipped = bytearray(data)
-    first = 0 if wanted.at is None else wanted.place(data, dice)
+    first = 0 if wanted.at is None else wanted.place(data, rng)
     room = 8 * (1 if wanted.at is not None and wanted.bits <= 8 else len(data) - first)
     places: set[int] = set()
     while len(places) < min(wanted.bits, room):
-        places.add(dice.below(room))
+        places.add(rng.below(room))
     for place in places:
         flipped[first + place // 8] ^= 1 << place % 8
     return [Piece(bytes(flipped))]
 
 
 @kind(Layer.BYTE, Target.PACKET, _DAMAGE, _Several)
-def insert_bytes(data: bytes, wanted: _Several, dice: Dice, context: Context) -> Pieces:
+def insert_bytes(data: bytes, wanted: _Several, rng: Rng, context: Context) -> Pieces:
     """Random bytes appear inside a packet."""
-    at = wanted.place(data, dice)
-    return [Piece(data[:at] + dice.data(wanted.bytes) + data[at:])]
+    at = wanted.place(data, rng)
+    return [Piece(data[:at] + rng.data(wanted.bytes) + data[at:])]
 
 
 @kind(Layer.BYTE, Target.PACKET, "1 fault 'bytes between packets' and junk_bytes = bytes", _Several)
-def noise_between(data: bytes, wanted: _Several, dice: Dice, context: Context) -> Pieces:
+def noise_between(data: bytes, wanted: _Several, rng: Rng, context: Context) -> Pieces:
     """Random bytes without a start appear before a packet."""
-    noise = bytes(_CALM[dice.below(len(_CALM))] for _ in range(wanted.bytes))
+    noise = bytes(_CALM[rng.below(len(_CALM))] for _ in range(wanted.bytes))
     return [Piece(noise + data)]
 
 
 @kind(Layer.BYTE, Target.PACKET, f"{_DAMAGE}; in a frame's samples off_lattice_samples", _Burst)
-def burst_errors(data: bytes, wanted: _Burst, dice: Dice, context: Context) -> Pieces:
+def burst_errors(data: bytes, wanted: _Burst, rng: Rng, context: Context) -> Pieces:
     """Bursts of bit errors after Gilbert and Elliott."""
     bad = False
     damaged = bytearray(data)
     for index in range(len(damaged)):
-        bad = not dice.chance(wanted.leave) if bad else dice.chance(wanted.enter)
+        bad = not rng.chance(wanted.leave) if bad else rng.chance(wanted.enter)
         if bad:
-            damaged[index] ^= sum(1 << bit for bit in range(8) if dice.chance(wanted.flip))
+            damaged[index] ^= sum(1 << bit for bit in range(8) if rng.chance(wanted.flip))
     return None if damaged == data else [Piece(bytes(damaged))]
 
 
 @kind(Layer.BYTE, Target.PACKET, "1 fault; 2 where the byte behind it was 7D, which is a start now")
-def escape_lost(data: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def escape_lost(data: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """An escape byte of a Normal packet is lost."""
     if data[:1] != bytes((START,)):
         return None
@@ -133,39 +133,41 @@ def escape_lost(data: bytes, wanted: Parameters, dice: Dice, context: Context) -
         index += 1
     if not places:
         return None
-    at = places[dice.below(len(places))]
+    at = places[rng.below(len(places))]
     return [Piece(data[:at] + data[at + 1 :])]
 
 
 @kind(Layer.BYTE, Target.PACKET, _DAMAGE)
-def flow_control_swallowed(data: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def flow_control_swallowed(data: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A line with XON/XOFF swallows bytes 11 and 13."""
     left = data.translate(None, _FLOW_CONTROL)
     return None if left == data else [Piece(left)]
 
 
 @kind(Layer.BYTE, Target.PACKET, _DAMAGE)
-def seven_bits(data: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def seven_bits(data: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A line of seven bits clears the highest bit of every byte."""
     left = bytes(byte & 0x7F for byte in data)
     return None if left == data else [Piece(left)]
 
 
 @kind(Layer.BYTE, Target.PACKET, "nothing", _Split, hidden=_SAME_BYTES)
-def split_writes(data: bytes, wanted: _Split, dice: Dice, context: Context) -> Pieces:
+def split_writes(data: bytes, wanted: _Split, rng: Rng, context: Context) -> Pieces:
     """A packet comes in several writes."""
     return _cut(data, wanted.bytes, wanted.gap_us)
 
 
 @kind(Layer.BYTE, Target.PACKET, "nothing", _Gap, hidden=_SAME_BYTES)
-def one_byte_writes(data: bytes, wanted: _Gap, dice: Dice, context: Context) -> Pieces:
+def one_byte_writes(data: bytes, wanted: _Gap, rng: Rng, context: Context) -> Pieces:
     """A packet comes byte by byte."""
     return _cut(data, 1, wanted.gap_us)
 
 
-@kind(Layer.BYTE, Target.PACKET, "the packet is missing; what is heard of it counts as junk", _Baud)
-def wrong_baud(data: bytes, wanted: _Baud, dice: Dice, context: Context) -> Pieces:
+@kind(
+    Layer.BYTE, Target.PACKET, "the packet is missing; what is received of it counts as junk", _Baud
+)
+def wrong_baud(data: bytes, wanted: _Baud, rng: Rng, context: Context) -> Pieces:
     """Sender and host disagree on the UART's rate; computed from the bits on the line."""
     if wanted.sent == wanted.heard:
         return None
-    return [Piece(what_is_heard(data, wanted.sent, wanted.heard))]
+    return [Piece(received_bytes(data, wanted.sent, wanted.heard))]

@@ -21,7 +21,7 @@ from emulator.faults.kind import (
     normal_payload,
     response_bytes,
 )
-from emulator.scene.philox import Dice
+from emulator.scene.philox import Rng
 from xethru_protocol.wire.codes import PongCode, ResponseCode, SystemCode
 from xethru_protocol.wire.framing import END, ESCAPE, START, encode_normal
 from xethru_protocol.wire.messages import Ack, Error, Ping, Pong, System, X4DriverSet
@@ -59,7 +59,7 @@ def _cut(value: float, step: float) -> float:
 
 
 @kind(Layer.TRANSACTION, Target.COMMAND, "1 DeviceError of the code", _Code)
-def nack(packet: bytes, wanted: _Code, dice: Dice, context: Context) -> Handling | None:
+def nack(packet: bytes, wanted: _Code, rng: Rng, context: Context) -> Handling | None:
     """The module refuses a command with a code, and does not carry it out."""
     if isinstance(context.command, Ping):
         return None  # PING has no errors
@@ -67,7 +67,7 @@ def nack(packet: bytes, wanted: _Code, dice: Dice, context: Context) -> Handling
 
 
 @kind(Layer.TRANSACTION, Target.REPLY, "1 ResponseTimeout")
-def no_reply(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def no_reply(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """The module carries a command out, and its answer is lost."""
     return []
 
@@ -78,36 +78,36 @@ def no_reply(packet: bytes, wanted: Parameters, dice: Dice, context: Context) ->
     "beyond the time limit 1 ResponseTimeout and, when it comes, 1 stray; else nothing",
     _Slow,
 )
-def slow_reply(packet: bytes, wanted: _Slow, dice: Dice, context: Context) -> Pieces:
+def slow_reply(packet: bytes, wanted: _Slow, rng: Rng, context: Context) -> Pieces:
     """An answer is late; frames pass it."""
     factor = 1.0
     if wanted.tail == "uniform":
-        factor = 2 * dice.uniform()
+        factor = 2 * rng.uniform()
     elif wanted.tail == "heavy":
-        factor = min((1 - dice.uniform()) ** -0.5, _LONGEST_WAIT)
+        factor = min((1 - rng.uniform()) ** -0.5, _LONGEST_WAIT)
     return [Piece(packet, delay_ns=round(wanted.delay_ms * factor * _NS_PER_MS), aside=True)]
 
 
 @kind(Layer.TRANSACTION, Target.REPLY, "1 stray")
-def duplicate_ack(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def duplicate_ack(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """An answer comes twice."""
     return [Piece(packet), Piece(packet)]
 
 
 @kind(Layer.TRANSACTION, Target.REPLY, "1 stray")
-def stale_ack(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def stale_ack(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """The ACK of an earlier command comes before the answer."""
     return [Piece(response_bytes(Ack())), Piece(packet)]
 
 
 @kind(Layer.TRANSACTION, Target.REPLY, "1 ResponseTimeout and 1 stray")
-def late_reply(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def late_reply(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """An answer comes behind the next one."""
     return [Piece(packet, behind=1)]
 
 
 @kind(Layer.TRANSACTION, Target.REPLY, "1 ResponseTimeout and 1 stray")
-def wrong_reply(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def wrong_reply(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A REPLY carries the content id of another question."""
     payload = normal_payload(packet)
     if payload is None or len(payload) < 6 or payload[0] != ResponseCode.XTS_SPR_REPLY:
@@ -117,13 +117,13 @@ def wrong_reply(packet: bytes, wanted: Parameters, dice: Dice, context: Context)
 
 
 @kind(Layer.TRANSACTION, Target.PACKET, "BOOTING: 1 reboot", _SystemCode)
-def system_message(packet: bytes, wanted: _SystemCode, dice: Dice, context: Context) -> Pieces:
+def system_message(packet: bytes, wanted: _SystemCode, rng: Rng, context: Context) -> Pieces:
     """A SYSTEM message comes in mid-session."""
     return [Piece(response_bytes(System(code=wanted.code)) + packet)]
 
 
 @kind(Layer.TRANSACTION, Target.REPLY, "1 PONG 'not ready'")
-def not_ready(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def not_ready(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """The module answers PING with 'not ready'."""
     if not isinstance(context.command, Ping):
         return None
@@ -136,7 +136,7 @@ def not_ready(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -
     "1 RemoteProtocolError where the setting is read back and differs",
 )
 def ack_then_ignore(
-    packet: bytes, wanted: Parameters, dice: Dice, context: Context
+    packet: bytes, wanted: Parameters, rng: Rng, context: Context
 ) -> Handling | None:
     """The module acknowledges an X4 setting and does not change it."""
     if not isinstance(context.command, X4DriverSet):
@@ -150,7 +150,7 @@ def ack_then_ignore(
     "1 RemoteProtocolError or warning where it is read back",
     _Step,
 )
-def ack_quantised(packet: bytes, wanted: _Step, dice: Dice, context: Context) -> Handling | None:
+def ack_quantised(packet: bytes, wanted: _Step, rng: Rng, context: Context) -> Handling | None:
     """The module acknowledges an X4 setting and sets it to a step of its own."""
     command = context.command
     if not isinstance(command, X4DriverSet):
@@ -168,18 +168,18 @@ def ack_quantised(packet: bytes, wanted: _Step, dice: Dice, context: Context) ->
 
 
 @kind(Layer.TRANSACTION, Target.COMMAND, "1 ResponseTimeout")
-def command_lost(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Handling:
+def command_lost(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Handling:
     """A command does not reach the module."""
     return Handling()
 
 
-@kind(Layer.TRANSACTION, Target.COMMAND, "1 ResponseTimeout; the module says nothing")
+@kind(Layer.TRANSACTION, Target.COMMAND, "1 ResponseTimeout; the module does not answer")
 def command_damaged(
-    packet: bytes, wanted: Parameters, dice: Dice, context: Context
+    packet: bytes, wanted: Parameters, rng: Rng, context: Context
 ) -> Handling | None:
     """A command reaches the module with a wrong checksum."""
     if packet[-3] == ESCAPE:
         return None
     right = packet[-2]
     wrong = [code for code in range(256) if code not in (right, START, END, ESCAPE)]
-    return Handling(to_module=packet[:-2] + bytes((wrong[dice.below(len(wrong))], END)))
+    return Handling(to_module=packet[:-2] + bytes((wrong[rng.below(len(wrong))], END)))

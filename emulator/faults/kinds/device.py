@@ -16,7 +16,7 @@ from emulator.faults.kind import (
     Piece,
     Pieces,
     Restart,
-    SayToModule,
+    SendToModule,
     Target,
     Unplug,
     frame_packet,
@@ -24,7 +24,7 @@ from emulator.faults.kind import (
     kind,
     response_bytes,
 )
-from emulator.scene.philox import Dice
+from emulator.scene.philox import Rng
 from xethru_protocol.wire.codes import DirCode, InfoItem, PongCode, SensorMode, X4Setting
 from xethru_protocol.wire.messages import (
     GetProfileId,
@@ -54,17 +54,17 @@ class _Loop(Parameters):
 
 
 class _Version(Parameters):
-    version: Annotated[str, Field(max_length=60, description="version that it tells")] = "0.0.1"
+    version: Annotated[str, Field(max_length=60, description="version that it reports")] = "0.0.1"
 
 
 class _Serial(Parameters):
     serial: Annotated[
-        str, Field(pattern=r"^[0-9]{12}$", description="serial number that it tells")
+        str, Field(pattern=r"^[0-9]{12}$", description="serial number that it reports")
     ] = "000000000001"
 
 
 class _Profile(Parameters):
-    profile: Annotated[int, Field(ge=0, le=2**31 - 1, description="profile id that it tells")] = 0
+    profile: Annotated[int, Field(ge=0, le=2**31 - 1, description="profile id that it reports")] = 0
 
 
 class _Drift(Parameters):
@@ -72,7 +72,7 @@ class _Drift(Parameters):
     seconds: Annotated[float, Field(gt=0, le=86_400, description="time that takes, s")] = 10.0
 
 
-def _says(item: InfoItem, text: str, context: Context) -> Pieces:
+def _info_reply(item: InfoItem, text: str, context: Context) -> Pieces:
     command = context.command
     if not isinstance(command, SystemGetInfo) or command.item != item:
         return None
@@ -105,29 +105,29 @@ class _Silence(Parameters):
 
 
 _ARRIVAL = "nothing; the arrival times show it"
-_TIMING = "Frames carry no time; only their arrival shows it, to who looks at it."
+_TIMING = "Frames carry no time; only when they arrive shows it."
 
 
 @kind(Layer.DEVICE, Target.MOMENT, "1 reconnect", _Away)
-def unplug(wanted: _Away, dice: Dice) -> Sequence[Action]:
+def unplug(wanted: _Away, rng: Rng) -> Sequence[Action]:
     """The port vanishes and comes back; the module restarts by that."""
     return [Unplug(round(wanted.away_s * _NS_PER_S))]
 
 
 @kind(Layer.DEVICE, Target.MOMENT, "1 reconnect", _MidFrame)
-def disconnect_mid_frame(wanted: _MidFrame, dice: Dice) -> Sequence[Action]:
+def disconnect_mid_frame(wanted: _MidFrame, rng: Rng) -> Sequence[Action]:
     """The port vanishes in the middle of a frame and comes back."""
     return [Unplug(round(wanted.away_s * _NS_PER_S), part_of_frame=wanted.part)]
 
 
 @kind(Layer.DEVICE, Target.MOMENT, "1 reboot, and ResponseTimeout where frames were waited for")
-def watchdog_reboot(wanted: Parameters, dice: Dice) -> Sequence[Action]:
+def watchdog_reboot(wanted: Parameters, rng: Rng) -> Sequence[Action]:
     """The module restarts by itself and counts it towards safe mode; its port stays."""
     return [Restart()]
 
 
 @kind(Layer.DEVICE, Target.MOMENT, "restarts reboots", _Loop)
-def brown_out(wanted: _Loop, dice: Dice) -> Sequence[Action]:
+def brown_out(wanted: _Loop, rng: Rng) -> Sequence[Action]:
     """The module restarts several times in a row; ten faults in a row start safe mode."""
     period_ns = round(wanted.period_s * _NS_PER_S)
     return [
@@ -136,7 +136,7 @@ def brown_out(wanted: _Loop, dice: Dice) -> Sequence[Action]:
 
 
 @kind(Layer.DEVICE, Target.REPLY, "1 warning where raw radar mode is set up", lasting=True)
-def safe_mode(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def safe_mode(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """The module answers PING as one in safe mode from now on."""
     if not isinstance(context.command, Ping):
         return None
@@ -144,37 +144,37 @@ def safe_mode(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -
 
 
 @kind(Layer.DEVICE, Target.REPLY, "another profile id", _Profile, lasting=True)
-def wrong_profile(packet: bytes, wanted: _Profile, dice: Dice, context: Context) -> Pieces:
-    """The module tells another profile than the one that is loaded, from now on."""
+def wrong_profile(packet: bytes, wanted: _Profile, rng: Rng, context: Context) -> Pieces:
+    """The module reports another profile than the one that is loaded, from now on."""
     if not isinstance(context.command, GetProfileId):
         return None
     return [Piece(response_bytes(ReplyInt(values=(wanted.profile,))))]
 
 
 @kind(Layer.DEVICE, Target.REPLY, "another version", _Version, lasting=True)
-def wrong_version(packet: bytes, wanted: _Version, dice: Dice, context: Context) -> Pieces:
-    """The module tells another firmware version, from now on."""
-    return _says(InfoItem.XTID_SSIC_VERSION, wanted.version, context)
+def wrong_version(packet: bytes, wanted: _Version, rng: Rng, context: Context) -> Pieces:
+    """The module reports another firmware version, from now on."""
+    return _info_reply(InfoItem.XTID_SSIC_VERSION, wanted.version, context)
 
 
 @kind(Layer.DEVICE, Target.REPLY, "another serial number", _Serial, lasting=True)
-def duplicate_serial(packet: bytes, wanted: _Serial, dice: Dice, context: Context) -> Pieces:
-    """The module tells another module's serial number, from now on."""
-    return _says(InfoItem.XTID_SSIC_SERIALNUMBER, wanted.serial, context)
+def duplicate_serial(packet: bytes, wanted: _Serial, rng: Rng, context: Context) -> Pieces:
+    """The module reports another module's serial number, from now on."""
+    return _info_reply(InfoItem.XTID_SSIC_SERIALNUMBER, wanted.serial, context)
 
 
 @kind(
     Layer.DEVICE, Target.MOMENT, "ResponseTimeout where frames were waited for; the mode reads STOP"
 )
-def mode_lost(wanted: Parameters, dice: Dice) -> Sequence[Action]:
+def mode_lost(wanted: Parameters, rng: Rng) -> Sequence[Action]:
     """The module falls back to STOP by itself."""
-    return [SayToModule(SetMode(mode=SensorMode.XTID_SM_STOP))]
+    return [SendToModule(SetMode(mode=SensorMode.XTID_SM_STOP))]
 
 
 @kind(Layer.DEVICE, Target.MOMENT, "ResponseTimeout where frames were waited for; the rate reads 0")
-def stream_stopped(wanted: Parameters, dice: Dice) -> Sequence[Action]:
+def stream_stopped(wanted: Parameters, rng: Rng) -> Sequence[Action]:
     """The module sets its frame rate to 0 by itself, as the transmitter guard does."""
-    return [SayToModule(X4DriverSet(setting=X4Setting.FPS, value=0.0))]
+    return [SendToModule(X4DriverSet(setting=X4Setting.FPS, value=0.0))]
 
 
 @kind(
@@ -183,9 +183,9 @@ def stream_stopped(wanted: Parameters, dice: Dice) -> Sequence[Action]:
     "nothing",
     _Drift,
     lasting=True,
-    hidden="Whole bins of true samples: only who knows the scene can tell.",
+    hidden="Whole bins of true samples: only the scene shows that they are wrong.",
 )
-def range_offset_drift(packet: bytes, wanted: _Drift, dice: Dice, context: Context) -> Pieces:
+def range_offset_drift(packet: bytes, wanted: _Drift, rng: Rng, context: Context) -> Pieces:
     """Echoes wander in range, as with temperature."""
     parts = frame_parts(packet)
     if parts is None or parts.samples.size == 0:
@@ -198,27 +198,27 @@ def range_offset_drift(packet: bytes, wanted: _Drift, dice: Dice, context: Conte
 
 
 @kind(Layer.TIME, Target.PACKET, _ARRIVAL, _Offset, lasting=True, hidden=_TIMING)
-def start_offset(packet: bytes, wanted: _Offset, dice: Dice, context: Context) -> Pieces:
+def start_offset(packet: bytes, wanted: _Offset, rng: Rng, context: Context) -> Pieces:
     """Everything comes later by the same time."""
     return [Piece(packet, delay_ns=round(wanted.offset_ms * _NS_PER_MS))]
 
 
 @kind(Layer.TIME, Target.PACKET, _ARRIVAL, _Ppm, lasting=True, hidden=_TIMING)
-def clock_drift(packet: bytes, wanted: _Ppm, dice: Dice, context: Context) -> Pieces:
+def clock_drift(packet: bytes, wanted: _Ppm, rng: Rng, context: Context) -> Pieces:
     """The module's clock is slow."""
     delay_ns = round((context.now_ns - context.since_ns) * wanted.ppm * 1e-6)
     return [Piece(packet, delay_ns=delay_ns)]
 
 
 @kind(Layer.TIME, Target.PACKET, _ARRIVAL, _Walk, lasting=True, hidden=_TIMING)
-def jitter(packet: bytes, wanted: _Walk, dice: Dice, context: Context) -> Pieces:
+def jitter(packet: bytes, wanted: _Walk, rng: Rng, context: Context) -> Pieces:
     """Delays wander at random."""
     # reflected at 0: nothing can be early
-    return [Piece(packet, delay_ns=round(abs(dice.walk(wanted.sigma_us)) * _NS_PER_US))]
+    return [Piece(packet, delay_ns=round(abs(rng.walk(wanted.sigma_us)) * _NS_PER_US))]
 
 
 @kind(Layer.TIME, Target.PACKET, _ARRIVAL, _Poll, lasting=True, hidden=_TIMING)
-def usb_latency(packet: bytes, wanted: _Poll, dice: Dice, context: Context) -> Pieces:
+def usb_latency(packet: bytes, wanted: _Poll, rng: Rng, context: Context) -> Pieces:
     """The host polls now and then: packets come in batches, at multiples of a period."""
     period_ns = round(wanted.period_ms * _NS_PER_MS)
     return [Piece(packet, delay_ns=(context.since_ns - context.now_ns) % period_ns)]
@@ -231,7 +231,7 @@ def usb_latency(packet: bytes, wanted: _Poll, dice: Dice, context: Context) -> P
     _Silence,
     lasting=True,
 )
-def silent(packet: bytes, wanted: _Silence, dice: Dice, context: Context) -> Pieces:
+def silent(packet: bytes, wanted: _Silence, rng: Rng, context: Context) -> Pieces:
     """Nothing comes from the module, though its port is there."""
     end_ns = context.since_ns + round(wanted.seconds * _NS_PER_S)
     return [] if not wanted.seconds or context.now_ns < end_ns else [Piece(packet)]

@@ -24,7 +24,7 @@ from emulator.faults.kind import (
     normal_payload,
     response_bytes,
 )
-from emulator.scene.philox import Dice
+from emulator.scene.philox import Rng
 from xethru_protocol.wire.framing import (
     END,
     ESCAPE,
@@ -75,7 +75,7 @@ class _Length(Parameters):
 def _replaced(
     packet: bytes,
     wanted: _Samples,
-    dice: Dice,
+    rng: Rng,
     replace: Callable[[NDArray[np.float32]], NDArray[np.float32]],
 ) -> Pieces:
     """Return a frame of which some samples, chosen at random, are replaced."""
@@ -84,7 +84,7 @@ def _replaced(
         return None
     places: set[int] = set()
     while len(places) < wanted.samples:
-        places.add(dice.below(parts.samples.size))
+        places.add(rng.below(parts.samples.size))
     chosen = sorted(places)
     samples = parts.samples.copy()
     samples[chosen] = replace(samples[chosen])
@@ -92,7 +92,7 @@ def _replaced(
 
 
 @kind(Layer.FRAME, Target.REPLY, f"1 fault 'wrong checksum'; {_LOST_REPLY}")
-def bad_checksum(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def bad_checksum(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """The checksum of a Normal packet is wrong."""
     payload = _whole_normal(packet)
     if payload is None:
@@ -101,73 +101,73 @@ def bad_checksum(packet: bytes, wanted: Parameters, dice: Dice, context: Context
     wrong = [code for code in range(256) if code != right and code not in _SPECIAL]
     body = encode_normal(payload)
     end = -3 if right in _SPECIAL else -2  # the right one was escaped
-    return [Piece(body[:end] + bytes((wrong[dice.below(len(wrong))], END)))]
+    return [Piece(body[:end] + bytes((wrong[rng.below(len(wrong))], END)))]
 
 
 @kind(Layer.FRAME, Target.PACKET, "1 unknown")
-def escaped_checksum(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def escaped_checksum(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """An intact packet of an unknown code, whose checksum needs an escape, comes before."""
     checksum_is_end = encode_normal(bytes((_UNKNOWN_CODE, END ^ START ^ _UNKNOWN_CODE)))
     return [Piece(checksum_is_end + packet)]
 
 
 @kind(Layer.FRAME, Target.REPLY, f"1 fault at the next packet; {_LOST_REPLY}")
-def missing_end(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def missing_end(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """The end byte of a Normal packet is missing."""
     return _changed(packet, packet[:-1])
 
 
 @kind(Layer.FRAME, Target.REPLY, f"1 fault 'bytes between packets'; {_LOST_REPLY}")
-def missing_start(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def missing_start(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """The start byte of a Normal packet is missing."""
     return _changed(packet, packet[1:])
 
 
 @kind(Layer.FRAME, Target.REPLY, "1 junk byte, no fault: nothing was lost")
-def double_start(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def double_start(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A Normal packet has two start bytes."""
     return _changed(packet, packet[:1] + packet)
 
 
 @kind(Layer.FRAME, Target.REPLY, "1 fault 'bytes between packets', 1 junk byte")
-def double_end(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def double_end(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A Normal packet has two end bytes."""
     return _changed(packet, packet + packet[-1:])
 
 
 @kind(Layer.FRAME, Target.REPLY, f"1 fault; {_LOST_REPLY}")
-def early_end(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def early_end(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """An unescaped end byte stands inside a Normal packet."""
     return _changed(packet, packet[:2] + bytes((END,)) + packet[2:])
 
 
 @kind(Layer.FRAME, Target.REPLY, f"1 fault at the next packet; {_LOST_REPLY}", _Cut)
-def truncated_reply(packet: bytes, wanted: _Cut, dice: Dice, context: Context) -> Pieces:
+def truncated_reply(packet: bytes, wanted: _Cut, rng: Rng, context: Context) -> Pieces:
     """Only the first bytes of a reply are sent."""
     return None if wanted.keep >= len(packet) else [Piece(packet[: wanted.keep])]
 
 
 @kind(Layer.FRAME, Target.PACKET, "1 fault 'packet longer than any receiver accepts'")
-def oversized(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def oversized(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A Normal packet that is longer than any receiver accepts comes before."""
     longest = bytes((START, *bytes(2 * MAX_NORMAL_BYTES + 8), END))
     return [Piece(longest + packet)]
 
 
 @kind(Layer.FRAME, Target.PACKET, "1 fault 'packet without payload'")
-def empty_packet(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def empty_packet(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A packet without payload comes before."""
     return [Piece(bytes((START, END)) + packet)]
 
 
 @kind(Layer.FRAME, Target.PACKET, "1 unknown")
-def unknown_response(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def unknown_response(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """An intact packet of an unknown code comes before."""
     return [Piece(encode_normal(bytes((_UNKNOWN_CODE, 1, 2, 3))) + packet)]
 
 
 @kind(Layer.FRAME, Target.PACKET, "1 unknown")
-def unknown_content(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def unknown_content(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """An intact profile message with an unknown content id comes before."""
     return [Piece(encode_normal(_UNKNOWN_CONTENT) + packet)]
 
@@ -178,13 +178,13 @@ def unknown_content(packet: bytes, wanted: Parameters, dice: Dice, context: Cont
     "nothing",
     hidden="Data may precede any reply; a driver that stumbles over it is wrong.",
 )
-def stray_data(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def stray_data(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A data message stands between a command and its answer."""
     return [Piece(response_bytes(DataString(text="between command and answer")) + packet)]
 
 
 @kind(Layer.FRAME, Target.PACKET, "1 fault 'implausible NoEscape header'")
-def false_bulk_start(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def false_bulk_start(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A NoEscape start with length 0 comes before."""
     return [Piece(NO_ESCAPE_START + bytes(4) + b"\x00" + packet)]
 
@@ -195,15 +195,15 @@ def false_bulk_start(packet: bytes, wanted: Parameters, dice: Dice, context: Con
     "nothing",
     hidden="The 8-bit XOR is the same; of random damage it passes 1 in 256.",
 )
-def cancelling_flips(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def cancelling_flips(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """The same bit of two bytes of a reply is inverted."""
     payload = _whole_normal(packet)
     first = 10  # behind content id and info of a REPLY, so that the answer still fits the question
     if payload is None or len(payload) < first + 6:
         return None
     changed = bytearray(payload)
-    mask = 1 << dice.below(8)
-    place = first + 4 + dice.below(len(payload) - first - 5)
+    mask = 1 << rng.below(8)
+    place = first + 4 + rng.below(len(payload) - first - 5)
     for index in (place, place + 1):
         changed[index] ^= mask
     return [Piece(encode_normal(bytes(changed)))]
@@ -215,31 +215,31 @@ def cancelling_flips(packet: bytes, wanted: Parameters, dice: Dice, context: Con
     "1 frame lost, 1 fault; the next frame's first bytes are taken for samples",
     _Cut,
 )
-def truncated_frame(packet: bytes, wanted: _Cut, dice: Dice, context: Context) -> Pieces:
+def truncated_frame(packet: bytes, wanted: _Cut, rng: Rng, context: Context) -> Pieces:
     """Only the first bytes of a radar frame are sent."""
     return None if wanted.keep >= len(packet) else [Piece(packet[: wanted.keep])]
 
 
 @kind(Layer.FRAME, Target.FRAME, "off_lattice_samples = samples", _Samples)
-def nan_samples(packet: bytes, wanted: _Samples, dice: Dice, context: Context) -> Pieces:
+def nan_samples(packet: bytes, wanted: _Samples, rng: Rng, context: Context) -> Pieces:
     """Samples of a frame are no numbers."""
-    return _replaced(packet, wanted, dice, lambda samples: np.full_like(samples, np.nan))
+    return _replaced(packet, wanted, rng, lambda samples: np.full_like(samples, np.nan))
 
 
 @kind(Layer.FRAME, Target.FRAME, "off_lattice_samples = samples", _Samples)
-def infinite_samples(packet: bytes, wanted: _Samples, dice: Dice, context: Context) -> Pieces:
+def infinite_samples(packet: bytes, wanted: _Samples, rng: Rng, context: Context) -> Pieces:
     """Samples of a frame are infinite."""
-    return _replaced(packet, wanted, dice, lambda samples: np.full_like(samples, np.inf))
+    return _replaced(packet, wanted, rng, lambda samples: np.full_like(samples, np.inf))
 
 
 @kind(Layer.FRAME, Target.FRAME, "off_lattice_samples = samples", _Samples)
-def denormal_samples(packet: bytes, wanted: _Samples, dice: Dice, context: Context) -> Pieces:
+def denormal_samples(packet: bytes, wanted: _Samples, rng: Rng, context: Context) -> Pieces:
     """Samples of a frame are denormal numbers."""
-    return _replaced(packet, wanted, dice, lambda samples: np.full_like(samples, 1e-40))
+    return _replaced(packet, wanted, rng, lambda samples: np.full_like(samples, 1e-40))
 
 
 @kind(Layer.FRAME, Target.FRAME, "off_lattice_samples = samples", _Samples)
-def off_lattice_samples(packet: bytes, wanted: _Samples, dice: Dice, context: Context) -> Pieces:
+def off_lattice_samples(packet: bytes, wanted: _Samples, rng: Rng, context: Context) -> Pieces:
     """Samples lie between two values that the chip can give."""
     lattice = context.lattice
     if lattice is None:
@@ -251,7 +251,7 @@ def off_lattice_samples(packet: bytes, wanted: _Samples, dice: Dice, context: Co
         # between two chip counters, whatever the sample was
         return (samples + np.where(samples + half > highest, -half, half)).astype(np.float32)
 
-    return _replaced(packet, wanted, dice, between)
+    return _replaced(packet, wanted, rng, between)
 
 
 @kind(
@@ -261,7 +261,7 @@ def off_lattice_samples(packet: bytes, wanted: _Samples, dice: Dice, context: Co
     _Samples,
     hidden="NoEscape packets carry no checksum, and the new values are as good as the old.",
 )
-def in_range_samples(packet: bytes, wanted: _Samples, dice: Dice, context: Context) -> Pieces:
+def in_range_samples(packet: bytes, wanted: _Samples, rng: Rng, context: Context) -> Pieces:
     """Samples are replaced by other values that the chip can give."""
     lattice = context.lattice
     if lattice is None:
@@ -271,7 +271,7 @@ def in_range_samples(packet: bytes, wanted: _Samples, dice: Dice, context: Conte
     return _replaced(
         packet,
         wanted,
-        dice,
+        rng,
         lambda samples: lattice.nearest(
             np.where(samples > middle, samples - quarter, samples + quarter)
         ),
@@ -279,7 +279,7 @@ def in_range_samples(packet: bytes, wanted: _Samples, dice: Dice, context: Conte
 
 
 @kind(Layer.FRAME, Target.FRAME, "1 frame discarded, 1 frame lost", _Bins)
-def wrong_bin_count(packet: bytes, wanted: _Bins, dice: Dice, context: Context) -> Pieces:
+def wrong_bin_count(packet: bytes, wanted: _Bins, rng: Rng, context: Context) -> Pieces:
     """A frame has another number of bins than the settings make."""
     parts = frame_parts(packet)
     if parts is None or wanted.more == 0 or parts.samples.size + wanted.more < 1:
@@ -292,7 +292,7 @@ def wrong_bin_count(packet: bytes, wanted: _Bins, dice: Dice, context: Context) 
 
 
 @kind(Layer.FRAME, Target.FRAME, "1 fault 'implausible NoEscape header', 1 frame lost", _Length)
-def wrong_length(packet: bytes, wanted: _Length, dice: Dice, context: Context) -> Pieces:
+def wrong_length(packet: bytes, wanted: _Length, rng: Rng, context: Context) -> Pieces:
     """The length of a NoEscape packet contradicts its content."""
     if not packet.startswith(NO_ESCAPE_START) or wanted.more == 0:
         return None
@@ -305,7 +305,7 @@ def wrong_length(packet: bytes, wanted: _Length, dice: Dice, context: Context) -
 @kind(
     Layer.FRAME, Target.FRAME, "1 fault, 4 junk bytes; the frame's later samples are shifted by one"
 )
-def packet_inside_frame(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def packet_inside_frame(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """An ACK stands inside a frame."""
     if context.packet_class is not PacketClass.FRAME:
         return None
@@ -319,7 +319,7 @@ def packet_inside_frame(packet: bytes, wanted: Parameters, dice: Dice, context: 
     "nothing",
     hidden="A host must accept both framings for every message.",
 )
-def normal_framed(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def normal_framed(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A frame comes in Normal framing."""
     payload = packet[NO_ESCAPE_HEADER_BYTES:]
     if not packet.startswith(NO_ESCAPE_START) or not 0 < len(payload) < MAX_NORMAL_BYTES:

@@ -21,7 +21,7 @@ from emulator.faults.kind import (
     frame_parts,
     kind,
 )
-from emulator.scene.philox import Dice
+from emulator.scene.philox import Rng
 
 _WRAP = 1 << 32
 _NS_PER_S = 1_000_000_000
@@ -72,8 +72,8 @@ def _since_first(counter: int, context: Context) -> int:
 
 
 _BACK = "A counter that goes back looks like a chip that was restarted, which loses nothing."
-_CONTENT = "The samples are such as the chip can give; only who looks at the scene can tell."
-_TIMING = "Frames carry no time; only their arrival shows it, to who looks at it."
+_CONTENT = "The samples are values that the chip can give; only the scene shows the fault."
+_TIMING = "Frames carry no time; only when they arrive shows it."
 
 
 _CYCLES_PER_BIN = 7.29 / 23.328  # carrier of the pulse over the sampling rate, Hz / Hz
@@ -108,7 +108,7 @@ def _with_echo(
 
 
 @kind(Layer.STREAM, Target.FRAME, "frames_lost += frames", _Frames, lasting=True)
-def counter_jump(packet: bytes, wanted: _Frames, dice: Dice, context: Context) -> Pieces:
+def counter_jump(packet: bytes, wanted: _Frames, rng: Rng, context: Context) -> Pieces:
     """The frame counter jumps ahead, and goes on from there."""
     return _renumbered(packet, lambda counter: counter + wanted.frames * context.firings)
 
@@ -121,13 +121,13 @@ def counter_jump(packet: bytes, wanted: _Frames, dice: Dice, context: Context) -
     lasting=True,
     hidden=_BACK,
 )
-def counter_back(packet: bytes, wanted: _Frames, dice: Dice, context: Context) -> Pieces:
+def counter_back(packet: bytes, wanted: _Frames, rng: Rng, context: Context) -> Pieces:
     """The frame counter jumps back, and goes on from there."""
     return _renumbered(packet, lambda counter: counter - wanted.frames * context.firings)
 
 
 @kind(Layer.STREAM, Target.FRAME, "nothing; a wrap is no loss", _Frames, lasting=True, hidden=_BACK)
-def counter_wrap(packet: bytes, wanted: _Frames, dice: Dice, context: Context) -> Pieces:
+def counter_wrap(packet: bytes, wanted: _Frames, rng: Rng, context: Context) -> Pieces:
     """The frame counter goes on shortly before 2**32, and wraps after some frames."""
     return _renumbered(
         packet, lambda counter: _WRAP - wanted.frames + _since_first(counter, context)
@@ -142,7 +142,7 @@ def counter_wrap(packet: bytes, wanted: _Frames, dice: Dice, context: Context) -
     lasting=True,
     hidden=_BACK,
 )
-def counter_reset(packet: bytes, wanted: _Frames, dice: Dice, context: Context) -> Pieces:
+def counter_reset(packet: bytes, wanted: _Frames, rng: Rng, context: Context) -> Pieces:
     """The frame counter begins again at 0."""
     return _renumbered(packet, lambda counter: _since_first(counter, context))
 
@@ -154,19 +154,19 @@ def counter_reset(packet: bytes, wanted: _Frames, dice: Dice, context: Context) 
     _Copies,
     hidden="The counter does not move, so no frame is missing.",
 )
-def duplicate_frame(packet: bytes, wanted: _Copies, dice: Dice, context: Context) -> Pieces:
+def duplicate_frame(packet: bytes, wanted: _Copies, rng: Rng, context: Context) -> Pieces:
     """A frame comes again."""
     return [Piece(packet)] * (1 + wanted.copies)
 
 
 @kind(Layer.STREAM, Target.FRAME, "frames_lost += frames", _Frames, lasting=True)
-def missing_frames(packet: bytes, wanted: _Frames, dice: Dice, context: Context) -> Pieces:
+def missing_frames(packet: bytes, wanted: _Frames, rng: Rng, context: Context) -> Pieces:
     """Frames are missing."""
     return [] if context.packets_since < wanted.frames else [Piece(packet)]
 
 
 @kind(Layer.STREAM, Target.FRAME, "frames_lost += 2: the counter jumps ahead by one twice")
-def reordered_frames(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def reordered_frames(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A frame comes behind the next one."""
     return [Piece(packet, behind=1)]
 
@@ -179,7 +179,7 @@ def reordered_frames(packet: bytes, wanted: Parameters, dice: Dice, context: Con
     lasting=True,
     hidden=_TIMING,
 )
-def slow_rate(packet: bytes, wanted: _Slower, dice: Dice, context: Context) -> Pieces:
+def slow_rate(packet: bytes, wanted: _Slower, rng: Rng, context: Context) -> Pieces:
     """Frames come at a lower rate than was asked for."""
     delay_ns = round((context.now_ns - context.since_ns) * wanted.percent / 100)
     return [Piece(packet, delay_ns=delay_ns)]
@@ -193,14 +193,14 @@ def slow_rate(packet: bytes, wanted: _Slower, dice: Dice, context: Context) -> P
     lasting=True,
     hidden=_TIMING,
 )
-def stall(packet: bytes, wanted: _Seconds, dice: Dice, context: Context) -> Pieces:
+def stall(packet: bytes, wanted: _Seconds, rng: Rng, context: Context) -> Pieces:
     """Nothing comes for a while, then all at once."""
     end_ns = context.since_ns + round(wanted.seconds * _NS_PER_S)
     return [Piece(packet, delay_ns=max(end_ns - context.now_ns, 0))]
 
 
 @kind(Layer.STREAM, Target.FRAME, "nothing", _Level, hidden=_CONTENT)
-def saturation(packet: bytes, wanted: _Level, dice: Dice, context: Context) -> Pieces:
+def saturation(packet: bytes, wanted: _Level, rng: Rng, context: Context) -> Pieces:
     """The amplitudes of a frame are clipped."""
     parts = frame_parts(packet)
     if parts is None or context.lattice is None or parts.samples.size == 0:
@@ -211,7 +211,7 @@ def saturation(packet: bytes, wanted: _Level, dice: Dice, context: Context) -> P
 
 
 @kind(Layer.STREAM, Target.FRAME, "nothing", _DeadBins, hidden=_CONTENT)
-def dead_bins(packet: bytes, wanted: _DeadBins, dice: Dice, context: Context) -> Pieces:
+def dead_bins(packet: bytes, wanted: _DeadBins, rng: Rng, context: Context) -> Pieces:
     """Bins of a frame are stuck at one value."""
     parts = frame_parts(packet)
     if parts is None or wanted.first >= parts.samples.size:
@@ -223,7 +223,7 @@ def dead_bins(packet: bytes, wanted: _DeadBins, dice: Dice, context: Context) ->
 
 
 @kind(Layer.STREAM, Target.FRAME, "nothing", _Amplitude, lasting=True, hidden=_CONTENT)
-def dc_step(packet: bytes, wanted: _Amplitude, dice: Dice, context: Context) -> Pieces:
+def dc_step(packet: bytes, wanted: _Amplitude, rng: Rng, context: Context) -> Pieces:
     """All samples are moved by the same amount from now on."""
     parts = frame_parts(packet)
     if parts is None or context.lattice is None:
@@ -233,7 +233,7 @@ def dc_step(packet: bytes, wanted: _Amplitude, dice: Dice, context: Context) -> 
 
 
 @kind(Layer.STREAM, Target.FRAME, "nothing", hidden=_CONTENT)
-def stale_frame(packet: bytes, wanted: Parameters, dice: Dice, context: Context) -> Pieces:
+def stale_frame(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A frame carries the samples of the one before."""
     parts = frame_parts(packet)
     before = None if context.previous_frame is None else frame_parts(context.previous_frame)
@@ -243,7 +243,7 @@ def stale_frame(packet: bytes, wanted: Parameters, dice: Dice, context: Context)
 
 
 @kind(Layer.ENVIRONMENT, Target.FRAME, "nothing", _Clutter, lasting=True, hidden=_CONTENT)
-def strong_clutter(packet: bytes, wanted: _Clutter, dice: Dice, context: Context) -> Pieces:
+def strong_clutter(packet: bytes, wanted: _Clutter, rng: Rng, context: Context) -> Pieces:
     """A strong reflector stands in one place."""
 
     def clutter(n: int) -> NDArray[np.float64]:
@@ -258,20 +258,20 @@ def strong_clutter(packet: bytes, wanted: _Clutter, dice: Dice, context: Context
 
 
 @kind(Layer.ENVIRONMENT, Target.FRAME, "nothing", _Rain, lasting=True, hidden=_CONTENT)
-def interference(packet: bytes, wanted: _Rain, dice: Dice, context: Context) -> Pieces:
+def interference(packet: bytes, wanted: _Rain, rng: Rng, context: Context) -> Pieces:
     """Every frame has pulses at random bins."""
 
     def pulses(n: int) -> NDArray[np.float64]:
         samples = np.zeros(n)
         for _ in range(wanted.pulses):
-            samples[dice.below(n)] += wanted.amplitude * (2 * dice.below(2) - 1)
+            samples[rng.below(n)] += wanted.amplitude * (2 * rng.below(2) - 1)
         return samples
 
     return _with_echo(packet, context, pulses)
 
 
 @kind(Layer.ENVIRONMENT, Target.FRAME, "nothing", _Fading, lasting=True, hidden=_CONTENT)
-def fading(packet: bytes, wanted: _Fading, dice: Dice, context: Context) -> Pieces:
+def fading(packet: bytes, wanted: _Fading, rng: Rng, context: Context) -> Pieces:
     """All echoes fade and come back."""
     parts = frame_parts(packet)
     if parts is None or context.lattice is None:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from emulator.chip import Pace
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source
-from emulator.faults.faulty_device import wrap
+from emulator.faults.faulty_device import FaultyDevice
 from emulator.faults.kind import (
     Context,
     Handling,
@@ -25,7 +25,7 @@ from emulator.faults.kind import (
 from emulator.faults.kinds import KINDS
 from emulator.faults.plan import FaultPlan, TruthLog, fault_spec
 from emulator.module.memory import Identity
-from emulator.scene.philox import Dice
+from emulator.scene.philox import Rng
 from emulator.scene.scene import empty_room
 from xethru_protocol.driver.frames import Lattice
 from xethru_protocol.wire import messages as m
@@ -93,7 +93,7 @@ def transcript(device: InnerDevice, chunk: int = 7) -> list[tuple[int, bytes]]:
 
 
 def test_without_a_plan_every_byte_is_the_same() -> None:
-    assert transcript(wrap(module(), "radar_1")) == transcript(module())
+    assert transcript(FaultyDevice(module(), "radar_1")) == transcript(module())
 
 
 @pytest.mark.parametrize(
@@ -101,14 +101,14 @@ def test_without_a_plan_every_byte_is_the_same() -> None:
 )
 def test_a_fault_that_never_fires_changes_no_byte(kind: str) -> None:
     plan = FaultPlan(fault=(fault_spec(kind, at_s=3600.0),))
-    assert transcript(wrap(module(), "radar_1", plan)) == transcript(module())
+    assert transcript(FaultyDevice(module(), "radar_1", plan)) == transcript(module())
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_one_seed_gives_the_same_bytes(kind: str) -> None:
     plan = FaultPlan(seed=5, fault=(fault_spec(kind, probability=0.5, count=0),))
     truths = TruthLog(), TruthLog()
-    first, second = (transcript(wrap(module(), "radar_1", plan, truth)) for truth in truths)
+    first, second = (transcript(FaultyDevice(module(), "radar_1", plan, truth)) for truth in truths)
     assert first == second
     assert truths[0].records == truths[1].records
 
@@ -116,7 +116,7 @@ def test_one_seed_gives_the_same_bytes(kind: str) -> None:
 def test_another_seed_or_radar_gives_other_bytes() -> None:
     def bytes_of(seed: int, radar: str) -> list[tuple[int, bytes]]:
         fault = fault_spec("flip_bits", packet="frame", probability=0.5, count=0, bits=20)
-        return transcript(wrap(module(), radar, FaultPlan(seed=seed, fault=(fault,))))
+        return transcript(FaultyDevice(module(), radar, FaultPlan(seed=seed, fault=(fault,))))
 
     assert bytes_of(1, "a") != bytes_of(2, "a")
     assert bytes_of(1, "a") != bytes_of(1, "b")
@@ -125,7 +125,7 @@ def test_another_seed_or_radar_gives_other_bytes() -> None:
 def test_a_plan_for_another_radar_changes_nothing() -> None:
     plan = FaultPlan(fault=(fault_spec("silent", radar=["other"]),))
     truth = TruthLog()
-    assert transcript(wrap(module(), "radar_1", plan, truth)) == transcript(module())
+    assert transcript(FaultyDevice(module(), "radar_1", plan, truth)) == transcript(module())
     assert not truth.records
 
 
@@ -140,7 +140,7 @@ def effect_of(kind: Kind, packet: bytes, seed: int) -> Any:  # noqa: ANN401 - of
         lattice=LATTICE,
     )
     effect = cast("Any", kind.effect)
-    return effect(packet, kind.parameters(), Dice(seed), context)
+    return effect(packet, kind.parameters(), Rng(seed), context)
 
 
 @pytest.mark.parametrize("kind", [k for k in KINDS if KINDS[k].target is not Target.MOMENT])
@@ -161,16 +161,16 @@ def test_effects_are_pure_and_take_any_bytes(kind: str, packet: bytes, seed: int
 
 @given(seed=st.integers(0, 2**64 - 1), count=st.integers(1, 1000))
 def test_dice_stay_in_their_range(seed: int, count: int) -> None:
-    dice = Dice(seed)
-    assert 0 <= dice.below(count) < count
-    assert 0 <= dice.uniform() < 1
-    assert abs(dice.normal()) <= 6
+    rng = Rng(seed)
+    assert 0 <= rng.below(count) < count
+    assert 0 <= rng.uniform() < 1
+    assert abs(rng.normal()) <= 6
 
 
 def test_dice_are_fair() -> None:
-    dice = Dice(1)
-    normals = np.array([dice.normal() for _ in range(4000)])
+    rng = Rng(1)
+    normals = np.array([rng.normal() for _ in range(4000)])
     assert abs(normals.mean()) < 4 / 4000**0.5
     assert abs(normals.var() - 1) < 4 * (2 / 4000) ** 0.5
-    counts = np.bincount([dice.below(6) for _ in range(6000)])
+    counts = np.bincount([rng.below(6) for _ in range(6000)])
     assert np.abs(counts - 1000).max() < 4 * (6000 * 5 / 36) ** 0.5

@@ -8,7 +8,7 @@ import pytest
 
 from emulator.scene.wheels import scene_odometry
 from hil_tests.system.short_scene import write_short_scene
-from hil_tests.unit.slam.app.authors_bag import AuthorsBag
+from hil_tests.unit.slam.app.convert.authors_bag import AuthorsBag
 from slam.app.cli import main
 from slam.app.odometry.track import OdometryTrack
 from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, open_loopback, scene_and_config

@@ -14,7 +14,7 @@ import pytest
 from mcap.writer import Writer
 from scipy.io import savemat
 
-from hil_tests.unit.slam.app.authors_bag import authors_bag
+from hil_tests.unit.slam.app.convert.authors_bag import authors_bag
 from hil_tests.unit.slam.app.sessions import session_info, write_session
 from hil_tests.unit.transcripts.test_transcripts import check_transcript
 from slam.app.odometry.track import OdometryTrack

@@ -8,17 +8,17 @@ import pytest
 
 from emulator.faults.kinds import KINDS
 from emulator.faults.plan import (
+    FaultPlan,
     FaultPlanError,
     described,
     example,
     fault_spec,
     load_plan,
-    parse_plan,
-    plan_names,
 )
+from emulator.scene.tables import parse_table, shipped_names
 
 
-@pytest.mark.parametrize("name", plan_names())
+@pytest.mark.parametrize("name", shipped_names("faults"))
 def test_shipped_scenarios_load(name: str) -> None:
     plan = load_plan(name)
     assert plan.description
@@ -26,12 +26,14 @@ def test_shipped_scenarios_load(name: str) -> None:
 
 
 def test_there_are_shipped_scenarios() -> None:
-    assert len(plan_names()) >= 3
+    assert len(shipped_names("faults")) >= 3
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_example_of_every_kind_is_a_scenario(kind: str) -> None:
-    (spec,) = parse_plan(example(KINDS[kind])).fault
+    (spec,) = parse_table(
+        FaultPlan, example(KINDS[kind]), source="scenario", error=FaultPlanError
+    ).fault
     assert spec.kind == kind
     assert spec.kind_parameters() == KINDS[kind].parameters()
 
@@ -70,7 +72,7 @@ def test_every_parameter_has_a_meaning_and_a_limit(kind: str) -> None:
 )
 def test_a_mistake_is_one_line_that_names_the_place(text: str, place: str) -> None:
     with pytest.raises(FaultPlanError) as caught:
-        parse_plan(text)
+        parse_table(FaultPlan, text, source="scenario", error=FaultPlanError)
     assert place in str(caught.value)
     assert "\n" not in str(caught.value).replace(text, "")
     assert str(caught.value).startswith("scenario: ")

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from emulator.chip import Pace
 from emulator.device import Device
-from emulator.module.settings import what_is_heard
+from emulator.module.settings import received_bytes
 from emulator.ports.lines import Line, UartLine, UsbLine
 from emulator.ports.pty import PtyLink
 from emulator.ports.server import Port
@@ -53,21 +53,21 @@ SECOND = 1_000_000_000
 def test_another_rate_hears_what_the_bits_say(
     sent: str, sent_baud: int, read_baud: int, heard: str
 ) -> None:
-    assert what_is_heard(bytes.fromhex(sent), sent_baud, read_baud) == bytes.fromhex(heard)
+    assert received_bytes(bytes.fromhex(sent), sent_baud, read_baud) == bytes.fromhex(heard)
 
 
 @given(st.binary(max_size=60), st.sampled_from([9600, 115200, 921600, 4_000_000]))
 def test_the_same_rate_hears_every_byte(data: bytes, baud: int) -> None:
-    assert what_is_heard(data, baud, baud) == data
+    assert received_bytes(data, baud, baud) == data
     # 1 % off is half a bit in fifty: every middle stays in its bit
-    assert what_is_heard(data, baud, baud * 101 // 100) == data
+    assert received_bytes(data, baud, baud * 101 // 100) == data
 
 
 @given(st.binary(max_size=60), st.integers(600, 10_000_000), st.integers(600, 10_000_000))
 def test_no_receiver_hears_more_than_one_byte_per_falling_edge(
     data: bytes, sent_baud: int, read_baud: int
 ) -> None:
-    heard = what_is_heard(data, sent_baud, read_baud)
+    heard = received_bytes(data, sent_baud, read_baud)
     assert len(heard) <= 5 * len(data), "a character has at most five falling edges"
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from emulator.scene.scene import Scene, SceneError, empty_room, load_scene, scene_names
+from emulator.scene.scene import Scene, SceneError, empty_room, load_scene
+from emulator.scene.tables import shipped_names
 
 RADAR = '[[radars]]\nname = "left"\nserial = "000000000001"\nx_m = 0.0\ny_m = 0.2\nyaw_deg = 90.0\n'
 HEAD = 'name = "mine"\nenvironment = "lab"\ndescription = "a scene"\n'
@@ -37,10 +38,10 @@ def write(tmp_path: Path, text: str) -> Path:
 
 
 def test_the_shipped_scenes_are_known_by_name() -> None:
-    assert {"lab", "classroom", "smoke"} <= set(scene_names())
+    assert {"lab", "classroom", "smoke"} <= set(shipped_names("scenes"))
 
 
-@pytest.mark.parametrize("name", scene_names())
+@pytest.mark.parametrize("name", shipped_names("scenes"))
 def test_every_shipped_scene_loads_under_its_own_name(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from hil_tests.unit.slam.app.authors_bag import (
+from hil_tests.unit.slam.app.convert.authors_bag import (
     N_SCANS,
     START_NS,
     AuthorsBag,

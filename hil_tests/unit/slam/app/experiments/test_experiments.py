@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from emulator.scene.scene import Scene, load_scene
 from hil_tests.paths import FIXTURES, REPOSITORY
-from hil_tests.unit.slam.app.sweep_runs import run_of
+from hil_tests.unit.slam.app.sweep.sweep_runs import run_of
 from slam.app.cli import main
 from slam.app.experiments.figure7 import measure_steps, range_errors
 from slam.app.experiments.filter import Origin, Seen, Setting, drive, outcomes
@@ -31,9 +31,8 @@ from slam.app.run.pictures import picture
 from slam.app.sweep.run import SweepRun, make_case
 from slam.app.sweep.statistics import summarise_groups
 from slam.geometry import paper_rig, transform
-from slam.robust.matching import sure_landmarks
+from slam.robust.association import antennas_of, sides_of, sure_landmarks, view
 from slam.robust.parameters import ContinuationRule, RangeNoise
-from slam.robust.ranges import antennas_of, sides_of, view
 from slam.robust.state import Motion
 
 RANGES_M = (0.6, 0.61, 0.62, 0.9, 0.91, 0.92)
@@ -345,54 +344,49 @@ def runs() -> list[SweepRun]:
     ]
 
 
-def test_consistency_counts_the_times_in_their_bands(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    command = ["experiment", "consistency", "--sweep", written(tmp_path, runs())]
-    assert main([*command, "--out", str(tmp_path / "out")]) == 0
-    numbers = json.loads((tmp_path / "out" / "consistency.json").read_text())
+def numbers_of(name: str, folder: Path) -> dict[str, Any]:
+    """Return what an experiment on the sweep of `runs` writes beside its picture."""
+    command = ["experiment", name, "--sweep", written(folder, runs()), "--out", str(folder / "out")]
+    assert main(command) == 0
+    assert (folder / "out" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    numbers: dict[str, Any] = json.loads((folder / "out" / f"{name}.json").read_text())
+    return numbers
+
+
+def test_consistency_counts_the_times_in_their_bands(tmp_path: Path) -> None:
+    numbers = numbers_of("consistency", tmp_path)
     assert numbers["simulated"] is True
     # the stressed runs are not in it
     assert [
         (row["name"], row["runs"], row["anees_in_band"], row["nis_in_band"])
         for row in numbers["groups"]
     ] == [("lab, preset paper", 4, 8, 9), ("lab, preset robust", 4, 10, 9)]
-    assert (tmp_path / "out" / "consistency.png").read_bytes().startswith(b"\x89PNG")
-    assert "lab, preset robust" in capsys.readouterr().out
 
 
 def test_stress_compares_with_clean_runs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["experiment", "stress", "--sweep", written(tmp_path, runs())]
-    assert main([*command, "--out", str(tmp_path / "out")]) == 0
-    numbers = json.loads((tmp_path / "out" / "stress.json").read_text())
-    times = {row["name"]: row["times_clean"]["median"] for row in numbers["groups"]}
-    assert times == {
+    groups = numbers_of("stress", tmp_path)["groups"]
+    assert {row["name"]: row["times_clean"]["median"] for row in groups} == {
         "lab, preset paper": 1.0,
         "lab, preset paper, stress skew": pytest.approx(3.0),
         "lab, preset robust": 1.0,
         "lab, preset robust, stress skew": pytest.approx(1.5),
     }
-    assert (tmp_path / "out" / "stress.png").read_bytes().startswith(b"\x89PNG")
     assert capsys.readouterr().out.count("x clean") == 4
 
 
 def test_scenes_has_a_row_per_clean_group(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["experiment", "scenes", "--sweep", written(tmp_path, runs())]
-    assert main([*command, "--out", str(tmp_path / "out")]) == 0
-    numbers = json.loads((tmp_path / "out" / "scenes.json").read_text())
     # 10 and 2 mm, where the wheels have 40
     assert [
         (row["name"], row["ratio"], row["anees_mean"], row["anees_in_band"])
-        for row in numbers["groups"]
+        for row in numbers_of("scenes", tmp_path)["groups"]
     ] == [
         ("lab, preset paper", pytest.approx(0.25), pytest.approx(3.35), 8),
         ("lab, preset robust", pytest.approx(0.05), pytest.approx(3.0), 10),
     ]
-    assert (tmp_path / "out" / "scenes.png").read_bytes().startswith(b"\x89PNG")
     assert "0.250" in capsys.readouterr().out
 
 

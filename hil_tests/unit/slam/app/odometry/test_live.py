@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from hil_tests.patience import seconds
-from hil_tests.unit.slam.app.virtual_rig import straight_odometry
+from hil_tests.unit.slam.app.run.virtual_rig import straight_odometry
 from slam.app.errors import OdometryError, UsageError
 from slam.app.odometry.arrival import ClockLine
 from slam.app.odometry.live import (

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from emulator.scene.scene import Scene, load_scene
 from hil_tests.patience import seconds
 from hil_tests.system.short_scene import write_short_scene
-from hil_tests.unit.slam.app.virtual_rig import (
+from hil_tests.unit.slam.app.run.virtual_rig import (
     Timed,
     VirtualInbox,
     Words,

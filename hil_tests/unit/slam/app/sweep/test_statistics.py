@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from emulator.scene.scene import ObjectSpec, Scene, TargetSpec, WallSpec, empty_room
-from hil_tests.unit.slam.app.sweep_runs import run_of
+from hil_tests.unit.slam.app.sweep.sweep_runs import run_of
 from slam.app.run.evaluation import LandmarkSummary
 from slam.app.run.runner import RunRecord
 from slam.app.sweep.bound import BoundSummary

@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 import pytest
 
 from hil_tests.system.short_scene import write_short_scene
-from hil_tests.unit.slam.app.sweep_runs import run_of
+from hil_tests.unit.slam.app.sweep.sweep_runs import run_of
 from slam.app.errors import AppError
 from slam.app.sweep import sweep
 from slam.app.sweep.run import Case, Key, SweepRun, finite, make_case
