@@ -450,17 +450,10 @@ def config_from_tables(
 ) -> SlamConfig:
     """Return the configuration that the tables of a preset file describe.
 
-    Parameters
-    ----------
-    tables
-        The parsed file: one table per part of SlamConfig, and ``environment.<name>`` with the
-        values that differ there.
-    environment
-        "lab" is the top level itself; any other name must have its table, unless the file has
-        none at all and so is the same everywhere. The tables of all environments are checked,
-        whichever is asked for.
-    source
-        What to call the tables in an error message.
+    There is one table per part of SlamConfig, and ``environment.<name>`` with the values that
+    differ there. Environment "lab" is the top level itself; any other must have its table, unless
+    the file has none at all and so is the same everywhere. The tables of all environments are
+    checked, whichever is asked for. ``source`` names the tables in an error message.
     """
     base = {key: value for key, value in tables.items() if key != "environment"}
     overrides = _table(tables.get("environment", {}), "environment", source)

@@ -36,17 +36,8 @@ def associate_times(
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return index pairs of stamps that belong together, each stamp used at most once.
 
-    Parameters
-    ----------
-    estimate_ns, reference_ns
-        shapes (n,) and (m,), strictly increasing [ns].
-    tolerance_ns
-        Largest difference of a pair.
-
-    Returns
-    -------
-    estimate_rows, reference_rows
-        Equal lengths, increasing. Empty where nothing is close enough.
+    Stamps are strictly increasing [ns], those of a pair no farther apart than the tolerance. The
+    rows have equal lengths and increase; empty where nothing is close enough.
     """
     if len(estimate_ns) == 0 or len(reference_ns) == 0:
         return np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp)
@@ -65,19 +56,10 @@ def associate_times(
 
 
 def align_se2(estimate_xy: Array, reference_xy: Array) -> Array:
-    """Return the rigid motion that brings an estimate closest to a reference, point by point.
+    """Return the rigid motion (3,) that brings an estimate closest to a reference, row by row.
 
-    Least squares over rotation and translation, no scale (Umeyama 1991 in the plane).
-
-    Parameters
-    ----------
-    estimate_xy, reference_xy
-        shape (n, 2) each [m], n >= 1; row i of one belongs to row i of the other.
-
-    Returns
-    -------
-    pose
-        shape (3,): ``transform(pose, estimate_xy)`` is the aligned estimate.
+    Least squares over rotation and translation, no scale (Umeyama 1991 in the plane), shapes (n, 2)
+    [m]: ``transform(pose, estimate_xy)`` is the aligned estimate.
     """
     _check_rows(estimate_xy, reference_xy)
     centre_e, centre_r = estimate_xy.mean(axis=0), reference_xy.mean(axis=0)
@@ -139,41 +121,25 @@ def icp_align_se2(estimate_xy: Array, reference_xy: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LandmarkScore:
-    """How a map compares with the landmarks that were there to be found.
+    """How a map compares with the landmarks that were there to be found."""
 
-    Attributes
-    ----------
-    true, estimated, matched
-        Numbers of true landmarks, of estimates, and of one-to-one matches within 0.15 m.
-    precision, recall
-        matched / estimated and matched / true; None where the denominator is 0.
-    duplicates
-        Further estimates within 0.15 m of a matched true landmark.
-    rmse_m
-        RMS distance of the matches; None without any.
-    """
-
+    # Numbers of true landmarks, of estimates, and of one-to-one matches within 0.15 m
     true: int
     estimated: int
     matched: int
+    # matched / estimated and matched / true; None where the denominator is 0
     precision: float | None
     recall: float | None
-    duplicates: int
-    rmse_m: float | None
+    duplicates: int  # further estimates within 0.15 m of a matched true landmark
+    rmse_m: float | None  # RMS distance of the matches; None without any
 
 
 def landmark_metrics(estimated_xy: Array, true_xy: Array, alignment: Array) -> LandmarkScore:
-    """Return how well estimated landmarks match the true ones.
+    """Return how well estimated landmarks (n, 2), map frame, match true ones (m, 2), world frame.
 
-    Parameters
-    ----------
-    estimated_xy
-        shape (n, 2) [m], map frame.
-    true_xy
-        shape (m, 2) [m], world frame: the landmarks that count (``observable_landmarks``).
-    alignment
-        shape (3,), the *trajectory's* alignment (``align_se2`` of its positions). The map is not
-        fitted to the landmarks it is judged by.
+    The true ones are those that count (``observable_landmarks``). ``alignment`` (3,) is the
+    *trajectory's* (``align_se2`` of its positions): the map is not fitted to the landmarks it is
+    judged by.
     """
     n, m = len(estimated_xy), len(true_xy)
     if n and m:
@@ -203,17 +169,10 @@ def landmark_metrics(estimated_xy: Array, true_xy: Array, alignment: Array) -> L
 def nees_pose(estimate: Array, covariance: Array, truth: Array) -> float:
     """Return the normalised estimation error squared of a pose (3 dof), not aligned.
 
-    ``e^T P^-1 e`` with the pseudo-inverse where P is singular, as it is after a turn on the spot
-    from a perfect start under proportional noise: a direction without variance adds nothing if
-    the error in it is rounding, and makes the result inf if not, the limit of a vanishing
-    variance. Then fewer than 3 degrees of freedom take part.
-
-    Parameters
-    ----------
-    estimate, truth
-        shape (3,) each, both in the start frame; the heading difference is wrapped.
-    covariance
-        shape (3, 3), symmetric, positive semidefinite.
+    ``e^T P^-1 e``, both poses in the start frame, with the pseudo-inverse where P is singular, as
+    it is after a turn on the spot from a perfect start under proportional noise: a direction
+    without variance adds nothing if the error in it is rounding, and makes the result inf if not,
+    the limit of a vanishing variance. Then fewer than 3 degrees of freedom take part.
     """
     error = np.array(
         [estimate[0] - truth[0], estimate[1] - truth[1], wrap_angle(estimate[2] - truth[2])]

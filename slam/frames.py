@@ -15,35 +15,20 @@ from slam.geometry import Rig
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RadarFrame:
-    """One raw RF frame of one radar, with everything a front end needs to turn bins into metres.
+    """One raw RF frame of one radar, with everything a front end needs to turn bins into metres."""
 
-    Attributes
-    ----------
-    radar
-        Index of the radar's mount in the rig.
-    t_ns
-        Session time at which this radar really took the frame, int64 nanoseconds; radars are not
-        synchronised, so those of one scan differ.
-    counter
-        Frame counter of the module; gaps show lost frames.
-    samples
-        shape (n_bins,), float32, signed normalised RF amplitude.
-    range_start_m
-        Range label of sample 0 in *true* metres (light at 299 792 458 m/s), before the mount's
-        own ``range_offset_m`` is removed.
-    bin_length_m
-        Spacing of the samples in true metres.
-    limits
-        Smallest and largest value the module's sampler can give, normalised RF amplitude; a
-        sample at one of them was cut off there. None where nobody knows.
-    """
-
-    radar: int
+    radar: int  # index of the radar's mount in the rig
+    # Session time at which this radar really took the frame, int64 nanoseconds; radars are not
+    # synchronised, so those of one scan differ
     t_ns: int
-    counter: int
-    samples: NDArray[np.float32]
+    counter: int  # frame counter of the module; gaps show lost frames
+    samples: NDArray[np.float32]  # shape (n_bins,), float32, signed normalised RF amplitude
+    # Range label of sample 0 in *true* metres (light at 299 792 458 m/s), before the mount's own
+    # ``range_offset_m`` is removed
     range_start_m: float
-    bin_length_m: float
+    bin_length_m: float  # spacing of the samples in true metres
+    # Smallest and largest value the module's sampler can give, normalised RF amplitude; a sample at
+    # one of them was cut off there. None where nobody knows.
     limits: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
@@ -62,37 +47,21 @@ _LIMIT_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Detection:
-    """One echo seen by one radar: a range without a direction.
+    """One echo seen by one radar: a range without a direction."""
 
-    Attributes
-    ----------
-    radar
-        Index of the mount.
-    t_ns
-        Session time of the frame.
-    range_m
-        True metres from the antenna, the mount's range offset removed.
-    amplitude
-        Normalised RF units: of the pulse, or of the smoothed peak under the paper's front end.
-    phase_rad
-        Carrier phase of the echo at ``range_m``, in [-pi, pi]; NaN where the front end has none.
-    sigma_m
-        Predicted standard deviation of ``range_m``; NaN where the front end predicts none.
-    misfit
-        Energy near the peak that the fitted pulse leaves over what noise would leave: about 1
-        for one pulse alone; NaN where the front end fits none.
-    saturated
-        Whether samples of the echo lay at a limit of the module's sampler.
-    """
-
-    radar: int
-    t_ns: int
-    range_m: float
+    radar: int  # index of the mount
+    t_ns: int  # session time of the frame
+    range_m: float  # true metres from the antenna, the mount's range offset removed
+    # Normalised RF units: of the pulse, or of the smoothed peak under the paper's front end
     amplitude: float
+    # Carrier phase of the echo at ``range_m``, in [-pi, pi]; NaN where the front end has none
     phase_rad: float = math.nan
+    # Predicted standard deviation of ``range_m``; NaN where the front end predicts none
     sigma_m: float = math.nan
+    # Energy near the peak that the fitted pulse leaves over what noise would leave: about 1 for one
+    # pulse alone; NaN where the front end fits none
     misfit: float = math.nan
-    saturated: bool = False
+    saturated: bool = False  # whether samples of the echo lay at a limit of the module's sampler
 
 
 class Detector(Protocol):

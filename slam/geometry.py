@@ -82,28 +82,17 @@ def transform(pose: Array, points: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mount:
-    """Where one radar sits on the robot and how its range zero is off.
+    """Where one radar sits on the robot and how its range zero is off."""
 
-    Attributes
-    ----------
-    name
-        The radar's name in messages.
-    x_m, y_m
-        Antenna position in the body frame.
-    yaw_rad
-        Boresight in the body frame, counter-clockwise from forward.
-    range_offset_m
-        What this module measures too long; the front end subtracts it from every range.
-    phase_offset_rad
-        What this module and its antennas add to an echo's carrier phase. Rig files and sessions
-        keep it; SLAM does not use it.
-    """
-
-    name: str
+    name: str  # the radar's name in messages
+    # Antenna position in the body frame
     x_m: float
     y_m: float
-    yaw_rad: float
+    yaw_rad: float  # boresight in the body frame, counter-clockwise from forward
+    # What this module measures too long; the front end subtracts it from every range
     range_offset_m: float = 0.0
+    # What this module and its antennas add to an echo's carrier phase. Rig files and sessions keep
+    # it; SLAM does not use it.
     phase_offset_rad: float = 0.0
 
 
@@ -130,28 +119,19 @@ class RadarPair:
     ``first`` and ``second`` are mount indices; in the pairs of a rig they are ordered so that the
     boresight lies to the left of the base from first to second. On the paper's left side first is
     the rear radar, on its right side the front one: a rotation by pi, not a mirror image.
-
-    Attributes
-    ----------
-    baseline_m
-        Distance of the two antennas, d of the paper.
-    midpoint
-        shape (2,) [m], body frame: middle of the base.
-    along, ahead
-        shape (2,) each, unit vectors, body frame: along the base from first to second, and
-        square to it on the side of the boresight.
-    boresights_rad
-        Angle of each boresight, of the first and of the second radar, from ``along`` towards
-        ``ahead``, in [-pi/2, 3 pi/2); pi/2 in the paper's rig. They differ only where the two
-        sampled at different times while the robot turned.
     """
 
     first: int
     second: int
-    baseline_m: float
-    midpoint: Array
+    baseline_m: float  # distance of the two antennas, d of the paper
+    midpoint: Array  # shape (2,) [m], body frame: middle of the base
+    # shape (2,) each, unit vectors, body frame: along the base from first to second, and square to
+    # it on the side of the boresight
     along: Array
     ahead: Array
+    # Angle of each boresight, of the first and of the second radar, from ``along`` towards
+    # ``ahead``, in [-pi/2, 3 pi/2); pi/2 in the paper's rig. They differ only where the two sampled
+    # at different times while the robot turned.
     boresights_rad: tuple[float, float]
 
 

@@ -13,19 +13,10 @@ from slam.robust.pipeline import RobustSlam
 def make_slam(
     config: SlamConfig, rig: Rig, wheels: WheelNoise, detector: Detector | None = None
 ) -> Slam:
-    """Return the pipeline that a configuration names.
+    """Return the pipeline that ``config.back_end`` names.
 
-    Parameters
-    ----------
-    config
-        ``back_end`` decides.
-    rig
-        Where the radars sit.
-    wheels
-        How the robot's odometry errs, as its specification says; preset ``paper`` has numbers of
-        its own.
-    detector
-        The front end, if not the one that the configuration names.
+    ``wheels`` is the robot's odometry noise; preset ``paper`` has numbers of its own. ``detector``
+    replaces the front end that the configuration names.
     """
     if config.back_end is BackEnd.ROBUST:
         return RobustSlam(config, rig, wheels, detector)

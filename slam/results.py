@@ -25,47 +25,30 @@ PoseAt = Callable[[int], Array]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fix:
-    """One trilaterated point, seen once.
+    """One trilaterated point, seen once."""
 
-    Attributes
-    ----------
-    pair
-        Index into ``Rig.pairs()``.
-    t_ns
-        Session time of the pose in whose body frame the position is given; the two detections
-        keep their own times.
-    x_m, y_m
-        Position in that body frame.
-    detections
-        The two ranges it was made of, first and second radar of the pair.
-    """
-
-    pair: int
+    pair: int  # index into ``Rig.pairs()``
+    # Session time of the pose in whose body frame the position is given; the two detections keep
+    # their own times
     t_ns: int
+    # Position in that body frame
     x_m: float
     y_m: float
+    # The two ranges it was made of, first and second radar of the pair
     detections: tuple[Detection, Detection]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Observation:
-    """A confirmed point, as the filter gets it: range and bearing from the base footprint.
+    """A confirmed point, as the filter gets it: range and bearing from the base footprint."""
 
-    Attributes
-    ----------
-    x_m, y_m
-        Position in the body frame of the window's first pose.
-    n_fixes, n_poses
-        How many fixes, from how many poses, the confirming cluster holds.
-    fixes
-        The fixes whose mean this is.
-    """
-
+    # Position in the body frame of the window's first pose
     x_m: float
     y_m: float
+    # How many fixes, from how many poses, the confirming cluster holds
     n_fixes: int
     n_poses: int
-    fixes: tuple[Fix, ...]
+    fixes: tuple[Fix, ...]  # the fixes whose mean this is
 
     @property
     def range_m(self) -> float:
@@ -83,24 +66,13 @@ def landmark_slice(row: int) -> slice:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Belief:
-    """What the filter knows: a Gaussian over pose and landmarks.
+    """What the filter knows: a Gaussian over pose and landmarks."""
 
-    Attributes
-    ----------
-    mean
-        shape (3 + 2 n,), [m, m, rad, m, m, ...], map frame; the heading lies in [-pi, pi).
-    covariance
-        shape (3 + 2 n, 3 + 2 n), symmetric.
-    landmark_ids
-        n ids in the order of the rows.
-    next_id
-        The id the next new landmark gets; ids are never used twice.
-    """
-
+    # shape (3 + 2 n,), [m, m, rad, m, m, ...], map frame; the heading lies in [-pi, pi)
     mean: Array
-    covariance: Array
-    landmark_ids: tuple[int, ...] = ()
-    next_id: int = 0
+    covariance: Array  # shape (3 + 2 n, 3 + 2 n), symmetric
+    landmark_ids: tuple[int, ...] = ()  # n ids in the order of the rows
+    next_id: int = 0  # the id the next new landmark gets; ids are never used twice
 
     def __post_init__(self) -> None:
         """Check the shapes and make the fields read-only views.
@@ -140,25 +112,14 @@ class Belief:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Association:
-    """What became of one observation.
+    """What became of one observation."""
 
-    Attributes
-    ----------
-    landmark_id
-        The landmark it updated, or the one born from it.
-    is_new
-        True if the landmark was born from this observation.
-    mahalanobis_sq
-        shape (n,): squared distance to every landmark of the map before this observation, before
-        any gate; inf for one under the robot's own position. Two degrees of freedom.
-    candidate_ids
-        n landmark ids belonging to ``mahalanobis_sq``.
-    """
-
-    landmark_id: int
-    is_new: bool
+    landmark_id: int  # the landmark it updated, or the one born from it
+    is_new: bool  # true if the landmark was born from this observation
+    # shape (n,): squared distance to every landmark of the map before this observation, before any
+    # gate; inf for one under the robot's own position. Two degrees of freedom.
     mahalanobis_sq: Array
-    candidate_ids: tuple[int, ...]
+    candidate_ids: tuple[int, ...]  # n landmark ids belonging to ``mahalanobis_sq``
 
     @property
     def nis(self) -> float | None:
@@ -180,86 +141,53 @@ class MapLandmark:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MapWall:
-    """One wall of the map: the line n . x = d, n = [cos phi, sin phi], and its known parts.
+    """One wall of the map: the line n . x = d, n = [cos phi, sin phi], and its known parts."""
 
-    Attributes
-    ----------
-    hits
-        The frames that hit it.
-    phi_rad, d_m
-        Direction of its normal, away from the robot, and distance along it from the origin.
-    covariance
-        shape (2, 2), of (phi, d), additive errors.
-    spans_m
-        shape (k, 2, 2): ends of the stretches that answered, map frame [m].
-    """
-
+    # Direction of its normal, away from the robot, and distance along it from the origin
     phi_rad: float
     d_m: float
-    covariance: Array
-    spans_m: Array
-    hits: int
+    covariance: Array  # shape (2, 2), of (phi, d), additive errors
+    spans_m: Array  # shape (k, 2, 2): ends of the stretches that answered, map frame [m]
+    hits: int  # the frames that hit it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictedRange:
-    """A range that could have continued a track, as predicted before any was looked at.
+    """A range that could have continued a track, as predicted before any was looked at."""
 
-    Attributes
-    ----------
-    radar, landmark_id
-        Whose range of what.
-    range_m, variance
-        Prediction, and its variance [m^2] from pose, map and offsets; the noise of the range
-        itself comes on top.
-    antenna_m, point_m
-        Body frame of the pose, x and y [m]: where the antenna was when it sampled, and where the
-        landmark is believed to be.
-    """
-
+    # Whose range of what
     radar: int
     landmark_id: int
+    # Prediction, and its variance [m^2] from pose, map and offsets; the noise of the range itself
+    # comes on top
     range_m: float
     variance: float
+    # Body frame of the pose, x and y [m]: where the antenna was when it sampled, and where the
+    # landmark is believed to be
     antenna_m: tuple[float, float]
     point_m: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UpdateReport:
-    """What became of the ranges of one time.
+    """What became of the ranges of one time."""
 
-    Attributes
-    ----------
-    continued
-        (radar, index of the range in its scan, landmark id).
-    initialised, seen_again
-        Ids of landmarks that tracklets made, or were recognised as.
-    merged
-        (kept, gone) ids.
-    deleted
-        Ids.
-    nis, dof
-        Normalised innovation squared of the ranges that continued tracks, before Huber's weights,
-        and its degrees of freedom.
-    relinearised
-        Whether all poses were solved for.
-    predicted
-        Every range of a landmark, not of walls, that took part, measured or not.
-    carried, lost, relocated
-        Whether a kidnapping was detected now; whether the place on the map is unknown, so that pose
-        and covariance say nothing but that; whether the place was found again now.
-    """
-
+    # (radar, index of the range in its scan, landmark id)
     continued: tuple[tuple[int, int, int], ...]
+    # Ids of landmarks that tracklets made, or were recognised as
     initialised: tuple[int, ...]
     seen_again: tuple[int, ...]
-    merged: tuple[tuple[int, int], ...]
-    deleted: tuple[int, ...]
+    merged: tuple[tuple[int, int], ...]  # (kept, gone) ids
+    deleted: tuple[int, ...]  # ids
+    # Normalised innovation squared of the ranges that continued tracks, before Huber's weights, and
+    # its degrees of freedom
     nis: float
     dof: int
-    relinearised: bool
+    relinearised: bool  # whether all poses were solved for
+    # Every range of a landmark, not of walls, that took part, measured or not
     predicted: tuple[PredictedRange, ...] = ()
+    # Whether a kidnapping was detected now; whether the place on the map is unknown, so that pose
+    # and covariance say nothing but that; whether the place was found again now
     carried: bool = False
     lost: bool = False
     relocated: bool = False
@@ -267,37 +195,22 @@ class UpdateReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StepResult:
-    """One estimated state, and all that led to it.
+    """One estimated state, and all that led to it."""
 
-    Attributes
-    ----------
-    t_ns
-        Session time of the state; under the paper's window - 1 states before the newest one.
-    odometry_pose
-        shape (3,), odometry frame.
-    belief
-        Pose and landmarks after this state's observations, map frame.
-    detections, fixes
-        Ranges and trilaterated points of this state.
-    observations, associations
-        Points that passed the outlier filter, and what became of each.
-    rejected
-        Fixes of this state that no cluster confirmed.
-    report
-        Of the robust back end, which has no fixes nor observations.
-    range_sigmas_m
-        Standard deviation of every detection in the robust back end; infinite for one left out.
-    """
-
+    # Session time of the state; under the paper's window - 1 states before the newest one
     t_ns: int
-    odometry_pose: Array
-    belief: Belief
+    odometry_pose: Array  # shape (3,), odometry frame
+    belief: Belief  # pose and landmarks after this state's observations, map frame
+    # Ranges and trilaterated points of this state
     detections: tuple[Detection, ...]
     fixes: tuple[Fix, ...] = ()
+    # Points that passed the outlier filter, and what became of each
     observations: tuple[Observation, ...] = ()
     associations: tuple[Association, ...] = ()
-    rejected: tuple[Fix, ...] = ()
+    rejected: tuple[Fix, ...] = ()  # fixes of this state that no cluster confirmed
+    # Of the robust back end, which has no fixes nor observations
     report: UpdateReport | None = None
+    # Standard deviation of every detection in the robust back end; infinite for one left out
     range_sigmas_m: tuple[float, ...] = ()
 
     @property

@@ -17,7 +17,7 @@ curvature rad/m]; and for each radar its range offset [m] and mount position x, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -36,8 +36,8 @@ class Term(Protocol):
     """One group of residuals of one kind."""
 
     @property
-    def kernel(self) -> Kernel:
-        """The cost of a residual."""
+    def cauchy_scale(self) -> float | None:
+        """Residual, in standard deviations, with half the weight; None for least squares."""
 
     def residuals(self, state: Array) -> Array:
         """Return the whitened residuals, shape (m,)."""
@@ -46,40 +46,21 @@ class Term(Protocol):
         """Return their derivatives, shape (m, n_state)."""
 
 
-class Kernel(Protocol):
-    """The cost of a whitened residual and the weight it gets in the normal equations."""
-
-    def costs(self, residuals: Array) -> Array:
-        """Return the cost of each residual; half its square where nothing is robust."""
-
-    def weights(self, residuals: Array) -> Array:
-        """Return the derivative of the cost by half the square, in [0, 1]."""
+CAUCHY_SCALE = 2.385
+"""Scale of a robust term that keeps 95 % of the efficiency under Gaussian noise."""
 
 
-class Square:
-    """Least squares: for Gaussian noise without outliers."""
-
-    def costs(self, residuals: Array) -> Array:
+def _costs(residuals: Array, scale: float | None) -> Array:
+    """Return c^2 / 2 ln(1 + r^2 / c^2), Cauchy's cost for the scale c; r^2 / 2 without one."""
+    if scale is None:
         return residuals**2 / 2
+    result: Array = scale**2 / 2 * np.log1p((residuals / scale) ** 2)
+    return result
 
-    def weights(self, residuals: Array) -> Array:
-        return np.ones_like(residuals)
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Cauchy:
-    """Lorentzian cost: an outlier pulls the less the farther it is off."""
-
-    # Residual, in standard deviations, at which the weight is one half; 2.385 keeps 95 % of the
-    # efficiency under Gaussian noise
-    scale: float = 2.385
-
-    def costs(self, residuals: Array) -> Array:
-        result: Array = self.scale**2 / 2 * np.log1p((residuals / self.scale) ** 2)
-        return result
-
-    def weights(self, residuals: Array) -> Array:
-        return 1 / (1 + (residuals / self.scale) ** 2)
+def _weights(residuals: Array, scale: float | None) -> Array:
+    """Return the derivative of the cost by half the square, in [0, 1]."""
+    return np.ones_like(residuals) if scale is None else 1 / (1 + (residuals / scale) ** 2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,7 +149,7 @@ def minimise(start: Array, terms: Sequence[Term], damping: Damping | None = None
 
 def _cost(terms: Sequence[Term], state: Array) -> float:
     with np.errstate(over="ignore", invalid="ignore"):  # a wild trial step is refused anyway
-        return float(sum(term.kernel.costs(term.residuals(state)).sum() for term in terms))
+        return float(sum(_costs(term.residuals(state), term.cauchy_scale).sum() for term in terms))
 
 
 def _normal_equations(terms: Sequence[Term], state: Array) -> tuple[csc_array[np.float64], Array]:
@@ -177,7 +158,7 @@ def _normal_equations(terms: Sequence[Term], state: Array) -> tuple[csc_array[np
     for term in terms:
         residuals = term.residuals(state)
         jacobian = term.jacobian(state)
-        weights = term.kernel.weights(residuals)
+        weights = _weights(residuals, term.cauchy_scale)
         weighted = diags_array(weights, format="csr") @ jacobian
         information = csc_array(information + jacobian.T @ weighted)
         gradient += np.asarray(weighted.T @ residuals)
@@ -241,7 +222,7 @@ class PriorTerm:
     indices: Indices
     means: Array
     sigmas: Array
-    kernel: Kernel = field(default_factory=Square)
+    cauchy_scale: float | None = None
 
     def residuals(self, state: Array) -> Array:
         return (state[self.indices] - self.means) / self.sigmas
@@ -264,7 +245,7 @@ class OdometryTerm:
     layout: Layout
     steps: Array  # shape (n_poses - 1, 3): reported ux [m], uy [m], ua [rad]
     sigmas: Array  # shape (n_poses - 1, 3), standard deviations in the same units
-    kernel: Kernel = field(default_factory=Square)
+    cauchy_scale: float | None = None
 
     def residuals(self, state: Array) -> Array:
         dx, dy, turn, *_ = self._motion(state)
@@ -344,7 +325,7 @@ class RangeTerm:
     # Shape (m,), true metres, no offset removed; and its standard deviation
     range_m: Array
     sigma_m: Array
-    kernel: Kernel = field(default_factory=Square)
+    cauchy_scale: float | None = None
 
     def residuals(self, state: Array) -> Array:
         _, _, distance, _, _ = self._sight(state)

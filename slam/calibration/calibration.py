@@ -18,15 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.calibration.batch import (
-    Cauchy,
+    CAUCHY_SCALE,
     Damping,
-    Kernel,
     Layout,
     OdometryTerm,
     PriorTerm,
     RangeTerm,
     Solution,
-    Square,
     Term,
     minimise,
 )
@@ -214,7 +212,7 @@ class _Estimator:
             gates = np.clip(_GATE_SIGMAS * self._sigmas(), _LEAST_GATE_M, _GATES_M[-1])
             landmark = self._assign(model, landmark, gates)
             model, landmark = self._without_poor(model, landmark)
-            model, solution = self._solve(model, landmark, Square(), Damping())
+            model, solution = self._solve(model, landmark, None, Damping())
         return self._result(model, landmark, solution)
 
     def _growing(self) -> tuple[_Model, Indices]:
@@ -293,7 +291,7 @@ class _Estimator:
 
     def _solved_and_merged(self, model: _Model, landmark: Indices) -> tuple[_Model, Indices]:
         while True:
-            model, solution = self._solve(model, landmark, Cauchy(), _ROUGH)
+            model, solution = self._solve(model, landmark, CAUCHY_SCALE, _ROUGH)
             pair = self._same_landmark(model, landmark, solution)
             if pair is None:
                 return model, landmark
@@ -337,10 +335,10 @@ class _Estimator:
         )
 
     def _solve(
-        self, model: _Model, landmark: Indices, kernel: Kernel, damping: Damping
+        self, model: _Model, landmark: Indices, cauchy_scale: float | None, damping: Damping
     ) -> tuple[_Model, Solution]:
         layout = self._layout(model)
-        term = self._range_term(layout, landmark, kernel)
+        term = self._range_term(layout, landmark, cauchy_scale)
         solution = minimise(model.state(), [*self._fixed_terms(layout), term], damping)
         state = solution.state
         self._learn_sigma(np.abs(term.residuals(state)) * term.sigma_m, landmark != UNASSIGNED)
@@ -362,7 +360,9 @@ class _Estimator:
             # the median of |N(0, 1)| is 0.6745
             self._sigma_scale = float(np.median(errors_m[clean] / told[clean])) / 0.6745
 
-    def _range_term(self, layout: Layout, landmark: Indices, kernel: Kernel) -> RangeTerm:
+    def _range_term(
+        self, layout: Layout, landmark: Indices, cauchy_scale: float | None
+    ) -> RangeTerm:
         rows = np.flatnonzero(landmark != UNASSIGNED)
         ranges = self._drive.ranges
         pose, fraction = self._drive.path.between(ranges.t_ns[rows])
@@ -374,7 +374,7 @@ class _Estimator:
             radar=ranges.radar[rows],
             range_m=ranges.range_m[rows],
             sigma_m=self._sigmas()[rows],
-            kernel=kernel,
+            cauchy_scale=cauchy_scale,
         )
 
     def _fixed_terms(self, layout: Layout) -> Sequence[Term]:
@@ -413,7 +413,7 @@ class _Estimator:
 
     def _result(self, model: _Model, landmark: Indices, solution: Solution) -> Calibration:
         layout = self._layout(model)
-        term = self._range_term(layout, landmark, Square())
+        term = self._range_term(layout, landmark, None)
         used = term.residuals(solution.state) * term.sigma_m
         return Calibration(
             offsets_m=model.radars[:, 0],

@@ -178,19 +178,11 @@ class _Following:
 
 
 def place(sights: Array, range_m: Array) -> tuple[Array, Array] | None:
-    """Find the still point in front of a moving radar that explains its ranges.
+    """Return the still point that explains the ranges of a moving radar, and its covariance.
 
-    Parameters
-    ----------
-    sights
-        Shape (m, 3): antenna x, y [m] and boresight [rad] at each range.
-    range_m
-        Shape (m,); all share one unknown offset, 30 mm (1 sigma).
-
-    Returns
-    -------
-    Point, shape (2,), and covariance, shape (2, 2); None where no point fits, or where the motion
-    leaves it open along an arc.
+    ``sights`` (m, 3): antenna x, y [m] and boresight [rad] at each range; the ranges (m,) share one
+    unknown offset, 30 mm (1 sigma). None where no point fits, or where the motion leaves it open
+    along an arc.
     """
     middle = len(range_m) // 2
     bearing = sights[middle, 2] + np.linspace(-HALF_VIEW_RAD, HALF_VIEW_RAD, 61)
@@ -304,23 +296,11 @@ def assign(
 ) -> Assignment:
     """Give each range the one landmark whose predicted range it meets.
 
-    A range is left alone where two landmarks would meet it, and where another echo overlaps so
-    much that it bends the peak by more than 4 mm. A landmark takes one range per frame.
-
-    Parameters
-    ----------
-    ranges
-        All ranges, n.
-    sights
-        Shape (n, 3): antenna x, y [m] and boresight [rad] at each range, map frame.
-    offset_m
-        Shape (n,): the range offset of each range's radar.
-    landmarks_m
-        Shape (k, 2), map frame.
-    gate_m
-        Shape (n,): largest difference.
-    strengths
-        Shape (k,): amplitude of each landmark's echo on boresight at 1 m, in any unit.
+    A range is left alone where two landmarks would meet it, and where another echo overlaps so much
+    that it bends the peak by more than 4 mm. A landmark takes one range per frame. ``sights`` (n,
+    3): antenna x, y [m] and boresight [rad] at each range, map frame; ``offset_m`` and ``gate_m``
+    (n,): the radar's offset and the largest difference; ``strengths`` (k,) of the landmarks, see
+    there.
     """
     nobody = np.full(len(ranges), UNASSIGNED, dtype=np.intp)
     if not len(landmarks_m) or not len(ranges):

@@ -243,18 +243,9 @@ def saturated_pulses(position_bins: Array, filtered: Filtered) -> BoolArray:
 
 
 def refit(peaks: Peaks, again: BoolArray, filtered: Filtered, split: SplitTest) -> Peaks:
-    """Return the peaks with the marked ones, and those that overlap with them, fitted anew.
+    """Return the peaks with those ``again`` (k,), and those that overlap with them, fitted anew.
 
-    Parameters
-    ----------
-    peaks
-        As if each were a single pulse.
-    again
-        shape (k,), which of them are fitted anew.
-    filtered
-        The frame they come from.
-    split
-        When one more echo is accepted; ``max_echoes`` 1 leaves each peak one echo.
+    Before, each is as if it were a single pulse. ``split.max_echoes`` 1 leaves each peak one echo.
     """
     pulse_filter = filtered.pulse_filter
     table = np.column_stack(

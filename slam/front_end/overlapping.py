@@ -96,14 +96,8 @@ class State(NamedTuple):
 class Solver:
     """Positions of K echoes by Levenberg-Marquardt, kept in the window and apart.
 
-    Parameters
-    ----------
-    sigma
-        Standard deviation of the envelope, in bins.
-    first, last
-        Least and largest position, in bins.
-    separation
-        Least distance of two positions, in bins.
+    ``sigma`` is that of the envelope, ``first`` and ``last`` are the limits of a position, and
+    ``separation`` is the least distance of two positions, all in bins.
     """
 
     def __init__(self, sigma: float, first: float, last: float, separation: float) -> None:
@@ -113,18 +107,10 @@ class Solver:
         self._last = last
 
     def fit(self, data: Window, starts: Array, tolerance: float) -> State:
-        """Return the best fit over some starts, one row.
+        """Return the best fit over some starts (n_starts, K), ascending positions; one row.
 
-        Its ``sse`` is infinite if the positions are never apart enough.
-
-        Parameters
-        ----------
-        data
-            The window.
-        starts
-            Shape (n_starts, K): ascending positions.
-        tolerance
-            A gain of twice the log-likelihood too small to go on.
+        Its ``sse`` is infinite if the positions are never apart enough. The search ends where twice
+        the log-likelihood gains less than ``tolerance``.
         """
         fitted = evaluate(data, starts, self.sigma)
         fitted.sse[~self._apart(fitted.positions)] = math.inf
@@ -313,20 +299,10 @@ def fit_echoes(
 ) -> tuple[EchoFit, ...]:
     """Return the echoes of a window, nearest first, between one and ``split.max_echoes``.
 
-    Parameters
-    ----------
-    samples
-        Shape (n,), float64: raw samples. About 3.5 envelope sigmas either side of the cluster.
-    pulse
-        The pulse.
-    noise_sigma
-        Standard deviation of a sample's noise, > 0.
-    usable
-        Shape (n,): false where a sample is unknown (clipped, outside the frame). All, if None.
-    search_bins
-        Least and largest position of an echo, in bins; 1.5 envelope sigmas off the ends, if None.
-    split
-        When one more echo is accepted; `SplitTest()`, if None.
+    ``samples`` (n,) are raw, about 3.5 envelope sigmas either side of the cluster, with noise of
+    standard deviation ``noise_sigma`` > 0; ``usable`` (n,) is false where one is unknown (clipped,
+    outside the frame). Echoes are looked for between the positions ``search_bins``, or 1.5 envelope
+    sigmas off the ends.
     """
     split = split or SplitTest()
     n_bins = len(samples)
@@ -426,16 +402,8 @@ _TAYLOR = np.linalg.inv(np.vander(_WINDOW - REACH_STEPS, increasing=True)).T + 0
 class Correlation:
     """z of a stretch of one frame, a polynomial around each of its steps.
 
-    Parameters
-    ----------
-    z
-        Shape (n,), complex: the filter's output with the carrier turned back.
-    step_bins
-        Bins from one value to the next.
-    sigma_bins
-        s, of the envelope.
-    sigma_y
-        Standard deviation of the noise of z, per quadrature.
+    ``z`` (n,), complex, is the filter's output with the carrier turned back, ``step_bins`` apart;
+    ``sigma_bins`` is s of the envelope, ``sigma_y`` the noise of z per quadrature.
     """
 
     def __init__(
@@ -514,21 +482,10 @@ class _Fit:
 def fit_whole_echoes(
     data: Correlation, first: float, last: float, split: SplitTest
 ) -> tuple[EchoFit, ...]:
-    """Return the echoes between two positions, at least one and at most ``split.max_echoes``.
+    """Return the echoes between two positions [bins], between one and ``split.max_echoes``.
 
-    Parameters
-    ----------
-    data
-        z around them, all other echoes of the frame subtracted.
-    first, last
-        Least and largest position [bins].
-    split
-        When one more echo is accepted.
-
-    Returns
-    -------
-    Nearest first, positions counted in bins from ``z[0]``, phases at the positions with the carrier
-    turned back.
+    ``data`` is z around them, all other echoes of the frame subtracted. Nearest first, positions
+    counted in bins from ``z[0]``, phases at the positions with the carrier turned back.
     """
     s = data.sigma_bins
     grid, z = data.on_steps(first, last)

@@ -76,19 +76,10 @@ class PulseModel:
         return math.ceil(_HALF_LENGTH_SIGMAS * self.sigma_bins(bin_length_m))
 
     def samples(self, offset_bins: Array, bin_length_m: float) -> ComplexArray:
-        """Return pulses of amplitude 1 and phase 0, sampled around their nearest bins.
+        """Return pulses of amplitude 1 and phase 0, shape (k, 2 half_length + 1).
 
-        Parameters
-        ----------
-        offset_bins
-            shape (k,): where each pulse lies from its nearest bin, -0.5 ... 0.5.
-        bin_length_m
-            Spacing of the samples, true metres.
-
-        Returns
-        -------
-        shape (k, 2 half_length + 1), the nearest bin in the middle. The real part of a row times
-        ``A exp(j phi)`` is the RF pulse.
+        ``offset_bins`` (k,) is the place of each from its nearest bin, -0.5 ... 0.5, which is in
+        the middle of its row. The real part of a row times ``A exp(j phi)`` is the RF pulse.
         """
         half = self.half_length(bin_length_m)
         x = np.arange(-half, half + 1) - np.asarray(offset_bins, dtype=np.float64)[:, np.newaxis]

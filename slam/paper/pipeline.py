@@ -46,16 +46,10 @@ class UwbRadarSlam:
     ) -> tuple[StepResult, ...]:
         """Take in the frames and odometry around one time; return the state now ready, if any.
 
-        Parameters
-        ----------
-        frames
-            At most one frame per radar, each with the time it was taken at; a radar whose frame was
-            lost is absent.
-        pose_at
-            Odometry; asked for the pose at ``t_ns`` and, where ``trilateration.sample_time`` is
-            "own", at the time of every frame with an echo.
-        t_ns
-            Session time of the state.
+        There is at most one frame per radar, each with the time it was taken at; a radar whose
+        frame was lost is absent. ``pose_at`` is asked for the pose at ``t_ns``, the time of the
+        state, and, where ``trilateration.sample_time`` is "own", at the time of every frame with an
+        echo.
         """
         detect = partial(detect_all, self._detector, frames, self.rig)
         return self._take(detect, pose_at, t_ns)

@@ -49,22 +49,9 @@ def bilaterate(
     to the point is less than theta / 2 off its boresight; for a boresight square to the base that
     is exactly alpha > gamma and beta > gamma.
 
-    Parameters
-    ----------
-    first_m, second_m
-        shape (n,) each, ranges from the first and the second antenna of the pair [m].
-    pair
-        The two mounts, each at the time of its sample.
-    field_of_view_rad
-        Opening angle theta of one radar.
-
-    Returns
-    -------
-    xy
-        shape (n, 2) [m], body frame; NaN where the circles do not meet.
-    accepted
-        shape (n,), True where the circles meet inside both fields of view. Ranges that are
-        negative, zero, not finite or beyond 1e150 m are never accepted.
+    Returns positions (n, 2) [m], body frame, NaN where the circles do not meet; and whether they
+    meet inside both fields of view (n,), never for ranges that are negative, zero, not finite or
+    beyond 1e150 m.
     """
     l1, l2 = np.asarray(first_m, dtype=np.float64), np.asarray(second_m, dtype=np.float64)
     d = pair.baseline_m

@@ -11,6 +11,21 @@ from numpy.typing import NDArray
 
 from slam.geometry import Rig
 from slam.results import MapLandmark, MapWall, PredictedRange, UpdateReport
+from slam.robust.association import (
+    Antennas,
+    Continuation,
+    RangeScan,
+    SureLandmarks,
+    View,
+    antennas_of,
+    continue_tracks,
+    labelled,
+    landmarks_in_view,
+    predicted_ranges,
+    rows_of,
+    sides_of,
+    view,
+)
 from slam.robust.initialisation import (
     Member,
     RangeBearing,
@@ -28,16 +43,7 @@ from slam.robust.initialisation import (
 )
 from slam.robust.kidnapping import Evidence, Localisation, evidence, forget, merge_landmarks
 from slam.robust.map import Existence, Roundness
-from slam.robust.matching import (
-    Continuation,
-    SureLandmarks,
-    continue_tracks,
-    labelled,
-    landmarks_in_view,
-    predicted_ranges,
-)
 from slam.robust.parameters import BackEndParameters, PointRule
-from slam.robust.ranges import Antennas, RangeScan, View, antennas_of, rows_of, sides_of, view
 from slam.robust.run_log import RunLog
 from slam.robust.smoother import is_due, relinearise
 from slam.robust.state import Array, State, at_rest, calibrated_motion, predict
@@ -197,14 +203,9 @@ class RobustBackEnd:
         )
 
     def predict(self, increment: Array, covariance: Array | None = None) -> None:
-        """Move by one odometry increment.
+        """Move by an odometry increment: dx, dy [m], turn [rad] in the body frame before it.
 
-        Parameters
-        ----------
-        increment
-            shape (3,): dx, dy [m], turn [rad] in the body frame before it, as reported.
-        covariance
-            Its noise, shape (3, 3), where that is known better than from the wheels' model.
+        ``covariance`` (3, 3) is its noise, where that is known better than from the wheels' model.
         """
         wheels = self.parameters.wheels
         motion = calibrated_motion(increment, self.state.calibration, wheels, covariance)

@@ -34,8 +34,8 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from slam.geometry import compose, wrap_angle
+from slam.robust.association import LONGEST_M, Antennas, RangeScan, fix_of_pair
 from slam.robust.parameters import MapRule, RangeNoise, TrackletRule, chi_square_limit
-from slam.robust.ranges import LONGEST_M, Antennas, RangeScan, fix_of_pair
 from slam.robust.state import POSITION, Array, Indices, Motion, State, rotation
 
 
@@ -86,14 +86,8 @@ class Slot:
 class UnassignedRanges:
     """The unused ranges of the last frames, and the way of the robot between them.
 
-    Parameters
-    ----------
-    capacity
-        Number of frames kept.
-    sigma_m
-        Standard deviation of a range whose scan has none.
-    drift_per_m, drift_per_rad_m
-        Standard deviation a range gains per metre of way back, and per radian of turn.
+    ``sigma_m`` is for ranges whose scan has none; ``drift_per_m`` and ``drift_per_rad_m`` are what
+    the standard deviation of a range gains per metre of way back, and per radian of turn.
     """
 
     def __init__(

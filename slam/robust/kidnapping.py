@@ -37,10 +37,9 @@ import numpy as np
 from scipy.special import chdtri
 
 from slam.geometry import between, compose, transform
+from slam.robust.association import RangeScan, SureLandmarks, View
 from slam.robust.map import Existence, apply_merge, find_merge
-from slam.robust.matching import SureLandmarks
 from slam.robust.parameters import BackEndParameters, MapRule, RelocationRule, SurpriseRule
-from slam.robust.ranges import RangeScan, View
 from slam.robust.run_log import RunLog
 from slam.robust.smoother import relinearise
 from slam.robust.state import (

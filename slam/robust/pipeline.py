@@ -15,9 +15,9 @@ from slam.frames import Detection, Detector, RadarFrame, detect_all
 from slam.front_end import make_detector
 from slam.geometry import Rig, between, has_moved
 from slam.results import Belief, PoseAt, StepResult
+from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.parameters import BackEndParameters, RangeNoise
-from slam.robust.ranges import RangeScan
 from slam.robust.state import quarter_turn
 
 Array = NDArray[np.float64]
@@ -28,17 +28,6 @@ class RobustSlam:
 
     The map frame is the body frame at the first odometry pose. The belief's errors are additive, as
     everywhere outside ``slam.robust``; it holds the reported landmarks, and their ids stay.
-
-    Parameters
-    ----------
-    config
-        Front end, window, and the table ``robust``.
-    rig
-        Where the radars sit.
-    wheels
-        How odometry errs.
-    detector
-        The front end, if not the one that the configuration names.
     """
 
     def __init__(
@@ -55,15 +44,9 @@ class RobustSlam:
     ) -> tuple[StepResult, ...]:
         """Take in the frames and odometry around one time; return the state if the robot has moved.
 
-        Parameters
-        ----------
-        frames
-            At most one frame per radar, each with the time it was taken at; a radar whose frame was
-            lost is absent, and none at all leaves odometry alone.
-        pose_at
-            Odometry, asked for the pose at ``t_ns`` and at the time of every frame.
-        t_ns
-            Session time of the state.
+        There is at most one frame per radar, each with the time it was taken at; a radar whose
+        frame was lost is absent, and without any there is odometry alone. ``pose_at`` is asked for
+        the pose at ``t_ns``, the time of the state, and at the time of every frame.
         """
         stamps_ns = {frame.radar: frame.t_ns for frame in frames}
         detect = partial(detect_all, self._detector, frames, self.rig)

@@ -369,24 +369,10 @@ class State:
     def update(self, at: Indices, H: Array, residual: Array, R: Array) -> tuple[float, Array]:
         """Correct mean and covariance with k measurements, ``residual = z - h``.
 
-        With S = H P H^T + R = L L^T and W = P H^T L^-T: ``error = W L^-1 residual``,
-        ``P -= W W^T``, one pass over the triangle.
-
-        Parameters
-        ----------
-        at
-            Columns of the error that H has entries for, shape (c,).
-        H
-            shape (k, c).
-        residual
-            shape (k,).
-        R
-            Measurement noise, shape (k, k) or its diagonal, shape (k,).
-
-        Returns
-        -------
-        nis, S
-            Normalised innovation squared (k degrees of freedom), and S, shape (k, k).
+        With S = H P H^T + R = L L^T and W = P H^T L^-T: ``error = W L^-1 residual``, ``P -= W
+        W^T``, one pass over the triangle. H has shape (k, c), entries for the columns ``at`` (c,)
+        of the error; R (k, k) or its diagonal (k,). Returns the normalised innovation squared (k
+        dof) and S.
         """
         PHt = self.P.columns(at) @ H.T
         S = H @ PHt[at]
@@ -494,18 +480,9 @@ def at_rest() -> Motion:
 def calibrated_motion(
     increment: Array, calibration: Array, wheels: WheelNoise, covariance: Array | None = None
 ) -> Motion:
-    """Return the motion that a reported increment stands for.
+    """Return the motion that a reported increment (ux, uy [m], ua [rad]) stands for.
 
-    Parameters
-    ----------
-    increment
-        shape (3,): ux, uy [m], ua [rad].
-    calibration
-        shape (3,): s, w, kappa.
-    wheels
-        Model of the step's noise ...
-    covariance
-        ... unless it is given, shape (3, 3).
+    ``calibration`` is (s, w, kappa); ``covariance`` (3, 3) replaces the noise of the wheels' model.
     """
     s, w, kappa = (float(value) for value in calibration)
     step = np.asarray(increment[:2]) / (1.0 + s)

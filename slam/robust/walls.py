@@ -25,6 +25,7 @@ import numpy as np
 
 from slam.geometry import wrap_angle
 from slam.results import MapWall
+from slam.robust.association import Antennas, View
 from slam.robust.initialisation import (
     FeatureRows,
     Followed,
@@ -38,7 +39,6 @@ from slam.robust.initialisation import (
 )
 from slam.robust.map import Law, Sightings, compare, fit_wall
 from slam.robust.parameters import BackEndParameters, RangeNoise, WallRule
-from slam.robust.ranges import Antennas, View
 from slam.robust.state import HEADING, Array, State, rotation
 
 _PRIOR_RAD = 0.3

@@ -25,9 +25,8 @@ from slam.app.experiments import Result
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label
 from slam.config import WheelNoise
 from slam.geometry import paper_rig
-from slam.robust.matching import sure_landmarks
+from slam.robust.association import antennas_of, rows_of, sides_of, sure_landmarks, view
 from slam.robust.parameters import ContinuationRule, RangeNoise
-from slam.robust.ranges import antennas_of, rows_of, sides_of, view
 from slam.robust.state import Motion, State, SymmetricMatrix, calibrated_motion, predict
 from xethru_protocol.system import StopFlag
 

@@ -44,7 +44,7 @@ from slam.config import BackEnd, SlamConfig, WheelNoise
 from slam.evaluation import ate_rmse_m, nees_pose
 from slam.frames import Detection
 from slam.geometry import Mount, Rig, between, mount_at, pair_of, transform, wrap_angle, wrap_angles
-from slam.robust.ranges import fix_of_pair
+from slam.robust.association import fix_of_pair
 from slam.robust.state import calibrated_motion, rotation
 
 

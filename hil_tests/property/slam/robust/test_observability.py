@@ -20,7 +20,7 @@ from slam.config import WheelNoise
 from slam.geometry import paper_rig
 from slam.paper import ekf as ekf_slam
 from slam.results import Belief, landmark_slice
-from slam.robust.ranges import antennas_of, rows_of, view
+from slam.robust.association import antennas_of, rows_of, view
 from slam.robust.state import State, SymmetricMatrix, calibrated_motion, predict, quarter_turn
 
 Array = NDArray[np.float64]

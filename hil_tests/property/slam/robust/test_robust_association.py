@@ -18,6 +18,17 @@ from hil_tests.property.robust_oracles import N_RADARS, random_state, seeds, val
 from hil_tests.property.trilateration_oracles import NO_RANGES
 from slam.config import WheelNoise
 from slam.geometry import paper_rig
+from slam.robust.association import (
+    RangeScan,
+    SureLandmarks,
+    antennas_of,
+    cheapest,
+    continue_tracks,
+    fix_of_pair,
+    options_of,
+    sure_landmarks,
+    view,
+)
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import (
     BodyPoint,
@@ -27,13 +38,6 @@ from slam.robust.initialisation import (
     point_rows,
     range_bearing_rows,
 )
-from slam.robust.matching import (
-    SureLandmarks,
-    cheapest,
-    continue_tracks,
-    options_of,
-    sure_landmarks,
-)
 from slam.robust.parameters import (
     BackEndParameters,
     ContinuationRule,
@@ -41,7 +45,6 @@ from slam.robust.parameters import (
     PointRule,
     RangeNoise,
 )
-from slam.robust.ranges import RangeScan, antennas_of, fix_of_pair, view
 from slam.robust.state import State, SymmetricMatrix, calibrated_motion, rotation
 
 Array = NDArray[np.float64]

@@ -21,9 +21,9 @@ from hil_tests.property.robust_oracles import (
 )
 from slam.config import WheelNoise
 from slam.geometry import paper_rig
+from slam.robust.association import Rows, antennas_of, rows_of, view
 from slam.robust.initialisation import BodyPoint, initialise_landmark, point_rows, update_with_point
 from slam.robust.map import apply_merge
-from slam.robust.ranges import Rows, antennas_of, rows_of, view
 from slam.robust.state import State, SymmetricMatrix, calibrated_motion, predict, quarter_turn
 
 WHEELS = WheelNoise()

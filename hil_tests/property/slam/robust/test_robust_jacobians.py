@@ -27,6 +27,7 @@ from hil_tests.property.robust_oracles import (
 )
 from slam.config import WheelNoise
 from slam.geometry import paper_rig
+from slam.robust.association import RangeScan, antennas_of, rows_of, view
 from slam.robust.initialisation import (
     BodyPoint,
     RangeBearing,
@@ -34,7 +35,6 @@ from slam.robust.initialisation import (
     point_rows,
     range_bearing_rows,
 )
-from slam.robust.ranges import RangeScan, antennas_of, rows_of, view
 from slam.robust.run_log import Estimate, Problem, start_prior
 from slam.robust.smoother import measurement_residuals, motion_residuals
 from slam.robust.state import State, calibrated_motion, left_jacobian, predict, rotation

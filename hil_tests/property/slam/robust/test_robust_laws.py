@@ -16,10 +16,9 @@ from hil_tests.property.robust_oracles import (
     seeds,
 )
 from slam.config import WheelNoise
+from slam.robust.association import NOTHING, Antennas, Option, cheapest, rows_of, view
 from slam.robust.initialisation import BodyPoint, initialise_landmark, update_with_point
 from slam.robust.map import apply_merge, merge_rows
-from slam.robust.matching import NOTHING, Option, cheapest
-from slam.robust.ranges import Antennas, rows_of, view
 from slam.robust.state import Indices, State, SymmetricMatrix, calibrated_motion, predict
 
 WHEELS = WheelNoise(walk_per_sqrt_m=0.1)

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from slam.config import WheelNoise
 from slam.geometry import Mount, paper_rig
+from slam.robust.association import RangeScan
 from slam.robust.parameters import BackEndParameters, RangeNoise
-from slam.robust.ranges import RangeScan
 
 Array = NDArray[np.float64]
 

@@ -17,10 +17,10 @@ from hil_tests.unit.slam.robust.range_world import (
 )
 from slam.evaluation import align_se2, ate_rmse_m, landmark_metrics, observable_landmarks
 from slam.geometry import Mount, Rig, paper_rig, transform
+from slam.robust.association import RangeScan, sides_of
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import RangeBearing
 from slam.robust.parameters import BackEndParameters
-from slam.robust.ranges import RangeScan, sides_of
 
 SIGMA_M = 7.4e-3
 

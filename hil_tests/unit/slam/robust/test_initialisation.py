@@ -15,6 +15,7 @@ from hil_tests.unit.slam.robust.range_world import (
 )
 from slam.config import WheelNoise
 from slam.geometry import paper_rig
+from slam.robust.association import RangeScan, antennas_of
 from slam.robust.back_end import RobustBackEnd, huber_weighted_sigmas_m
 from slam.robust.initialisation import (
     BodyPoint,
@@ -27,7 +28,6 @@ from slam.robust.initialisation import (
 )
 from slam.robust.map import Existence, find_merge
 from slam.robust.parameters import MapRule, RangeNoise, TrackletRule
-from slam.robust.ranges import RangeScan, antennas_of
 from slam.robust.state import Array, State, SymmetricMatrix, calibrated_motion
 
 SIGMA_M = 5e-3

@@ -10,11 +10,11 @@ from hil_tests.unit.slam.robust.test_walls import antennas, state_with_map
 from slam.config import WheelNoise
 from slam.evaluation import nees_pose
 from slam.geometry import paper_rig
+from slam.robust.association import RangeScan, antennas_of, landmarks_in_view, view
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import UnassignedRanges
 from slam.robust.kidnapping import Evidence, Surprise
 from slam.robust.map import arc_of, radius_of
-from slam.robust.matching import landmarks_in_view
 from slam.robust.parameters import (
     BackEndParameters,
     ContinuationRule,
@@ -22,7 +22,6 @@ from slam.robust.parameters import (
     RoundnessRule,
     SurpriseRule,
 )
-from slam.robust.ranges import RangeScan, antennas_of, view
 from slam.robust.run_log import RunLog, start_prior
 from slam.robust.smoother import give_radius
 from slam.robust.state import State, at_rest

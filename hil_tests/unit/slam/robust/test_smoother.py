@@ -15,10 +15,10 @@ from hil_tests.unit.slam.robust.range_world import LAB, parameters_for, simulate
 from hil_tests.unit.slam.robust.test_roundness import RODS, SIGMA_M, drive
 from slam.config import WheelNoise
 from slam.geometry import paper_rig
+from slam.robust.association import RangeScan
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import RangeBearing
 from slam.robust.parameters import RelinearisationRule
-from slam.robust.ranges import RangeScan
 from slam.robust.run_log import Condensed, Estimate, Prior, Problem, RunLog, _keep, start_prior
 from slam.robust.smoother import (
     Smoother,

@@ -11,11 +11,11 @@ from hil_tests.unit.slam.robust.range_world import LAB, odometry_path, reported,
 from slam.config import WheelNoise
 from slam.evaluation import nees_pose
 from slam.geometry import paper_rig
+from slam.robust.association import Antennas, RangeScan, antennas_of, rows_of, view
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import Slot, UnassignedRange
 from slam.robust.map import Law, Sightings, compare
 from slam.robust.parameters import BackEndParameters, RangeNoise, WallRule
-from slam.robust.ranges import Antennas, RangeScan, antennas_of, rows_of, view
 from slam.robust.run_log import Estimate, RunLog, start_prior
 from slam.robust.smoother import measurement_residuals, prior_about, prior_cost, prior_terms
 from slam.robust.state import Array, State, SymmetricMatrix, calibrated_motion, predict

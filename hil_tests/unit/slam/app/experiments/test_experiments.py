@@ -31,9 +31,8 @@ from slam.app.run.pictures import picture
 from slam.app.sweep.run import SweepRun, make_case
 from slam.app.sweep.statistics import summarise_groups
 from slam.geometry import paper_rig, transform
-from slam.robust.matching import sure_landmarks
+from slam.robust.association import antennas_of, sides_of, sure_landmarks, view
 from slam.robust.parameters import ContinuationRule, RangeNoise
-from slam.robust.ranges import antennas_of, sides_of, view
 from slam.robust.state import Motion
 
 RANGES_M = (0.6, 0.61, 0.62, 0.9, 0.91, 0.92)
