@@ -11,20 +11,20 @@ EXIT_USAGE = 2
 
 
 class AppError(Exception):
-    """The thing asked for failed; the message is one line that names the thing and the remedy."""
+    """A command failed; the message is one line that names the cause and the remedy."""
 
     exit_code = EXIT_FAILED
 
 
 class UsageError(AppError):
-    """The command was called wrongly, for example with the name of a scene that does not exist."""
+    """A command was called wrongly, for example with the name of a scene that does not exist."""
 
     exit_code = EXIT_USAGE
 
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Let a failing write say which file it is about; the system's own error does not always."""
+    """Turn an OSError into an AppError that names the file."""
     try:
         yield
     except OSError as error:

@@ -43,7 +43,7 @@ _OUTPUTS = ("session.mcap", "session.rrd", "report.html", *RESULTS)
 class WireTap:
     """Keeps the bytes of every port of a rig until a session log takes them.
 
-    Modules answer for their settings before there is a log, which needs these answers.
+    Modules report their settings before there is a log, which needs these answers.
     """
 
     def __init__(self, rig_source: RigSource) -> None:

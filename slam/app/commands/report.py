@@ -54,7 +54,7 @@ _KEPT_WARNINGS = 200
 
 
 class ReportSeries(NamedTuple):
-    """Numbers over the states of a run, each of shape (n_states,); NaN where there is none.
+    """Numbers over the states of a run, each of shape (n_states,); NaN if there is none.
 
     Attributes
     ----------
@@ -521,19 +521,19 @@ def _write_parameters(page: Page, info: SessionInfo) -> None:
     )
     page.note("Mounts in the robot's frame: x forward, y left. First bin in module metres.")
     page.settings("SLAM", json.loads(info.config_json or "{}"))
-    page.settings("Wheels, as SLAM was told", info.wheels)
+    page.settings("Wheels, as SLAM assumes", info.wheels)
     page.settings("Radars", {radar.name: asdict(radar) for radar in info.radars})
     page.settings("Versions of the run", info.versions)
 
 
 def _what_it_is(session: RecordedSession, data: ReportData) -> str:
     info = session.info
-    words = [f"{session.path.name}: {data.duration_s:.1f} s of {len(info.radars)} radars"]
+    parts = [f"{session.path.name}: {data.duration_s:.1f} s of {len(info.radars)} radars"]
     if info.started_unix_ns is not None:
         began = datetime.fromtimestamp(info.started_unix_ns / NS_PER_S, UTC)
-        words.append(f"begun {began:%Y-%m-%d %H:%M:%S} UTC")
+        parts.append(f"begun {began:%Y-%m-%d %H:%M:%S} UTC")
     if "xethru-hil" in info.versions:
-        words.append(f"xethru-hil {info.versions['xethru-hil']}")
+        parts.append(f"xethru-hil {info.versions['xethru-hil']}")
     if session.cut_at_byte is not None:
-        words.append(f"cut at byte {session.cut_at_byte}: this is what is left of it")
-    return "; ".join(words) + "."
+        parts.append(f"cut at byte {session.cut_at_byte}: this is what is left of it")
+    return "; ".join(parts) + "."

@@ -80,7 +80,7 @@ _SETTLE_LIMIT_S = 30.0
 _PERIOD_S = 0.5
 _PALETTE = 256
 _MENU_PIXELS = 36
-"""The viewer's own bar on top, which says what machine drew it."""
+"""The viewer's own bar on top, which names the machine that drew it."""
 
 
 def take_screenshot(rrd: Path, out: Path, *, at_s: float | None, stop: StopFlag) -> None:

@@ -407,7 +407,7 @@ class EventQueue(Protocol):
 
 
 class LiveLog(LinkLog):
-    """Writes what a live run learns into its session log; keeps odometry until there is one.
+    """Writes a live run into its session log; keeps odometry until there is one.
 
     If the log cannot be written any more, this is reported once, and the run goes on without it.
 
@@ -504,7 +504,7 @@ class LiveSource:
     worst_lag_s
         How long ago a tick was over when SLAM got it, at worst.
     busy_s
-        Time spent by whoever took the scans.
+        Time spent in SLAM, logs and views.
     lost_frames
         Frames missing between the counters that arrived, over all radars.
     """

@@ -203,7 +203,7 @@ def summary_rows(
 
 def _landmark_row(landmarks: LandmarkSummary) -> Row:
     if landmarks.true is None:
-        return ("landmarks", str(landmarks.estimated), "nobody told what really stands there")
+        return ("landmarks", str(landmarks.estimated), "the true ones are unknown")
     return (
         "landmarks",
         f"{landmarks.estimated} for {landmarks.true} true",
@@ -213,12 +213,12 @@ def _landmark_row(landmarks: LandmarkSummary) -> Row:
 
 
 def mm_text(length_m: float | None) -> str:
-    """Return a length in millimetres, a dash where there is none."""
+    """Return a length in millimetres, or a dash."""
     return "-" if length_m is None else f"{1e3 * length_m:.1f} mm"
 
 
 def share_text(value: float | None) -> str:
-    """Return a share of one, a dash where there is none."""
+    """Return a share of one, or a dash."""
     return "-" if value is None else f"{value:.2f}"
 
 

@@ -20,7 +20,7 @@ from slam.app.view.rerun_recording import (
     part,
 )
 from slam.app.view.rerun_sdk import rr
-from slam.frames import Detection, RadarFrame
+from slam.frames import RadarFrame
 
 _CARRIER_HZ = 7.29e9
 _LIGHT_MPS = 299_792_458.0
@@ -62,23 +62,21 @@ def bscan_picture(
 
 
 BLOCK_FRAMES = 128
-"""Rows of one B-scan picture; as many frames are sent at once where nobody watches."""
+"""Rows of one B-scan picture; as many frames are sent at once to a file."""
 
 _DETECTION_WIDTH_M = 0.03
 _ONE_VALUE = np.zeros(1, dtype=np.float32)
 _NO_DETECTIONS = _ONE_VALUE
-"""A chart needs a bar: one of no height at the antenna stands for none."""
+"""A chart needs a bar: one without height at the antenna stands for none."""
 
 
 class FrameLayer:
-    """Collects frames and detections, and sends them in blocks."""
+    """Collects frames and sends them in blocks; sends detections."""
 
     def __init__(self, recording: Recording, radars: Sequence[RadarInfo]) -> None:
         self._recording = recording
         self._radars = tuple(radars)
         self._blocks = [_FrameBlock(radar.name) for radar in radars]
-        self._detections: list[tuple[Detection, ...]] = []
-        self._detected = Stamps.none()
         for index, radar in enumerate(radars):
             colour = RADAR_RGB[index % len(RADAR_RGB)]
             recording.static(f"radar/{part(radar.name)}/frame", _chart_style(color=colour))
@@ -93,17 +91,10 @@ class FrameLayer:
             if len(block.stamps) == BLOCK_FRAMES:
                 self._send_frames(block)
 
-    def on_snapshot(self, snapshot: Snapshot, host_ns: int | None) -> None:
-        """Take the detections of a state."""
-        if snapshot.step is not None:
-            self._detections.append(snapshot.step.detections)
-            self._detected.add(snapshot.t_ns, snapshot.counter, host_ns)
-
     def send(self) -> None:
-        """Send everything that waits."""
+        """Send the frames that wait."""
         for block in self._blocks:
             self._send_frames(block)
-        self.send_detections()
 
     def send_older(self, t_ns: int) -> None:
         """Send the frames of radars of which one from `t_ns` or before still waits."""
@@ -111,10 +102,11 @@ class FrameLayer:
             if len(block.stamps) and block.stamps.t_ns[0] <= t_ns:
                 self._send_frames(block)
 
-    def send_detections(self) -> None:
-        """Send the detections that wait."""
-        rows, self._detections = self._detections, []
-        stamps, self._detected = self._detected, Stamps.none()
+    def send_detections(self, snapshots: Sequence[Snapshot], stamps: Stamps) -> None:
+        """Send the detections of some states."""
+        known = [row for row, snapshot in enumerate(snapshots) if snapshot.step is not None]
+        steps = [snapshots[row].step for row in known]
+        rows = [step.detections for step in steps if step is not None]
         if not rows:
             return
         for index, radar in enumerate(self._radars):
@@ -132,7 +124,7 @@ class FrameLayer:
             ]
             widths = [np.full(len(row), _DETECTION_WIDTH_M, dtype=np.float32) for row in labels_m]
             entity = f"radar/{part(radar.name)}/detections"
-            self._recording.rows(entity, stamps, _charts(heights, labels_m, widths))
+            self._recording.rows(entity, stamps.at(known), _charts(heights, labels_m, widths))
 
     def _send_frames(self, block: _FrameBlock) -> None:
         if not len(block.stamps):
@@ -168,13 +160,11 @@ class _FrameBlock:
         self.clear()
 
     def add(self, frame: RadarFrame, host_ns: int | None) -> None:
-        """Take a frame."""
         self.stamps.add(frame.t_ns, frame.counter, host_ns)
         self.samples.append(frame.samples)
         self.range_start_m, self.bin_length_m = frame.range_start_m, frame.bin_length_m
 
     def clear(self) -> None:
-        """Forget the frames."""
         self.stamps = Stamps.none()
         self.samples: list[NDArray[np.float32]] = []
 

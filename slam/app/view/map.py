@@ -1,4 +1,4 @@
-"""The map in Rerun: truth, odometry, estimate, landmarks, and what the robot sees right now."""
+"""The map in Rerun: truth, odometry, estimate, landmarks and echoes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from slam.app.odometry.tum import NS_PER_S
 from slam.app.records import RadarInfo, SessionInfo, Snapshot
-from slam.app.run.evaluation import world_from_odom
 from slam.app.run.pictures import ellipse_95, rotate_covariances
 from slam.app.view.rerun_recording import (
     ARROW_M,
@@ -46,14 +45,14 @@ _PAPERS_REACH_M = 1.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Beams:
-    """How wide and how far radars look.
+    """Beam width and reach of radars.
 
     Attributes
     ----------
     field_of_view_rad
         Opening angle.
     reach_m
-        Longest range that the front end looks at.
+        Longest range of the front end.
     n_points
         Points of an arc.
     """
@@ -79,7 +78,7 @@ class Beams:
 
 
 def beams_of(config_json: str) -> Beams:
-    """Return how SLAM was told the radars look; as in the paper where it is not recorded."""
+    """Return the beams that SLAM assumes; those of the paper if they are not recorded."""
     settings = json.loads(config_json) if config_json else {}
     table = settings.get("robust" if settings.get("back_end") == "robust" else "trilateration", {})
     opening_deg = float(table.get("field_of_view_deg", _PAPERS_FIELD_OF_VIEW_DEG))
@@ -139,35 +138,31 @@ _POINTS: tuple[tuple[str, Rgb, float, float], ...] = (
 
 
 class MapLayer:
-    """Collects states, and sends poses and echoes in blocks, the map once per second."""
+    """Sends poses and echoes in blocks, the map once per second."""
 
     def __init__(self, recording: Recording, info: SessionInfo, beams: Beams) -> None:
         self._recording = recording
         self._radars = info.radars
         self._beams = beams
-        self._rows: list[Snapshot] = []
-        self._stamps = Stamps.none()
         self._paths: dict[str, list[Array]] = defaultdict(list)
         self._trails: dict[str, deque[Array]] = {
             name: deque(maxlen=TRAIL_STATES) for name, *_ in _POINTS
         }
-        self._odom: Array | None = None
-        self._first_ns = self._next_map_ns = self._next_path_ns = 0
+        self._first_ns: int | None = None
+        self._next_map_ns = self._next_path_ns = 0
         self._last: tuple[Snapshot, int | None] | None = None
         self._send_statics(info)
 
-    def on_snapshot(self, snapshot: Snapshot, host_ns: int | None) -> None:
-        """Take a state of SLAM."""
-        if self._odom is None:
-            self._first_ns, self._odom = snapshot.t_ns, world_from_odom(snapshot)
-        self._rows.append(snapshot)
-        self._stamps.add(snapshot.t_ns, snapshot.counter, host_ns)
+    def on_snapshot(self, snapshot: Snapshot, host_ns: int | None, odom: Array) -> None:
+        """Add a state to the paths; `odom` is `world_from_odom` of the first one."""
+        if self._first_ns is None:
+            self._first_ns = snapshot.t_ns
         self._last = snapshot, host_ns
         place = snapshot.world_from_map
-        self._paths["odometry"].append(transform(self._odom, snapshot.odometry[:2]))
+        self._paths["odometry"].append(transform(odom, snapshot.odometry[:2]))
         self._paths["estimate"].append(transform(place, snapshot.estimate[:2]))
         if np.isfinite(snapshot.truth).all():
-            if not self._paths["truth"]:  # nobody shall see a robot where none was
+            if not self._paths["truth"]:  # no robot is shown where there is no truth
                 self._recording.static("map/truth/robot", _arrow(TRUTH_RGB, 45.0))
             self._paths["truth"].append(snapshot.truth[:2])
         if snapshot.t_ns >= self._next_map_ns:
@@ -179,12 +174,8 @@ class MapLayer:
             self._next_path_ns = snapshot.t_ns + max(_PATH_PERIOD_NS, lasted_ns // 100)
             self._send_paths(snapshot, host_ns)
 
-    def send(self) -> None:
-        """Send the states that wait."""
-        rows, self._rows = self._rows, []
-        stamps, self._stamps = self._stamps, Stamps.none()
-        if not rows:
-            return
+    def send(self, rows: Sequence[Snapshot], stamps: Stamps) -> None:
+        """Send poses and echoes of some states."""
         world = np.array([compose(row.world_from_map, row.estimate) for row in rows])
         self._send_poses("map/robot", stamps, world)
         known = [k for k, row in enumerate(rows) if np.isfinite(row.truth).all()]
@@ -200,13 +191,12 @@ class MapLayer:
         ellipses = strips_column(screen(np.array(spread)))
         one_each = np.ones(len(rows), dtype=np.int64)
         self._recording.rows("map/estimate/ellipse", stamps, [ellipses.partition(one_each)])
-        told = [k for k, row in enumerate(rows) if row.step is not None]
-        if told:
-            self._send_echoes([rows[k] for k in told], stamps.at(told), world[told])
+        known = [k for k, row in enumerate(rows) if row.step is not None]
+        if known:
+            self._send_echoes([rows[k] for k in known], stamps.at(known), world[known])
 
-    def finish(self) -> None:
-        """Send what waits, and the last map."""
-        self.send()
+    def send_last(self) -> None:
+        """Send the map of the last state."""
         if self._last is not None:
             self._send_landmarks(*self._last)
             self._send_paths(*self._last)

@@ -1,7 +1,7 @@
-"""A session in Rerun: what observers hear, drawn on a map, as echoes, numbers and links.
+"""A session in Rerun: map, echoes, numbers and links.
 
-The recording is re-creatable from the session log and never the only copy: Rerun reads files of
-adjacent versions only.
+The recording can be made again from the session log and is never the only copy: Rerun reads files
+of adjacent versions only.
 """
 
 from __future__ import annotations
@@ -40,11 +40,9 @@ from slam.app.view.rerun_recording import (
     LANDMARK_RGB,
     ODOMETRY_RGB,
     RADAR_RGB,
-    FileTarget,
     Recording,
     Rgb,
     Stamps,
-    ViewerTarget,
     part,
     screen,
 )
@@ -82,12 +80,12 @@ _POINTS = (
 
 
 def is_world_known(info: SessionInfo) -> bool:
-    """Return whether a view may expect a true path: that of a scene, not of a robot's drive."""
+    """Return whether a true path may be expected: for a scene, not for a real drive."""
     return len(info.true_landmarks_m) > 0 or len(info.outlines_m) > 0
 
 
 def about(info: SessionInfo, *, block: int, states: int) -> str:
-    """Return the guide for a run: frames in a B-scan, states whose points are on the map."""
+    """Return the text about a run: frames in a B-scan, states with points on the map."""
     settings = json.loads(info.config_json or "{}")
     return _ABOUT.format(
         n_radars=len(info.radars),
@@ -102,7 +100,7 @@ _MAP_MARGIN_M = 0.6
 
 
 def blueprint(info: SessionInfo) -> rrb.Blueprint:
-    """Return the layout; the cursor keeps to the newest data: a file opens with its whole map."""
+    """Return the layout; the cursor follows the newest data, so a file opens with its whole map."""
     names = [radar.name for radar in info.radars]
     return rrb.Blueprint(
         rrb.Horizontal(
@@ -157,7 +155,7 @@ def _echoes(names: Sequence[str]) -> rrb.Tabs:
 
 
 def _numbers(info: SessionInfo) -> rrb.Tabs:
-    """Lay out the curves; in the world without known truth the first two stay empty."""
+    """Lay out the curves; without truth the first two stay empty."""
     origins = {
         "Position error": "/error",
         "NEES": "/consistency/nees",
@@ -172,7 +170,7 @@ def _numbers(info: SessionInfo) -> rrb.Tabs:
 
 
 def _whole_run() -> rrb.TimeAxis:
-    """Return an axis from the first to the newest moment; Rerun's own shows one minute."""
+    """Return an axis over the whole run; the default is one minute."""
     everything = rrb.TimeRange(
         start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite()
     )
@@ -218,7 +216,7 @@ class LinkLayer:
     def __init__(self, recording: Recording, radars: Sequence[RadarInfo]) -> None:
         self._recording = recording
         self._states = LinkStates(tuple(radars))
-        self._heard: deque[LogLine] = deque()
+        self._lines: deque[LogLine] = deque()
         self._changes: list[tuple[LinkChange, int, int | None]] = []
         self._losses: dict[str, tuple[Stamps, list[int]]] = {
             radar.name: (Stamps.none(), []) for radar in radars
@@ -244,7 +242,6 @@ class LinkLayer:
             recording.static(f"link/faults/{part(radar.name)}", marker)
 
     def on_scan(self, scan: Scan, host_ns: int | None) -> None:
-        """Take the frames of one tick: who sent, who lost."""
         self._follow_log()
         self._counter, self._t_ns, self._host_ns = scan.counter, scan.t_ns, host_ns
         before = {name: count.lost for name, count in self._states.counts.items()}
@@ -257,11 +254,9 @@ class LinkLayer:
                 values.append(count.lost)
 
     def on_log(self, line: LogLine) -> None:
-        """Take a line about the link."""
-        self._heard.append(line)
+        self._lines.append(line)
 
     def send(self) -> None:
-        """Send what waits."""
         self._follow_log()
         changes, self._changes = self._changes, []
         for radar in self._states.radars:
@@ -281,7 +276,7 @@ class LinkLayer:
                 self._recording.rows(f"link/lost/{part(radar.name)}", losses, scalars)
 
     def finish(self) -> None:
-        """Send what waits, and end every lane."""
+        """Send what waits, and end every link."""
         self._follow_log()
         self._note(self._states.end(self._t_ns))
         for name, count in self._states.counts.items():
@@ -294,10 +289,10 @@ class LinkLayer:
         self._changes += [(change, self._counter, self._host_ns) for change in changes]
 
     def _follow_log(self) -> None:
-        """Send the lines that came meanwhile, and let the lanes follow them."""
+        """Send the lines that came meanwhile, and update the states."""
         lines = []
-        while self._heard:  # not a swap: another thread may add while this runs
-            lines.append(self._heard.popleft())
+        while self._lines:  # not a swap: another thread may add while this runs
+            lines.append(self._lines.popleft())
         for line in lines:
             self._note(self._states.on_log(line))
         for name in dict.fromkeys(line.radar for line in lines):
@@ -339,63 +334,50 @@ _SERIES: tuple[tuple[str, str, Rgb, float], ...] = (
 )
 
 
-class NumberLayer:
-    """Collects states, and sends what they amount to in blocks."""
+def style_numbers(recording: Recording) -> None:
+    """Send how the curves look."""
+    for entity, name, colour, width in _SERIES:
+        line = rr.SeriesLines(
+            colors=colour,
+            names=name,
+            widths=width,
+            interpolation_mode=rr.components.InterpolationMode.StepAfter
+            if entity == "landmarks/count"
+            else None,
+        )
+        recording.static(entity, line)
 
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
-        self._rows: list[Snapshot] = []
-        self._odom: NDArray[np.float64] | None = None
-        self._stamps = Stamps.none()
-        for entity, name, colour, width in _SERIES:
-            line = rr.SeriesLines(
-                colors=colour,
-                names=name,
-                widths=width,
-                interpolation_mode=rr.components.InterpolationMode.StepAfter
-                if entity == "landmarks/count"
-                else None,
-            )
-            recording.static(entity, line)
 
-    def on_snapshot(self, snapshot: Snapshot, host_ns: int | None) -> None:
-        """Take a state of SLAM."""
-        if self._odom is None:
-            self._odom = world_from_odom(snapshot)
-        self._rows.append(snapshot)
-        self._stamps.add(snapshot.t_ns, snapshot.counter, host_ns)
+def send_numbers(
+    recording: Recording, rows: Sequence[Snapshot], stamps: Stamps, odom: NDArray[np.float64]
+) -> None:
+    """Send the curves of some states; a value that is not finite is left out.
 
-    def send(self) -> None:
-        """Send the states that wait."""
-        rows, self._rows = self._rows, []
-        stamps, self._stamps = self._stamps, Stamps.none()
-        if not rows or self._odom is None:
-            return
-        errors_m = [position_errors_m(row, self._odom) for row in rows]
-        self._send("error/slam", stamps, [slam_m for slam_m, _ in errors_m])
-        self._send("error/odometry", stamps, [wheels_m for _, wheels_m in errors_m])
-        self._send("landmarks/count", stamps, [float(len(row.landmark_ids)) for row in rows])
-        means = [np.mean(row.nis_per_dof) if row.nis_per_dof else math.nan for row in rows]
-        self._send("consistency/nis/value", stamps, [float(mean) for mean in means])
-        nis_bands = [_band(nis_dof(row)) for row in rows]
-        self._send("consistency/nis/low", stamps, [low for low, _ in nis_bands])
-        self._send("consistency/nis/high", stamps, [high for _, high in nis_bands])
-        nees = [pose_nees(row) / POSE_DOF for row in rows]
-        self._send("consistency/nees/value", stamps, nees)
-        low, high = _band(POSE_DOF)
-        known = [math.isfinite(value) for value in nees]
-        for name, bound in (("low", low), ("high", high)):
-            self._send(
-                f"consistency/nees/{name}", stamps, [bound if told else math.nan for told in known]
-            )
-
-    def _send(self, entity: str, stamps: Stamps, values: Sequence[float]) -> None:
-        """Send a series; a value that is no number is left out."""
-        told = [row for row, value in enumerate(values) if math.isfinite(value)]
-        if told:
-            scalars = np.array([values[row] for row in told])
-            columns = rr.Scalars.columns(scalars=scalars)
-            self._recording.rows(entity, stamps.at(told), columns)
+    `odom` is `world_from_odom` of the first state.
+    """
+    errors_m = [position_errors_m(row, odom) for row in rows]
+    nis_bands = [_band(nis_dof(row)) for row in rows]
+    nees = [pose_nees(row) / POSE_DOF for row in rows]
+    low, high = _band(POSE_DOF)
+    known = [math.isfinite(value) for value in nees]
+    curves: dict[str, Sequence[float]] = {
+        "error/slam": [slam_m for slam_m, _ in errors_m],
+        "error/odometry": [wheels_m for _, wheels_m in errors_m],
+        "landmarks/count": [float(len(row.landmark_ids)) for row in rows],
+        "consistency/nis/value": [
+            float(np.mean(row.nis_per_dof)) if row.nis_per_dof else math.nan for row in rows
+        ],
+        "consistency/nis/low": [low for low, _ in nis_bands],
+        "consistency/nis/high": [high for _, high in nis_bands],
+        "consistency/nees/value": nees,
+        "consistency/nees/low": [low if has_nees else math.nan for has_nees in known],
+        "consistency/nees/high": [high if has_nees else math.nan for has_nees in known],
+    }
+    for entity, values in curves.items():
+        finite = [row for row, value in enumerate(values) if math.isfinite(value)]
+        if finite:
+            columns = rr.Scalars.columns(scalars=np.array([values[row] for row in finite]))
+            recording.rows(entity, stamps.at(finite), columns)
 
 
 def _band(dof: int | None) -> tuple[float, float]:
@@ -415,15 +397,15 @@ class RerunView(SessionObserver):
     Parameters
     ----------
     target
-        A path for an .rrd file, or where a viewer listens.
+        An .rrd file, or the address of a viewer that listens.
     info
-        What the run is.
+        Describes the run.
     flush_s
         Live: longest time that a row waits before it is sent; None for full blocks only.
     clock_s
         Monotonic, for `flush_s`.
     time_of_day_ns
-        Live: tells when a scan arrived that does not say so itself; None leaves it unknown.
+        Live: the clock for scans that arrive without a time of arrival; None leaves it unknown.
 
     Raises
     ------
@@ -433,7 +415,7 @@ class RerunView(SessionObserver):
 
     def __init__(
         self,
-        target: Path | ViewerTarget,
+        target: Path | str,
         info: SessionInfo,
         *,
         flush_s: float | None = None,
@@ -443,31 +425,32 @@ class RerunView(SessionObserver):
         self._clock_s, self._flush_s = clock_s, flush_s
         self._time_of_day_ns = time_of_day_ns
         self._flushed_s = clock_s()
-        self._n_waiting = 0
+        self._waiting: list[Snapshot] = []
+        self._stamps = Stamps.none()
+        self._odom: NDArray[np.float64] | None = None
         self._host_ns: int | None = None
         self._began = False
         seed = "" if info.seed is None else f"-{info.seed}"
         self._recording = Recording(
-            FileTarget(path=target) if isinstance(target, Path) else target,
+            target,
             blueprint(info),
             recording_id=f"{info.scene}-{info.preset}{seed}",
         )
         of_seed = "" if info.seed is None else f", seed {info.seed}"
         name = f"{info.scene}, preset {info.preset}{of_seed}"
         self._recording.name(name, info.started_unix_ns or 0)
-        guide = rr.TextDocument(
+        text = rr.TextDocument(
             about(info, block=BLOCK_FRAMES, states=TRAIL_STATES), media_type=rr.MediaType.MARKDOWN
         )
-        self._recording.static("about", guide)
+        self._recording.static("about", text)
         settings = json.dumps([asdict(radar) for radar in info.radars], indent=1)
         self._recording.static("radars", rr.TextDocument(settings))
         self._frames = FrameLayer(self._recording, info.radars)
         self._map = MapLayer(self._recording, info, beams_of(info.config_json))
-        self._numbers = NumberLayer(self._recording)
+        style_numbers(self._recording)
         self._link = LinkLayer(self._recording, info.radars)
 
     def on_scan(self, scan: Scan) -> None:
-        """Take the frames of one counter; a block of them goes out at once."""
         if not self._began:
             # Session time is the odometry's: that of a robot's drive begins anywhere.
             self._began, self._recording.epoch_ns = True, scan.t_ns
@@ -481,15 +464,16 @@ class RerunView(SessionObserver):
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         """Take a state of SLAM: poses and scalars in blocks, the map once per second."""
-        self._map.on_snapshot(snapshot, self._host_ns)
-        self._numbers.on_snapshot(snapshot, self._host_ns)
-        self._frames.on_snapshot(snapshot, self._host_ns)
-        self._n_waiting += 1
-        if self._n_waiting == _BLOCK_STATES:
+        if self._odom is None:
+            self._odom = world_from_odom(snapshot)
+        self._map.on_snapshot(snapshot, self._host_ns, self._odom)
+        self._waiting.append(snapshot)
+        self._stamps.add(snapshot.t_ns, snapshot.counter, self._host_ns)
+        if len(self._waiting) == _BLOCK_STATES:
             self._send_states()
+            self._link.send()
 
     def on_log(self, line: LogLine) -> None:
-        """Take a line about the link."""
         if self._recording.is_finished:
             raise ValueError("the view is closed already")
         self._link.on_log(line)
@@ -499,8 +483,8 @@ class RerunView(SessionObserver):
         if self._recording.is_finished:
             return
         self._frames.send()
-        self._map.finish()
-        self._numbers.send()
+        self._send_states()
+        self._map.send_last()
         self._link.finish()
         self._recording.finish()
 
@@ -523,10 +507,12 @@ class RerunView(SessionObserver):
         self._frames.send_older(older_than_ns)
         self._link.send()
         self._send_states()
+        self._link.send()
 
     def _send_states(self) -> None:
-        self._n_waiting = 0
-        self._map.send()
-        self._numbers.send()
-        self._frames.send_detections()
-        self._link.send()
+        rows, self._waiting = self._waiting, []
+        stamps, self._stamps = self._stamps, Stamps.none()
+        if rows and self._odom is not None:
+            self._map.send(rows, stamps)
+            send_numbers(self._recording, rows, stamps, self._odom)
+            self._frames.send_detections(rows, stamps)

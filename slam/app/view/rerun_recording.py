@@ -1,6 +1,6 @@
-"""One Rerun recording being written to a file or a viewer: rows counted, never waited for long.
+"""A Rerun recording that is written to a file or a viewer, with its rows counted.
 
-Rerun's 2D views have y downwards and ours upwards: `screen` is the one place that negates it.
+Rerun's 2D views have y downwards, our frames upwards: only `screen` negates it.
 """
 
 from __future__ import annotations
@@ -50,21 +50,7 @@ _STATIC = " (static)"
 _FILE_CLOSE_LIMIT_S = 20.0
 """Longest wait for Rerun to finish the file."""
 _VIEWER_CLOSE_LIMIT_S = 5.0
-"""Longest wait for a viewer to take the last rows; one that hangs takes none."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FileTarget:
-    """The recording becomes an .rrd file."""
-
-    path: Path
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ViewerTarget:
-    """The recording goes to a viewer or server that listens at a `rerun+http://` address."""
-
-    url: str
+"""Longest wait for a viewer to take the last rows."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -84,21 +70,17 @@ class Stamps:
 
     @classmethod
     def none(cls) -> Stamps:
-        """Return no rows."""
         return cls(t_ns=[], counters=[], host_ns=[])
 
     def __len__(self) -> int:
-        """Return the number of rows."""
         return len(self.t_ns)
 
     def add(self, t_ns: int, counter: int, host_ns: int | None) -> None:
-        """Add a row."""
         self.t_ns.append(t_ns)
         self.counters.append(counter)
         self.host_ns.append(host_ns)
 
     def at(self, rows: Iterable[int]) -> Stamps:
-        """Return some of the rows."""
         picked = Stamps.none()
         for row in rows:
             picked.add(self.t_ns[row], self.counters[row], self.host_ns[row])
@@ -123,7 +105,7 @@ class Recording:
     Parameters
     ----------
     target
-        Where to.
+        An .rrd file, or the `rerun+http://` address of a viewer that listens.
     blueprint
         How a viewer lays it out, unless its user chose otherwise.
     recording_id
@@ -143,9 +125,7 @@ class Recording:
         The file cannot be begun; from `finish`: it does not hold every row that was sent.
     """
 
-    def __init__(
-        self, target: FileTarget | ViewerTarget, blueprint: rrb.Blueprint, *, recording_id: str
-    ) -> None:
+    def __init__(self, target: Path | str, blueprint: rrb.Blueprint, *, recording_id: str) -> None:
         rr.set_strict_mode(True)
         self._target = target
         self.epoch_ns = 0
@@ -156,22 +136,21 @@ class Recording:
         )
         self._stream.set_log_time_enabled(False)
         self._stream.set_log_tick_enabled(False)
-        if isinstance(target, FileTarget):
+        if isinstance(target, Path):
             try:
-                self._stream.save(target.path, default_blueprint=blueprint)
-            except RuntimeError as error:  # Rerun's own, with the system's words at its end
+                self._stream.save(target, default_blueprint=blueprint)
+            except RuntimeError as error:  # Rerun's own, with the system's message at its end
                 reason = str(error).rpartition(": ")[2]
-                raise AppError(f"{target.path}: cannot be written: {reason}") from None
+                raise AppError(f"{target}: cannot be written: {reason}") from None
         else:
-            self._stream.connect_grpc(target.url, default_blueprint=blueprint)
+            self._stream.connect_grpc(target, default_blueprint=blueprint)
 
     @property
     def is_finished(self) -> bool:
-        """Return whether nothing more can be sent."""
         return self._stream is None
 
     def name(self, name: str, start_ns: int = 0) -> None:
-        """Tell the recording's name and when it began."""
+        """Send the recording's name and when it began."""
         self._open().send_recording_name(name)
         self._open().send_recording_start_time_nanos(start_ns)
 
@@ -210,15 +189,14 @@ class Recording:
         # On a full disk Rerun's writer is gone and disconnect may wait for it without end.
         closing = Thread(target=stream.disconnect, daemon=True)
         closing.start()
-        is_file = isinstance(self._target, FileTarget)
+        is_file = isinstance(self._target, Path)
         closing.join(_FILE_CLOSE_LIMIT_S if is_file else _VIEWER_CLOSE_LIMIT_S)
         if closing.is_alive():
             rr.unregister_shutdown()  # or it waits once more when the interpreter ends
-            if isinstance(self._target, FileTarget):
-                raise AppError(f"{self._target.path}: cannot be finished; is the disk full?")
-            return  # whoever closed the viewer knows
-        if isinstance(self._target, FileTarget):
-            check_rows(self._target.path, self.sent)
+            if is_file:
+                raise AppError(f"{self._target}: cannot be finished; is the disk full?")
+        elif isinstance(self._target, Path):
+            _check_rows(self._target, self.sent)
 
     def _open(self) -> rr.RecordingStream:
         if self._stream is None:
@@ -226,8 +204,8 @@ class Recording:
         return self._stream
 
 
-def check_rows(path: Path, sent: dict[str, int]) -> None:
-    """Compare the rows of a finished file with what was sent.
+def _check_rows(path: Path, sent: dict[str, int]) -> None:
+    """Require that a finished file holds the rows that were sent.
 
     Raises
     ------

@@ -77,7 +77,6 @@ class ViewerProcess:
 
     @property
     def has_ended(self) -> bool:
-        """Whether the process is gone."""
         return self._process is None or self._process.poll() is not None
 
     def __enter__(self) -> Self:
@@ -289,12 +288,11 @@ class LiveView:
 
     def observer(self, info: SessionInfo) -> SessionObserver:
         """Return an observer that shows a run."""
-        from slam.app.view.panels import RerunView
-        from slam.app.view.rerun_recording import ViewerTarget  # half a second, as in the run
+        from slam.app.view.panels import RerunView  # loads Rerun, half a second
 
         self._has_shown = True
         view = RerunView(
-            ViewerTarget(url=self._url),
+            self._url,
             info,
             flush_s=_FLUSH_S,
             time_of_day_ns=None if self._is_replay else time.time_ns,
