@@ -28,7 +28,7 @@ class RadarFrame:
     range_start_m: float
     bin_length_m: float  # spacing of the samples in true metres
     # Smallest and largest value the module's sampler can give, normalised RF amplitude; a sample at
-    # one of them was cut off there. None where nobody knows.
+    # one of them was cut off there. None if unknown.
     limits: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:

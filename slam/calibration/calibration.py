@@ -197,8 +197,8 @@ class _Estimator:
     def __init__(self, drive: Drive, priors: CalibrationPriors, known_m: Array) -> None:
         self._drive, self._priors, self._known_m = drive, priors, known_m
         self._mounts = np.array([(m.x_m, m.y_m) for m in drive.rig.mounts])
-        told = drive.ranges.sigma_m
-        self._told_sigma_m = np.where(np.isnan(told), _ASSUMED_SIGMA_M, told)
+        reported = drive.ranges.sigma_m
+        self._reported_sigma_m = np.where(np.isnan(reported), _ASSUMED_SIGMA_M, reported)
         self._sigma_scale = 1.0
         self._bend_m = np.zeros(len(drive.ranges))
 
@@ -258,7 +258,7 @@ class _Estimator:
         return tuple(tracks)
 
     def _sigmas(self) -> Array:
-        own = np.maximum(self._sigma_scale * self._told_sigma_m, _LEAST_SIGMA_M)
+        own = np.maximum(self._sigma_scale * self._reported_sigma_m, _LEAST_SIGMA_M)
         return np.hypot(own, self._bend_m)
 
     def _sights(self, model: _Model) -> Array:
@@ -354,11 +354,11 @@ class _Estimator:
 
     def _learn_sigma(self, errors_m: Array, used: NDArray[np.bool_]) -> None:
         """Scale the front end's sigmas to what its ranges show, where nothing overlaps."""
-        told, bend = self._told_sigma_m[used], self._bend_m[used]
-        clean = bend < told * self._sigma_scale / 3
+        reported, bend = self._reported_sigma_m[used], self._bend_m[used]
+        clean = bend < reported * self._sigma_scale / 3
         if np.count_nonzero(clean) > _LEAST_RANGES:
             # the median of |N(0, 1)| is 0.6745
-            self._sigma_scale = float(np.median(errors_m[clean] / told[clean])) / 0.6745
+            self._sigma_scale = float(np.median(errors_m[clean] / reported[clean])) / 0.6745
 
     def _range_term(
         self, layout: Layout, landmark: Indices, cauchy_scale: float | None

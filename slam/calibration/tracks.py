@@ -302,9 +302,9 @@ def assign(
     (n,): the radar's offset and the largest difference; ``strengths`` (k,) of the landmarks, see
     there.
     """
-    nobody = np.full(len(ranges), UNASSIGNED, dtype=np.intp)
+    unassigned = np.full(len(ranges), UNASSIGNED, dtype=np.intp)
     if not len(landmarks_m) or not len(ranges):
-        return Assignment(landmark=nobody, bend_m=np.zeros(len(ranges)))
+        return Assignment(landmark=unassigned, bend_m=np.zeros(len(ranges)))
     distance, cosine = _seen(sights, landmarks_m)
     visible = cosine > _HALF_VIEW_COS
     error = np.abs(distance + offset_m[:, np.newaxis] - ranges.range_m[:, np.newaxis])
@@ -318,7 +318,7 @@ def assign(
     keys = np.column_stack([ranges.t_ns[rows], ranges.radar[rows], best[rows]])
     first = np.ones(len(rows), dtype=np.bool_)
     first[1:] = np.any(keys[1:] != keys[:-1], axis=1)
-    landmark = nobody
+    landmark = unassigned
     landmark[rows[first]] = best[rows[first]]
     return Assignment(landmark=landmark, bend_m=bend_m)
 

@@ -491,9 +491,9 @@ class MatchedFilterDetector:
         samples -= np.add.reduce(samples) / samples.size
         y = pulse_filter.apply(samples)
         power = y.real**2 + y.imag**2
-        told = self.config.matched_filter.noise_sigma
-        sigma_y = told * pulse_filter.noise_gain
-        if not told:
+        configured = self.config.matched_filter.noise_sigma
+        sigma_y = configured * pulse_filter.noise_gain
+        if not configured:
             sigma_y = math.sqrt(pulse_filter.noise_power(power))
         sigma_y = max(sigma_y, _RESOLUTION * max(highest, -lowest))
         return Filtered(

@@ -193,7 +193,7 @@ def begin_submap(state: State, pose: Array) -> None:
     P[:, :3] = 0.0
     state.position_m = np.array(pose[:2])
     state.heading_rad = float(pose[2])
-    # With no doubt about the heading, invariant errors are additive ones.
+    # With a certain heading, invariant errors are additive ones.
     state.P = SymmetricMatrix(P)
 
 
