@@ -123,7 +123,7 @@ def _control(arguments: argparse.Namespace) -> int:
 
 
 def request_of(words: Sequence[str]) -> dict[str, Any]:  # noqa: PLR0911 - one return per form
-    """Return what words of a command line ask for; ValueError if they ask for nothing known.
+    """Return the request of a command line's words; ValueError if there is no such request.
 
     >>> request_of(["fault", "add", "stall", "seconds=2", "count=3"])["fault"]
     {'kind': 'stall', 'count': 3, 'parameters': {'seconds': 2}}
@@ -310,16 +310,16 @@ def _run(arguments: argparse.Namespace, stop: StopFlag) -> int:
     try:
         start[arguments.command](arguments, stop, _warn)
     except serving.CannotServeError as error:
-        _say(str(error))
+        _print_line(str(error))
         return error.exit_code
     return 0
 
 
 def _warn(text: str) -> None:
-    _say(f"warning: {text}")
+    _print_line(f"warning: {text}")
 
 
-def _say(text: str) -> None:
+def _print_line(text: str) -> None:
     if sys.stderr is not None:  # started with stderr closed
         line = " ".join(text.split())
         sys.stderr.write(f"xethru-emulator: {line}\n")

@@ -1,7 +1,7 @@
 """One emulated X4M300 without I/O and without a clock: bytes and times in, bytes out.
 
 `Device` joins the parts: the connection turns bytes into commands, `commands` answers them, a
-`MessageStream` makes messages of its own accord, an `Outbox` holds what waits for the line.
+`MessageStream` makes unsolicited messages, an `Outbox` holds what waits for the line.
 
 A reset: ACK, half a second later the module restarts, receives nothing for two seconds, then sends
 BOOTING and READY. Whatever owns the port asks `Device.port_present` whether it is there meanwhile.

@@ -7,8 +7,8 @@ answers every command like any other; FPS, mode and geometry settings are acknow
 nothing about what is played. Nothing is dropped: a host that reads slowly makes the recording
 wait. A host that only asks something and leaves within half a second gets none of it.
 
-A host sets a frame area, reads back what the module made of it, and takes only frames of that
-size. While a recording plays, its frames are what they are, so the read-back must be theirs.
+A host takes only frames of the size that the module reports for its frame area, so while a
+recording plays the module reports the frame area of the recording.
 
 Times of the recording are mapped to times of the device piece by piece: within a piece
 ``due = anchor + (position - anchor position) / rate``, and every pause, seek and change of rate

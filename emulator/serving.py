@@ -349,11 +349,11 @@ def _run(
     announcement = Announcement(ready)
     cleanup.callback(announcement.close)
     ports.moved = lambda: announcement.update({**ready, "devices": ports.entries()})
-    _say_ready(ready)
+    _print_ready_line(ready)
     server.run()
 
 
-def _say_ready(ready: dict[str, object]) -> None:
+def _print_ready_line(ready: dict[str, object]) -> None:
     if sys.stdout is None:  # started with stdout closed: serve without a word
         return
     try:

@@ -1,7 +1,7 @@
 """What the numbers mean: trajectory, landmark and consistency metrics.
 
 Every trajectory error states its alignment. ``ate_rmse_m`` is the one to quote; the ICP numbers
-of the paper are computed beside it because they answer a different, kinder question.
+of the paper are computed beside it because they answer a different question.
 
 The rule is part of the metric, not of the design under test, so its numbers are constants here:
 designs are compared on equal seeds only, and against the same landmarks.
@@ -326,7 +326,7 @@ DISTINCT_RAD = 0.1
 
 
 def observable_landmarks(rig: Rig, poses: Array, landmarks_xy: Array) -> NDArray[np.bool_]:
-    """Tell which landmarks were in view of both radars of a pair at nine or more poses, shape (m,).
+    """Return which landmarks both radars of a pair could see at nine or more poses, shape (m,).
 
     In view means within the 65 degree field of view and between 0.2 and 1.5 m. Poses less than 5 mm
     and 0.1 rad from the last distinct one count with it, so standing still adds nothing. ``poses``

@@ -105,7 +105,7 @@ def usable_samples(frame: RadarFrame) -> NDArray[np.bool_]:
 
 
 def reaches_limits(frame: RadarFrame, lowest: float, highest: float) -> bool:
-    """Tell whether a frame with these extreme samples is cut off at its limits."""
+    """Return whether a frame with these extreme samples is cut off at its limits."""
     if frame.limits is None:
         return False
     low, high = _inner_limits(frame.limits)

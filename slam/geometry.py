@@ -60,7 +60,7 @@ def between(origin: Array, pose: Array) -> Array:
 
 
 def has_moved(previous: Array, pose: Array, min_distance_m: float, min_turn_rad: float) -> bool:
-    """Tell whether two poses of shape (3,) differ by at least a distance or a turn.
+    """Return whether two poses of shape (3,) differ by at least a distance or a turn.
 
     The turn is wrapped, so a heading that passes pi is no motion.
     """

@@ -77,8 +77,8 @@ class Belief:
     def __post_init__(self) -> None:
         """Check the shapes and make the fields read-only views.
 
-        The arrays are not copied, a dense map's covariance is large: whoever passes them must not
-        write to them any more.
+        The arrays are not copied, since the covariance of a dense map is large: the caller must
+        not write to them any more.
         """
         size = POSE_SIZE + LANDMARK_SIZE * len(self.landmark_ids)
         if self.mean.shape != (size,) or self.covariance.shape != (size, size):

@@ -2,7 +2,7 @@
 
 A frame is a pure function of the source, the counter and the settings: raw RF counters come from
 an `EchoSource` as integers; the chip turns them into the float32 values the firmware sends.
-Frames are synthesised in blocks because that is faster, and a block is thrown away whenever a
+Frames are synthesised in blocks because that is faster, and a block is discarded whenever a
 setting changes; block size never changes a value.
 
 A coupled register is computed from the chip's settings when read and changes them when written,
@@ -218,7 +218,7 @@ class Refusal(Exception):  # noqa: N818 - a refusal is an answer of the module, 
         self.code = code
 
 
-class Silence(Exception):  # noqa: N818 - as above
+class Silence(Exception):  # noqa: N818 - not an error of ours
     """A command the module does not answer."""
 
 
@@ -705,7 +705,7 @@ def _baseband_values(
 
 
 _GETTERS: dict[X4Setting, Callable[[Chip], X4Value]] = {
-    X4Setting.FPS: lambda chip: _fps_read_back(chip.settings.fps),
+    X4Setting.FPS: lambda chip: x4.frame_rate_read_back(chip.settings.fps),
     X4Setting.PULSESPERSTEP: lambda chip: chip.settings.pulses_per_step,
     X4Setting.ITERATIONS: lambda chip: chip.settings.iterations,
     X4Setting.DOWNCONVERSION: lambda chip: chip.settings.downconversion,
@@ -719,7 +719,3 @@ _GETTERS: dict[X4Setting, Callable[[Chip], X4Value]] = {
     X4Setting.PRFDIV: lambda chip: chip.settings.prf_div,
     X4Setting.FRAMEBINCOUNT: lambda chip: chip.area.n_bins,
 }
-
-
-def _fps_read_back(fps: float) -> float:
-    return x4.frame_rate_read_back(fps)

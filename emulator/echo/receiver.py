@@ -373,7 +373,7 @@ class _Row:
 
 @functools.cache
 def _near_scatterers(first_cell: int, n_cells: int) -> NDArray[np.int64]:
-    """Return which normals the samples of each cell hear, shape (4 * _REACH, n_cells).
+    """Return which normals reach the samples of each cell, shape (4 * _REACH, n_cells).
 
     Nearest range first; first of the scatterers' real, then of their imaginary parts.
     """

@@ -16,12 +16,10 @@ A face is a straight segment of the floor plan from ``a`` over its length along 
 ``t``; its normal ``n = (-t_y, t_x)`` is on its left. ``along`` and ``height`` are a point's
 coordinates on t and n, from a. Faces of boxes are given clockwise, so that n points outwards.
 
-Formulas and sources are on the model page, ``emulator.echo.echo``. A radar sees itself in a flat
-face: the transmitter's image is as far behind as the radar is in front.
-
-Formulas and sources are on the model page, ``emulator.echo.echo``. Seen from the target, the radar
-stands where it is and once more behind every face that shows it: legs from there to the target,
-one for the way out and one for the way back, make every path with at most one mirror each way.
+A radar sees itself in a flat face: the transmitter's image is as far behind as the radar is in
+front. Seen from a target, the radar stands where it is and once more behind every face that shows
+it: legs from there to the target, one for the way out and one for the way back, make every path
+with at most one mirror each way. All formulas and their sources are in ``emulator.echo.echo``.
 """
 
 from __future__ import annotations

@@ -579,8 +579,8 @@ def fault(device: FaultyDevice, kind: str, **keys: Any) -> Iterator[Injection]: 
     Parameters
     ----------
     keys
-        Those of a scenario file (``count``, ``every``, ``command`` ...); what is none of them is
-        a parameter of the kind.
+        Those of a scenario file (``count``, ``every``, ``command`` ...); all others
+        are parameters of the kind.
 
     Raises
     ------

@@ -209,7 +209,7 @@ class Piece:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Context:
-    """What an effect knows beside the packet.
+    """What an effect is given beside the packet.
 
     Attributes
     ----------

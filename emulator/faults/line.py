@@ -163,7 +163,7 @@ class Watch:
         return pieces
 
     def command_sent(self, command: Command[Response], *, silent: bool = False) -> None:
-        """Learn that the module got a command; ``silent`` if the host shall not see its answer."""
+        """Note that the module got a command; ``silent`` if the host shall not see its answer."""
         self._pending.append(_Pending(command, silent))
         if isinstance(command, X4DriverInit):
             self._settings.clear()

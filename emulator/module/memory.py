@@ -3,11 +3,7 @@
 Files are as long as they were created; erased bytes are FF. Assumed: sizes add up to the storage
 without overhead, and a write may change erased and written bytes alike.
 
-Source: protocol reference 4.11 and 5.1.
-
-Source: protocol reference 4.7, 4.10, 4.11 and 8.2.
-
-Source: protocol reference 8.5 and 11, row 18.
+Source: protocol reference 4.7, 4.10, 4.11, 5.1, 8.2, 8.5 and 11, row 18.
 """
 
 from __future__ import annotations

@@ -1,17 +1,16 @@
 """The mode machine of an X4M300, and which commands it takes in which state.
 
 `TRANSITIONS` is the machine; ``python -m emulator.module.modes`` prints it as a Mermaid state
-diagram. The reference leaves open what follows here from assumptions: MANUAL and REG unload the
-profile (their GETs answer as if none were loaded), IDLE pauses a profile that was loaded but never
-run, and is refused like RUN when none is loaded. The direct jump from RUN to MANUAL is an option.
+diagram, and the table of commands. The reference leaves open what follows here from assumptions:
+MANUAL and REG unload the profile (their GETs answer as if none were loaded), IDLE pauses a profile
+that was loaded but never run, and is refused like RUN when none is loaded. The direct jump from RUN
+to MANUAL is an option.
 
-Source: protocol reference 4.2, 4.3, 8.2 and 8.3.
+Rows and columns of the table are those of protocol reference 8.3, with columns for certification
+mode (as MANUAL), the bare base firmware (2) and the bootloader (4.12) added. What the reference
+leaves open is an option; a verdict names it.
 
-Rows and columns are those of protocol reference 8.3, with columns for certification mode (as
-MANUAL), the bare base firmware (2) and the bootloader (4.12) added. What the reference leaves
-open is an option; a verdict names it. ``python -m emulator.module.modes`` prints the table.
-
-Source: protocol reference 2, 8.3, 8.5.
+Source: protocol reference 2, 4.2, 4.3, 8.2, 8.3 and 8.5.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ class MessageKind(Enum):
 
 
 class MessageStream(ABC):
-    """Messages a module sends of its own accord, each with the time it falls due."""
+    """Unsolicited messages of a module, each with the time it falls due."""
 
     @abstractmethod
     def next_due_ns(self) -> int | None:
@@ -45,17 +45,17 @@ class MessageStream(ABC):
 
     @abstractmethod
     def command_done(self, command: Command[Response], now_ns: int) -> None:
-        """Learn that the module carried out, or refused, a command."""
+        """Note that the module carried out, or refused, a command."""
 
     # A recording goes on through a reset; a radar streams whether a host listens or not.
     def restarted(self, ready_ns: int) -> None:  # noqa: B027 - see above
-        """Learn that the module restarts, and when it will be ready; until then it is silent."""
+        """Note that the module restarts, and when it will be ready; until then it is silent."""
 
     def port_opened(self, now_ns: int) -> None:  # noqa: B027 - see above
-        """Learn that a host opened the port."""
+        """Note that a host opened the port."""
 
     def port_closed(self, now_ns: int) -> None:  # noqa: B027 - see above
-        """Learn that the last host closed the port."""
+        """Note that the last host closed the port."""
 
 
 class _Queued(NamedTuple):

@@ -78,7 +78,7 @@ class IoPins:
         self.movement = presence == PresenceState.PRESENCE and direction != PresenceDirection.STILL
 
     def set_control(self, pin: int, setup: int, feature: int) -> None:
-        """Say what a pin does; pin 0 is all."""
+        """Set what a pin does; pin 0 is all."""
         pins = self._pins(pin)
         if self._base_firmware:
             if feature != IoPinFeature.PASSIVE:

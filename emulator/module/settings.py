@@ -1,23 +1,16 @@
-"""Settings of a profile: detection zone, sensitivity, band, LED, noise map, messages.
+"""Settings of a module and its profile: firmware options, baud rates, messages, limits.
 
 A question the reference answers is no option. Where it marks a guess, the default is that guess;
 where it reports an observation of hardware, the default is the observation.
 
-Source: protocol reference, the rows marked [INF], 4.3, 4.4, 8.3, 8.5 and chapter 15.
-
-Source: protocol reference 4.10 and chapter 10.
-
 Line levels are bytes of 0 and 1, one per bit time of the sender; between characters, before the
 first and after the last the line is high. Eight data bits, least significant first, no parity.
-
-A table of bits by message id holds only messages that are on.
-
-Source: protocol reference 4.7 and 11, row 5.
 
 `ProfileSettings` is what commands change and what a running profile obeys. Values out of range
 raise `Refusal` or are clamped, as the options say.
 
-Source: protocol reference 4.4 to 4.7.
+Source: protocol reference, the rows marked [INF], 4.3 to 4.7, 4.10, 8.3, 8.5, chapters 10 and 15,
+and 11, row 5.
 """
 
 from __future__ import annotations
@@ -385,7 +378,7 @@ class ProfileSettings:
 
 
 def _checked(value: float, lowest: float, highest: float, options: DeviceOptions) -> float:
-    """Return a value within limits, or what the options say of one outside.
+    """Return a value within limits; one outside is clamped or refused, as the options say.
 
     Limits are met in float32: 9.4 arrives as 9.3999996185.
     """

@@ -67,7 +67,7 @@ class Announcement:
         self.update(ready)
 
     def update(self, ready: dict[str, Any]) -> None:
-        """Say something else from now on; who reads it sees the old word or the new one."""
+        """Replace the ready line; a reader sees the old one or the new one."""
         if self._path is None:
             return
         with contextlib.suppress(OSError):

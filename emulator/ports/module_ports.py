@@ -35,7 +35,7 @@ class DeviceSide:
 
     @property
     def wants_data(self) -> bool:
-        """Whether to read from the host; what is read without having the module is thrown away."""
+        """Whether to read from the host; what is read without having the module is discarded."""
         return not self._has_it() or self._device.wants_data
 
     def receive_data(self, data: bytes, now_ns: int) -> None:

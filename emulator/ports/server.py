@@ -29,7 +29,7 @@ class ByteLink(Protocol):
     def fileno(self) -> int:
         """Return the descriptor to wait on; -1 while the line is unplugged.
 
-        It may change between turns. Whoever closes it takes it out of the selector first.
+        It may change between turns. It is taken out of the selector before it is closed.
         """
         ...
 

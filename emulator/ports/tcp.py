@@ -134,7 +134,7 @@ class TcpLink(Service):
             client, _ = self._listener.accept()
         except OSError as error:
             if error.errno in _NO_DESCRIPTOR:
-                self._turn_away()
+                self._refuse_client()
             return  # else it left again before it was let in
         if self._client is not None or not self._admits():
             client.close()
@@ -144,7 +144,7 @@ class TcpLink(Service):
         client.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         self._client = client
 
-    def _turn_away(self) -> None:
+    def _refuse_client(self) -> None:
         """Hang up on a waiting client without a descriptor for it, which would wake us for ever."""
         if self._spare_fd < 0:
             return

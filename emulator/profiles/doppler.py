@@ -1,10 +1,8 @@
-"""The noise map: what the pulse-Doppler matrices hold of a room where nobody moves.
+"""The radar under a profile: its baseband, pulse-Doppler matrices and noise map.
 
 The profile drives the X4 with the sensor's working point: 17 frames/s of baseband over the
 detection zone and one bin more at either end. The profile's chip is a model of its own, so the
 X4 commands of a host neither see nor disturb it (assumed; on hardware they would disturb it).
-
-Source: protocol reference 7.1, 8.3 and 9.3.
 
 | Matrix | Frames averaged | Pulses F | Window | Frequencies | Sent |
 |---|---|---|---|---|---|
@@ -16,15 +14,13 @@ reference gives none. Power is that of a complex tone: amplitude A at one of the
 A**2, in the normalised units of baseband. What stands still is at 0 Hz and, through the Hann
 window, at one step on either side. Approaching is positive, as the phase falls with range.
 
-Source: protocol reference 4.6 and 7.2.
-
 Noise map control chooses where the map of a starting profile comes from (`map_source`): a stored
 one, the default - the receiver noise of a nominal module, the same in every bin - or one created
 from the first 100 s after the matrices are full. Afterwards it follows the room with a time
 constant of ten minutes, but not in bins where a person may be. The two last numbers of that
 sentence and the default map are ours; the reference names the 100 s only.
 
-Source: protocol reference 4.6.
+Source: protocol reference 4.6, 7.1, 7.2, 8.3 and 9.3.
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ _NO_MOVEMENT_DB = 3.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Detection:
-    """Somebody in the zone.
+    """A person in the zone.
 
     Attributes
     ----------

@@ -1,12 +1,8 @@
 """The running profile as a stream of messages: it starts, pauses and ends with the mode.
 
-Source: protocol reference 7.1; amplitude, not power, as 11 row 23 assumes.
-
 Assumed where the reference is silent: counters of all messages are those of radar frames; radar
 cross sections are 0, because released firmware computes none; bytes begin at -130 dB and go in
-steps of 0.5 dB, rounded to the nearest.
-
-Source: protocol reference 7.2 and 7.3.
+steps of 0.5 dB, rounded to the nearest. Samples are amplitude, not power (11, row 23).
 
 A matrix is hundreds of messages, a range bin each; they are spread evenly over the frames until
 the next one, so that the module's queue of 50 slots can take them. Pulse-Doppler matrices are sent
@@ -26,7 +22,7 @@ is dropped.
 RUN after a pause fills the matrices anew (assumed) and keeps the noise map. A module that restarts
 begins when it is ready.
 
-Source: protocol reference 4.6, 8.1 to 8.3.
+Source: protocol reference 4.6, 7.1 to 7.3, 8.1 to 8.3.
 """
 
 from __future__ import annotations

@@ -182,7 +182,7 @@ class JitterSpec(Table):
 
 
 class CarriedSpec(Table):
-    """Somebody picks the robot up and sets it down further on along its course.
+    """The robot is picked up and set down further on along its course.
 
     At ``at_s`` of scene time it is lifted, for ``takes_s`` it moves straight to where it would
     have been ``skips_s`` later, turned likewise, and drives on from there. Its radars see where

@@ -113,19 +113,19 @@ def matched(path: Path, drivers: Mapping[str, X4M300]) -> Mapping[str, X4M300]:
         wanted = {radar.serial: radar.name for radar in load_rig(path).radars}
     except AppError as error:
         pytest.fail(str(error), pytrace=False)
-    there = {name: driver.info().serial_number or "none told" for name, driver in drivers.items()}
+    there = {name: driver.info().serial_number or "unknown" for name, driver in drivers.items()}
     missing = {serial: name for serial, name in wanted.items() if serial not in there.values()}
     if missing:
         lost = ", ".join(f"{name} ({serial})" for serial, name in missing.items())
         others = ", ".join(f"{serial} at {name}" for name, serial in there.items())
         pytest.fail(f"{path}: missing {lost}; there are {others}", pytrace=False)
-    strangers = [f"{serial} at {name}" for name, serial in there.items() if serial not in wanted]
-    if strangers:
-        pytest.fail(f"{path}: not of this rig: {', '.join(strangers)}", pytrace=False)
+    foreign = [f"{serial} at {name}" for name, serial in there.items() if serial not in wanted]
+    if foreign:
+        pytest.fail(f"{path}: not of this rig: {', '.join(foreign)}", pytrace=False)
     return {wanted[serial]: drivers[name] for name, serial in there.items()}
 
 
-_PATIENCE_NS = 10_000_000_000  # a restart takes 2 ... 9 s (Protocol reference 8.1)
+_RESTART_LIMIT_NS = 10_000_000_000  # a restart takes 2 ... 9 s (Protocol reference 8.1)
 _QUIET_S = 0.05
 _LATE_READS = 10_000
 
@@ -219,7 +219,7 @@ class RadarUnderTest:
             self._lock.release()
 
     def _settle(self) -> None:
-        deadline_ns = self.place.clock_ns() + _PATIENCE_NS
+        deadline_ns = self.place.clock_ns() + _RESTART_LIMIT_NS
         while True:
             try:
                 line = self.tap.around(self.place.open_line())

@@ -41,7 +41,7 @@ from xethru_protocol.wire.messages import (
 EMULATED = FIXTURES / "cassettes" / "emulated.json"
 FORMAT = 1
 _ANSWERS = (Ack, Error, Pong, ReplyByte, ReplyInt, ReplyFloat, ReplyString)
-_PATIENCE_S = 1.5  # the vendor's host waits 2 s; answers take milliseconds
+_ANSWER_LIMIT_S = 1.5  # the vendor's host waits 2 s; answers take milliseconds
 
 
 class CassetteError(Exception):
@@ -131,7 +131,7 @@ def _answer(
     line: Transport, reader: PacketReader, clock_ns: Callable[[], int], command: bytes
 ) -> bytes | None:
     line.write(encode_normal(command))
-    deadline_ns = clock_ns() + round(_PATIENCE_S * 1e9)
+    deadline_ns = clock_ns() + round(_ANSWER_LIMIT_S * 1e9)
     while (left_ns := deadline_ns - clock_ns()) > 0:
         reader.receive_data(line.read(left_ns * 1e-9))
         while not isinstance(found := reader.next_packet(), NeedData):

@@ -170,7 +170,7 @@ def _add_run(run: argparse.ArgumentParser) -> None:
         dest="clock",
         default="arrival",
         metavar="CLOCK",
-        help="what its stamps are: arrival (any clock, told by when lines come; the default), "
+        help="what its stamps are: arrival (any clock, found from when lines come; the default), "
         "unix, monotonic, or the monotonic nanoseconds at stamp 0",
     )
     run.add_argument(

@@ -6,7 +6,7 @@ robot's first pose; `odom` is the wheel odometry's own.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Self
@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 
 from slam.frames import RadarFrame
 from slam.results import StepResult
+
+TruthAt = Callable[[NDArray[np.int64]], NDArray[np.float64]]
+"""True poses, shape (n, 3), world frame, at n session times [ns]; NaN if unknown."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -271,10 +271,10 @@ class _Estimator:
 
     def _assign(self, model: _Model, landmark: Indices, gates_m: Array) -> Indices:
         ranges, sights = self._drive.ranges, self._sights(model)
-        loud = strengths(ranges, sights, model.landmarks, landmark)
+        strength = strengths(ranges, sights, model.landmarks, landmark)
         offsets_m = model.radars[ranges.radar, 0]
         assignment = assign(
-            ranges, sights, offsets_m, model.landmarks, gate_m=gates_m, strengths=loud
+            ranges, sights, offsets_m, model.landmarks, gate_m=gates_m, strengths=strength
         )
         self._bend_m = assignment.bend_m
         return assignment.landmark

@@ -374,7 +374,7 @@ def _bends(distance: Array, amplitude: Array, own: Indices) -> Array:
 
 
 def well_seen(ranges: RangeSet, landmark: Indices, n_landmarks: int) -> NDArray[np.bool_]:
-    """Tell which landmarks have enough ranges to be trusted, shape (n_landmarks,).
+    """Return which landmarks have enough ranges to be trusted, shape (n_landmarks,).
 
     Two radars (where there are two) must have followed it, and not much less often than others:
     what only one radar saw, or few times, is as likely a misplaced piece of another echo.

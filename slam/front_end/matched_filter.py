@@ -79,7 +79,7 @@ _LEAST_QUIET = 8
 class PulseFilter:
     """Correlation of frames of one length with one pulse.
 
-    ``false_alarms`` is the mean number of peaks in a frame of noise; with ``noise_is_told``, sigma
+    ``false_alarms`` is the mean number of peaks in a frame of noise; with ``noise_is_known``, sigma
     is known, and the threshold needs no allowance for its scatter.
     """
 
@@ -90,7 +90,7 @@ class PulseFilter:
         bin_length_m: float,
         *,
         false_alarms: float,
-        noise_is_told: bool,
+        noise_is_known: bool,
     ) -> None:
         half = pulse.half_length(bin_length_m)
         template = pulse.samples(np.zeros(1), bin_length_m)[0]
@@ -126,7 +126,7 @@ class PulseFilter:
         self.probe_noise = float(np.sum(2 - (2 + 0.5 * self.probe_sigmas**2) * rho_sq))
         """Energy at the probes, over sigma_y**2, that noise leaves once a pulse is fitted."""
         self.threshold = threshold_sigmas(
-            n_bins / self.sigma_bins, false_alarms, noise_is_told=noise_is_told
+            n_bins / self.sigma_bins, false_alarms, noise_is_known=noise_is_known
         )
 
     def apply(self, samples: Array) -> ComplexArray:
@@ -153,10 +153,10 @@ class PulseFilter:
         )
 
 
-def threshold_sigmas(length_sigmas: float, false_alarms: float, *, noise_is_told: bool) -> float:
+def threshold_sigmas(length_sigmas: float, false_alarms: float, *, noise_is_known: bool) -> float:
     """Return the level, in sigma_y, with ``false_alarms`` local maxima of noise above it per frame.
 
-    ``length_sigmas`` is the length of the frame in envelope sigmas; ``noise_is_told`` says that
+    ``length_sigmas`` is the length of the frame in envelope sigmas; ``noise_is_known`` says that
     sigma_y is known and not estimated from the frame itself.
     """
     rate = length_sigmas / (2 * math.sqrt(math.pi))
@@ -164,7 +164,7 @@ def threshold_sigmas(length_sigmas: float, false_alarms: float, *, noise_is_told
 
     def excess(r: float) -> float:
         t = r * r / 2
-        tail = t if noise_is_told else cells * math.log1p(t / cells)
+        tail = t if noise_is_known else cells * math.log1p(t / cells)
         return math.log(rate * r) - tail - math.log(false_alarms)
 
     # Upcrossings are rarer below the level sigma_y than at it; no threshold lies there.
@@ -474,7 +474,7 @@ class MatchedFilterDetector:
                 self.pulse,
                 *key,
                 false_alarms=settings.false_alarms_per_frame,
-                noise_is_told=settings.noise_sigma > 0,
+                noise_is_known=settings.noise_sigma > 0,
             )
         return self._filters[key]
 

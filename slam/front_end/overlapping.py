@@ -1,4 +1,4 @@
-"""Echoes that overlap, told apart by joint maximum likelihood.
+"""Echoes that overlap, separated by joint maximum likelihood.
 
 A window of a raw frame is modelled as K pulses of known shape and white noise,
 
@@ -652,10 +652,9 @@ def _inverse(matrix: Matrix) -> Matrix:
 
 def _fitted_echoes(fit: _Fit, sigma_y: float) -> tuple[EchoFit, ...]:
     information = fit.information
-    told = [row[k] for k, row in enumerate(information)]
-    blind = min(told) <= 1e-12 * max(told)
+    diagonal = [row[k] for k, row in enumerate(information)]
     variances = [math.inf] * len(information)
-    if not blind:
+    if min(diagonal) > 1e-12 * max(diagonal):
         variances = [row[k] for k, row in enumerate(_inverse(information))]
     spread = [sigma_y * math.sqrt(v) if v > 0.0 else math.inf for v in variances]
     return tuple(

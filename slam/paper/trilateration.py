@@ -161,8 +161,9 @@ def one_to_one(fixes: Sequence[Fix]) -> list[Fix]:
     """Return fixes of one pair of radars that share no detection.
 
     As many as possible; among those choices the one whose amplitudes fit best: least sum of
-    ``|ln(a1 / a2)|``, because one target answers two radars side by side about equally loud. The
-    order of the fixes plays no part, in ties neither: detections are numbered by range first.
+    ``|ln(a1 / a2)|``, because two radars side by side receive one target with nearly equal
+    amplitude. The order of the fixes plays no part, in ties neither: detections are numbered by
+    range first.
     Equal detections of one radar are one.
     """
     firsts = _numbered(fix.detections[0] for fix in fixes)

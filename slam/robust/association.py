@@ -80,16 +80,16 @@ class RangeScan:
         return replace(self, sigmas_m=tuple(math.hypot(s, sigma_m) for s in self.sigmas_m))
 
     def is_alone(self, index: int) -> bool:
-        """Tell whether no other echo overlaps that of a range."""
+        """Return whether no other echo overlaps that of a range."""
         others = (*self.ranges_m[:index], *self.ranges_m[index + 1 :], *self.blurred_m)
         return all(abs(other_m - self.ranges_m[index]) > BLUR_M for other_m in others)
 
     def may_hide(self, range_m: float) -> bool:
-        """Tell whether an echo at a range may be part of a blurred one."""
+        """Return whether an echo at a range may be part of a blurred one."""
         return any(abs(blurred_m - range_m) <= BLUR_M for blurred_m in self.blurred_m)
 
     def answers(self, range_m: float, reach_m: float) -> bool:
-        """Tell whether any echo, blurred or not, may be that of a target at a range."""
+        """Return whether any echo, blurred or not, may be that of a target at a range."""
         return any(abs(detected_m - range_m) <= reach_m for detected_m in self.ranges_m) or any(
             abs(blurred_m - range_m) <= BLUR_M + reach_m for blurred_m in self.blurred_m
         )

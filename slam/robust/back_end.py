@@ -289,7 +289,7 @@ class RobustBackEnd:
         return landmark_id
 
     def relinearise(self) -> bool:
-        """Solve for all poses and replace the belief; tell whether that worked.
+        """Solve for all poses and replace the belief; return whether that worked.
 
         Not while the robot is lost or evidence speaks against its pose: a wrong measurement would
         be spread over the whole run.
@@ -302,7 +302,7 @@ class RobustBackEnd:
         return not (self._localisation.is_lost or self._localisation.surprise.is_suspicious)
 
     def _smooth_if_due(self) -> bool:
-        """Give landmarks their radii and solve for all poses; tell whether they were solved for."""
+        """Give landmarks their radii and solve for all poses; return whether that worked."""
         relinearised = False
         if self._roundness is not None and self._is_located():
             hits = self._existence.hits

@@ -1,13 +1,12 @@
 """New landmarks: ranges of the last frames that one point at rest explains.
 
-A range is used once. One that continues a track never comes here, and one that a tracklet takes is
-gone for every later tracklet.
-
 A point is guessed from ranges of the newest frame and followed back through the frames along
 odometry by a small Kalman filter on its position in the newest body frame; each frame gives the
 unused range nearest to the prediction, if it passes the gate. The guess is accepted if enough
 frames hold it and its residuals are as small as those of a point at rest: clutter has no past, and
 a ghost, the fix of two ranges of different targets, does not stay at rest while the robot moves.
+A range is used once: ranges assigned to landmarks are left out, and so are those of earlier
+tracklets.
 
 A point b with noise n and known dependence D_b on the radars' range offsets measures
 
@@ -427,8 +426,8 @@ class Tracker:
         self._noise, self._rule = noise, rule
         self._offsets: list[float] = offsets_m.tolist()
         self._offset_covariance = offset_covariance
-        self._doubt: list[float] = offset_covariance.diagonal().tolist()
-        self._offsets_known = max(self._doubt, default=0.0) <= (0.1 * noise.sigma_m) ** 2
+        self._offset_variances: list[float] = offset_covariance.diagonal().tolist()
+        self._offsets_known = max(self._offset_variances, default=0.0) <= (0.1 * noise.sigma_m) ** 2
 
     def follow(self, guess: Guess, frames: Sequence[Sequence[Slot]]) -> Tracklet:
         """Return the ranges that follow a guess; twice, the second time from the first result."""
@@ -471,7 +470,7 @@ class Tracker:
                 ux, uy = dx / distance, dy / distance
                 px, py = cxx * ux + cxy * uy, cxy * ux + cyy * uy
                 variance = nearest.sigma_m**2 + slot.drift
-                s = ux * px + uy * py + variance + self._doubt[radar]
+                s = ux * px + uy * py + variance + self._offset_variances[radar]
                 if nu * nu > gate_sq * s:
                     continue
                 kx, ky = px / s, py / s
@@ -544,7 +543,7 @@ class Tracker:
 
 
 def is_believable(tracklet: Tracklet, n_radars: int, rule: TrackletRule) -> bool:
-    """Tell whether a tracklet is evidence of a point at rest; ``n_radars`` is 1 or 2."""
+    """Return whether a tracklet is evidence of a point at rest; ``n_radars`` is 1 or 2."""
     frames = {member.slot.back for member in tracklet.members}
     alone = n_radars == 1
     if len(frames) < (rule.single_min_frames if alone else rule.min_frames):
@@ -559,7 +558,7 @@ def is_believable(tracklet: Tracklet, n_radars: int, rule: TrackletRule) -> bool
 
 
 def is_consistent(followed: Followed, n_radars: int, rule: TrackletRule) -> bool:
-    """Tell whether enough radars and frames hold it, with residuals as small as their noise."""
+    """Return whether enough radars and frames hold it, with residuals as small as their noise."""
     hits = Counter(member.slot.radar for member in followed.members)
     if len(hits) < n_radars or min(hits.values()) < rule.min_hits_per_radar:
         return False

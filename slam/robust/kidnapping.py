@@ -5,7 +5,7 @@ prediction with the detection probability; where it is not, by chance only: with
 span L, with 1 - exp(-n w / L) for a gate of width w. The log likelihood ratios are summed from each
 of several moments at which the robot may have been carried, and the largest sum counts (a
 cumulative sum test, Page, Biometrika 41, 1954, with few moments). Landmarks mapped after that
-moment were put where the robot was believed to be: they are no witnesses. One landmark that was
+moment were put where the robot was believed to be: they give no evidence. One landmark that was
 taken away proves nothing about the robot: the evidence of each is bounded, so that several must be
 missing.
 
@@ -103,7 +103,7 @@ class _Hypothesis:
     """The robot was carried away before a pose: landmarks known before it, and their votes."""
 
     first_pose: int
-    witnesses: frozenset[int]
+    known_before: frozenset[int]
     votes: dict[int, float]
 
     def score(self) -> float:
@@ -132,13 +132,13 @@ class Surprise:
         return max(self._hypotheses, key=_Hypothesis.score).first_pose
 
     @property
-    def witnesses(self) -> frozenset[int]:
+    def known_before(self) -> frozenset[int]:
         """Return the landmarks that were known before that."""
-        return max(self._hypotheses, key=_Hypothesis.score).witnesses
+        return max(self._hypotheses, key=_Hypothesis.score).known_before
 
     @property
     def is_suspicious(self) -> bool:
-        """Tell whether more than one landmark gives evidence against the pose.
+        """Return whether more than one landmark gives evidence against the pose.
 
         One alone may be hidden or not be a point: were that enough, it could neither be deleted nor
         solved for again, and would count on.
@@ -158,7 +158,7 @@ class Surprise:
         rule = self._rule
         for one in self._hypotheses:
             for trial in frame:
-                if trial.landmark_id in one.witnesses:
+                if trial.landmark_id in one.known_before:
                     vote = one.votes.get(trial.landmark_id, 0.0) + trial.evidence
                     vote = min(max(vote, -rule.most_for), rule.most_against)
                     one.votes[trial.landmark_id] = vote
@@ -227,7 +227,7 @@ def find_join(
 
 
 def _differ(state: State, one: Join, other: Join, rule: RelocationRule) -> bool:
-    """Tell whether two joins put the robot in different places."""
+    """Return whether two joins put the robot in different places."""
     away = between(compose(one.motion, state.pose), compose(other.motion, state.pose))
     return math.hypot(away[0], away[1]) > rule.reach_m or abs(float(away[2])) > rule.turn_rad
 
@@ -414,7 +414,7 @@ class Localisation:
         """
         first = self.surprise.first_pose
         log.forget_from(first)
-        known = self.old_map if self.is_lost else self.surprise.witnesses
+        known = self.old_map if self.is_lost else self.surprise.known_before
         for id_ in state.feature_ids:
             if id_ not in known:
                 forget(id_, state, existence, log)

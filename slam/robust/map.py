@@ -96,7 +96,7 @@ class Existence:
                 self._together[key] = self._together.get(key, 0) + 1
 
     def are_apart(self, first: int, second: int) -> bool:
-        """Tell whether two landmarks were seen whole together, and so are two.
+        """Return whether two landmarks were seen whole together, and so are two.
 
         Only whole sightings count: of two copies of one target, each can be given one of its two
         ranges, and they would veto their own merge.
@@ -549,7 +549,7 @@ class Roundness:
         parameters: BackEndParameters,
         hits: Callable[[int], int],
     ) -> bool:
-        """Give landmarks the radii that are evident; tell whether all poses were solved for.
+        """Give landmarks the radii that are evident; return whether all poses were solved for.
 
         ``hits`` returns how many frames hit a landmark so far.
         """
@@ -579,7 +579,7 @@ class Roundness:
         return solved
 
     def _is_news(self, id_: int, radius: Radius) -> bool:
-        """Tell whether a radius is worth a solution over all poses."""
+        """Return whether a radius is worth a solution over all poses."""
         limit = chi_square_limit(radius.dof, self._rule.excess_sigmas)
         before_m = self._sigmas_m.get(id_)
         if radius.chi_square > limit:

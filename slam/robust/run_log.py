@@ -75,7 +75,7 @@ class Problem:
 
     @property
     def is_walking(self) -> bool:
-        """Tell whether the calibration has one value per pose."""
+        """Return whether the calibration has one value per pose."""
         return bool(np.any(self.walks > 0.0))
 
     def beginning(self, n_steps: int) -> Problem:

@@ -602,7 +602,7 @@ _UNKNOWN = 100.0
 
 
 def is_due(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
-    """Tell whether the pose is too far from the stored trajectory, or that is too long."""
+    """Return whether the pose is too far from the stored trajectory, or too many poses are kept."""
     rule = parameters.relinearisation
     if rule is None:
         return False
@@ -617,7 +617,7 @@ def is_due(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
 
 
 def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
-    """Solve for all poses and replace the belief by the result; tell whether it worked."""
+    """Solve for all poses and replace the belief by the result; return whether it worked."""
     rule = parameters.relinearisation
     if rule is None:
         return False
@@ -646,7 +646,7 @@ def give_radius(
     candidate: tuple[int, float],
     margin: float,
 ) -> bool:
-    """Give the landmark in a row a radius if a solution with it is likelier; tell whether it is.
+    """Give the landmark in a row a radius if a solution with it is likelier; return whether it is.
 
     The cost of the solution over all poses must fall by ``margin``. Then that solution replaces the
     belief.
@@ -681,7 +681,7 @@ def give_radius(
 
 
 def is_determined(information: Array) -> bool:
-    """Tell whether all unknowns of a solution are known to better than 100 m, rad or 1.
+    """Return whether all unknowns of a solution are known to better than 100 m, rad or 1.
 
     A landmark all of whose ranges were left out as too far off has no information but rounding;
     its covariance would be of 1e14 m^2, and have negative eigenvalues.

@@ -1,12 +1,4 @@
-"""Prediction: the robot moves by an odometry increment whose calibration errors are states.
-
-A change of low rank reads and writes the whole triangle and computes next to nothing with it, so
-in a large map memory is what it costs. Changes of large matrices are therefore kept as factors,
-
-    P = L + A B^T + B A^T - G G^T,
-
-L the stored triangle, and carried out together: many changes, one pass. Columns and blocks, which
-are all that a step of the filter reads, come out as if that had been done.
+"""The state of the robust back end, its covariance, and its prediction from odometry.
 
 The map frame is the body frame at the start. The state holds the heading theta, the position p,
 the calibration errors (s, w, kappa) of the wheels, one range offset b per radar, and landmarks l.
@@ -33,6 +25,14 @@ and to first order, with J = [0, -1; 1, 0], heading noise n_a and step noise n_d
     e_th  += q,   e_p += -J p' q - R d / (1 + s) e_s + R n_d,   e_l += -J l q,   e_phi -= q.
 
 That is the identity, two rows and a change of rank two: O(m^2), in place.
+
+A change of low rank reads and writes the whole triangle and computes next to nothing with it, so
+in a large map memory is what it costs. Changes of large matrices are therefore kept as factors,
+
+    P = L + A B^T + B A^T - G G^T,
+
+L the stored triangle, and carried out together: many changes, one pass. Columns and blocks, which
+are all that a step of the filter reads, come out as if that had been done.
 """
 
 from __future__ import annotations

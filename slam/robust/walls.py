@@ -89,8 +89,8 @@ class WallTracker:
     ) -> None:
         self._noise, self._rule, self._walls = parameters.ranges, parameters.tracklets, rule
         self._offsets: list[float] = offsets_m.tolist()
-        self._doubt: list[float] = offset_covariance.diagonal().tolist()
-        known = max(self._doubt, default=0.0) <= (0.1 * self._noise.sigma_m) ** 2
+        self._offset_variances: list[float] = offset_covariance.diagonal().tolist()
+        known = max(self._offset_variances, default=0.0) <= (0.1 * self._noise.sigma_m) ** 2
         self._offset_covariance = None if known else offset_covariance
         self._heading_rad_per_sqrt_m = parameters.wheels.heading_rad_per_sqrt_m
 
@@ -127,7 +127,7 @@ class WallTracker:
                 h = sine * slot.x_m - cosine * slot.y_m
                 pp, pd = cpp * h + cpd, cpd * h + cdd
                 variance = nearest.sigma_m**2 + slot.drift
-                s = h * pp + pd + variance + self._doubt[radar]
+                s = h * pp + pd + variance + self._offset_variances[radar]
                 if nearest.label is not None or nu * nu > gate_sq * s:
                     continue
                 kp, kd = pp / s, pd / s
@@ -195,7 +195,7 @@ class WallTracker:
         return max(max(places) - min(places) for places in of_radar.values())
 
     def is_wall(self, tracklet: WallTracklet) -> bool:
-        """Tell whether a tracklet is evidence of a wall and not of a point."""
+        """Return whether a tracklet is evidence of a wall and not of a point."""
         members = tracklet.members
         if len({member.slot.back for member in members}) < self._walls.min_frames:
             return False
@@ -207,7 +207,7 @@ class WallTracker:
         return verdict.law(self._walls.wall_margin) is Law.WALL
 
     def is_point(self, tracklet: Tracklet) -> bool:
-        """Tell whether the ranges of a tracklet follow a point's law, not a wall's."""
+        """Return whether the ranges of a tracklet follow a point's law, not a wall's."""
         members = tracklet.members
         middle = np.mean([(m.slot.x_m, m.slot.y_m) for m in members], axis=0)
         x, y = tracklet.point_m - middle
@@ -264,7 +264,7 @@ class WallCells:
         return self._cell_m * min(abs(here - cell) for cell in cells)
 
     def surrounds(self, wall_id: int, along_m: float) -> bool:
-        """Tell whether the cell of a place and both its neighbours gave echoes."""
+        """Return whether the cell of a place and both its neighbours gave echoes."""
         cells = self._cells.get(wall_id, set())
         here = math.floor(along_m / self._cell_m)
         return {here - 1, here, here + 1} <= cells
@@ -328,7 +328,7 @@ def match_wall(state: State, seen: BodyWall, cells: WallCells, rule: WallRule) -
 
 
 def is_unresolved(state: State, seen: BodyWall, cells: WallCells, rule: WallRule) -> bool:
-    """Tell whether a wall seen is nearer to a mapped one than radars tell two walls apart."""
+    """Return whether a wall seen is nearer to a mapped one than radars tell two walls apart."""
     feet = seen.in_map(state)
     phi_seen = float(seen.wall[0]) + state.heading_rad
     for row, wall_id in enumerate(state.wall_ids):
@@ -412,7 +412,7 @@ class WallKeeper:
         return hide_unknown(state, seen, by_radar, self.cells)
 
     def is_point(self, tracklet: Tracklet) -> bool:
-        """Tell whether the ranges of a tracklet follow a point's law rather than a wall's.
+        """Return whether the ranges of a tracklet follow a point's law rather than a wall's.
 
         What goes on where a mapped wall does is not known to be a point yet: over a few frames both
         laws fit.
@@ -423,7 +423,7 @@ class WallKeeper:
         return tracker.is_point(tracklet) and not self._is_on_a_wall(tracklet, tracker)
 
     def _is_on_a_wall(self, tracklet: Tracklet, tracker: WallTracker) -> bool:
-        """Tell whether a mapped wall nearby explains the ranges, too."""
+        """Return whether a mapped wall nearby explains the ranges, too."""
         state, rule = self._state, self._rule
         if not state.wall_ids:
             return False

@@ -176,14 +176,14 @@ def _bootloader(probe: PortProbe) -> str | None:
     return "the module is in its bootloader; more than 15 faults in a row bring it there, too"
 
 
-def _gibberish(probe: PortProbe) -> str | None:
+def _no_packets(probe: PortProbe) -> str | None:
     contact = probe.contact
     if contact.pong is None and contact.damaged:
         return "it sends bytes, but no XeThru packets, and answers at none of the known rates"
     return None
 
 
-def _deaf(probe: PortProbe) -> str | None:
+def _no_answer(probe: PortProbe) -> str | None:
     contact = probe.contact
     if contact.pong is None and contact.talks:
         return "the module sends messages, but does not answer"
@@ -200,7 +200,7 @@ def _echo(probe: PortProbe) -> str | None:
     return None
 
 
-def _stranger(probe: PortProbe) -> str | None:
+def _unknown_device(probe: PortProbe) -> str | None:
     pong = probe.contact.pong
     if pong in set(PongCode):
         return None
@@ -353,14 +353,14 @@ PORT_CHECKS = (
     Check(
         name="speaks XeThru",
         looks_at="what comes after PING",
-        find=_gibberish,
+        find=_no_packets,
         remedy="is it another device? If it is a module, " + _POWER_CYCLE,
         ends=True,
     ),
     Check(
         name="listens",
         looks_at="what comes after PING",
-        find=_deaf,
+        find=_no_answer,
         remedy=f"{_POWER_CYCLE}; on a UART, check the line from host to module",
         ends=True,
     ),
@@ -382,7 +382,7 @@ PORT_CHECKS = (
     Check(
         name="is a module",
         looks_at="the answer to PING",
-        find=_stranger,
+        find=_unknown_device,
         remedy="is it another device? 'xethru list' shows the ports there are",
         ends=True,
     ),

@@ -238,8 +238,8 @@ _OTHER_BAUDRATES = (
     *(921600, 460800, 230400, 1000000, 2000000, 3000000, 4000000),
     *(500000, 576000, 38400, 19200, 9600),
 )
-_PATIENCE_S = 1.0
-_GLANCE_S = 0.25  # enough for the 18 bytes of PING and PONG at 9600 baud
+_ANSWER_LIMIT_S = 1.0
+_REPLY_LIMIT_S = 0.25  # enough for the 18 bytes of PING and PONG at 9600 baud
 _WITHOUT_RATE = ("/dev/pts/", "/dev/ttyACM")  # pseudo-terminals, and USB of class CDC ACM
 
 
@@ -353,15 +353,15 @@ class PortProbe:
     @cached_property
     def contact(self) -> Contact:
         """Send PING, at other rates too, and a command of the bootloader."""
-        first = self._ask(m.Ping(), _PATIENCE_S)
+        first = self._ask(m.Ping(), _ANSWER_LIMIT_S)
         if first.pong is not None or first.gone:
             return first
-        if self._ask(m.BootloaderGetDeviceInfo(), _GLANCE_S).talks and not first.talks:
+        if self._ask(m.BootloaderGetDeviceInfo(), _REPLY_LIMIT_S).talks and not first.talks:
             return Contact(bootloader=True)
         if not ignores_baudrate(self.target):
             for baudrate in _OTHER_BAUDRATES:
                 if self._reopen(baudrate):
-                    contact = self._ask(m.Ping(), _GLANCE_S, baudrate)
+                    contact = self._ask(m.Ping(), _REPLY_LIMIT_S, baudrate)
                     if contact.pong is not None:
                         return contact
             self._reopen(USUAL_BAUDRATE)

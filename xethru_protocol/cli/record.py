@@ -393,7 +393,7 @@ class Recorder:
         }
 
 
-_GLANCE_S = 0.2  # how late a signal, or the end, may be noticed
+_POLL_S = 0.2  # how late a signal, or the end, may be noticed
 
 
 def record(arguments: Namespace) -> int:
@@ -467,8 +467,8 @@ def _record_from(
                 raise ResponseTimeout(
                     f"the module sent nothing to record for {silence_s:g} s; {likely}"
                 )
-            left_s = _GLANCE_S if duration_s is None else duration_s - recorder.elapsed_s
-            mode.wait(radar, min(_GLANCE_S, left_s))  # the recorder gets what comes
+            left_s = _POLL_S if duration_s is None else duration_s - recorder.elapsed_s
+            mode.wait(radar, min(_POLL_S, left_s))  # the recorder gets what comes
             progress.show(recorder.numbers)
     finally:
         recorder.stop_listening(radar)

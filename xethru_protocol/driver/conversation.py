@@ -250,7 +250,7 @@ class Conversation:
             self._take_data(message, arrival_ns)
             return
         if self._is_answer(message):
-            self._sign_of_life()
+            self._reset_diagnosis()
             if self._request is None:
                 self.stray_count += 1  # not kept: a faulty module may never stop sending them
             else:
@@ -289,7 +289,7 @@ class Conversation:
         self._request = None
         self._answer_owed = False
         self._pongs_owed = 0
-        self._sign_of_life()
+        self._reset_diagnosis()
 
     def wind_down(self) -> None:
         """From now on care for answers only.
@@ -334,7 +334,7 @@ class Conversation:
         if self._observer is not None:
             self._observer(ProtocolRecord(t_ns=self._clock(), direction=direction, summary=text))
 
-    def _sign_of_life(self) -> None:
+    def _reset_diagnosis(self) -> None:
         self._damaged_since = False
         self._rebooted_since = False
 

@@ -91,7 +91,7 @@ def write(
     except GeneratorExit:
         raise
     except BaseException:
-        yield from _quietly(link, delete(link, file_type, identifier))
+        yield from _clean_up(link, delete(link, file_type, identifier))
         raise
 
 
@@ -141,7 +141,7 @@ def _read_chunks(
     on_progress: OnProgress | None,
 ) -> Steps[bytes]:
     data = bytearray()
-    _tell(on_progress, 0, total)
+    _report_progress(on_progress, 0, total)
     while len(data) < total:
         wanted = min(CHUNK_BYTES, total - len(data))
         got = (yield from link.request(chunk(len(data), wanted))).values
@@ -150,21 +150,21 @@ def _read_chunks(
                 f"{link.path} sent {len(got)} bytes from {len(data)} on, not {wanted}"
             )
         data += got
-        _tell(on_progress, len(data), total)
+        _report_progress(on_progress, len(data), total)
     return bytes(data)
 
 
 def _write_chunks(
     link: Link, file_type: int, identifier: int, data: bytes, on_progress: OnProgress | None
 ) -> Steps[None]:
-    _tell(on_progress, 0, len(data))
+    _report_progress(on_progress, 0, len(data))
     for offset in range(0, len(data), CHUNK_BYTES):
         piece = data[offset : offset + CHUNK_BYTES]
         command = m.SetFileData(
             file_type=file_type, identifier=identifier, offset=offset, data=piece
         )
         yield from link.request(command, SLOW_TIMEOUT_S)
-        _tell(on_progress, offset + len(piece), len(data))
+        _report_progress(on_progress, offset + len(piece), len(data))
 
 
 def _then_close(link: Link, file_type: int, identifier: int, body: Steps[T]) -> Steps[T]:
@@ -175,13 +175,13 @@ def _then_close(link: Link, file_type: int, identifier: int, body: Steps[T]) -> 
     except GeneratorExit:  # the steps are not carried out any more
         raise
     except BaseException:  # also an interrupt: the module has room for ten open files
-        yield from _quietly(link, close)
+        yield from _clean_up(link, close)
         raise
     yield from close
     return result
 
 
-def _quietly(link: Link, procedure: Steps[object]) -> Steps[None]:
+def _clean_up(link: Link, procedure: Steps[object]) -> Steps[None]:
     """Clean up after a failure; what fails meanwhile is only a warning."""
     try:
         yield from procedure
@@ -189,7 +189,7 @@ def _quietly(link: Link, procedure: Steps[object]) -> Steps[None]:
         link.warn(f"could not clean up: {error}")
 
 
-def _tell(on_progress: OnProgress | None, done: int, total: int) -> None:
+def _report_progress(on_progress: OnProgress | None, done: int, total: int) -> None:
     if on_progress is not None:
         on_progress(done, total)
 

@@ -291,7 +291,7 @@ class FrameQueue:
     statistics
         Where lost frames and damaged samples are counted.
     warn
-        Told once per burst of drops: from a first one until the queue was empty again.
+        Called once per burst of drops: from a first one until the queue was empty again.
 
     Attributes
     ----------

@@ -2,12 +2,11 @@
 
 A kind knows how one field is packed, unpacked and shown. The codec walks a message's fields in
 order; the layouts themselves are in the rows. All numbers are little-endian, unpadded
-(Protocol reference, head). A kind raises
-``struct.error`` or ``ValueError`` when the bytes do not fit; the codec turns that into
-`UnknownMessage`.
+(Protocol reference, head). A kind raises ``struct.error`` or ``ValueError`` when the bytes do not
+fit; the codec turns that into `UnknownMessage`.
 
 A `Count` lies on the wire only: a row declares it as ``ClassVar``, so that a message has the
-list and not, beside it, a number that could contradict it. Kinds in general: ``wire``.
+list and not, beside it, a number that could contradict it.
 """
 
 import struct

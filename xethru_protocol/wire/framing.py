@@ -1,16 +1,14 @@
 """Packets in their two framings, and the receiver that finds them in any bytes.
 
-A NoEscape packet has no checksum, so a receiver that believes a damaged length field loses all
-that follows. The judgement needs the length and at most the first 14 payload bytes, and is the
-same for every receiver, so that it depends on nothing but the bytes (Protocol reference 1.3, 1.4).
-
 Normal framing escapes 7D, 7E, 7F and ends with an XOR checksum; NoEscape framing announces a
-length and has neither (Protocol reference 1.1, 1.3).
+length and has neither (Protocol reference 1.1, 1.3). A receiver that believes a damaged length
+field loses all that follows, so a NoEscape header is judged by its length and at most the first 14
+payload bytes, in the same way by every receiver (1.4).
 
 All positions are offsets in the stream; a buffer is given with the offset ``base`` of its first
 byte. No byte is searched twice by one finder, however the bytes arrive.
 
-What it guarantees, for any bytes in any chunks:
+The receiver guarantees, for any bytes in any chunks:
 
 - The packets and faults depend on the bytes only, not on how they were cut into chunks.
 - It never raises, and once it asks for data it holds less than one packet (65 544 bytes) that

@@ -85,7 +85,7 @@ class _Clutter(Parameters):
     bins: Annotated[float, Field(gt=0, le=200, description="standard deviation, bins")] = 4.0
 
 
-class _Rain(Parameters):
+class _Pulses(Parameters):
     pulses: Annotated[int, Field(ge=1, le=1000, description="pulses per frame")] = 5
     amplitude: Annotated[float, Field(gt=0, le=1, description="full scale of the DAC is 1")] = 0.05
 
@@ -257,8 +257,8 @@ def strong_clutter(packet: bytes, wanted: _Clutter, rng: Rng, context: Context) 
     return _with_echo(packet, context, clutter)
 
 
-@kind(Layer.ENVIRONMENT, Target.FRAME, "nothing", _Rain, lasting=True, hidden=_CONTENT)
-def interference(packet: bytes, wanted: _Rain, rng: Rng, context: Context) -> Pieces:
+@kind(Layer.ENVIRONMENT, Target.FRAME, "nothing", _Pulses, lasting=True, hidden=_CONTENT)
+def interference(packet: bytes, wanted: _Pulses, rng: Rng, context: Context) -> Pieces:
     """Every frame has pulses at random bins."""
 
     def pulses(n: int) -> NDArray[np.float64]:

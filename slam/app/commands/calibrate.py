@@ -338,8 +338,8 @@ def _lines(report: CalibrationReport, planted: Mapping[str, tuple[float, float]]
     marked = bool(np.any(calibration.offset_sigmas_m > OFFSET_LIMIT_M))
     if marked:
         yield (
-            f"? not told to {1e3 * OFFSET_LIMIT_M:g} mm (one standard deviation): a rig file keeps "
-            "the nominal offset and mount"
+            f"? not known to {1e3 * OFFSET_LIMIT_M:g} mm (one standard deviation): a rig file "
+            "keeps the nominal offset and mount"
         )
     yield from report.poor
     if marked:

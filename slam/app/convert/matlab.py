@@ -89,7 +89,7 @@ def read_mat(path: Path) -> MatDrive:
     Raises
     ------
     AppError
-        No such MATLAB file, or without the variables above.
+        It is no MATLAB file, or lacks the variables of the module's docstring.
     """
     try:
         with path.open("rb") as stream:

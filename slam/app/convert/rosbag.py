@@ -163,7 +163,7 @@ def convert_bag(
         No bag, a damaged one, one without radars or odometry, or frames that do not fit the frame
         area.
     """
-    contents = _look_through(bag, truth_topic, check)
+    contents = _contents(bag, truth_topic, check)
     warnings = []
     if contents.left_out:
         warnings.append(f"poses that went back in time and are left out: {contents.left_out}")
@@ -205,7 +205,7 @@ def convert_bag(
     )
 
 
-def _look_through(bag: Path, truth_topic: str, check: Callable[[], None]) -> _Contents:
+def _contents(bag: Path, truth_topic: str, check: Callable[[], None]) -> _Contents:
     contents = _Contents()
     with _open(bag) as reader:
         for connection in reader.connections:

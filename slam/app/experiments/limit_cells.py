@@ -2,12 +2,12 @@
 
 Positions in bins, s the envelope's standard deviation in bins, sigma the noise per RF sample.
 
-``chip_frames`` goes the emulator's way: its pulse, its receiver (noise by counter, counting,
+``chip_frames`` uses the emulator: its pulse, its receiver (noise by counter, counting,
 clipping) and the module's normalisation. ``closed_form_frames`` writes the pulse down and adds
 NumPy's noise; neither counts nor clips. That both give the same numbers shows that neither carries
 a mistake of its own.
 
-All see the same windows as `slam.front_end.overlapping.fit_many`, know the same pulse and believe
+All see the same windows as `slam.front_end.overlapping`, know the same pulse and believe
 one more echo by the same test; they differ in how they look for it. Each works on the correlation
 of the window with pulses on a fine grid of positions, cosine and sine taken as orthogonal.
 
@@ -665,7 +665,7 @@ def detection_against_snr(
     }
     sigma = known_pulse(BIN_LENGTH_M).envelope_sigma_bins
     threshold = threshold_sigmas(
-        N_BINS / sigma, MatchedFilterConfig().false_alarms_per_frame, noise_is_told=True
+        N_BINS / sigma, MatchedFilterConfig().false_alarms_per_frame, noise_is_known=True
     )
     rows: list[dict[str, object]] = []
     for snr_db in DETECTION_SNRS_DB:

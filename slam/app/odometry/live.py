@@ -73,7 +73,7 @@ class LiveOdometry:
         self._fixed = clock
         self._envelope = LowerEnvelope()
         self._track: OdometryTrack | None = None
-        self._heard_ns: int | None = None  # host time of the newest pose taken
+        self._newest_host_ns: int | None = None  # host time of the newest pose taken
         self._trouble = ""  # why the lines since then were refused
         self._complaints = 0
         self.n_refused = 0
@@ -122,7 +122,7 @@ class LiveOdometry:
             sample = parse_tum_line(line)
         except TumError as error:
             return None, self._refuse(str(error))
-        if trouble := _cannot_be(sample):
+        if trouble := _rejection(sample):
             return None, self._refuse(trouble)
         if self._track is not None and sample.t_ns <= self._track.last_ns:
             back_s = (self._track.last_ns - sample.t_ns) / NS_PER_S
@@ -134,7 +134,7 @@ class LiveOdometry:
         warning = self._accept(sample)
         if self._fixed is None:
             self._envelope.take(sample.t_ns, arrival_ns)
-        self._heard_ns = arrival_ns
+        self._newest_host_ns = arrival_ns
         return sample, warning
 
     def _accept(self, sample: TumSample) -> str:
@@ -178,7 +178,7 @@ class LiveOdometry:
         self.ended, self.trouble = True, trouble
 
     def dead(self, now_ns: int, since_ns: int) -> str:
-        """Return why the source must be taken for dead, "" if it need not.
+        """Return why no more poses can be expected, "" if they can.
 
         Parameters
         ----------
@@ -187,17 +187,17 @@ class LiveOdometry:
         since_ns
             Host time from which on poses are expected.
         """
-        heard_ns = since_ns if self._heard_ns is None else max(self._heard_ns, since_ns)
-        if self.ended or now_ns - heard_ns <= SILENCE_S * NS_PER_S:
+        newest_ns = max(since_ns, self._newest_host_ns or since_ns)
+        if self.ended or now_ns - newest_ns <= SILENCE_S * NS_PER_S:
             return ""
         if self._trouble:
             return (
                 f"odometry from {self._name}: no usable line for {SILENCE_S:g} s: {self._trouble}"
             )
-        said = "no line" if self._heard_ns is None else "no more line"
+        said = "no line" if self._newest_host_ns is None else "no more line"
         return f"odometry from {self._name}: {said} for {SILENCE_S:g} s; is its sender running?"
 
-    def is_elsewhere(self, now_ns: int) -> str:
+    def clock_mismatch(self, now_ns: int) -> str:
         """Return why its stamps cannot be of the given clock, "" if they can."""
         t_ns = self.session_ns(now_ns)
         if self._fixed is None or self.first_ns - AHEAD_NS <= t_ns <= self.last_ns + AHEAD_NS:
@@ -224,7 +224,7 @@ class LiveOdometry:
         return self._track
 
 
-def _cannot_be(sample: TumSample) -> str:
+def _rejection(sample: TumSample) -> str:
     """Return why a session cannot hold a pose, or the filter not take it; "" if both can."""
     if not 0 <= sample.t_ns < MOST_STAMP_NS:
         return (

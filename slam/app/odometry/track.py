@@ -172,7 +172,7 @@ def read_odometry_socket(path: str, timeout_s: float = 10.0) -> OdometryTrack:
     Raises
     ------
     OdometryError
-        Nobody listens there, the sender falls silent before the end, or a line is malformed.
+        There is no listener, the sender stops before the end, or a line is malformed.
     """
     received = bytearray()
     try:

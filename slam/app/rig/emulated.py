@@ -130,7 +130,7 @@ class EmulatorProcess:
         except subprocess.TimeoutExpired:
             return None
         how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
-        return f"the emulator ended {how}{self._last_words()}"
+        return f"the emulator ended {how}{self._last_message()}"
 
     def wait_until_ready(self, check: Callable[[], None]) -> None:
         """Read the ready line, which names ports and odometry socket.
@@ -174,7 +174,7 @@ class EmulatorProcess:
         except (ValueError, KeyError, TypeError):
             raise EmulatorError(f"the emulator's ready line is unknown: {line[:200]!r}") from None
 
-    def _last_words(self) -> str:
+    def _last_message(self) -> str:
         self._errors.seek(0)
         lines = self._errors.read().decode(errors="replace").split("\n")
         said = [line.strip() for line in lines if line.strip()]

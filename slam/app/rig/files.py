@@ -1,10 +1,10 @@
-"""Modules on ports, and the radars of a rig file: who is who, by the modules' own serial numbers.
+"""Rig files, and the modules on ports: who is who, by the modules' own serial numbers.
 
-What `uwb-slam calibrate --rig` writes and `load_rig` reads back. Lengths in true metres, body frame
-x forward and y left, yaw in degrees counter-clockwise from forward; `range_offset_m` is what the
-module measures too long, `phase_offset_deg` what it adds to an echo's carrier phase
-(`Mount.phase_offset_rad`; no command estimates it), `gain_db` how much louder it hears than the
-mean of the rig. `uwb-slam run --rig` reads it and finds each radar by its module's serial number.
+A rig file is what `uwb-slam calibrate --rig` writes and `load_rig` reads back. Lengths in true
+metres, body frame x forward and y left, yaw in degrees counter-clockwise from forward;
+`range_offset_m` is what the module measures too long, `phase_offset_deg` what it adds to an echo's
+carrier phase (`Mount.phase_offset_rad`; no command estimates it), `gain_db` how much stronger its
+echoes are than the mean of the rig.
 
 Which cable ends where does not matter: a module's mount, offset and gain follow its serial number.
 A module that is missing, foreign or there twice is refused by name before anything is set.

@@ -596,7 +596,7 @@ class LiveSource:
                     f"by its clock it is {start_ns / NS_PER_S:.3f} s: it ended before the run "
                     "could begin, or --odometry-clock is another"
                 )
-            if text := self._odometry.is_elsewhere(now_ns):
+            if text := self._odometry.clock_mismatch(now_ns):
                 raise AppError(text)
             if self._odometry.session_ns(now_ns) < NS_PER_S:
                 continue  # no session holds what was before 0

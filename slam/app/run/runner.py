@@ -16,14 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, SessionObserver, Snapshot
+from slam.app.records import (
+    LogLine,
+    RadarInfo,
+    Scan,
+    SessionInfo,
+    SessionObserver,
+    Snapshot,
+    TruthAt,
+)
 from slam.frames import RadarFrame
 from slam.geometry import Rig
 from slam.results import Slam, StepResult
 from xethru_protocol.driver.conversation import ProtocolRecord
-
-TruthAt = Callable[[NDArray[np.int64]], NDArray[np.float64]]
-"""True poses, shape (n, 3), world frame, at n session times [ns]; NaN if unknown."""
 
 
 def unknown_truth(stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 
 from slam.app.odometry.track import OdometryTrack
 from slam.app.odometry.tum import TumSample
-from slam.app.records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
+from slam.app.records import (
+    LogLine,
+    Scan,
+    SessionInfo,
+    SessionObserver,
+    Snapshot,
+    TruthAt,
+)
 from slam.app.session import messages as ros
 from slam.app.session.mcap import SessionFile
 from slam.app.session.messages import METADATA_NAME, radar_text, session_table, state_row
@@ -31,9 +38,6 @@ from xethru_protocol.recordings.mcap import (
 )
 
 _ORIGIN = np.zeros(3)
-
-TruthAt = Callable[[NDArray[np.int64]], NDArray[np.float64]]
-"""True poses, shape (n, 3), world frame, at n session times [ns]."""
 
 
 class SessionLog(SessionObserver):

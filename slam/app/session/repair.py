@@ -148,7 +148,7 @@ def repair(path: Path, out: Path | None, check: Callable[[], None]) -> Repair:
 
 
 def _swap(fresh: Path, path: Path, kept: Path) -> None:
-    """Put a file in another's place, which goes on under its second name; all of it or nothing."""
+    """Put a file in another's place, and keep that one under its second name; all or nothing."""
     try:
         kept.hardlink_to(path)  # whatever ends us before the next line, the session has its name
     except OSError:  # FAT and some network shares have no second names

@@ -1,12 +1,5 @@
 """The known-association bound of one run: what is possible with the true ids, on the same data.
 
-Between poses 0 and 1, with d = (ux, uy) / (1 + s), D = |d| and a = (ua - kappa D) / (1 + w)::
-
-    r = [R0^T (p1 - p0) - d, theta1 - theta0 - a]
-
-Derivatives are by body-frame changes of the poses (GTSAM's) and by (s, w, kappa). Plain floats:
-the function runs once per step and linearisation, and arrays of three cost more than they do.
-
 Each range goes to the true landmark that it fits: nearest in range, in front of the antenna, no
 landmark twice in a frame, and within ``gate_sigmas`` standard deviations of the true range. What
 fits none is clutter to the bound. Nothing else of the truth gets in.
@@ -15,6 +8,14 @@ GTSAM solves for poses, landmarks, the wheels' calibration errors (s, w, kappa) 
 are unknown, the radars' range offsets, with the noise model of ``slam.robust``. ISAM2 takes one
 step at a time and relinearises as it goes: the last pose after each step is the filtered path,
 causal as a filter's. Levenberg-Marquardt over everything is the full smoother.
+
+The residual of odometry between poses 0 and 1, with d = (ux, uy) / (1 + s), D = |d| and
+a = (ua - kappa D) / (1 + w), is::
+
+    r = [R0^T (p1 - p0) - d, theta1 - theta0 - a]
+
+Derivatives are by body-frame changes of the poses (GTSAM's) and by (s, w, kappa). Plain floats:
+the function runs once per step and linearisation, and arrays of three cost more than they do.
 
 What the bound is: the best that this noise model gives on these ranges, up to ISAM2's thresholds.
 It is no bound on luck: a filter with fewer ranges may end nearer to the truth in a single run.

@@ -38,7 +38,7 @@ def group_name(group: dict[str, Any]) -> str:
 
 
 def group_line(group: dict[str, Any]) -> str:
-    """Return what a person wants to know of a group, in a line."""
+    """Return a group in one line of text."""
     estimate, wheels, found = (
         group[key] for key in ("ate_rmse_m", "odometry_ate_rmse_m", "landmark_medians")
     )

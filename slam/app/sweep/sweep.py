@@ -1,7 +1,7 @@
 """`uwb-slam sweep`: the same run over scenes, presets, settings, stresses and seeds.
 
-The file is a JSON object, ``{"command": {...}, "runs": [...]}``, whole after every run: each is
-appended over the closing brackets by one write.
+The file of results is a JSON object, ``{"command": {...}, "runs": [...]}``, whole after every run:
+each is appended over the closing brackets by one write.
 """
 
 from __future__ import annotations

@@ -56,11 +56,11 @@ def worker_results(
     try:
         yield results
     finally:
-        _throw_away(results)
+        _end_workers(results)
 
 
-def _throw_away(results: Generator[_Result, None, None]) -> None:
-    """End the workers, without joblib's regrets about the work that is lost."""
+def _end_workers(results: Generator[_Result, None, None]) -> None:
+    """End the workers, without joblib's messages about the work that is lost."""
     before = threading.excepthook
 
     def silent_about_lost_work(crash: threading.ExceptHookArgs) -> None:
@@ -97,7 +97,7 @@ def _signals_left_to_the_parent() -> Iterator[None]:
 
 
 def _start_trackers() -> None:
-    """Start the processes that remove what killed workers leave behind, and let them do it quietly.
+    """Start the processes that remove what killed workers leave behind, without warnings.
 
     They would warn on stderr about each semaphore that is left or was removed before.
     """
@@ -122,7 +122,7 @@ def _belong_to(parent: int) -> None:
         os._exit(1)
 
 
-PATIENCE_S = 10.0
+TIMEOUT_S = 10.0
 """How long a scheduler may take to answer, and then a first worker to be there."""
 
 
@@ -163,7 +163,7 @@ def dask_results(
         yield _in_order(futures, address)
     finally:
         client.cancel(futures, force=True)
-        client.close(timeout=PATIENCE_S)
+        client.close(timeout=TIMEOUT_S)
 
 
 def _connect(address: str) -> Any:  # noqa: ANN401 - Dask is optional
@@ -174,7 +174,7 @@ def _connect(address: str) -> Any:  # noqa: ANN401 - Dask is optional
     # what goes wrong becomes one line of ours
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     try:
-        client: Any = cast(Any, distributed.Client)(address, timeout=PATIENCE_S)
+        client: Any = cast(Any, distributed.Client)(address, timeout=TIMEOUT_S)
     except ValueError as error:
         raise UsageError(f"--dask {address}: {error}; write it as tcp://HOST:PORT") from None
     except (OSError, MemoryError):  # MemoryError: something answers, in another language
@@ -182,9 +182,9 @@ def _connect(address: str) -> Any:  # noqa: ANN401 - Dask is optional
             f"--dask {address}: no Dask scheduler answers there; start one with `dask scheduler`"
         ) from None
     try:
-        client.wait_for_workers(1, timeout=PATIENCE_S)
+        client.wait_for_workers(1, timeout=TIMEOUT_S)
     except TimeoutError:
-        client.close(timeout=PATIENCE_S)
+        client.close(timeout=TIMEOUT_S)
         raise AppError(
             f"--dask {address}: the scheduler has no worker; start some with "
             f"`dask worker {address}`"

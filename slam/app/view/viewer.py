@@ -269,7 +269,7 @@ class LiveView:
             self._url, self._has_ended = viewer.url, lambda: viewer.has_ended
             if kind is ViewerKind.WEB:
                 self._web_url = viewer.web_url
-                _say(f"watch at {self._web_url}")
+                _print_line(f"watch at {self._web_url}")
         else:
             require_listening(self._url)
         return self
@@ -303,7 +303,7 @@ class LiveView:
         """Serve a page for the browser until a signal comes; a window needs nothing."""
         if not self._web_url:
             return
-        _say(f"the view stays at {self._web_url} until Ctrl-C")
+        _print_line(f"the view stays at {self._web_url} until Ctrl-C")
         while not self._has_ended():
             self._stop.check()
             time.sleep(_VIEW_POLL_S)
@@ -319,7 +319,7 @@ class _WhileWatched(SessionObserver):
     def on_scan(self, scan: Scan) -> None:
         if self._is_watched and self._has_ended():
             self._is_watched = False
-            _say("the viewer was closed; the run goes on without it")
+            _print_line("the viewer was closed; the run goes on without it")
         if self._is_watched:
             self._view.on_scan(scan)
 
@@ -336,6 +336,6 @@ class _WhileWatched(SessionObserver):
         self._view.close()
 
 
-def _say(text: str) -> None:
+def _print_line(text: str) -> None:
     sys.stderr.write(f"uwb-slam: {text}\n")
     sys.stderr.flush()

@@ -1,4 +1,4 @@
-"""What the back end believes: tracklets, births from one radar, merges, weights of ranges."""
+"""Tracklets, initialisation from one radar, merges, weights of ranges."""
 
 import numpy as np
 import pytest

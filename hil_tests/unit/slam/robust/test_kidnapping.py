@@ -54,7 +54,7 @@ def see(state: State, places: Array) -> None:
 
 
 def on_an_island(places: Array, seen: Array, pose: Array, apart: Array) -> State:
-    """Return a map of places, and an island begun at a pose that sees some, in truth ``apart``."""
+    """Return a map of places, and a submap begun at a pose that sees some, in truth ``apart``."""
     state = mapped(places)
     begin_submap(state, pose)
     see(state, transform(between(apart, np.zeros(3)), seen))
@@ -127,7 +127,7 @@ def test_several_must_be_missing_and_nothing_speak_for_the_map() -> None:
 
 
 def test_a_robot_carried_away_from_a_map_of_which_nothing_is_left_stays_lost() -> None:
-    """Else its pose, free of doubt on an island of its own, would pass for one on the map."""
+    """Else its pose, exact in a submap of its own, would pass for one on the map."""
     where, log = Localisation(BackEndParameters()), RunLog(WheelNoise())
     state, existence = mapped(PLACES[:2]), Existence(MapRule())
     log.add_motion(np.array([0.1, 0.0, 0.0]), 1e-6 * np.eye(3), 0.0, np.zeros(3))
@@ -157,7 +157,7 @@ def test_what_was_mapped_after_the_robot_was_carried_is_no_witness() -> None:
         surprise.look(frame, pose, (1, 2, 3, 4) if pose < 115 else (1, 2, 3, 4, 8, 9))
     assert surprise.is_carried
     assert 100 <= surprise.first_pose <= 110
-    assert surprise.witnesses == {1, 2, 3, 4}
+    assert surprise.known_before == {1, 2, 3, 4}
 
 
 def carried_run(seed: int) -> tuple[Run, int]:
@@ -205,7 +205,7 @@ def test_nobody_is_carried_by_a_motion_the_wheels_report() -> None:
 
 
 def test_islands_turn_with_the_motion_that_joins_them() -> None:
-    """The pose relative to its island does not change by a join without noise."""
+    """The pose relative to its submap does not change by a join without noise."""
     truth = np.array([-0.3, 0.4, -2.5])
     state = on_an_island(PLACES, PLACES[:4], np.array([1.0, 2.0, 0.5]), truth)
     seen = transform(between(state.pose, np.zeros(3)), state.landmarks_m[7:])
@@ -218,7 +218,7 @@ def test_islands_turn_with_the_motion_that_joins_them() -> None:
 
 
 def test_where_the_island_was_begun_does_not_matter() -> None:
-    """Pose, map and their covariances after a join are the same for any place of the island."""
+    """Pose, map and their covariances after a join are the same for any place of the submap."""
     truth, wheels = np.array([0.2, -0.1, 0.7]), WheelNoise()
     after = []
     for begun in (np.zeros(3), np.array([3.0, -2.0, 2.5])):

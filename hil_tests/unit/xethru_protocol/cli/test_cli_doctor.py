@@ -43,8 +43,8 @@ def only_own_emulators(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 @pytest.fixture
 def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait less for modules that never answer, and longer at a rate at which one may."""
-    monkeypatch.setattr(port_probe, "_PATIENCE_S", 0.3)
-    monkeypatch.setattr(port_probe, "_GLANCE_S", 1.0)
+    monkeypatch.setattr(port_probe, "_ANSWER_LIMIT_S", 0.3)
+    monkeypatch.setattr(port_probe, "_REPLY_LIMIT_S", 1.0)
 
 
 def examined(capsys: Capture, *arguments: str) -> tuple[int, list[dict[str, Any]]]:

@@ -153,7 +153,7 @@ def test_stamps_of_another_clock_than_the_one_named_are_told(
 ) -> None:
     odometry = LiveOdometry("a test", ClockLine(origin_ns=origin_s * NS_PER_S))
     odometry.take(line(100.0), 0)
-    said = odometry.is_elsewhere(now_s * NS_PER_S)
+    said = odometry.clock_mismatch(now_s * NS_PER_S)
     assert (said == "") is fits
     assert fits or "its stamps are of another clock" in said
 

@@ -15,7 +15,7 @@ from slam.app.cli import main
 from slam.app.errors import AppError
 from slam.app.sweep import workers as sweep_dask
 from slam.app.sweep.run import make_case, run_case
-from slam.app.sweep.workers import _throw_away
+from slam.app.sweep.workers import _end_workers
 
 LIMIT_S = seconds(15)
 OUTLASTS_S = 10 * LIMIT_S
@@ -147,7 +147,7 @@ def test_only_the_managers_search_for_lost_work_is_silent(
 
     begun = results()
     next(begun)
-    _throw_away(begun)
+    _end_workers(begun)
     assert bool(told) == is_told
     assert threading.excepthook == told.append
 
@@ -185,7 +185,7 @@ def test_a_scheduler_that_does_not_answer_is_1_in_bounded_time(
     port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("distributed")
-    monkeypatch.setattr(sweep_dask, "PATIENCE_S", 0.5)
+    monkeypatch.setattr(sweep_dask, "TIMEOUT_S", 0.5)
     address = f"tcp://127.0.0.1:{port}"
     assert main(["sweep", "--dask", address, "--json", str(tmp_path / "o.json")]) == 1
     text = capsys.readouterr()
@@ -197,7 +197,7 @@ def test_somebody_else_at_the_port_is_1(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("distributed")
-    monkeypatch.setattr(sweep_dask, "PATIENCE_S", 2.0)
+    monkeypatch.setattr(sweep_dask, "TIMEOUT_S", 2.0)
     with socket.create_server(("127.0.0.1", 0)) as server:
 
         def answer() -> None:
