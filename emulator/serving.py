@@ -360,6 +360,6 @@ def _print_ready_line(ready: dict[str, object]) -> None:
         sys.stdout.write(json.dumps(ready, separators=(",", ":")) + "\n")
         sys.stdout.flush()
     except OSError as error:
-        # nobody can use ports that were not announced; the interpreter must not flush again
+        # ports that were not announced are of no use; the interpreter must not flush again
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise CannotServeError(f"stdout: cannot write the ready line: {error.strerror}") from error

@@ -3,8 +3,9 @@
 Every trajectory error states its alignment. ``ate_rmse_m`` is the one to quote; the ICP numbers
 of the paper are computed beside it because they answer a different question.
 
-The rule is part of the metric, not of the design under test, so its numbers are constants here:
-designs are compared on equal seeds only, and against the same landmarks.
+Which landmarks are observable is part of the metric, not of the design under test, so the numbers
+of that rule are constants here: designs are compared on equal seeds only, and against the same
+landmarks.
 """
 
 from __future__ import annotations

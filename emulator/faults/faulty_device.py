@@ -1,7 +1,7 @@
-"""Faults for a test, by name: armed within a block, and counted.
+"""A module with faults as one device; and faults for a test, armed within a block and counted.
 
-While no fault is armed every byte goes through as it is. Whatever the faults, everything depends
-on the bytes, the times and the seed alone.
+While no fault is armed every byte passes unchanged. What happens depends on the bytes, the times
+and the seed only.
 
 >>> from emulator.faults.plan import fault_spec
 >>> fault_spec("counter_jump", frames=3).row.layer.value

@@ -1,9 +1,5 @@
 """Scenario files: which faults hit which radar, when, how often; and the truth log.
 
-The truth log is JSON lines, one object per injected fault: ``t_ns`` (device time), ``radar``,
-``kind``, ``parameters``, ``counter`` (of the last radar frame, null before the first), ``offset``
-(bytes sent to the host before the packet that it hit).
-
 A scenario is TOML that a person reads and writes; a mistake is one `FaultPlanError` line naming
 file, key and what is allowed::
 
@@ -21,6 +17,10 @@ file, key and what is allowed::
     packet = "frame"           # faults of any packet: frame, reply, system or data only
     count = 3                  # how often; 1 if left out, 0: without end
     parameters = { }           # of the kind
+
+The truth log is JSON lines, one object per injected fault: ``t_ns`` (device time), ``radar``,
+``kind``, ``parameters``, ``counter`` (of the last radar frame, null before the first), ``offset``
+(bytes sent to the host before the packet that it hit).
 """
 
 from __future__ import annotations

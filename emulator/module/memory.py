@@ -254,7 +254,7 @@ class VolatileMemory:
         return None
 
     def save(self, state: SavedState) -> None:
-        """Forget it."""
+        """Discard it."""
 
 
 SAFE_MODE_FAULTS = 10

@@ -137,7 +137,7 @@ class Module:
         self._power_up_parts(into_bootloader=into_bootloader)
 
     def power_cycle(self, now_ns: int) -> None:
-        """Ask for a restart as after a power cut: at once, and faults are forgotten."""
+        """Restart at once, as after a power cut; faults are no longer counted."""
         self.faults.clear()
         self.restart = Restart(at_ns=now_ns)
 
@@ -167,7 +167,7 @@ class Module:
         self._baudrate_change = (self.now_ns + BAUDRATE_DELAY_NS, baudrate)
 
     def request_restart(self, *, into_bootloader: bool = False) -> None:
-        """Ask for a restart on the host's wish; it ends a series of faults."""
+        """Restart as the host commands, which ends a series of faults."""
         self.faults.clear()
         self.restart = Restart(into_bootloader=into_bootloader)
 

@@ -352,7 +352,7 @@ class ProfileRun:
                 self._ready.append(waiting.popleft())
 
     def _jump(self, time_ns: int) -> int:
-        """Leave out frames whose messages nobody gets, if many; return how many messages."""
+        """Skip frames whose messages are not sent, if many; return how many messages."""
         if not self.processing.noise_map.complete:
             return 0
         cycles = 0

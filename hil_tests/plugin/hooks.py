@@ -138,7 +138,7 @@ def _rigs(specs: tuple[RadarSpec, ...]) -> list[tuple[str, ...]]:
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object | None:  # noqa: ANN401 - as above
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object | None:  # noqa: ANN401 - xdist is not typed
     """Keep the tests of real radars on one worker, however the others are spread."""
     shared = [spec.name for spec in config.stash[CHOICES].specs if spec.shared]
     if not shared:

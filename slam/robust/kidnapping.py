@@ -157,11 +157,11 @@ class Surprise:
             self._hypotheses.append(_Hypothesis(pose, frozenset(ids), {}))
         rule = self._rule
         for one in self._hypotheses:
-            for trial in frame:
-                if trial.landmark_id in one.known_before:
-                    vote = one.votes.get(trial.landmark_id, 0.0) + trial.evidence
+            for given in frame:
+                if given.landmark_id in one.known_before:
+                    vote = one.votes.get(given.landmark_id, 0.0) + given.evidence
                     vote = min(max(vote, -rule.most_for), rule.most_against)
-                    one.votes[trial.landmark_id] = vote
+                    one.votes[given.landmark_id] = vote
 
     def reset(self) -> None:
         self._hypotheses.clear()

@@ -184,7 +184,7 @@ class SurpriseRule:
     # that are no evidence
     gate_sigmas: float = 3.0
     most_sigma_m: float = 0.05
-    # How far inside a radar's limits a landmark must lie to be a trial
+    # How far inside a radar's limits a landmark must lie to give evidence
     view_inset_rad: float = 0.15
     view_inset_m: float = 0.1
     # Least probability that a range lies near a prediction it has nothing to do with
@@ -196,7 +196,7 @@ class SurpriseRule:
     # Frames between two moments at which the robot may have been carried; how many are tested
     every: int = 10
     hypotheses: int = 40
-    # Evidence from which on nothing is undone for good, and from which on the robot is old_map
+    # Evidence from which on no decision is final, and from which on the robot counts as carried
     suspicious: float = 2.0
     carried: float = 25.0
 

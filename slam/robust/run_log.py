@@ -203,7 +203,7 @@ def _columns(rows: Sequence[int], head: int) -> Indices:
     return np.stack([first, first + 1], axis=-1).ravel()
 
 
-# Standard deviations of a step that someone else made the robot take.
+# Standard deviations of a step that the wheels did not measure.
 _CARRIED_M, _CARRIED_RAD = 100.0, 10.0
 # No frame gives more used ranges than that.
 _MOST_RANGES_PER_POSE = 24

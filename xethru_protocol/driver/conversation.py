@@ -265,7 +265,7 @@ class Conversation:
             self.report("rx", summary(message))
 
     def _is_answer(self, message: Response) -> bool:
-        # some firmware answers with a message that others send of their own accord
+        # some firmware answers with a message that other firmware sends unasked
         request = self._request
         return isinstance(message, _ANSWERS) or (
             request is not None and isinstance(message, request.row.replies)
@@ -292,7 +292,7 @@ class Conversation:
         self._reset_diagnosis()
 
     def wind_down(self) -> None:
-        """From now on care for answers only.
+        """Read answers only from now on.
 
         An interrupt may have come while bytes were taken in, so what is half-read is forgotten;
         the rest of a packet that was cut so looks like damage and is neither reported nor counted.

@@ -405,7 +405,7 @@ def _write_numbers(
     times = [row for row in driven if row[0] in {"time", "driven"}]
     nis = "-" if summary.nis_mean is None else f"{summary.nis_mean:.2f}"
     page.numbers(
-        [*times, *judged, ("NIS, mean", nis, "of true associations over their dof; honest is 1")]
+        [*times, *judged, ("NIS, mean", nis, "of true associations over their dof; expected 1")]
     )
 
 
@@ -429,7 +429,7 @@ def _write_figures(
     )
     page.heading("Consistency")
     page.note(
-        "How far estimates are off by their own measure. An honest filter stays inside the grey "
+        "Errors over their own covariance. A consistent filter stays inside the grey "
         "band 95 % of the time; of one run, states are not independent."
     )
     page.picture(

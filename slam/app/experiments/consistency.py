@@ -92,7 +92,7 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
     ]
     return Result(
         numbers={"simulated": True, "groups": rows},
-        title="Mean over seeds against the 95 % band of an honest filter (simulated)",
+        title="Mean over seeds against the 95 % band of a consistent filter (simulated)",
         size_in=(1.2 + 4.6 * len(scenes), 7.2),
         draw=lambda figure: _draw(figure, groups, scenes),
         tables=[

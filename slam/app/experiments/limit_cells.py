@@ -4,12 +4,12 @@ Positions in bins, s the envelope's standard deviation in bins, sigma the noise 
 
 ``chip_frames`` uses the emulator: its pulse, its receiver (noise by counter, counting,
 clipping) and the module's normalisation. ``closed_form_frames`` writes the pulse down and adds
-NumPy's noise; neither counts nor clips. That both give the same numbers shows that neither carries
-a mistake of its own.
+NumPy's noise, without counting or clipping. Both give the same numbers, so an error in one of them
+would show.
 
-All see the same windows as `slam.front_end.overlapping`, know the same pulse and believe
-one more echo by the same test; they differ in how they look for it. Each works on the correlation
-of the window with pulses on a fine grid of positions, cosine and sine taken as orthogonal.
+Three other methods are compared with `slam.front_end.overlapping`. They get the same windows and
+the same pulse, and accept one more echo by the same test. Each works on the correlation of the
+window with pulses on a fine grid of positions, cosine and sine taken as orthogonal.
 
 CLEAN
     Subtracts the strongest pulse of what is left, again and again (Hogbom 1974). Each is placed as

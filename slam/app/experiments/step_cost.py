@@ -27,7 +27,7 @@ from slam.config import WheelNoise
 from slam.geometry import paper_rig
 from slam.robust.association import antennas_of, rows_of, sides_of, sure_landmarks, view
 from slam.robust.parameters import ContinuationRule, RangeNoise
-from slam.robust.state import Motion, State, SymmetricMatrix, calibrated_motion, predict
+from slam.robust.state import State, SymmetricMatrix, at_rest, calibrated_motion, predict
 from xethru_protocol.system import StopFlag
 
 N_UPDATES = 4
@@ -109,7 +109,7 @@ def stepper(state: State) -> Callable[[], None]:
     sides = sides_of(rig)
     radars = np.array([radar for side in sides for radar in side], dtype=np.intp)
     R = np.full(N_UPDATES, noise.sigma_m**2)
-    mounts = antennas_of(rig, (), _at_rest())
+    mounts = antennas_of(rig, (), at_rest())
     seen = view(state, mounts)
     nearest = [int(np.argmin(seen.ranges_m[radar, :2])) for radar in radars]
     landmarks = np.array(nearest, dtype=np.intp)
@@ -226,10 +226,6 @@ def _least_ms(work: Callable[[], object], repetitions: int) -> float:
         work()
         least = min(least, 1e-6 * (time.thread_time_ns() - began))
     return least
-
-
-def _at_rest() -> Motion:
-    return Motion(step_m=np.zeros(2), turn_rad=0.0, covariance=np.zeros((3, 3)), walk_variance=0.0)
 
 
 def _draw(figure: Figure, costs: Sequence[StepCost]) -> None:

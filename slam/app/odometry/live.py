@@ -36,7 +36,7 @@ from xethru_protocol.wire.errors import XeThruError
 MOST_GAP_NS = NS_PER_S
 """Between two samples farther apart the motion of the robot is unknown."""
 SILENCE_S = 10.0
-"""A source without a new pose for so long is dead: wheels that stand still send poses, too."""
+"""A source without a new pose for so long has ended: wheels at rest send poses, too."""
 MOST_SPEED_MPS = 10.0
 """Faster robots do not carry these radars; a pose that far off was set by hand or reset."""
 AHEAD_NS = 60 * NS_PER_S
@@ -348,7 +348,7 @@ class _Bytes(Protocol):
         """Return what came, None if nothing did in a while, b"" at the end."""
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the source."""
 
 
 def read_lines(source: LineSource, is_stopped: Callable[[], bool]) -> Iterator[tuple[str, int]]:

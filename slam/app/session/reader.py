@@ -80,7 +80,7 @@ class ScanEnd:
 
 
 Recorded: TypeAlias = ReceivedFrame | TumSample | TruthPose | LogLine | ScanEnd | Snapshot
-"""What is in a session; a TumSample is odometry."""
+"""A record of the file; a TumSample is odometry."""
 
 FrameTopics: TypeAlias = Mapping[str, tuple[int, RadarInfo, tuple[float, float] | None]]
 """By topic: index and description of a radar, and the limits of its sampler."""
@@ -185,7 +185,7 @@ class WireBytes:
 
 
 SessionRecord: TypeAlias = RadarFrame | TumSample | TruthPose | LogLine | ScanEnd | Snapshot
-"""What a session is made of; a TumSample is odometry."""
+"""What `RecordedSession.records` yields; a TumSample is odometry."""
 
 
 class RecordedSession:

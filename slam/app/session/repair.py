@@ -57,7 +57,7 @@ class Repair:
     path
         The file that opens everywhere now.
     was_whole
-        There was nothing to do.
+        The file needed no repair.
     n_messages, first_ns, last_ns
         Messages in it, and the session time they span [ns].
     cut_at

@@ -65,7 +65,7 @@ def _end_workers(results: Generator[_Result, None, None]) -> None:
 
     def silent_about_lost_work(crash: threading.ExceptHookArgs) -> None:
         # loky's manager forgets all tasks, kills the workers, and may then look for a task that
-        # it had not yet handed out; nothing is left for it to do but to end, which it does.
+        # it had not yet handed out; it then ends, as it should.
         thread = crash.thread.name if crash.thread else ""
         if not (crash.exc_type is KeyError and thread == "ExecutorManagerThread"):
             before(crash)

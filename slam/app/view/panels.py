@@ -63,8 +63,9 @@ only. {data}
   the right, constant part removed. A landmark that the robot passes is a curved line.
 * **Frame**: the newest raw frame, amplitude over range in metres; red bars are detections.
 * **Position error** (below the map): distance to the truth, which SLAM never sees. **NIS**,
-  **NEES**: how surprised the filter is by echoes, and how wrong by its own measure; an honest
-  filter stays inside the grey 95 % band most of the time. Below it is too modest, above too sure.
+  **NEES**: errors of predicted echoes, and of the pose, over their own covariance; a consistent
+  filter stays inside the grey 95 % band most of the time. Below, its covariance is too large,
+  above too small.
 * **Links** (right, below): the state of each serial link; losses and faults in the next tab,
   every command and answer under *Log*.
 
