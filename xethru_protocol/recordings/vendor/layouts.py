@@ -48,6 +48,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta, tzinfo
+from functools import cache
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -191,6 +192,11 @@ def _value(kind: fields.Kind, cell: str) -> Any:  # noqa: ANN401 - what the mess
     return int(cell)
 
 
+@cache
+def _kinds(message: type[Response]) -> dict[str, fields.Kind]:
+    return dict(ROWS[message].kinds)
+
+
 @dataclass(frozen=True, slots=True)
 class TextKind(_Kind):
     """One kind of text file; ``columns`` are titles with the message's fields, in their order."""
@@ -205,7 +211,7 @@ class TextKind(_Kind):
 
     def record(self, message: Response, time_ms: int, zone: tzinfo | None) -> bytes:
         """Return the line of a message and its time [ms since 1970], with its end of line."""
-        kinds = dict(ROWS[self.message].kinds)
+        kinds = _kinds(self.message)
         time = (_UNIX + timedelta(milliseconds=time_ms)).astimezone(zone)
         cells = [time.isoformat(timespec="milliseconds")]
         for name in self.columns.values():
@@ -224,7 +230,7 @@ class TextKind(_Kind):
         ValueError, OverflowError, LocalProtocolError
             If the line is not of this kind.
         """
-        kinds = dict(ROWS[self.message].kinds)
+        kinds = _kinds(self.message)
         stamp, *cells = line.rstrip("\r\n").split(";")
         if len(cells) != len(self.columns):
             n_columns = len(self.columns) + 1
