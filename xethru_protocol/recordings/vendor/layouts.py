@@ -48,7 +48,6 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta, tzinfo
-from functools import cache
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -192,11 +191,6 @@ def _value(kind: fields.Kind, cell: str) -> Any:  # noqa: ANN401 - what the mess
     return int(cell)
 
 
-@cache
-def _kinds(message: type[Response]) -> dict[str, fields.Kind]:
-    return dict(ROWS[message].kinds)
-
-
 @dataclass(frozen=True, slots=True)
 class TextKind(_Kind):
     """One kind of text file; ``columns`` are titles with the message's fields, in their order."""
@@ -211,7 +205,7 @@ class TextKind(_Kind):
 
     def record(self, message: Response, time_ms: int, zone: tzinfo | None) -> bytes:
         """Return the line of a message and its time [ms since 1970], with its end of line."""
-        kinds = _kinds(self.message)
+        kinds = dict(ROWS[self.message].kinds)
         time = (_UNIX + timedelta(milliseconds=time_ms)).astimezone(zone)
         cells = [time.isoformat(timespec="milliseconds")]
         for name in self.columns.values():
@@ -230,7 +224,7 @@ class TextKind(_Kind):
         ValueError, OverflowError, LocalProtocolError
             If the line is not of this kind.
         """
-        kinds = _kinds(self.message)
+        kinds = dict(ROWS[self.message].kinds)
         stamp, *cells = line.rstrip("\r\n").split(";")
         if len(cells) != len(self.columns):
             n_columns = len(self.columns) + 1
