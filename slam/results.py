@@ -112,7 +112,7 @@ class Belief:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Association:
-    """What became of one observation."""
+    """The result of one observation."""
 
     landmark_id: int  # the landmark it updated, or the one born from it
     is_new: bool  # true if the landmark was born from this observation
@@ -170,7 +170,7 @@ class PredictedRange:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UpdateReport:
-    """What became of the ranges of one time."""
+    """The result of the ranges of one time."""
 
     # (radar, index of the range in its scan, landmark id)
     continued: tuple[tuple[int, int, int], ...]
@@ -204,7 +204,7 @@ class StepResult:
     # Ranges and trilaterated points of this state
     detections: tuple[Detection, ...]
     fixes: tuple[Fix, ...] = ()
-    # Points that passed the outlier filter, and what became of each
+    # Points that passed the outlier filter, and the result of each
     observations: tuple[Observation, ...] = ()
     associations: tuple[Association, ...] = ()
     rejected: tuple[Fix, ...] = ()  # fixes of this state that no cluster confirmed

@@ -222,6 +222,8 @@ class Silence(Exception):  # noqa: N818 - not an error of ours
     """A command the module does not answer."""
 
 
+# --- settings
+
 DAC_LEVELS = 2048
 
 
@@ -352,6 +354,8 @@ SETTERS: dict[X4Setting, Setter] = {
 }
 
 
+# --- registers
+
 _RESET = {
     X4Setting.SPIREGISTER: "01:FF 02:01 03:02 04:AA 06:01 10:04 14:02 1A:01",
     X4Setting.PIFREGISTER: (
@@ -475,6 +479,8 @@ def _parse(text: str) -> dict[int, int]:
     pairs = (item.split(":") for item in text.split())
     return {int(address, 16): int(value, 16) for address, value in pairs}
 
+
+# --- frames
 
 MAX_TIMER_HZ = 65535.0
 """The firmware's frame rate is a 16-bit integer."""

@@ -242,7 +242,7 @@ class Context:
 
 @dataclass(frozen=True, slots=True)
 class Handling:
-    """What becomes of a command.
+    """The result of a fault on a command.
 
     Attributes
     ----------

@@ -34,7 +34,7 @@ class LineQueue:
         return bool(self._heap or self._held)
 
     def put(self, pieces: Iterable[Piece], packet_class: PacketClass, now_ns: int) -> None:
-        """Add what became of one packet; those that wait for others of its class come nearer."""
+        """Add what is left of one packet; those that wait for others of its class come nearer."""
         waiting, self._held = self._held, []
         for piece in pieces:
             self._put(piece, packet_class, now_ns)

@@ -246,7 +246,7 @@ class Group(Enum):
 
 
 class Verdict(Enum):
-    """What becomes of a command; all but TAKEN end it."""
+    """How a command is answered; all but TAKEN end it."""
 
     TAKEN = "ok"
     UNKNOWN = "ERROR 1"

@@ -136,6 +136,8 @@ def accepted_baudrate(wanted: int, current: int) -> int:
     return wanted if _SLOWEST <= wanted <= _FASTEST else current
 
 
+# --- bits on the serial line
+
 BITS_PER_BYTE = 10
 """Start, eight data bits, stop."""
 _FALLING = b"\x01\x00"
@@ -203,6 +205,8 @@ def received_bytes(data: bytes, sent_baud: int, read_baud: int) -> bytes:
     return sampled(line_levels(data), sent_baud, read_baud)
 
 
+# --- messages that are on
+
 _BASEBAND = frozenset({OutputFeature.BASEBAND_IQ, OutputFeature.BASEBAND_AMPLITUDE_PHASE})
 _RIVALS: dict[int, OutputFeature] = {
     OutputFeature.PULSEDOPPLER_FLOAT: OutputFeature.PULSEDOPPLER_BYTE,
@@ -262,6 +266,8 @@ def _keep(table: dict[int, int], feature: int, bits: int, on: int) -> None:
     if on:
         table[int(feature)] = int(bits)
 
+
+# --- the profile
 
 ZONE_LIMITS_M = (0.40, 9.40)
 """Smallest start and largest end of a detection zone, module metres."""

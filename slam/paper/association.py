@@ -79,7 +79,7 @@ def update_map(
     ``one_to_one`` all are assigned jointly against the belief before any of them.
 
     Returns the belief after all observations, (range [m], bearing [rad]) each with noise Q, and
-    what became of each, in their order.
+    the result of each, in their order.
     """
     planned: list[int | None] | None = None
     if config.assignment is Assignment.ONE_TO_ONE and observations:

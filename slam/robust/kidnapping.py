@@ -410,7 +410,7 @@ class Localisation:
         """Begin a submap at the present pose, and forget all measurements since the pose was wrong.
 
         Landmarks mapped since are removed; the rest is solved for without the ranges since then. A
-        submap that exists already is given up: what is left is the old map.
+        submap that exists already is deleted: only the old map is left.
         """
         first = self.surprise.first_pose
         log.forget_from(first)

@@ -38,7 +38,7 @@ from xethru_protocol.wire.framing import LinkStatistics
 from xethru_protocol.wire.table import Response
 
 
-def what_must_go(targets: Iterable[Path], *, replace: bool) -> list[Path]:
+def files_to_replace(targets: Iterable[Path], *, replace: bool) -> list[Path]:
     """Files of older recordings where new ones shall be.
 
     Of a directory only the files of a recording are in the way.
@@ -72,7 +72,7 @@ def make_room(targets: Iterable[Path], *, replace: bool) -> None:
     RecordingError
         If something is there and must stay, or cannot be removed.
     """
-    for path in what_must_go(targets, replace=replace):
+    for path in files_to_replace(targets, replace=replace):
         try:
             path.unlink()
         except OSError as error:
@@ -93,7 +93,7 @@ def set_aside(target: Path, *, replace: bool) -> Iterator[None]:
     was_there = target.exists()
     kept = [
         (path, path.with_name(f".{path.name}.old"))
-        for path in what_must_go((target,), replace=replace)
+        for path in files_to_replace((target,), replace=replace)
     ]
     try:
         for path, aside in kept:
@@ -238,7 +238,7 @@ class Targets:
             raise RecordingError(f"{self.directory} is no directory; name a new one")
         if self.wire is not None and self.wire.is_dir():
             raise RecordingError(f"{self.wire} is a directory; name a file in it")
-        what_must_go(self.paths, replace=replace)
+        files_to_replace(self.paths, replace=replace)
 
 
 class Recorder:

@@ -44,7 +44,7 @@ from xethru_protocol.wire.errors import LocalProtocolError
 HEAD_BYTES = 14  # payload bytes needed to judge
 MAX_LENGTH = 65535
 _VENDOR_LIMIT = 7995  # what the module's own parser can receive
-_COUNT = struct.Struct("<I")
+_LENGTH = struct.Struct("<I")
 
 
 class Direction(Enum):
@@ -127,9 +127,11 @@ def plausible(  # noqa: PLR0911 - one return per kind of message
 
 
 def _count(head: bytes, offset: int) -> int:
-    (count,) = _COUNT.unpack_from(head, offset)
+    (count,) = _LENGTH.unpack_from(head, offset)
     return int(count)
 
+
+# --- packets and faults
 
 START: Final = 0x7D
 END: Final = 0x7E
@@ -321,6 +323,8 @@ class LinkStatistics:
         }
 
 
+# --- search
+
 NEVER: Final = 1 << 62  # a stream offset that is not reached
 
 _NEAR: Final = 256  # in which most packets end: looked at before more is marked
@@ -448,13 +452,14 @@ class _Window:
         return self._unescaped[self._bounds[index - 1] + 1 : self._bounds[index]]
 
 
+# --- the receiver
+
 Span = tuple[Framing, bytes, int, int, int]
 """Framing, buffer, payload start and end in it, offset of the packet in the stream."""
 
 MAX_NORMAL_WIRE_BYTES: Final = 2 * MAX_NORMAL_BYTES + 2  # all escaped, with start and end
 
 _JOIN_BYTES = 4096  # of the next chunk, to a Normal packet whose end is not known
-_LENGTH = struct.Struct("<I")
 # Magic and length, then code, type and element count of a DATA FLOAT.
 _FRAME_HEADER = struct.Struct("<4sIxBB8xI")
 _ESCAPED = re.compile(rb"\x7f(.)", re.DOTALL)

@@ -30,7 +30,7 @@ from xethru_protocol.wire.framing import NeedData
 
 @pytest.mark.parametrize("pace", list(Pace))
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_hostile_client_disturbs_nobody(seed: int, pace: Pace) -> None:
+def test_a_hostile_client_disturbs_no_other_port(seed: int, pace: Pace) -> None:
     outcome = run(1.0, seed, pace)
     assert outcome.answers
     assert (outcome.gaps, outcome.in_order) == (0, True)

@@ -53,7 +53,7 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Reported:
     )
 
 
-def test_the_page_asks_nobody_for_anything(reported: Reported) -> None:
+def test_the_page_loads_nothing_from_elsewhere(reported: Reported) -> None:
     addresses = Addresses()
     addresses.feed(reported.text)
     assert addresses.tags.isdisjoint({"script", "link", "iframe", "object", "embed", "base"})

@@ -172,7 +172,7 @@ def test_a_run_goes_on_when_its_viewer_is_killed(
     assert said.count("the viewer was closed; the run goes on without it") == 1
 
 
-def test_an_address_where_nobody_listens_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_address_without_a_listener_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))  # bound and not listening: nobody else gets it meanwhile
         url = f"rerun+http://127.0.0.1:{probe.getsockname()[1]}/proxy"

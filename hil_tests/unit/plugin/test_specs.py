@@ -1,4 +1,4 @@
-"""What a user may write behind --radar, and what is said about everything else."""
+"""Values of --radar, and the errors for all others."""
 
 from __future__ import annotations
 

@@ -128,6 +128,8 @@ def detection_probability(snr: Array, threshold_sigmas: float, envelope_sigma: f
     return probability
 
 
+# --- frames
+
 N_BINS = 1431
 RANGE_START_M = 0.2
 BIN_LENGTH_M = 299_792_458.0 / (2 * 23.328e9)
@@ -270,6 +272,8 @@ def _frame(
         limits=limits,
     )
 
+
+# --- other methods to separate echoes
 
 ComplexArray = NDArray[np.complex128]
 
@@ -421,6 +425,8 @@ def _threshold(dictionary: _Dictionary, split: SplitTest, sigma: float) -> float
 
 SEPARATORS: Mapping[str, Separator] = MappingProxyType({"clean": clean, "omp": omp, "lasso": lasso})
 
+
+# --- the cells
 
 AMPLITUDE = 0.015
 NOISE_SIGMA = 5e-4

@@ -45,7 +45,7 @@ MOST_STAMP_NS = (2**31 - 1_000_000) * NS_PER_S
 """The seconds of a ROS message end at 2**31; days before, for a drive that begins there goes on."""
 MOST_M = 1e8
 """Farther than once around the Earth, as positions on a map may be; the filter squares them."""
-_COMPLAINTS = 5
+_MOST_WARNINGS = 5
 
 
 class LiveOdometry:
@@ -75,7 +75,7 @@ class LiveOdometry:
         self._track: OdometryTrack | None = None
         self._newest_host_ns: int | None = None  # host time of the newest pose taken
         self._trouble = ""  # why the lines since then were refused
-        self._complaints = 0
+        self._n_warnings = 0
         self.n_refused = 0
         self.ended = False
         self.trouble = ""
@@ -146,7 +146,7 @@ class LiveOdometry:
         warnings = []
         if self._trouble:
             warnings.append("its lines are sound again")
-            self._trouble, self._complaints = "", 0
+            self._trouble, self._n_warnings = "", 0
         elapsed_ns = sample.t_ns - before.t_ns
         step_m = math.hypot(sample.x_m - before.x_m, sample.y_m - before.y_m)
         if elapsed_ns > MOST_GAP_NS:
@@ -162,13 +162,13 @@ class LiveOdometry:
 
     def _refuse(self, trouble: str) -> str:
         self.n_refused += 1
-        is_news = not self._trouble
+        is_first = not self._trouble
         self._trouble = self._trouble or trouble
-        self._complaints += 1
-        if is_news:
+        self._n_warnings += 1
+        if is_first:
             return f"{trouble}; such lines are passed over"
-        if self._complaints == _COMPLAINTS:
-            return f"{trouble}; no more is said of such lines"
+        if self._n_warnings == _MOST_WARNINGS:
+            return f"{trouble}; further ones are not reported"
         return ""
 
     def end(self, trouble: str) -> None:

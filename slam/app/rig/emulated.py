@@ -124,7 +124,7 @@ class EmulatorProcess:
         self._cleanup.close()
 
     def ended(self) -> str | None:
-        """Return what became of the process if it is gone, else None."""
+        """Return how the process ended; None if it runs."""
         try:
             code = self._process.wait(timeout=_POLL_S)
         except subprocess.TimeoutExpired:

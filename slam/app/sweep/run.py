@@ -296,7 +296,7 @@ class SweepRun(Summary):
         return (self.scene, self.preset, tuple(self.settings.items()), self.stress, self.seed)
 
 
-def never() -> None:
+def no_stop() -> None:
     """Do not stop."""
 
 
@@ -343,7 +343,7 @@ def loopback_source(
     *,
     noise_seed: int | None = None,
     stress: Stress = STRESSES[CLEAN],
-    check: Callable[[], None] = never,
+    check: Callable[[], None] = no_stop,
 ) -> RunSource:
     """Return the emulated robot in this process: same driver, device and odometry text as the demo.
 
@@ -373,7 +373,7 @@ def loopback_source(
     )
 
 
-def source_of(case: Case, *, check: Callable[[], None] = never) -> RunSource:
+def source_of(case: Case, *, check: Callable[[], None] = no_stop) -> RunSource:
     """Return the source of a case; SLAM gets the scene's own rig and wheels, no stress."""
     stress = STRESSES[case.stress]
     scene = stressed_scene(case.scene, stress, case.seed)
@@ -384,7 +384,7 @@ def source_of(case: Case, *, check: Callable[[], None] = never) -> RunSource:
 
 
 def run_case(
-    case: Case, program: str | None = None, *, check: Callable[[], None] = never
+    case: Case, program: str | None = None, *, check: Callable[[], None] = no_stop
 ) -> SweepRun:
     """Run one case and return its numbers.
 

@@ -34,7 +34,7 @@ from slam.results import Belief, landmark_slice
 
 Check = Callable[..., None]
 
-# One failure is enough to condemn a mutant, and nobody needs its simplest form.
+# One failure is enough to detect a mutant; its simplest form is not needed.
 thorough = settings(report_multiple_bugs=False)
 condemning = settings(thorough, phases=(Phase.generate,))
 
@@ -401,7 +401,7 @@ def test_motion_without_noise_leaves_landmarks_alone(belief: Belief, u: Array) -
 
 
 @given(beliefs(min_landmarks=0), st.floats(0.3, 2.0), angles)
-def test_observing_a_new_landmark_again_without_noise_surprises_nobody(
+def test_observing_a_new_landmark_again_without_noise_changes_nothing(
     belief: Belief, r: float, phi: float
 ) -> None:
     z = np.array([r, phi])

@@ -31,7 +31,7 @@ Bilaterate = Callable[[Array, Array, RadarPair, float], tuple[Array, NDArray[np.
 FIELD_OF_VIEW_RAD = math.radians(65.0)
 GAMMA_RAD = (math.pi - FIELD_OF_VIEW_RAD) / 2
 MIN_RANGE_M, MAX_RANGE_M = 0.2, 1.5
-# One failure is enough to condemn a mutant, and nobody needs its simplest form.
+# One failure is enough to detect a mutant; its simplest form is not needed.
 thorough = settings(
     report_multiple_bugs=False,
     suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],

@@ -194,7 +194,7 @@ def test_a_carried_robot_says_so_and_finds_itself_on_the_old_map() -> None:
     assert len(back_end.landmarks()) == len(PLACES)
 
 
-def test_nobody_is_carried_by_a_motion_the_wheels_report() -> None:
+def test_a_motion_the_wheels_report_is_no_kidnapping() -> None:
     run, cut = carried_run(1)
     back_end = RobustBackEnd(paper_rig(), BackEndParameters())
     for increment, scans in list(zip(run.increments, run.scans, strict=True))[: cut - 1]:

@@ -1,4 +1,4 @@
-"""Drums among rods: who gets a radius, and that odometry's errors give nobody one."""
+"""Drums among rods: which get a radius, and that odometry's errors give none."""
 
 import math
 from collections.abc import Sequence

@@ -393,7 +393,7 @@ def test_the_first_pose_is_where_the_first_values_are() -> None:
     assert np.array_equal(values[3:6], start.calibration[0])
 
 
-def test_a_log_that_nobody_solves_stays_short() -> None:
+def test_a_log_that_is_never_solved_stays_short() -> None:
     log, sizes = RunLog(WheelNoise(), most_unsolved=10), []
     for k in range(1, 200):
         log.add_motion(np.array([0.1, 0.0, 0.1]), 1e-4 * np.eye(3), 0.0, np.zeros(3))

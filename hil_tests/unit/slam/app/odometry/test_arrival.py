@@ -65,7 +65,7 @@ def test_drift_is_found_and_jitter_gone(ppm: float, kind: str) -> None:
     assert np.abs(errors_ms[300:]).max() < 0.6
 
 
-def test_its_uncertainty_is_honest() -> None:
+def test_its_uncertainty_covers_its_error() -> None:
     """Of 100 clocks, crystals of 20 ppm and delays of 1.5 ms, over a minute: two thirds inside."""
     inside, sigmas_ppm = 0, []
     for seed in range(100):
@@ -83,7 +83,7 @@ def test_its_uncertainty_is_honest() -> None:
 
 
 def test_a_least_delay_that_wanders_is_allowed_for() -> None:
-    """Half a minute in, a busy host delays everything by 0.4 ms: what is said holds that error."""
+    """Half a minute in, a busy host delays everything by 0.4 ms: the stated uncertainty covers that error."""
     clock = ArrivalClock(RATE_HZ)
     for counter in range(300):
         clock.stamp_ns(counter, taken_ns(counter, 0.0) + (400_000 if counter >= 150 else 0))

@@ -61,7 +61,7 @@ def test_a_stamp_that_comes_twice_is_refused() -> None:
 def test_rubbish_is_refused_twice_said_and_never_fatal() -> None:
     odometry, said = fed(line(1.0), *["rubbish"] * 8, line(1.1))
     assert said[1].startswith("expected 8 numbers")
-    assert said[5].endswith("no more is said of such lines")
+    assert said[5].endswith("further ones are not reported")
     assert [text for text in said if text] == [said[1], said[5], said[9]]
     assert odometry.n_refused == 8
 

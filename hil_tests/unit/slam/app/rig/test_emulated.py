@@ -37,7 +37,7 @@ def fake_emulator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return script
 
 
-def never() -> None:
+def no_stop() -> None:
     """Do not stop."""
 
 
@@ -53,7 +53,7 @@ def never() -> None:
 def test_a_bad_start_is_one_line(fake_emulator: Path, does: str) -> None:
     fake_emulator.write_text(f"#!/bin/sh\n{does}\n")
     with EmulatorProcess("lab", 0) as emulator, pytest.raises(EmulatorError) as caught:
-        emulator.wait_until_ready(never)
+        emulator.wait_until_ready(no_stop)
     assert "\n" not in str(caught.value)
 
 
@@ -64,7 +64,7 @@ def test_no_ready_line_in_time(fake_emulator: Path, monkeypatch: pytest.MonkeyPa
         EmulatorProcess("lab", 0) as emulator,
         pytest.raises(EmulatorError, match=r"not ready after 0\.3 s"),
     ):
-        emulator.wait_until_ready(never)
+        emulator.wait_until_ready(no_stop)
 
 
 def test_one_that_ignores_sigterm_is_killed(
@@ -88,7 +88,7 @@ def test_the_arguments_are_those_of_the_emulators_command_line(
     said = tmp_path / "arguments"
     fake_emulator.write_text(f'#!/bin/sh\necho "$@" > {said}\n')
     with EmulatorProcess("scene.toml", 42) as emulator, pytest.raises(EmulatorError):
-        emulator.wait_until_ready(never)
+        emulator.wait_until_ready(no_stop)
     assert said.read_text() == "-P -m emulator.cli serve scene.toml --pace asap --seed 42\n"
 
 

@@ -1,4 +1,4 @@
-"""The known-association bound: against truth, against our own smoother, and what it is told."""
+"""The known-association bound: against truth, against our own smoother, and its inputs."""
 
 import math
 import sys
