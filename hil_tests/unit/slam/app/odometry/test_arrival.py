@@ -83,7 +83,7 @@ def test_its_uncertainty_covers_its_error() -> None:
 
 
 def test_a_least_delay_that_wanders_is_allowed_for() -> None:
-    """Half a minute in, a busy host delays everything by 0.4 ms: the stated uncertainty covers that error."""
+    """A busy host delays everything by 0.4 ms from 30 s on: the stated uncertainty covers that."""
     clock = ArrivalClock(RATE_HZ)
     for counter in range(300):
         clock.stamp_ns(counter, taken_ns(counter, 0.0) + (400_000 if counter >= 150 else 0))
