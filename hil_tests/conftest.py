@@ -16,6 +16,7 @@ SLOW_TIMEOUT_S = 120.0
 
 if importlib.util.find_spec("hypothesis") is not None:
     from hypothesis import HealthCheck, settings
+    from hypothesis.internal.conjecture import providers
 
     # No verdict on speed, which is that of the machine.
     timeless = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -23,6 +24,9 @@ if importlib.util.find_spec("hypothesis") is not None:
     settings.register_profile("ci", timeless, derandomize=True, print_blob=True)
     settings.register_profile("explore", timeless, max_examples=2000)
     settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
+    # Hypothesis also draws constants of the modules loaded so far, hence other examples after other
+    # tests and with another number of workers. It has no setting for that.
+    vars(providers)["is_local_module_file"] = lambda path: False
 
 
 def pytest_configure(config: pytest.Config) -> None:
