@@ -18,6 +18,7 @@ import select
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -29,6 +30,7 @@ from xethru_protocol.wire.errors import Disconnected, PortUnavailable
 
 _CHUNK_BYTES = 65536
 _WRITE_TIMEOUT_S = 5.0
+_TURN_S = 0.005  # how long one task of asyncio may read on while data never end
 _LONGEST_WAIT_S = 86400.0  # poll() takes 31 bits of milliseconds; a caller waits again
 _BAUD = 115200  # what a UART module starts with; without meaning on USB and ptys
 _BITS_PER_BYTE = 10  # start and stop bit
@@ -153,11 +155,8 @@ class SerialTransport:
 
     def close(self) -> None:
         self._fd = -1
-        try:
+        with suppress(OSError):  # the device vanished: there is nothing left to release
             self._port.close()
-        except OSError:
-            # The device vanished: there is nothing left to release.
-            return
 
     def _lost(self) -> str:
         if self._fd < 0:
@@ -205,41 +204,29 @@ def _why(path: str, error: Exception) -> str:
     return f"port {path} cannot be opened: {text}"
 
 
-_TURN_S = 0.005  # how long one task may read on while data never end
-
-
 class AsyncTransport(Protocol):
-    """What `AsyncX4M300` needs of a line to a module."""
+    """What `AsyncX4M300` needs of a line to a module: a `Transport` whose calls are awaited."""
 
     @property
-    def name(self) -> str:
-        """What to call this line in messages to people."""
+    def name(self) -> str: ...
 
-    async def read(self, timeout_s: float) -> bytes:
-        """Whatever has arrived, waiting up to ``timeout_s`` for the first byte; b"" if none.
+    async def read(self, timeout_s: float) -> bytes: ...
 
-        Raises `Disconnected` if the line is gone.
-        """
-
-    async def write(self, data: bytes) -> None:
-        """Send all of ``data``; raises `Disconnected` if the line is gone."""
+    async def write(self, data: bytes) -> None: ...
 
     def close(self) -> None:
-        """Release the line; who reads from it gets `Disconnected`. May be called twice."""
+        """Release the line; a task that reads from it gets `Disconnected`. May be called twice."""
 
 
 class AsyncSerialTransport:
     """A serial port whose descriptor the running event loop watches; see `SerialTransport`."""
 
     def __init__(self, path: str, baudrate: int = _BAUD) -> None:
+        self.name = path
         self._port = SerialTransport(path, baudrate)
         # Tasks that wait for the descriptor, which must not be watched once it is closed.
         self._waiting: dict[asyncio.Future[bool], Callable[[int], object]] = {}
         self._turn_ends_s = 0.0
-
-    @property
-    def name(self) -> str:
-        return self._port.name
 
     @property
     def bytes_per_s(self) -> float:
@@ -374,6 +361,6 @@ def is_running(pid: int) -> bool:
         os.kill(pid, 0)
     except (ProcessLookupError, OverflowError):
         return False
-    except PermissionError:
-        return True
+    except PermissionError:  # it exists and is another user's
+        pass
     return True

@@ -23,7 +23,7 @@ from xethru_protocol.system import StopFlag
 def write_wire(session: RecordedSession, out: Path, radar: str | None, stop: StopFlag) -> str:
     """Write the bytes of a radar's port, both ways; return a description of what was written.
 
-    Their times are those of the host's own clock, whose zero means nothing.
+    Their times are those of the host's monotonic clock.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def write_wire(session: RecordedSession, out: Path, radar: str | None, stop: Sto
 
 SESSION_SUFFIX, MAT_SUFFIX, WIRE_SUFFIX = ".mcap", ".mat", ".xtwire"
 _PRESET = "robust"
-_MAT_PRESET = "paper"  # whose front end such ranges are of: they scatter by a bin, 7 mm
+_MAT_PRESET = "paper"  # such ranges are of its front end: they scatter by a bin, 7 mm
 
 
 def run_convert(
@@ -122,7 +122,7 @@ def run_convert(
 def _is_session(path: Path) -> bool:
     try:
         open_session(path)
-    except AppError:  # what else it is, or what is wrong with it, the reader of bags tells
+    except AppError:  # the reader of bags reports what it is, or what is wrong with it
         return False
     return True
 

@@ -101,9 +101,9 @@ def read_mat(path: Path) -> MatDrive:
     except OSError as error:
         raise AppError(f"{path}: cannot read: {error.strerror or error}") from None
     except Exception as error:  # scipy documents no exceptions for damaged files
-        words = " ".join(str(error).split()) or type(error).__name__
+        reason = " ".join(str(error).split()) or type(error).__name__
         raise AppError(
-            f"{path}: no MATLAB file, or a damaged one{describe_kind(path)}: {words}"
+            f"{path}: no MATLAB file, or a damaged one{describe_kind(path)}: {reason}"
         ) from None
     odometry = _variable(path, table, "odom", (3,))
     n_states = len(odometry)

@@ -269,9 +269,9 @@ def _open(bag: Path) -> Iterator[Any]:
     except OSError as error:
         raise AppError(f"{bag}: cannot read: {error.strerror or error}") from None
     except Exception as error:  # rosbags documents no exceptions for damaged bags
-        words = " ".join(str(error).split()) or type(error).__name__
+        reason = " ".join(str(error).split()) or type(error).__name__
         raise AppError(
-            f"{bag}: no bag of ROS 1 or 2, or a damaged one: {words}; `rosbag reindex` or "
+            f"{bag}: no bag of ROS 1 or 2, or a damaged one: {reason}; `rosbag reindex` or "
             "`ros2 bag reindex` mend some"
         ) from None
 

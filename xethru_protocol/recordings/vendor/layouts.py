@@ -425,7 +425,7 @@ class Meta:
     """A meta file.
 
     ``index_end`` is 0 until the recording is closed. ``index`` holds the entries as they were read,
-    packed; ``complete`` says that the recording was closed and nothing is missing.
+    packed; ``complete``: the recording was closed and nothing is missing.
     """
 
     start_ms: int = 0
