@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -30,7 +31,14 @@ if importlib.util.find_spec("hypothesis") is not None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Register the one marker that tests outside the plugin use."""
+    """Register the one marker that tests outside the plugin use; let signals end what tests start.
+
+    `nohup` and a shell's background jobs ignore some signals, and all children would inherit that.
+    """
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     config.addinivalue_line("markers", "slow: ends after 120 s * XETHRU_TEST_PATIENCE, not 20 s")
 
 
