@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ SLOW_TIMEOUT_S = 120.0
 
 if importlib.util.find_spec("hypothesis") is not None:
     from hypothesis import HealthCheck, settings
+    from hypothesis.internal.conjecture import providers
 
     # No verdict on speed, which is that of the machine.
     timeless = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -23,10 +25,20 @@ if importlib.util.find_spec("hypothesis") is not None:
     settings.register_profile("ci", timeless, derandomize=True, print_blob=True)
     settings.register_profile("explore", timeless, max_examples=2000)
     settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
+    # Hypothesis also draws constants of the modules loaded so far, hence other examples after other
+    # tests and with another number of workers. It has no setting for that.
+    vars(providers)["is_local_module_file"] = lambda path: False
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Register the one marker that tests outside the plugin use."""
+    """Register the one marker that tests outside the plugin use; let signals end what tests start.
+
+    `nohup` and a shell's background jobs ignore some signals, and all children would inherit that.
+    """
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     config.addinivalue_line("markers", "slow: ends after 120 s * XETHRU_TEST_PATIENCE, not 20 s")
 
 
