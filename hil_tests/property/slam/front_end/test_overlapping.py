@@ -277,7 +277,7 @@ MODEL_SIGMA = MODEL.sigma_bins(BIN_M)
 MODEL_CARRIER = MODEL.carrier_rad(BIN_M)
 N_WHOLE = 240
 FIRST, LAST = 90.0, 150.0
-FILTER = PulseFilter(MODEL, N_WHOLE, BIN_M, false_alarms=0.1, noise_is_told=True)
+FILTER = PulseFilter(MODEL, N_WHOLE, BIN_M, false_alarms=0.1, noise_is_known=True)
 MARGIN = round(1.5 * MODEL_SIGMA)
 
 
