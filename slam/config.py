@@ -507,9 +507,9 @@ def without_removed_keys(tables: Mapping[str, Any], source: str) -> dict[str, An
     for removed, default in REMOVED_KEYS.items():
         part, _, field = removed.partition(".")
         table = kept.get(part)
-        if not isinstance(table, dict) or field not in table:
+        if not isinstance(table, dict):
             continue
-        if not _is_same(table[field], default):
+        if not _is_same(table.get(field, default), default):
             raise ConfigError(
                 f"{source}: {removed}: version {_LAST_VERSION_WITH_THEM} was the last with this "
                 f"key; only its default {default!r} is still read (given: {table[field]!r})"

@@ -1,7 +1,19 @@
 """Driver of one X4M300, blocking (`X4M300`) or with asyncio (`async_radar.AsyncX4M300`)."""
 
+from xethru_protocol.driver.conversation import Listener, Observer, ProtocolRecord, RawListener
 from xethru_protocol.driver.frames import Frame, FrameGeometry
-from xethru_protocol.driver.link import RawConfig
-from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.driver.link import ModuleInfo, RawConfig
+from xethru_protocol.driver.radar import X4M300, known_ports
 
-__all__ = ["X4M300", "Frame", "FrameGeometry", "RawConfig"]
+__all__ = [
+    "X4M300",
+    "Frame",
+    "FrameGeometry",
+    "Listener",
+    "ModuleInfo",
+    "Observer",
+    "ProtocolRecord",
+    "RawConfig",
+    "RawListener",
+    "known_ports",
+]

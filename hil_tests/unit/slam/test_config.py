@@ -163,6 +163,10 @@ def test_every_removed_key_at_its_old_default_is_read_from_a_file() -> None:
     assert config == config_from_tables({"window": {"size": 7}}, source="x.toml")
 
 
+def test_table_that_held_only_removed_keys_may_be_empty() -> None:
+    assert config_from_tables({"leakage": {}}, source="old.toml") == SlamConfig()
+
+
 @pytest.mark.parametrize("key", REMOVED_KEYS)
 @pytest.mark.parametrize("value", [1e-3, "other", True, False, None])
 def test_removed_key_at_another_value_is_one_line_naming_key_and_version(
