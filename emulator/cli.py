@@ -524,13 +524,13 @@ def _link(text: str) -> tuple[str, float | None]:
     if not colon:
         return kind, None
     least, most = _LINKS[kind]
-    value = _finite_number(number)
+    value = _number_or_nan(number)
     if not least <= value <= most:  # so not-a-number, too
         raise argparse.ArgumentTypeError(f"{number!r} of {kind} is not in {least}...{most}")
     return kind, value
 
 
-def _finite_number(text: str) -> float:
+def _number_or_nan(text: str) -> float:
     try:
         return float(text)
     except ValueError:
@@ -555,7 +555,7 @@ def _kind(text: str) -> str:
 
 
 def _rate(text: str) -> float:
-    value = _finite_number(text)
+    value = _number_or_nan(text)
     if not (math.isfinite(value) and value >= 0):
         raise argparse.ArgumentTypeError(f"{text} is not a finite number >= 0")
     return value
