@@ -17,8 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from emulator.scene.scene import Scene, SceneError, load_scene
 from slam.app.errors import AppError, UsageError
-from slam.app.odometry.track import OdometryTrack
-from slam.app.odometry.tum import TumSample
+from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.records import SessionInfo
 from slam.app.rig.files import RigFile, RigRadar, write_rig
 from slam.app.session.reader import RecordedSession, open_session

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from slam.app.commands.view import refuse_overwriting, session_file
 from slam.app.errors import AppError, naming
-from slam.app.odometry.tum import NS_PER_S
+from slam.app.odometry.track import NS_PER_S
 from slam.app.records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.run.evaluation import (
     POSE_DOF,

@@ -15,7 +15,7 @@ import numpy as np
 from slam.app.errors import AppError, UsageError
 from slam.app.odometry.arrival import ClockLine
 from slam.app.odometry.live import LineSource, LiveOdometry, parse_source
-from slam.app.odometry.tum import NS_PER_S
+from slam.app.odometry.track import NS_PER_S
 from slam.app.records import RadarInfo, SessionInfo, SessionObserver
 from slam.app.rig.emulated import RAW_CONFIG, versions
 from slam.app.rig.files import are_emulated, load_rig, open_rig

@@ -35,8 +35,7 @@ from scipy.io import loadmat, savemat
 
 from slam.app.convert.rosbag import authors_rig, rig_of
 from slam.app.errors import AppError, OdometryError, naming
-from slam.app.odometry.track import OdometryTrack
-from slam.app.odometry.tum import NS_PER_S, TumSample
+from slam.app.odometry.track import NS_PER_S, OdometryTrack, TumSample
 from slam.app.records import RadarInfo, Scan
 from slam.app.rig.sources import TRUE_PER_MODULE_METRE
 from slam.app.session.log import SessionLog

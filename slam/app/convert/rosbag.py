@@ -35,8 +35,7 @@ from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_typestore
 
 from slam.app.errors import AppError, OdometryError
-from slam.app.odometry.track import OdometryTrack
-from slam.app.odometry.tum import NS_PER_S, TumSample
+from slam.app.odometry.track import NS_PER_S, OdometryTrack, TumSample
 from slam.app.records import RadarInfo, Scan, SessionInfo
 from slam.app.rig.sources import TRUE_PER_MODULE_METRE
 from slam.app.session import messages as ros

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from emulator.scene.scene import Scene
 from slam.app.experiments import Result
-from slam.app.odometry.tum import NS_PER_S
+from slam.app.odometry.track import NS_PER_S
 from slam.app.rig.emulated import rig_of, scene_and_config, true_landmarks_m
 from slam.app.run.output import share_text
 from slam.app.run.pictures import ESTIMATE, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label

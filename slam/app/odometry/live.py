@@ -28,8 +28,7 @@ from numpy.typing import NDArray
 
 from slam.app.errors import OdometryError, UsageError
 from slam.app.odometry.arrival import ClockLine, LowerEnvelope
-from slam.app.odometry.track import OdometryTrack
-from slam.app.odometry.tum import NS_PER_S, TumError, TumSample, parse_tum_line
+from slam.app.odometry.track import NS_PER_S, OdometryTrack, TumError, TumSample, parse_tum_line
 from xethru_protocol.transport import SerialTransport
 from xethru_protocol.wire.errors import XeThruError
 

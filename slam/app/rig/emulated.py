@@ -31,7 +31,7 @@ from emulator.loopback import LoopbackTransport
 from emulator.module.memory import Identity
 from emulator.scene.scene import Scene, SceneError, UnknownSceneError, load_scene
 from slam.app.errors import AppError, EmulatorError, UsageError
-from slam.app.odometry.tum import NS_PER_S
+from slam.app.odometry.track import NS_PER_S
 from slam.app.rig.sources import RadarLink, RigSource
 from slam.config import ConfigError, SlamConfig, WheelNoise, load_preset
 from slam.geometry import Mount, Rig, transform

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.app.errors import AppError, RadarSilentError
-from slam.app.odometry.tum import NS_PER_S
+from slam.app.odometry.track import NS_PER_S
 from slam.app.records import RadarInfo, Scan
 from slam.frames import RadarFrame
 from slam.geometry import Mount

@@ -27,7 +27,7 @@ from typing import Literal, Protocol, Self, TypeAlias
 from slam.app.errors import AppError, OdometryError
 from slam.app.odometry.arrival import ArrivalClock
 from slam.app.odometry.live import LineSource, LiveOdometry, read_lines
-from slam.app.odometry.tum import NS_PER_S, TumSample
+from slam.app.odometry.track import NS_PER_S, TumSample
 from slam.app.records import LogLine, RadarInfo, Scan, Snapshot
 from slam.app.rig.sources import RadarLink, radar_frame
 from slam.app.run.runner import LinkLog

@@ -13,7 +13,7 @@ from typing import TextIO
 import numpy as np
 
 from slam.app.errors import naming
-from slam.app.odometry.tum import NS_PER_S
+from slam.app.odometry.track import NS_PER_S
 from slam.app.records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.run.evaluation import LandmarkSummary, Summary, ratio
 from slam.app.run.runner import RunRecord, RunSource

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from slam.app.errors import AppError, OdometryError
-from slam.app.odometry.track import OdometryTrack
-from slam.app.odometry.tum import TumSample
+from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.records import LogLine, Scan, SessionObserver, Snapshot
 from slam.app.run.output import Progress
 from slam.app.run.results import RESULTS, finish, prepare_folder, saying_what_is_left

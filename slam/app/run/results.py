@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.app.errors import AppError, naming
-from slam.app.odometry.tum import NS_PER_S, Trajectory, read_tum, write_tum
+from slam.app.odometry.track import NS_PER_S, Trajectory, read_tum, write_tum
 from slam.app.records import SessionInfo
 from slam.app.run.evaluation import Summary, summarise
 from slam.app.run.output import Row, print_result

@@ -14,8 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.app.odometry.track import OdometryTrack
-from slam.app.odometry.tum import TumSample
+from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.records import (
     LogLine,
     Scan,

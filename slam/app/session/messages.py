@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
 from slam.app.errors import AppError
-from slam.app.odometry.tum import NS_PER_S, TumSample
+from slam.app.odometry.track import NS_PER_S, TumSample
 from slam.app.records import RadarInfo, SessionInfo, Snapshot
 from slam.config import SlamConfig
 from slam.geometry import Mount

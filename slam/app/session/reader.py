@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.app.errors import AppError, OdometryError
-from slam.app.odometry.track import OdometryTrack
-from slam.app.odometry.tum import TumSample
+from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, Snapshot
 from slam.app.rig.sources import TRUE_PER_MODULE_METRE, sampler_limits
 from slam.app.session import messages as ros

@@ -37,7 +37,7 @@ from scipy.optimize import least_squares, linear_sum_assignment
 
 from emulator.scene.scene import Scene
 from slam.app.errors import AppError
-from slam.app.odometry.tum import NS_PER_S
+from slam.app.odometry.track import NS_PER_S
 from slam.app.rig.emulated import rig_of, true_landmarks_m, wheels_of
 from slam.app.run.evaluation import NEES_AT
 from slam.app.run.runner import RunRecord

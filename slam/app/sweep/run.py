@@ -22,8 +22,7 @@ from emulator.scene.philox import counter_normals
 from emulator.scene.scene import CarriedSpec, Scene
 from emulator.scene.wheels import scene_odometry
 from slam.app.errors import AppError, UsageError
-from slam.app.odometry.track import OdometryTrack
-from slam.app.odometry.tum import NS_PER_S
+from slam.app.odometry.track import NS_PER_S, OdometryTrack
 from slam.app.records import Scan, SessionInfo
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,

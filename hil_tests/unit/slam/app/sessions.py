@@ -6,8 +6,7 @@ import numpy as np
 from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader
 
-from slam.app.odometry.track import OdometryTrack
-from slam.app.odometry.tum import format_tum_line
+from slam.app.odometry.track import OdometryTrack, format_tum_line
 from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.session.log import SessionLog
 from slam.frames import RadarFrame

@@ -17,8 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from hil_tests.paths import FIXTURES
 from hil_tests.unit.slam.app.sessions import scan, session_info
 from hil_tests.unit.xethru_protocol.recordings.messages import frame, read_with_faults
-from slam.app.odometry.track import OdometryTrack
-from slam.app.odometry.tum import format_tum_line
+from slam.app.odometry.track import OdometryTrack, format_tum_line
 from slam.app.session.log import SessionLog
 from xethru_protocol.recordings import (
     RecordingError,

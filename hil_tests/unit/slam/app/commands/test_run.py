@@ -14,7 +14,7 @@ from slam.app.cli import CSV_TO_TUM, main
 from slam.app.commands.run import parse_clock
 from slam.app.errors import UsageError
 from slam.app.odometry.live import parse_source
-from slam.app.odometry.tum import TumSample, parse_tum_line
+from slam.app.odometry.track import TumSample, parse_tum_line
 from slam.app.records import LogLine, SessionObserver
 from slam.app.run.live_source import LiveLog
 from slam.app.session import messages as ros

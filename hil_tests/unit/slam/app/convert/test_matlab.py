@@ -16,8 +16,7 @@ from hil_tests.unit.slam.app.sessions import scan, session_info
 from slam.app.cli import main
 from slam.app.convert.matlab import MAT_RIG, MatDrive, read_mat, write_mat
 from slam.app.errors import AppError
-from slam.app.odometry.track import OdometryTrack
-from slam.app.odometry.tum import format_tum_line
+from slam.app.odometry.track import OdometryTrack, format_tum_line
 from slam.app.records import SessionInfo
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import settings_text

@@ -22,8 +22,7 @@ from hil_tests.unit.slam.app.convert.authors_bag import (
 from hil_tests.unit.slam.app.sessions import FRAME_NS, feed, scan, session_info, snapshot
 from slam.app.cli import main
 from slam.app.convert.rosbag import convert_bag, write_bag
-from slam.app.odometry.track import OdometryTrack
-from slam.app.odometry.tum import format_tum_line
+from slam.app.odometry.track import OdometryTrack, format_tum_line
 from slam.app.records import Scan
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import SlamSettings

@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slam.app.errors import OdometryError
-from slam.app.odometry.track import OdometryTrack, read_odometry_socket
-from slam.app.odometry.tum import TumSample, format_tum_line
+from slam.app.odometry.track import OdometryTrack, TumSample, format_tum_line, read_odometry_socket
 from slam.geometry import wrap_angle
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from slam.app.odometry.tum import (
+from slam.app.odometry.track import (
     Trajectory,
     TumError,
     TumSample,
@@ -85,6 +85,6 @@ def test_files_round_trip_and_skip_comments(tmp_path: Path) -> None:
 
 
 def test_endless_input_is_no_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("slam.app.odometry.tum._MAX_BYTES", 1000)
+    monkeypatch.setattr("slam.app.odometry.track._MAX_BYTES", 1000)
     with pytest.raises(TumError, match="it is no trajectory"):
         read_tum(Path("/dev/zero"))

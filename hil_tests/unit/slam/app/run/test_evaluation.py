@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from slam.app.cli import main
-from slam.app.odometry.tum import Trajectory, write_tum
+from slam.app.odometry.track import Trajectory, write_tum
 from slam.app.run.evaluation import NEES_AT, LandmarkSummary, Summary, summarise
 from slam.app.run.output import summary_rows, table_text
 from slam.app.run.results import evaluate

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil_tests.unit.slam.app.sessions import FRAME_NS, scan, session_info, snapshot
-from slam.app.odometry.track import OdometryTrack
-from slam.app.odometry.tum import TumSample
+from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.records import LogLine, Scan, SessionObserver, Snapshot
 from slam.app.run.output import Progress
 from slam.app.run.runner import LinkStates, run_slam, unknown_truth

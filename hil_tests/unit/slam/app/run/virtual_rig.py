@@ -19,7 +19,7 @@ from emulator.module.memory import Identity
 from emulator.ports.odometry import stamp_ns
 from emulator.scene.scene import Scene
 from emulator.scene.wheels import scene_odometry
-from slam.app.odometry.tum import TumSample
+from slam.app.odometry.track import TumSample
 from slam.app.records import RadarInfo
 from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, rig_of
 from slam.app.rig.sources import RadarLink, RigSource

@@ -18,7 +18,7 @@ from hil_tests.unit.slam.app.sessions import (
     write_session,
 )
 from slam.app.errors import AppError
-from slam.app.odometry.tum import TumSample
+from slam.app.odometry.track import TumSample
 from slam.app.records import LogLine, Scan, Snapshot
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import (
