@@ -13,8 +13,7 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.sessions import scan, session_info
-from slam.app.odometry.track import OdometryTrack
-from slam.app.odometry.tum import TumSample
+from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
     RAW_CONFIG,

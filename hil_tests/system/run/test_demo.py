@@ -14,7 +14,7 @@ from rerun.chunk import RrdReader
 from rosbags.highlevel import AnyReader
 
 from hil_tests.system.short_scene import write_short_scene
-from slam.app.odometry.tum import read_tum
+from slam.app.odometry.track import read_tum
 from slam.app.run.results import evaluate, summary_of
 from slam.app.run.runner import RunRecord, RunSource, execute
 from slam.app.session import messages as ros

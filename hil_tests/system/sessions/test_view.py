@@ -30,8 +30,7 @@ from slam.app.run.replay import recorded_source
 from slam.app.run.runner import execute
 from slam.app.session.reader import open_session
 from slam.app.view import rerun_recording
-from slam.app.view.rerun_recording import count_rows
-from slam.app.view.rerun_sdk import RrdReader, rr
+from slam.app.view.rerun_recording import RrdReader, count_rows, rr
 from slam.app.view.viewer import LiveView, executable
 from xethru_protocol.system import StopFlag
 

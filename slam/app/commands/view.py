@@ -23,8 +23,7 @@ from slam.app.run.replay import recorded_source
 from slam.app.run.runner import RunSource, execute
 from slam.app.session.reader import RecordedSession, open_session
 from slam.app.view import SERVE_WEB, SPAWN
-from slam.app.view.rerun_recording import DEVICE_TIME
-from slam.app.view.rerun_sdk import ViewerClient
+from slam.app.view.rerun_recording import DEVICE_TIME, ViewerClient
 from slam.app.view.viewer import LiveView, ViewerKind, ViewerProcess
 from xethru_protocol.recordings.mcap import MAGIC
 from xethru_protocol.system import StopFlag

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.app.errors import AppError
-from slam.app.odometry.tum import NS_PER_S
+from slam.app.odometry.track import NS_PER_S
 from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.run.evaluation import (
     POSE_DOF,
@@ -30,8 +30,7 @@ from slam.app.run.evaluation import (
     world_from_odom,
 )
 from slam.app.run.runner import LinkChange, LinkState, LinkStates
-from slam.app.view.frames import BLOCK_FRAMES, FrameLayer
-from slam.app.view.map import TRAIL_STATES, MapLayer, beams_of
+from slam.app.view.layers import BLOCK_FRAMES, TRAIL_STATES, FrameLayer, MapLayer, beams_of
 from slam.app.view.rerun_recording import (
     BAND_RGB,
     DEVICE_TIME,
@@ -44,9 +43,10 @@ from slam.app.view.rerun_recording import (
     Rgb,
     Stamps,
     part,
+    rr,
+    rrb,
     screen,
 )
-from slam.app.view.rerun_sdk import rr, rrb
 
 _ABOUT = """\
 # What you see

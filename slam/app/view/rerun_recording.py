@@ -1,10 +1,12 @@
 """A Rerun recording that is written to a file or a viewer, with its rows counted.
 
+The only module that imports Rerun; that takes half a second, and names vanish often.
 Rerun's 2D views have y downwards, our frames upwards: only `screen` negates it.
 """
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections import defaultdict
 from collections.abc import Iterable, Sequence, Sized
@@ -14,10 +16,20 @@ from threading import Thread
 
 import numpy as np
 import pyarrow as pa
+import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import NDArray
+from rerun.chunk import RrdReader
+from rerun.error_utils import RerunWarning
+from rerun.experimental import ViewerClient
 
 from slam.app.errors import AppError
-from slam.app.view.rerun_sdk import RerunWarning, RrdReader, rr, rrb
+
+__all__ = ["RrdReader", "ViewerClient", "rr", "rrb"]
+
+# Rerun reports a full disk or a closed viewer in lines of its own, from its own threads; we report
+# it in one.
+os.environ.setdefault("RUST_LOG", "off")
 
 Rgb = tuple[int, int, int]
 

@@ -12,7 +12,7 @@ from rerun.chunk import RrdReader
 from hil_tests.unit.slam.app.sessions import feed, scan, session_info, snapshot
 from slam.app.errors import AppError
 from slam.app.records import LogLine
-from slam.app.view.frames import bscan_picture
+from slam.app.view.layers import bscan_picture
 from slam.app.view.panels import RerunView
 from slam.app.view.rerun_recording import count_rows
 from slam.frames import Detection

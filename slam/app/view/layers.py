@@ -1,4 +1,4 @@
-"""The map in Rerun: truth, odometry, estimate, landmarks and echoes."""
+"""What is drawn in Rerun: of every radar the frames, their detections and B-scan; and the map."""
 
 from __future__ import annotations
 
@@ -9,18 +9,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
-from slam.app.odometry.tum import NS_PER_S
-from slam.app.records import RadarInfo, SessionInfo, Snapshot
+from slam.app.odometry.track import NS_PER_S
+from slam.app.records import RadarInfo, Scan, SessionInfo, Snapshot
 from slam.app.run.pictures import ellipse_95, rotate_covariances
 from slam.app.view.rerun_recording import (
     ARROW_M,
     ESTIMATE_RGB,
+    FAULT_RGB,
     FIX_RGB,
     KEPT_RGB,
     LANDMARK_RGB,
     ODOMETRY_RGB,
+    RADAR_RGB,
     REJECTED_RGB,
     TRUTH_RGB,
     UNUSED_RGB,
@@ -30,14 +33,237 @@ from slam.app.view.rerun_recording import (
     Recording,
     Rgb,
     Stamps,
+    arrow_column,
     lengths,
     part,
+    rr,
     screen,
     strips_column,
 )
-from slam.app.view.rerun_sdk import rr
+from slam.frames import RadarFrame
 from slam.geometry import compose, transform
 from slam.results import Fix, Observation, StepResult
+
+_CARRIER_HZ = 7.29e9
+_LIGHT_MPS = 299_792_458.0
+
+# What the paper's front end looks at and a little beyond, from the receiver's noise (5.6e-4 per
+# sample, so an envelope of -62 dB) to a near rod.
+_SHOWN_RANGE_M = 3.0
+_FLOOR_DB, _TOP_DB = -62.0, -30.0
+
+
+def bscan_picture(
+    frames: NDArray[np.float32], range_start_m: float, bin_length_m: float
+) -> NDArray[np.uint8]:
+    """Draw echoes as grey levels: constant part removed, envelope, decibels.
+
+    Parameters
+    ----------
+    frames
+        Shape (n_frames, n_bins), raw RF, slow time downwards.
+    range_start_m, bin_length_m
+        True metres of the first bin and between two bins.
+
+    Returns
+    -------
+    Shape (n_frames, n_shown - 2), up to 3 m of range; 0 is -62 dB of full scale or less, 255 is
+    -30 dB or more. The quadrature of the pulse comes from the central difference of the samples,
+    which for a carrier of w radians per sample is its Hilbert partner times 2 sin w.
+    """
+    n_wanted = int((_SHOWN_RANGE_M - range_start_m) / bin_length_m)
+    n_shown = min(frames.shape[1], max(n_wanted, 3))
+    echoes = frames[:, :n_shown] - frames[:, :n_shown].mean(axis=0)
+    phase_step_rad = 2.0 * np.pi * _CARRIER_HZ * 2.0 * bin_length_m / _LIGHT_MPS
+    quadrature = (echoes[:, 2:] - echoes[:, :-2]) / np.float32(2.0 * np.sin(phase_step_rad))
+    power = echoes[:, 1:-1] ** 2 + quadrature**2
+    level_db = 10.0 * np.log10(np.maximum(power, np.float32(1e-12)))
+    scaled = (level_db - _FLOOR_DB) / (_TOP_DB - _FLOOR_DB)
+    picture: NDArray[np.uint8] = (np.clip(scaled, 0.0, 1.0) * 255.0).astype(np.uint8)
+    return picture
+
+
+BLOCK_FRAMES = 128
+"""Rows of one B-scan picture; as many frames are sent at once to a file."""
+
+_DETECTION_WIDTH_M = 0.03
+_ONE_VALUE = np.zeros(1, dtype=np.float32)
+_NO_DETECTIONS = _ONE_VALUE
+"""A chart needs a bar: one without height at the antenna stands for none."""
+
+
+class FrameLayer:
+    """Collects frames and sends them in blocks; sends detections."""
+
+    def __init__(self, recording: Recording, radars: Sequence[RadarInfo]) -> None:
+        self._recording = recording
+        self._radars = tuple(radars)
+        self._blocks = [_FrameBlock(radar.name) for radar in radars]
+        for index, radar in enumerate(radars):
+            colour = RADAR_RGB[index % len(RADAR_RGB)]
+            recording.static(f"radar/{part(radar.name)}/frame", _chart_style(color=colour))
+            recording.static(f"radar/{part(radar.name)}/detections", _chart_style(color=FAULT_RGB))
+
+    def on_scan(self, scan: Scan) -> None:
+        """Take the frames of one tick; a full block goes out at once."""
+        host = scan.host_ns or (None,) * len(scan.frames)
+        for frame, host_ns in zip(scan.frames, host, strict=True):
+            block = self._blocks[frame.radar]
+            block.add(frame, host_ns)
+            if len(block.stamps) == BLOCK_FRAMES:
+                self._send_frames(block)
+
+    def send(self) -> None:
+        """Send the frames that wait."""
+        for block in self._blocks:
+            self._send_frames(block)
+
+    def send_older(self, t_ns: int) -> None:
+        """Send the frames of radars of which one from `t_ns` or before still waits."""
+        for block in self._blocks:
+            if len(block.stamps) and block.stamps.t_ns[0] <= t_ns:
+                self._send_frames(block)
+
+    def send_detections(self, snapshots: Sequence[Snapshot], stamps: Stamps) -> None:
+        """Send the detections of some states."""
+        known = [row for row, snapshot in enumerate(snapshots) if snapshot.step is not None]
+        steps = [snapshots[row].step for row in known]
+        rows = [step.detections for step in steps if step is not None]
+        if not rows:
+            return
+        for index, radar in enumerate(self._radars):
+            of_radar = [[d for d in row if d.radar == index] for row in rows]
+            # Where the echo lies in the frame: with the offset that ranges are freed of.
+            labels_m = [
+                np.array([d.range_m + radar.range_offset_m for d in row], dtype=np.float32)
+                if row
+                else _NO_DETECTIONS
+                for row in of_radar
+            ]
+            heights = [
+                np.array([d.amplitude for d in row], dtype=np.float32) if row else _NO_DETECTIONS
+                for row in of_radar
+            ]
+            widths = [np.full(len(row), _DETECTION_WIDTH_M, dtype=np.float32) for row in labels_m]
+            entity = f"radar/{part(radar.name)}/detections"
+            self._recording.rows(entity, stamps.at(known), _charts(heights, labels_m, widths))
+
+    def _send_frames(self, block: _FrameBlock) -> None:
+        if not len(block.stamps):
+            return
+        frames = np.stack(block.samples)
+        if block.axis != (axis := (block.range_start_m, block.bin_length_m, frames.shape[1])):
+            block.axis = axis
+            labels_m = (axis[0] + axis[1] * np.arange(axis[2])).astype(np.float32)
+            style = _chart_style(abscissa=labels_m, bar_m=block.bin_length_m)
+            self._recording.static(f"radar/{part(block.name)}/frame", style)
+        self._recording.rows(f"radar/{part(block.name)}/frame", block.stamps, [_bar_charts(frames)])
+        block.shown.extend(block.samples)
+        # Stamped with its first frame, so that the cursor is inside the picture it shows; where
+        # blocks come early, because someone watches, the picture is of the newest frames.
+        shown = frames if len(frames) == BLOCK_FRAMES else np.stack(block.shown)
+        picture = bscan_picture(shown, block.range_start_m, block.bin_length_m)
+        self._recording.row(
+            f"radar/{part(block.name)}/bscan",
+            block.stamps,
+            rr.Tensor(picture, dim_names=("frame", "range_bin"), value_range=(0.0, 255.0)),
+        )
+        block.clear()
+
+
+class _FrameBlock:
+    """Frames of one radar that wait to be sent together."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.range_start_m = self.bin_length_m = 0.0
+        self.axis: tuple[float, float, int] | None = None
+        self.shown: deque[NDArray[np.float32]] = deque(maxlen=BLOCK_FRAMES)
+        self.clear()
+
+    def add(self, frame: RadarFrame, host_ns: int | None) -> None:
+        self.stamps.add(frame.t_ns, frame.counter, host_ns)
+        self.samples.append(frame.samples)
+        self.range_start_m, self.bin_length_m = frame.range_start_m, frame.bin_length_m
+
+    def clear(self) -> None:
+        self.stamps = Stamps.none()
+        self.samples: list[NDArray[np.float32]] = []
+
+
+def _chart_style(
+    *,
+    color: Rgb | None = None,
+    abscissa: NDArray[np.float32] | None = None,
+    bar_m: float | None = None,
+) -> list[rr.DescribedComponentBatch]:
+    """Return a bar chart without its values; `BarChart.from_fields` cannot leave them out."""
+    widths = None if abscissa is None or bar_m is None else np.full(len(abscissa), bar_m)
+    chart = rr.BarChart(_ONE_VALUE, color=color, abscissa=abscissa, widths=widths)
+    batches = chart.as_component_batches()
+    return [b for b in batches if b.component_descriptor().component != "BarChart:values"]
+
+
+def _bar_charts(frames: NDArray[np.float32]) -> rr.ComponentColumn:
+    """Make one bar chart per row of shape (n_frames, n_bins), as one column."""
+    return _tensors("BarChart:values", frames.ravel(), np.full(len(frames), frames.shape[1]))
+
+
+def _charts(
+    heights: Sequence[NDArray[np.float32]],
+    places: Sequence[NDArray[np.float32]],
+    widths: Sequence[NDArray[np.float32]],
+) -> list[rr.ComponentColumn]:
+    """Make bar charts with bars at given places, one per row, rows of any length."""
+    sizes = np.array([len(row) for row in heights])
+    every_width = rr.BarChart(_ONE_VALUE, widths=np.concatenate(widths)).as_component_batches()
+    (width,) = (b for b in every_width if b.component_descriptor().component == "BarChart:widths")
+    return [
+        _tensors("BarChart:values", np.concatenate(heights), sizes),
+        _tensors("BarChart:abscissa", np.concatenate(places), sizes),
+        rr.ComponentColumn(width.component_descriptor(), width).partition(sizes),
+    ]
+
+
+def _tensors(
+    component: str, values: NDArray[np.float32], sizes: NDArray[np.int64]
+) -> rr.ComponentColumn:
+    """Make a column of one-dimensional tensors, one per row, of the sizes given.
+
+    rr.BarChart has no working `columns`, and one log call per frame costs half a millisecond. So
+    the arrow array of n one-dimensional tensors is built here, without copying the samples.
+    """
+    batches = rr.BarChart(_ONE_VALUE, abscissa=_ONE_VALUE).as_component_batches()
+    (template,) = (b for b in batches if b.component_descriptor().component == component)
+    tensor = template.as_arrow_array().type
+    shape, names, buffer = (tensor.field(name).type for name in ("shape", "names", "buffer"))
+    kinds = [buffer.field(index) for index in range(buffer.num_fields)]
+    n_rows = len(sizes)
+    row_ends = np.arange(n_rows + 1, dtype=np.int32)
+    value_ends = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
+    float32 = [kind.name for kind in kinds].index("F32")
+    children = [pa.array([], type=kind.type) for kind in kinds]
+    children[float32] = pa.ListArray.from_arrays(
+        pa.array(value_ends), pa.array(values), type=kinds[float32].type
+    )
+    codes = np.full(n_rows, float32, dtype=np.int8)
+    union = pa.Array.from_buffers(
+        buffer,
+        n_rows,
+        [None, pa.py_buffer(codes), pa.py_buffer(row_ends[:-1].copy())],
+        children=children,
+    )
+    lengths = pa.array(sizes.astype(np.uint64))
+    column = pa.StructArray.from_arrays(
+        [
+            pa.ListArray.from_arrays(pa.array(row_ends), lengths, type=shape),
+            pa.nulls(n_rows, names),
+            union,
+        ],
+        fields=[tensor.field(name) for name in ("shape", "names", "buffer")],
+    )
+    return arrow_column(template.component_descriptor(), column)
+
 
 _PAPERS_FIELD_OF_VIEW_DEG = 65.0
 _PAPERS_REACH_M = 1.5
