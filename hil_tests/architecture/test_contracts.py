@@ -39,10 +39,6 @@ PLANTED = {
 MOST_ENTRIES = 12
 MARKERS = {"__init__.py", "__main__.py", "__pycache__", "conftest.py", "py.typed"}
 SMALL_LINES = 80
-# Files under 80 lines with one importer, and why they are not part of it.
-SMALL_FILES = {
-    "hil_tests/plugin/scheduling.py": "imports xdist, which need not be installed",
-}
 
 
 def contracts() -> list[str]:
@@ -116,7 +112,7 @@ def test_small_files_with_one_importer_are_part_of_it() -> None:
             importers = graph.find_modules_that_directly_import(module)
             if sum(f"{importer}.".startswith(prefixes) for importer in importers) == 1:
                 found.add(file.as_posix())
-    assert found == set(SMALL_FILES)
+    assert found == set()
 
 
 def loaded(program: str) -> set[str]:

@@ -14,8 +14,7 @@ import pytest
 from hil_tests.plugin.bench import RadarUnderTest
 from hil_tests.plugin.cassette import EMULATED, Cassette, ask_all, differences
 from hil_tests.plugin.choices import CHOICES
-from hil_tests.plugin.gate import leave_out
-from hil_tests.plugin.measurements import Measure
+from hil_tests.plugin.gate import Measure, leave_out
 from hil_tests.plugin.specs import parse_specs
 
 

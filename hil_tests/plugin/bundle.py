@@ -18,18 +18,19 @@ import importlib.metadata
 import json
 import platform
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hil_tests.plugin.bench import RadarUnderTest
-from hil_tests.plugin.measurements import Measurement
-from hil_tests.plugin.wire_tap import WireTap, decoded
+from hil_tests.plugin.gate import Measurement
+from hil_tests.plugin.radar_targets import WireBytes, WireTap
 from xethru_protocol.recordings.mcap import BYTE_ARRAY, SCHEMAS, pack_array
 from xethru_protocol.wire.codec import describe, encode
-from xethru_protocol.wire.framing import FramingFault
+from xethru_protocol.wire.connection import Connection, Role
+from xethru_protocol.wire.framing import NEED_DATA, FramingFault
 from xethru_protocol.wire.messages import BasebandIq, Command, DataFloat, Message
 
 if TYPE_CHECKING:
@@ -140,6 +141,22 @@ def _about(
             },
         },
     }
+
+
+def decoded(tap: WireTap) -> Iterator[tuple[WireBytes, Sequence[Message | FramingFault]]]:
+    """Yield each piece that passed with the messages and faults that it completed.
+
+    Commands are read as the module reads them, answers as the driver does.
+    """
+    ends = {"tx": Connection(Role.MODULE), "rx": Connection(Role.HOST)}
+    for passed in tap.passed:
+        end = ends[passed.way]
+        end.receive_data(passed.data)
+        events: list[Message | FramingFault] = []
+        while (event := end.next_event()) is not NEED_DATA:
+            if isinstance(event, Message | FramingFault):
+                events.append(event)
+        yield passed, events
 
 
 def _write_wire(path: Path, taps: Mapping[str, WireTap]) -> None:

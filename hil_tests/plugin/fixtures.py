@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from hil_tests.plugin.choices import CHOICES
-from hil_tests.plugin.gate import findings_of, gate, lacking
-from hil_tests.plugin.measurements import Measure
+from hil_tests.plugin.gate import Measure, findings_of, gate, lacking
 
 if TYPE_CHECKING:
     from hil_tests.plugin.bench import Bench, RadarUnderTest

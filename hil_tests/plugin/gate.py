@@ -1,19 +1,80 @@
-"""Whether a test can run on a radar: capabilities, permissions, and radars that do not answer."""
+"""What is found of a test: whether it can run on its radars, and the numbers that it measures."""
 
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import pytest
 
 from hil_tests.plugin.choices import CHOICES
-from hil_tests.plugin.measurements import Measure
 
 if TYPE_CHECKING:
     from hil_tests.plugin.bench import Bench, RadarUnderTest
+
+
+Limit = tuple[float | None, float | None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measurement:
+    """One number in ``unit`` (empty: a count), with its inclusive limits (None: no limit)."""
+
+    name: str
+    value: float
+    unit: str
+    low: float | None
+    high: float | None
+
+    @property
+    def within(self) -> bool:
+        """Whether the value is within its limits; NaN never is."""
+        above = self.low is None or self.value >= self.low
+        below = self.high is None or self.value <= self.high
+        return above and below and not math.isnan(self.value)
+
+    @property
+    def text(self) -> str:
+        """Value, unit and limits.
+
+        >>> Measurement(name="jitter", value=6.25, unit="ms", low=None, high=5.0).text
+        '6.25 ms (at most 5)'
+        """
+        limits = []
+        if self.low is not None:
+            limits.append(f"at least {self.low:g}")
+        if self.high is not None:
+            limits.append(f"at most {self.high:g}")
+        shown = f"{self.value:.6g} {self.unit}".rstrip()
+        return f"{shown} ({', '.join(limits)})" if limits else shown
+
+    def as_json(self) -> dict[str, Any]:
+        return {**asdict(self), "within": self.within}
+
+
+class Measure:
+    """Takes measurements of one test; one outside its limits fails the test at once.
+
+    They go into ``properties``, the user properties of the test, and so into JUnit files.
+    """
+
+    def __init__(self, properties: list[tuple[str, object]]) -> None:
+        self._properties = properties
+        self.taken: list[Measurement] = []
+
+    def __call__(
+        self, name: str, value: float, *, unit: str = "", limit: Limit = (None, None)
+    ) -> None:
+        """Record a number; ``limit`` holds the smallest and the largest allowed value."""
+        low, high = limit
+        measurement = Measurement(name=name, value=float(value), unit=unit, low=low, high=high)
+        self.taken.append(measurement)
+        self._properties.append((f"measurement {name}", measurement.text))
+        if not measurement.within:
+            pytest.fail(f"{name} is {measurement.text}", pytrace=False)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -31,6 +92,10 @@ class Findings:
     bundle: str | None = None
     failures: list[str] = field(default_factory=list)
 
+    @property
+    def measurements(self) -> Sequence[Measurement]:
+        return self.measure.taken if self.measure else ()
+
     def as_json(self) -> Mapping[str, Any]:
         """Return what the report of the test carries, also from a worker."""
         return {
@@ -45,9 +110,7 @@ class Findings:
             "names": list(self.names),
             "reason": self.reason,
             "bundle": self.bundle,
-            "measurements": [
-                dict(one.as_json()) for one in (self.measure.taken if self.measure else ())
-            ],
+            "measurements": [one.as_json() for one in self.measurements],
         }
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter, defaultdict
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -139,13 +140,34 @@ def _rigs(specs: tuple[RadarSpec, ...]) -> list[tuple[str, ...]]:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object | None:  # noqa: ANN401 - xdist is not typed
-    """Keep the tests of real radars on one worker, however the others are spread."""
+    """Keep the tests of real radars on one worker, however the others are spread.
+
+    The mark ``xdist_group`` would need ``--dist loadgroup``, and xdist 3.8 loses groups under
+    pytest 9.2.
+    """
     shared = [spec.name for spec in config.stash[CHOICES].specs if spec.shared]
     if not shared:
         return None
-    from hil_tests.plugin.scheduling import RealRadarScheduling
+    from xdist.scheduler import LoadScopeScheduling  # which need not be installed
 
-    return RealRadarScheduling(config, log, shared)
+    class RealRadarScheduling(LoadScopeScheduling):  # type: ignore[misc]  # xdist is not typed
+        def _split_scope(self, nodeid: str) -> str:
+            return group_of(nodeid, shared)
+
+    return RealRadarScheduling(config, log)
+
+
+def group_of(nodeid: str, radars: Iterable[str]) -> str:
+    """Return the group that must stay on one worker; the test's id if it may go to any.
+
+    >>> group_of("test_raw.py::test_frames[ttyACM0-1431]", ["ttyACM0"])
+    'tests of real radars'
+    >>> group_of("test_raw.py::test_frames[emu-1431]", ["ttyACM0"])
+    'test_raw.py::test_frames[emu-1431]'
+    """
+    found = re.search(r"\[(.*)\]", nodeid, re.DOTALL)
+    parameters = f"-{found[1]}-".replace("+", "-") if found else ""
+    return "tests of real radars" if any(f"-{name}-" in parameters for name in radars) else nodeid
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
@@ -187,7 +209,7 @@ def _keep(item: pytest.Item, findings: Findings, report: pytest.TestReport) -> N
             findings.radars,
             about=about,
             failure="\n\n".join(findings.failures) or "none",
-            measurements=findings.measure.taken if findings.measure else (),
+            measurements=findings.measurements,
         )
     except Exception as error:  # the failure of the test is reported in any case
         report.sections.append(("radar artefacts", f"{folder}: incomplete: {error!r}"))

@@ -6,8 +6,8 @@ import pytest
 
 from hil_tests.plugin.bench import Bench
 from hil_tests.plugin.gate import findings_of, gate
+from hil_tests.plugin.radar_targets import TappedTransport
 from hil_tests.plugin.specs import parse_specs
-from hil_tests.plugin.wire_tap import TappedTransport
 
 
 @pytest.mark.requires("profiles")

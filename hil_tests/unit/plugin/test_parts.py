@@ -10,12 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.plugin import wire_tap
+from hil_tests.plugin import radar_targets
 from hil_tests.plugin.bench import PortBusyError, PortLock
 from hil_tests.plugin.fixtures import carried_rate_hz
-from hil_tests.plugin.measurements import Measure
-from hil_tests.plugin.radar_targets import TcpTransport
-from hil_tests.plugin.wire_tap import WireTap
+from hil_tests.plugin.gate import Measure
+from hil_tests.plugin.radar_targets import TcpTransport, WireTap
 from xethru_protocol.wire.errors import PortUnavailable
 
 
@@ -55,7 +54,7 @@ def test_a_lock_follows_no_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_a_tap_forgets_the_oldest(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(wire_tap, "MOST_BYTES", 10)
+    monkeypatch.setattr(radar_targets, "MOST_BYTES", 10)
     wire = WireTap(clock_ns=lambda: 5)
     for data in (b"abcd", b"efgh", b"ijkl"):
         wire.note("rx", data)
