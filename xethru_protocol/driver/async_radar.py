@@ -15,10 +15,11 @@ commands wait for each other, and what one task reads reaches the others.
 """
 
 import asyncio
+import itertools
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from types import TracebackType
-from typing import Concatenate, Self
+from typing import Self
 
 from xethru_protocol.driver import raw_mode, reconnect
 from xethru_protocol.driver.conversation import Observer
@@ -26,15 +27,13 @@ from xethru_protocol.driver.files import AsyncFiles
 from xethru_protocol.driver.frames import DEFAULT_FRAMES, Frame, FrameGeometry
 from xethru_protocol.driver.link import (
     TIMEOUT_S,
-    CloseLine,
     Link,
     ModuleInfo,
-    OpenLine,
     P,
+    Procedure,
     RawConfig,
     Read,
     ReplyT,
-    SetLineRate,
     Sleep,
     Step,
     Steps,
@@ -43,22 +42,19 @@ from xethru_protocol.driver.link import (
 )
 from xethru_protocol.driver.profiles import AsyncPresence
 from xethru_protocol.driver.radar import RadarState, known_ports
-from xethru_protocol.transport import (
-    AsyncSerialTransport,
-    AsyncTransport,
-    capacity_bytes_per_s,
-    set_rate,
-)
+from xethru_protocol.transport import AsyncSerialTransport, AsyncTransport
 from xethru_protocol.wire.codes import PongCode, X4Setting
 from xethru_protocol.wire.errors import Disconnected, XeThruError
 from xethru_protocol.wire.messages import Command, X4Value
 
-_BAUD = 115200
 _LONGEST_WAIT_S = 86400.0
 
 
 class AsyncX4M300(RadarState):
     """One module at the other end of a transport of asyncio; all members as of `X4M300`."""
+
+    _port_type = AsyncSerialTransport
+    _transport: AsyncTransport
 
     def __init__(
         self,
@@ -80,43 +76,12 @@ class AsyncX4M300(RadarState):
             reconnect_s=reconnect_s,
             candidates=candidates,
         )
-        self._transport = transport
         self._open_port = open_port
         self._sleep = sleep
         self._one_at_a_time = asyncio.Lock()
         self._reading: asyncio.Future[None] | None = None
         self.presence = AsyncPresence(self._call, self._listen)
         self.files = AsyncFiles(self._call, self._call_once)
-
-    @classmethod
-    def open(
-        cls,
-        path: str,
-        *,
-        baudrate: int = _BAUD,
-        clock: Callable[[], int] = time.monotonic_ns,
-        observer: Observer | None = None,
-        queue_frames: int = DEFAULT_FRAMES,
-        reconnect_s: float = 0.0,
-    ) -> Self:
-        """Driver on a serial port; `PortUnavailable` if it cannot be opened.
-
-        ``baudrate`` is the rate at which a UART module talks now; USB and ptys have none.
-        """
-        transport = AsyncSerialTransport(path, baudrate)
-        try:
-            radar = cls(
-                transport,
-                clock=clock,
-                observer=observer,
-                queue_frames=queue_frames,
-                reconnect_s=reconnect_s,
-            )
-        except BaseException:
-            transport.close()
-            raise
-        radar._link.baudrate = baudrate
-        return radar
 
     async def __aenter__(self) -> Self:
         return self
@@ -196,40 +161,22 @@ class AsyncX4M300(RadarState):
         self, count: int | None = None, timeout_s: float = TIMEOUT_S
     ) -> AsyncIterator[Frame]:
         """Iterate over frames; ``count`` of them, or without end; see `X4M300.frames`."""
-        while count is None or count > 0:
+        for _ in itertools.count() if count is None else range(count):
             yield await self.read_frame(timeout_s)
-            if count is not None:
-                count -= 1
 
     # --- carrying out steps ---------------------------------------------------------------------
 
-    async def _call(
-        self,
-        procedure: Callable[Concatenate[Link, P], Steps[T]],
-        /,
-        *args: P.args,
-        **kwargs: P.kwargs,
-    ) -> T:
+    async def _call(self, procedure: Procedure[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """Carry out a procedure that sends commands; again after a reconnect, if that is on."""
         link = self._link
         return await self._run(reconnect.resilient(link, lambda: procedure(link, *args, **kwargs)))
 
     async def _call_once(
-        self,
-        procedure: Callable[Concatenate[Link, P], Steps[T]],
-        /,
-        *args: P.args,
-        **kwargs: P.kwargs,
+        self, procedure: Procedure[P, T], /, *args: P.args, **kwargs: P.kwargs
     ) -> T:
         return await self._run(procedure(self._link, *args, **kwargs))
 
-    async def _listen(
-        self,
-        procedure: Callable[Concatenate[Link, P], Steps[T]],
-        /,
-        *args: P.args,
-        **kwargs: P.kwargs,
-    ) -> T:
+    async def _listen(self, procedure: Procedure[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """Carry out a procedure that only receives, beside one that sends; also repeated."""
         link = self._link
         if link.reconnect_s > 0 and not link.identified:
@@ -271,14 +218,8 @@ class AsyncX4M300(RadarState):
                 await self._transport.write(data)
             case Sleep(seconds):
                 await self._sleep(seconds)
-            case CloseLine():
-                self._transport.close()
-            case OpenLine(path, baudrate):
-                self._transport = self._open_port(path, baudrate)
-                self._link.bytes_per_s = capacity_bytes_per_s(self._transport)
-            case SetLineRate(baudrate):
-                set_rate(self._transport, baudrate)
-                self._link.bytes_per_s = capacity_bytes_per_s(self._transport)
+            case _:
+                self._change_line(step)
         return False
 
     async def _pump(self, timeout_s: float) -> bool:

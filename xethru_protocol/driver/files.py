@@ -4,7 +4,7 @@ A transfer is not repeated when the line breaks: it raises `Disconnected`.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from xethru_protocol.driver.link import SLOW_TIMEOUT_S, AsyncCall, Call, Link, Steps
@@ -53,10 +53,7 @@ def find(link: Link, file_type: int) -> Steps[tuple[FileName, ...]]:
 
 def length(link: Link, file_type: int, identifier: int) -> Steps[int]:
     command = m.GetFileLength(file_type=file_type, identifier=identifier)
-    values = (yield from link.request(command)).values
-    if len(values) != 1 or values[0] < 0:
-        raise RemoteProtocolError(f"{link.path} reports a file's length as {values}")
-    return values[0]
+    return (yield from _length(link, command, "a file's length"))
 
 
 def read(
@@ -64,12 +61,7 @@ def read(
 ) -> Steps[bytes]:
     total = yield from length(link, file_type, identifier)
     yield from _open(link, file_type, identifier)
-
-    def chunk(offset: int, count: int) -> m.GetFileData:
-        return m.GetFileData(
-            file_type=file_type, identifier=identifier, offset=offset, length=count
-        )
-
+    chunk = m.GetFileData(file_type=file_type, identifier=identifier, offset=0, length=0)
     body = _read_chunks(link, chunk, total, on_progress)
     return (yield from _then_close(link, file_type, identifier, body))
 
@@ -100,26 +92,20 @@ def delete(link: Link, file_type: int, identifier: int) -> Steps[None]:
     yield from link.request(command, SLOW_TIMEOUT_S)
 
 
-def format_all(link: Link, key: int) -> Steps[None]:
-    yield from link.request(m.FormatFilesystem(key=key), SLOW_TIMEOUT_S)
-
-
 def crash_dump(link: Link, on_progress: OnProgress | None = None) -> Steps[bytes]:
-    values = (yield from link.request(m.GetCrashDumpLength())).values
-    if len(values) != 1 or values[0] < 0:
-        raise RemoteProtocolError(f"{link.path} reports its crash dump's length as {values}")
-
-    def chunk(offset: int, count: int) -> m.GetCrashDump:
-        return m.GetCrashDump(offset=offset, length=count)
-
-    return (yield from _read_chunks(link, chunk, values[0], on_progress))
-
-
-def clear_crash_dump(link: Link) -> Steps[None]:
-    yield from link.request(m.ClearCrashDump(), SLOW_TIMEOUT_S)
+    total = yield from _length(link, m.GetCrashDumpLength(), "its crash dump's length")
+    chunk = m.GetCrashDump(offset=0, length=0)
+    return (yield from _read_chunks(link, chunk, total, on_progress))
 
 
 # --- inside -------------------------------------------------------------------------------------
+
+
+def _length(link: Link, command: m.Command[m.ReplyInt], what: str) -> Steps[int]:
+    values = (yield from link.request(command)).values
+    if len(values) != 1 or values[0] < 0:
+        raise RemoteProtocolError(f"{link.path} reports {what} as {values}")
+    return values[0]
 
 
 def _open(link: Link, file_type: int, identifier: int) -> Steps[None]:
@@ -135,36 +121,36 @@ def _open(link: Link, file_type: int, identifier: int) -> Steps[None]:
 
 
 def _read_chunks(
-    link: Link,
-    chunk: Callable[[int, int], m.Command[m.ReplyByte]],
-    total: int,
-    on_progress: OnProgress | None,
+    link: Link, chunk: m.GetFileData | m.GetCrashDump, total: int, on_progress: OnProgress | None
 ) -> Steps[bytes]:
     data = bytearray()
-    _report_progress(on_progress, 0, total)
-    while len(data) < total:
+    while True:
+        if on_progress is not None:
+            on_progress(len(data), total)
         wanted = min(CHUNK_BYTES, total - len(data))
-        got = (yield from link.request(chunk(len(data), wanted))).values
+        if not wanted:
+            return bytes(data)
+        got = (yield from link.request(replace(chunk, offset=len(data), length=wanted))).values
         if len(got) != wanted:
             raise RemoteProtocolError(
                 f"{link.path} sent {len(got)} bytes from {len(data)} on, not {wanted}"
             )
         data += got
-        _report_progress(on_progress, len(data), total)
-    return bytes(data)
 
 
 def _write_chunks(
     link: Link, file_type: int, identifier: int, data: bytes, on_progress: OnProgress | None
 ) -> Steps[None]:
-    _report_progress(on_progress, 0, len(data))
     for offset in range(0, len(data), CHUNK_BYTES):
+        if on_progress is not None:
+            on_progress(offset, len(data))
         piece = data[offset : offset + CHUNK_BYTES]
         command = m.SetFileData(
             file_type=file_type, identifier=identifier, offset=offset, data=piece
         )
         yield from link.request(command, SLOW_TIMEOUT_S)
-        _report_progress(on_progress, offset + len(piece), len(data))
+    if on_progress is not None:
+        on_progress(len(data), len(data))
 
 
 def _then_close(link: Link, file_type: int, identifier: int, body: Steps[T]) -> Steps[T]:
@@ -187,11 +173,6 @@ def _clean_up(link: Link, procedure: Steps[object]) -> Steps[None]:
         yield from procedure
     except XeThruError as error:
         link.warn(f"could not clean up: {error}")
-
-
-def _report_progress(on_progress: OnProgress | None, done: int, total: int) -> None:
-    if on_progress is not None:
-        on_progress(done, total)
 
 
 class Files:
@@ -258,7 +239,7 @@ class Files:
 
         It is `xethru_protocol.wire.codes.FORMAT_KEY`; the module refuses any other.
         """
-        self._call_once(format_all, key)
+        self._call_once(Link.request, m.FormatFilesystem(key=key), SLOW_TIMEOUT_S)
 
     def crash_dump(self, on_progress: OnProgress | None = None) -> bytes:
         """Read what the firmware left when it crashed last; empty if it did not."""
@@ -266,7 +247,7 @@ class Files:
 
     def clear_crash_dump(self) -> None:
         """Delete the crash dump, if there is one."""
-        self._call_once(clear_crash_dump)
+        self._call_once(Link.request, m.ClearCrashDump(), SLOW_TIMEOUT_S)
 
 
 class AsyncFiles:
@@ -299,10 +280,10 @@ class AsyncFiles:
         await self._call_once(delete, file_type, identifier)
 
     async def format_all(self, key: int) -> None:
-        await self._call_once(format_all, key)
+        await self._call_once(Link.request, m.FormatFilesystem(key=key), SLOW_TIMEOUT_S)
 
     async def crash_dump(self, on_progress: OnProgress | None = None) -> bytes:
         return await self._call_once(crash_dump, on_progress)
 
     async def clear_crash_dump(self) -> None:
-        await self._call_once(clear_crash_dump)
+        await self._call_once(Link.request, m.ClearCrashDump(), SLOW_TIMEOUT_S)

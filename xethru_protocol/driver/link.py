@@ -66,6 +66,7 @@ class SetLineRate:
 
 
 Step: TypeAlias = Read | Write | Sleep | CloseLine | OpenLine | SetLineRate
+P = ParamSpec("P")
 T = TypeVar("T")
 Steps: TypeAlias = Generator[Step, bool, T]
 ReplyT = TypeVar("ReplyT", bound=Response)
@@ -83,33 +84,6 @@ _BAUD_SETTLE_S = (0.1, 0.4)  # before and after the change, as the vendor's host
 POWER_UP_BAUD = 115200  # a UART module's rate after every restart (Protocol reference 10)
 _WARNINGS = 1000  # kept; a radar may run for months
 _MESSAGES = 4096  # of a profile that wait unread: pulse-Doppler sends one per range bin
-
-
-P = ParamSpec("P")
-
-
-class Call(Protocol):
-    """Carries a procedure of the link out and returns its result."""
-
-    def __call__(
-        self,
-        procedure: Callable[Concatenate["Link", P], Steps[T]],
-        /,
-        *args: P.args,
-        **kwargs: P.kwargs,
-    ) -> T: ...
-
-
-class AsyncCall(Protocol):
-    """Carries a procedure of the link out; its result is awaited."""
-
-    def __call__(
-        self,
-        procedure: Callable[Concatenate["Link", P], Steps[T]],
-        /,
-        *args: P.args,
-        **kwargs: P.kwargs,
-    ) -> Awaitable[T]: ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -236,18 +210,11 @@ class Link:
 
     Parameters
     ----------
-    path
-        Of the line, as the user named it.
-    candidates
-        Finds the ports at which a module that vanished may have come back.
-    clock, observer, queue_frames, reconnect_s
+    path, clock, observer, queue_frames, reconnect_s, candidates
         As of `X4M300`.
 
     Attributes
     ----------
-    warnings
-        What probably fails although the module accepts it, and what failed without an error; the
-        last 1000.
     messages
         Messages of the running profile that were not taken yet; None: nobody reads them.
     home
@@ -260,12 +227,8 @@ class Link:
         Rate of a UART.
     bytes_per_s
         What the line carries at most; infinite if it has no known limit.
-    reconnects
-        Times a module that vanished was found again.
     raw_mode
         Whether this driver put the module into raw radar mode.
-    closed
-        Whether the user closed the driver.
     """
 
     def __init__(
@@ -480,3 +443,20 @@ class Link:
                     timeout_s,
                     "did the module stop, or its recording end?",
                 )
+
+
+Procedure: TypeAlias = Callable[Concatenate[Link, P], Steps[T]]
+
+
+class Call(Protocol):
+    """Carries a procedure of the link out and returns its result."""
+
+    def __call__(self, procedure: Procedure[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T: ...
+
+
+class AsyncCall(Protocol):
+    """Carries a procedure of the link out; its result is awaited."""
+
+    def __call__(
+        self, procedure: Procedure[P, T], /, *args: P.args, **kwargs: P.kwargs
+    ) -> Awaitable[T]: ...

@@ -12,6 +12,7 @@
             ...
 """
 
+import itertools
 from collections import deque
 from collections.abc import AsyncIterator, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -90,8 +91,7 @@ def _load(link: Link, profile_id: int) -> Steps[None]:
 
 
 def profile_id(link: Link) -> Steps[int]:
-    values = (yield from link.request(m.GetProfileId())).values
-    return _first(link, values, "profile") & 0xFFFFFFFF
+    return (yield from _value(link, m.GetProfileId(), "profile")) & 0xFFFFFFFF
 
 
 # --- settings: after `load`, before `run` -------------------------------------------------------
@@ -134,29 +134,14 @@ def set_sensitivity(link: Link, sensitivity: int) -> Steps[None]:
     yield from _set(link, m.SetSensitivity(sensitivity=sensitivity))
 
 
-def sensitivity(link: Link) -> Steps[int]:
-    yield from _need_profile(link)
-    return _first(link, (yield from link.request(m.GetSensitivity())).values, "sensitivity")
-
-
 def set_band(link: Link, tx_center_frequency: int) -> Steps[None]:
     if tx_center_frequency not in {3, 4}:
         raise LocalProtocolError(f"band must be 3 (low) or 4 (high), not {tx_center_frequency}")
     yield from _set(link, m.SetTxCenterFrequency(tx_center_frequency=tx_center_frequency))
 
 
-def band(link: Link) -> Steps[int]:
-    yield from _need_profile(link)
-    return _first(link, (yield from link.request(m.GetTxCenterFrequency())).values, "band")
-
-
-def set_led(link: Link, mode: LedMode, intensity: int = 0) -> Steps[None]:
-    yield from _set(link, m.AppSetLedControl(mode=mode, intensity=intensity))
-
-
 def led(link: Link) -> Steps[LedMode]:
-    yield from _need_profile(link)
-    value = _first(link, (yield from link.request(m.AppGetLedControl())).values, "LED mode")
+    value = yield from _setting(link, m.AppGetLedControl(), "LED mode")
     try:
         return LedMode(value)
     except ValueError:
@@ -165,41 +150,15 @@ def led(link: Link) -> Steps[LedMode]:
         ) from None
 
 
-def set_noise_map(link: Link, control: NoiseMapControl) -> Steps[None]:
-    yield from _set(link, m.NoiseMapSetControl(control=control))
-
-
-def noise_map(link: Link) -> Steps[NoiseMapControl]:
-    yield from _need_profile(link)
-    values = (yield from link.request(m.NoiseMapGetControl())).values
-    return NoiseMapControl(_first(link, values, "noise map control"))
-
-
-def store_noise_map(link: Link) -> Steps[None]:
-    yield from link.request(m.StoreNoiseMap(), SLOW_TIMEOUT_S)
-
-
-def load_noise_map(link: Link) -> Steps[None]:
-    yield from link.request(m.LoadNoiseMap(), SLOW_TIMEOUT_S)
-
-
-def delete_noise_map(link: Link) -> Steps[None]:
-    yield from link.request(m.DeleteNoiseMap(), SLOW_TIMEOUT_S)
-
-
 def factory_preset(link: Link) -> Steps[None]:
     yield from link.request(m.FactoryPreset(), SLOW_TIMEOUT_S)
     if isinstance(link.plan, ProfilePlan):
         link.plan = replace(link.plan, settings={})
 
 
-def set_output(link: Link, feature: OutputFeature, control: int = 1) -> Steps[None]:
-    yield from _set(link, m.OutputSetControl(feature=feature, control=control))
-
-
 def output(link: Link, feature: OutputFeature) -> Steps[int]:
-    values = (yield from link.request(m.OutputGetControl(feature=feature))).values
-    return _first(link, values, f"the control of output {feature:#x}") & 0xFFFFFFFF
+    command = m.OutputGetControl(feature=feature)
+    return (yield from _value(link, command, f"the control of output {feature:#x}")) & 0xFFFFFFFF
 
 
 # --- running ------------------------------------------------------------------------------------
@@ -217,10 +176,6 @@ def run(link: Link) -> Steps[None]:
         yield from await_restart(link, readies)
         plan = link.plan = replace(plan, mode=SensorMode.XTID_SM_RUN)
         yield from plan.restore(link)
-
-
-def idle(link: Link) -> Steps[None]:
-    yield from _set_mode(link, SensorMode.XTID_SM_IDLE)
 
 
 def stop(link: Link) -> Steps[None]:
@@ -313,7 +268,13 @@ def _need_profile(link: Link) -> Steps[None]:
     link.plan = ProfilePlan(profile_id=found, loaded=False)
 
 
-def _first(link: Link, values: bytes | tuple[int, ...], what: str) -> int:
+def _setting(link: Link, command: m.Command[m.ReplyByte | m.ReplyInt], what: str) -> Steps[int]:
+    yield from _need_profile(link)
+    return (yield from _value(link, command, what))
+
+
+def _value(link: Link, command: m.Command[m.ReplyByte | m.ReplyInt], what: str) -> Steps[int]:
+    values = (yield from link.request(command)).values
     if not values:
         raise RemoteProtocolError(f"{link.path} reports no value as its {what}")
     return values[0]
@@ -364,7 +325,7 @@ class Presence:
         self._call(set_sensitivity, sensitivity)
 
     def sensitivity(self) -> int:
-        return self._call(sensitivity)
+        return self._call(_setting, m.GetSensitivity(), "sensitivity")
 
     def set_band(self, tx_center_frequency: int) -> None:
         """Choose the band: 3 is 7.29 GHz (low), 4 is 8.748 GHz (high)."""
@@ -372,32 +333,33 @@ class Presence:
 
     def band(self) -> int:
         """Ask for the band, 3 or 4."""
-        return self._call(band)
+        return self._call(_setting, m.GetTxCenterFrequency(), "band")
 
     def set_led(self, mode: LedMode, intensity: int = 0) -> None:
         """Choose what the LED shows; released firmware ignores ``intensity`` 0 ... 100."""
-        self._call(set_led, mode, intensity)
+        self._call(_set, m.AppSetLedControl(mode=mode, intensity=intensity))
 
     def led(self) -> LedMode:
         return self._call(led)
 
     def set_noise_map(self, control: NoiseMapControl) -> None:
         """Choose where the noise map comes from when the profile starts."""
-        self._call(set_noise_map, control)
+        self._call(_set, m.NoiseMapSetControl(control=control))
 
     def noise_map(self) -> NoiseMapControl:
-        return self._call(noise_map)
+        value = self._call(_setting, m.NoiseMapGetControl(), "noise map control")
+        return NoiseMapControl(value)
 
     def store_noise_map(self) -> None:
         """Store the noise map for later starts."""
-        self._call(store_noise_map)
+        self._call(Link.request, m.StoreNoiseMap(), SLOW_TIMEOUT_S)
 
     def load_noise_map(self) -> None:
         """Load the stored noise map; without effect in released firmware."""
-        self._call(load_noise_map)
+        self._call(Link.request, m.LoadNoiseMap(), SLOW_TIMEOUT_S)
 
     def delete_noise_map(self) -> None:
-        self._call(delete_noise_map)
+        self._call(Link.request, m.DeleteNoiseMap(), SLOW_TIMEOUT_S)
 
     def factory_preset(self) -> None:
         """Set the profile back to its factory settings."""
@@ -414,7 +376,7 @@ class Presence:
         control
             0 or 1; for pulse-Doppler and noise maps `MatrixControl` bits.
         """
-        self._call(set_output, feature, control)
+        self._call(_set, m.OutputSetControl(feature=feature, control=control))
 
     def output(self, feature: OutputFeature) -> int:
         """Ask whether a message is on: its control bits."""
@@ -431,7 +393,7 @@ class Presence:
 
     def idle(self) -> None:
         """Pause the profile; `run` resumes it."""
-        self._call(idle)
+        self._call(_set_mode, SensorMode.XTID_SM_IDLE)
 
     def stop(self) -> None:
         """Stop and unload the profile."""
@@ -458,10 +420,8 @@ class Presence:
         self, count: int | None = None, timeout_s: float = MESSAGE_TIMEOUT_S
     ) -> Iterator[m.Response]:
         """Iterate over what the profile sends, except frames; raises `ResponseTimeout`."""
-        while count is None or count > 0:
+        for _ in itertools.count() if count is None else range(count):
             yield self._call(wait_for_message, timeout_s)
-            if count is not None:
-                count -= 1
 
 
 class AsyncPresence:
@@ -492,40 +452,41 @@ class AsyncPresence:
         await self._call(set_sensitivity, sensitivity)
 
     async def sensitivity(self) -> int:
-        return await self._call(sensitivity)
+        return await self._call(_setting, m.GetSensitivity(), "sensitivity")
 
     async def set_band(self, tx_center_frequency: int) -> None:
         await self._call(set_band, tx_center_frequency)
 
     async def band(self) -> int:
-        return await self._call(band)
+        return await self._call(_setting, m.GetTxCenterFrequency(), "band")
 
     async def set_led(self, mode: LedMode, intensity: int = 0) -> None:
-        await self._call(set_led, mode, intensity)
+        await self._call(_set, m.AppSetLedControl(mode=mode, intensity=intensity))
 
     async def led(self) -> LedMode:
         return await self._call(led)
 
     async def set_noise_map(self, control: NoiseMapControl) -> None:
-        await self._call(set_noise_map, control)
+        await self._call(_set, m.NoiseMapSetControl(control=control))
 
     async def noise_map(self) -> NoiseMapControl:
-        return await self._call(noise_map)
+        value = await self._call(_setting, m.NoiseMapGetControl(), "noise map control")
+        return NoiseMapControl(value)
 
     async def store_noise_map(self) -> None:
-        await self._call(store_noise_map)
+        await self._call(Link.request, m.StoreNoiseMap(), SLOW_TIMEOUT_S)
 
     async def load_noise_map(self) -> None:
-        await self._call(load_noise_map)
+        await self._call(Link.request, m.LoadNoiseMap(), SLOW_TIMEOUT_S)
 
     async def delete_noise_map(self) -> None:
-        await self._call(delete_noise_map)
+        await self._call(Link.request, m.DeleteNoiseMap(), SLOW_TIMEOUT_S)
 
     async def factory_preset(self) -> None:
         await self._call(factory_preset)
 
     async def set_output(self, feature: OutputFeature, control: int = 1) -> None:
-        await self._call(set_output, feature, control)
+        await self._call(_set, m.OutputSetControl(feature=feature, control=control))
 
     async def output(self, feature: OutputFeature) -> int:
         return await self._call(output, feature)
@@ -536,7 +497,7 @@ class AsyncPresence:
         await self._call(run)
 
     async def idle(self) -> None:
-        await self._call(idle)
+        await self._call(_set_mode, SensorMode.XTID_SM_IDLE)
 
     async def stop(self) -> None:
         await self._call(stop)
@@ -548,7 +509,5 @@ class AsyncPresence:
     async def messages(
         self, count: int | None = None, timeout_s: float = MESSAGE_TIMEOUT_S
     ) -> AsyncIterator[m.Response]:
-        while count is None or count > 0:
+        for _ in itertools.count() if count is None else range(count):
             yield await self._listen(wait_for_message, timeout_s)
-            if count is not None:
-                count -= 1

@@ -3,22 +3,25 @@
 `AsyncX4M300` has the same methods as coroutines.
 """
 
+import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
-from typing import Concatenate, Self
+from typing import ClassVar, Self
 
 from xethru_protocol.driver import raw_mode, reconnect
 from xethru_protocol.driver.conversation import Listener, Observer, RawListener
 from xethru_protocol.driver.files import Files
 from xethru_protocol.driver.frames import DEFAULT_FRAMES, Frame, FrameGeometry
 from xethru_protocol.driver.link import (
+    POWER_UP_BAUD,
     TIMEOUT_S,
     CloseLine,
     Link,
     ModuleInfo,
     OpenLine,
     P,
+    Procedure,
     RawConfig,
     Read,
     ReplyT,
@@ -31,6 +34,7 @@ from xethru_protocol.driver.link import (
 )
 from xethru_protocol.driver.profiles import Presence
 from xethru_protocol.transport import (
+    AsyncSerialTransport,
     AsyncTransport,
     SerialTransport,
     Transport,
@@ -44,6 +48,11 @@ from xethru_protocol.wire.framing import LinkStatistics
 from xethru_protocol.wire.messages import Command, X4Value
 
 
+def known_ports() -> Sequence[str]:
+    """Ports of this machine at which a module that vanished may come back."""
+    return [port.path for port in find_ports()]
+
+
 class RadarState:
     """Counters and settings of a driver, blocking or not.
 
@@ -54,6 +63,9 @@ class RadarState:
         time [ns]; may be None.
     """
 
+    _port_type: ClassVar[type[SerialTransport] | type[AsyncSerialTransport]]
+    _open_port: Callable[[str, int], Transport | AsyncTransport]
+
     def __init__(
         self,
         transport: Transport | AsyncTransport,
@@ -62,8 +74,9 @@ class RadarState:
         observer: Observer | None,
         queue_frames: int,
         reconnect_s: float,
-        candidates: Callable[[], Sequence[str]],
+        candidates: Callable[[], Sequence[str]] = known_ports,
     ) -> None:
+        self._transport = transport
         self.raw_listener: RawListener | None = None
         self._link = Link(
             transport.name,
@@ -74,6 +87,36 @@ class RadarState:
             candidates=candidates,
         )
         self._link.bytes_per_s = capacity_bytes_per_s(transport)
+
+    @classmethod
+    def open(
+        cls,
+        path: str,
+        *,
+        baudrate: int = POWER_UP_BAUD,
+        clock: Callable[[], int] = time.monotonic_ns,
+        observer: Observer | None = None,
+        queue_frames: int = DEFAULT_FRAMES,
+        reconnect_s: float = 0.0,
+    ) -> Self:
+        """Driver on a serial port; `PortUnavailable` if it cannot be opened.
+
+        ``baudrate`` is the rate at which a UART module talks now; USB and ptys have none.
+        """
+        transport = cls._port_type(path, baudrate)
+        try:
+            radar = cls(
+                transport,
+                clock=clock,
+                observer=observer,
+                queue_frames=queue_frames,
+                reconnect_s=reconnect_s,
+            )
+        except BaseException:
+            transport.close()
+            raise
+        radar._link.baudrate = baudrate
+        return radar
 
     @property
     def port(self) -> str:
@@ -151,13 +194,16 @@ class RadarState:
         """Times the module vanished and was found again."""
         return self._link.reconnects
 
-
-_BAUD = 115200
-
-
-def known_ports() -> Sequence[str]:
-    """Ports of this machine at which a module that vanished may come back."""
-    return [port.path for port in find_ports()]
+    def _change_line(self, step: Step) -> None:
+        match step:
+            case CloseLine():
+                self._transport.close()
+            case OpenLine(path, baudrate):
+                self._transport = self._open_port(path, baudrate)
+                self._link.bytes_per_s = capacity_bytes_per_s(self._transport)
+            case SetLineRate(baudrate):
+                set_rate(self._transport, baudrate)
+                self._link.bytes_per_s = capacity_bytes_per_s(self._transport)
 
 
 class X4M300(RadarState):
@@ -191,6 +237,9 @@ class X4M300(RadarState):
         Files in the module's flash, and its crash dump.
     """
 
+    _port_type = SerialTransport
+    _transport: Transport
+
     def __init__(
         self,
         transport: Transport,
@@ -211,41 +260,10 @@ class X4M300(RadarState):
             reconnect_s=reconnect_s,
             candidates=candidates,
         )
-        self._transport = transport
         self._open_port = open_port
         self._sleep = sleep
         self.presence = Presence(self._call)
         self.files = Files(self._call, self._call_once)
-
-    @classmethod
-    def open(
-        cls,
-        path: str,
-        *,
-        baudrate: int = _BAUD,
-        clock: Callable[[], int] = time.monotonic_ns,
-        observer: Observer | None = None,
-        queue_frames: int = DEFAULT_FRAMES,
-        reconnect_s: float = 0.0,
-    ) -> Self:
-        """Driver on a serial port; `PortUnavailable` if it cannot be opened.
-
-        ``baudrate`` is the rate at which a UART module talks now; USB and ptys have none.
-        """
-        transport = SerialTransport(path, baudrate)
-        try:
-            radar = cls(
-                transport,
-                clock=clock,
-                observer=observer,
-                queue_frames=queue_frames,
-                reconnect_s=reconnect_s,
-            )
-        except BaseException:
-            transport.close()
-            raise
-        radar._link.baudrate = baudrate
-        return radar
 
     def __enter__(self) -> Self:
         return self
@@ -437,33 +455,19 @@ class X4M300(RadarState):
 
         The line is read only when no frame waits, so a slow reader holds a lossless line back.
         """
-        while count is None or count > 0:
+        for _ in itertools.count() if count is None else range(count):
             yield self.read_frame(timeout_s)
-            if count is not None:
-                count -= 1
 
     # --- carrying out steps ---------------------------------------------------------------------
 
-    def _call(
-        self,
-        procedure: Callable[Concatenate[Link, P], Steps[T]],
-        /,
-        *args: P.args,
-        **kwargs: P.kwargs,
-    ) -> T:
+    def _call(self, procedure: Procedure[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """Carry a procedure out; again after a reconnect, if that is on."""
         link = self._link
         if link.reconnect_s > 0:
             return self._run(reconnect.resilient(link, lambda: procedure(link, *args, **kwargs)))
         return self._run(procedure(link, *args, **kwargs))
 
-    def _call_once(
-        self,
-        procedure: Callable[Concatenate[Link, P], Steps[T]],
-        /,
-        *args: P.args,
-        **kwargs: P.kwargs,
-    ) -> T:
+    def _call_once(self, procedure: Procedure[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """Carry a procedure out; a broken line raises `Disconnected`."""
         return self._run(procedure(self._link, *args, **kwargs))
 
@@ -491,14 +495,8 @@ class X4M300(RadarState):
                 self._transport.write(data)
             case Sleep(seconds):
                 self._sleep(seconds)
-            case CloseLine():
-                self._transport.close()
-            case OpenLine(path, baudrate):
-                self._transport = self._open_port(path, baudrate)
-                self._link.bytes_per_s = capacity_bytes_per_s(self._transport)
-            case SetLineRate(baudrate):
-                set_rate(self._transport, baudrate)
-                self._link.bytes_per_s = capacity_bytes_per_s(self._transport)
+            case _:
+                self._change_line(step)
         return False
 
     def _pump(self, timeout_s: float) -> bool:

@@ -141,18 +141,13 @@ def _restore(link: Link) -> Steps[None]:
         link.plan = plan  # also if the module vanished meanwhile
 
 
-def _find_again(
-    link: Link,
-    deadline_ns: int,
-    timeout_s: float,
-    *,
-    restore: bool,
-) -> Steps[None]:
+def _find_again(link: Link, deadline_ns: int, timeout_s: float, *, restore: bool) -> Steps[None]:
     lost = link.path
     foreign: dict[str, int] = {}
     why = "no port of it"
     while True:
-        for path in _where_to_look(link):
+        elsewhere = () if link.serial_number is None else link.candidates()
+        for path in dict.fromkeys((link.path, link.home, *elsewhere)):
             asked_ns = foreign.get(path)
             if asked_ns is not None and link.clock() - asked_ns < _FOREIGN_NS:
                 continue
@@ -161,7 +156,10 @@ def _find_again(
                 if (yield from _open_ours(link, path)):
                     if restore:
                         yield from _restore(link)
-                    _note_return(link, lost, path)
+                    link.path = path
+                    link.reconnects += 1
+                    moved = "" if path == lost else f", formerly at {lost}"
+                    link.conversation.report("warning", f"the module is back at {path}{moved}")
                     return
                 foreign[path] = link.clock()
                 why = f"at {path} is another module"
@@ -181,12 +179,6 @@ def _find_again(
                 f"the module of {lost} did not come back within {timeout_s:g} s: {why}"
             )
         yield Sleep(min(_LOOK_AGAIN_S, left_s))
-
-
-def _where_to_look(link: Link) -> tuple[str, ...]:
-    first = (link.path, link.home)
-    elsewhere = () if link.serial_number is None else link.candidates()
-    return tuple(dict.fromkeys((*first, *elsewhere)))
 
 
 def _open_ours(link: Link, path: str) -> Steps[bool]:
@@ -228,13 +220,6 @@ def _is_ours(link: Link, path: str) -> Steps[bool]:
             return True
         return False
     return serial == wanted
-
-
-def _note_return(link: Link, lost: str, path: str) -> None:
-    link.path = path
-    link.reconnects += 1
-    moved = "" if path == lost else f", formerly at {lost}"
-    link.conversation.report("warning", f"the module is back at {path}{moved}")
 
 
 def _answers(link: Link) -> Steps[bool]:

@@ -9,7 +9,7 @@ profile sub-command, ``XTS_SPCX_*`` X4 driver sub-command, ``XTS_SDC_*`` system 
 PONG. Members without prefix have the reference's own words where it gives no vendor's name.
 """
 
-from enum import Enum, IntEnum, IntFlag
+from enum import IntEnum, IntFlag
 
 
 class CommandCode(IntEnum):
@@ -643,52 +643,32 @@ class IoPinError(IntEnum):
     MODE_NOT_SUPPORTED = 4
 
 
-class ErrorSpace(Enum):
-    """Which meanings the codes of a command's ERROR have; a command's row names it."""
-
-    PROTOCOL = "protocol"
-    X4_DRIVER = "X4 driver"
-    FILES = "files"
-    IO_PINS = "IO pins"
-
-
-_OWN: dict[ErrorSpace, tuple[str, type[IntEnum]]] = {
-    ErrorSpace.X4_DRIVER: ("X4 ", X4Error),
-    ErrorSpace.FILES: ("FILE ", FileError),
-    ErrorSpace.IO_PINS: ("IOPIN ", IoPinError),
+_ERROR_PREFIXES: dict[type[IntEnum], str] = {
+    X4Error: "X4 ",
+    FileError: "FILE ",
+    IoPinError: "IOPIN ",
 }
 
 
-def error_name(code: int, space: ErrorSpace = ErrorSpace.PROTOCOL) -> str:
+def error_name(code: int, errors: type[IntEnum] = ErrorCode) -> str:
     """Name of an ERROR code; empty if unknown. Protocol reference 5.1.
 
     Parameters
     ----------
     code
         0 ... 2**32 - 1.
-    space
+    errors
         The failed command's ``Row.errors``. An ERROR does not name the command that failed: without
         that knowledge the protocol's own names win and the rest is read as the X4 driver's.
 
-    >>> error_name(1), error_name(17), error_name(1, ErrorSpace.X4_DRIVER)
+    >>> error_name(1), error_name(17), error_name(1, X4Error)
     ('NOT_RECOGNIZED', 'X4 FRAME_AREA_END_OUT_OF_SCOPE', 'X4 GENERAL_FAILURE')
-    >>> error_name(6, ErrorSpace.FILES), error_name(0x22, ErrorSpace.FILES)
+    >>> error_name(6, FileError), error_name(0x22, FileError)
     ('FILE NOT_OPEN', 'RESTARTING')
     """
-    own = _name(space, code)
-    protocol = next((error.name for error in ErrorCode if error == code), "")
-    return own or protocol.removeprefix("XTS_SPRE_") or _x4_guess(space, code)
-
-
-def _x4_guess(space: ErrorSpace, code: int) -> str:
-    return _name(ErrorSpace.X4_DRIVER, code) if space is ErrorSpace.PROTOCOL else ""
-
-
-def _name(space: ErrorSpace, code: int) -> str:
-    if space not in _OWN:
-        return ""
-    prefix, errors = _OWN[space]
-    name = next((error.name for error in errors if error == code), "")
-    if name and code == X4Error.UNINITIALIZED:
-        name += " (-1)"
-    return name and prefix + name
+    for space in (ErrorCode, X4Error) if errors is ErrorCode else (errors, ErrorCode):
+        name = next((error.name for error in space if error == code), "")
+        if name:
+            signed = " (-1)" if code == X4Error.UNINITIALIZED else ""
+            return _ERROR_PREFIXES.get(space, "") + name.removeprefix("XTS_SPRE_") + signed
+    return ""

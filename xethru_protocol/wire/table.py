@@ -4,11 +4,12 @@ A row is a class under a decorator that names the bytes its payload begins with 
 frozen dataclass; ``Annotated`` fields give their place on the wire. Encoder, decoder, CLI dump and
 test strategy follow from the row. A field under ``ClassVar`` exists on the wire only: a count that
 follows from the lists it counts. A command's row names its reply by its base, ``Command[Reply]``;
-that is what `X4M300.request` returns. The rows are in ``responses`` and ``commands``.
+that is what `X4M300.request` returns. The rows are in ``messages``.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from enum import IntEnum
 from types import UnionType
 from typing import (
     Any,
@@ -22,7 +23,7 @@ from typing import (
 )
 
 from xethru_protocol.wire import fields
-from xethru_protocol.wire.codes import ErrorSpace
+from xethru_protocol.wire.codes import ErrorCode
 
 
 class Message:
@@ -69,7 +70,7 @@ class Row:
     bulk: bool  # a real module sends it in NoEscape framing
     replies: tuple[type[Response], ...]
     content_id: Callable[[Any], int] | None  # content id the reply must carry
-    errors: ErrorSpace  # what the codes of an ERROR to this command mean
+    errors: type[IntEnum]  # what the codes of an ERROR to this command mean
     derived: Mapping[str, Callable[[Any], Any]]  # dump entries computed from the message
 
 
@@ -103,7 +104,7 @@ def command(
     *prefix: int,
     name: str,
     reply_content_id: Callable[[Any], int] | None = None,
-    errors: ErrorSpace = ErrorSpace.PROTOCOL,
+    errors: type[IntEnum] = ErrorCode,
     derived: Mapping[str, Callable[[Any], Any]] | None = None,
 ) -> Callable[[type[MessageT]], type[MessageT]]:
     """Enter a command into the table; ``prefix`` is the payload's first byte or bytes."""
@@ -111,9 +112,9 @@ def command(
     def enter(cls: type[MessageT]) -> type[MessageT]:
         (answer,) = get_args(cls.__orig_bases__[0])  # type: ignore[attr-defined] # set for every generic base
         replies = get_args(answer) if isinstance(answer, UnionType) else (answer,)
-        whole = _as_dataclass(cls, eq=True)
-        row = _row(whole, bytes(prefix), name, derived, replies, reply_content_id, errors)
-        return _enter(COMMANDS, whole, row)
+        return _enter(
+            COMMANDS, cls, bytes(prefix), name, derived, replies, reply_content_id, errors
+        )
 
     return enter
 
@@ -123,17 +124,12 @@ def response(
     *prefix: int,
     name: str,
     bulk: bool = False,
-    eq: bool = True,
     derived: Mapping[str, Callable[[Any], Any]] | None = None,
 ) -> Callable[[type[MessageT]], type[MessageT]]:
-    """Enter a response into the table; ``bulk`` ones travel in NoEscape framing (1.3).
-
-    ``eq`` is False for a class that compares itself.
-    """
+    """Enter a response into the table; ``bulk`` ones travel in NoEscape framing (1.3)."""
 
     def enter(cls: type[MessageT]) -> type[MessageT]:
-        whole = _as_dataclass(cls, eq=eq)
-        return _enter(RESPONSES, whole, _row(whole, bytes(prefix), name, derived, bulk=bulk))
+        return _enter(RESPONSES, cls, bytes(prefix), name, derived, bulk=bulk)
 
     return enter
 
@@ -142,38 +138,31 @@ def id32(number: int) -> tuple[int, ...]:
     return tuple(number.to_bytes(4, "little"))
 
 
-def _as_dataclass(cls: type[MessageT], *, eq: bool) -> type[MessageT]:
-    return dataclass(frozen=True, slots=True, kw_only=True, eq=eq)(cls)
-
-
-def _row(  # noqa: PLR0917 - the two decorators above are its only callers
-    cls: type[Message],
+def _enter(  # noqa: PLR0917 - the two decorators above are its only callers
+    prefixes: Prefixes,
+    cls: type[MessageT],
     prefix: bytes,
     name: str,
     derived: Mapping[str, Callable[[Any], Any]] | None,
     replies: tuple[type[Response], ...] = (),
     content_id: Callable[[Any], int] | None = None,
-    errors: ErrorSpace = ErrorSpace.PROTOCOL,
+    errors: type[IntEnum] = ErrorCode,
     bulk: bool = False,
-) -> Row:
+) -> type[MessageT]:
+    compares_itself = cls.__eq__ is not object.__eq__
+    cls = dataclass(frozen=True, slots=True, kw_only=True, eq=not compares_itself)(cls)
     hints = get_type_hints(cls, include_extras=True)
     wire_only = frozenset(field for field, hint in hints.items() if get_origin(hint) is ClassVar)
     kinds = tuple(
         (field, get_args(get_args(hint)[0] if field in wire_only else hint)[1])
         for field, hint in hints.items()
     )
-    fields = tuple(field for field in hints if field not in wire_only)
-    return Row(
-        name, prefix, kinds, fields, wire_only, bulk, replies, content_id, errors, derived or {}
+    own = tuple(field for field in hints if field not in wire_only)
+    first = kinds[0][1] if kinds else None
+    spellings = first.codes if isinstance(first, fields.Spelling) else None
+    for code in [b""] if spellings is None else [bytes((code,)) for code in spellings]:
+        prefixes.enter(prefix + code, cls)
+    ROWS[cls] = Row(
+        name, prefix, kinds, own, wire_only, bulk, replies, content_id, errors, derived or {}
     )
-
-
-def _enter(prefixes: Prefixes, cls: type[MessageT], row: Row) -> type[MessageT]:
-    first = row.kinds[0][1] if row.kinds else None
-    codes = (
-        [bytes((code,)) for code in first.codes] if isinstance(first, fields.Spelling) else [b""]
-    )
-    for code in codes:
-        prefixes.enter(row.prefix + code, cls)
-    ROWS[cls] = row
     return cls

@@ -67,9 +67,8 @@ def frame_area(
     end_m: float,
     offset_m: float = DEFAULT_OFFSET_M,
     downconversion: bool = False,
-    tx_wait: int = 1,
 ) -> FrameArea:
-    """Quantise a requested frame area exactly as the firmware does.
+    """Quantise a requested frame area exactly as the firmware does. Protocol reference 9.4.
 
     Parameters
     ----------
@@ -79,17 +78,11 @@ def frame_area(
         FRAMEAREAOFFSET [m], rounded to float32.
     downconversion
         False: RF bins of 6.43 mm; True: baseband bins of 51.4 mm.
-    tx_wait
-        The chip's transmit delay in coarse steps.
 
     Raises
     ------
     LocalProtocolError
         If the start lies behind the end (the module answers ERROR 17).
-
-    Notes
-    -----
-    Protocol reference 9.4, steps 1-10.
 
     >>> frame_area(0.2, 9.4).n_bins, frame_area(0.2, 9.4, downconversion=True).n_bins
     (1431, 181)
@@ -123,7 +116,7 @@ def frame_area(
         bin_length_m=bin_m,
         base_m=base,
         first_index=first,
-        rx_wait=(tx_wait + delay_steps) % 256,
+        rx_wait=(1 + delay_steps) % 256,
         requested_start_m=start,
         requested_end_m=end,
         offset_m=offset,
@@ -180,12 +173,10 @@ def fps_max(
     dac_max: int,
     dac_step: int = 0,
     prf_div: int = DEFAULT_PRF_DIV,
-    duty: float = 0.95,
 ) -> float:
-    """Highest frame rate [Hz] the chip can sweep at. Protocol reference 9.6.
+    """Highest frame rate [Hz] at which the chip sweeps 95 % of the time. Protocol reference 9.6.
 
-    ``dac_step`` is the setting 0 ... 3 (steps of 1, 2, 4, 8); ``duty`` is the share of time
-    spent sweeping, at most 0.95 as the vendor recommends.
+    The vendor recommends this reserve. ``dac_step`` is the setting 0 ... 3 (steps of 1, 2, 4, 8).
 
     >>> round(fps_max(iterations=16, pulses_per_step=300, dac_min=949, dac_max=1100), 1)
     19.8
@@ -197,7 +188,7 @@ def fps_max(
             "no frame rate without a sweep: iterations, pulses per step and "
             "dac_max - dac_min must be positive"
         )
-    return float(duty * COMMON_PLL_HZ / prf_div / sweep)
+    return float(0.95 * COMMON_PLL_HZ / prf_div / sweep)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -53,7 +53,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from xethru_protocol.recordings.records import EARLIEST_MS, LATEST_MS, MS_NS, RecordingError
-from xethru_protocol.wire import fields, responses
+from xethru_protocol.wire import fields, messages
 from xethru_protocol.wire.codec import encode
 from xethru_protocol.wire.table import ROWS, Response
 
@@ -133,15 +133,15 @@ def _binary(name: str, bit: int, message: type[Response]) -> BinaryKind:
 
 
 BINARY_KINDS = (
-    _binary("baseband_ap", 0, responses.BasebandAp),  # bit [OBS], name [FMT]
-    _binary("baseband_iq", 1, responses.BasebandIq),  # bit, name and records [OBS]
-    _binary("pulsedoppler_float", 6, responses.PulseDopplerFloat),  # bit [OBS], name [FMT]
-    _binary("pulsedoppler_byte", 7, responses.PulseDopplerByte),  # bit [OBS], name [FMT]
+    _binary("baseband_ap", 0, messages.BasebandAp),  # bit [OBS], name [FMT]
+    _binary("baseband_iq", 1, messages.BasebandIq),  # bit, name and records [OBS]
+    _binary("pulsedoppler_float", 6, messages.PulseDopplerFloat),  # bit [OBS], name [FMT]
+    _binary("pulsedoppler_byte", 7, messages.PulseDopplerByte),  # bit [OBS], name [FMT]
     # bits [HDR], names [FMT] (their endings inferred from pulse-Doppler)
-    _binary("noisemap_float", 8, responses.NoiseMapFloat),
-    _binary("noisemap_byte", 9, responses.NoiseMapByte),
-    _binary("datafloat", 10, responses.DataFloat),  # bit, name and records [OBS]
-    _binary("databyte", 11, responses.DataByte),  # bit [HDR], name [FMT]
+    _binary("noisemap_float", 8, messages.NoiseMapFloat),
+    _binary("noisemap_byte", 9, messages.NoiseMapByte),
+    _binary("datafloat", 10, messages.DataFloat),  # bit, name and records [OBS]
+    _binary("databyte", 11, messages.DataByte),  # bit [HDR], name [FMT]
 )
 
 
@@ -269,7 +269,7 @@ TEXT_KINDS = (
     TextKind(  # bit, name and columns [OBS]
         "presence_single",
         1 << 12,
-        responses.PresenceSingle,
+        messages.PresenceSingle,
         {
             "Counter": "counter",
             "PresenceState": "state",
@@ -281,7 +281,7 @@ TEXT_KINDS = (
     TextKind(  # bit [OBS]; name, columns and brackets as others report them [INF]
         "presence_movinglist",
         1 << 13,
-        responses.PresenceMovingList,
+        messages.PresenceMovingList,
         {
             "Counter": "counter",
             "PresenceState": "state",
@@ -294,7 +294,7 @@ TEXT_KINDS = (
     TextKind(  # bit [HDR]; name and columns as others report them, the last two [INF]
         "sleep",
         1 << 2,
-        responses.SleepStatus,
+        messages.SleepStatus,
         _FRAME_STATE
         | {
             "ObjectDistance": "distance_m",
@@ -306,7 +306,7 @@ TEXT_KINDS = (
     TextKind(  # bit [HDR]; name as others report it, columns [INF]
         "respiration",
         1 << 3,
-        responses.RespStatus,
+        messages.RespStatus,
         _FRAME_STATE
         | {
             "ObjectDistance": "distance_m",
@@ -318,25 +318,25 @@ TEXT_KINDS = (
     TextKind(
         "string",
         1 << 5,
-        responses.DataString,
+        messages.DataString,
         {"ContentId": "content_id", "Info": "info", "Text": "text"},
     ),
     TextKind(
         "respiration_detectionlist",
         1 << 14,
-        responses.RespirationDetectionList,
+        messages.RespirationDetectionList,
         {"Counter": "counter", "DetectionCount": "detection_count"} | _DETECTION,
     ),
     TextKind(
         "respiration_movinglist",
         1 << 15,
-        responses.RespirationMovingList,
+        messages.RespirationMovingList,
         {"Counter": "counter", "MovementIntervalCount": "interval_count"} | _MOVEMENT,
     ),
     TextKind(
         "vitalsigns",
         1 << 16,
-        responses.VitalSigns,
+        messages.VitalSigns,
         {
             "Counter": "counter",
             "State": "state",
@@ -355,13 +355,13 @@ TEXT_KINDS = (
     TextKind(
         "sleepstage",
         1 << 17,
-        responses.SleepStage,
+        messages.SleepStage,
         {"Counter": "counter", "SleepStage": "stage"},
     ),
     TextKind(
         "respiration_normalizedmovementlist",
         1 << 18,
-        responses.RespirationNormalizedMovementList,
+        messages.RespirationNormalizedMovementList,
         {
             "Counter": "counter",
             "Start": "start_m",

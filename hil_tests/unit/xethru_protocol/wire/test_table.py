@@ -1,5 +1,6 @@
 """What a row of the message table can say, and how wrong messages and codes are named."""
 
+from enum import IntEnum
 from typing import Annotated
 
 import pytest
@@ -15,42 +16,49 @@ from xethru_protocol.wire.codec import (
     encode,
     message_type,
 )
-from xethru_protocol.wire.codes import ErrorSpace, MatrixControl, error_name
+from xethru_protocol.wire.codes import (
+    ErrorCode,
+    FileError,
+    IoPinError,
+    MatrixControl,
+    X4Error,
+    error_name,
+)
 from xethru_protocol.wire.errors import LocalProtocolError
 from xethru_protocol.wire.table import ROWS, Command, Prefixes, command
 
 # Every row of 5.1 as (code, name by space); "" where the reference has no meaning.
-X4, FILES, PINS = ErrorSpace.X4_DRIVER, ErrorSpace.FILES, ErrorSpace.IO_PINS
+PROTOCOL, X4, FILES, PINS = ErrorCode, X4Error, FileError, IoPinError
 
 
 @pytest.mark.parametrize(
     ("code", "space", "name"),
     [
-        (1, ErrorSpace.PROTOCOL, "NOT_RECOGNIZED"),
+        (1, PROTOCOL, "NOT_RECOGNIZED"),
         (1, X4, "X4 GENERAL_FAILURE"),
         (1, FILES, "FILE INVALID_PARAMETER"),
         (1, PINS, "IOPIN WRONG_PIN"),
-        (3, ErrorSpace.PROTOCOL, "BUSY"),
+        (3, PROTOCOL, "BUSY"),
         (3, FILES, "FILE ALREADY_EXISTS"),
         (3, PINS, "IOPIN INTERRUPT_NOT_AVAILABLE"),
-        (4, ErrorSpace.PROTOCOL, "X4 REGISTER_TIMEOUT"),
+        (4, PROTOCOL, "X4 REGISTER_TIMEOUT"),
         (4, FILES, "FILE BUSY"),
         (5, PINS, ""),
         (14, FILES, "FILE NOT_SUPPORTED"),
         (15, FILES, ""),
-        (17, ErrorSpace.PROTOCOL, "X4 FRAME_AREA_END_OUT_OF_SCOPE"),
+        (17, PROTOCOL, "X4 FRAME_AREA_END_OUT_OF_SCOPE"),
         (17, FILES, ""),
-        (0x21, ErrorSpace.PROTOCOL, "COMMAND_FAILED"),
+        (0x21, PROTOCOL, "COMMAND_FAILED"),
         (0x21, FILES, "FILE OUT_OF_RANGE"),
         (0x22, X4, "RESTARTING"),
         (999, X4, "X4 HAL_ERROR"),
         (0xFFFFFFFF, X4, "X4 UNINITIALIZED (-1)"),
         (0xFFFFFFFF, FILES, ""),
-        (100, ErrorSpace.PROTOCOL, ""),
+        (100, PROTOCOL, ""),
     ],
 )
 def test_an_errors_name_depends_on_the_command_that_failed(
-    code: int, space: ErrorSpace, name: str
+    code: int, space: type[IntEnum], name: str
 ) -> None:
     assert error_name(code, space) == name
 
@@ -65,11 +73,13 @@ def test_an_errors_name_depends_on_the_command_that_failed(
         (m.FormatFilesystem, FILES),
         (m.IoPinSetValue, PINS),
         (m.IoPinGetControl, PINS),
-        (m.SetMode, ErrorSpace.PROTOCOL),
-        (m.OutputSetControl, ErrorSpace.PROTOCOL),
+        (m.SetMode, PROTOCOL),
+        (m.OutputSetControl, PROTOCOL),
     ],
 )
-def test_a_commands_row_names_its_errors(cls: type[Command[m.Response]], space: ErrorSpace) -> None:
+def test_a_commands_row_names_its_errors(
+    cls: type[Command[m.Response]], space: type[IntEnum]
+) -> None:
     assert ROWS[cls].errors is space
 
 
