@@ -18,12 +18,12 @@ from hil_tests.unit.slam.app.sessions import FRAME_NS, session_info, snapshot
 from slam.app.errors import AppError
 from slam.app.records import Scan
 from slam.app.session.log import SessionLog
-from slam.app.session.mcap import read_entries
-from slam.app.session.reader import open_session
+from slam.app.session.reader import open_session, read_entries
 from slam.app.session.repair import KEPT_SUFFIX, repair
 from slam.frames import RadarFrame
 from xethru_protocol.recordings.mcap import CHUNK, FLOAT_ARRAY
 from xethru_protocol.recordings.mcap import Message as StoredMessage
+from xethru_protocol.system import StopFlag
 
 N_BINS = 32
 N_SCANS = 16
@@ -149,16 +149,16 @@ def test_repair_makes_what_every_program_opens(
         return
     if not before:
         with pytest.raises(AppError, match="nothing in it can be kept"):
-            repair(path, None, lambda: None)
+            repair(path, None, StopFlag())
         assert path.read_bytes() == whole[:cut]
         return
-    done = repair(path, None, lambda: None)
+    done = repair(path, None, StopFlag())
     assert not done.was_whole
     assert done.n_messages == len(before)
     assert kept.read_bytes() == whole[:cut]
     assert messages(path) == messages_by_mcap(path) == before
     assert count_by_rosbags(path) == len(before)
-    assert repair(path, None, lambda: None).was_whole
+    assert repair(path, None, StopFlag()).was_whole
     assert {found.name for found in tmp_path.iterdir()} == {path.name, kept.name}
 
 
@@ -175,7 +175,7 @@ def test_damage_in_the_middle_loses_the_chunk_it_is_in(
     # the second chunk or a later one: the first holds what all others need to be understood
     place = chunks[1] + round(share * (chunks[-1] - chunks[1]))
     path.write_bytes(whole[:place] + garbage + whole[place + len(garbage) :])
-    repair(path, None, lambda: None)
+    repair(path, None, StopFlag())
     found = messages(path)
     assert messages_by_mcap(path) == found
     assert count_by_rosbags(path) == len(found)
@@ -226,7 +226,7 @@ def test_a_foreign_file_is_repaired_whatever_is_in_it(
     before = messages(path)
     assert len(before) > 300
     out = tmp_path / "whole.mcap"
-    done = repair(path, out, lambda: None)
+    done = repair(path, out, StopFlag())
     assert (done.path, done.kept) == (out, None)
     assert path.stat().st_size == end_of_data
     assert messages_by_mcap(out) == before
@@ -249,7 +249,7 @@ def test_a_foreign_file_is_repaired_whatever_is_in_it(
 def test_ros_types_survive(whole: Content, tmp_path: Path) -> None:
     path = tmp_path / "cut.mcap"
     path.write_bytes(whole[: len(whole) * 2 // 3])
-    repair(path, None, lambda: None)
+    repair(path, None, StopFlag())
     with AnyReader([path]) as reader:
         connection = next(c for c in reader.connections if c.topic == "/radar/radar1/frame")
         _, t_ns, raw = next(reader.messages([connection]))
@@ -278,7 +278,7 @@ def test_any_bytes_are_one_line_or_messages(
         with suppress(AppError):
             read(path)
     try:
-        repair(path, out, lambda: None)
+        repair(path, out, StopFlag())
     except AppError:
         assert not out.exists()
     else:

@@ -16,19 +16,11 @@ from slam.app.errors import AppError, UsageError
 from slam.app.odometry.arrival import ClockLine
 from slam.app.odometry.live import LineSource, LiveOdometry, parse_source
 from slam.app.odometry.track import NS_PER_S
-from slam.app.records import RadarInfo, SessionInfo, SessionObserver
+from slam.app.records import SessionInfo, SessionObserver
 from slam.app.rig.emulated import RAW_CONFIG, versions
 from slam.app.rig.files import are_emulated, load_rig, open_rig
 from slam.app.rig.sources import RigSource, sampler_limits
-from slam.app.run.live_source import (
-    Inbox,
-    LinkRecorded,
-    LiveLog,
-    LiveSource,
-    Readers,
-    WireBytes,
-    drift_text,
-)
+from slam.app.run.live_source import Inbox, LiveLog, LiveSource, drift_text, reading
 from slam.app.run.output import Progress, Row
 from slam.app.run.results import RESULTS, finish, prepare_folder
 from slam.app.run.runner import RunRecord, RunSource, execute
@@ -37,7 +29,7 @@ from slam.app.session.messages import settings_text
 from slam.app.view.viewer import LiveView
 from slam.config import ConfigError, load_preset
 from slam.pipelines import make_slam
-from xethru_protocol.system import StopFlag
+from xethru_protocol.system import StopFlag, StopRequestedError
 
 _SESSION = "session.mcap"
 _STALE = ("session.rrd", "report.html")
@@ -89,15 +81,13 @@ def run_rig(
             rig_file,
             rig,
             None if ports is None else tuple(ports),
-            lambda radar, record: inbox.put(LinkRecorded(radar=radar, record=record)),
+            lambda radar, record: inbox.put(("link", radar, record)),
             _note,
         )
         rig_source = held.enter_context(RigSource(links))
         if wire:
             rig_source.listen(
-                lambda radar, way, data, host_ns: inbox.put(
-                    WireBytes(radar=radar, way=way, data=data, host_ns=host_ns)
-                )
+                lambda radar, way, data, host_ns: inbox.put(("wire", radar, way, data, host_ns))
             )
         stop.check()
         rig_source.start(RAW_CONFIG, fps)
@@ -133,7 +123,7 @@ def run_rig(
             lost_frames=lambda: live.lost_frames,
             link_log=log,
         )
-        with Readers(links, line_source, inbox):
+        with reading(links, line_source, inbox):
             start_ns = live.settle()
             session_log = SessionLog(out / _SESSION, info, start_ns=start_ns)
             held.callback(session_log.close)
@@ -146,7 +136,7 @@ def run_rig(
             record = execute(source, sinks)
         rig_source.close()  # while a page is served, others may have the modules
         # without the flag: the signal that ended the drive does not end the writing
-        finish(out, source, record, StopFlag(), _rows(info.radars, record, live))
+        finish(out, source, record, StopFlag(), _rows(record, live, live_odometry))
         _report_end(live, log, out)
         if view is not None:
             sys.stdout.flush()
@@ -156,13 +146,8 @@ def run_rig(
 def parse_clock(text: str, source: LineSource) -> ClockLine | None:
     """Return the odometry's clock; None if the arrival of its lines gives the time.
 
-    Parameters
-    ----------
-    text
-        `arrival`; `unix`, seconds since 1970; `monotonic`, this machine's CLOCK_MONOTONIC; or
-        that clock's nanoseconds at stamp 0, as in an emulator's ready line.
-    source
-        The source of the lines.
+    `text` is `arrival`; `unix`, seconds since 1970; `monotonic`, this machine's CLOCK_MONOTONIC; or
+    that clock's nanoseconds at stamp 0, as in an emulator's ready line.
 
     Raises
     ------
@@ -191,18 +176,17 @@ def parse_clock(text: str, source: LineSource) -> ClockLine | None:
 def _report_end(live: LiveSource, log: LiveLog, out: Path) -> None:
     """Print why a run ended, or raise if it had to end early or was not recorded."""
     ended = live.ended
-    assert ended is not None
     kept = f"; {log.failure or f'what was recorded is in {out}'}"
-    if ended.stopped is not None:
-        raise type(ended.stopped)(ended.stopped.received, kept)
-    if ended.failed:
-        raise AppError(f"{ended.text}{kept}")
+    if isinstance(ended, StopRequestedError):
+        raise StopRequestedError(ended.received, kept)
+    if isinstance(ended, AppError):
+        raise AppError(f"{ended}{kept}")
     if log.failure:
         raise AppError(log.failure)
-    _note(f"{ended.text}{kept}")
+    _note(f"{ended}{kept}")
 
 
-def _rows(radars: tuple[RadarInfo, ...], record: RunRecord, live: LiveSource) -> list[Row]:
+def _rows(record: RunRecord, live: LiveSource, odometry: LiveOdometry) -> list[Row]:
     load = live.busy_s / max(record.duration_ns / NS_PER_S, 1e-9)
     rows = [
         (
@@ -212,20 +196,21 @@ def _rows(radars: tuple[RadarInfo, ...], record: RunRecord, live: LiveSource) ->
         ),
         (
             "left out",
-            f"{live.n_unused}",
-            f"scans recorded without SLAM; {live.n_left_out} frames came too late",
+            f"{live.ticks.n_unused}",
+            f"scans recorded without SLAM; {live.ticks.n_left_out} frames came too late",
         ),
     ]
-    if (drift_ppm := live.odometry_drift_ppm) is not None:
+    if (drift_ppm := odometry.drift_ppm) is not None:
         rows.append(("odometry", f"{drift_ppm:+.2f} ppm", "clock against this machine's"))
-    for radar, clock in zip(radars, live.clocks, strict=True):
+    for radar, clock in zip(live.radars, live.clocks, strict=True):
         drift, _, rest = drift_text(clock).removeprefix("clock ").partition(" against")
         rows.append((radar.name, drift, f"clock against{rest}"))
     return rows
 
 
 def _lag_text(live: LiveSource) -> str:
-    return f"  {live.lag_s:.1f} s behind" if live.lag_s >= 1.0 else ""
+    lag_s = live.ticks.lag_ns / NS_PER_S
+    return f"  {lag_s:.1f} s behind" if lag_s >= 1.0 else ""
 
 
 def _note(text: str) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 
 from slam.app.convert.matlab import convert_mat, write_detections
@@ -13,23 +12,20 @@ from slam.app.convert.rosbag import AUTHORS_RIG, convert_bag, write_bag
 from slam.app.errors import AppError, UsageError
 from slam.app.rig.files import load_rig
 from slam.app.run.replay import recorded_config
-from slam.app.session.messages import SlamSettings, settings_text
 from slam.app.session.reader import RecordedSession, open_session
-from slam.config import ConfigError, SlamConfig, WheelNoise, load_preset
+from slam.config import ConfigError, SlamConfig, load_preset
 from xethru_protocol.recordings import RecordingError, WireCapture
 from xethru_protocol.system import StopFlag
 
 
-def write_wire(session: RecordedSession, out: Path, radar: str | None, stop: StopFlag) -> str:
-    """Write the bytes of a radar's port, both ways; return a description of what was written.
-
-    Their times are those of the host's monotonic clock.
+def _write_wire(session: RecordedSession, out: Path, radar: str | None, stop: StopFlag) -> str:
+    """Write the bytes of a radar's port, both ways, with the times of the host's monotonic clock.
 
     Raises
     ------
     AppError
         The session has no such radar, or several and none is named, or no raw bytes; the file
-        exists or cannot be written.
+        cannot be written.
     """
     known = [info.name for info in session.info.radars]
     names = ", ".join(known)
@@ -53,7 +49,7 @@ def write_wire(session: RecordedSession, out: Path, radar: str | None, stop: Sto
     return f"{out}: {sizes['rx']} bytes from the module, {sizes['tx']} to it"
 
 
-SESSION_SUFFIX, MAT_SUFFIX, WIRE_SUFFIX = ".mcap", ".mat", ".xtwire"
+_SESSION_SUFFIX, _MAT_SUFFIX, _WIRE_SUFFIX = ".mcap", ".mat", ".xtwire"
 _PRESET = "robust"
 _MAT_PRESET = "paper"  # such ranges are of its front end: they scatter by a bin, 7 mm
 
@@ -72,44 +68,37 @@ def run_convert(
 ) -> None:
     """Convert a session to a bag or MATLAB file, or such a file to a session; names say which.
 
-    Raises
-    ------
-    AppError
-        One line; what was begun is removed.
+    After an error, what was begun is removed.
     """
     if out.exists():
         raise AppError(f"{out}: exists; choose another name")
     warnings: list[str] = []
-    if source.suffix == SESSION_SUFFIX and out.suffix != SESSION_SUFFIX:
+    if source.suffix == _SESSION_SUFFIX and out.suffix != _SESSION_SUFFIX:
         with _removing(out):
             result = _from_session(open_session(source), out, preset, radar, stop)
-    elif out.suffix != SESSION_SUFFIX:
+    elif out.suffix != _SESSION_SUFFIX:
         raise UsageError(
             f"{out}: of a bag or MATLAB file a session is made; give a name that ends in .mcap"
         )
-    elif source.suffix == SESSION_SUFFIX and _is_session(source):
+    elif source.suffix == _SESSION_SUFFIX and _is_session(source):
         raise UsageError(
             f"{source}: is a session already; name an OUT that ends in .mat, .xtwire or .bag, or "
             "a new folder for a bag of ROS 2"
         )
     else:
-        is_mat = source.suffix == MAT_SUFFIX
+        is_mat = source.suffix == _MAT_SUFFIX
         name = preset or (_MAT_PRESET if is_mat else _PRESET)
-        settings = SlamSettings(
-            preset=name, config_json=settings_text(_config(name)), wheels=asdict(WheelNoise())
-        )
+        _config(name)  # reports a wrong name before anything is read
         given_rig = None if rig is None else load_rig(rig).rig
         with _removing(out):
             if is_mat:
-                result = convert_mat(
-                    source, out, stop.check, settings=settings, rig=given_rig, rate_hz=rate_hz
-                )
+                result = convert_mat(source, out, stop, preset=name, rig=given_rig, rate_hz=rate_hz)
             else:
                 result, warnings = convert_bag(
                     source,
                     out,
-                    stop.check,
-                    settings=settings,
+                    stop,
+                    preset=name,
                     rig=given_rig or AUTHORS_RIG,
                     area_m=None if area_m is None else (area_m[0], area_m[1]),
                     truth_topic=truth_topic,
@@ -141,15 +130,15 @@ def _removing(out: Path) -> Iterator[None]:
 def _from_session(
     session: RecordedSession, out: Path, preset: str | None, radar: str | None, stop: StopFlag
 ) -> str:
-    if out.suffix == WIRE_SUFFIX:
-        return write_wire(session, out, radar, stop)
-    if out.suffix != MAT_SUFFIX:
-        return write_bag(session, out, stop.check)
+    if out.suffix == _WIRE_SUFFIX:
+        return _write_wire(session, out, radar, stop)
+    if out.suffix != _MAT_SUFFIX:
+        return write_bag(session, out, stop)
     if preset is None and session.info.config_json:
         config = recorded_config(session)
     else:
         config = _config(preset or _PRESET)
-    return write_detections(session, out, config, stop.check)
+    return write_detections(session, out, config, stop)
 
 
 def _config(preset: str) -> SlamConfig:

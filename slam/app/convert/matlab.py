@@ -24,7 +24,6 @@ authors' narrower field of view left out.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -39,14 +38,14 @@ from slam.app.odometry.track import NS_PER_S, OdometryTrack, TumSample
 from slam.app.records import RadarInfo, Scan
 from slam.app.rig.sources import TRUE_PER_MODULE_METRE
 from slam.app.session.log import SessionLog
-from slam.app.session.mcap import describe_kind
-from slam.app.session.messages import SlamSettings, imported_info, imported_radar
-from slam.app.session.reader import RecordedSession
+from slam.app.session.messages import imported_info, imported_radar
+from slam.app.session.reader import RecordedSession, describe_kind
 from slam.config import SlamConfig
 from slam.frames import RadarFrame
 from slam.front_end import make_detector
 from slam.geometry import Mount, RadarPair, Rig
 from slam.paper.trilateration import Trilaterator
+from xethru_protocol.system import StopFlag
 
 _MM = 1e-3
 _POSE_UNITS = np.array([_MM, _MM, 1.0])
@@ -83,13 +82,7 @@ class MatDrive:
 
 
 def read_mat(path: Path) -> MatDrive:
-    """Read a file.
-
-    Raises
-    ------
-    AppError
-        It is no MATLAB file, or lacks the variables of the module's docstring.
-    """
+    """Read a file; raise AppError if it lacks the variables of the module's docstring."""
     try:
         with path.open("rb") as stream:
             table = loadmat(stream)  # type: ignore[arg-type]  # takes files, the stubs know names
@@ -130,13 +123,7 @@ def read_mat(path: Path) -> MatDrive:
 
 
 def write_mat(path: Path, drive: MatDrive) -> None:
-    """Write a file that `read_mat`, MATLAB and Octave read.
-
-    Raises
-    ------
-    AppError
-        It cannot be written.
-    """
+    """Write a file that `read_mat`, MATLAB and Octave read."""
     table: dict[str, Any] = {
         "odom": drive.odometry / _POSE_UNITS,
         "obsLHS": _polar_of(drive.left, unwrapped=False),
@@ -213,16 +200,16 @@ _STEP_M2, _STEP_RAD = 20e-6, 2e-3
 def convert_mat(
     mat: Path,
     out: Path,
-    check: Callable[[], None],
+    stop: StopFlag,
     *,
-    settings: SlamSettings,
-    rig: Rig | None = None,
-    rate_hz: float = 5.0,
+    preset: str,
+    rig: Rig | None,
+    rate_hz: float,
 ) -> str:
     """Write the detections and odometry of a file as a session; return a line about it.
 
-    Without ``rig`` the mounts are those in the file, or else those of the authors' robot;
-    ``rate_hz`` is of states, for a file without stamps.
+    Without `rig` the mounts are those in the file, or else those of the authors' robot; `rate_hz`
+    is of states, for a file without stamps.
 
     Raises
     ------
@@ -248,7 +235,7 @@ def convert_mat(
         )
         for number, mount in enumerate(rig.mounts, start=1)
     )
-    info = imported_info(mat, radars, settings, time_base="states", has_detections=True)
+    info = imported_info(mat, radars, preset, time_base="states", has_detections=True)
     poses = [
         TumSample(t_ns=t_ns, x_m=x, y_m=y, qz=math.sin(turn / 2), qw=math.cos(turn / 2))
         for t_ns, (x, y, turn) in zip(stamps_ns, drive.odometry.tolist(), strict=True)
@@ -257,7 +244,7 @@ def convert_mat(
     n_fixes = n_ranges = 0
     try:
         for row, t_ns in enumerate(stamps_ns):
-            check()
+            stop.check()
             for pair, points in zip(pairs, (drive.left[row], drive.right[row]), strict=True):
                 n_fixes += len(points)
                 for radar in (pair.first, pair.second):
@@ -274,9 +261,9 @@ def convert_mat(
 
 
 def write_detections(
-    session: RecordedSession, out: Path, config: SlamConfig, check: Callable[[], None]
+    session: RecordedSession, out: Path, config: SlamConfig, stop: StopFlag
 ) -> str:
-    """Write what the front end of ``config`` finds in a session; return a line about it.
+    """Write what the front end of `config` finds in a session; return a line about it.
 
     A state is collected as the authors do: after 4.5 mm or 2 mrad of odometry.
 
@@ -301,7 +288,7 @@ def write_detections(
     fixes: tuple[list[Array], list[Array]] = ([], [])
     frames: dict[int, list[NDArray[np.float32]]] = {number: [] for number in _RADARS}
     for scan, _ in session.scans():
-        check()
+        stop.check()
         # in the order of counters, whether the state is collected or not: a front end may learn
         offsets = [rig.mounts[frame.radar].range_offset_m for frame in scan.frames]
         found = detector.detect_many(scan.frames, offsets)
@@ -350,7 +337,7 @@ def _sides(path: Path, rig: Rig) -> tuple[RadarPair, RadarPair]:
 
 
 def _ranges(points: Array, mount: Mount) -> Array:
-    """Return the distances of points from a radar, each once, shape (k,), ascending [m]."""
+    """Return the distances of points from a radar, each once, shape (k,) [m], ascending."""
     ranges_m = np.sort(np.hypot(points[:, 0] - mount.x_m, points[:, 1] - mount.y_m))
     new = np.diff(ranges_m, prepend=-math.inf) > _SAME_RANGE_M
     return ranges_m[new]

@@ -20,8 +20,8 @@ import math
 import re
 import shutil
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -36,12 +36,11 @@ from rosbags.typesys import Stores, get_typestore
 
 from slam.app.errors import AppError, OdometryError
 from slam.app.odometry.track import NS_PER_S, OdometryTrack, TumSample
-from slam.app.records import RadarInfo, Scan, SessionInfo
+from slam.app.records import RadarInfo, Scan, SessionInfo, TruthAt
 from slam.app.rig.sources import TRUE_PER_MODULE_METRE
 from slam.app.session import messages as ros
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import (
-    SlamSettings,
     imported_info,
     imported_radar,
     radar_text,
@@ -53,7 +52,7 @@ from slam.app.session.reader import RecordedSession, ScanEnd
 from slam.frames import RadarFrame
 from slam.geometry import Mount, Rig
 from xethru_protocol.recordings.mcap import FLOAT_ARRAY, STRING, pack_array, pack_string
-from xethru_protocol.system import StopRequestedError
+from xethru_protocol.system import StopFlag, StopRequestedError
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.x4 import frame_area
 
@@ -132,22 +131,18 @@ class _Contents:
 def convert_bag(
     bag: Path,
     out: Path,
-    check: Callable[[], None],
+    stop: StopFlag,
     *,
-    settings: SlamSettings,
-    rig: Rig = AUTHORS_RIG,
-    area_m: tuple[float, float] | None = None,
-    truth_topic: str = TRUTH_TOPIC,
+    preset: str,
+    rig: Rig,
+    area_m: tuple[float, float] | None,
+    truth_topic: str,
 ) -> tuple[str, list[str]]:
     """Write a bag as a session; return a line about it, and warnings.
 
     Parameters
     ----------
-    bag, out
-        The files.
-    check
-        Called for every message; may raise to stop.
-    settings
+    preset
         For bags that were not made of a session of this program.
     rig
         Mounts under the names of the topics (UWBradar1, ...); ignored if the bag has them.
@@ -162,7 +157,7 @@ def convert_bag(
         No bag, a damaged one, one without radars or odometry, or frames that do not fit the frame
         area.
     """
-    contents = _contents(bag, truth_topic, check)
+    contents = _contents(bag, truth_topic, stop)
     warnings = []
     if contents.left_out:
         warnings.append(f"poses that went back in time and are left out: {contents.left_out}")
@@ -179,14 +174,14 @@ def convert_bag(
     start_ns = min(stream.stamps_ns[0] for stream in contents.streams.values())
     log = SessionLog(
         out,
-        _session_info(bag, contents, radars, settings),
+        _session_info(bag, contents, radars, preset),
         odometry,
-        truth_at=None if truth is None else _poses_of(truth),
+        truth_at=None if truth is None else _truth_at(truth),
         start_ns=min(start_ns, odometry.first_ns),
     )
     unused = n_scans = 0
     try:
-        for scan in _scans(_frames(bag, names, radars, check), period_ns):
+        for scan in _scans(_frames(bag, names, radars, stop), period_ns):
             newest_ns = max(frame.t_ns for frame in scan.frames)
             used = odometry.first_ns <= scan.t_ns and newest_ns <= odometry.last_ns
             unused += not used
@@ -204,13 +199,13 @@ def convert_bag(
     )
 
 
-def _contents(bag: Path, truth_topic: str, check: Callable[[], None]) -> _Contents:
+def _contents(bag: Path, truth_topic: str, stop: StopFlag) -> _Contents:
     contents = _Contents()
     with _open(bag) as reader:
         for connection in reader.connections:
             _check_type(bag, connection.topic, connection.msgtype, truth_topic)
         for connection, t_ns, raw in reader.messages():
-            check()
+            stop.check()
             topic = connection.topic
             if (radar := _radar_of(_FRAMES, topic)) is not None:
                 n_bins = len(reader.deserialize(raw, connection.msgtype).data)
@@ -337,7 +332,7 @@ def _rate_hz(stream: _Stream) -> float:
 
 
 def _session_info(
-    bag: Path, contents: _Contents, radars: tuple[RadarInfo, ...], settings: SlamSettings
+    bag: Path, contents: _Contents, radars: tuple[RadarInfo, ...], preset: str
 ) -> SessionInfo:
     if contents.session is not None:
         try:
@@ -345,11 +340,11 @@ def _session_info(
         except ValueError as error:
             raise AppError(f"{bag}: {SESSION_TOPIC} cannot be read: {error}") from None
         return read_session_table(bag, table, radars)
-    return imported_info(bag, radars, settings, time_base="recording")
+    return imported_info(bag, radars, preset, time_base="recording")
 
 
-def _poses_of(track: OdometryTrack) -> Callable[[NDArray[np.int64]], NDArray[np.float64]]:
-    """Return the true poses at times [ns]; NaN further outside the truth than it is held."""
+def _truth_at(track: OdometryTrack) -> TruthAt:
+    """Return what gives true poses; NaN further outside the truth than it is held."""
 
     def pose_at(t_ns: int) -> NDArray[np.float64]:
         try:
@@ -361,13 +356,13 @@ def _poses_of(track: OdometryTrack) -> Callable[[NDArray[np.int64]], NDArray[np.
 
 
 def _frames(
-    bag: Path, names: Sequence[str], radars: Sequence[RadarInfo], check: Callable[[], None]
+    bag: Path, names: Sequence[str], radars: Sequence[RadarInfo], stop: StopFlag
 ) -> Iterator[RadarFrame]:
     counters = [0] * len(names)
     with _open(bag) as reader:
         wanted = [one for one in reader.connections if _radar_of(_FRAMES, one.topic) is not None]
         for connection, t_ns, raw in reader.messages(wanted):
-            check()
+            stop.check()
             index = names.index(str(_radar_of(_FRAMES, connection.topic)))
             message = reader.deserialize(raw, connection.msgtype)
             yield RadarFrame(
@@ -433,31 +428,20 @@ class _Bag:
         self._writer.close()
 
 
-def write_bag(session: RecordedSession, out: Path, check: Callable[[], None]) -> str:
+def write_bag(session: RecordedSession, out: Path, stop: StopFlag) -> str:
     """Write frames, odometry and truth of a session; return a line about it.
 
-    Parameters
-    ----------
-    session
-        A recording.
-    out
-        ``*.bag`` for ROS 1, otherwise a new folder for ROS 2; bag times are session times.
-    check
-        Called for every message; may raise to stop, which leaves nothing behind.
+    `*.bag` is for ROS 1, any other name a new folder for ROS 2; bag times are session times. A stop
+    or an error leaves nothing behind.
 
     Raises
     ------
     AppError
-        It exists already or cannot be written, or the session is damaged.
+        It cannot be written, or the session is damaged.
     """
-    if out.exists():
-        raise AppError(f"{out}: exists; choose another name")
     try:
-        bag = _Bag(out)
-        try:
-            counts = _fill(bag, session, check)
-        finally:
-            bag.close()
+        with closing(_Bag(out)) as bag:
+            counts = _fill(bag, session, stop)
     except BaseException as error:
         if out.is_dir():
             shutil.rmtree(out, ignore_errors=True)
@@ -473,11 +457,11 @@ def write_bag(session: RecordedSession, out: Path, check: Callable[[], None]) ->
     return f"{out}: {kind}, {frames} frames, {poses} poses of the wheels, {truths} true poses"
 
 
-def _fill(bag: _Bag, session: RecordedSession, check: Callable[[], None]) -> tuple[int, int, int]:
+def _fill(bag: _Bag, session: RecordedSession, stop: StopFlag) -> tuple[int, int, int]:
     head_is_written = False
     frames = poses = truths = 0
     for record in session.records():
-        check()
+        stop.check()
         if isinstance(record, RadarFrame | TumSample | ScanEnd) and not head_is_written:
             head_is_written = True
             table = json.dumps(session_table(session.info))

@@ -1,8 +1,7 @@
 """Scans of radars on real ports in real time: threads, ticks, stamps, and the log of a live run.
 
-Each thread reads one radar or the odometry and puts events into one queue; the main loop reads
-that queue only. A radar that falls silent or vanishes is looked for until it is back or the run
-ends.
+Threads put events into one queue; the main loop reads that queue only. A radar that falls silent
+or vanishes is looked for until it is back or the run ends.
 
 Ticks are frame periods of session time. A tick is complete when every radar that is not lost has
 sent a frame of it or a later one, and odometry has come past it; or when waiting longer would not
@@ -19,10 +18,10 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from contextlib import contextmanager
+from dataclasses import replace
 from queue import Empty, SimpleQueue
-from types import TracebackType
-from typing import Literal, Protocol, Self, TypeAlias
+from typing import Literal, TypeAlias
 
 from slam.app.errors import AppError, OdometryError
 from slam.app.odometry.arrival import ArrivalClock
@@ -31,75 +30,32 @@ from slam.app.odometry.track import NS_PER_S, TumSample
 from slam.app.records import LogLine, RadarInfo, Scan, Snapshot
 from slam.app.rig.sources import RadarLink, radar_frame
 from slam.app.run.runner import LinkLog
-from slam.app.session.log import SessionLog
-from slam.app.session.mcap import CannotWriteError
+from slam.app.session.log import CannotWriteError, SessionLog
 from slam.frames import RadarFrame
 from xethru_protocol.driver.conversation import ProtocolRecord
 from xethru_protocol.driver.frames import Frame
 from xethru_protocol.system import StopFlag, StopRequestedError
 from xethru_protocol.wire.errors import ResponseTimeout, XeThruError
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FrameArrived:
-    """A frame of a radar, by its index in the rig."""
-
-    radar: int
-    frame: Frame
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RadarLost:
-    """A radar sends no more; `text` is the reason."""
-
-    radar: int
-    text: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RadarBack:
-    """A radar that was lost sends again, from a port."""
-
-    radar: int
-    port: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LinkRecorded:
-    """A line of the protocol log of a radar."""
-
-    radar: str
-    record: ProtocolRecord
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WireBytes:
-    """Bytes as they went over a radar's port."""
-
-    radar: str
-    way: Literal["rx", "tx"]
-    data: bytes
-    host_ns: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OdometryLine:
-    """A line of the odometry's source, and the host's monotonic time of its arrival."""
-
-    text: str
-    arrival_ns: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OdometryEnded:
-    """No more lines will come; `trouble` is the reason, "" if the source just ended."""
-
-    trouble: str
-
-
 Event: TypeAlias = (
-    FrameArrived | RadarLost | RadarBack | LinkRecorded | WireBytes | OdometryLine | OdometryEnded
+    tuple[Literal["frame"], int, Frame]
+    | tuple[Literal["lost", "back"], int, str]
+    | tuple[Literal["link"], str, ProtocolRecord]
+    | tuple[Literal["wire"], str, Literal["rx", "tx"], bytes, int]
+    | tuple[Literal["odometry line"], str, int]
+    | tuple[Literal["odometry end"], str]
 )
+"""What threads hand to the main loop, by its first item.
+
+- "frame": the radar's index in the rig, and the frame;
+- "lost", "back": the radar's index, and why it is lost, or its new port;
+- "link": the radar's name, and a line of its protocol log;
+- "wire": the radar's name, way, bytes and host time of what went over its port;
+- "odometry line": its text, and the host's monotonic time of its arrival;
+- "odometry end": why no more lines will come, "" if the source just ended.
+"""
+
+Inbox: TypeAlias = SimpleQueue[Event]
 
 
 SILENCE_S = 3.0
@@ -110,86 +66,60 @@ _LOOK_AGAIN_S = 1.0
 _JOIN_S = 10.0
 """More than a look for a module takes; a thread that still reads then hangs in the system."""
 
-Inbox = SimpleQueue[Event]
 
+@contextmanager
+def reading(links: Sequence[RadarLink], source: LineSource, inbox: Inbox) -> Iterator[None]:
+    """Read every radar, in the order of the rig, and the odometry, each in a thread of its own.
 
-class Readers:
-    """Reads all radars and the odometry while it is entered.
-
-    Parameters
-    ----------
-    links
-        Radars that stream, in the order of the rig; their drivers are the threads' own meanwhile.
-    source
-        Where odometry comes from.
-    inbox
-        Gets everything.
+    The drivers belong to the threads meanwhile.
     """
-
-    def __init__(self, links: Sequence[RadarLink], source: LineSource, inbox: Inbox) -> None:
-        self._stopped = threading.Event()
-        self._inbox = inbox
-        self._threads = [
-            threading.Thread(
-                target=_read_radar,
-                args=(index, link, inbox, self._stopped),
-                name=f"radar {link.mount.name}",
-                daemon=True,
-            )
-            for index, link in enumerate(links)
-        ]
-        self._threads.append(
-            threading.Thread(
-                target=_read_odometry,
-                args=(source, inbox, self._stopped),
-                name="odometry",
-                daemon=True,
-            )
+    stopped = threading.Event()
+    threads = [
+        threading.Thread(
+            target=_read_radar,
+            args=(index, link, inbox, stopped),
+            name=f"radar {link.mount.name}",
+            daemon=True,
         )
-
-    def __enter__(self) -> Self:
-        for thread in self._threads:
-            thread.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """End the threads; afterwards the drivers may be used again."""
-        self._stopped.set()
+        for index, link in enumerate(links)
+    ]
+    threads.append(
+        threading.Thread(
+            target=_read_odometry, args=(source, inbox, stopped), name="odometry", daemon=True
+        )
+    )
+    for thread in threads:
+        thread.start()
+    try:
+        yield
+    finally:
+        stopped.set()
         give_up = time.monotonic() + _JOIN_S
-        for thread in self._threads:
+        for thread in threads:
             thread.join(max(give_up - time.monotonic(), 0.0))
 
 
 def _read_radar(radar: int, link: RadarLink, inbox: Inbox, stopped: threading.Event) -> None:
-    try:
-        _follow_radar(radar, link, inbox, stopped)
-    except Exception as error:  # a bug: reported, so that no radar is lost silently
-        inbox.put(RadarLost(radar=radar, text=f"its reader failed: {error!r}"))
-        raise
-
-
-def _follow_radar(radar: int, link: RadarLink, inbox: Inbox, stopped: threading.Event) -> None:
     received_s = time.monotonic()
-    while not stopped.is_set():
-        trouble = ""
-        try:
-            inbox.put(FrameArrived(radar=radar, frame=link.driver.read_frame(_POLL_S)))
-            received_s = time.monotonic()
-        except ResponseTimeout:
-            if time.monotonic() - received_s > SILENCE_S:
-                trouble = f"no frame for {SILENCE_S:g} s"
-        except XeThruError as error:
-            trouble = str(error)
-        if trouble:
-            inbox.put(RadarLost(radar=radar, text=trouble))
-            if _found_again(link, stopped):
-                inbox.put(RadarBack(radar=radar, port=link.driver.port))
-            received_s = time.monotonic()
+    try:
+        while not stopped.is_set():
+            trouble = ""
+            try:
+                inbox.put(("frame", radar, link.driver.read_frame(_POLL_S)))
+                received_s = time.monotonic()
+            except ResponseTimeout:
+                if time.monotonic() - received_s > SILENCE_S:
+                    trouble = f"no frame for {SILENCE_S:g} s"
+            except XeThruError as error:
+                trouble = str(error)
+            if trouble:
+                inbox.put(("lost", radar, trouble))
+                if _found_again(link, stopped):
+                    inbox.put(("back", radar, link.driver.port))
+                received_s = time.monotonic()
+    except Exception as error:  # a bug: reported, so that no radar is lost silently
+        inbox.put(("lost", radar, f"its reader failed: {error!r}"))
+        raise
 
 
 def _found_again(link: RadarLink, stopped: threading.Event) -> bool:
@@ -207,13 +137,13 @@ def _read_odometry(source: LineSource, inbox: Inbox, stopped: threading.Event) -
     trouble = ""
     try:
         for text, arrival_ns in read_lines(source, stopped.is_set):
-            inbox.put(OdometryLine(text=text, arrival_ns=arrival_ns))
+            inbox.put(("odometry line", text, arrival_ns))
     except OdometryError as error:
         trouble = str(error)
     except Exception as error:  # a bug, as above
-        inbox.put(OdometryEnded(trouble=f"its reader failed: {error!r}"))
+        inbox.put(("odometry end", f"its reader failed: {error!r}"))
         raise
-    inbox.put(OdometryEnded(trouble=trouble))
+    inbox.put(("odometry end", trouble))
 
 
 GRACE_NS = NS_PER_S // 2
@@ -223,14 +153,6 @@ ODOMETRY_WAIT_NS = NS_PER_S
 MOST_LAG_NS = 10 * NS_PER_S
 """When SLAM is later than that, scans are recorded and not used until it has caught up."""
 CAUGHT_UP_NS = NS_PER_S
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReceivedFrame:
-    """A frame with session time, and when it arrived, nanoseconds since 1970."""
-
-    frame: RadarFrame
-    host_ns: int
 
 
 class TickAssembler:
@@ -247,12 +169,14 @@ class TickAssembler:
 
     Attributes
     ----------
+    alive
+        Indices of the radars that are not lost.
     start_ns
         Session time of tick 0; None before `begin`.
     lag_ns
         How long ago the newest tick given out was over.
-    n_unused, n_late
-        Scans given out that SLAM must not use; those among them for which it was too late.
+    n_unused
+        Scans given out that SLAM must not use.
     n_left_out
         Frames that came too late for SLAM, given out in scans that it must not use.
     ended
@@ -262,35 +186,26 @@ class TickAssembler:
     def __init__(self, n_radars: int, period_ns: int, odometry: LiveOdometry) -> None:
         self._odometry = odometry
         self._period_ns = period_ns
-        self._waiting: list[deque[ReceivedFrame]] = [deque() for _ in range(n_radars)]
-        self._alive = set(range(n_radars))
+        # frames in session time, each with its arrival, nanoseconds since 1970
+        self._waiting: list[deque[tuple[RadarFrame, int]]] = [deque() for _ in range(n_radars)]
         self._tick = 0
         self._is_late = False
+        self.alive = set(range(n_radars))
         self.start_ns: int | None = None
         self.lag_ns = 0
-        self.n_unused = self.n_late = self.n_left_out = 0
+        self.n_unused = self.n_left_out = 0
         self.ended = False
-
-    @property
-    def alive(self) -> frozenset[int]:
-        return frozenset(self._alive)
 
     def begin(self, start_ns: int) -> None:
         """Let tick 0 begin at a session time; frames before it are dropped."""
         self.start_ns = start_ns
         for queue in self._waiting:
-            while queue and queue[0].frame.t_ns < start_ns:
+            while queue and queue[0][0].t_ns < start_ns:
                 queue.popleft()
 
-    def take(self, received: ReceivedFrame) -> None:
+    def take(self, frame: RadarFrame, host_ns: int) -> None:
         """Take a frame; the frames of one radar come in the order of time."""
-        self._waiting[received.frame.radar].append(received)
-
-    def lost(self, radar: int) -> None:
-        self._alive.discard(radar)
-
-    def back(self, radar: int) -> None:
-        self._alive.add(radar)
+        self._waiting[frame.radar].append((frame, host_ns))
 
     def next_scan(self, now_ns: int) -> Scan | None:
         """Return the next scan if it is complete at a session time, else None."""
@@ -304,55 +219,48 @@ class TickAssembler:
                 self.n_left_out += len(late)
                 return self._scan(late, begin_ns, used=False)
             self.ended = self._odometry.ended and not self._odometry.covers(begin_ns)
-            received = self._of_tick(end_ns)
-            stamps_ns = [begin_ns, *(row.frame.t_ns for row in received)]
-            if self.ended or self._may_get_more(received, max(stamps_ns), end_ns, now_ns):
+            received = [q[0] for q in self._waiting if q and q[0][0].t_ns < end_ns]
+            stamps_ns = [begin_ns, *(frame.t_ns for frame, _ in received)]
+            if self.ended or self._may_get_more(bool(received), max(stamps_ns), end_ns, now_ns):
                 return None
             if received:
                 break
-            self._tick = max(self._tick + 1, self._next_with_something(now_ns))
-        for row in received:
-            self._waiting[row.frame.radar].popleft()
-        self._note_lag(now_ns - end_ns)
+            # to the oldest frame, or the first tick that may still get some: there are billions of
+            # empty ones if odometry's clock is set from 1970
+            heads_ns = [queue[0][0].t_ns for queue in self._waiting if queue]
+            next_ns = min([now_ns - GRACE_NS, *heads_ns])
+            self._tick = max(self._tick + 1, (next_ns - self.start_ns) // self._period_ns)
+        for frame, _ in received:
+            self._waiting[frame.radar].popleft()
+        self.lag_ns = now_ns - end_ns
+        self._is_late = self.lag_ns > (CAUGHT_UP_NS if self._is_late else MOST_LAG_NS)
         used = not self._is_late and all(map(self._odometry.is_known, stamps_ns))
-        self.n_late += self._is_late
         scan = self._scan(received, begin_ns, used=used)
         self._tick += 1
         return scan
 
-    def _next_with_something(self, now_ns: int) -> int:
-        """Return the tick of the oldest frame, or the first one that may still get some.
-
-        Those before it are empty; there are billions if odometry's clock is set from 1970.
-        """
-        assert self.start_ns is not None
-        heads_ns = [queue[0].frame.t_ns for queue in self._waiting if queue]
-        return (min([now_ns - GRACE_NS, *heads_ns]) - self.start_ns) // self._period_ns
-
-    def _may_get_more(
-        self, received: Sequence[ReceivedFrame], needed_ns: int, end_ns: int, now_ns: int
-    ) -> bool:
+    def _may_get_more(self, has_frames: bool, needed_ns: int, end_ns: int, now_ns: int) -> bool:
         """Return whether a tick may get more frames, or odometry for them."""
-        missing = not self._alive or any(not self._waiting[radar] for radar in self._alive)
+        missing = not self.alive or any(not self._waiting[radar] for radar in self.alive)
         if missing and now_ns < end_ns + GRACE_NS:
             return True
-        if not received:
+        if not has_frames:
             return now_ns < end_ns
         if self._odometry.covers(needed_ns) or self._odometry.ended:
             return False
         return now_ns < needed_ns + ODOMETRY_WAIT_NS
 
-    def _scan(self, received: Sequence[ReceivedFrame], t_ns: int, *, used: bool) -> Scan:
+    def _scan(self, received: Sequence[tuple[RadarFrame, int]], t_ns: int, *, used: bool) -> Scan:
         self.n_unused += not used
         return Scan(
             counter=self._tick,
             t_ns=t_ns,
-            frames=tuple(row.frame for row in received),
-            host_ns=tuple(row.host_ns for row in received),
+            frames=tuple(frame for frame, _ in received),
+            host_ns=tuple(host_ns for _, host_ns in received),
             used=used,
         )
 
-    def _late(self, begin_ns: int, end_ns: int) -> Sequence[ReceivedFrame]:
+    def _late(self, begin_ns: int, end_ns: int) -> Sequence[tuple[RadarFrame, int]]:
         """Take the oldest frame of every radar that is too old for a tick.
 
         Too old is by more than a whole period, or by a quarter of one if a newer frame of the tick
@@ -361,22 +269,11 @@ class TickAssembler:
         """
         late = []
         for queue in self._waiting:
-            age_ns = begin_ns - queue[0].frame.t_ns if queue else 0
-            has_newer = len(queue) > 1 and queue[1].frame.t_ns < end_ns
+            age_ns = begin_ns - queue[0][0].t_ns if queue else 0
+            has_newer = len(queue) > 1 and queue[1][0].t_ns < end_ns
             if age_ns > (self._period_ns // 4 if has_newer else self._period_ns):
                 late.append(queue.popleft())
         return late
-
-    def _of_tick(self, end_ns: int) -> Sequence[ReceivedFrame]:
-        """Return the oldest frame of every radar, if it was taken before the tick's end."""
-        return [q[0] for q in self._waiting if q and q[0].frame.t_ns < end_ns]
-
-    def _note_lag(self, lag_ns: int) -> None:
-        self.lag_ns = lag_ns
-        if self._is_late:
-            self._is_late = lag_ns > CAUGHT_UP_NS
-        else:
-            self._is_late = lag_ns > MOST_LAG_NS
 
 
 SETTLE_S = 2.0
@@ -389,27 +286,10 @@ _SOURCE_POLL_S = 0.05
 _DRIFT_EVERY_S = 60.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Ended:
-    """Why a run ended; `failed` if it should have gone on."""
-
-    text: str
-    failed: bool = False
-    stopped: StopRequestedError | None = None
-
-
-class EventQueue(Protocol):
-    """A `queue.SimpleQueue`, or one in virtual time; both methods raise `queue.Empty`."""
-
-    def get(self, *, timeout: float) -> Event: ...
-
-    def get_nowait(self) -> Event: ...
-
-
 class LiveLog(LinkLog):
     """Writes a live run into its session log; keeps odometry until there is one.
 
-    If the log cannot be written any more, this is reported once, and the run goes on without it.
+    If the log cannot be written any more, a warning is logged once, and the run goes on without it.
 
     Attributes
     ----------
@@ -431,15 +311,14 @@ class LiveLog(LinkLog):
             self.on_odometry(sample)
 
     def on_odometry(self, sample: TumSample) -> None:
-        """Write a pose of the wheels."""
         if self._early is None:
             self._write(lambda log: log.on_odometry(sample))
         else:
             self._early.append(sample)
 
-    def on_wire(self, event: WireBytes) -> None:
+    def on_wire(self, radar: str, way: Literal["rx", "tx"], data: bytes, host_ns: int) -> None:
         """Write raw bytes of a port; those from before `begin` are dropped."""
-        self._write(lambda log: log.on_wire(event.radar, event.way, event.data, event.host_ns))
+        self._write(lambda log: log.on_wire(radar, way, data, host_ns))
 
     def on_scan(self, scan: Scan) -> None:
         super().on_scan(scan)
@@ -484,12 +363,8 @@ class LiveSource:
         Of the sampler, see `RadarFrame`.
     odometry
         Takes the lines.
-    inbox
-        Where the threads' events are.
     log
         Gets everything but the scans, in this thread.
-    stop
-        Checked often; ends the run.
     duration_s
         When to end; None if never.
     clock_ns
@@ -497,10 +372,12 @@ class LiveSource:
 
     Attributes
     ----------
+    ticks
+        Makes scans of frames.
     clocks
         Of every radar, in the order of the rig.
     ended
-        Why `scans` came to its end.
+        Why `scans` ended: a text if that was to be expected, else the error.
     worst_lag_s
         How long ago a tick was over when SLAM got it, at worst.
     busy_s
@@ -514,18 +391,17 @@ class LiveSource:
         radars: tuple[RadarInfo, ...],
         limits: tuple[float, float] | None,
         odometry: LiveOdometry,
-        inbox: EventQueue,
+        inbox: Inbox,
         log: LiveLog,
         stop: StopFlag,
         *,
         duration_s: float | None = None,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self._radars, self._limits = radars, limits
+        self.radars, self._limits = radars, limits
         self._odometry, self._inbox, self._log = odometry, inbox, log
         self._stop, self._duration_s, self._clock_ns = stop, duration_s, clock_ns
         self._unix_ns = time.time_ns() - time.monotonic_ns()
-        self._assembler = TickAssembler(len(radars), round(NS_PER_S / radars[0].rate_hz), odometry)
         self._began_ns = clock_ns()
         self._all_lost_ns: int | None = None
         self._last_counters: list[int | None] = [None] * len(radars)
@@ -533,29 +409,11 @@ class LiveSource:
         self._lag_warned_s = WARN_LAG_S
         self._unused_since_ns: int | None = None
         self._unused_warned = False
+        self.ticks = TickAssembler(len(radars), round(NS_PER_S / radars[0].rate_hz), odometry)
         self.clocks = tuple(ArrivalClock(radar.rate_hz) for radar in radars)
-        self.ended: Ended | None = None
+        self.ended: str | AppError | StopRequestedError | None = None
         self.worst_lag_s = self.busy_s = 0.0
         self.lost_frames = 0
-
-    @property
-    def lag_s(self) -> float:
-        """How long ago the newest tick given out was over."""
-        return self._assembler.lag_ns / NS_PER_S
-
-    @property
-    def n_unused(self) -> int:
-        return self._assembler.n_unused
-
-    @property
-    def n_left_out(self) -> int:
-        """Frames that came too late for SLAM and are only recorded."""
-        return self._assembler.n_left_out
-
-    @property
-    def odometry_drift_ppm(self) -> float | None:
-        """Rate of the odometry's clock against the host's; None if its clock was given."""
-        return self._odometry.drift_ppm
 
     def settle(self) -> int:
         """Read until every clock is roughly known; return the session time of the first scan.
@@ -575,7 +433,7 @@ class LiveSource:
             waited_s = (now_ns - self._began_ns) / NS_PER_S
             silent = [
                 radar.name
-                for radar, last in zip(self._radars, self._last_counters, strict=True)
+                for radar, last in zip(self.radars, self._last_counters, strict=True)
                 if last is None
             ]
             if silent and waited_s > START_LIMIT_S:
@@ -600,7 +458,7 @@ class LiveSource:
                 raise AppError(text)
             if self._odometry.session_ns(now_ns) < NS_PER_S:
                 continue  # no session holds what was before 0
-            self._assembler.begin(start_ns)
+            self.ticks.begin(start_ns)
             return start_ns
 
     def scans(self) -> Iterator[Scan]:
@@ -609,7 +467,7 @@ class LiveSource:
             try:
                 self._stop.check()
             except StopRequestedError as stopped:
-                self.ended = Ended(text=str(stopped), stopped=stopped)
+                self.ended = stopped
                 break
             self._drain(_SOURCE_POLL_S)
             while (scan := self._next_scan()) is not None:
@@ -623,13 +481,13 @@ class LiveSource:
     def _next_scan(self) -> Scan | None:
         if self.ended is not None:
             return None
-        scan = self._assembler.next_scan(self._odometry.session_ns(self._clock_ns()))
+        scan = self.ticks.next_scan(self._odometry.session_ns(self._clock_ns()))
         if scan is None:
             return None
-        assert self._assembler.start_ns is not None
-        elapsed_s = (scan.t_ns - self._assembler.start_ns) / NS_PER_S
+        assert self.ticks.start_ns is not None
+        elapsed_s = (scan.t_ns - self.ticks.start_ns) / NS_PER_S
         if self._duration_s is not None and elapsed_s >= self._duration_s:
-            self.ended = Ended(text=f"the {self._duration_s:g} s asked for are over")
+            self.ended = f"the {self._duration_s:g} s asked for are over"
             return None
         self._note_lag()
         self._note_unused(scan)
@@ -646,36 +504,32 @@ class LiveSource:
 
     def _take(self, event: Event) -> None:
         match event:
-            case FrameArrived():
-                self._take_frame(event.radar, event.frame)
-            case OdometryLine():
-                sample, warning = self._odometry.take(event.text, event.arrival_ns)
+            case "frame", radar, frame:
+                self._take_frame(radar, frame)
+            case "odometry line", text, arrival_ns:
+                sample, warning = self._odometry.take(text, arrival_ns)
                 if warning:
                     self._log.log("odometry", warning, warning=True)
                 if sample is not None:
                     self._log.on_odometry(sample)
-            case OdometryEnded():
-                self._odometry.end(event.trouble)
-                self._log.log("odometry", event.trouble or "ended", warning=bool(event.trouble))
-            case RadarLost():
-                self._assembler.lost(event.radar)
-                left = len(self._assembler.alive)
-                self._log.log(
-                    self._radars[event.radar].name,
-                    f"{event.text}; the run goes on with {left} of {len(self._radars)} radars",
-                    warning=True,
-                )
-            case RadarBack():
-                self._assembler.back(event.radar)
-                text = f"is back, at {event.port}"
-                self._log.log(self._radars[event.radar].name, text, warning=True)
-            case LinkRecorded():
-                self._log.on_record(event.radar, event.record)
-            case WireBytes():
-                self._log.on_wire(event)
+            case "odometry end", trouble:
+                self._odometry.end(trouble)
+                self._log.log("odometry", trouble or "ended", warning=bool(trouble))
+            case "lost", radar, trouble:
+                self.ticks.alive.discard(radar)
+                left = f"{len(self.ticks.alive)} of {len(self.radars)} radars"
+                text = f"{trouble}; the run goes on with {left}"
+                self._log.log(self.radars[radar].name, text, warning=True)
+            case "back", radar, port:
+                self.ticks.alive.add(radar)
+                self._log.log(self.radars[radar].name, f"is back, at {port}", warning=True)
+            case "link", name, record:
+                self._log.on_record(name, record)
+            case "wire", name, way, data, host_ns:
+                self._log.on_wire(name, way, data, host_ns)
 
     def _take_frame(self, radar: int, frame: Frame) -> None:
-        info = self._radars[radar]
+        info = self.radars[radar]
         last = self._last_counters[radar]
         if last is not None and frame.counter > last:
             self.lost_frames += frame.counter - last - 1
@@ -684,15 +538,11 @@ class LiveSource:
         if not self._odometry.has_pose:
             return  # session time is unknown until then
         made = radar_frame(radar, frame, info.rate_hz, limits=self._limits)
-        self._assembler.take(
-            ReceivedFrame(
-                frame=replace(made, t_ns=self._odometry.session_ns(taken_ns)),
-                host_ns=frame.arrival_ns + self._unix_ns,
-            )
-        )
+        made = replace(made, t_ns=self._odometry.session_ns(taken_ns))
+        self.ticks.take(made, frame.arrival_ns + self._unix_ns)
 
     def _note_lag(self) -> None:
-        lag_s = self.lag_s
+        lag_s = self.ticks.lag_ns / NS_PER_S
         self.worst_lag_s = max(self.worst_lag_s, lag_s)
         if lag_s > self._lag_warned_s:
             self._lag_warned_s = 2.0 * lag_s
@@ -726,26 +576,24 @@ class LiveSource:
             self._log_drifts()
         if self.ended is not None:
             return
-        if self._assembler.ended:
-            self.ended = Ended(text=self._odometry.trouble or "odometry ended")
-            if self._odometry.trouble:
-                self.ended = replace(self.ended, failed=True)
+        if self.ticks.ended:
+            trouble = self._odometry.trouble
+            self.ended = AppError(trouble) if trouble else "odometry ended"
         elif text := self._odometry.dead(now_ns, self._began_ns):
-            self.ended = Ended(text=text, failed=True)
-        elif self._assembler.alive:
+            self.ended = AppError(text)
+        elif self.ticks.alive:
             self._all_lost_ns = None
         elif self._all_lost_ns is None:
             self._all_lost_ns = now_ns
         elif now_ns - self._all_lost_ns > SILENT_RIG_S * NS_PER_S:
-            self.ended = Ended(text=f"no radar for {SILENT_RIG_S:g} s", failed=True)
+            self.ended = AppError(f"no radar for {SILENT_RIG_S:g} s")
 
     def _log_drifts(self) -> None:
-        for info, clock in zip(self._radars, self.clocks, strict=True):
+        for info, clock in zip(self.radars, self.clocks, strict=True):
             self._log.log(info.name, drift_text(clock), warning=False)
 
 
 def drift_text(clock: ArrivalClock) -> str:
-    """Return a clock's drift against the host's as text."""
     return (
         f"clock {clock.drift_ppm:+.2f} ppm against this machine's, "
         f"+-{clock.drift_sigma_ppm:.2f} over {clock.baseline_s:.0f} s"

@@ -2,18 +2,25 @@
 
 Times in the file are session time. The order of the file is the order in which the run learned of
 things: what stands before a scan's mark was known when SLAM took that scan.
+
+A chunk is closed and handed to the operating system after 256 KiB or one second, so a killed
+process leaves a file without index that lacks its last chunk only.
 """
 
 from __future__ import annotations
 
+import contextlib
+import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from io import BufferedWriter, FileIO
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.app.errors import AppError
 from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.records import (
     LogLine,
@@ -24,19 +31,166 @@ from slam.app.records import (
     TruthAt,
 )
 from slam.app.session import messages as ros
-from slam.app.session.mcap import SessionFile
-from slam.app.session.messages import METADATA_NAME, radar_text, session_table, state_row
+from slam.app.session.messages import (
+    METADATA_NAME,
+    radar_text,
+    schema_text,
+    session_table,
+    state_row,
+)
 from slam.geometry import between, compose
 from xethru_protocol.recordings.mcap import (
     BYTE_ARRAY,
+    CHUNK_BYTES,
     DOUBLE_ARRAY,
     FLOAT_ARRAY,
     STRING,
+    McapWriter,
     pack_array,
     pack_string,
 )
 
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
+
 _ORIGIN = np.zeros(3)
+_CHUNK_NS = 1_000_000_000
+# MCAP's message record: opcode, length, channel, sequence, two times.
+_RECORD_OVERHEAD_BYTES = 31
+
+_LATCHED_QOS = """\
+- history: 1
+  depth: 1
+  reliability: 1
+  durability: 1
+  deadline: {sec: 9223372036, nsec: 854775807}
+  lifespan: {sec: 9223372036, nsec: 854775807}
+  liveliness: 1
+  liveliness_lease_duration: {sec: 9223372036, nsec: 854775807}
+  avoid_ros_namespace_conventions: false
+"""
+
+
+class CannotWriteError(AppError):
+    """The file cannot be written any further; the message describes what is kept."""
+
+
+class _Disk(FileIO):
+    """Writes until `gave_up` is set, and then discards, so that closing succeeds."""
+
+    gave_up = False
+
+    def write(self, data: ReadableBuffer, /) -> int:
+        if self.gave_up:
+            return memoryview(data).nbytes
+        return super().write(data)
+
+
+class _SessionFile:
+    """An MCAP file of ROS 2 messages, in chunks that are cut by size and by time.
+
+    If the disk refuses a chunk, the file is closed after the last whole one and CannotWriteError is
+    raised; whatever is written from then on is discarded.
+    """
+
+    def __init__(self, path: Path, start_ns: int, clock_ns: Callable[[], int]) -> None:
+        self.path = path
+        self._start_ns = start_ns
+        self._clock_ns = clock_ns
+        try:
+            self._disk = _Disk(path, "wb")
+        except OSError as error:
+            raise CannotWriteError(
+                f"{path}: cannot be written: {error.strerror or error}"
+            ) from None
+        self._stream = BufferedWriter(self._disk)
+        # Chunks are cut here, by size and by time; the writer itself knows size only.
+        self._writer = McapWriter(self._stream, chunk_bytes=2 * CHUNK_BYTES)
+        self._pending_bytes = 0
+        self._whole_bytes = 0  # of the file, up to its last whole chunk
+        self._newest_ns = self._whole_ns = start_ns
+        self._chunk_started_ns = clock_ns()
+
+    def add_metadata(self, name: str, table: Mapping[str, str]) -> None:
+        with self._giving_up():
+            self._writer.add_metadata(name, dict(table))
+
+    def channel(self, topic: str, message_type: str, *, latched: bool = False) -> int:
+        """Return the number of a new channel; a latched one keeps its last message for all."""
+        if self._disk.gave_up:
+            return 0
+        metadata = {"offered_qos_profiles": _LATCHED_QOS} if latched else {}
+        with self._giving_up():
+            return self._writer.add_channel(
+                topic, message_type, schema_text(message_type), metadata
+            )
+
+    def write(
+        self,
+        channel: int,
+        t_ns: int,
+        data: bytes | memoryview,
+        *,
+        sequence: int = 0,
+        publish_ns: int | None = None,
+    ) -> None:
+        """Write a message in CDR at a session time [ns]; ``publish_ns`` is the same if None."""
+        if self._disk.gave_up:
+            return
+        size = len(data) + _RECORD_OVERHEAD_BYTES
+        late = self._clock_ns() - self._chunk_started_ns >= _CHUNK_NS
+        if late or self._pending_bytes + size > CHUNK_BYTES:
+            self.cut_chunk()
+        self._pending_bytes += size
+        self._newest_ns = max(self._newest_ns, t_ns)
+        with self._giving_up():
+            self._writer.add_message(
+                channel_id=channel,
+                log_time=t_ns,
+                publish_time=t_ns if publish_ns is None else publish_ns,
+                sequence=sequence,
+                data=data,  # type: ignore[arg-type]  # annotated bytes; it only concatenates
+            )
+
+    def cut_chunk(self) -> None:
+        if self._disk.gave_up:
+            return
+        with self._giving_up():
+            self._writer.end_chunk()
+            self._stream.flush()
+            self._whole_bytes = self._disk.tell()
+        self._whole_ns = self._newest_ns
+        self._pending_bytes = 0
+        self._chunk_started_ns = self._clock_ns()
+
+    def close(self) -> None:
+        """Write index and footer, and close the file; doing so again does nothing."""
+        if self._stream.closed:
+            return
+        self.cut_chunk()
+        with self._giving_up():
+            self._writer.finish()
+            self._stream.close()
+
+    @contextlib.contextmanager
+    def _giving_up(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            # the bytes of an incomplete chunk are useless, and their room is needed
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._disk.fileno(), self._whole_bytes)
+            self._disk.gave_up = True
+            self._stream.close()
+            kept = (
+                f"its first {(self._whole_ns - self._start_ns) / 1e9:.1f} s are kept there "
+                f"without an index: make room, then `uwb-slam repair {self.path}`"
+                if self._whole_ns > self._start_ns
+                else "nothing was recorded: make room"
+            )
+            raise CannotWriteError(
+                f"{self.path}: cannot be written: {error.strerror or error}; {kept}"
+            ) from None
 
 
 class SessionLog(SessionObserver):
@@ -47,15 +201,12 @@ class SessionLog(SessionObserver):
     and the true pose where it is known, or `/scan_unused`; `/odom`, `/truth`, `/estimate`,
     `/landmarks`, `/tf`, `/tf_static`, `/log`; `/slam/state`, the same states to the last bit
     (`state_row`); where there are such, raw bytes in `/radar/<name>/rx` and `tx`, and ranges
-    that another program found in `/radar/<name>/detections`. A metadata record names scene, preset,
-    seed, settings, versions.
+    that another program found in `/radar/<name>/detections`. A metadata record is `session_table`.
 
     Parameters
     ----------
     path
         The file; replaced if it exists.
-    info
-        What the run is.
     odometry
         The whole track where it is known before the run; None where `on_odometry` brings it.
     truth_at
@@ -81,12 +232,12 @@ class SessionLog(SessionObserver):
         start_ns: int = 0,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self._file = SessionFile(path, start_ns=start_ns, clock_ns=clock_ns)
+        self._file = _SessionFile(path, start_ns, clock_ns)
         self._samples: Iterator[TumSample] = iter(odometry.samples if odometry else ())
         self._odometry_ns = -1  # of the newest sample written
         self._truth_at = truth_at
         self._t_ns = start_ns
-        self._rare: dict[str, int] = {}
+        self._rare_channels: dict[str, int] = {}
         self._names = [radar.name for radar in info.radars]
         self._frame_channels: list[int] = []
         self._file.add_metadata(METADATA_NAME, session_table(info))
@@ -141,7 +292,7 @@ class SessionLog(SessionObserver):
 
     def on_detections(self, radar: int, t_ns: int, ranges_m: NDArray[np.float64]) -> None:
         """Write ranges of the scan that comes next, shape (n,) [m], of a radar by its index."""
-        channel = self._lazily(radar, "detections", DOUBLE_ARRAY)
+        channel = self._rare_channel(self._names[radar], "detections", DOUBLE_ARRAY)
         self._file.write(channel, t_ns, pack_array(DOUBLE_ARRAY, ranges_m, "range_m"))
 
     def on_odometry(self, sample: TumSample) -> None:
@@ -174,24 +325,23 @@ class SessionLog(SessionObserver):
     def on_wire(self, radar: str, way: Literal["rx", "tx"], data: bytes, host_ns: int) -> None:
         """Write bytes as a radar's port gave (rx) or took (tx) them, at a host time [ns].
 
-        In the file they lie at the time of the newest scan, and keep ``host_ns`` beside it.
+        Their time in the file is that of the newest scan; `host_ns` is their publish time.
         """
         if not data:
             return
-        channel = self._lazily(radar, way, BYTE_ARRAY)
+        channel = self._rare_channel(radar, way, BYTE_ARRAY)
         message = pack_array(BYTE_ARRAY, np.frombuffer(data, np.uint8))
         self._file.write(channel, self._t_ns, message, publish_ns=host_ns)
 
     def _write(self, channel: int, t_ns: int, message: ros.Message) -> None:
         self._file.write(channel, t_ns, ros.serialise(message))
 
-    def _lazily(self, radar: int | str, part: str, message_type: str) -> int:
+    def _rare_channel(self, radar: str, part: str, message_type: str) -> int:
         """Return the channel of a part that few sessions have, made when it is first needed."""
-        name = self._names[radar] if isinstance(radar, int) else radar
-        topic = f"/radar/{name}/{part}"
-        if topic not in self._rare:
-            self._rare[topic] = self._file.channel(topic, message_type)
-        return self._rare[topic]
+        topic = f"/radar/{radar}/{part}"
+        if topic not in self._rare_channels:
+            self._rare_channels[topic] = self._file.channel(topic, message_type)
+        return self._rare_channels[topic]
 
     def close(self) -> None:
         self._file.close()

@@ -18,7 +18,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, asdict, dataclass, field, fields
+from dataclasses import MISSING, asdict, fields
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -30,7 +30,7 @@ from rosbags.typesys import Stores, get_typestore
 from slam.app.errors import AppError
 from slam.app.odometry.track import NS_PER_S, TumSample
 from slam.app.records import RadarInfo, SessionInfo, Snapshot
-from slam.config import SlamConfig
+from slam.config import SlamConfig, WheelNoise, load_preset
 from slam.geometry import Mount
 
 _COUNTS = 2
@@ -38,7 +38,7 @@ _PER_LANDMARK = 7
 
 
 def state_row(snapshot: Snapshot) -> NDArray[np.float64]:
-    """Return the row of a state, shape (23 + 7 n_landmarks + n_nis,), float64."""
+    """Return the row of a state, shape (23 + 7 n_landmarks + n_nis,)."""
     n_landmarks, n_nis = len(snapshot.landmark_ids), len(snapshot.nis_per_dof)
     landmarks = np.column_stack(
         [
@@ -97,7 +97,7 @@ TRANSFORMS = "tf2_msgs/msg/TFMessage"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 LOG = "rcl_interfaces/msg/Log"
 
-_LOG_INFO, _LOG_WARN = 20, 30
+_LOG_INFO, LOG_WARN = 20, 30
 _POINT_FIELD_FLOAT32, _POINT_FIELD_UINT32 = 7, 6
 
 # PointCloud2 is the one standard message that carries named fields per point, so the covariance
@@ -144,9 +144,9 @@ def deserialise(data: bytes, message_type: str) -> Message:
 
 
 def odometry(sample: TumSample) -> Message:
-    """Wrap an odometry sample; the quaternion is kept as it came, so replay sees the same floats.
+    """Wrap an odometry sample; covariances are zero, which means unknown in ROS.
 
-    Covariances are zero, which means unknown in ROS.
+    The quaternion is kept as it came, so replay sees the same floats.
     """
     pose = _pose(sample.x_m, sample.y_m, sample.qz, sample.qw)
     with_covariance = _type("geometry_msgs/msg/PoseWithCovariance")(
@@ -178,7 +178,9 @@ def odometry_sample(message: Message) -> TumSample:
 
 def pose_stamped(t_ns: int, frame: str, pose: NDArray[np.float64]) -> Message:
     """Wrap a planar pose, shape (3,), of the robot in a frame."""
-    return _type(POSE)(header=_header(t_ns, frame), pose=_pose_of(pose))
+    x, y, heading = (float(value) for value in pose)
+    wrapped = _pose(x, y, math.sin(heading / 2), math.cos(heading / 2))
+    return _type(POSE)(header=_header(t_ns, frame), pose=wrapped)
 
 
 def transforms(t_ns: int, links: Mapping[tuple[str, str], NDArray[np.float64]]) -> Message:
@@ -224,7 +226,7 @@ def log_line(t_ns: int, radar: str, text: str, *, warning: bool) -> Message:
     """Wrap one line of the protocol log; the radar is the logger's name."""
     return _type(LOG)(
         stamp=_time(t_ns),
-        level=_LOG_WARN if warning else _LOG_INFO,
+        level=LOG_WARN if warning else _LOG_INFO,
         name=radar,
         msg=text,
         file="",
@@ -268,19 +270,13 @@ def _pose(x_m: float, y_m: float, qz: float, qw: float) -> Message:
     )
 
 
-def _pose_of(pose: NDArray[np.float64]) -> Message:
-    x, y, heading = (float(value) for value in pose)
-    return _pose(x, y, math.sin(heading / 2), math.cos(heading / 2))
-
-
 METADATA_NAME = "xethru-hil session"
-"""Of the table in the file."""
 
 LENGTH_UNIT = "module metres, c = 3.0e8 m/s"
-"""Of a radar's range_start_m and bin_length_m in its text; its mount is in true metres."""
+"""Of a radar's range_start_m and bin_length_m; its mount is in true metres."""
 
 FORMAT = 2
-"""Of the file; format 1 was never released."""
+"""Format 1 was never released."""
 
 
 def session_table(info: SessionInfo) -> dict[str, str]:
@@ -305,8 +301,7 @@ def session_table(info: SessionInfo) -> dict[str, str]:
 def settings_text(config: SlamConfig) -> str:
     """Return SLAM's settings for `SessionInfo.config_json`.
 
-    `SlamConfig.model_validate_json` reads them back the same; pydantic's own text has null for
-    infinity, which is not.
+    Pydantic's own text has null for infinity, which `SlamConfig.model_validate_json` refuses.
     """
     return json.dumps(config.model_dump(mode="json"))
 
@@ -316,13 +311,7 @@ def radar_text(radar: RadarInfo) -> str:
 
 
 def check_format(path: Path, table: Mapping[str, str]) -> None:
-    """Check that this version reads the file's format.
-
-    Raises
-    ------
-    AppError
-        The file is of another format; one line.
-    """
+    """Raise AppError if the file is of another format."""
     number = table.get("format", "1")
     if number == str(FORMAT):
         return
@@ -335,12 +324,12 @@ def check_format(path: Path, table: Mapping[str, str]) -> None:
 def read_session_table(
     path: Path, table: Mapping[str, str], radars: tuple[RadarInfo, ...]
 ) -> SessionInfo:
-    """Read the table of a run back; keys that older files lack have their defaults.
+    """Read the table of a run; keys that older files lack have their defaults.
 
     Raises
     ------
     AppError
-        The table makes no sense; one line with the file.
+        The table makes no sense.
     """
     try:
         seed, started = table["seed"], table.get("started_unix_ns", "")
@@ -374,7 +363,7 @@ def read_radar_text(path: Path, topic: str, text: str) -> RadarInfo:
     Raises
     ------
     AppError
-        The text makes no sense, or its lengths are in another unit; one line with file and topic.
+        The text makes no sense, or its lengths are in another unit.
     """
     try:
         facts = json.loads(text)
@@ -387,9 +376,7 @@ def read_radar_text(path: Path, topic: str, text: str) -> RadarInfo:
     missing = [
         field.name
         for field in fields(RadarInfo)
-        if known.get(field.name) is None
-        and field.default is MISSING
-        and field.default_factory is MISSING
+        if field.default is MISSING and known.get(field.name) is None
     ]
     if missing:
         raise AppError(f"{path}: {topic} does not tell {', '.join(missing)}")
@@ -398,19 +385,10 @@ def read_radar_text(path: Path, topic: str, text: str) -> RadarInfo:
     return RadarInfo(**known)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SlamSettings:
-    """Settings of SLAM; see the fields of `SessionInfo` of these names."""
-
-    preset: str = "robust"
-    config_json: str = ""
-    wheels: Mapping[str, float] = field(default_factory=dict)
-
-
 def imported_info(
     source: Path,
     radars: tuple[RadarInfo, ...],
-    settings: SlamSettings,
+    preset: str,
     *,
     time_base: str,
     has_detections: bool = False,
@@ -418,13 +396,13 @@ def imported_info(
     """Return the head of a session made of a file; it is named after the file."""
     return SessionInfo(
         scene=source.resolve().stem,
-        preset=settings.preset,
+        preset=preset,
         seed=None,
         radars=radars,
         true_landmarks_m=np.zeros((0, 2)),
         versions={},
-        config_json=settings.config_json,
-        wheels=settings.wheels,
+        config_json=settings_text(load_preset(preset)),
+        wheels=asdict(WheelNoise()),
         simulated=False,
         time_base=time_base,
         has_detections=has_detections,

@@ -1,19 +1,20 @@
 """A recorded session read back: what `SessionLog` wrote, in the order it was written.
 
-`open_session` reads who recorded what; `RecordedSession.records` streams frames (true metres, own
-stamps), odometry, truth, states and log lines with the same floats the run itself saw. Nothing is
-held but one chunk of the file, so a recording of hours costs no more memory than one of seconds.
+Frames (true metres, own stamps), odometry, states and log lines have the same floats that the run
+saw. Only one chunk of the file is in memory.
 """
 
 from __future__ import annotations
 
 import math
+import os
+import stat
 import struct
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import BinaryIO, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,6 @@ from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, Snapshot
 from slam.app.rig.sources import TRUE_PER_MODULE_METRE, sampler_limits
 from slam.app.session import messages as ros
-from slam.app.session.mcap import read_entries
 from slam.app.session.messages import (
     METADATA_NAME,
     check_format,
@@ -38,37 +38,129 @@ from xethru_protocol.recordings.mcap import (
     BYTE_ARRAY,
     DOUBLE_ARRAY,
     FLOAT_ARRAY,
+    MAGIC,
+    Channel,
+    Cut,
+    Damage,
     Message,
     Metadata,
     unpack_array,
     unpack_string,
 )
+from xethru_protocol.recordings.mcap import read_entries as entries_of
 
-_LOG_WARN = 30
+_KINDS = {
+    b"RRF": "a Rerun recording (.rrd), a view that other versions of Rerun may not open; the "
+    "record of the run is the session.mcap beside it",
+    b"#ROSBAG V2": "a bag of ROS 1; `uwb-slam convert` makes a session of it",
+    b"#ROSBAG": "a bag of ROS 1 of an old version; `rosbag migrate` it first",
+    b"SQLite format 3\0": "an SQLite file, like those in a rosbag2 folder; give that folder to "
+    "`uwb-slam convert`",
+    b"\x89XTWIRE": "a wire capture of one port; `xethru dump` reads it",
+    b"MATLAB 5.0 MAT-file": "a MATLAB file; `uwb-slam convert` reads detections from it",
+    b"\x89HDF": "an HDF5 file",
+    b"PK\x03\x04": "a zip archive; unpack it first",
+    b"\x1f\x8b": "a gzip file; unpack it first",
+    b"\x28\xb5\x2f\xfd": "a zstd file; unpack it first",
+}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class TruthPose:
-    """Where the robot really was; shape (3,), [x m, y m, heading rad], world frame."""
+def describe_kind(path: Path) -> str:
+    r"""Return ``, it is ...`` for a file that is known by its first bytes, or what to give instead.
 
-    t_ns: int
-    pose: NDArray[np.float64]
+    >>> from tempfile import NamedTemporaryFile
+    >>> with NamedTemporaryFile() as file:
+    ...     _ = file.write(b"#ROSBAG V2.0\n")
+    ...     file.flush()
+    ...     describe_kind(Path(file.name))
+    ', it is a bag of ROS 1; `uwb-slam convert` makes a session of it'
+    """
+    if path.is_dir():
+        return " with a rosbag2 in it" if (path / "metadata.yaml").exists() else ""
+    with path.open("rb") as stream:
+        head = stream.read(32)
+    if not head:
+        return ", it is empty; whatever was to write it ended before it did"
+    for magic, kind in _KINDS.items():
+        if head.startswith(magic):
+            return f", it is {kind}"
+    return "; give the session.mcap of a run"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReceivedFrame:
-    """A frame and when it arrived at the host, nanoseconds since 1970; None if not recorded."""
+@contextmanager
+def open_mcap(path: Path, size: int | None = None) -> Iterator[tuple[BinaryIO, int]]:
+    """Open a file whose first bytes are those of MCAP; yield it and how much of it to read [bytes].
 
-    frame: RadarFrame
-    host_ns: int | None
+    That is `size`, if given, of a file that grows.
+
+    Raises
+    ------
+    AppError
+        Missing, unreadable or not MCAP; the message names the kind of file if it is known.
+    """
+    with ExitStack() as stack:
+        try:
+            if stat.S_ISFIFO(path.stat().st_mode):  # opening one waits for who writes into it
+                raise AppError(f"{path}: is a pipe; give a file, the session.mcap of a run")
+            stream = stack.enter_context(path.open("rb"))
+            if stream.read(len(MAGIC)) != MAGIC:
+                raise AppError(f"{path}: is no MCAP file{describe_kind(path)}")
+            whole = os.fstat(stream.fileno()).st_size
+        except IsADirectoryError:
+            raise AppError(
+                f"{path}: is a directory{describe_kind(path)}; give the session.mcap in it"
+            ) from None
+        except OSError as error:
+            raise _unreadable(path, error) from None
+        yield stream, whole if size is None else min(size, whole)
+
+
+def read_entries(
+    path: Path, on_cut: Callable[[int], None], size: int | None = None
+) -> Iterator[Metadata | Message]:
+    """Yield metadata and messages in the order of the file, holding one chunk in memory.
+
+    Parameters
+    ----------
+    path
+        The file.
+    on_cut
+        Called with the position in bytes where the file ends too early, before the end.
+    size
+        How many bytes of the file to read, so that one that grows reads the same again; None: all.
+
+    Raises
+    ------
+    AppError
+        Missing, unreadable, not MCAP, or damaged other than by being cut.
+    """
+    with open_mcap(path, size) as (stream, n_bytes):
+        try:
+            for found in entries_of(stream, n_bytes):
+                if isinstance(found, Cut):
+                    on_cut(found.at)
+                    return
+                if isinstance(found, Damage):
+                    raise AppError(
+                        f"{path}: damaged at byte {found.at}: {found.reason}; "
+                        f"`uwb-slam repair {path}` keeps what is whole"
+                    )
+                if not isinstance(found, Channel):
+                    yield found
+        except OSError as error:
+            raise _unreadable(path, error) from None
+
+
+def _unreadable(path: Path, error: OSError) -> AppError:
+    return AppError(f"{path}: cannot read: {error.strerror or error}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ScanEnd:
     """The frames before it made a scan; see `Scan`.
 
-    ``members`` are their radars and counters, so that a scan is known to be whole.
-    ``truth`` has shape (3,), [x m, y m, heading rad], world frame; None if unknown.
+    `members` are their radars and counters, so that a scan is known to be whole.
+    `truth` has shape (3,), [x m, y m, heading rad], world frame; None if unknown.
     """
 
     counter: int
@@ -78,21 +170,8 @@ class ScanEnd:
     truth: NDArray[np.float64] | None
 
 
-Recorded: TypeAlias = ReceivedFrame | TumSample | TruthPose | LogLine | ScanEnd | Snapshot
-"""A record of the file; a TumSample is odometry."""
-
-FrameTopics: TypeAlias = Mapping[str, tuple[int, RadarInfo, tuple[float, float] | None]]
-"""By topic: index and description of a radar, and the limits of its sampler."""
-
-
-def read_record(message: Message, frame_of: FrameTopics) -> Recorded | None:
-    """Return the content of a message; None for messages that repeat others."""
-    found = frame_of.get(message.topic)
-    if found is not None:
-        host_ns = None if message.publish_ns == message.t_ns else message.publish_ns
-        return ReceivedFrame(frame=_frame(message, *found), host_ns=host_ns)
-    read = _READERS.get(message.topic)
-    return None if read is None else read(message)
+SessionRecord: TypeAlias = RadarFrame | TumSample | LogLine | ScanEnd | Snapshot
+"""What `RecordedSession.records` yields; a TumSample is odometry."""
 
 
 def _frame(
@@ -112,7 +191,7 @@ def _frame(
     )
 
 
-def limits_of(radar: RadarInfo) -> tuple[float, float] | None:
+def _limits_of(radar: RadarInfo) -> tuple[float, float] | None:
     """Return the sampler's limits where the recorded settings are those of this driver."""
     known = {field.name for field in fields(RawConfig)}
     if set(radar.settings) != known:
@@ -144,27 +223,18 @@ def _odometry(message: Message) -> TumSample:
     return ros.odometry_sample(ros.deserialise(message.data, ros.ODOMETRY))
 
 
-def _truth(message: Message) -> TruthPose:
-    pose = ros.deserialise(message.data, ros.POSE).pose
-    heading_rad = 2.0 * math.atan2(pose.orientation.z, pose.orientation.w)
-    return TruthPose(
-        t_ns=message.t_ns, pose=np.array([pose.position.x, pose.position.y, heading_rad])
-    )
-
-
 def _log_line(message: Message) -> LogLine:
     line = ros.deserialise(message.data, ros.LOG)
     return LogLine(
-        t_ns=message.t_ns, radar=line.name, warning=line.level >= _LOG_WARN, text=line.msg
+        t_ns=message.t_ns, radar=line.name, warning=line.level >= ros.LOG_WARN, text=line.msg
     )
 
 
-_READERS: Mapping[str, Callable[[Message], Recorded]] = {
+_READERS: Mapping[str, Callable[[Message], SessionRecord]] = {
     "/scan": _scan_end,
     "/scan_unused": _scan_end,
     "/slam/state": _state,
     "/odom": _odometry,
-    "/truth": _truth,
     "/log": _log_line,
 }
 
@@ -183,19 +253,11 @@ class WireBytes:
     host_ns: int
 
 
-SessionRecord: TypeAlias = RadarFrame | TumSample | TruthPose | LogLine | ScanEnd | Snapshot
-"""What `RecordedSession.records` yields; a TumSample is odometry."""
-
-
 class RecordedSession:
     """One session file.
 
     Attributes
     ----------
-    path
-        The file.
-    info
-        Scene, preset, seed, settings, radars and versions of the run.
     cut_at_byte
         Where the file ends too early, after `records` has come to its end; None where it is whole.
     """
@@ -230,36 +292,34 @@ class RecordedSession:
         AppError
             The file is damaged other than by being cut at its end.
         """
-        for record in self._received():
-            yield record.frame if isinstance(record, ReceivedFrame) else record
+        for _, record in self._records():
+            yield record
 
     def scans(self) -> Iterator[tuple[Scan, NDArray[np.float64] | None]]:
         """Yield every scan as the run took it, and the true pose at it, shape (3,), if known.
 
         A scan that damage or the end of a cut file left incomplete is not among them.
         """
-        held: list[ReceivedFrame] = []
-        for record in self._received():
-            if isinstance(record, ReceivedFrame):
-                held.append(record)
+        held: list[tuple[RadarFrame, int]] = []
+        for message, record in self._records():
+            if isinstance(record, RadarFrame):
+                held.append((record, message.publish_ns))
             elif isinstance(record, ScanEnd):
                 # frames before them are of a scan whose mark is lost
                 held = held[max(len(held) - len(record.members), 0) :]
-                if tuple((row.frame.radar, row.frame.counter) for row in held) != record.members:
-                    held = []
-                    continue
-                arrivals = tuple(row.host_ns for row in held if row.host_ns is not None)
-                yield (
-                    Scan(
+                frames = tuple(frame for frame, _ in held)
+                # the same as the stamp, if it was not recorded when the frame arrived
+                arrivals = tuple(host_ns for frame, host_ns in held if host_ns != frame.t_ns)
+                held = []
+                if tuple((frame.radar, frame.counter) for frame in frames) == record.members:
+                    scan = Scan(
                         counter=record.counter,
                         t_ns=record.t_ns,
-                        frames=tuple(row.frame for row in held),
-                        host_ns=arrivals if len(arrivals) == len(held) else (),
+                        frames=frames,
+                        host_ns=arrivals if len(arrivals) == len(frames) else (),
                         used=record.used,
-                    ),
-                    record.truth,
-                )
-                held = []
+                    )
+                    yield scan, record.truth
 
     def detections(self) -> dict[int, tuple[Detection, ...]]:
         """Return the recorded ranges by the time of their scan [ns]; amplitudes are unknown."""
@@ -303,31 +363,29 @@ class RecordedSession:
                 )
 
     def odometry(self) -> OdometryTrack:
-        """Return the whole track of the wheels.
-
-        Raises
-        ------
-        AppError
-            None was recorded, or the file is damaged.
-        """
         samples = [record for record in self.records() if isinstance(record, TumSample)]
         try:
             return OdometryTrack(samples)
         except OdometryError as error:
             raise AppError(f"{self.path}: {error}") from None
 
-    def _received(self) -> Iterator[Recorded]:
-        frame_of = {
-            f"/radar/{radar.name}/frame": (index, radar, limits_of(radar))
+    def _records(self) -> Iterator[tuple[Message, SessionRecord]]:
+        """Yield the messages that do not repeat others, each with its content."""
+        radar_of = {
+            f"/radar/{radar.name}/frame": (index, radar, _limits_of(radar))
             for index, radar in enumerate(self.info.radars)
         }
         for entry in read_entries(self.path, self._on_cut, self._size):
             if not isinstance(entry, Message):
                 continue
+            record: SessionRecord | None = None
             with self._naming(entry):
-                record = read_record(entry, frame_of)
+                if entry.topic in radar_of:
+                    record = _frame(entry, *radar_of[entry.topic])
+                elif entry.topic in _READERS:
+                    record = _READERS[entry.topic](entry)
             if record is not None:
-                yield record
+                yield entry, record
 
     @contextmanager
     def _naming(self, entry: Message) -> Iterator[None]:
@@ -349,7 +407,7 @@ def open_session(path: Path) -> RecordedSession:
     Raises
     ------
     AppError
-        One line with the file: missing, foreign, damaged, or cut before the radars are named.
+        Missing, foreign, damaged, or cut before the radars are named.
     """
     head: dict[str, str] | None = None
     radars: list[RadarInfo] = []

@@ -9,13 +9,13 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from slam.app.errors import AppError
-from slam.app.session.mcap import open_mcap
+from slam.app.session.reader import open_mcap
 from xethru_protocol.recordings import mcap
 from xethru_protocol.system import PathInUseError, StopFlag, locked
 
@@ -29,7 +29,28 @@ _CHECKED_FOOTER_BYTES = 16  # of its body, that its checksum covers
 
 
 @dataclass(slots=True, kw_only=True)
-class _Survey:
+class Repair:
+    """What a file holds and lacks, and what was made of it.
+
+    Attributes
+    ----------
+    path
+        The file that opens everywhere now.
+    cut_at
+        Byte at which the old file ended too early; None if it did not.
+    damages
+        Places of the old file that were left out.
+    has_index
+        Whether the old file had an index, with the right checksum.
+    schemas, channels
+        By their numbers in the old file.
+    n_messages, first_ns, last_ns
+        Messages in the new file, and the session time they span [ns].
+    kept
+        Where the old file is now; None where it was not moved.
+    """
+
+    path: Path
     cut_at: int | None = None
     damages: list[mcap.Damage] = field(default_factory=list)
     has_index: bool = False
@@ -37,6 +58,10 @@ class _Survey:
     library: str = ""
     schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
     channels: dict[int, tuple[int, str, str, dict[str, str]]] = field(default_factory=dict)
+    n_messages: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    kept: Path | None = None
 
     def lose(self, record: mcap.Record, error: Exception) -> None:
         """Note that a record is left out, once for all that begin in the same place."""
@@ -44,38 +69,8 @@ class _Survey:
             self.damages.append(mcap.Damage(record.at, record.at, f"records there: {error!r}"))
 
     @property
-    def is_whole(self) -> bool:
+    def was_whole(self) -> bool:
         return self.cut_at is None and not self.damages and self.has_index
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Repair:
-    """What was done.
-
-    Attributes
-    ----------
-    path
-        The file that opens everywhere now.
-    was_whole
-        The file needed no repair.
-    n_messages, first_ns, last_ns
-        Messages in it, and the session time they span [ns].
-    cut_at
-        Byte at which the old file ended too early; None if it did not.
-    damages
-        Places of the old file that were left out.
-    kept
-        Where the old file is now; None where it was not moved.
-    """
-
-    path: Path
-    was_whole: bool
-    n_messages: int
-    first_ns: int
-    last_ns: int
-    cut_at: int | None
-    damages: tuple[mcap.Damage, ...]
-    kept: Path | None
 
     def __str__(self) -> str:
         span = f"{self.n_messages} messages, {(self.last_ns - self.first_ns) / 1e9:.1f} s"
@@ -95,11 +90,10 @@ class Repair:
 
 
 def run_repair(stop: StopFlag, *, session: Path, out: Path | None) -> None:
-    """Repair a recording and print the outcome; see `repair`."""
-    print(repair(session, out, stop.check))  # noqa: T201 - the result
+    print(repair(session, out, stop))  # noqa: T201 - the result
 
 
-def repair(path: Path, out: Path | None, check: Callable[[], None]) -> Repair:
+def repair(path: Path, out: Path | None, stop: StopFlag) -> Repair:
     """Make a recording whole.
 
     Parameters
@@ -107,10 +101,10 @@ def repair(path: Path, out: Path | None, check: Callable[[], None]) -> Repair:
     path
         An MCAP file, of this program or another.
     out
-        Where to write; None: in its place, and the old one stays as ``path`` + `KEPT_SUFFIX`. A
+        Where to write; None: in its place, and the old one stays as `path` + `KEPT_SUFFIX`. A
         file that is whole is left alone then.
-    check
-        Called now and then; may raise to stop, which leaves everything as it was.
+    stop
+        A stop leaves everything as it was.
 
     Raises
     ------
@@ -118,22 +112,24 @@ def repair(path: Path, out: Path | None, check: Callable[[], None]) -> Repair:
         Not an MCAP file, nothing left of it, still being written, or no place to write.
     """
     with _held(path):
-        survey = _survey(path, check)
+        survey = _survey(path, stop)
         kept = path.with_name(path.name + KEPT_SUFFIX)
-        if survey.is_whole and out is None:
-            return _result(path, path, survey, None)
+        if survey.was_whole and out is None:
+            _read_back(path, survey)
+            return survey
         if not survey.channels:
             raise AppError(f"{path}: nothing in it can be kept, no channel is named before its end")
         if out is None and kept.exists():
             raise AppError(f"{kept}: exists, from an earlier repair; move or remove it first")
         if out is not None and out.exists():
             raise AppError(f"{out}: exists; choose another --out")
-        target = path if out is None else out
-        fresh = target.with_name(f".{target.name}.repairing")
+        survey.path = path if out is None else out
+        fresh = survey.path.with_name(f".{survey.path.name}.repairing")
         try:
-            _write(path, fresh, survey, check)
-            result = _result(fresh, target, survey, kept if out is None else None)
+            _write(path, fresh, survey, stop)
+            _read_back(fresh, survey)
             if out is None:
+                survey.kept = kept
                 _swap(fresh, path, kept)
             else:
                 fresh.replace(out)
@@ -144,7 +140,7 @@ def repair(path: Path, out: Path | None, check: Callable[[], None]) -> Repair:
             ) from None
         finally:
             fresh.unlink(missing_ok=True)
-    return result
+    return survey
 
 
 def _swap(fresh: Path, path: Path, kept: Path) -> None:
@@ -171,8 +167,8 @@ def _held(path: Path) -> Iterator[None]:
         raise AppError(f"{path}: a run is still writing it; wait for its end") from None
 
 
-def _survey(path: Path, check: Callable[[], None]) -> _Survey:
-    survey = _Survey()
+def _survey(path: Path, stop: StopFlag) -> Repair:
+    survey = Repair(path=path)
     with open_mcap(path) as opened:
         for found in mcap.RecordReader(*opened).read():
             if isinstance(found, mcap.Cut):
@@ -180,7 +176,7 @@ def _survey(path: Path, check: Callable[[], None]) -> _Survey:
             elif isinstance(found, mcap.Damage):
                 survey.damages.append(found)
             else:
-                check()
+                stop.check()
                 try:
                     _note(survey, path, found)
                 except mcap.DAMAGES as error:
@@ -188,7 +184,7 @@ def _survey(path: Path, check: Callable[[], None]) -> _Survey:
     return survey
 
 
-def _note(survey: _Survey, path: Path, record: mcap.Record) -> None:
+def _note(survey: Repair, path: Path, record: mcap.Record) -> None:
     body = record.body
     if record.code == mcap.HEADER:
         survey.profile, at = mcap.text_at(body, 0)
@@ -219,7 +215,7 @@ def _is_index_right(path: Path, footer: mcap.Record) -> bool:
     return ends_well and start != 0 and checksum in (0, zlib.crc32(index))
 
 
-def _write(path: Path, fresh: Path, survey: _Survey, check: Callable[[], None]) -> None:
+def _write(path: Path, fresh: Path, survey: Repair, stop: StopFlag) -> None:
     with fresh.open("wb") as stream, open_mcap(path) as opened:
         writer = mcap.McapWriter(stream, profile=survey.profile, library=survey.library)
         schemas = {0: 0} | {
@@ -230,7 +226,7 @@ def _write(path: Path, fresh: Path, survey: _Survey, check: Callable[[], None]) 
             for number, (schema, topic, encoding, table) in survey.channels.items()
         }
         for found in mcap.RecordReader(*opened).read():
-            check()
+            stop.check()
             if not isinstance(found, mcap.Record):
                 continue
             try:
@@ -264,19 +260,12 @@ def _copy(writer: mcap.McapWriter, channels: dict[int, int], record: mcap.Record
         writer.add_attachment(created_ns, log_ns, name, media_type, body[at + 8 : at + 8 + size])
 
 
-def _result(readable: Path, target: Path, survey: _Survey, kept: Path | None) -> Repair:
+def _read_back(readable: Path, survey: Repair) -> None:
     """Read the finished file's own index, as every other program will."""
     try:
         statistics = mcap.statistics_of(readable)
     except ValueError as error:
-        raise AppError(f"{target}: cannot be made whole: {error}") from None
-    return Repair(
-        path=target,
-        was_whole=survey.is_whole,
-        n_messages=statistics.message_count,
-        first_ns=statistics.message_start_time,
-        last_ns=statistics.message_end_time,
-        cut_at=survey.cut_at,
-        damages=tuple(survey.damages),
-        kept=kept,
-    )
+        raise AppError(f"{survey.path}: cannot be made whole: {error}") from None
+    survey.n_messages = statistics.message_count
+    survey.first_ns = statistics.message_start_time
+    survey.last_ns = statistics.message_end_time

@@ -18,8 +18,7 @@ from slam.app.odometry.track import TumSample, parse_tum_line
 from slam.app.records import LogLine, SessionObserver
 from slam.app.run.live_source import LiveLog
 from slam.app.session import messages as ros
-from slam.app.session.log import SessionLog
-from slam.app.session.mcap import CannotWriteError
+from slam.app.session.log import CannotWriteError, SessionLog
 from slam.app.session.reader import open_session
 
 

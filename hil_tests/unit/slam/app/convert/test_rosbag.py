@@ -21,13 +21,12 @@ from hil_tests.unit.slam.app.convert.authors_bag import (
 )
 from hil_tests.unit.slam.app.sessions import FRAME_NS, feed, scan, session_info, snapshot
 from slam.app.cli import main
-from slam.app.convert.rosbag import convert_bag, write_bag
+from slam.app.convert.rosbag import AUTHORS_RIG, convert_bag, write_bag
 from slam.app.odometry.track import OdometryTrack, format_tum_line
 from slam.app.records import Scan
 from slam.app.session.log import SessionLog
-from slam.app.session.messages import SlamSettings
 from slam.app.session.reader import RecordedSession, open_session
-from xethru_protocol.system import StopRequestedError
+from xethru_protocol.system import StopFlag, StopRequestedError
 
 KINDS = ("bag.bag", "bag")
 
@@ -220,11 +219,18 @@ def test_a_topic_of_another_type_is_named(
 def test_a_signal_stops_a_conversion_and_leaves_nothing(recorded: Path, tmp_path: Path) -> None:
     bag = authors_bag(tmp_path / "a.bag")
 
-    def stop() -> None:
-        raise StopRequestedError(signal.SIGINT)
-
+    stop = StopFlag()
+    stop.received = signal.SIGINT
     with pytest.raises(StopRequestedError):
-        convert_bag(bag, tmp_path / "s.mcap", stop, settings=SlamSettings())
+        convert_bag(
+            bag,
+            tmp_path / "s.mcap",
+            stop,
+            preset="robust",
+            rig=AUTHORS_RIG,
+            area_m=None,
+            truth_topic="/slam_out_pose",
+        )
     with pytest.raises(StopRequestedError):
         write_bag(open_session(recorded), tmp_path / "out", stop)
     assert not (tmp_path / "out").exists()

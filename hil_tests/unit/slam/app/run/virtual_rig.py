@@ -7,7 +7,7 @@ import heapq
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from queue import Empty
+from queue import Empty, SimpleQueue
 
 import numpy as np
 
@@ -23,13 +23,7 @@ from slam.app.odometry.track import TumSample
 from slam.app.records import RadarInfo
 from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, rig_of
 from slam.app.rig.sources import RadarLink, RigSource
-from slam.app.run.live_source import (
-    Event,
-    FrameArrived,
-    LiveLog,
-    OdometryEnded,
-    OdometryLine,
-)
+from slam.app.run.live_source import Event, LiveLog
 from xethru_protocol.driver.radar import X4M300
 
 NS_PER_S = 1_000_000_000
@@ -43,7 +37,7 @@ class Timed:
     event: Event
 
 
-class VirtualInbox:
+class VirtualInbox(SimpleQueue[Event]):
     """An inbox whose events come when virtual time reaches them; waiting takes none."""
 
     def __init__(self, events: list[Timed]) -> None:
@@ -59,7 +53,8 @@ class VirtualInbox:
             raise Empty
         return heapq.heappop(self._heap)[2]
 
-    def get(self, timeout: float) -> Event:
+    def get(self, block: bool = True, timeout: float | None = None) -> Event:
+        assert timeout is not None
         end_ns = self.now_ns + round(timeout * NS_PER_S)
         if not self._heap or self._heap[0][0] > end_ns:
             self.now_ns = end_ns
@@ -117,7 +112,7 @@ def radar_events(
                 # a line keeps the order of what it delays
                 last_ns = max(frame.arrival_ns + delay_ns(), last_ns + 1)
                 late = replace(frame, arrival_ns=last_ns)
-                events.append(Timed(last_ns, FrameArrived(radar=radar_index, frame=late)))
+                events.append(Timed(last_ns, ("frame", radar_index, late)))
     return rig.radars, events
 
 
@@ -126,8 +121,8 @@ def odometry_events(scene: Scene, seed: int, delay_ns: Callable[[], int]) -> lis
     events, last_ns = [], 0
     for text in scene_odometry(scene, seed):
         last_ns = max(stamp_ns(text) + delay_ns(), last_ns + 1)
-        events.append(Timed(last_ns, OdometryLine(text=text, arrival_ns=last_ns)))
-    return [*events, Timed(last_ns, OdometryEnded(trouble=""))]
+        events.append(Timed(last_ns, ("odometry line", text, last_ns)))
+    return [*events, Timed(last_ns, ("odometry end", ""))]
 
 
 def delays(seed: int, most_ms: float) -> Callable[[], int]:

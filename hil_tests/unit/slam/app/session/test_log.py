@@ -24,8 +24,7 @@ from hil_tests.unit.slam.app.sessions import (
     write_session,
 )
 from slam.app.session import messages as ros
-from slam.app.session.log import SessionLog
-from slam.app.session.mcap import CannotWriteError
+from slam.app.session.log import CannotWriteError, SessionLog
 from slam.app.session.messages import METADATA_NAME
 from slam.app.session.reader import open_session
 
@@ -261,8 +260,7 @@ FULL_DISK = """
 import resource, sys
 from pathlib import Path
 from hil_tests.unit.slam.app.sessions import feed, session_info
-from slam.app.session.mcap import CannotWriteError
-from slam.app.session.log import SessionLog
+from slam.app.session.log import CannotWriteError, SessionLog
 from slam.app.session.reader import open_session
 
 resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))  # as a disk with that much room

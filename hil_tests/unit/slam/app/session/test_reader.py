@@ -26,7 +26,7 @@ from slam.app.session.messages import (
     snapshot_of,
     state_row,
 )
-from slam.app.session.reader import TruthPose, open_session
+from slam.app.session.reader import open_session
 from slam.config import SlamConfig, load_preset
 from slam.frames import RadarFrame
 
@@ -62,14 +62,11 @@ def test_frames_come_back_in_true_metres_with_their_own_stamps(session_file: Pat
         assert frame.bin_length_m == pytest.approx(0.0064 * LIGHT_OVER_MODULE, rel=1e-12)
 
 
-def test_odometry_truth_and_log_come_back(session_file: Path) -> None:
+def test_odometry_and_log_come_back(session_file: Path) -> None:
     records = list(open_session(session_file).records())
     samples = [r for r in records if isinstance(r, TumSample)]
     assert tuple(samples) == odometry(80).samples[: len(samples)]
     assert samples[-1].t_ns >= (N_SCANS - 1) * FRAME_NS
-    truths = [r for r in records if isinstance(r, TruthPose)]
-    assert len(truths) == N_SCANS
-    np.testing.assert_allclose(truths[7].pose, snapshot(7).truth, atol=1e-12)
     lines = [r for r in records if isinstance(r, LogLine)]
     assert [(line.radar, line.warning) for line in lines] == [("radar0", False), ("radar1", True)]
 
@@ -131,9 +128,7 @@ def test_what_is_unknown_stays_unknown(tmp_path: Path) -> None:
     assert (session.info.seed, session.info.simulated) == (None, False)
     assert session.info.time_base == "arrival"
     assert [truth for _, truth in session.scans()] == [None]
-    records = list(session.records())
-    assert not [record for record in records if isinstance(record, TruthPose)]
-    (state,) = [record for record in records if isinstance(record, Snapshot)]
+    (state,) = [record for record in session.records() if isinstance(record, Snapshot)]
     assert np.isnan(state.truth).all()
 
 

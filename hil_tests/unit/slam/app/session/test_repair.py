@@ -10,7 +10,7 @@ from hil_tests.unit.slam.app.sessions import write_session
 from slam.app.cli import main
 from slam.app.session.reader import open_session
 from slam.app.session.repair import repair
-from xethru_protocol.system import StopRequestedError, locked
+from xethru_protocol.system import StopFlag, StopRequestedError, locked
 
 
 @pytest.fixture
@@ -64,12 +64,13 @@ def test_a_folder_in_which_a_run_is_recording_is_left_alone(
 def test_a_signal_leaves_everything_as_it_was(cut: Path, tmp_path: Path) -> None:
     before = cut.read_bytes()
 
-    def check() -> None:
-        if (tmp_path / f".{cut.name}.repairing").exists():  # while the new file is written
-            raise StopRequestedError(signal.SIGTERM)
+    class StopWhileWriting(StopFlag):
+        def check(self) -> None:
+            if (tmp_path / f".{cut.name}.repairing").exists():
+                raise StopRequestedError(signal.SIGTERM)
 
     with pytest.raises(StopRequestedError):
-        repair(cut, None, check)
+        repair(cut, None, StopWhileWriting())
     assert list(tmp_path.iterdir()) == [cut]
     assert cut.read_bytes() == before
 
