@@ -45,7 +45,7 @@ end; these are what others report of split recordings in the same format.
 """
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sized
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta, tzinfo
 from typing import Any, ClassVar, NamedTuple
@@ -77,26 +77,14 @@ class _Kind:
 
 @dataclass(frozen=True, slots=True)
 class BinaryKind(_Kind):
-    """One kind of binary data file.
-
-    Attributes
-    ----------
-    header
-        The message's fields before its elements, as a packed numpy type.
-    count
-        Name of the header field that counts the elements.
-    columns
-        Values per element: 2 where all of one column come before all of the other.
-    values
-        numpy type of one value.
-    """
+    """One kind of binary data file."""
 
     suffix: ClassVar[str] = ".dat"
     titles: ClassVar[bytes] = b""
-    header: np.dtype[np.void]
-    count: str
-    columns: int
-    values: str
+    header: np.dtype[np.void]  # the message's fields before its elements, packed
+    count: str  # header field that counts the elements
+    columns: int  # values per element: 2 where all of one column come before all of the other
+    values: str  # numpy type of one value
 
     @property
     def prefix(self) -> bytes:
@@ -159,89 +147,110 @@ def float_text(value: float) -> str:
     return text
 
 
+_FLOAT = struct.Struct("<f")
+
+
 def _float32(text: str) -> float:
-    (value,) = struct.unpack("<f", struct.pack("<f", float(text)))
-    return float(value)
+    value: float = _FLOAT.unpack(_FLOAT.pack(float(text)))[0]
+    return value
+
+
+def _list_text(values: Iterable[float]) -> str:
+    return "[" + ",".join(float_text(float(value)) for value in values) + "]"
+
+
+def _list(text: str) -> tuple[float, ...]:
+    if not (text.startswith("[") and text.endswith("]")):
+        raise ValueError(f"a list in square brackets was expected, not {text!r}")
+    numbers = [float(item) for item in text[1:-1].split(",") if item]
+    layout = f"<{len(numbers)}f"
+    return struct.unpack(layout, struct.pack(layout, *numbers))
 
 
 _ESCAPES = str.maketrans({"\\": "\\\\", "\n": "\\n", "\r": "\\r", ";": "\\x3b"})
 
 
-def _cell(kind: fields.Kind, value: Any) -> str:  # noqa: ANN401 - what the message's field holds
-    match kind:
-        case fields.Number(code="f"):
-            return float_text(value)
-        case fields.Floats():
-            return "[" + ",".join(float_text(float(one)) for one in value) + "]"
-        case fields.Elements():
-            return str(value).translate(_ESCAPES)
-    return str(value)
+def _escaped(text: str) -> str:
+    return text.translate(_ESCAPES)
 
 
-def _value(kind: fields.Kind, cell: str) -> Any:  # noqa: ANN401 - what the message's field holds
-    match kind:
-        case fields.Number(code="f"):
-            return _float32(cell)
-        case fields.Floats():
-            if not (cell.startswith("[") and cell.endswith("]")):
-                raise ValueError(f"a list in square brackets was expected, not {cell!r}")
-            return tuple(_float32(one) for one in cell[1:-1].split(",") if one)
-        case fields.Elements():
-            return cell.encode("latin-1").decode("unicode_escape")
-    return int(cell)
+def _unescaped(text: str) -> str:
+    return text.encode("latin-1").decode("unicode_escape")
+
+
+def _length_text(values: Sized) -> str:
+    return str(len(values))
+
+
+class _Column(NamedTuple):
+    """A column of a text file: its title, the message's field, the field as text and back."""
+
+    title: str
+    field: str
+    text: Callable[[Any], str]
+    value: Callable[[str], Any]
+    is_count: bool = False  # of the list ``field``
 
 
 @dataclass(frozen=True, slots=True)
 class TextKind(_Kind):
-    """One kind of text file; ``columns`` are titles with the message's fields, in their order."""
+    """One kind of text file."""
 
     suffix: ClassVar[str] = ".csv"
-    columns: dict[str, str]
+    columns: tuple[_Column, ...]
 
     @property
     def titles(self) -> bytes:
         """First line of a file, with its end of line."""
-        return (";".join(("TimeStamp", *self.columns)) + "\n").encode()
+        return (";".join(("TimeStamp", *(column.title for column in self.columns))) + "\n").encode()
 
     def record(self, message: Response, time_ms: int, zone: tzinfo | None) -> bytes:
         """Return the line of a message and its time [ms since 1970], with its end of line."""
-        kinds = dict(ROWS[self.message].kinds)
         time = (_UNIX + timedelta(milliseconds=time_ms)).astimezone(zone)
-        cells = [time.isoformat(timespec="milliseconds")]
-        for name in self.columns.values():
-            kind = kinds[name]
-            if isinstance(kind, fields.Count):
-                cells.append(str(len(getattr(message, kind.of[0]))))
-            else:
-                cells.append(_cell(kind, getattr(message, name)))
-        return (";".join(cells) + "\n").encode("latin-1")
+        cells = (column.text(getattr(message, column.field)) for column in self.columns)
+        return (";".join((time.isoformat(timespec="milliseconds"), *cells)) + "\n").encode(
+            "latin-1"
+        )
 
     def parse(self, line: str) -> tuple[Response, int]:
         """Return the message of a line and its time [ns since 1970].
 
-        Raises
-        ------
-        ValueError, OverflowError, LocalProtocolError
-            If the line is not of this kind.
+        ValueError, OverflowError or LocalProtocolError if the line is not of this kind.
         """
-        kinds = dict(ROWS[self.message].kinds)
         stamp, *cells = line.rstrip("\r\n").split(";")
         if len(cells) != len(self.columns):
             n_columns = len(self.columns) + 1
             raise ValueError(f"{n_columns} columns were expected, not {len(cells) + 1}")
-        values = {
-            name: _value(kinds[name], cell)
-            for name, cell in zip(self.columns.values(), cells, strict=True)
-        }
-        for name in self.columns.values():
-            kind = kinds[name]
-            if isinstance(kind, fields.Count):
-                counted, count = kind.of[0], values.pop(name)
-                if len(values[counted]) != count:
-                    raise ValueError(f"{counted} has {len(values[counted])} values, not {count}")
+        values: dict[str, Any] = {}
+        counts: dict[str, int] = {}
+        for (_, name, _, value_of, is_count), cell in zip(self.columns, cells, strict=True):
+            (counts if is_count else values)[name] = value_of(cell)
+        for name, count in counts.items():
+            if len(values[name]) != count:
+                raise ValueError(f"{name} has {len(values[name])} values, not {count}")
         message = self.message(**values)
         encode(message)  # raises if a value does not fit its field on the wire
         return message, _time_ns(stamp)
+
+
+def _text(name: str, bit: int, message: type[Response], titles: dict[str, str]) -> TextKind:
+    """Return the kind whose columns have these titles and hold these fields, in their order."""
+    kinds = dict(ROWS[message].kinds)
+    columns = []
+    for title, field_name in titles.items():
+        match kinds[field_name]:
+            case fields.Number(code="f"):
+                column = _Column(title, field_name, float_text, _float32)
+            case fields.Floats():
+                column = _Column(title, field_name, _list_text, _list)
+            case fields.Elements():
+                column = _Column(title, field_name, _escaped, _unescaped)
+            case fields.Count(of=(counted, *_)):
+                column = _Column(title, counted, _length_text, int, is_count=True)
+            case _:
+                column = _Column(title, field_name, str, int)
+        columns.append(column)
+    return TextKind(name, 1 << bit, message, tuple(columns))
 
 
 _UNIX = datetime.fromisoformat("1970-01-01T00:00:00+00:00")
@@ -266,9 +275,9 @@ _DETECTION = {
 }
 
 TEXT_KINDS = (
-    TextKind(  # bit, name and columns [OBS]
+    _text(  # bit, name and columns [OBS]
         "presence_single",
-        1 << 12,
+        12,
         messages.PresenceSingle,
         {
             "Counter": "counter",
@@ -278,9 +287,9 @@ TEXT_KINDS = (
             "SignalQuality": "signal_quality",
         },
     ),
-    TextKind(  # bit [OBS]; name, columns and brackets as others report them [INF]
+    _text(  # bit [OBS]; name, columns and brackets as others report them [INF]
         "presence_movinglist",
-        1 << 13,
+        13,
         messages.PresenceMovingList,
         {
             "Counter": "counter",
@@ -291,9 +300,9 @@ TEXT_KINDS = (
         | _MOVEMENT
         | _DETECTION,
     ),
-    TextKind(  # bit [HDR]; name and columns as others report them, the last two [INF]
+    _text(  # bit [HDR]; name and columns as others report them, the last two [INF]
         "sleep",
-        1 << 2,
+        2,
         messages.SleepStatus,
         _FRAME_STATE
         | {
@@ -303,9 +312,9 @@ TEXT_KINDS = (
             "MovementFast": "movement_fast",
         },
     ),
-    TextKind(  # bit [HDR]; name as others report it, columns [INF]
+    _text(  # bit [HDR]; name as others report it, columns [INF]
         "respiration",
-        1 << 3,
+        3,
         messages.RespStatus,
         _FRAME_STATE
         | {
@@ -315,27 +324,27 @@ TEXT_KINDS = (
         },
     ),
     # bits [HDR], names and columns [INF] from here on
-    TextKind(
+    _text(
         "string",
-        1 << 5,
+        5,
         messages.DataString,
         {"ContentId": "content_id", "Info": "info", "Text": "text"},
     ),
-    TextKind(
+    _text(
         "respiration_detectionlist",
-        1 << 14,
+        14,
         messages.RespirationDetectionList,
         {"Counter": "counter", "DetectionCount": "detection_count"} | _DETECTION,
     ),
-    TextKind(
+    _text(
         "respiration_movinglist",
-        1 << 15,
+        15,
         messages.RespirationMovingList,
         {"Counter": "counter", "MovementIntervalCount": "interval_count"} | _MOVEMENT,
     ),
-    TextKind(
+    _text(
         "vitalsigns",
-        1 << 16,
+        16,
         messages.VitalSigns,
         {
             "Counter": "counter",
@@ -352,15 +361,15 @@ TEXT_KINDS = (
             "NormalizedMovementEnd": "normalized_movement_end_m",
         },
     ),
-    TextKind(
+    _text(
         "sleepstage",
-        1 << 17,
+        17,
         messages.SleepStage,
         {"Counter": "counter", "SleepStage": "stage"},
     ),
-    TextKind(
+    _text(
         "respiration_normalizedmovementlist",
-        1 << 18,
+        18,
         messages.RespirationNormalizedMovementList,
         {
             "Counter": "counter",
@@ -473,13 +482,7 @@ class Meta:
 
 
 def parse_meta(data: bytes) -> Meta:
-    """Read a meta file, as much of it as is there.
-
-    Raises
-    ------
-    RecordingError
-        If the head is damaged or not of this format.
-    """
+    """Read a meta file, as much of it as is there; RecordingError if its head is damaged."""
     if len(data) < _HEAD.size:
         raise RecordingError(f"it is cut: {len(data)} of {_HEAD.size} bytes of its head are there")
     (magic, version, start_ms, _, duration_ms, size, index_end, data_types, _, largest, profile, _,

@@ -6,10 +6,10 @@ up to the last record and the index up to the last entry. Only the totals in the
 file and its list of files are missing then; the reader does without them.
 """
 
+from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from xethru_protocol.recordings.records import MS_NS, GrowingFile, RecordingError, writing
@@ -128,45 +128,25 @@ class RecordingWriter:
                 )
         if parameter_file is not None:
             content = parameter_file.encode() if isinstance(parameter_file, str) else parameter_file
-            file = GrowingFile(self.directory / PARAMETER_FILE_NAME)
-            try:
+            with closing(GrowingFile(self.directory / PARAMETER_FILE_NAME)) as file:
                 file.append(content)
-            finally:
-                file.close()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        exception: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
         try:
             self.close()
         except RecordingError:
-            if value is None:  # the first error is raised
+            if error is None:  # the first error is raised
                 raise
 
     def write(self, message: Response, t_ns: int) -> bool:
-        """Append a message.
+        """Append a message of time ``t_ns`` [ns since 1970] and return whether it was stored.
 
-        Parameters
-        ----------
-        message
-            Any message from a module.
-        t_ns
-            Its time [ns since 1970]; stored with 1 ms, never before the first message's.
-
-        Returns
-        -------
-        Whether it was stored: the format has no place for answers, system messages and the like.
-
-        Raises
-        ------
-        RecordingError
-            If the disk is full or the directory went away. What was written before stays.
+        The format has no place for answers, system messages and the like. Times are stored with
+        1 ms, never before the first message's. RecordingError if the disk is full or the directory
+        went away; what was written before stays.
         """
         if self._closed:
             raise RecordingError(f"{self.directory}: the recording is closed")
@@ -200,11 +180,8 @@ class RecordingWriter:
     def close(self, *, stopped_ns: int | None = None, closed_ns: int | None = None) -> None:
         """Write the totals and close all files; calling it again does nothing.
 
-        Parameters
-        ----------
-        stopped_ns, closed_ns
-            When the data files and when the recording ended [ns since 1970]; None: with the
-            last message, and with ``stopped_ns``.
+        ``stopped_ns`` and ``closed_ns`` are when the data files and when the recording ended [ns
+        since 1970]; None: with the last message, and with ``stopped_ns``.
         """
         if self._closed:
             return
