@@ -13,20 +13,14 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any, Literal, Self
 
 MOST_BYTES = 1 << 20
 
 
 def read_bounded(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
-    """Return all of a file, which may be a pipe.
-
-    Raises
-    ------
-    OSError
-        It cannot be read, or has more bytes than that.
-    """
+    """Return all of a file, which may be a pipe; OSError if it has more bytes than that."""
     with path.open("rb") as file:
         content = file.read(most_bytes + 1)
     if len(content) > most_bytes:
@@ -40,16 +34,9 @@ class PathInUseError(Exception):
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold an existing file or folder while the block runs.
+    """Hold an existing file or folder while the block runs; OSError if it cannot be opened.
 
     The lock is advisory, and has no effect on a file system without locks.
-
-    Raises
-    ------
-    PathInUseError
-        Another process holds it.
-    OSError
-        It cannot be opened.
     """
     descriptor = os.open(path, os.O_RDONLY)
     try:
@@ -100,11 +87,6 @@ class StopFlag:
         The last signal that arrived; None: none did.
     requested
         Whether the end was requested, by a signal or by `request`.
-
-    Examples
-    --------
-    >>> with StopFlag() as stop:
-    ...     stop.check()  # nothing arrived: returns
     """
 
     def __init__(self, second: Literal["default", "previous", "same"] = "default") -> None:
@@ -122,12 +104,7 @@ class StopFlag:
                 self._previous[which] = signal.signal(which, self._on_signal)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         for which, handler in self._previous.items():
             signal.signal(which, handler)
 

@@ -63,17 +63,9 @@ class SerialTransport:
 
     Takes an exclusive lock, so that two programs do not each get half of the bytes.
 
-    Parameters
-    ----------
-    path
-        For example ``/dev/ttyACM0`` or a link made by ``xethru-emulator``.
-    baudrate
-        Rate of a UART; without meaning on USB and ptys.
-
-    Raises
-    ------
-    PortUnavailable
-        If the port does not exist, is no serial port, is in use, or may not be opened.
+    ``path`` is, for example, ``/dev/ttyACM0`` or a link made by ``xethru-emulator``; ``baudrate``
+    matters on a UART only. Raises PortUnavailable if the port does not exist, is no serial port,
+    is in use, or may not be opened.
     """
 
     def __init__(self, path: str, baudrate: int = _BAUD) -> None:

@@ -42,20 +42,9 @@ def message_name(message: Response) -> str:
 class RecordingSummary:
     """What a recording holds.
 
-    Attributes
-    ----------
-    path, format
-        Where, and ``"vendor"``, ``"wire"``, ``"mcap"`` or ``"npz"``.
-    start_ns, duration_ns
-        Time of the first message [ns since 1970] and from there to the last; None without times.
-    messages
-        How many of each kind, by name.
-    size_bytes
-        Of all its files.
-    parameter_file
-        Name of the stored parameter file; None if there is none.
-    faults
-        What could not be read.
+    ``start_ns`` is the time of the first message [ns since 1970], ``duration_ns`` lasts from there
+    to the last; both are None without times. ``messages`` counts each kind by name, ``size_bytes``
+    is of all files, ``parameter_file`` the name of the stored one.
     """
 
     path: Path
@@ -78,13 +67,7 @@ _MAGICS: dict[bytes, RecordingFormat] = {
 
 
 def recording_format(path: Path | str) -> RecordingFormat:
-    """Return the format of a recording by the bytes it begins with.
-
-    Raises
-    ------
-    RecordingError
-        If there is nothing, or nothing that this can read.
-    """
+    """Return the format of a recording; RecordingError if there is nothing that this can read."""
     path = Path(path)
     with reading(path):
         if not path.exists():
@@ -107,7 +90,9 @@ def recording_format(path: Path | str) -> RecordingFormat:
 def read_recording(
     path: Path | str, on_fault: FaultHandler | None = None, *, radar: str | None = None
 ) -> TimedMessages:
-    """Messages of a recording with their times, whatever its format.
+    """Yield the messages of a recording with their times [ns since 1970], None where unknown.
+
+    Times of vendor directories have a resolution of 1 ms.
 
     Parameters
     ----------
@@ -120,15 +105,8 @@ def read_recording(
     radar
         Which radar's, by its name in `recording_radars`; needed where there are several.
 
-    Yields
-    ------
-    The message, and its time [ns since 1970]; None where the recording has none. In vendor
-    directories the resolution is 1 ms.
-
-    Raises
-    ------
-    RecordingError
-        If there is nothing to read, or messages are lost and ``on_fault`` is None.
+    Raises RecordingError if there is nothing to read, or messages are lost and ``on_fault`` is
+    None.
     """
     path = Path(path)
     found = recording_format(path)
@@ -148,13 +126,7 @@ def read_recording(
 
 
 def recording_radars(path: Path | str) -> tuple[RadarFacts, ...]:
-    """Return the radars of a recording; only a session (MCAP) has several, and names them.
-
-    Raises
-    ------
-    RecordingError
-        If there is nothing that this can read.
-    """
+    """Return the radars of a recording; only a session (MCAP) has several, and names them."""
     path = Path(path)
     if recording_format(path) != "mcap":
         return (RadarFacts(),)
@@ -180,10 +152,7 @@ def recording_facts(path: Path | str) -> RecordingFacts:
 
 
 def describe_recording(path: Path | str, *, radar: str | None = None) -> RecordingSummary:
-    """Read a whole recording and summarise it; RecordingError if it holds nothing.
-
-    Of a session of several radars, only the named one, as in `read_recording`.
-    """
+    """Read a whole recording, or the named radar's part, and summarise it."""
     path = Path(path)
     faults: list[RecordingFault] = []
     counts: Counter[str] = Counter()
@@ -213,22 +182,9 @@ def describe_recording(path: Path | str, *, radar: str | None = None) -> Recordi
     )
 
 
-_PROGRESS_EVERY = 1000
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Conversion:
-    """What a conversion did.
-
-    Attributes
-    ----------
-    messages
-        How many messages were written.
-    skipped
-        By name, how many the target's format has no place for.
-    faults
-        What could not be read from the source.
-    """
+    """What a conversion did: messages written, and by name those the format has no place for."""
 
     messages: int
     skipped: dict[str, int]
@@ -256,11 +212,8 @@ def convert(
     radar
         Which radar of a session of several, as in `read_recording`.
 
-    Raises
-    ------
-    RecordingError
-        If the source cannot be read, the target exists or cannot be written, or its suffix
-        names no format.
+    Raises RecordingError if the source cannot be read, the target exists or cannot be written, or
+    its suffix names no format.
     """
     source, target = Path(source), Path(target)
     write = _writer(target)
@@ -273,7 +226,7 @@ def convert(
         for timed in read_recording(source, faults.append, radar=radar):
             yield timed
             n_messages += 1
-            if on_progress is not None and n_messages % _PROGRESS_EVERY == 0:
+            if on_progress is not None and n_messages % 1000 == 0:
                 on_progress(n_messages)
 
     skipped = write(target, counted(), facts) or {}
@@ -291,18 +244,21 @@ def _writer(target: Path) -> _Writer:
     """Return what writes ``target``; it returns by name how many messages it left out, if any."""
     if target.is_dir() or not target.suffix:
         return _write_vendor
-    writers: dict[str, _Writer] = {
-        ".mcap": _write_mcap,
-        npz.SUFFIX: npz.write_npz,
-        wire_capture.SUFFIX: _write_wire,
-    }
-    writer = writers.get(target.suffix)
-    if writer is None:
-        known = ", ".join(writers)
-        raise RecordingError(
-            f"{target}: no format has the suffix {target.suffix}; known are {known},"
-            " and none for a directory of ModuleConnector"
-        )
+    writer: _Writer
+    match target.suffix:
+        case ".mcap":
+            from xethru_protocol.recordings.mcap import write_mcap
+
+            writer = write_mcap
+        case npz.SUFFIX:
+            writer = npz.write_npz
+        case wire_capture.SUFFIX:
+            writer = _write_wire
+        case unknown:
+            raise RecordingError(
+                f"{target}: no format has the suffix {unknown}; known are .mcap, {npz.SUFFIX},"
+                f" {wire_capture.SUFFIX}, and none for a directory of ModuleConnector"
+            )
     if target.exists():
         raise RecordingError(f"{target} exists already")
     return writer
@@ -324,12 +280,6 @@ def _write_vendor(target: Path, messages: TimedMessages, facts: RecordingFacts) 
                 skipped[message_name(message)] += 1
         writer.close(stopped_ns=facts.stopped_ns, closed_ns=facts.closed_ns)
     return dict(skipped)
-
-
-def _write_mcap(target: Path, messages: TimedMessages, facts: RecordingFacts) -> None:
-    from xethru_protocol.recordings.mcap import write_mcap
-
-    write_mcap(target, messages, facts)
 
 
 def _write_wire(target: Path, messages: TimedMessages, facts: RecordingFacts) -> None:

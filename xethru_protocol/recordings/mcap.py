@@ -28,7 +28,7 @@ import os
 import re
 import struct
 import zlib
-from collections.abc import Generator, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
@@ -125,13 +125,7 @@ def _counted(text: str) -> bytes:
 
 
 def unpack_array(message_type: str, data: bytes) -> npt.NDArray[Any]:
-    """Return the values of an array message, shape (n,), read-only.
-
-    Raises
-    ------
-    ValueError, struct.error
-        If the bytes are not such a message.
-    """
+    """Return the values, shape (n,), read-only; ValueError or struct.error if it is no array."""
     body, dtype = _body(data), _DTYPE[message_type]
     (dimensions,) = _U32.unpack_from(body, 0)
     position = 4
@@ -149,13 +143,7 @@ def unpack_array(message_type: str, data: bytes) -> npt.NDArray[Any]:
 
 
 def unpack_string(data: bytes) -> str:
-    """Return the text of a String message.
-
-    Raises
-    ------
-    ValueError, struct.error
-        If the bytes are not such a message.
-    """
+    """Return the text; ValueError or struct.error if it is no String message."""
     body = _body(data)
     (length,) = _U32.unpack_from(body)
     return body[4 : 4 + length].rstrip(b"\0").decode()
@@ -180,7 +168,8 @@ MESSAGE_HEAD = struct.Struct("<HIQQ")
 # A recorder writes chunks of 256 KiB; beyond this a length is damage, not data.
 _MOST_BYTES = 1 << 28
 # How a chunk names its compression, at a fixed place of its head.
-_NAMES = (b"\x04\0\0\0zstd", b"\x03\0\0\0lz4")
+_NAMES = re.compile(rb"\x04\0\0\0zstd|\x03\0\0\0lz4")
+_LONGEST_NAME_BYTES = 8
 _NAME_AT = _HEAD.size + _CHUNK.size
 _PIECE_BYTES = 1 << 20
 _FOOTER_BYTES, _DATA_END_BYTES = 20, 4
@@ -218,14 +207,9 @@ Found: TypeAlias = Record | Cut | Damage
 
 
 class RecordReader:
-    """Walks through a file once.
+    """Walks once through a file of ``size`` bytes that begins with `MAGIC`.
 
-    Parameters
-    ----------
-    stream
-        The file; its first bytes are known to be `MAGIC`.
-    size
-        Of the file in bytes; what a recorder adds meanwhile is not looked at.
+    What a recorder adds meanwhile is not looked at.
     """
 
     def __init__(self, stream: BinaryIO, size: int) -> None:
@@ -246,10 +230,19 @@ class RecordReader:
                 yield Cut(at)
                 return
             code, length = _HEAD.unpack(head)
+            is_record = _is_code(code) and min(length, self._size) <= _MOST_BYTES
             end = at + _HEAD.size + length
-            if not self._is_record(code, length) or end > self._size:
+            if not is_record or end > self._size:
                 # A length that is damaged looks like a cut, but then a sound chunk follows.
-                at = yield from self._last_or_damaged(at, code, length)
+                following = self._next_chunk(at + 1)
+                if following is None and is_record:
+                    if code == CHUNK:
+                        self._stream.seek(at + _HEAD.size)
+                        yield from _records_in(at, _content_before_cut(self._read()))
+                    yield Cut(at)
+                    return
+                yield self._damage(at, following, "no record stands there")
+                at = following
                 continue
             body = self._read(length)
             try:
@@ -259,11 +252,15 @@ class RecordReader:
                     self._check(at, code, body)
                     yield Record(at, code, body)
             except DAMAGES as error:
-                sound = self._is_head(end)
-                at = yield from self._damaged(at, str(error), end if sound else None)
+                following = end if self._is_head(end) else self._next_chunk(at + 1)
+                yield self._damage(at, following, str(error))
+                at = following
                 continue
             self._is_data_over |= code == DATA_END
             at = None if code == FOOTER else end
+
+    def _damage(self, at: int, until: int | None, reason: str) -> Damage:
+        return Damage(at, self._size if until is None else until, reason)
 
     def _check(self, at: int, code: int, body: bytes) -> None:
         """Raise ValueError where a record does not fit its opcode.
@@ -291,29 +288,6 @@ class RecordReader:
         if not fits:
             raise ValueError("the record there is not what it says")
 
-    def _last_or_damaged(
-        self, at: int, code: int, length: int
-    ) -> Generator[Found, None, int | None]:
-        following = self._next_chunk(at + 1)
-        if following is None and self._is_record(code, length):
-            if code == CHUNK:
-                self._stream.seek(at + _HEAD.size)
-                yield from _records_in(at, _content_before_cut(self._read()))
-            yield Cut(at)
-            return None
-        yield Damage(at, self._size if following is None else following, "no record stands there")
-        return following
-
-    def _damaged(
-        self, at: int, reason: str, resume: int | None
-    ) -> Generator[Found, None, int | None]:
-        resume = self._next_chunk(at + 1) if resume is None else resume
-        yield Damage(at, self._size if resume is None else resume, reason)
-        return resume
-
-    def _is_record(self, code: int, length: int) -> bool:
-        return _is_code(code) and min(length, self._size) <= _MOST_BYTES
-
     def _is_head(self, at: int) -> bool:
         """Whether a record of a known kind may begin at a place, or the file ends there."""
         self._stream.seek(at)
@@ -333,13 +307,13 @@ class RecordReader:
 
     def _next_chunk(self, at: int) -> int | None:
         """Return where the next chunk begins whose checksum is right."""
-        overlap = max(map(len, _NAMES)) - 1
+        overlap = _LONGEST_NAME_BYTES - 1
         place = at + _NAME_AT  # of a name, at the earliest
         while place < self._size:
             self._stream.seek(place)
             piece = self._read(_PIECE_BYTES + overlap)
-            for found in _all_in(piece):
-                chunk_at = place + found - _NAME_AT
+            for found in _NAMES.finditer(piece):
+                chunk_at = place + found.start() - _NAME_AT
                 if self._is_sound(chunk_at):
                     return chunk_at
             place += _PIECE_BYTES
@@ -385,16 +359,6 @@ def table_at(body: bytes, at: int) -> tuple[dict[str, str], int]:
         key, at = text_at(body, at)
         table[key], at = text_at(body, at)
     return table, end
-
-
-def _all_in(piece: bytes) -> list[int]:
-    places = []
-    for name in _NAMES:
-        found = piece.find(name)
-        while found >= 0:
-            places.append(found)
-            found = piece.find(name, found + 1)
-    return sorted(places)
 
 
 def _content(body: bytes) -> bytes:
@@ -534,17 +498,7 @@ CHUNK_BYTES = 256 * 1024
 
 
 class McapWriter(Writer):
-    """Writes a file of chunks compressed by zstd, by default of messages of ROS 2.
-
-    Parameters
-    ----------
-    stream
-        The new file; stays open.
-    chunk_bytes
-        Size at which a chunk ends.
-    profile, library
-        For the file's header.
-    """
+    """Writes chunks compressed by zstd, by default of messages of ROS 2; the file stays open."""
 
     def __init__(
         self,
@@ -581,10 +535,7 @@ class McapWriter(Writer):
 def statistics_of(path: Path) -> Statistics:
     """Return the statistics in the index of a finished file, read by mcap's own reader.
 
-    Raises
-    ------
-    ValueError
-        The file cannot be read, or has no index.
+    ValueError if the file cannot be read, or has no index.
     """
     try:
         with path.open("rb") as stream:
@@ -598,6 +549,7 @@ def statistics_of(path: Path) -> Statistics:
 
 _FACTS = "xethru-hil recording"
 _LENGTH_UNIT = "module metres, c = 3.0e8 m/s"
+_RADAR = "module"
 _CONTENT = frozenset({"frame", "payload"})
 """Topics of messages."""
 _UNTIMED = {"xethru-hil": "time unknown"}
@@ -606,10 +558,8 @@ _UNTIMED = {"xethru-hil": "time unknown"}
 class _RecordingWriter:
     """The channels of one radar in a file being written."""
 
-    def __init__(self, stream: BinaryIO, radar: str, facts: RecordingFacts) -> None:
-        self._radar = radar
-        self._writer = McapWriter(stream)
-        self._writer.add_metadata(_FACTS, {"facts": json.dumps(facts.as_json())})
+    def __init__(self, writer: McapWriter) -> None:
+        self._writer = writer
         self._channels: dict[tuple[str, bool], int] = {}
         self._others = 0
         self._has_info = False
@@ -634,9 +584,6 @@ class _RecordingWriter:
             self._add("message", STRING, pack_string(text), t_ns, self._others)
         self._others = (self._others + 1) & 0xFFFFFFFF
 
-    def finish(self) -> None:
-        self._writer.finish()
-
     def _info(self, frame: DataFloat | BasebandIq | BasebandAp, t_ns: int | None) -> None:
         """Write once what is known of the frames; null is unknown."""
         if self._has_info:
@@ -644,7 +591,7 @@ class _RecordingWriter:
         self._has_info = True
         geometry = self._geometry(frame)
         info: dict[str, object] = {
-            "name": self._radar,
+            "name": _RADAR,
             "serial": "",
             "port": "",
             "x_m": None,
@@ -690,51 +637,42 @@ class _RecordingWriter:
                 self._settings[X4Setting.FRAMEBINCOUNT.name] = n_bins
 
     def _add(self, topic: str, schema: str, data: bytes, t_ns: int | None, sequence: int) -> None:
-        channel = self._channel(topic, schema, timed=t_ns is not None)
+        key = topic, t_ns is not None
+        if key not in self._channels:
+            self._channels[key] = self._writer.add_channel(
+                f"/radar/{_RADAR}/{topic}",
+                schema,
+                SCHEMAS[schema].encode(),
+                _UNTIMED if t_ns is None else {},
+            )
         stamp_ns = t_ns or 0
         if stamp_ns < 0:
             raise RecordingError("MCAP has no place for times before 1970")
         self._writer.add_message(
-            channel_id=channel,
+            channel_id=self._channels[key],
             log_time=stamp_ns,
             publish_time=stamp_ns,
             sequence=sequence,
             data=data,
         )
 
-    def _channel(self, topic: str, schema: str, *, timed: bool) -> int:
-        key = topic, timed
-        if key not in self._channels:
-            self._channels[key] = self._writer.add_channel(
-                f"/radar/{self._radar}/{topic}",
-                schema,
-                SCHEMAS[schema].encode(),
-                {} if timed else _UNTIMED,
-            )
-        return self._channels[key]
 
+def write_mcap(path: Path, messages: Iterable[Timed], facts: RecordingFacts) -> None:
+    """Write messages to a new file; RecordingError if it exists or cannot be written.
 
-def write_mcap(
-    path: Path, messages: Iterable[Timed], facts: RecordingFacts, radar: str = "module"
-) -> None:
-    """Write messages to a new file; ``radar`` is the name in its topics.
-
-    Raises
-    ------
-    RecordingError
-        If the file exists or cannot be written. What was written before stays.
+    What was written before an error stays.
     """
     with writing(path), path.open("xb") as stream:
-        writer = _RecordingWriter(stream, radar, facts)
+        writer = McapWriter(stream)
+        writer.add_metadata(_FACTS, {"facts": json.dumps(facts.as_json())})
+        recording = _RecordingWriter(writer)
         for message, t_ns in messages:
-            writer.write(message, t_ns)
+            recording.write(message, t_ns)
         writer.finish()
 
 
 def read_mcap(path: Path, on_fault: FaultHandler | None, radar: str | None = None) -> TimedMessages:
-    """Messages of an MCAP file of this program: a recording, or a session of one radar.
-
-    Of a session of several, those of the named ``radar``.
+    """Messages of a recording or of a session; of several radars, those of the named one.
 
     Raises
     ------

@@ -31,7 +31,7 @@ from collections.abc import Iterable, Iterator
 from operator import itemgetter
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import IO, Any, Literal
+from typing import IO, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -117,7 +117,7 @@ class _Bulk:
             shape = (len(headers), *columns, int(counts[0]))
         about = {"descr": kind.values, "fortran_order": False, "shape": shape}
         self.samples.seek(0)
-        with _member(archive, f"{group}_samples", "w") as stream:
+        with _new_member(archive, f"{group}_samples") as stream:
             write_array_header_1_0(stream, about)
             shutil.copyfileobj(self.samples, stream, _AT_ONCE)
 
@@ -152,10 +152,7 @@ class _Others:
 def write_npz(path: Path, messages: Iterable[Timed], facts: RecordingFacts) -> None:
     """Write messages to a new archive; samples wait in unnamed files beside it meanwhile.
 
-    Raises
-    ------
-    RecordingError
-        If the file exists or cannot be written; then it is not left behind.
+    RecordingError if the file exists or cannot be written; then it is not left behind.
     """
     if path.exists():
         raise RecordingError(f"{path} exists already")
@@ -184,23 +181,17 @@ def write_npz(path: Path, messages: Iterable[Timed], facts: RecordingFacts) -> N
         os.replace(partial, path)
 
 
-def _member(archive: zipfile.ZipFile, name: str, mode: Literal["r", "w"]) -> IO[bytes]:
-    return archive.open(f"{name}.npy", mode, force_zip64=mode == "w")
+def _new_member(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
+    return archive.open(f"{name}.npy", "w", force_zip64=True)
 
 
 def _add(archive: zipfile.ZipFile, name: str, values: npt.NDArray[Any]) -> None:
-    with _member(archive, name, "w") as stream:
+    with _new_member(archive, name) as stream:
         write_array(stream, values, allow_pickle=False)
 
 
 def read_npz(path: Path) -> TimedMessages:
-    """Messages of an archive of this module, in their order.
-
-    Raises
-    ------
-    RecordingError
-        If the file is cut, damaged or not of this kind.
-    """
+    """Messages of an archive; RecordingError if it is cut, damaged or not of this program."""
     with _open(path, " is cut or damaged") as archive, contextlib.ExitStack() as cleanup:
         # Checksums are of whole arrays: without this, damaged samples would come out first.
         if (damaged := archive.zip.testzip()) is not None:
@@ -252,7 +243,7 @@ def _bulk_messages(kind: BinaryKind, archive: _Archive, cleanup: contextlib.Exit
     for part, name in _header_arrays(kind).items():
         headers[part] = archive[name]
     sizes = headers[kind.count].astype(np.int64) * kind.element_bytes
-    samples = cleanup.enter_context(_member(archive.zip, f"{group}_samples", "r"))
+    samples = cleanup.enter_context(archive.zip.open(f"{group}_samples.npy"))
     held = _samples_bytes(samples, kind)
     if int(sizes.sum()) != held:
         raise ValueError(f"{group}_samples holds {held} bytes, not {int(sizes.sum())}")

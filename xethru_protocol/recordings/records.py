@@ -62,10 +62,7 @@ def writing(path: object) -> Iterator[None]:
 class GrowingFile:
     """A new file that grows by whole pieces, each handed to the operating system at once.
 
-    Raises
-    ------
-    RecordingError
-        If the file exists or cannot be made; of every method, if it cannot be written.
+    Creating it and every method raise RecordingError if the file cannot be made or written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -76,7 +73,6 @@ class GrowingFile:
 
     @property
     def closed(self) -> bool:
-        """Whether `close` was called."""
         return self._stream.closed
 
     def append(self, data: bytes) -> None:
@@ -167,13 +163,7 @@ class RecordingFacts:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self:
-        """Read `as_json` back; unknown keys are left out.
-
-        Raises
-        ------
-        ValueError, TypeError
-            If a value is not of its kind.
-        """
+        """Read `as_json` back without unknown keys; ValueError or TypeError for a bad value."""
         known = {name: values[name] for name in cls.__slots__ if name in values}
         for name, value in known.items():
             if not isinstance(value, _JSON_TYPES[name]):

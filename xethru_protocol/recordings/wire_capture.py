@@ -25,7 +25,6 @@ import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO, Literal, Self
 
 from xethru_protocol.recordings.records import (
@@ -68,17 +67,8 @@ class Chunk:
 class WireCapture:
     """Writes a wire capture; each chunk is handed to the operating system at once.
 
-    Parameters
-    ----------
-    path
-        A new file.
-    note
-        Note about the capture, as JSON-able values.
-
-    Raises
-    ------
-    RecordingError
-        If the file exists or cannot be made.
+    ``note`` holds JSON-able values about the capture. RecordingError if the file exists or cannot
+    be made.
     """
 
     def __init__(self, path: Path | str, note: Mapping[str, Any] | None = None) -> None:
@@ -90,21 +80,13 @@ class WireCapture:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        exception: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.close()
 
     def write(self, direction: Way, data: bytes, t_ns: int | None) -> None:
         """Append a chunk; ``t_ns`` since 1970, None if unknown.
 
-        Raises
-        ------
-        RecordingError
-            If the disk is full or the file went away. What was written before stays.
+        RecordingError if the disk is full or the file went away; what was written before stays.
         """
         if not data:
             return
@@ -122,12 +104,8 @@ def read_chunks(path: Path | str, on_fault: FaultHandler | None = None) -> Itera
     """Chunks of a wire capture in the order in which they passed.
 
     A cut last chunk is yielded as far as it is there, then reported. A chunk of more than 1 MiB,
-    which a damaged length makes, comes in pieces of that size.
-
-    Raises
-    ------
-    RecordingError
-        If the file is no wire capture, or is cut and ``on_fault`` is None.
+    which a damaged length makes, comes in pieces of that size. RecordingError if the file is no
+    wire capture, or is cut and ``on_fault`` is None.
     """
     path = Path(path)
 
@@ -159,7 +137,7 @@ def read_chunks(path: Path | str, on_fault: FaultHandler | None = None) -> Itera
 
 
 def read_note(path: Path | str) -> dict[str, Any]:
-    """Return the note of a wire capture; RecordingError if the file is not one."""
+    """Return the note; RecordingError if the file is no wire capture."""
     path = Path(path)
     with reading(path), path.open("rb") as stream:
         return _read_note(path, stream)
