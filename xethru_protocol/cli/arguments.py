@@ -3,7 +3,7 @@
 import argparse
 import math
 from argparse import ArgumentTypeError
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, TypeAlias
 
 if TYPE_CHECKING:
@@ -12,28 +12,6 @@ if TYPE_CHECKING:
 
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 _LONGEST_S = 1e9  # 30 years
-
-
-def frame_rate(text: str) -> float:
-    value = _number(text)
-    if not 0 < value < 65536:
-        raise ArgumentTypeError(f"{text!r} must be a number between 0 and 65536")
-    return value
-
-
-def seconds(text: str) -> float:
-    value = _number(text)
-    if not 0 < value <= _LONGEST_S:
-        raise ArgumentTypeError(f"{text!r} must be seconds, more than 0")
-    return value
-
-
-def metres(text: str) -> float:
-    """Read a distance [m], a hundred times what any radar sees."""
-    value = _number(text)
-    if not -1000 <= value <= 1000:
-        raise ArgumentTypeError(f"{text!r} must be metres between -1000 and 1000")
-    return value
 
 
 def not_empty(text: str) -> str:
@@ -50,32 +28,32 @@ def utf8_text(text: str) -> str:
     return text
 
 
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan  # in no range: the caller says what is allowed
+def _number(
+    kind: Callable[[str], float], is_allowed: Callable[[float], bool], allowed: str
+) -> Callable[[str], float]:
+    """Return a reader of numbers that refuses others than the ``allowed`` ones."""
+
+    def read(text: str) -> float:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = math.nan
+        if not is_allowed(value):
+            raise ArgumentTypeError(f"{text!r} must be {allowed}")
+        return value
+
+    return read
 
 
-def at_least_one(text: str) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
-    if value < 1:
-        raise ArgumentTypeError(f"{text!r} must be a whole number from 1 on")
-    return value
-
-
-def baud_rate(text: str) -> int:
-    """Read a rate that a module could be set to (Protocol reference 4.10)."""
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
-    if not 600 <= value <= 10_000_000:
-        raise ArgumentTypeError(f"{text!r} must be a whole number from 600 to 10000000")
-    return value
+frame_rate = _number(float, lambda value: 0 < value < 65536, "a number between 0 and 65536")
+seconds = _number(float, lambda value: 0 < value <= _LONGEST_S, "seconds, more than 0")
+# a hundred times what any radar sees
+metres = _number(float, lambda value: -1000 <= value <= 1000, "metres between -1000 and 1000")
+at_least_one = _number(int, lambda value: value >= 1, "a whole number from 1 on")
+# rates that a module could be set to (Protocol reference 4.10)
+baud_rate = _number(
+    int, lambda value: 600 <= value <= 10_000_000, "a whole number from 600 to 10000000"
+)
 
 
 def _add_command(
@@ -107,7 +85,7 @@ def _add_port(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_raw_settings(parser: argparse.ArgumentParser) -> None:
-    """Add the settings of raw radar frames; `raw_config` reads them."""
+    """Add the settings that `raw_config` reads."""
     group = parser.add_argument_group("raw radar frames")
     group.add_argument(
         "--frame-area",

@@ -1,17 +1,18 @@
 """``xethru doctor``: what is wrong with the ports of this machine, and what to do about it.
 
-To add a check, add a row where its turn is. A port that another program has open must not be
-touched, so whatever opens the port comes after the rows that look for such programs.
+To add a check, add a function where its turn is: it returns what is wrong, None if nothing is. A
+port that another program has open must not be touched, so whatever opens the port comes after the
+checks that look for such programs.
 """
 
 import json
+import os
 import textwrap
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from xethru_protocol.cli.output import counted, one_line, print_json, print_line, profile_name
 from xethru_protocol.cli.port_probe import (
@@ -20,6 +21,7 @@ from xethru_protocol.cli.port_probe import (
     Finding,
     Level,
     PortProbe,
+    check,
     run_checks,
 )
 from xethru_protocol.transport import find_ports, is_running, run_directory
@@ -72,78 +74,117 @@ def _is_readable(entry: Path) -> bool:
         return False
 
 
-def _no_module(machine: Machine) -> str | None:
-    if machine.ports:
-        return None
-    return "no module was found: none on USB, no emulator is running"
-
-
-def _stale_entries(machine: Machine) -> str | None:
-    if not machine.stale:
-        return None
-    return f"{machine.run_directory} still holds entries of emulators that have died"
-
-
-def _damaged_entries(machine: Machine) -> str | None:
-    if not machine.damaged:
-        return None
-    return "the entry of a running emulator cannot be read"
-
-
-MACHINE_CHECKS = (
-    Check(
-        name="modules found",
-        looks_at="USB ids, and the run directory of emulators",
-        find=_no_module,
-        remedy="plug one in, run xethru-emulator serve --bare, or name a port with --port",
-    ),
-    Check(
-        name="no dead emulators",
-        looks_at="processes named in the run directory",
-        find=_stale_entries,
-        remedy="start an emulator, which removes them, or run: rm -r {stale}",
-    ),
-    Check(
-        name="emulators' word readable",
-        looks_at="entries of the run directory",
-        find=_damaged_entries,
-        remedy="stop that emulator and run: rm {damaged}",
-    ),
-)
-
+MACHINE_CHECKS: list[Check[Machine]] = []
+PORT_CHECKS: list[Check[PortProbe]] = []
 
 _OLDEST_SOUND_FIRMWARE = (1, 6, 8)  # Protocol reference 15, item 10
 _FEW = 4
 _POWER_CYCLE = "take the module's power away for some seconds"
 
 
-# --- the port ---------------------------------------------------------------------------------
+@check(
+    MACHINE_CHECKS,
+    "modules found",
+    looks_at="USB ids, and the run directory of emulators",
+    remedy="plug one in, run xethru-emulator serve --bare, or name a port with --port",
+)
+def _no_module(machine: Machine) -> str | None:
+    if machine.ports:
+        return None
+    return "no module was found: none on USB, no emulator is running"
 
 
+@check(
+    MACHINE_CHECKS,
+    "no dead emulators",
+    looks_at="processes named in the run directory",
+    remedy="start an emulator, which removes them, or run: rm -r {stale}",
+)
+def _stale_entries(machine: Machine) -> str | None:
+    if not machine.stale:
+        return None
+    return f"{machine.run_directory} still holds entries of emulators that have died"
+
+
+@check(
+    MACHINE_CHECKS,
+    "emulators' word readable",
+    looks_at="entries of the run directory",
+    remedy="stop that emulator and run: rm {damaged}",
+)
+def _damaged_entries(machine: Machine) -> str | None:
+    if not machine.damaged:
+        return None
+    return "the entry of a running emulator cannot be read"
+
+
+@check(
+    PORT_CHECKS,
+    "link leads to a port",
+    looks_at="what the path links to",
+    remedy="start the emulator again, or remove the link: rm {path}",
+    ends=True,
+)
 def _stale_link(probe: PortProbe) -> str | None:
-    if probe.is_stale_link:
+    if os.path.islink(probe.path) and not os.path.exists(probe.path):
         return f"it is a link to {probe.target}, which is gone: its emulator has died"
     return None
 
 
+@check(
+    PORT_CHECKS,
+    "port exists",
+    looks_at="the path",
+    remedy="plug the module in; 'xethru list' shows the ports there are",
+    ends=True,
+)
 def _missing(probe: PortProbe) -> str | None:
-    return None if probe.exists else "there is no such port"
+    return None if os.path.exists(probe.path) else "there is no such port"
 
 
+@check(
+    PORT_CHECKS,
+    "is a serial port",
+    looks_at="what kind of file the path is, and its driver",
+    remedy="name the module's port, such as /dev/ttyACM0; 'xethru list' shows them",
+    ends=True,
+)
 def _no_port(probe: PortProbe) -> str | None:
     return None if probe.is_serial_port else "it is no serial port"
 
 
+@check(
+    PORT_CHECKS,
+    "group has rights",
+    looks_at="permissions of the device",
+    remedy="its group may not open it either: add a udev rule, or run sudo chmod 660 {target}",
+    ends=True,
+)
+def _no_rights_for_the_group(probe: PortProbe) -> str | None:
+    joining_helps = os.stat(probe.path).st_mode & 0o060 == 0o060
+    return None if joining_helps else _no_rights(probe)
+
+
+@check(
+    PORT_CHECKS,
+    "user has rights",
+    looks_at="permissions of the device",
+    remedy="join the group with sudo usermod -aG {group} {user}, then log in again",
+    ends=True,
+)
 def _no_rights(probe: PortProbe) -> str | None:
-    if probe.may_be_opened:
+    if os.access(probe.path, os.R_OK | os.W_OK):
         return None
     return f"user {probe.user} may not open it; it belongs to group {probe.group}"
 
 
-def _no_rights_for_the_group(probe: PortProbe) -> str | None:
-    return None if probe.group_may_open else _no_rights(probe)
-
-
+@check(
+    PORT_CHECKS,
+    "no two readers",
+    looks_at="open files of all programs (/proc)",
+    remedy="end all of them but one",
+    ends=True,
+)
 def _shared(probe: PortProbe) -> str | None:
     if len(probe.users) < 2:
         return None
@@ -153,29 +194,59 @@ def _shared(probe: PortProbe) -> str | None:
     return f"{names} have it open at once: each gets only a part of what the module sends"
 
 
+@check(
+    PORT_CHECKS,
+    "nobody else has it open",
+    looks_at="open files of all programs (/proc)",
+    remedy="end that program; the port was left alone, so nothing else is known",
+    ends=True,
+)
 def _in_use(probe: PortProbe) -> str | None:
     return f"{probe.users[0]} has it open" if probe.users else None
 
 
+@check(
+    PORT_CHECKS,
+    "can be opened",
+    looks_at="the answer of the system",
+    remedy="if a program of another user has it, sudo xethru doctor --port {path} names it",
+    ends=True,
+)
 def _cannot_open(probe: PortProbe) -> str | None:
-    if probe.opens or probe.refusal is None:
-        return None
     return probe.refusal
 
 
-# --- whether a module answers -------------------------------------------------------------------
-
-
+@check(
+    PORT_CHECKS,
+    "stays connected",
+    looks_at="the line while PING is sent",
+    remedy="check plug and cable; a module that has just restarted needs ten seconds",
+    ends=True,
+)
 def _gone(probe: PortProbe) -> str | None:
     return "it went away while the module was checked" if probe.contact.gone else None
 
 
+@check(
+    PORT_CHECKS,
+    "not in the bootloader",
+    looks_at="the answer to a command only the bootloader knows",
+    remedy=f"{_POWER_CYCLE}; if it stays there, write its firmware anew",
+    ends=True,
+)
 def _bootloader(probe: PortProbe) -> str | None:
     if not probe.contact.bootloader:
         return None
     return "the module is in its bootloader; more than 15 faults in a row bring it there, too"
 
 
+@check(
+    PORT_CHECKS,
+    "speaks XeThru",
+    looks_at="what comes after PING",
+    remedy="is it another device? If it is a module, " + _POWER_CYCLE,
+    ends=True,
+)
 def _no_packets(probe: PortProbe) -> str | None:
     contact = probe.contact
     if contact.pong is None and contact.damaged:
@@ -183,6 +254,13 @@ def _no_packets(probe: PortProbe) -> str | None:
     return None
 
 
+@check(
+    PORT_CHECKS,
+    "listens",
+    looks_at="what comes after PING",
+    remedy=f"{_POWER_CYCLE}; on a UART, check the line from host to module",
+    ends=True,
+)
 def _no_answer(probe: PortProbe) -> str | None:
     contact = probe.contact
     if contact.pong is None and contact.talks:
@@ -190,16 +268,38 @@ def _no_answer(probe: PortProbe) -> str | None:
     return None
 
 
+@check(
+    PORT_CHECKS,
+    "answers",
+    looks_at="the answer to PING, at all rates on a UART",
+    remedy="is a module there, and powered? One that has just restarted needs ten seconds; "
+    f"if it stays silent, {_POWER_CYCLE}",
+    ends=True,
+)
 def _silent(probe: PortProbe) -> str | None:
     return "nothing answers" if probe.contact.pong is None else None
 
 
+@check(
+    PORT_CHECKS,
+    "no echo",
+    looks_at="the answer to PING",
+    remedy="connect the port to a module",
+    ends=True,
+)
 def _echo(probe: PortProbe) -> str | None:
     if probe.contact.pong == Ping().seed:
         return "it sends back what it gets, like a cable whose ends are joined"
     return None
 
 
+@check(
+    PORT_CHECKS,
+    "is a module",
+    looks_at="the answer to PING",
+    remedy="is it another device? 'xethru list' shows the ports there are",
+    ends=True,
+)
 def _unknown_device(probe: PortProbe) -> str | None:
     pong = probe.contact.pong
     if pong in set(PongCode):
@@ -207,6 +307,13 @@ def _unknown_device(probe: PortProbe) -> str | None:
     return f"it answers PING with 0x{pong:08X}, as no XeThru module does"
 
 
+@check(
+    PORT_CHECKS,
+    "usual baud rate",
+    looks_at="the rate at which PING was answered",
+    remedy=f"{_POWER_CYCLE} (the rate is not stored), or give "
+    "--baudrate {contact.baudrate} to the other commands",
+)
 def _other_rate(probe: PortProbe) -> str | None:
     rate = probe.contact.baudrate
     if rate == USUAL_BAUDRATE:
@@ -214,27 +321,63 @@ def _other_rate(probe: PortProbe) -> str | None:
     return f"it answers at {rate} baud, not at {USUAL_BAUDRATE}"
 
 
-# --- the module -------------------------------------------------------------------------------
-
-
+@check(
+    PORT_CHECKS,
+    "ready",
+    looks_at="the answer to PING",
+    remedy="wait ten seconds; if this stays, xethru reset --port {path}",
+    ends=True,
+)
 def _not_ready(probe: PortProbe) -> str | None:
     if probe.contact.pong == PongCode.XTS_SPRP_NOTREADY:
         return "the module reports that it is not ready yet"
     return None
 
 
+@check(
+    PORT_CHECKS,
+    "not in safe mode",
+    looks_at="the answer to PING",
+    remedy=f"xethru reset --port {{path}}, or {_POWER_CYCLE}",
+    ends=True,
+)
 def _safe_mode(probe: PortProbe) -> str | None:
     if probe.contact.pong == PongCode.XTS_SPRP_SAFEMODE:
         return "it is in safe mode: ten faults in a row made it start without its profiles"
     return None
 
 
+@check(
+    PORT_CHECKS,
+    "has profiles",
+    looks_at="order code and firmware id",
+    remedy="for profiles, write the sensor firmware of the product; raw radar needs nothing",
+    level=Level.NOTE,
+)
 def _bare_xep(probe: PortProbe) -> str | None:
     if not probe.is_bare_xep:
         return None
     return f"bare {probe.info.firmware_id or 'XEP'} firmware without profiles: raw frames only"
 
 
+@check(
+    PORT_CHECKS,
+    "is an X4M300",
+    looks_at="order code",
+    remedy="raw frames work alike; presence needs an X4M300",
+    level=Level.NOTE,
+)
+def _other_product(probe: PortProbe) -> str | None:
+    code = probe.info.order_code
+    return None if code is None or code == "X4M300" else f"it is an {code}, not an X4M300"
+
+
+@check(
+    PORT_CHECKS,
+    "firmware",
+    looks_at="firmware version",
+    remedy="write firmware 1.6.8 or newer with the vendor's tool",
+)
 def _stale_firmware(probe: PortProbe) -> str | None:
     version = probe.version
     if probe.is_bare_xep or version is None or version >= _OLDEST_SOUND_FIRMWARE:
@@ -245,11 +388,12 @@ def _stale_firmware(probe: PortProbe) -> str | None:
     )
 
 
-def _other_product(probe: PortProbe) -> str | None:
-    code = probe.info.order_code
-    return None if code is None or code == "X4M300" else f"it is an {code}, not an X4M300"
-
-
+@check(
+    PORT_CHECKS,
+    "right profile",
+    looks_at="GET_PROFILEID",
+    remedy="a program that wants presence must load PRESENCE_2; raw radar needs no profile",
+)
 def _wrong_profile(probe: PortProbe) -> str | None:
     loaded = probe.profile_id
     if loaded is None or loaded in (ProfileId.XTS_ID_APP_NONE, ProfileId.XTS_ID_APP_PRESENCE_2):
@@ -257,12 +401,27 @@ def _wrong_profile(probe: PortProbe) -> str | None:
     return f"profile {profile_name(loaded)} is loaded, not PRESENCE_2, the X4M300's own"
 
 
+@check(
+    PORT_CHECKS,
+    "profile loaded",
+    looks_at="GET_PROFILEID",
+    remedy="nothing, for raw radar; for presence, load and start PRESENCE_2 with "
+    "xethru record --profile presence",
+    level=Level.NOTE,
+)
 def _no_profile(probe: PortProbe) -> str | None:
     if probe.profile_id == ProfileId.XTS_ID_APP_NONE:
         return f"no profile is loaded (mode {probe.info.mode}); raw programs leave it so"
     return None
 
 
+@check(
+    PORT_CHECKS,
+    "radar runs",
+    looks_at="the mode",
+    remedy="start it: xethru stream --port {path}",
+    level=Level.NOTE,
+)
 def _stopped(probe: PortProbe) -> str | None:
     paused = (SensorMode.XTID_SM_IDLE.label, SensorMode.XTID_SM_STOP.label)
     if probe.profile_id != ProfileId.XTS_ID_APP_NONE and probe.info.mode in paused:
@@ -270,6 +429,12 @@ def _stopped(probe: PortProbe) -> str | None:
     return None
 
 
+@check(
+    PORT_CHECKS,
+    "transmitter on",
+    looks_at="TXPOWER, if no profile runs",
+    remedy="xethru reset --port {path}; check the antenna side if it happens again",
+)
 def _transmitter_off(probe: PortProbe) -> str | None:
     # asking the chip would disturb a running profile
     if probe.info.mode not in (None, SensorMode.XTID_SM_MANUAL.label) or probe.tx_power != 0:
@@ -277,196 +442,16 @@ def _transmitter_off(probe: PortProbe) -> str | None:
     return "the transmitter is off; the module does that itself after 100 frames of zeros"
 
 
-# --- the table ----------------------------------------------------------------------------------
-
-PORT_CHECKS = (
-    Check(
-        name="link leads to a port",
-        looks_at="what the path links to",
-        find=_stale_link,
-        remedy="start the emulator again, or remove the link: rm {path}",
-        ends=True,
-    ),
-    Check(
-        name="port exists",
-        looks_at="the path",
-        find=_missing,
-        remedy="plug the module in; 'xethru list' shows the ports there are",
-        ends=True,
-    ),
-    Check(
-        name="is a serial port",
-        looks_at="what kind of file the path is, and its driver",
-        find=_no_port,
-        remedy="name the module's port, such as /dev/ttyACM0; 'xethru list' shows them",
-        ends=True,
-    ),
-    Check(
-        name="group has rights",
-        looks_at="permissions of the device",
-        find=_no_rights_for_the_group,
-        remedy="its group may not open it either: add a udev rule, or run sudo chmod 660 {target}",
-        ends=True,
-    ),
-    Check(
-        name="user has rights",
-        looks_at="permissions of the device",
-        find=_no_rights,
-        remedy="join the group with sudo usermod -aG {group} {user}, then log in again",
-        ends=True,
-    ),
-    Check(
-        name="no two readers",
-        looks_at="open files of all programs (/proc)",
-        find=_shared,
-        remedy="end all of them but one",
-        ends=True,
-    ),
-    Check(
-        name="nobody else has it open",
-        looks_at="open files of all programs (/proc)",
-        find=_in_use,
-        remedy="end that program; the port was left alone, so nothing else is known",
-        ends=True,
-    ),
-    Check(
-        name="can be opened",
-        looks_at="the answer of the system",
-        find=_cannot_open,
-        remedy="if a program of another user has it, sudo xethru doctor --port {path} names it",
-        ends=True,
-    ),
-    Check(
-        name="stays connected",
-        looks_at="the line while PING is sent",
-        find=_gone,
-        remedy="check plug and cable; a module that has just restarted needs ten seconds",
-        ends=True,
-    ),
-    Check(
-        name="not in the bootloader",
-        looks_at="the answer to a command only the bootloader knows",
-        find=_bootloader,
-        remedy=f"{_POWER_CYCLE}; if it stays there, write its firmware anew",
-        ends=True,
-    ),
-    Check(
-        name="speaks XeThru",
-        looks_at="what comes after PING",
-        find=_no_packets,
-        remedy="is it another device? If it is a module, " + _POWER_CYCLE,
-        ends=True,
-    ),
-    Check(
-        name="listens",
-        looks_at="what comes after PING",
-        find=_no_answer,
-        remedy=f"{_POWER_CYCLE}; on a UART, check the line from host to module",
-        ends=True,
-    ),
-    Check(
-        name="answers",
-        looks_at="the answer to PING, at all rates on a UART",
-        find=_silent,
-        remedy="is a module there, and powered? One that has just restarted needs ten seconds; "
-        f"if it stays silent, {_POWER_CYCLE}",
-        ends=True,
-    ),
-    Check(
-        name="no echo",
-        looks_at="the answer to PING",
-        find=_echo,
-        remedy="connect the port to a module",
-        ends=True,
-    ),
-    Check(
-        name="is a module",
-        looks_at="the answer to PING",
-        find=_unknown_device,
-        remedy="is it another device? 'xethru list' shows the ports there are",
-        ends=True,
-    ),
-    Check(
-        name="usual baud rate",
-        looks_at="the rate at which PING was answered",
-        find=_other_rate,
-        remedy=f"{_POWER_CYCLE} (the rate is not stored), or give "
-        "--baudrate {contact.baudrate} to the other commands",
-    ),
-    Check(
-        name="ready",
-        looks_at="the answer to PING",
-        find=_not_ready,
-        remedy="wait ten seconds; if this stays, xethru reset --port {path}",
-        ends=True,
-    ),
-    Check(
-        name="not in safe mode",
-        looks_at="the answer to PING",
-        find=_safe_mode,
-        remedy=f"xethru reset --port {{path}}, or {_POWER_CYCLE}",
-        ends=True,
-    ),
-    Check(
-        name="has profiles",
-        looks_at="order code and firmware id",
-        find=_bare_xep,
-        remedy="for profiles, write the sensor firmware of the product; raw radar needs nothing",
-        level=Level.NOTE,
-    ),
-    Check(
-        name="is an X4M300",
-        looks_at="order code",
-        find=_other_product,
-        remedy="raw frames work alike; presence needs an X4M300",
-        level=Level.NOTE,
-    ),
-    Check(
-        name="firmware",
-        looks_at="firmware version",
-        find=_stale_firmware,
-        remedy="write firmware 1.6.8 or newer with the vendor's tool",
-    ),
-    Check(
-        name="right profile",
-        looks_at="GET_PROFILEID",
-        find=_wrong_profile,
-        remedy="a program that wants presence must load PRESENCE_2; raw radar needs no profile",
-    ),
-    Check(
-        name="profile loaded",
-        looks_at="GET_PROFILEID",
-        find=_no_profile,
-        remedy="nothing, for raw radar; for presence, load and start PRESENCE_2 with "
-        "xethru record --profile presence",
-        level=Level.NOTE,
-    ),
-    Check(
-        name="radar runs",
-        looks_at="the mode",
-        find=_stopped,
-        remedy="start it: xethru stream --port {path}",
-        level=Level.NOTE,
-    ),
-    Check(
-        name="transmitter on",
-        looks_at="TXPOWER, if no profile runs",
-        find=_transmitter_off,
-        remedy="xethru reset --port {path}; check the antenna side if it happens again",
-    ),
-)
-
-
 _WIDTH = 100
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Report:
-    """What was found out about one subject: a port, or the machine."""
+    """What was found out about a port or the machine, ``about`` what it is as far as known."""
 
     subject: str
-    about: str  # what it is, as far as known
-    findings: tuple[Finding, ...]
+    about: str
+    checks: tuple[Finding, ...]
 
 
 def doctor(arguments: Namespace) -> int:
@@ -477,9 +462,9 @@ def doctor(arguments: Namespace) -> int:
         if not arguments.json:  # at once: silent ports take seconds
             for line in _lines(report):
                 print_line(line)
-    faults = sum(f.level is Level.FAULT for report in reports for f in report.findings)
+    faults = sum(f.level is Level.FAULT for report in reports for f in report.checks)
     if arguments.json:
-        print_json({"ok": not faults, "reports": [_as_json(report) for report in reports]})
+        print_json({"ok": not faults, "reports": [asdict(report) for report in reports]})
     else:
         print_line("all is well" if not faults else counted(faults, "fault"))
     return 1 if faults else 0
@@ -493,7 +478,7 @@ def _reports(paths: Sequence[str]) -> Iterator[Report]:
     if not paths:
         machine = Machine(ports=tuple(found), run_directory=run_directory())
         findings = tuple(run_checks(machine, MACHINE_CHECKS))
-        yield Report(subject="this machine", about="", findings=findings)
+        yield Report(subject="this machine", about="", checks=findings)
 
 
 def _check_port(path: str, description: str) -> Report:
@@ -502,7 +487,7 @@ def _check_port(path: str, description: str) -> Report:
         about = description
         if findings[-1].check == PORT_CHECKS[-1].name:  # it was asked about itself
             about = ", ".join(filter(None, (description, _introduction(probe))))
-        return Report(subject=path, about=about, findings=findings)
+        return Report(subject=path, about=about, checks=findings)
 
 
 def _introduction(probe: PortProbe) -> str:
@@ -521,31 +506,14 @@ def _introduction(probe: PortProbe) -> str:
     return ", ".join(filter(None, parts))
 
 
-def _as_json(report: Report) -> dict[str, Any]:
-    return {
-        "subject": report.subject,
-        "about": report.about,
-        "checks": [
-            {
-                "check": finding.check,
-                "level": finding.level.value,
-                "looks_at": finding.looks_at,
-                "found": finding.found,
-                "remedy": finding.remedy,
-            }
-            for finding in report.findings
-        ],
-    }
-
-
 def _lines(report: Report) -> Iterator[str]:
     yield f"{one_line(report.subject)}{': ' if report.about else ''}{report.about}"
-    well = sum(finding.level is Level.OK for finding in report.findings)
+    well = sum(finding.level is Level.OK for finding in report.checks)
     if well:
         yield f"  ok     {counted(well, 'check')}"
-    for finding in report.findings:
+    for finding in report.checks:
         if finding.level is not Level.OK:
-            yield from _wrapped(f"  {finding.level.value:<6} ", one_line(finding.found))
+            yield from _wrapped(f"  {finding.level:<6} ", one_line(finding.found))
             yield from _wrapped("      -> ", one_line(finding.remedy))
     yield ""
 

@@ -48,12 +48,7 @@ def print_json(value: dict[str, Any]) -> None:
 def print_line(text: str) -> None:
     """Write a result line at once, so that the reader of a pipe gets it immediately.
 
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
-    BrokenPipeError
-        If its reader has ended.
+    OutputError if it cannot be written, BrokenPipeError if its reader has ended.
     """
     print_text(text + "\n")
 
@@ -119,15 +114,7 @@ _LINE_S = 10.0
 
 
 class Progress:
-    """Shows the newest of many states, not too often.
-
-    Parameters
-    ----------
-    name
-        What to begin lines of a log with, for example ``"xethru record"``.
-    clock
-        Monotonic time [s].
-    """
+    """Shows the newest of many states, not too often; ``name`` begins the lines of a log."""
 
     def __init__(self, name: str, clock: Callable[[], float] = time.monotonic) -> None:
         self._name = name
@@ -208,13 +195,8 @@ class CommandFailed(XeThruError):  # noqa: N818 - reads as the event it is
 def module_at(port: str, baudrate: int) -> Iterator[X4M300]:
     """Open a module, and close it however the block ends.
 
-    A failure to stop the module is part of the error that ended the block; after a
-    good end, or a signal, it is a warning.
-
-    Raises
-    ------
-    CommandFailed
-        If the block failed, and then the module could not be stopped.
+    A failure to stop the module is part of the error that ended the block, then a CommandFailed;
+    after a good end, or a signal, it is a warning.
     """
     from xethru_protocol.driver.radar import X4M300  # heavy, and --help needs this module
 
@@ -225,7 +207,11 @@ def module_at(port: str, baudrate: int) -> Iterator[X4M300]:
             try:
                 yield radar
             finally:
-                losses = _losses(radar)  # what is skipped to stop the module is no loss
+                # what is skipped to stop the module is no loss
+                if radar.frames_lost or radar.fault_count:
+                    lost = counted(radar.frames_lost, "frame")
+                    damaged = counted(radar.fault_count, "damaged place")
+                    losses = f"{lost} lost, {damaged} on the line"
                 print_warnings(radar)
     except Disconnected:  # that it could not be stopped goes without saying
         raise
@@ -244,15 +230,6 @@ def print_warnings(radar: X4M300) -> None:
     for text in radar.warnings:
         warn(f"xethru: {one_line(text)}")
     radar.warnings.clear()
-
-
-def _losses(radar: X4M300) -> str:
-    if not radar.frames_lost and not radar.fault_count:
-        return ""
-    return (
-        f"{counted(radar.frames_lost, 'frame')} lost, "
-        f"{counted(radar.fault_count, 'damaged place')} on the line"
-    )
 
 
 def _print_end(radar: X4M300, losses: str) -> None:

@@ -12,8 +12,8 @@ import shlex
 import stat
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from enum import Enum
+from dataclasses import dataclass, replace
+from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -31,7 +31,7 @@ from xethru_protocol.wire.table import Command, Message, Response
 SubjectT = TypeVar("SubjectT")
 
 
-class Level(Enum):
+class Level(StrEnum):
     """How bad a finding is."""
 
     OK = "ok"
@@ -41,16 +41,33 @@ class Level(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Check(Generic[SubjectT]):
-    """A row of a table.
+    """A row of a table; see `check`."""
 
-    Attributes
+    name: str
+    looks_at: str
+    find: Callable[[SubjectT], str | None]
+    remedy: str
+    level: Level
+    ends: bool
+
+
+def check(
+    table: list[Check[SubjectT]],
+    name: str,
+    *,
+    looks_at: str,
+    remedy: str,
+    level: Level = Level.FAULT,
+    ends: bool = False,
+) -> Callable[[Callable[[SubjectT], str | None]], Callable[[SubjectT], str | None]]:
+    """Enter a function into a table; it returns what is wrong, None if nothing is.
+
+    Parameters
     ----------
     name
         What is in order if nothing is found.
     looks_at
         Where the evidence comes from.
-    find
-        Returns what is wrong, None if nothing is.
     remedy
         What to do about it; ``{...}`` may name any attribute of the subject, which is quoted for
         a shell.
@@ -61,12 +78,12 @@ class Check(Generic[SubjectT]):
         disturb another program.
     """
 
-    name: str
-    looks_at: str
-    find: Callable[[SubjectT], str | None]
-    remedy: str
-    level: Level = Level.FAULT
-    ends: bool = False
+    def enter(find: Callable[[SubjectT], str | None]) -> Callable[[SubjectT], str | None]:
+        row = Check(name=name, looks_at=looks_at, find=find, remedy=remedy, level=level, ends=ends)
+        table.append(row)
+        return find
+
+    return enter
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,37 +91,32 @@ class Finding:
     """Result of a check; ``found`` and ``remedy`` are empty if all is well."""
 
     check: str
+    level: Level = Level.OK
     looks_at: str
-    level: Level
     found: str = ""
     remedy: str = ""
 
 
 def run_checks(subject: SubjectT, checks: Sequence[Check[SubjectT]]) -> Iterator[Finding]:
     """Run checks in order, until one with ``ends`` finds something."""
-    for check in checks:
+    for row in checks:
+        finding = Finding(check=row.name, looks_at=row.looks_at)
         try:
-            found = check.find(subject)
+            found = row.find(subject)
         except (XeThruError, OSError) as error:  # a module that answered, a port that was there
-            yield Finding(
-                check=check.name,
-                looks_at=check.looks_at,
+            yield replace(
+                finding,
                 level=Level.FAULT,
                 found=f"this could not be found out: {getattr(error, 'strerror', None) or error}",
                 remedy="try again; if this stays, take the module's power away for some seconds",
             )
             return
         if found is None:
-            yield Finding(check=check.name, looks_at=check.looks_at, level=Level.OK)
+            yield finding
             continue
-        yield Finding(
-            check=check.name,
-            looks_at=check.looks_at,
-            level=check.level,
-            found=found,
-            remedy=check.remedy.format_map(_Attributes(subject)),
-        )
-        if check.ends:
+        remedy = row.remedy.format_map(_Attributes(subject))
+        yield replace(finding, level=row.level, found=found, remedy=remedy)
+        if row.ends:
             return
 
 
@@ -245,30 +257,14 @@ _WITHOUT_RATE = ("/dev/pts/", "/dev/ttyACM")  # pseudo-terminals, and USB of cla
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Contact:
-    """What came back over an opened port.
+    """What came back over an opened port."""
 
-    Attributes
-    ----------
-    pong
-        Answer to PING; None: there was none.
-    baudrate
-        Rate at which that came, or the usual one.
-    talks
-        Whether other messages came.
-    damaged
-        Whether bytes came that are no packets.
-    bootloader
-        Whether a bootloader answered.
-    gone
-        Whether the port went away meanwhile.
-    """
-
-    pong: int | None = None
-    baudrate: int = USUAL_BAUDRATE
-    talks: bool = False
-    damaged: bool = False
-    bootloader: bool = False
-    gone: bool = False
+    pong: int | None = None  # answer to PING
+    baudrate: int = USUAL_BAUDRATE  # at which that came
+    talks: bool = False  # other messages came
+    damaged: bool = False  # bytes came that are no packets
+    bootloader: bool = False  # a bootloader answered
+    gone: bool = False  # the port went away meanwhile
 
 
 class PortProbe:
@@ -276,7 +272,6 @@ class PortProbe:
 
     def __init__(self, path: str) -> None:
         self.path = path
-        self.refusal: str | None = None
         self._transport: Transport | None = None
 
     def close(self) -> None:
@@ -291,14 +286,6 @@ class PortProbe:
         return os.path.realpath(self.path)
 
     @property
-    def is_stale_link(self) -> bool:
-        return os.path.islink(self.path) and not os.path.exists(self.path)
-
-    @property
-    def exists(self) -> bool:
-        return os.path.exists(self.path)
-
-    @property
     def is_serial_port(self) -> bool:
         """Whether it is a device, and of a serial driver where the system lists them (Linux)."""
         status = os.stat(self.path)
@@ -311,21 +298,12 @@ class PortProbe:
         )
 
     @property
-    def may_be_opened(self) -> bool:
-        return os.access(self.path, os.R_OK | os.W_OK)
-
-    @property
     def group(self) -> str:
         number = os.stat(self.path).st_gid
         try:
             return grp.getgrgid(number).gr_name
         except KeyError:
             return str(number)
-
-    @property
-    def group_may_open(self) -> bool:
-        """Whether joining the group would help."""
-        return os.stat(self.path).st_mode & 0o060 == 0o060
 
     @property
     def user(self) -> str:
@@ -341,14 +319,13 @@ class PortProbe:
     # --- having opened it -----------------------------------------------------------------------
 
     @cached_property
-    def opens(self) -> bool:
-        """Open the port; if that fails, `refusal` holds the reason."""
+    def refusal(self) -> str | None:
+        """Open the port; if that fails, return the reason."""
         try:
             self._transport = SerialTransport(self.path)
         except PortUnavailable as error:
-            self.refusal = str(error)
-            return False
-        return True
+            return str(error)
+        return None
 
     @cached_property
     def contact(self) -> Contact:
@@ -404,8 +381,6 @@ class PortProbe:
         except DeviceError:
             return None
         return int(values[0]) if values else None
-
-    # --- inside ---------------------------------------------------------------------------------
 
     def _reopen(self, baudrate: int) -> bool:
         """Open the port at another rate; False where the adapter does not know that."""

@@ -11,7 +11,6 @@ from contextlib import contextmanager, suppress
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal, Self
 
 from xethru_protocol.cli.arguments import raw_config
@@ -41,12 +40,8 @@ from xethru_protocol.wire.table import Response
 def files_to_replace(targets: Iterable[Path], *, replace: bool) -> list[Path]:
     """Files of older recordings where new ones shall be.
 
-    Of a directory only the files of a recording are in the way.
-
-    Raises
-    ------
-    RecordingError
-        If something is there and must stay.
+    Of a directory only the files of a recording are in the way. RecordingError if something is
+    there and must stay.
     """
     old = [path for target in targets for path in _recording_files(target)]
     for path in old:
@@ -64,31 +59,12 @@ def is_part_of(source: Path, target: Path) -> bool:
     )
 
 
-def make_room(targets: Iterable[Path], *, replace: bool) -> None:
-    """Remove older recordings where new ones shall be, if that is allowed.
-
-    Raises
-    ------
-    RecordingError
-        If something is there and must stay, or cannot be removed.
-    """
-    for path in files_to_replace(targets, replace=replace):
-        try:
-            path.unlink()
-        except OSError as error:
-            raise RecordingError(f"{path} cannot be removed: {error.strerror}") from None
-
-
 @contextmanager
 def set_aside(target: Path, *, replace: bool) -> Iterator[None]:
-    """Keep an older recording under other names meanwhile; back it comes if the block fails.
+    """Keep an older recording under other names meanwhile; it is put back if the block fails.
 
-    What the failed block has written goes: it would pass for a whole recording.
-
-    Raises
-    ------
-    RecordingError
-        If something is there and must stay, or cannot be moved.
+    What the failed block has written is removed: it would pass for a whole recording.
+    RecordingError if something is there and must stay, or cannot be moved.
     """
     was_there = target.exists()
     kept = [
@@ -138,12 +114,9 @@ _FRAMES_AT_ONCE = 100
 
 
 class Listen:
-    """How to get a module to send what is recorded: here, whatever it sends by itself.
+    """How to get a module to send what is recorded: here, whatever it sends by itself."""
 
-    ``profile_id``: profile that runs then; None if there is none, or it is not known.
-    """
-
-    profile_id: int | None = None
+    profile_id: int | None = None  # that runs then; None if there is none, or it is not known
 
     def prepare(self, radar: X4M300) -> None:
         """Bring the module to where it sends nothing yet; what comes meanwhile is old."""
@@ -201,27 +174,13 @@ _ANSWERS = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Targets:
-    """Where a recording goes.
+    """Where a recording goes, and what is kept with it; None: not wanted, or not known."""
 
-    Attributes
-    ----------
-    directory
-        For the vendor's format; None: not wanted.
-    wire
-        File for all bytes of both directions; None: not wanted.
-    session_id
-        Name kept in the vendor's format.
-    profile_id
-        Profile that runs, kept in the vendor's format; None: none, or not known.
-    port
-        Where the module is, kept in the wire capture.
-    """
-
-    directory: Path | None
-    wire: Path | None
-    session_id: str = ""
-    profile_id: int | None = None
-    port: str = ""
+    directory: Path | None  # in the vendor's format
+    wire: Path | None  # file for all bytes of both directions
+    session_id: str
+    profile_id: int | None
+    port: str
 
     @property
     def text(self) -> str:
@@ -229,7 +188,6 @@ class Targets:
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """What there is of both."""
         return tuple(path for path in (self.directory, self.wire) if path is not None)
 
     def check(self, *, replace: bool) -> None:
@@ -247,26 +205,13 @@ class Recorder:
     Files are made, and older ones removed, only by `open`: a module that does not answer must
     not cost an older recording. Bytes that come before that are kept until then.
 
-    An error of a file is kept, not raised: the caller is in the middle of receiving.
-
-    Parameters
-    ----------
-    targets
-        Where to.
-    count
-        Messages after which it is enough; None: never.
-
-    Attributes
-    ----------
-    messages
-        Messages taken.
-    failure
-        Why nothing more is written; None: all is well.
+    An error of a file is kept in ``failure``, not raised: the caller is in the middle of
+    receiving. After ``count`` messages it is enough; None: never.
     """
 
     def __init__(self, targets: Targets, count: int | None) -> None:
-        self.messages = 0
-        self.failure: XeThruError | None = None
+        self.messages = 0  # taken
+        self.failure: XeThruError | None = None  # why nothing more is written
         self._targets = targets
         self._count = count
         self._statistics = LinkStatistics()
@@ -280,12 +225,7 @@ class Recorder:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         """Complete the files, however it ended; what was recorded into none goes."""
         for file in (self._writer, self._wire):
             try:
@@ -299,15 +239,13 @@ class Recorder:
                 remove_unfinished(path, was_there=was_there)
 
     def open(self, *, replace: bool) -> None:
-        """Make the files.
-
-        Raises
-        ------
-        RecordingError
-            If something is in the way and must stay, or a file cannot be made.
-        """
+        """Remove older files if that is allowed, and make new ones; RecordingError if not."""
         targets = self._targets
-        make_room(targets.paths, replace=replace)
+        for path in files_to_replace(targets.paths, replace=replace):
+            try:
+                path.unlink()
+            except OSError as error:
+                raise RecordingError(f"{path} cannot be removed: {error.strerror}") from None
         self._were_there = {path: path.exists() for path in targets.paths}
         if targets.directory is not None:
             self._writer = RecordingWriter(

@@ -210,7 +210,7 @@ def test_names_in_remedies_can_be_given_to_a_shell(tmp_path: Path, capsys: Captu
 def test_a_port_that_vanishes_while_it_is_examined(
     capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(port_probe.PortProbe, "exists", True)
+    monkeypatch.setattr("os.path.exists", lambda path: True)
     _, finding = only_finding(capsys, "/dev/none")
     assert finding["check"] == "is a serial port"
     assert finding["found"] == "this could not be found out: No such file or directory"
