@@ -21,7 +21,6 @@ from xethru_protocol.cli.port_probe import (
     Finding,
     Level,
     PortProbe,
-    check,
     run_checks,
 )
 from xethru_protocol.transport import find_ports, is_running, run_directory
@@ -82,7 +81,7 @@ _FEW = 4
 _POWER_CYCLE = "take the module's power away for some seconds"
 
 
-@check(
+@Check(
     MACHINE_CHECKS,
     "modules found",
     looks_at="USB ids, and the run directory of emulators",
@@ -94,7 +93,7 @@ def _no_module(machine: Machine) -> str | None:
     return "no module was found: none on USB, no emulator is running"
 
 
-@check(
+@Check(
     MACHINE_CHECKS,
     "no dead emulators",
     looks_at="processes named in the run directory",
@@ -106,7 +105,7 @@ def _stale_entries(machine: Machine) -> str | None:
     return f"{machine.run_directory} still holds entries of emulators that have died"
 
 
-@check(
+@Check(
     MACHINE_CHECKS,
     "emulators' word readable",
     looks_at="entries of the run directory",
@@ -118,7 +117,7 @@ def _damaged_entries(machine: Machine) -> str | None:
     return "the entry of a running emulator cannot be read"
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "link leads to a port",
     looks_at="what the path links to",
@@ -131,7 +130,7 @@ def _stale_link(probe: PortProbe) -> str | None:
     return None
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "port exists",
     looks_at="the path",
@@ -142,7 +141,7 @@ def _missing(probe: PortProbe) -> str | None:
     return None if os.path.exists(probe.path) else "there is no such port"
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "is a serial port",
     looks_at="what kind of file the path is, and its driver",
@@ -153,7 +152,7 @@ def _no_port(probe: PortProbe) -> str | None:
     return None if probe.is_serial_port else "it is no serial port"
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "group has rights",
     looks_at="permissions of the device",
@@ -165,7 +164,7 @@ def _no_rights_for_the_group(probe: PortProbe) -> str | None:
     return None if joining_helps else _no_rights(probe)
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "user has rights",
     looks_at="permissions of the device",
@@ -178,7 +177,7 @@ def _no_rights(probe: PortProbe) -> str | None:
     return f"user {probe.user} may not open it; it belongs to group {probe.group}"
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "no two readers",
     looks_at="open files of all programs (/proc)",
@@ -188,13 +187,13 @@ def _no_rights(probe: PortProbe) -> str | None:
 def _shared(probe: PortProbe) -> str | None:
     if len(probe.users) < 2:
         return None
-    names = " and ".join(map(str, probe.users[:_FEW]))
+    names = " and ".join(probe.users[:_FEW])
     if len(probe.users) > _FEW:
         names += f" and {len(probe.users) - _FEW} more"
     return f"{names} have it open at once: each gets only a part of what the module sends"
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "nobody else has it open",
     looks_at="open files of all programs (/proc)",
@@ -205,7 +204,7 @@ def _in_use(probe: PortProbe) -> str | None:
     return f"{probe.users[0]} has it open" if probe.users else None
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "can be opened",
     looks_at="the answer of the system",
@@ -216,7 +215,7 @@ def _cannot_open(probe: PortProbe) -> str | None:
     return probe.refusal
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "stays connected",
     looks_at="the line while PING is sent",
@@ -227,7 +226,7 @@ def _gone(probe: PortProbe) -> str | None:
     return "it went away while the module was checked" if probe.contact.gone else None
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "not in the bootloader",
     looks_at="the answer to a command only the bootloader knows",
@@ -240,7 +239,7 @@ def _bootloader(probe: PortProbe) -> str | None:
     return "the module is in its bootloader; more than 15 faults in a row bring it there, too"
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "speaks XeThru",
     looks_at="what comes after PING",
@@ -254,7 +253,7 @@ def _no_packets(probe: PortProbe) -> str | None:
     return None
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "listens",
     looks_at="what comes after PING",
@@ -268,7 +267,7 @@ def _no_answer(probe: PortProbe) -> str | None:
     return None
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "answers",
     looks_at="the answer to PING, at all rates on a UART",
@@ -280,7 +279,7 @@ def _silent(probe: PortProbe) -> str | None:
     return "nothing answers" if probe.contact.pong is None else None
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "no echo",
     looks_at="the answer to PING",
@@ -293,7 +292,7 @@ def _echo(probe: PortProbe) -> str | None:
     return None
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "is a module",
     looks_at="the answer to PING",
@@ -307,7 +306,7 @@ def _unknown_device(probe: PortProbe) -> str | None:
     return f"it answers PING with 0x{pong:08X}, as no XeThru module does"
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "usual baud rate",
     looks_at="the rate at which PING was answered",
@@ -321,7 +320,7 @@ def _other_rate(probe: PortProbe) -> str | None:
     return f"it answers at {rate} baud, not at {USUAL_BAUDRATE}"
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "ready",
     looks_at="the answer to PING",
@@ -334,7 +333,7 @@ def _not_ready(probe: PortProbe) -> str | None:
     return None
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "not in safe mode",
     looks_at="the answer to PING",
@@ -347,7 +346,7 @@ def _safe_mode(probe: PortProbe) -> str | None:
     return None
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "has profiles",
     looks_at="order code and firmware id",
@@ -360,7 +359,7 @@ def _bare_xep(probe: PortProbe) -> str | None:
     return f"bare {probe.info.firmware_id or 'XEP'} firmware without profiles: raw frames only"
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "is an X4M300",
     looks_at="order code",
@@ -372,7 +371,7 @@ def _other_product(probe: PortProbe) -> str | None:
     return None if code is None or code == "X4M300" else f"it is an {code}, not an X4M300"
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "firmware",
     looks_at="firmware version",
@@ -388,7 +387,7 @@ def _stale_firmware(probe: PortProbe) -> str | None:
     )
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "right profile",
     looks_at="GET_PROFILEID",
@@ -401,7 +400,7 @@ def _wrong_profile(probe: PortProbe) -> str | None:
     return f"profile {profile_name(loaded)} is loaded, not PRESENCE_2, the X4M300's own"
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "profile loaded",
     looks_at="GET_PROFILEID",
@@ -415,7 +414,7 @@ def _no_profile(probe: PortProbe) -> str | None:
     return None
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "radar runs",
     looks_at="the mode",
@@ -429,7 +428,7 @@ def _stopped(probe: PortProbe) -> str | None:
     return None
 
 
-@check(
+@Check(
     PORT_CHECKS,
     "transmitter on",
     looks_at="TXPOWER, if no profile runs",

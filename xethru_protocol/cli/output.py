@@ -32,8 +32,8 @@ def profile_name(profile_id: int) -> str:
     return f"0x{profile_id:08X}"
 
 
-class OutputError(XeThruError):
-    """Standard output takes nothing more: it is closed, or its disk is full."""
+class CommandFailed(XeThruError):  # noqa: N818 - reads as the event it is
+    """A command came to nothing: the cause, and what followed from it."""
 
 
 def print_json(value: dict[str, Any]) -> None:
@@ -48,7 +48,7 @@ def print_json(value: dict[str, Any]) -> None:
 def print_line(text: str) -> None:
     """Write a result line at once, so that the reader of a pipe gets it immediately.
 
-    OutputError if it cannot be written, BrokenPipeError if its reader has ended.
+    CommandFailed if it cannot be written, BrokenPipeError if its reader has ended.
     """
     print_text(text + "\n")
 
@@ -56,17 +56,18 @@ def print_line(text: str) -> None:
 def print_text(text: str) -> None:
     """Write a part of a result, at once; raises like `print_line`."""
     if sys.stdout is None:  # started with it closed
-        raise OutputError("standard output is closed; nothing can be printed")
+        raise CommandFailed("standard output is closed; nothing can be printed")
     try:
         try:
             sys.stdout.write(text)
         except UnicodeEncodeError:  # a file name that is no text, or a terminal without UTF-8
-            sys.stdout.write(_printable(text, sys.stdout))
+            encoding = sys.stdout.encoding or "ascii"
+            sys.stdout.write(text.encode(encoding, "backslashreplace").decode(encoding))
         sys.stdout.flush()
     except BrokenPipeError:
         raise
     except OSError as error:
-        raise OutputError(f"standard output cannot be written: {error.strerror}") from None
+        raise CommandFailed(f"standard output cannot be written: {error.strerror}") from None
 
 
 def warn(text: str) -> None:
@@ -92,11 +93,6 @@ def is_terminal(stream: TextIO | None) -> bool:
 def one_line(text: str) -> str:
     """Write control characters out: a file name may hold line ends."""
     return "".join(part if part.isprintable() else ascii(part)[1:-1] for part in text)
-
-
-def _printable(text: str, stream: TextIO) -> str:
-    encoding = stream.encoding or "ascii"
-    return text.encode(encoding, "backslashreplace").decode(encoding)
 
 
 def _without_nan(value: Any) -> Any:  # noqa: ANN401 - any JSON value
@@ -185,10 +181,6 @@ def warn_of(command: str, faults: Sequence[RecordingFault]) -> None:
         )
     if len(faults) > _MOST:
         warn(f"xethru {command}: and {len(faults) - _MOST} faults more")
-
-
-class CommandFailed(XeThruError):  # noqa: N818 - reads as the event it is
-    """A command came to nothing: the cause, and what followed from it."""
 
 
 @contextmanager

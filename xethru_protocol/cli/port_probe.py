@@ -6,13 +6,14 @@ waits in it. So programs that have it open are looked for first, and a port in u
 
 import getpass
 import grp
+import math
 import os
 import re
 import shlex
 import stat
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
@@ -20,7 +21,7 @@ from typing import Generic, TypeVar
 
 from xethru_protocol.driver.link import ModuleInfo
 from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.transport import SerialTransport, Transport
+from xethru_protocol.transport import SerialTransport
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import X4Setting
 from xethru_protocol.wire.connection import Connection, Role
@@ -39,30 +40,11 @@ class Level(StrEnum):
     FAULT = "fault"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(eq=False)
 class Check(Generic[SubjectT]):
-    """A row of a table; see `check`."""
+    """Enters a function into a table: it returns what is wrong, None if nothing is.
 
-    name: str
-    looks_at: str
-    find: Callable[[SubjectT], str | None]
-    remedy: str
-    level: Level
-    ends: bool
-
-
-def check(
-    table: list[Check[SubjectT]],
-    name: str,
-    *,
-    looks_at: str,
-    remedy: str,
-    level: Level = Level.FAULT,
-    ends: bool = False,
-) -> Callable[[Callable[[SubjectT], str | None]], Callable[[SubjectT], str | None]]:
-    """Enter a function into a table; it returns what is wrong, None if nothing is.
-
-    Parameters
+    Attributes
     ----------
     name
         What is in order if nothing is found.
@@ -78,12 +60,18 @@ def check(
         disturb another program.
     """
 
-    def enter(find: Callable[[SubjectT], str | None]) -> Callable[[SubjectT], str | None]:
-        row = Check(name=name, looks_at=looks_at, find=find, remedy=remedy, level=level, ends=ends)
-        table.append(row)
-        return find
+    table: "list[Check[SubjectT]]"
+    name: str
+    looks_at: str
+    remedy: str
+    level: Level = Level.FAULT
+    ends: bool = False
+    find: Callable[[SubjectT], str | None] = field(init=False)
 
-    return enter
+    def __call__(self, find: Callable[[SubjectT], str | None]) -> Callable[[SubjectT], str | None]:
+        self.find = find
+        self.table.append(self)
+        return find
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,19 +127,8 @@ _FIRST_PTS_MAJOR, _LAST_PTS_MAJOR = 136, 143
 _MINORS_PER_PTS_MAJOR = 256
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PortUser:
-    """A program that has a port open."""
-
-    pid: int
-    name: str
-
-    def __str__(self) -> str:
-        return f"{self.name!r} (pid {self.pid})"
-
-
-def port_users(path: str) -> tuple[PortUser, ...]:
-    """Programs that have a port open, as far as this user may know; by process id.
+def port_users(path: str) -> tuple[str, ...]:
+    """Name and process id of programs that have a port open, as far as this user may know.
 
     The program that serves a pseudo-terminal is not listed. Only root sees other users' programs.
     """
@@ -162,7 +139,7 @@ def port_users(path: str) -> tuple[PortUser, ...]:
     if not stat.S_ISCHR(device.st_mode):
         return ()
     return tuple(
-        PortUser(pid=pid, name=_name(pid))
+        f"{_name(pid)!r} (pid {pid})"
         for pid in _process_ids()
         if _has_open(pid, device) and not _serves(pid, device)
     )
@@ -252,7 +229,6 @@ _OTHER_BAUDRATES = (
 )
 _ANSWER_LIMIT_S = 1.0
 _REPLY_LIMIT_S = 0.25  # enough for the 18 bytes of PING and PONG at 9600 baud
-_WITHOUT_RATE = ("/dev/pts/", "/dev/ttyACM")  # pseudo-terminals, and USB of class CDC ACM
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -272,7 +248,7 @@ class PortProbe:
 
     def __init__(self, path: str) -> None:
         self.path = path
-        self._transport: Transport | None = None
+        self._transport: SerialTransport | None = None
 
     def close(self) -> None:
         if self._transport is not None:
@@ -313,7 +289,7 @@ class PortProbe:
             return str(os.getuid())
 
     @cached_property
-    def users(self) -> tuple[PortUser, ...]:
+    def users(self) -> tuple[str, ...]:
         return port_users(self.path)
 
     # --- having opened it -----------------------------------------------------------------------
@@ -335,7 +311,8 @@ class PortProbe:
             return first
         if self._ask(m.BootloaderGetDeviceInfo(), _REPLY_LIMIT_S).talks and not first.talks:
             return Contact(bootloader=True)
-        if not ignores_baudrate(self.target):
+        assert self._transport is not None
+        if math.isfinite(self._transport.bytes_per_s):  # a UART
             for baudrate in _OTHER_BAUDRATES:
                 if self._reopen(baudrate):
                     contact = self._ask(m.Ping(), _REPLY_LIMIT_S, baudrate)
@@ -412,11 +389,6 @@ class PortProbe:
         except Disconnected:
             return Contact(gone=True)
         return Contact(talks=talks, damaged=damaged)
-
-
-def ignores_baudrate(target: str) -> bool:
-    """Whether a device talks alike at every rate."""
-    return target.startswith(_WITHOUT_RATE)
 
 
 def _serial_drivers() -> list[tuple[int, range]]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from xethru_protocol.cli.output import (
+    CommandFailed,
     Progress,
     bytes_text,
     counted,
@@ -33,7 +34,7 @@ from xethru_protocol.recordings import convert as convert_recording
 from xethru_protocol.recordings.wire_capture import MAGIC as WIRE_CAPTURE
 from xethru_protocol.wire.codec import decode_command, decode_response, describe, encode
 from xethru_protocol.wire.codes import PongCode
-from xethru_protocol.wire.errors import LocalProtocolError, XeThruError
+from xethru_protocol.wire.errors import LocalProtocolError
 from xethru_protocol.wire.fields import hex_bytes
 from xethru_protocol.wire.framing import (
     Direction,
@@ -49,10 +50,6 @@ from xethru_protocol.wire.table import ROWS
 _CHUNK_BYTES = 65536
 
 
-class DecodeError(XeThruError):
-    """The input is not of the format that was named."""
-
-
 def decode(arguments: Namespace) -> int:
     """Print one JSON object per packet and per fault; totals at the end, on stderr, if wanted."""
     file = None if arguments.file == "-" else arguments.file
@@ -60,7 +57,7 @@ def decode(arguments: Namespace) -> int:
     name = file or "standard input"
     statistics = LinkStatistics()
     if file is None and sys.stdin is None:
-        raise DecodeError("standard input is closed; there is nothing to decode")
+        raise CommandFailed("standard input is closed; there is nothing to decode")
     try:
         with Path(file).open("rb") if file else nullcontext(sys.stdin.buffer) as source:
             if arguments.hex:
@@ -71,7 +68,7 @@ def decode(arguments: Namespace) -> int:
     except BrokenPipeError:  # of stdout
         raise
     except OSError as error:
-        raise DecodeError(f"{name} cannot be read: {error.strerror}") from None
+        raise CommandFailed(f"{name} cannot be read: {error.strerror}") from None
     finally:
         if arguments.statistics:
             warn(json.dumps(statistics.summary()))
@@ -145,7 +142,7 @@ def _chunks(source: BinaryIO, name: str) -> Iterator[bytes]:
     read = getattr(source, "read1", source.read)  # read1 returns what there is, not a full chunk
     chunk = read(_CHUNK_BYTES)
     if chunk.startswith(WIRE_CAPTURE):
-        raise DecodeError(f"{name} is a wire capture and no bare bytes; use xethru dump")
+        raise CommandFailed(f"{name} is a wire capture and no bare bytes; use xethru dump")
     while chunk:
         yield chunk
         chunk = read(_CHUNK_BYTES)
@@ -156,7 +153,7 @@ def _from_hex(line: bytes, name: str, number: int) -> bytes:
         return bytes.fromhex(line.decode("ascii"))
     except ValueError:
         text = line.strip()[:40].decode("ascii", "replace")
-        raise DecodeError(
+        raise CommandFailed(
             f"{name} line {number} is not hexadecimal bytes: {text!r}; write them like 7D 10 6D 7E"
         ) from None
 

@@ -92,7 +92,8 @@ def read_recording(
 ) -> TimedMessages:
     """Yield the messages of a recording with their times [ns since 1970], None where unknown.
 
-    Times of vendor directories have a resolution of 1 ms.
+    Times of vendor directories have a resolution of 1 ms. RecordingError if there is nothing to
+    read, or messages are lost and ``on_fault`` is None.
 
     Parameters
     ----------
@@ -104,9 +105,6 @@ def read_recording(
         messages raises, what costs only times passes.
     radar
         Which radar's, by its name in `recording_radars`; needed where there are several.
-
-    Raises RecordingError if there is nothing to read, or messages are lost and ``on_fault`` is
-    None.
     """
     path = Path(path)
     found = recording_format(path)
@@ -200,6 +198,9 @@ def convert(
 ) -> Conversion:
     """Write a recording again in the format that the target's suffix names.
 
+    RecordingError if the source cannot be read, the target exists or cannot be written, or its
+    suffix names no format.
+
     Parameters
     ----------
     source
@@ -211,9 +212,6 @@ def convert(
         Called with the number of messages so far, every thousand and at the end.
     radar
         Which radar of a session of several, as in `read_recording`.
-
-    Raises RecordingError if the source cannot be read, the target exists or cannot be written, or
-    its suffix names no format.
     """
     source, target = Path(source), Path(target)
     write = _writer(target)

@@ -1,23 +1,18 @@
 """MCAP, which ROS 2, Foxglove and PlotJuggler open: reader, writer, and recordings in such files.
 
-The only file here that loads mcap. It has four parts:
+The only file here that loads mcap. Messages are CDR as ROS 2 has it: little-endian, each number
+aligned to its size counted from behind the four header bytes.
 
-CDR
-    How messages of ROS 2 are stored: little-endian, each number aligned to its size counted from
-    behind the four header bytes.
-Reader
-    Finds every whole record before the end of a file; of a chunk that the end cuts through it
-    decompresses what is there. Where a record makes no sense or the checksum of a chunk is wrong,
-    that place is reported, and reading goes on behind it, at the next sound chunk if need be.
-Writer
-    Messages of ROS 2 in chunks compressed by zstd.
-Recordings
-    Topics as in the sessions of this project: ``/radar/<name>/frame`` holds radar frames (DATA
-    FLOAT of content 0) as Float32MultiArray with the counter in the record's sequence number,
-    ``/radar/<name>/info`` once what is known of them, where the recorded module answered for its
-    settings. Every other message is on ``/radar/<name>/payload``, its payload as UInt8MultiArray,
-    and for reading, if it is a short one, on ``/radar/<name>/message`` as JSON. Messages without a
-    time have time 0, and their channel is marked.
+The reader finds every whole record before the end of a file; of a chunk that the end cuts through
+it decompresses what is there. Where a record makes no sense or the checksum of a chunk is wrong,
+that place is reported, and reading goes on behind it, at the next sound chunk if need be.
+
+Recordings have topics as the sessions of this project: ``/radar/<name>/frame`` holds radar frames
+(DATA FLOAT of content 0) as Float32MultiArray with the counter in the record's sequence number,
+``/radar/<name>/info`` once what the recorded module answered for its settings. Every other message
+is on ``/radar/<name>/payload``, its payload as UInt8MultiArray, and for reading, if it is a short
+one, on ``/radar/<name>/message`` as JSON. Messages without a time have time 0, and their channel is
+marked.
 
 Specification of the format: https://mcap.dev/spec
 """

@@ -6,8 +6,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from io import FileIO
 from pathlib import Path
-from types import NoneType
-from typing import Any, Self
+from typing import Any, Self, get_type_hints
 
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.table import Response
@@ -112,16 +111,10 @@ TimedMessages = Iterator[Timed]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RadarFacts:
-    """Facts about one radar of a recording.
+    """Facts about one radar of a recording; None where unknown.
 
-    Attributes
-    ----------
-    name
-        Its name in the recording; None where the recording is of one module and names none.
-    serial
-        Serial number; None where unknown.
-    area_m
-        Frame area as the module read it back [module metres]; None where unknown.
+    ``area_m`` is the frame area as the module read it back [module metres]. A recording of one
+    module has no ``name`` for it.
     """
 
     name: str | None = None
@@ -165,20 +158,10 @@ class RecordingFacts:
     def from_json(cls, values: Mapping[str, Any]) -> Self:
         """Read `as_json` back without unknown keys; ValueError or TypeError for a bad value."""
         known = {name: values[name] for name in cls.__slots__ if name in values}
-        for name, value in known.items():
-            if not isinstance(value, _JSON_TYPES[name]):
-                raise TypeError(f"{name} cannot be {value!r}")
         for name in ("parameter_file", "user_header"):
             if known.get(name) is not None:
                 known[name] = bytes.fromhex(known[name])
+        for name, hint in get_type_hints(cls).items():
+            if name in known and not isinstance(known[name], hint):
+                raise TypeError(f"{name} cannot be {known[name]!r}")
         return cls(**known)
-
-
-_JSON_TYPES: dict[str, tuple[type, ...]] = {
-    "session_id": (str,),
-    "profile_id": (int, NoneType),
-    "parameter_file": (str, NoneType),
-    "user_header": (str,),
-    "stopped_ns": (int, NoneType),
-    "closed_ns": (int, NoneType),
-}

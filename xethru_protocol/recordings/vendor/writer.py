@@ -118,8 +118,6 @@ class RecordingWriter:
         self._files: dict[int, _DataFile] = {}
         self._last_ms = 0
         self._closed = False
-        self.messages = 0
-        """Messages written so far."""
         with writing(self.directory):
             self.directory.mkdir(parents=True, exist_ok=True)
             if any(path.name.startswith("xethru_") for path in self.directory.iterdir()):
@@ -173,7 +171,6 @@ class RecordingWriter:
                 self._append(file, kind.titles, kind.data_type, since_ms)
         self._append(file, data, kind.data_type, since_ms)
         file.records += 1
-        self.messages += 1
         self._last_ms = max(self._last_ms, since_ms)
         return True
 

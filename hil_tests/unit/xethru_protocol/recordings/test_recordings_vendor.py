@@ -161,7 +161,6 @@ def test_messages_without_a_place_in_the_format_are_refused_quietly(tmp_path: Pa
     with RecordingWriter(tmp_path / "none") as writer:
         assert not writer.write(m.Ack(), 0)
         assert not writer.write(m.System(code=0x11), 0)
-        assert writer.messages == 0
 
 
 @pytest.mark.parametrize(
