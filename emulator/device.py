@@ -18,13 +18,13 @@ from emulator.chip import Pace
 from emulator.chip.chip import Chip, EchoSource, ModuleClock
 from emulator.module.commands import answer
 from emulator.module.memory import Identity, Memory
-from emulator.module.modes import STREAMING, State
-from emulator.module.module import Module
-from emulator.module.outbox import (
+from emulator.module.modes import STREAMING, Group, State, group_of
+from emulator.module.module import (
     FirmwareOutbox,
     LosslessOutbox,
     MessageKind,
     MessageStream,
+    Module,
     Outbox,
 )
 from emulator.module.settings import DeviceOptions
@@ -35,7 +35,6 @@ from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.framing import NeedData
 from xethru_protocol.wire.messages import (
     Command,
-    DataFloat,
     InjectFrame,
     PresenceSingle,
     Response,
@@ -67,8 +66,6 @@ class ChipStream(MessageStream):
         self._zero_ns = scene_time_zero_ns
         self._clock = clock
         self._was_streaming = False
-        self._known = False  # the due time, until a frame, a command or a restart changes it
-        self._due_ns: int | None = None
 
     @property
     def streaming(self) -> bool:
@@ -78,11 +75,6 @@ class ChipStream(MessageStream):
 
     def next_due_ns(self) -> int | None:
         """Return when the next frame is due; 0, long past, under `Pace.ASAP`."""
-        if not self._known:
-            self._due_ns, self._known = self._next_due_ns(), True
-        return self._due_ns
-
-    def _next_due_ns(self) -> int | None:
         if not self.streaming:
             return None
         if self._pace is Pace.ASAP:
@@ -92,68 +84,67 @@ class ChipStream(MessageStream):
         return self._zero_ns + self._clock.scene_time_ns(nominal_ns)
 
     def take(self) -> Response:
-        self._known = False
-        frame = self._module.chip.next_frame()
-        return DataFloat(info=frame.counter, values=frame.values)
+        return self._module.chip.next_frame()
 
-    def skip_due_before(self, time_ns: int) -> int:
+    def skip_due_before(self, time_ns: int) -> None:
         due_ns = self.next_due_ns()
         if due_ns is None or due_ns >= time_ns or self._pace is Pace.ASAP:
-            return 0
+            return
         timeline = self._module.chip.timeline
         # The clock's way back is exact to 1 ns: skip to just before, and go on one by one.
         nominal_ns = self._clock.nominal_ns(time_ns - self._zero_ns)
-        skipped = timeline.skip_before(nominal_ns - _CLOCK_TOLERANCE_NS)
-        while (due_ns := self._next_due_ns()) is not None and due_ns < time_ns:
+        timeline.skip_before(nominal_ns - _CLOCK_TOLERANCE_NS)
+        while (due_ns := self.next_due_ns()) is not None and due_ns < time_ns:
             timeline.next_counter += 1
-            skipped += 1
-        self._known = False
-        return skipped
 
     def command_done(self, command: Command[Response], now_ns: int) -> None:
         """Begin with the first frame still ahead when a command started the stream."""
-        self._known = False
         streaming = self.streaming
         if streaming and not self._was_streaming:
             self.skip_due_before(now_ns)
         self._was_streaming = streaming
 
-    def restarted(self, ready_ns: int) -> None:
-        """Look again: the chip is off until a host sets a rate again."""
-        self._known = False
-
 
 class CombinedStream(MessageStream):
-    """Messages of a module in any mode; at most one of its two streams has any."""
+    """Messages of a module in any mode; at most one of its two streams has any.
+
+    When the next one is due changes with a message, a restart, and commands that change modes or
+    settings, so it is computed then and kept.
+    """
 
     def __init__(self, raw: ChipStream, profile: ProfileStream) -> None:
         self._raw = raw
         self._profile = profile
-        self._active = self._choice()
+        self._choose()
 
     def next_due_ns(self) -> int | None:
-        return self._active.next_due_ns()
+        return self._due_ns
 
     def take(self) -> Response:
         message = self._active.take()
-        self._active = self._choice()  # a transmitter that saw nothing for long is off now
+        self._choose()  # a transmitter that saw nothing for long is off now
         return message
 
-    def skip_due_before(self, time_ns: int) -> int:
-        return self._active.skip_due_before(time_ns)
+    def skip_due_before(self, time_ns: int) -> None:
+        if self._due_ns is not None and self._due_ns < time_ns:
+            self._active.skip_due_before(time_ns)
+            self._due_ns = self._active.next_due_ns()
 
     def command_done(self, command: Command[Response], now_ns: int) -> None:
+        # a silent profile catches up with every command
+        if self._due_ns is not None and group_of(command) is Group.BASIC:
+            return
         self._raw.command_done(command, now_ns)
         self._profile.command_done(command, now_ns)
-        self._active = self._choice()
+        self._choose()
 
     def restarted(self, ready_ns: int) -> None:
-        self._raw.restarted(ready_ns)
         self._profile.restarted(ready_ns)
-        self._active = self._choice()
+        self._choose()
 
-    def _choice(self) -> ChipStream | ProfileStream:
-        return self._raw if self._raw.streaming else self._profile
+    def _choose(self) -> None:
+        self._active = self._raw if self._raw.streaming else self._profile
+        self._due_ns = self._active.next_due_ns()
 
 
 NORMAL_START = 0x7D

@@ -30,8 +30,7 @@ from emulator.chip.chip import Chip
 from emulator.device import BootTiming, Device
 from emulator.echo.echo import echo_source
 from emulator.module.memory import Identity
-from emulator.module.module import Module
-from emulator.module.outbox import LosslessOutbox, MessageStream
+from emulator.module.module import LosslessOutbox, MessageStream, Module
 from emulator.scene.scene import empty_room
 from xethru_protocol.recordings import (
     RadarFacts,
@@ -353,9 +352,8 @@ class PlayStream(MessageStream):
             self._next_round()
         return taken.message
 
-    def skip_due_before(self, time_ns: int) -> int:
+    def skip_due_before(self, time_ns: int) -> None:
         """Skip nothing: a recording is played whole."""
-        return 0
 
     def command_done(self, command: Command[Response], now_ns: int) -> None:
         """Begin when the host starts the radar; wait on while it asks and configures."""

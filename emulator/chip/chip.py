@@ -30,20 +30,16 @@ from numpy.typing import NDArray
 from emulator.chip.downconversion import CHANNELS, DECIMATION, LEAD_SAMPLES, TAP_COUNT, downconvert
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import ErrorCode, X4Error, X4Setting
-from xethru_protocol.wire.messages import REGISTERS, X4Value
+from xethru_protocol.wire.messages import REGISTERS, DataFloat, X4Value
 from xethru_protocol.wire.x4 import frame_time_ns
 
 NS_PER_S = 1_000_000_000
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Segment:
-    first_counter: int
-    start_ns: int
-    rate_hz: float
-
-    def time_ns(self, counter: int) -> int:
-        return self.start_ns + frame_time_ns(counter - self.first_counter, self.rate_hz)
+MAX_TIMER_HZ = 65535.0
+"""The firmware's frame rate is a 16-bit integer."""
+GUARD_FRAMES = 100
+"""All-zero frames after which the module switches its transmitter off."""
+DEFAULT_LARGEST_BLOCK = 32
+DAC_LEVELS = 2048
 
 
 class Timeline:
@@ -69,36 +65,33 @@ class Timeline:
     """
 
     def __init__(self) -> None:
-        self._segment: _Segment | None = None
         self.next_counter = 0
+        self._first_counter = 0
+        self._start_ns = 0
+        self._rate_hz: float | None = None
 
     def set_rate(self, rate_hz: float) -> None:
         """Run at another real frame rate (> 0) from the next counter on."""
-        old = self._segment
-        if old is not None and old.rate_hz == rate_hz:
-            return
-        start_ns = 0 if old is None else old.time_ns(self.next_counter)
-        self._segment = _Segment(
-            first_counter=self.next_counter, start_ns=start_ns, rate_hz=rate_hz
-        )
+        if rate_hz != self._rate_hz:
+            self._start_ns = self.scene_time_ns(self.next_counter)
+            self._first_counter = self.next_counter
+            self._rate_hz = rate_hz
 
     def scene_time_ns(self, counter: int) -> int:
-        """Return the scene time of a counter of the current segment, in ns."""
-        return 0 if self._segment is None else self._segment.time_ns(counter)
-
-    def skip_before(self, scene_time_ns: int) -> int:
-        """Move on to the first counter not before a scene time; return how many were skipped."""
-        segment = self._segment
-        if segment is None or segment.time_ns(self.next_counter) >= scene_time_ns:
+        """Return the scene time of a counter of the current segment; 0 without a rate."""
+        if self._rate_hz is None:
             return 0
-        elapsed_ns = scene_time_ns - segment.start_ns
-        counter = segment.first_counter + int(elapsed_ns * segment.rate_hz / NS_PER_S) - 1
-        counter = max(counter, self.next_counter)
-        while segment.time_ns(counter) < scene_time_ns:
-            counter += 1
-        skipped = counter - self.next_counter
-        self.next_counter = counter
-        return skipped
+        return self._start_ns + frame_time_ns(counter - self._first_counter, self._rate_hz)
+
+    def skip_before(self, scene_time_ns: int) -> None:
+        """Move on to the first counter not before a scene time."""
+        if self._rate_hz is None or self.scene_time_ns(self.next_counter) >= scene_time_ns:
+            return
+        elapsed_ns = scene_time_ns - self._start_ns
+        counter = self._first_counter + int(elapsed_ns * self._rate_hz / NS_PER_S) - 1
+        self.next_counter = max(counter, self.next_counter)
+        while self.scene_time_ns(self.next_counter) < scene_time_ns:
+            self.next_counter += 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -223,8 +216,6 @@ class Silence(Exception):  # noqa: N818 - not an error of ours
 
 
 # --- settings
-
-DAC_LEVELS = 2048
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -376,14 +367,6 @@ READ_ONLY = frozenset({(X4Setting.SPIREGISTER, address) for address in range(4)}
 """Constants and chip ids."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Coupling:
-    """A register that holds part of a setting, as its value and back."""
-
-    read: Callable[[ChipSettings], int]
-    write: Callable[[ChipSettings, int], ChipSettings]
-
-
 def _with_high(value: int, byte: int) -> int:
     return byte << 8 | value & 0xFF
 
@@ -413,66 +396,35 @@ def _area(settings: ChipSettings) -> x4.FrameArea:
     )
 
 
-# fmt: off
-COUPLED: dict[int, Coupling] = {
-    0x2C: Coupling(read=lambda s: s.prf_div,
-                   write=lambda s, b: replace(s, prf_div=max(b, 4))),
-    0x2E: Coupling(read=lambda s: s.pulses_per_step >> 8,
-                   write=lambda s, b: replace(s, pulses_per_step=_with_high(s.pulses_per_step, b))),
-    0x2F: Coupling(read=lambda s: s.pulses_per_step & 0xFF,
-                   write=lambda s, b: replace(s, pulses_per_step=_with_low(s.pulses_per_step, b))),
-    0x30: Coupling(read=lambda s: s.dac_max >> 3,
-                   write=lambda s, b: replace(s, dac_max=b << 3 | s.dac_max & 7)),
-    0x31: Coupling(read=lambda s: s.dac_max & 7,
-                   write=lambda s, b: replace(s, dac_max=_with_low_3(s.dac_max, b))),
-    0x32: Coupling(read=lambda s: s.dac_min >> 3,
-                   write=lambda s, b: replace(s, dac_min=b << 3 | s.dac_min & 7)),
-    0x33: Coupling(read=lambda s: s.dac_min & 7,
-                   write=lambda s, b: replace(s, dac_min=_with_low_3(s.dac_min, b))),
-    0x34: Coupling(read=lambda s: 0x20 | s.dac_step,
-                   write=lambda s, b: replace(s, dac_step=b & 3)),
-    0x35: Coupling(read=lambda s: s.iterations,
-                   write=lambda s, b: replace(s, iterations=b)),
-    0x65: Coupling(read=lambda s: s.tx_center_frequency << 4,
-                   write=lambda s, b: replace(s, tx_center_frequency=4 if b >> 4 & 7 == 4 else 3)),
-    0x75: Coupling(read=lambda s: 0x10 | s.tx_power << 5,
-                   write=lambda s, b: replace(s, tx_power=b >> 5 & 3)),
-    0x0F: Coupling(read=lambda s: int(s.downconversion != 0),
-                   write=lambda s, b: replace(s, downconversion=b & 1)),
-    0x1B: Coupling(read=lambda s: 6 if s.downconversion else 3,
-                   write=_ignored),
-    0x42: Coupling(read=lambda s: _area(s).rx_wait,
-                   write=_ignored),
+Reader = Callable[[ChipSettings], int]
+Writer = Callable[[ChipSettings, int], ChipSettings]
+
+COUPLED: dict[int, tuple[Reader, Writer]] = {
+    0x2C: (lambda s: s.prf_div, lambda s, b: replace(s, prf_div=max(b, 4))),
+    0x2E: (
+        lambda s: s.pulses_per_step >> 8,
+        lambda s, b: replace(s, pulses_per_step=_with_high(s.pulses_per_step, b)),
+    ),
+    0x2F: (
+        lambda s: s.pulses_per_step & 0xFF,
+        lambda s, b: replace(s, pulses_per_step=_with_low(s.pulses_per_step, b)),
+    ),
+    0x30: (lambda s: s.dac_max >> 3, lambda s, b: replace(s, dac_max=b << 3 | s.dac_max & 7)),
+    0x31: (lambda s: s.dac_max & 7, lambda s, b: replace(s, dac_max=_with_low_3(s.dac_max, b))),
+    0x32: (lambda s: s.dac_min >> 3, lambda s, b: replace(s, dac_min=b << 3 | s.dac_min & 7)),
+    0x33: (lambda s: s.dac_min & 7, lambda s, b: replace(s, dac_min=_with_low_3(s.dac_min, b))),
+    0x34: (lambda s: 0x20 | s.dac_step, lambda s, b: replace(s, dac_step=b & 3)),
+    0x35: (lambda s: s.iterations, lambda s, b: replace(s, iterations=b)),
+    0x65: (
+        lambda s: s.tx_center_frequency << 4,
+        lambda s, b: replace(s, tx_center_frequency=4 if b >> 4 & 7 == 4 else 3),
+    ),
+    0x75: (lambda s: 0x10 | s.tx_power << 5, lambda s, b: replace(s, tx_power=b >> 5 & 3)),
+    0x0F: (lambda s: int(s.downconversion != 0), lambda s, b: replace(s, downconversion=b & 1)),
+    0x1B: (lambda s: 6 if s.downconversion else 3, _ignored),
+    0x42: (lambda s: _area(s).rx_wait, _ignored),
 }
-"""PIF registers that are settings, by address."""
-# fmt: on
-
-
-class Registers:
-    """The stored bytes of the three register spaces, as INIT leaves them."""
-
-    def __init__(self) -> None:
-        self._bytes = {space: _parse(text) for space, text in _RESET.items()}
-        for space, values in _DRIVER_DEFAULTS.items():
-            self._bytes[space].update(values)
-
-    def read(self, space: X4Setting, address: int, settings: ChipSettings) -> int:
-        """Return one register; addresses without a known value read 0."""
-        coupling = COUPLED.get(address) if space is X4Setting.PIFREGISTER else None
-        if coupling is not None:
-            return coupling.read(settings)
-        return self._bytes[space].get(address, 0)
-
-    def write(
-        self, space: X4Setting, address: int, value: int, settings: ChipSettings
-    ) -> ChipSettings:
-        """Write one register; return the settings it leaves."""
-        coupling = COUPLED.get(address) if space is X4Setting.PIFREGISTER else None
-        if coupling is not None:
-            return coupling.write(settings, value)
-        if (space, address) not in READ_ONLY:
-            self._bytes[space][address] = value
-        return settings
+"""PIF registers that are settings, by address: its value, and the settings writing it leaves."""
 
 
 def _parse(text: str) -> dict[int, int]:
@@ -481,28 +433,6 @@ def _parse(text: str) -> dict[int, int]:
 
 
 # --- frames
-
-MAX_TIMER_HZ = 65535.0
-"""The firmware's frame rate is a 16-bit integer."""
-GUARD_FRAMES = 100
-"""All-zero frames after which the module switches its transmitter off."""
-DEFAULT_LARGEST_BLOCK = 32
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ChipFrame:
-    """One frame as the firmware sends it.
-
-    Attributes
-    ----------
-    counter
-        Frame counter, 32 bits.
-    values
-        RF amplitudes, shape (n_bins,); or all I, then all Q, shape (2 * n_bins,); float32.
-    """
-
-    counter: int
-    values: NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -548,7 +478,9 @@ class Chip:
     def init(self) -> None:
         """Restart the chip: default settings, FPS 0, counter 0 at scene time 0."""
         self.timeline = Timeline()
-        self._registers = Registers()
+        self._registers = {
+            space: _parse(text) | _DRIVER_DEFAULTS[space] for space, text in _RESET.items()
+        }
         self.powered = True
         self._zero_frames = 0
         self._apply(ChipSettings())
@@ -579,19 +511,31 @@ class Chip:
         return getter(self)
 
     def read_register(self, space: X4Setting, address: int) -> int:
-        """Return one register's byte; `Refusal` when the chip is off."""
+        """Return one register's byte, 0 where none is known; `Refusal` when the chip is off."""
         self._check_powered()
-        return self._registers.read(space, address & 0xFF, self.settings)
+        address &= 0xFF
+        if space is X4Setting.PIFREGISTER and address in COUPLED:
+            read, _ = COUPLED[address]
+            return read(self.settings)
+        return self._registers[space].get(address, 0)
 
     def write_register(self, space: X4Setting, address: int, value: int) -> None:
         """Write one register's byte; `Refusal` when the chip is off."""
         self._check_powered()
-        changed = self._registers.write(space, address & 0xFF, value, self.settings)
-        if changed is not self.settings:
-            self._apply(changed)
+        address &= 0xFF
+        if space is X4Setting.PIFREGISTER and address in COUPLED:
+            _, write = COUPLED[address]
+            changed = write(self.settings, value)
+            if changed is not self.settings:
+                self._apply(changed)
+        elif (space, address) not in READ_ONLY:
+            self._registers[space][address] = value
 
-    def next_frame(self) -> ChipFrame:
-        """Take the next frame; its counter moves on."""
+    def next_frame(self) -> DataFloat:
+        """Take the next frame; its counter moves on.
+
+        Its values are RF amplitudes, shape (n_bins,); or all I, then all Q, shape (2 * n_bins,).
+        """
         counter = self.timeline.next_counter
         block = self._block
         if block is None or not 0 <= counter - block.first_counter < len(block.values):
@@ -600,7 +544,7 @@ class Chip:
         index = counter - block.first_counter
         self.timeline.next_counter = counter + 1
         self._guard_transmitter(bool(block.all_zero[index]))
-        return ChipFrame(counter=counter & 0xFFFFFFFF, values=block.values[index])
+        return DataFloat(info=counter & 0xFFFFFFFF, values=block.values[index])
 
     def _frames_from(self, counter: int) -> int:
         if self._block_phase is None:
@@ -612,12 +556,7 @@ class Chip:
             raise Refusal(X4Error.REGISTER_TIMEOUT)
 
     def _apply(self, settings: ChipSettings) -> None:
-        self.area = x4.frame_area(
-            settings.start_m,
-            settings.end_m,
-            settings.offset_m,
-            downconversion=settings.downconversion != 0,
-        )
+        self.area = _area(settings)
         self.settings = replace(
             settings, start_m=self.area.requested_start_m, end_m=self.area.requested_end_m
         )

@@ -94,7 +94,6 @@ from emulator.chip.chip import CaptureSettings, EchoSource
 from emulator.echo.receiver import CarrierJitter, Receiver, one_count
 from emulator.echo.reflections import (
     Reflections,
-    Viewpoint,
     direct_reflections,
     person_scatterer,
     reflection_phase_rad,
@@ -123,6 +122,7 @@ class ScenePaths:
         self._trajectory = scene.trajectory()
         self._targets = target_scatterers(scene.targets)
         self._leakage_phase_rad = np.array([reflection_phase_rad("leakage")])
+        self._walled = bool(scene.walls or scene.objects)
         self._faces = faces_of(scene.walls, scene.objects)
         self._pairs = corner_pairs(self._faces)
 
@@ -138,40 +138,25 @@ class ScenePaths:
             *(person_scatterer(person, t_ns) for person in self._scene.people),
         ]
         direct = [direct_reflections(each, view) for each in scatterers]
-        if not len(self._faces):
-            return _together([direct[0], self._leakage(len(t_ns)), *direct[1:]])
-
-        behind: list[Reflections] = []
-        for number, each in enumerate(scatterers):
-            share = direct_share(self._faces, each, view, wavelength_m)
-            direct[number] = replace(
-                direct[number], amplitude=direct[number].amplitude * share * share
-            )
-            if self._scene.multipath.double_bounce:
-                behind.append(ghost_reflections(self._faces, each, view, share, wavelength_m))
-        return _together(
-            [
-                direct[0],
-                self._leakage(len(t_ns)),
-                *direct[1:],
-                *self._of_walls(view, wavelength_m),
-                *behind,
-            ]
-        )
-
-    def _of_walls(self, view: Viewpoint, wavelength_m: float) -> list[Reflections]:
-        found = [face_reflections(self._faces, view, wavelength_m)]
-        if self._scene.multipath.corners:
-            found.append(corner_reflections(self._faces, self._pairs, view, wavelength_m))
-        return found
-
-    def _leakage(self, n_frames: int) -> Reflections:
-        leakage = self._scene.leakage
-        return Reflections(
-            range_m=np.full((n_frames, 1), leakage.range_m),
-            amplitude=np.full((n_frames, 1), leakage.amplitude),
+        walls: list[Reflections] = []
+        ghosts: list[Reflections] = []
+        if self._walled:
+            walls.append(face_reflections(self._faces, view, wavelength_m))
+            if self._scene.multipath.corners:
+                walls.append(corner_reflections(self._faces, self._pairs, view, wavelength_m))
+            for number, each in enumerate(scatterers):
+                share = direct_share(self._faces, each, view, wavelength_m)
+                amplitude = direct[number].amplitude * share * share
+                direct[number] = replace(direct[number], amplitude=amplitude)
+                if self._scene.multipath.double_bounce:
+                    ghosts.append(ghost_reflections(self._faces, each, view, share, wavelength_m))
+        leakage = Reflections(
+            range_m=np.full((len(t_ns), 1), self._scene.leakage.range_m),
+            amplitude=np.full((len(t_ns), 1), self._scene.leakage.amplitude),
             phase_rad=self._leakage_phase_rad,
         )
+        # frames are sums in this order, to the last bit
+        return _together([direct[0], leakage, *direct[1:], *walls, *ghosts])
 
 
 def _together(terms: list[Reflections]) -> Reflections:

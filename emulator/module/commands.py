@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 from emulator.chip.chip import Refusal, Silence
 from emulator.module.modes import State, check_permission
 from emulator.module.module import CRASH_DUMP, NOISE_MAPS, Module
-from emulator.module.settings import ZONE_LIMITS_M, accepted_baudrate
+from emulator.module.settings import ZONE_LIMITS_M
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import (
@@ -37,6 +37,33 @@ from xethru_protocol.wire.codes import (
     X4Setting,
 )
 
+HIGHEST_TRACE_LEVEL = 9
+SLOWEST_BAUDRATE, FASTEST_BAUDRATE = 600, 10_000_000
+"""The firmware acknowledges and ignores any other rate."""
+PARAMETER_FILE = (int(FileType.PARAMETER_FILE), 0)
+TEST_REPLY_BYTES = 256
+_TEST_CONTENT_ID = 0x5090
+LONGEST_READ = 4096
+"""Register bytes one READ may ask for; the firmware checks nothing, its reply buffer would end."""
+_FEATURES: frozenset[int] = frozenset(OutputFeature)
+_BYTE_REPLIES = frozenset(
+    {
+        X4Setting.DOWNCONVERSION,
+        X4Setting.DACSTEP,
+        X4Setting.TXCENTERFREQUENCY,
+        X4Setting.TXPOWER,
+        X4Setting.PRFDIV,
+    }
+)
+_POSTPROCESSING_DEFAULTS: dict[int, m.PostprocessingValue] = {
+    FramePostprocessing.NORMALIZATION: 1,
+    FramePostprocessing.PHASE_NOISE_CORRECTION: (0, 0.0),
+    FramePostprocessing.DECIMATION_FACTOR: 1,
+    FramePostprocessing.NUMBER_FORMAT: 0,
+    FramePostprocessing.LEGACY_OUTPUT: 0,
+}
+"""Assumed: what leaves frames as chapter 6 describes them."""
+
 Handler = Callable[[Module, Any], m.Response | None]
 HANDLERS: dict[type[m.Message], Handler] = {}
 HandlerT = TypeVar("HandlerT", bound=Handler)
@@ -57,8 +84,6 @@ def _signed(value: int) -> int:
 
 
 # --- modes, profiles, restarts (4.1 to 4.3, 4.5, 4.12)
-
-HIGHEST_TRACE_LEVEL = 9
 
 
 @answers(m.Ping)
@@ -254,8 +279,6 @@ def _get_value(module: Module, command: m.IoPinGetValue) -> m.Response:
 
 # --- profile settings, noise maps, outputs (4.4 to 4.7)
 
-PARAMETER_FILE = (int(FileType.PARAMETER_FILE), 0)
-
 
 @answers(m.SetDetectionZone)
 def _set_zone(module: Module, command: m.SetDetectionZone) -> None:
@@ -370,9 +393,6 @@ def _delete_noise_map(module: Module, command: m.DeleteNoiseMap) -> None:
     module.save()
 
 
-_FEATURES: frozenset[int] = frozenset(OutputFeature)
-
-
 @answers(m.OutputSetControl)
 def _set_output(module: Module, command: m.OutputSetControl) -> None:
     module.profile.set_output(_known(command.feature), command.control)
@@ -413,9 +433,6 @@ def _as_bytes(value: str | bytes) -> bytes:
 
 # --- identity, UART, tests (4.10)
 
-TEST_REPLY_BYTES = 256
-_TEST_CONTENT_ID = 0x5090
-
 
 @answers(m.SystemGetInfo)
 def _system_get_info(module: Module, command: m.SystemGetInfo) -> m.Response:
@@ -427,7 +444,8 @@ def _system_get_info(module: Module, command: m.SystemGetInfo) -> m.Response:
 
 @answers(m.SetBaudRate)
 def _set_baud_rate(module: Module, command: m.SetBaudRate) -> None:
-    module.change_baudrate(accepted_baudrate(command.baudrate, module.uart_baudrate))
+    ignored = not SLOWEST_BAUDRATE <= command.baudrate <= FASTEST_BAUDRATE
+    module.change_baudrate(module.uart_baudrate if ignored else command.baudrate)
 
 
 @answers(m.PrepareInjectFrame, m.InjectFrame)
@@ -437,75 +455,37 @@ def _inject(module: Module, command: m.Message) -> m.Response:
 
 @answers(m.SystemTest)
 def _system_test(module: Module, command: m.SystemTest) -> m.Response:
-    if command.code in _ACKNOWLEDGED:
-        _ACKNOWLEDGED[command.code](module)
-        return m.Ack()
-    test = _TESTS.get(command.code)
-    if test is None:
-        raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
-    data = test(module)
+    passed, data = True, b""
+    match command.code:
+        case TestCode.TX_ONLY | TestCode.TX_ONLY_TX_OFF:
+            module.asleep = True
+            return m.Ack()
+        case TestCode.STREAM_TX_OFF:
+            module.chip.set(X4Setting.TXPOWER, 0)
+            return m.Ack()
+        case TestCode.EXTERNAL_RAM:
+            pass
+        case TestCode.READ_IO_PINS:
+            data = module.pins.levels().to_bytes(4, "little")
+        case TestCode.X4_CONNECTION:
+            passed = module.chip.powered
+            data = b"" if passed else bytes([X4Error.REGISTER_TIMEOUT])
+        case TestCode.CERTIFICATION_ON | TestCode.CERTIFICATION_OFF:
+            module.certification = command.code == TestCode.CERTIFICATION_ON
+            module.save()
+            passed = False  # although it worked, as the firmware answers
+        case TestCode.HARDWARE_CONFIG:
+            data = module.identity.serial.encode("ascii")
+        case _:
+            raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
     return m.ReplyByte(
         content_id=_TEST_CONTENT_ID,
-        info=command.code | data[0] << 8,
-        values=data.ljust(TEST_REPLY_BYTES, b"\x00"),
+        info=command.code | passed << 8,
+        values=(bytes([passed]) + data).ljust(TEST_REPLY_BYTES, b"\x00"),
     )
 
 
-def _external_ram(module: Module) -> bytes:
-    return b"\x01"
-
-
-def _read_io_pins(module: Module) -> bytes:
-    return b"\x01" + module.pins.levels().to_bytes(4, "little")
-
-
-def _x4_connection(module: Module) -> bytes:
-    if module.chip.powered:
-        return b"\x01"
-    return bytes([0, X4Error.REGISTER_TIMEOUT, 0])
-
-
-def _certification(on: bool) -> Callable[[Module], bytes]:
-    def switch(module: Module) -> bytes:
-        module.certification = on
-        module.save()
-        return b"\x00"  # "not passed" although it worked, as the firmware answers
-
-    return switch
-
-
-def _hardware_config(module: Module) -> bytes:
-    return b"\x01" + module.identity.serial.encode("ascii")
-
-
-def _sleep(module: Module) -> None:
-    module.asleep = True
-
-
-def _transmitter_off(module: Module) -> None:
-    module.chip.set(X4Setting.TXPOWER, 0)
-
-
-_TESTS: dict[int, Callable[[Module], bytes]] = {
-    TestCode.EXTERNAL_RAM: _external_ram,
-    TestCode.READ_IO_PINS: _read_io_pins,
-    TestCode.X4_CONNECTION: _x4_connection,
-    TestCode.CERTIFICATION_ON: _certification(on=True),
-    TestCode.CERTIFICATION_OFF: _certification(on=False),
-    TestCode.HARDWARE_CONFIG: _hardware_config,
-}
-"""Data of each test; the first byte is 1 if it passed."""
-_ACKNOWLEDGED: dict[int, Callable[[Module], None]] = {
-    TestCode.TX_ONLY: _sleep,
-    TestCode.TX_ONLY_TX_OFF: _sleep,
-    TestCode.STREAM_TX_OFF: _transmitter_off,
-}
-
-
 # --- X4 driver (4.9)
-
-LONGEST_READ = 4096
-"""Register bytes one READ may ask for; the firmware checks nothing, its reply buffer would end."""
 
 
 @answers(m.X4DriverInit)
@@ -517,17 +497,6 @@ def _x4_init(module: Module, command: m.X4DriverInit) -> None:
 @answers(m.X4DriverSet)
 def _x4_set(module: Module, command: m.X4DriverSet) -> None:
     module.chip.set(command.setting, command.value)
-
-
-_BYTE_REPLIES = frozenset(
-    {
-        X4Setting.DOWNCONVERSION,
-        X4Setting.DACSTEP,
-        X4Setting.TXCENTERFREQUENCY,
-        X4Setting.TXPOWER,
-        X4Setting.PRFDIV,
-    }
-)
 
 
 @answers(m.X4DriverGet)
@@ -587,16 +556,6 @@ def _read_i2c(module: Module, command: m.X4DriverReadI2c) -> m.Response:
 @answers(m.FramePostprocessingSet)
 def _set_postprocessing(module: Module, command: m.FramePostprocessingSet) -> None:
     module.postprocessing[command.setting] = command.value
-
-
-_POSTPROCESSING_DEFAULTS: dict[int, m.PostprocessingValue] = {
-    FramePostprocessing.NORMALIZATION: 1,
-    FramePostprocessing.PHASE_NOISE_CORRECTION: (0, 0.0),
-    FramePostprocessing.DECIMATION_FACTOR: 1,
-    FramePostprocessing.NUMBER_FORMAT: 0,
-    FramePostprocessing.LEGACY_OUTPUT: 0,
-}
-"""Assumed: what leaves frames as chapter 6 describes them."""
 
 
 @answers(m.FramePostprocessingGet)

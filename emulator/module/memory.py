@@ -247,16 +247,6 @@ class Memory(Protocol):
     def save(self, state: SavedState) -> None: ...
 
 
-class VolatileMemory:
-    """Keeps nothing: every start of the emulator finds a new module."""
-
-    def load(self) -> SavedState | None:
-        return None
-
-    def save(self, state: SavedState) -> None:
-        """Discard it."""
-
-
 SAFE_MODE_FAULTS = 10
 """Consecutive faults that start safe mode."""
 BOOTLOADER_FAULTS = 15

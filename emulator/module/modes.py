@@ -15,7 +15,6 @@ Source: protocol reference 2, 4.2, 4.3, 8.2, 8.3 and 8.5.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -50,45 +49,28 @@ class Request(Enum):
     LOAD = "LOADAPP"
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
-    """Where a request leads, and which options refuse it.
-
-    Attributes
-    ----------
-    target
-        State entered; None if the request is always refused.
-    refusal
-        Name of the option that holds the ERROR of a refusal; empty if there is none.
-    refused_if
-        Option and value that make a step with a target a refusal.
-    """
-
-    target: State | None
-    refusal: str = ""
-    refused_if: tuple[str, str] | None = None
-
-
-_NO_PROFILE = Step(None, "run_without_profile_error")
-_JUMP = Step(State.MANUAL, "busy_profile_error", ("run_to_manual", "refuse"))
 _ANYWHERE = {
-    Request.STOP: Step(State.STOPPED),
-    Request.LOAD: Step(State.LOADED),
-    Request.REG: Step(State.REG),
+    Request.STOP: State.STOPPED,
+    Request.LOAD: State.LOADED,
+    Request.REG: State.REG,
 }
-_WITH_PROFILE = {Request.RUN: Step(State.RUN), Request.IDLE: Step(State.IDLE)}
-_WITHOUT = {Request.RUN: _NO_PROFILE, Request.IDLE: _NO_PROFILE}
-_RAW = {Request.MANUAL: Step(State.MANUAL)}
+_WITH_PROFILE = {Request.RUN: State.RUN, Request.IDLE: State.IDLE}
+_RAW = {Request.MANUAL: State.MANUAL}
 
-TRANSITIONS: dict[State, dict[Request, Step]] = {
-    State.RUN: _ANYWHERE | _WITH_PROFILE | {Request.MANUAL: _JUMP},
-    State.IDLE: _ANYWHERE | _WITH_PROFILE | {Request.MANUAL: _JUMP},
+TRANSITIONS: dict[State, dict[Request, State]] = {
+    State.RUN: _ANYWHERE | _WITH_PROFILE | _RAW,
+    State.IDLE: _ANYWHERE | _WITH_PROFILE | _RAW,
     State.LOADED: _ANYWHERE | _WITH_PROFILE | _RAW,
-    State.STOPPED: _ANYWHERE | _WITHOUT | _RAW,
-    State.MANUAL: _ANYWHERE | _WITHOUT | _RAW,
-    State.REG: _ANYWHERE | _WITHOUT | _RAW,
+    State.STOPPED: _ANYWHERE | _RAW,
+    State.MANUAL: _ANYWHERE | _RAW,
+    State.REG: _ANYWHERE | _RAW,
 }
-"""The machine of the sensor firmware, by state and request; the other states know no modes."""
+"""The machine of the sensor firmware; without a profile, RUN and IDLE are refused.
+
+The other states know no modes.
+"""
+JUMPS = frozenset({(State.RUN, Request.MANUAL), (State.IDLE, Request.MANUAL)})
+"""Steps that option run_to_manual may refuse."""
 
 _REQUESTS: dict[int, Request] = {
     SensorMode.XTID_SM_RUN: Request.RUN,
@@ -138,9 +120,9 @@ class ModeMachine:
         Loaded profile, 0 for none.
     """
 
-    def __init__(self, options: DeviceOptions | None = None, start: Start | None = None) -> None:
-        self._options = options or DeviceOptions()
-        self.start = start or Start()
+    def __init__(self, options: DeviceOptions, start: Start) -> None:
+        self._options = options
+        self.start = start
         self.power_up(None)
 
     @property
@@ -187,13 +169,12 @@ class ModeMachine:
         self.start = Start(state=State.LOADED, profile_id=self.profile_id)
 
     def _enter(self, request: Request) -> None:
-        step = TRANSITIONS[self.state][request]
-        refused = step.refused_if is not None and (
-            getattr(self._options, step.refused_if[0]) == step.refused_if[1]
-        )
-        if step.target is None or refused:
-            raise Refusal(getattr(self._options, step.refusal))
-        self.state = step.target
+        target = TRANSITIONS[self.state].get(request)
+        if target is None:
+            raise Refusal(self._options.run_without_profile_error)
+        if (self.state, request) in JUMPS and self._options.run_to_manual == "refuse":
+            raise Refusal(self._options.busy_profile_error)
+        self.state = target
 
 
 def state_diagram() -> str:
@@ -211,18 +192,12 @@ def state_diagram() -> str:
     ]
     notes: list[str] = []
     for state, steps in TRANSITIONS.items():
-        by_target: dict[State, list[str]] = {}
-        refused: list[str] = []
-        for request, step in steps.items():
-            if step.target is None:
-                refused.append(request.value)
-            else:
-                condition = "" if step.refused_if is None else " (option)"
-                by_target.setdefault(step.target, []).append(request.value + condition)
         lines += [
-            f"    {state.name} --> {target.name}: {', '.join(requests)}"
-            for target, requests in by_target.items()
+            f"    {state.name} --> {target.name}: {request.value}"
+            + " (option)" * ((state, request) in JUMPS)
+            for request, target in steps.items()
         ]
+        refused = [request.value for request in Request if request not in steps]
         if refused:
             notes.append(f"    note right of {state.name}: {', '.join(refused)} get ERROR")
     return "\n".join(lines + notes)
@@ -231,6 +206,7 @@ def state_diagram() -> str:
 class Group(Enum):
     """Commands that are taken in the same states."""
 
+    # these change nothing that decides what streams, and when
     BASIC = "ping, info, reset, bootloader entry, files, IO pins"
     SENSOR = "what the base firmware lacks, in any mode"
     MODES = "modes and profiles"
@@ -246,7 +222,7 @@ class Group(Enum):
 
 
 class Verdict(Enum):
-    """How a command is answered; all but TAKEN end it."""
+    """How a command is answered; all but TAKEN end it, unless an option takes it."""
 
     TAKEN = "ok"
     UNKNOWN = "ERROR 1"
@@ -297,10 +273,6 @@ PERMISSIONS: dict[Group, dict[State, Verdict]] = {
     group: dict(zip(_ORDER, verdicts, strict=True)) for group, verdicts in _ROWS.items()
 }
 """The table, by group and state."""
-
-
-def _group_of_output(command: m.OutputSetControl | m.DebugOutputSetControl) -> Group:
-    return Group.STREAM_OUTPUT if command.feature in VOLATILE else Group.PRESENCE_OUTPUT
 
 
 GROUPS: dict[type[m.Message], Group] = {
@@ -360,7 +332,7 @@ GROUPS: dict[type[m.Message], Group] = {
 
 def group_of(command: m.Message) -> Group:
     if isinstance(command, m.OutputSetControl | m.DebugOutputSetControl):
-        return _group_of_output(command)
+        return Group.STREAM_OUTPUT if command.feature in VOLATILE else Group.PRESENCE_OUTPUT
     return GROUPS.get(type(command), Group.BASIC)
 
 
@@ -374,7 +346,11 @@ def check_permission(command: m.Message, state: State, options: DeviceOptions) -
     silent = verdict is Verdict.QUIET and options.get_without_profile == "silence"
     if verdict is Verdict.NO_ANSWER or silent:
         raise Silence
-    raise Refusal(_ERRORS[verdict](options))
+    if verdict is Verdict.NO_PROFILE:
+        raise Refusal(options.no_profile_error)
+    if verdict in (Verdict.BUSY_PROFILE, Verdict.RUNNING_OUTPUT):
+        raise Refusal(options.busy_profile_error)
+    raise Refusal(ErrorCode.XTS_SPRE_NOT_RECOGNIZED)
 
 
 def permission_table() -> str:
@@ -393,15 +369,6 @@ def permission_table() -> str:
         cells = (verdicts[state].value for state in _ORDER)
         lines.append(f"| {group.value} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
-
-
-_ERRORS: dict[Verdict, Callable[[DeviceOptions], int]] = {
-    Verdict.UNKNOWN: lambda options: ErrorCode.XTS_SPRE_NOT_RECOGNIZED,
-    Verdict.QUIET: lambda options: ErrorCode.XTS_SPRE_NOT_RECOGNIZED,
-    Verdict.NO_PROFILE: lambda options: options.no_profile_error,
-    Verdict.BUSY_PROFILE: lambda options: options.busy_profile_error,
-    Verdict.RUNNING_OUTPUT: lambda options: options.busy_profile_error,
-}
 
 
 if __name__ == "__main__":

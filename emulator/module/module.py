@@ -1,23 +1,23 @@
-"""The state of one module that commands act on, and what it keeps over a reset.
+"""One module: the state that commands act on, what it keeps over a reset, what waits to be sent.
 
-Source: protocol reference 4, 8.2 and 8.5.
+`Module` is the state. An `Outbox` is the queue between a module and its line, and a
+`MessageStream` what fills it beside the replies: messages and times in, messages out.
+
+Source: protocol reference 4, 8.2, 8.4 and 8.5.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from enum import Enum, auto
+from typing import NamedTuple
 
 from emulator.chip.chip import Chip, Refusal
-from emulator.module.memory import (
-    FaultCounter,
-    FileSystem,
-    Identity,
-    Memory,
-    SavedState,
-    VolatileMemory,
-)
+from emulator.module.memory import FaultCounter, FileSystem, Identity, Memory, SavedState
 from emulator.module.modes import ModeMachine, State
 from emulator.module.pins import IoPins
 from emulator.module.settings import DEFAULT_BAUDRATE, DeviceOptions, ProfileSettings
@@ -30,26 +30,17 @@ from xethru_protocol.wire.codes import (
     TraceLevel,
 )
 
-__all__ = ["CRASH_DUMP", "NOISE_MAPS", "Module", "Restart"]
-
 CRASH_DUMP = (int(FileType.CRASH_DUMP), 0)
 NOISE_MAPS = ((int(FileType.NOISEMAP_SLOW), 0), (int(FileType.NOISEMAP_FAST), 0))
-NS_PER_MIN = 60_000_000_000
-BAUDRATE_DELAY_NS = 500_000_000
+NS_PER_S = 1_000_000_000
+NS_PER_MIN = 60 * NS_PER_S
+BAUDRATE_DELAY_NS = NS_PER_S // 2
 """From the ACK of SETBAUDRATE to the switch."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Restart:
-    """A restart that is due.
-
-    Attributes
-    ----------
-    into_bootloader
-        Whether the bootloader stays in charge.
-    at_ns
-        When, as after a fault; None for half a second after the ACK.
-    """
+    """A restart that is due, at a time (as after a fault) or half a second after the ACK (None)."""
 
     into_bootloader: bool = False
     at_ns: int | None = None
@@ -105,8 +96,8 @@ class Module:
         self.identity = identity
         self.chip = chip
         self.options = options or DeviceOptions()
-        self._memory = memory or VolatileMemory()
-        saved = self._memory.load() or SavedState()
+        self._memory = memory
+        saved = (None if memory is None else memory.load()) or SavedState()
         self._saved_profiles = {key: value.copy() for key, value in saved.profiles.items()}
         self.modes = ModeMachine(self.options, saved.start)
         self.files = FileSystem(self.options.storage_bytes, saved.files)
@@ -116,10 +107,6 @@ class Module:
         self.faults = FaultCounter(self.options.watchdog_memory_ns)
         self.noise_maps: Callable[[], tuple[bytes, bytes]] = _placeholder_noise_maps
         self.now_ns = 0
-        self.restart: Restart | None = None
-        self._baudrate_change: tuple[int, int] | None = None
-        self._noise_map_busy_until_ns = 0
-        self._noise_map_stored_ns = 0
         self._power_up_parts(into_bootloader=False)
 
     @property
@@ -206,6 +193,8 @@ class Module:
         self._working[self.modes.profile_id] = self.profile
 
     def save(self) -> None:
+        if self._memory is None:
+            return
         self._memory.save(
             SavedState(
                 start=self.modes.start,
@@ -222,12 +211,12 @@ class Module:
             self.notices.append(m.DataString(text=text))
 
     def _power_up_parts(self, *, into_bootloader: bool) -> None:
-        self.restart = None
+        self.restart: Restart | None = None
         self.notices: list[m.Response] = []
         self.reply_delay_ns = 0
         self.asleep = False
         self.uart_baudrate = DEFAULT_BAUDRATE
-        self._baudrate_change = None
+        self._baudrate_change: tuple[int, int] | None = None
         self.trace_level: int = TraceLevel.NONE
         self.postprocessing: dict[int, m.PostprocessingValue] = {}
         self.i2c: dict[int, bytes] = {}
@@ -256,3 +245,183 @@ class Module:
             fresh = ProfileSettings.shipped(self.options) if saved is None else saved.after_reset()
             self._working[profile_id] = fresh
         return self._working[profile_id]
+
+
+class MessageKind(Enum):
+    """What a queued message is, because overflow treats kinds differently."""
+
+    REPLY = auto()
+    """ACK, ERROR, PONG, REPLY or SYSTEM."""
+    FRAME = auto()
+    """Radar frame or profile output."""
+    DEBUG = auto()
+    """DATA STRING and generic byte or float messages: the first to go."""
+
+
+class MessageStream(ABC):
+    """Unsolicited messages of a module, each with the time it falls due."""
+
+    @abstractmethod
+    def next_due_ns(self) -> int | None:
+        """Return when the next message is due; None while nothing streams."""
+
+    @abstractmethod
+    def take(self) -> m.Response:
+        """Return the next message and move on."""
+
+    @abstractmethod
+    def skip_due_before(self, time_ns: int) -> None:
+        """Give up every message due before a time; frame counters run on."""
+
+    @abstractmethod
+    def command_done(self, command: m.Command[m.Response], now_ns: int) -> None:
+        """Note that the module carried out, or refused, a command."""
+
+    # A recording goes on through a reset; a radar streams whether a host listens or not.
+    def restarted(self, ready_ns: int) -> None:  # noqa: B027 - see above
+        """Note that the module restarts, and when it will be ready; until then it is silent."""
+
+    def port_opened(self, now_ns: int) -> None:  # noqa: B027 - see above
+        """Note that a host opened the port."""
+
+    def port_closed(self, now_ns: int) -> None:  # noqa: B027 - see above
+        """Note that the last host closed the port."""
+
+
+class _Queued(NamedTuple):
+    kind: MessageKind
+    message: m.Response
+
+
+class Outbox(ABC):
+    """The queue between a module and its line."""
+
+    def __init__(self) -> None:
+        self._queue: deque[_Queued] = deque()
+
+    @property
+    @abstractmethod
+    def takes_replies(self) -> bool:
+        """Whether there is room for the reply to another command; if not, none should be read."""
+
+    @abstractmethod
+    def put(self, kind: MessageKind, message: m.Response, now_ns: int) -> None:
+        """Queue one message, or lose one, as the queue's rule demands."""
+
+    def refill_on_time(self, stream: MessageStream, now_ns: int) -> None:  # noqa: B027
+        """Fetch what fell due, because time passed."""
+
+    def refill_on_demand(self, stream: MessageStream, now_ns: int) -> None:  # noqa: B027
+        """Fetch what is due, because the line takes more."""
+
+    @abstractmethod
+    def wake_ns(self, stream: MessageStream, now_ns: int) -> int | None:
+        """Return when time alone brings the next message; None when only the line's room does."""
+
+    def take(self, now_ns: int) -> m.Response | None:
+        """Return the oldest message."""
+        return self._queue.popleft().message if self._queue else None
+
+    def clear(self) -> None:
+        self._queue.clear()
+
+    def __len__(self) -> int:
+        return len(self._queue)
+
+
+class LosslessOutbox(Outbox):
+    """Queue of a device whose clock waits for the line: nothing is dropped.
+
+    A stream message is fetched only when nothing else waits and it is due, so a reply stands
+    behind at most the one message the line is already sending.
+    """
+
+    MOST_REPLIES = 50
+
+    @property
+    def takes_replies(self) -> bool:
+        return len(self._queue) < self.MOST_REPLIES
+
+    def put(self, kind: MessageKind, message: m.Response, now_ns: int) -> None:
+        self._queue.append(_Queued(kind, message))
+
+    def refill_on_demand(self, stream: MessageStream, now_ns: int) -> None:
+        if not self._queue:
+            due_ns = stream.next_due_ns()
+            if due_ns is not None and due_ns <= now_ns:
+                self._queue.append(_Queued(MessageKind.FRAME, stream.take()))
+
+    def wake_ns(self, stream: MessageStream, now_ns: int) -> int | None:
+        """Return the next due time if it lies ahead; what is already due waits for the line."""
+        due_ns = stream.next_due_ns()
+        return due_ns if due_ns is not None and due_ns > now_ns else None
+
+
+class FirmwareOutbox(Outbox):
+    """The firmware's message queue: 50 slots, and a rule for a host that stops reading.
+
+    A host counts as stalled when messages have waited for a second and none was taken. Then every
+    further message first costs the queued debug messages, and after them the oldest of any kind
+    until a quarter of the slots is free. A full queue whose host still reads has no slot for
+    another frame: it is lost, and the gap in the counters shows it. A reply displaces the oldest
+    message instead, so a command is always answered (an assumption; the reference is silent).
+
+    Source: protocol reference 8.4.
+    """
+
+    SLOTS = 50
+    FREE_AFTER_PURGE = SLOTS // 4
+    STALL_NS = NS_PER_S
+    # One visit synthesises no more than this, so that one fast radar cannot hold up the others.
+    FRAMES_PER_REFILL = 8
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._waiting_since_ns = 0
+
+    @property
+    def takes_replies(self) -> bool:
+        """Whether another reply displaces a frame at worst, and not an unread reply."""
+        if len(self._queue) < self.SLOTS:
+            return True
+        return any(queued.kind is not MessageKind.REPLY for queued in self._queue)
+
+    def put(self, kind: MessageKind, message: m.Response, now_ns: int) -> None:
+        if self._queue and now_ns - self._waiting_since_ns >= self.STALL_NS:
+            self._purge()
+        if len(self._queue) >= self.SLOTS:
+            if kind is not MessageKind.REPLY:
+                return
+            self._queue.popleft()
+        if not self._queue:
+            self._waiting_since_ns = now_ns
+        self._queue.append(_Queued(kind, message))
+
+    def refill_on_time(self, stream: MessageStream, now_ns: int) -> None:
+        """Queue every frame due by now; without a free slot, lose it unsynthesised."""
+        # A module that fell more than a second behind its own clock lost those frames.
+        stream.skip_due_before(now_ns - self.STALL_NS)
+        for _ in range(self.FRAMES_PER_REFILL):
+            due_ns = stream.next_due_ns()
+            if due_ns is None or due_ns > now_ns:
+                return
+            stalled = now_ns - self._waiting_since_ns >= self.STALL_NS
+            if len(self._queue) >= self.SLOTS and not stalled:
+                stream.skip_due_before(now_ns + 1)
+                return
+            self.put(MessageKind.FRAME, stream.take(), now_ns)
+
+    def take(self, now_ns: int) -> m.Response | None:
+        """Return the oldest message; the host has proved that it reads."""
+        if self._queue:
+            self._waiting_since_ns = now_ns
+        return super().take(now_ns)
+
+    def wake_ns(self, stream: MessageStream, now_ns: int) -> int | None:
+        """Return the next due time, which may be past when a refill was cut short."""
+        return stream.next_due_ns()
+
+    def _purge(self) -> None:
+        kept = [queued for queued in self._queue if queued.kind is not MessageKind.DEBUG]
+        most = self.SLOTS - self.FREE_AFTER_PURGE
+        self._queue = deque(kept[-most:])

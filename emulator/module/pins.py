@@ -9,7 +9,6 @@ Source: protocol reference 4.8 and 5.1.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 from emulator.chip.chip import Refusal
@@ -21,8 +20,6 @@ from xethru_protocol.wire.codes import (
     PresenceDirection,
     PresenceState,
 )
-
-__all__ = ["IoPins", "PinControl"]
 
 SENSOR_PINS = tuple(pin for pin in IoPin if IoPin.IO1 <= pin <= IoPin.IO6)
 XEP_PINS = tuple(pin for pin in IoPin if pin is not IoPin.ALL)
@@ -65,11 +62,10 @@ class IoPins:
         self._base_firmware = base_firmware
         self.presence: int = int(PresenceState.NO_PRESENCE)
         self.movement = False
-        self._outside: dict[int, int] = {}
         self.reset()
 
     def reset(self) -> None:
-        """Disable all pins; what is wired to them stays."""
+        """Disable all pins."""
         self._controls: dict[int, PinControl] = {}
         self._values: dict[int, int] = {}
 
@@ -78,7 +74,7 @@ class IoPins:
         self.movement = presence == PresenceState.PRESENCE and direction != PresenceDirection.STILL
 
     def set_control(self, pin: int, setup: int, feature: int) -> None:
-        """Set what a pin does; pin 0 is all."""
+        """Set what a pin does, or raise `Refusal`; pin 0 is all."""
         pins = self._pins(pin)
         if self._base_firmware:
             if feature != IoPinFeature.PASSIVE:
@@ -93,8 +89,7 @@ class IoPins:
             self._values[each] = 0
 
     def control(self, pin: int) -> PinControl:
-        (each,) = self._pins(pin)[:1]
-        return self._controls.get(each, PinControl())
+        return self._controls.get(self._pins(pin)[0], PinControl())
 
     def set_value(self, pin: int, value: int) -> None:
         """Drive a passive output; on any other pin it shows when the pin becomes one."""
@@ -110,16 +105,9 @@ class IoPins:
             control = _DATASHEET.get(each, PinControl())
         driven = control.feature != IoPinFeature.DISABLE and control.setup & IoPinSetup.OUTPUT
         if not driven:
-            pulled = int(bool(control.setup & IoPinSetup.PULL_UP))
-            return self._outside.get(each, pulled)
+            return int(bool(control.setup & IoPinSetup.PULL_UP))
         active = self._active(control.feature, each)
         return int(active != bool(control.setup & IoPinSetup.ACTIVE_LOW))
-
-    def wire(self, pin: int, level: int | None) -> None:
-        """Connect a level to a pin from outside, or nothing (None)."""
-        self._outside.pop(pin, None)
-        if level is not None:
-            self._outside[pin] = level
 
     def levels(self) -> int:
         """Return the levels of IO1...IO6 as bits, IO1 lowest."""
@@ -135,7 +123,7 @@ class IoPins:
         return bool(self._values.get(pin, 0))
 
     def _pins(self, pin: int) -> list[int]:
-        known: Iterable[int] = XEP_PINS if self._base_firmware else SENSOR_PINS
+        known: tuple[int, ...] = XEP_PINS if self._base_firmware else SENSOR_PINS
         if pin == IoPin.ALL and not self._base_firmware:
             return list(known)
         if pin not in known:

@@ -1,14 +1,5 @@
 """Settings of a module and its profile: firmware options, baud rates, messages, limits.
 
-A question the reference answers is no option. Where it marks a guess, the default is that guess;
-where it reports an observation of hardware, the default is the observation.
-
-Line levels are bytes of 0 and 1, one per bit time of the sender; between characters, before the
-first and after the last the line is high. Eight data bits, least significant first, no parity.
-
-`ProfileSettings` is what commands change and what a running profile obeys. Values out of range
-raise `Refusal` or are clamped, as the options say.
-
 Source: protocol reference, the rows marked [INF], 4.3 to 4.7, 4.10, 8.3, 8.5, chapters 10 and 15,
 and 11, row 5.
 """
@@ -35,11 +26,43 @@ from xethru_protocol.wire.codes import (
 )
 
 X4M300_PROFILES = frozenset({ProfileId.XTS_ID_APP_PRESENCE_2})
+DEFAULT_BAUDRATE = 115_200
+"""After every power-up; a rate is never saved."""
+BITS_PER_BYTE = 10
+"""Start, eight data bits, stop."""
+_FALLING = b"\x01\x00"
+_CHARACTERS = tuple(bytes((0, *(byte >> bit & 1 for bit in range(8)), 1)) for byte in range(256))
+
+_BASEBAND = frozenset({OutputFeature.BASEBAND_IQ, OutputFeature.BASEBAND_AMPLITUDE_PHASE})
+_RIVALS: dict[int, OutputFeature] = {
+    OutputFeature.PULSEDOPPLER_FLOAT: OutputFeature.PULSEDOPPLER_BYTE,
+    OutputFeature.PULSEDOPPLER_BYTE: OutputFeature.PULSEDOPPLER_FLOAT,
+    OutputFeature.NOISEMAP_FLOAT: OutputFeature.NOISEMAP_BYTE,
+    OutputFeature.NOISEMAP_BYTE: OutputFeature.NOISEMAP_FLOAT,
+}
+"""Messages of the same matrices; an instance is sent as one of them."""
+VOLATILE: frozenset[int] = frozenset(_RIVALS) | _BASEBAND
+"""Messages that are off after every reset."""
+_SWITCH = OutputControl.ON | OutputControl.DEBUG_ROUTING
+_INSTANCES = MatrixControl.SLOW | MatrixControl.FAST
+
+ZONE_LIMITS_M = (0.40, 9.40)
+"""Smallest start and largest end of a detection zone, module metres."""
+SMALLEST_ZONE_M = 0.20
+MAX_SENSITIVITY = 9
+_NOISE_MAP_BITS = (
+    NoiseMapControl.NO_DEFAULT | NoiseMapControl.ADAPTIVE | NoiseMapControl.IGNORE_STORED
+)
+_GRID_TOLERANCE = 1e-3
+"""Part of a grid step: float32 values that were read back are on the grid."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeviceOptions:
     """How one emulated module behaves where the reference allows more than one answer.
+
+    A question the reference answers is no option. Where it marks a guess, the default is that
+    guess; where it reports an observation of hardware, the default is the observation.
 
     Attributes
     ----------
@@ -120,32 +143,13 @@ class DeviceOptions:
     watchdog_memory_ns: int = 300_000_000_000
 
 
-DEFAULT_BAUDRATE = 115_200
-"""After every power-up; a rate is never saved."""
-_SLOWEST, _FASTEST = 600, 10_000_000
-
-
-def accepted_baudrate(wanted: int, current: int) -> int:
-    """Return the rate after SETBAUDRATE; one the firmware ignores changes nothing.
-
-    Examples
-    --------
-    >>> accepted_baudrate(921_600, 115_200), accepted_baudrate(599, 115_200)
-    (921600, 115200)
-    """
-    return wanted if _SLOWEST <= wanted <= _FASTEST else current
-
-
 # --- bits on the serial line
-
-BITS_PER_BYTE = 10
-"""Start, eight data bits, stop."""
-_FALLING = b"\x01\x00"
-_CHARACTERS = tuple(bytes((0, *(byte >> bit & 1 for bit in range(8)), 1)) for byte in range(256))
 
 
 def line_levels(data: bytes) -> bytes:
-    """Return the levels of bytes sent one right after the other.
+    """Return the levels of bytes sent one right after the other, one per bit time.
+
+    Eight data bits, least significant first, no parity; an idle line is high.
 
     Examples
     --------
@@ -207,20 +211,6 @@ def received_bytes(data: bytes, sent_baud: int, read_baud: int) -> bytes:
 
 # --- messages that are on
 
-_BASEBAND = frozenset({OutputFeature.BASEBAND_IQ, OutputFeature.BASEBAND_AMPLITUDE_PHASE})
-_RIVALS: dict[int, OutputFeature] = {
-    OutputFeature.PULSEDOPPLER_FLOAT: OutputFeature.PULSEDOPPLER_BYTE,
-    OutputFeature.PULSEDOPPLER_BYTE: OutputFeature.PULSEDOPPLER_FLOAT,
-    OutputFeature.NOISEMAP_FLOAT: OutputFeature.NOISEMAP_BYTE,
-    OutputFeature.NOISEMAP_BYTE: OutputFeature.NOISEMAP_FLOAT,
-}
-"""Messages of the same matrices; an instance is sent as one of them."""
-
-MATRIX: frozenset[int] = frozenset(_RIVALS)
-"""Messages whose control has a bit per instance, `MatrixControl`."""
-VOLATILE: frozenset[int] = MATRIX | _BASEBAND
-"""Messages that are off after every reset."""
-
 
 def set_output(outputs: Mapping[int, int], feature: int, control: int) -> dict[int, int]:
     """Return the table after one message was switched.
@@ -237,8 +227,9 @@ def set_output(outputs: Mapping[int, int], feature: int, control: int) -> dict[i
         for excluded in _BASEBAND:  # switching either off switches both off
             changed.pop(excluded, None)
         _keep(changed, feature, control & _SWITCH, control & OutputControl.ON)
-    elif feature in MATRIX:
-        instances = _instances(control)
+    elif feature in _RIVALS:
+        fast = MatrixControl.FAST if MatrixControl(control).fast else MatrixControl(0)
+        instances = int(control & MatrixControl.SLOW | fast)
         rival = _RIVALS[feature]
         left = changed.get(rival, 0) & ~instances
         _keep(changed, rival, left, left & _INSTANCES)
@@ -248,17 +239,8 @@ def set_output(outputs: Mapping[int, int], feature: int, control: int) -> dict[i
     return changed
 
 
-def without_volatile(outputs: Mapping[int, int]) -> dict[int, int]:
+def _without_volatile(outputs: Mapping[int, int]) -> dict[int, int]:
     return {feature: bits for feature, bits in outputs.items() if feature not in VOLATILE}
-
-
-_SWITCH = OutputControl.ON | OutputControl.DEBUG_ROUTING
-_INSTANCES = MatrixControl.SLOW | MatrixControl.FAST
-
-
-def _instances(control: int) -> int:
-    fast = MatrixControl.FAST if MatrixControl(control).fast else MatrixControl(0)
-    return int(control & MatrixControl.SLOW | fast)
 
 
 def _keep(table: dict[int, int], feature: int, bits: int, on: int) -> None:
@@ -268,17 +250,6 @@ def _keep(table: dict[int, int], feature: int, bits: int, on: int) -> None:
 
 
 # --- the profile
-
-ZONE_LIMITS_M = (0.40, 9.40)
-"""Smallest start and largest end of a detection zone, module metres."""
-ZONE_SIZE_M = (0.20, 9.00)
-"""Smallest and largest size of a detection zone, module metres."""
-MAX_SENSITIVITY = 9
-_NOISE_MAP_BITS = (
-    NoiseMapControl.NO_DEFAULT | NoiseMapControl.ADAPTIVE | NoiseMapControl.IGNORE_STORED
-)
-_GRID_TOLERANCE = 1e-3
-"""Part of a grid step: float32 values that were read back are on the grid."""
 
 
 def snapped_zone(start_m: float, end_m: float) -> tuple[float, float]:
@@ -337,8 +308,8 @@ class ProfileSettings:
         """Return a copy without the messages that every reset switches off."""
         return replace(
             self,
-            outputs=without_volatile(self.outputs),
-            debug_outputs=without_volatile(self.debug_outputs),
+            outputs=_without_volatile(self.outputs),
+            debug_outputs=_without_volatile(self.debug_outputs),
         )
 
     def set_zone(self, start_m: float, end_m: float, options: DeviceOptions) -> None:
@@ -355,9 +326,9 @@ class ProfileSettings:
         end_m = _checked(end_m, *ZONE_LIMITS_M, options)
         if options.bad_value == "clamp":
             end_m = max(end_m, start_m)
-            start_m = min(start_m, ZONE_LIMITS_M[1] - ZONE_SIZE_M[0])
-            end_m = max(end_m, start_m + ZONE_SIZE_M[0])
-        elif not ZONE_SIZE_M[0] - tolerance_m <= end_m - start_m:
+            start_m = min(start_m, ZONE_LIMITS_M[1] - SMALLEST_ZONE_M)
+            end_m = max(end_m, start_m + SMALLEST_ZONE_M)
+        elif not SMALLEST_ZONE_M - tolerance_m <= end_m - start_m:
             raise Refusal(options.bad_value_error)
         self.zone_m = snapped_zone(start_m, end_m)
 
@@ -389,8 +360,7 @@ def _checked(value: float, lowest: float, highest: float, options: DeviceOptions
     Limits are met in float32: 9.4 arrives as 9.3999996185.
     """
     tolerance = 1e-6 * max(abs(highest), 1.0)
-    if lowest - tolerance <= value <= highest + tolerance:
-        return min(max(value, lowest), highest)
-    if options.bad_value == "clamp":
-        return min(max(value, lowest), highest)
-    raise Refusal(options.bad_value_error)
+    inside = lowest - tolerance <= value <= highest + tolerance
+    if not inside and options.bad_value != "clamp":
+        raise Refusal(options.bad_value_error)
+    return min(max(value, lowest), highest)

@@ -14,11 +14,11 @@ reference gives none. Power is that of a complex tone: amplitude A at one of the
 A**2, in the normalised units of baseband. What stands still is at 0 Hz and, through the Hann
 window, at one step on either side. Approaching is positive, as the phase falls with range.
 
-Noise map control chooses where the map of a starting profile comes from (`map_source`): a stored
-one, the default - the receiver noise of a nominal module, the same in every bin - or one created
-from the first 100 s after the matrices are full. Afterwards it follows the room with a time
-constant of ten minutes, but not in bins where a person may be. The two last numbers of that
-sentence and the default map are ours; the reference names the 100 s only.
+Noise map control chooses where the map of a starting profile comes from: a stored one, the
+default - the receiver noise of a nominal module, the same in every bin - or one created from the
+first 100 s after the matrices are full. Afterwards it follows the room with a time constant of ten
+minutes, but not in bins where a person may be. The time constant and the default map are ours; the
+reference names the 100 s only.
 
 Source: protocol reference 4.6, 7.1, 7.2, 8.3 and 9.3.
 """
@@ -28,7 +28,6 @@ from __future__ import annotations
 import struct
 from collections import deque
 from dataclasses import dataclass
-from enum import Enum, auto
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +36,7 @@ from emulator.chip.chip import Chip, EchoSource
 from emulator.chip.downconversion import CHANNELS
 from emulator.scene.scene import NoiseSpec
 from xethru_protocol.wire import x4
-from xethru_protocol.wire.codes import MatrixInstance, NoiseMapControl, X4Setting
+from xethru_protocol.wire.codes import MatrixInstance, X4Setting
 from xethru_protocol.wire.messages import X4Value
 
 REQUESTED_FPS = 17.0
@@ -55,6 +54,13 @@ _WORKING_POINT: dict[X4Setting, X4Value] = {
     X4Setting.DOWNCONVERSION: 1,
     X4Setting.FPS: REQUESTED_FPS,
 }
+CREATION_TICKS = 100
+"""Matrices that are averaged for a new map, one per tick of 0.997 s."""
+ADAPTATION = 1 / 600
+"""Share of the newest matrix in the adapting map, per tick."""
+_FILE_HEADER = struct.Struct("<ffII")
+
+Powers = dict[MatrixInstance, NDArray[np.float64]]
 
 
 class ProfileSweep:
@@ -213,47 +219,8 @@ class SlowTime:
         return np.ascontiguousarray(np.fft.fftshift(power, axes=0).T)
 
 
-CREATION_TICKS = 100
-"""Matrices that are averaged for a new map, one per tick of 0.997 s."""
-ADAPTATION = 1 / 600
-"""Share of the newest matrix in the adapting map, per tick."""
-
-_FILE_HEADER = struct.Struct("<ffII")
-
-Powers = dict[MatrixInstance, NDArray[np.float64]]
-
-
-class MapSource(Enum):
-    """Where the noise map of a starting profile comes from."""
-
-    STORED = auto()
-    DEFAULT = auto()
-    CREATED = auto()
-
-
-def map_source(control: int, *, stored: bool) -> MapSource:
-    """Return which map to start with.
-
-    Examples
-    --------
-    >>> [map_source(control, stored=False).name for control in (2, 3, 6, 7)]
-    ['DEFAULT', 'CREATED', 'DEFAULT', 'CREATED']
-    >>> [map_source(control, stored=True).name for control in (2, 3, 6, 7)]
-    ['STORED', 'STORED', 'DEFAULT', 'CREATED']
-    """
-    if stored and not control & NoiseMapControl.IGNORE_STORED:
-        return MapSource.STORED
-    return MapSource.CREATED if control & NoiseMapControl.NO_DEFAULT else MapSource.DEFAULT
-
-
 class NoiseMap:
-    """Mean power by matrix, range and frequency.
-
-    Attributes
-    ----------
-    power
-        By instance, shape (n_bins, frequencies), float64.
-    """
+    """Mean power, by instance of matrix: shape (n_bins, frequencies), float64."""
 
     def __init__(self, power: Powers | None = None) -> None:
         self.power: Powers = {} if power is None else power
@@ -277,9 +244,6 @@ class NoiseMap:
         for instance, newest in power.items():
             mean = self.power[instance]
             mean[quiet] += ADAPTATION * (newest[quiet] - mean[quiet])
-
-    def copy(self) -> NoiseMap:
-        return NoiseMap({instance: power.copy() for instance, power in self.power.items()})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -341,15 +305,10 @@ def default_noise_map(n_bins: int, tx_center_frequency: int) -> NoiseMap:
     taps = CHANNELS[tx_center_frequency]
     gain = sum(tap * tap for tap in taps.i_taps) / taps.absolute_sum**2
     variance = 2 * gain * NoiseSpec().rf_sigma ** 2
-    return NoiseMap(
-        {
-            matrix.instance: np.full((n_bins, matrix.pulses), variance * _noise_gain(matrix))
-            for matrix in MATRICES
-        }
-    )
-
-
-def _noise_gain(matrix: Matrix) -> float:
-    """Return the power at one frequency of white noise of variance 1 per frame."""
-    window = matrix.window
-    return float((window**2).sum() / window.sum() ** 2) / matrix.decimation
+    power = {}
+    for matrix in MATRICES:
+        window = matrix.window
+        # the power at one frequency of white noise of variance 1 per frame
+        noise_gain = float((window**2).sum() / window.sum() ** 2) / matrix.decimation
+        power[matrix.instance] = np.full((n_bins, matrix.pulses), variance * noise_gain)
+    return NoiseMap(power)

@@ -56,6 +56,8 @@ _QUIETEST_THRESHOLD_DB = 14.0
 _INTERVAL_BINS = 10
 _FULL_MOVEMENT_DB = 40.0
 _NO_MOVEMENT_DB = 3.0
+_ABSORBABLE = 2.0
+"""Excess up to which the noise map adapts; every threshold lies above."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,26 +87,8 @@ class Detection:
         return PresenceDirection.AWAY if away else PresenceDirection.TOWARDS
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Excess:
-    """Movement over the noise map per bin: `slow` and `fast`, shape (n_bins,), linear."""
-
-    slow: NDArray[np.float64]
-    fast: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, power: Powers, noise_map: NoiseMap) -> Excess:
-        return cls(
-            slow=_excess(power, noise_map, SLOW),
-            fast=_excess(power, noise_map, FAST),
-        )
-
-    @property
-    def either(self) -> NDArray[np.float64]:
-        return np.maximum(self.slow, self.fast)
-
-
-def _excess(power: Powers, noise_map: NoiseMap, matrix: Matrix) -> NDArray[np.float64]:
+def excess_over(noise_map: NoiseMap, power: Powers, matrix: Matrix) -> NDArray[np.float64]:
+    """Return movement over the noise map per bin, shape (n_bins,), linear."""
     moving = matrix.moving
     floor = noise_map.power[matrix.instance][:, moving].sum(axis=1)
     now = power[matrix.instance][:, moving].sum(axis=1)
@@ -119,7 +103,7 @@ def threshold_db(sensitivity: int) -> float:
 
 def detections(
     sweep: ProfileSweep,
-    excess: Excess,
+    excess: NDArray[np.float64],
     noise_map: NoiseMap,
     frames: NDArray[np.complex128],
     sensitivity: int,
@@ -128,8 +112,10 @@ def detections(
 
     Parameters
     ----------
+    excess
+        Shape (n_bins,): the larger of the two matrices'.
     noise_map
-        The map itself, from which the noise of a frame follows.
+        The noise of a frame follows from it.
     frames
         Shape (n_frames, n_bins), the frames of the fast matrix, oldest first.
     """
@@ -139,7 +125,7 @@ def detections(
     floor = _frame_noise(noise_map)
     audible = np.maximum(floor, _TINY) * 10 ** (_NEWEST_MARGIN_DB / 10) * threshold
     now = newest / audible * threshold
-    strength = np.maximum(excess.either, now)
+    strength = np.maximum(excess, now)
     found = []
     for first, last in _runs(strength > threshold):
         run = slice(first, last + 1)
@@ -242,10 +228,6 @@ def _centroid(power: NDArray[np.float64], centre: int) -> float:
     return float((near * weight).sum()) / total if total > 0 else float(centre)
 
 
-_ABSORBABLE = 2.0
-"""Excess up to which the noise map adapts; every threshold lies above."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Presence:
     """What the profile knows after a tick.
@@ -288,10 +270,6 @@ class PresenceProcessing:
         self.noise_map = noise_map
         self.power: Powers = {}
 
-    @property
-    def full(self) -> bool:
-        return all(slow_time.full for slow_time in self._slow_time.values())
-
     def add(self, iq: NDArray[np.complex128]) -> None:
         for slow_time in self._slow_time.values():
             slow_time.add(iq)
@@ -308,27 +286,26 @@ class PresenceProcessing:
             for instance, slow_time in self._slow_time.items()
             if slow_time.full
         }
-        if not self.full:
-            return self._initialising()
-        if not self.noise_map.complete:
+        ready = len(self.power) == len(self._slow_time)
+        if ready and not self.noise_map.complete:
             self.noise_map.learn(self.power)
-            return self._initialising()
-        excess = Excess.of(self.power, self.noise_map)
+            ready = False
+        if not ready:
+            nothing = movement_list(self._sweep, np.ones(self._sweep.n_bins))
+            return Presence(
+                state=PresenceState.INITIALIZING,
+                detections=(),
+                movement_slow=nothing,
+                movement_fast=nothing,
+            )
+        slow, fast = (excess_over(self.noise_map, self.power, matrix) for matrix in (SLOW, FAST))
+        either = np.maximum(slow, fast)
         frames = self._slow_time[FAST.instance].pulses()
-        found = detections(self._sweep, excess, self.noise_map, frames, sensitivity)
-        self.noise_map.adapt(self.power, excess.either < _ABSORBABLE)
+        found = detections(self._sweep, either, self.noise_map, frames, sensitivity)
+        self.noise_map.adapt(self.power, either < _ABSORBABLE)
         return Presence(
             state=PresenceState.PRESENCE if found else PresenceState.NO_PRESENCE,
             detections=found,
-            movement_slow=movement_list(self._sweep, excess.slow),
-            movement_fast=movement_list(self._sweep, excess.fast),
-        )
-
-    def _initialising(self) -> Presence:
-        nothing = movement_list(self._sweep, np.ones(self._sweep.n_bins))
-        return Presence(
-            state=PresenceState.INITIALIZING,
-            detections=(),
-            movement_slow=nothing,
-            movement_fast=nothing,
+            movement_slow=movement_list(self._sweep, slow),
+            movement_fast=movement_list(self._sweep, fast),
         )

@@ -36,22 +36,19 @@ from numpy.typing import NDArray
 
 from emulator.chip import Pace
 from emulator.chip.chip import EchoSource, ModuleClock, Refusal
-from emulator.module.module import NOISE_MAPS, Module
-from emulator.module.outbox import MessageStream
+from emulator.module.module import NOISE_MAPS, MessageStream, Module
 from emulator.module.settings import ProfileSettings
 from emulator.profiles.doppler import (
     FRAME_RATE_HZ,
     FRAMES_PER_TICK,
     MATRICES,
     SLOW,
-    MapSource,
     Matrix,
     NoiseMap,
     Powers,
     ProfileSweep,
     StoredMap,
     default_noise_map,
-    map_source,
 )
 from emulator.profiles.presence import Presence, PresenceProcessing, threshold_db
 from xethru_protocol.wire import messages as m
@@ -63,40 +60,7 @@ from xethru_protocol.wire.codes import (
     PresenceDirection,
     SensorMode,
 )
-from xethru_protocol.wire.messages import BasebandAp, BasebandIq, Command, Response
-
-
-def baseband_iq(
-    sweep: ProfileSweep, counter: int, iq: NDArray[np.complex128], sampling_hz: float
-) -> BasebandIq:
-    """Return a frame as I and Q; ``sampling_hz`` fills the sampling frequency's field."""
-    return BasebandIq(
-        counter=counter & 0xFFFFFFFF,
-        num_bins=sweep.n_bins,
-        bin_length_m=x4.BASEBAND_BIN_M,
-        sampling_frequency_hz=sampling_hz,
-        carrier_frequency_hz=sweep.carrier_hz,
-        range_offset_m=float(sweep.range_m[0]),
-        i=iq.real.astype(np.float32),
-        q=iq.imag.astype(np.float32),
-    )
-
-
-def baseband_ap(
-    sweep: ProfileSweep, counter: int, iq: NDArray[np.complex128], sampling_hz: float
-) -> BasebandAp:
-    """Return a frame as amplitude and phase [rad, -pi ... pi]; see `baseband_iq`."""
-    return BasebandAp(
-        counter=counter & 0xFFFFFFFF,
-        num_bins=sweep.n_bins,
-        bin_length_m=x4.BASEBAND_BIN_M,
-        sampling_frequency_hz=sampling_hz,
-        carrier_frequency_hz=sweep.carrier_hz,
-        range_offset_m=float(sweep.range_m[0]),
-        amplitude=np.hypot(iq.real, iq.imag).astype(np.float32),
-        phase=np.arctan2(iq.imag, iq.real).astype(np.float32),
-    )
-
+from xethru_protocol.wire.messages import Command, Response
 
 BYTE_START_DB = -130.0
 BYTE_STEP_DB = 0.5
@@ -110,6 +74,37 @@ MATRIX_REPORTS: dict[int, Callable[..., m.Response]] = {
     OutputFeature.NOISEMAP_BYTE: m.NoiseMapByte,
 }
 _BYTES = frozenset({OutputFeature.PULSEDOPPLER_BYTE, OutputFeature.NOISEMAP_BYTE})
+_BASEBAND = (OutputFeature.BASEBAND_IQ, OutputFeature.BASEBAND_AMPLITUDE_PHASE)
+_PRESENCE = (OutputFeature.PRESENCE_SINGLE, OutputFeature.PRESENCE_MOVINGLIST)
+_NOISE_MAPS = (OutputFeature.NOISEMAP_FLOAT, OutputFeature.NOISEMAP_BYTE)
+# Ticks and the matrices' periods repeat after it, so leaving out multiples shifts nothing.
+_CYCLE = SLOW.frames
+
+
+def baseband(
+    feature: int,
+    sweep: ProfileSweep,
+    iq: NDArray[np.complex128],
+    *,
+    counter: int,
+    sampling_hz: float,
+) -> m.BasebandIq | m.BasebandAp:
+    """Return a frame as I and Q, or as amplitude and phase [rad, -pi ... pi]."""
+    header = {
+        "counter": counter & 0xFFFFFFFF,
+        "num_bins": sweep.n_bins,
+        "bin_length_m": x4.BASEBAND_BIN_M,
+        "sampling_frequency_hz": sampling_hz,
+        "carrier_frequency_hz": sweep.carrier_hz,
+        "range_offset_m": float(sweep.range_m[0]),
+    }
+    if feature == OutputFeature.BASEBAND_IQ:
+        return m.BasebandIq(**header, i=iq.real.astype(np.float32), q=iq.imag.astype(np.float32))
+    return m.BasebandAp(
+        **header,
+        amplitude=np.hypot(iq.real, iq.imag).astype(np.float32),
+        phase=np.arctan2(iq.imag, iq.real).astype(np.float32),
+    )
 
 
 def presence_single(counter: int, presence: Presence, sensitivity: int) -> m.PresenceSingle:
@@ -167,7 +162,11 @@ def matrix_reports(
         Matrices of this kind since the profile started.
     """
     message = MATRIX_REPORTS[feature]
-    levels = _levels(power) if feature in _BYTES else None
+    levels = None
+    if feature in _BYTES:
+        decibels = 10 * np.log10(np.maximum(power, np.finfo(np.float64).tiny))
+        steps = np.rint((decibels - BYTE_START_DB) / BYTE_STEP_DB)
+        levels = np.clip(steps, 0, 255).astype(np.uint8)
     for index, range_m in enumerate(sweep.range_m.tolist()):
         content = (
             {"power": power[index].astype(np.float32)}
@@ -192,22 +191,6 @@ def matrix_reports(
             range_m=range_m,
             **content,
         )
-
-
-def _levels(power: NDArray[np.float64]) -> NDArray[np.uint8]:
-    decibels = 10 * np.log10(np.maximum(power, np.finfo(np.float64).tiny))
-    steps = np.rint((decibels - BYTE_START_DB) / BYTE_STEP_DB)
-    return np.clip(steps, 0, 255).astype(np.uint8)
-
-
-_BASEBAND = {
-    OutputFeature.BASEBAND_IQ: baseband_iq,
-    OutputFeature.BASEBAND_AMPLITUDE_PHASE: baseband_ap,
-}
-_PRESENCE = (OutputFeature.PRESENCE_SINGLE, OutputFeature.PRESENCE_MOVINGLIST)
-_NOISE_MAPS = (OutputFeature.NOISEMAP_FLOAT, OutputFeature.NOISEMAP_BYTE)
-# Ticks and the matrices' periods repeat after it, so leaving out multiples shifts nothing.
-_CYCLE = SLOW.frames
 
 
 class ProfileRun:
@@ -260,13 +243,10 @@ class ProfileRun:
             self._frame()
         return self._ready.popleft()
 
-    def skip_before(self, time_ns: int) -> int:
-        skipped = 0
+    def skip_before(self, time_ns: int) -> None:
         while (due_ns := self.next_due_ns()) is not None and due_ns < time_ns:
-            skipped += self._jump(time_ns)
+            self._jump(time_ns)
             self.take()
-            skipped += 1
-        return skipped
 
     def pass_before(self, time_ns: int) -> None:
         """Go through every frame due before a time without a message."""
@@ -285,7 +265,12 @@ class ProfileRun:
     def _next_index(self) -> int | None:
         """Return the frame that brings the next message."""
         candidates: list[int] = []
-        if any(map(self._on, _BASEBAND)) or any(self._spread.values()):
+        waiting = any(
+            self._spread[feature, matrix]
+            for feature, matrix in self._spread
+            if matrix in self._instances(feature)  # else the output was switched off meanwhile
+        )
+        if waiting or any(map(self._on, _BASEBAND)):
             candidates.append(self._taken)
         if any(map(self._on, _PRESENCE)):
             candidates.append(_next_multiple(self._taken, FRAMES_PER_TICK))
@@ -307,9 +292,11 @@ class ProfileRun:
         iq = self.sweep.frame(counter)
         self.processing.add(iq)
         self._taken += 1
-        for feature, message in _BASEBAND.items():
-            if self._on(feature):
-                self._ready.append(message(self.sweep, counter, iq, self._sampling_hz))
+        for feature in filter(self._on, _BASEBAND):
+            message = baseband(
+                feature, self.sweep, iq, counter=counter, sampling_hz=self._sampling_hz
+            )
+            self._ready.append(message)
         if self._taken % FRAMES_PER_TICK == 0:
             self._tick(counter)
         self._release()
@@ -351,23 +338,18 @@ class ProfileRun:
             for _ in range(min(share, len(waiting))):
                 self._ready.append(waiting.popleft())
 
-    def _jump(self, time_ns: int) -> int:
-        """Skip frames whose messages are not sent, if many; return how many messages."""
+    def _jump(self, time_ns: int) -> None:
+        """Skip frames whose messages are not sent, if many."""
         if not self.processing.noise_map.complete:
-            return 0
+            return
         cycles = 0
         while self._due_ns(self._taken + (cycles + 3) * _CYCLE) < time_ns:
             cycles += 1
-        if cycles == 0:
-            return 0
-        frames = cycles * _CYCLE
-        baseband = sum(map(bool, map(self._on, _BASEBAND))) * frames
-        presence = sum(map(bool, map(self._on, _PRESENCE))) * (frames // FRAMES_PER_TICK)
-        self._taken += frames
-        self.processing.refill()
-        self._ready.clear()
-        self._spread.clear()
-        return baseband + presence
+        if cycles:
+            self._taken += cycles * _CYCLE
+            self.processing.refill()
+            self._ready.clear()
+            self._spread.clear()
 
 
 def _next_multiple(taken: int, period: int) -> int:
@@ -424,14 +406,12 @@ class ProfileStream(MessageStream):
         self._keep_created_map()
         return message
 
-    def skip_due_before(self, time_ns: int) -> int:
-        """Give up every message due before a time; the radar sweeps on."""
+    def skip_due_before(self, time_ns: int) -> None:
         run = self.running
         if run is None or self._pace is Pace.ASAP:
-            return 0
-        skipped = run.skip_before(time_ns)
+            return
+        run.skip_before(time_ns)
         self._keep_created_map()
-        return skipped
 
     def command_done(self, command: Command[Response], now_ns: int) -> None:
         """Start, pause, resume or end with the mode; catch up when an output is switched on."""
@@ -495,22 +475,15 @@ class ProfileStream(MessageStream):
 
     def _first_map(self, sweep: ProfileSweep) -> NoiseMap:
         settings = self._module.profile
-        stored = self._stored_map(sweep)
-        match map_source(settings.noise_map_control, stored=stored is not None):
-            case MapSource.STORED if stored is not None:
-                return stored.noise_map
-            case MapSource.DEFAULT:
-                return default_noise_map(sweep.n_bins, settings.tx_center_frequency)
-        return NoiseMap()
-
-    def _stored_map(self, sweep: ProfileSweep) -> StoredMap | None:
-        """Return the map in the module's files, if there is one of this zone and band."""
+        control, band = settings.noise_map_control, settings.tx_center_frequency
         slow, fast = (self._module.files.get(key) or b"" for key in NOISE_MAPS)
         stored = StoredMap.of_files((slow, fast))
-        zone_m = self._module.profile.zone_m
-        if stored is None or not stored.fits(zone_m, sweep.tx_center_frequency, sweep.n_bins):
-            return None
-        return stored
+        usable = stored is not None and stored.fits(settings.zone_m, band, sweep.n_bins)
+        if stored is not None and usable and not control & NoiseMapControl.IGNORE_STORED:
+            return stored.noise_map
+        if control & NoiseMapControl.NO_DEFAULT:
+            return NoiseMap()
+        return default_noise_map(sweep.n_bins, band)
 
     def _keep_created_map(self) -> None:
         """Store a map that has just been created, if stored maps are in use."""
@@ -536,5 +509,5 @@ class ProfileStream(MessageStream):
         return StoredMap(
             zone_m=settings.zone_m,
             tx_center_frequency=settings.tx_center_frequency,
-            noise_map=run.processing.noise_map.copy(),
+            noise_map=run.processing.noise_map,
         )

@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from emulator.chip.chip import Chip
 from emulator.device import BootTiming, Device
 from emulator.loopback import LoopbackTransport
-from emulator.module.module import Module
-from emulator.module.outbox import LosslessOutbox
+from emulator.module.module import LosslessOutbox, Module
 from emulator.playback import QUIET_NS, PlayClock, PlayStream, TimedMessage
 from hil_tests.unit.emulator.doubles import IDENTITY, RampSource
 from xethru_protocol.wire import messages as m

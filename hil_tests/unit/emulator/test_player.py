@@ -6,8 +6,7 @@ import pytest
 
 from emulator.chip.chip import Chip
 from emulator.device import BootTiming, Device
-from emulator.module.module import Module
-from emulator.module.outbox import LosslessOutbox
+from emulator.module.module import LosslessOutbox, Module
 from emulator.playback import PlayStream, schedule
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource
 from xethru_protocol.wire import messages as m

@@ -171,7 +171,7 @@ def test_blocks_grow_but_never_change_a_value() -> None:
 def test_counter_wraps_at_32_bits() -> None:
     chip = Chip(RampSource())
     chip.timeline.next_counter = 2**32 - 1
-    assert [chip.next_frame().counter for _ in range(2)] == [2**32 - 1, 0]
+    assert [chip.next_frame().info for _ in range(2)] == [2**32 - 1, 0]
 
 
 def test_a_hundred_all_zero_frames_switch_the_transmitter_off() -> None:

@@ -50,7 +50,7 @@ def test_system_tests(host: BareHost) -> None:
     assert system_test(host, 0x11)[:9] == b"\x01" + bytes(8)
     assert system_test(host, 0x19)[:3] == b"\x01\x00\x00"
     assert system_test(host, 0x1C)[:13] == b"\x01" + IDENTITY.serial.encode()
-    host.device.module.pins.wire(3, 1)
+    host.command(m.IoPinSetControl(pin_id=3, pin_setup=8, pin_feature=2))  # pulled up
     assert system_test(host, 0x18)[:5] == b"\x01\x04\x00\x00\x00"
     for code in (0x10, *range(0x12, 0x18), 0x20, 0x00):
         assert host.ask(m.SystemTest(code=code)) == m.Error(code=1)

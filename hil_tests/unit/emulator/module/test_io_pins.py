@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from emulator.module.outbox import MessageKind
+from emulator.module.module import MessageKind
 from hil_tests.unit.emulator.doubles import BareHost
 from xethru_protocol.wire import messages as m
 
@@ -53,10 +53,10 @@ def test_a_passive_output_shows_its_value(host: BareHost, inverted: int, high: i
     assert level(host, 4) == 1 - high
 
 
-def test_an_input_shows_what_is_wired_to_it(host: BareHost) -> None:
+def test_an_open_input_is_low_unless_pulled_up(host: BareHost) -> None:
     assert control(host, 5, PULL_UP, PASSIVE) == m.Ack()
-    assert level(host, 5) == 1, "pulled up"
-    host.device.module.pins.wire(5, 0)
+    assert level(host, 5) == 1
+    assert control(host, 5, 0, PASSIVE) == m.Ack()
     assert level(host, 5) == 0
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from emulator.module.outbox import FirmwareOutbox, LosslessOutbox, MessageKind, MessageStream
+from emulator.module.module import FirmwareOutbox, LosslessOutbox, MessageKind, MessageStream
 from xethru_protocol.wire import messages as m
 
 SECOND = 1_000_000_000
@@ -18,6 +18,7 @@ class Ticker(MessageStream):
     period_ns: int
     counter: int = 0
     taken: int = 0
+    skipped: int = 0
 
     def next_due_ns(self) -> int | None:
         return self.counter * self.period_ns
@@ -27,10 +28,10 @@ class Ticker(MessageStream):
         self.taken += 1
         return m.Pong(value=self.counter - 1)
 
-    def skip_due_before(self, time_ns: int) -> int:
+    def skip_due_before(self, time_ns: int) -> None:
         first = max(-(-time_ns // self.period_ns), self.counter)
-        skipped, self.counter = first - self.counter, first
-        return skipped
+        self.skipped += first - self.counter
+        self.counter = first
 
     def command_done(self, command: m.Command[m.Response], now_ns: int) -> None: ...
 
@@ -51,19 +52,15 @@ def filled(count: int, kind: MessageKind = FRAME) -> FirmwareOutbox:
 
 
 def test_a_reading_host_gets_everything_in_order() -> None:
-    outbox = filled(50)
-    assert numbers(outbox, 0) == list(range(50))
-    assert outbox.frames_lost == 0
+    assert numbers(filled(50), 0) == list(range(50))
 
 
 def test_a_full_queue_loses_the_new_frame_but_never_a_reply() -> None:
     outbox = filled(50)
     outbox.put(FRAME, m.Pong(value=50), SECOND // 2)
     assert len(outbox) == 50
-    assert outbox.frames_lost == 1
     outbox.put(REPLY, m.Pong(value=999), SECOND // 2)
     assert numbers(outbox, SECOND // 2) == [*range(1, 50), 999]
-    assert outbox.frames_lost == 2
 
 
 def test_after_a_second_the_oldest_go_until_a_quarter_is_free() -> None:
@@ -71,7 +68,6 @@ def test_after_a_second_the_oldest_go_until_a_quarter_is_free() -> None:
     outbox.put(FRAME, m.Pong(value=50), SECOND)
     # a quarter of 50 slots is 12: 38 stay, the new one joins
     assert numbers(outbox, SECOND) == list(range(12, 51))
-    assert outbox.frames_lost == 12
 
 
 def test_debug_messages_go_first() -> None:
@@ -94,7 +90,7 @@ def test_frames_that_have_no_slot_are_not_made() -> None:
     for now_ns in range(0, SECOND * 9 // 10, SECOND // 400):
         outbox.refill_on_time(ticker, now_ns)
     assert ticker.taken == len(outbox) == 50
-    assert outbox.frames_lost == ticker.counter - 50
+    assert ticker.skipped == ticker.counter - 50
 
 
 def test_a_stalled_host_leaves_gaps_and_bounded_memory() -> None:
@@ -105,7 +101,6 @@ def test_a_stalled_host_leaves_gaps_and_bounded_memory() -> None:
     values = numbers(outbox, 60 * SECOND)
     assert values == sorted(values)
     assert values[-1] == ticker.counter - 1, "the newest survive"
-    assert outbox.frames_lost + len(values) == ticker.counter
 
 
 def test_one_visit_makes_a_bounded_number_of_frames() -> None:
@@ -117,7 +112,7 @@ def test_one_visit_makes_a_bounded_number_of_frames() -> None:
 def test_what_fell_due_more_than_a_second_ago_is_lost() -> None:
     outbox, ticker = FirmwareOutbox(), Ticker(period_ns=SECOND // 100)
     outbox.refill_on_time(ticker, 10 * SECOND)
-    assert outbox.frames_lost == 900, "those due before 9 s"
+    assert ticker.skipped == 900, "those due before 9 s"
     assert numbers(outbox, 10 * SECOND)[0] == 900
 
 

@@ -109,6 +109,16 @@ def test_idle_pauses_and_run_fills_the_matrices_anew() -> None:
     assert ready[0] == pytest.approx(120, abs=0.2)
 
 
+def test_an_output_that_is_switched_off_leaves_nothing_waiting() -> None:
+    """Rows of a matrix that are still to be sent are not waited for."""
+    stream, module = profile(room(), outputs={OutputFeature.PULSEDOPPLER_FLOAT: 2})
+    assert len(list(heard_until(stream, 3 * SECOND))) == 201
+    module.profile.set_output(OutputFeature.PULSEDOPPLER_FLOAT, 0)
+    assert stream.next_due_ns() is None
+    module.profile.set_output(OutputFeature.PRESENCE_SINGLE, 1)
+    assert presence_until(stream, 5)[0][0] == pytest.approx(4 * 17 / FRAME_HZ, abs=0.1)
+
+
 def test_stop_ends_it_and_a_restart_begins_when_the_module_is_ready() -> None:
     stream, module = profile(room())
     module.fake_modes.mode = SensorMode.XTID_SM_STOP
@@ -128,8 +138,8 @@ def test_under_asap_a_start_is_scene_time_zero() -> None:
     early, _ = profile(room(WALKER), pace=Pace.ASAP, zero_ns=0)
     late, _ = profile(room(WALKER), pace=Pace.ASAP, zero_ns=777 * SECOND)
     expected = [message for _, message in heard_until(early, 25 * SECOND)]
+    late.skip_due_before(10**15)
     assert [message for _, message in heard_until(late, (777 + 25) * SECOND)] == expected
-    assert late.skip_due_before(10**15) == 0
 
 
 def test_skipped_messages_change_nothing_but_their_absence() -> None:
@@ -138,7 +148,7 @@ def test_skipped_messages_change_nothing_but_their_absence() -> None:
     expected = presence_until(whole, 32)
     gappy, _ = profile(room(WALKER))
     presence_until(gappy, 5)
-    assert gappy.skip_due_before(25 * SECOND) == 20
+    gappy.skip_due_before(25 * SECOND)
     assert presence_until(gappy, 32) == expected[-7:]
 
 
