@@ -115,6 +115,7 @@ class CombinedStream(MessageStream):
     def __init__(self, raw: ChipStream, profile: ProfileStream) -> None:
         self._raw = raw
         self._profile = profile
+        self._due_ns: int | None
         self._choose()
 
     def next_due_ns(self) -> int | None:

@@ -107,6 +107,10 @@ class Module:
         self.faults = FaultCounter(self.options.watchdog_memory_ns)
         self.noise_maps: Callable[[], tuple[bytes, bytes]] = _placeholder_noise_maps
         self.now_ns = 0
+        self.restart: Restart | None
+        self._baudrate_change: tuple[int, int] | None
+        self._noise_map_busy_until_ns: int
+        self._noise_map_stored_ns: int
         self._power_up_parts(into_bootloader=False)
 
     @property
@@ -211,12 +215,12 @@ class Module:
             self.notices.append(m.DataString(text=text))
 
     def _power_up_parts(self, *, into_bootloader: bool) -> None:
-        self.restart: Restart | None = None
+        self.restart = None
         self.notices: list[m.Response] = []
         self.reply_delay_ns = 0
         self.asleep = False
         self.uart_baudrate = DEFAULT_BAUDRATE
-        self._baudrate_change: tuple[int, int] | None = None
+        self._baudrate_change = None
         self.trace_level: int = TraceLevel.NONE
         self.postprocessing: dict[int, m.PostprocessingValue] = {}
         self.i2c: dict[int, bytes] = {}

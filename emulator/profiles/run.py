@@ -30,6 +30,7 @@ from __future__ import annotations
 import contextlib
 from collections import deque
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,7 +91,7 @@ def baseband(
     sampling_hz: float,
 ) -> m.BasebandIq | m.BasebandAp:
     """Return a frame as I and Q, or as amplitude and phase [rad, -pi ... pi]."""
-    header = {
+    header: dict[str, Any] = {
         "counter": counter & 0xFFFFFFFF,
         "num_bins": sweep.n_bins,
         "bin_length_m": x4.BASEBAND_BIN_M,
