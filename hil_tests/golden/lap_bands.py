@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hil_tests.paths import FIXTURES
-from slam.app.sweep.run import SweepRun, make_case, run_case
+from slam.app.sweep.run import SweepRun, first_laps, make_case, run_case
 
 BANDS = FIXTURES / "baselines" / "lap_bands.toml"
 N_SEEDS = 30
@@ -53,9 +53,7 @@ class Band:
 def run_lap(scene: str, preset: str, seed: int) -> SweepRun:
     """Run SLAM on the first lap of a scene."""
     case = make_case(scene, preset, seed)
-    path = case.scene.path
-    lap = path.model_copy(update={"laps": path.laps[:1]})
-    return run_case(replace(case, scene=case.scene.model_copy(update={"path": lap})))
+    return run_case(replace(case, scene=first_laps(case.scene, 1)))
 
 
 def stored_bands() -> tuple[Band, ...]:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from slam.app.commands.options import add_rerun, count, folder, seconds, seed
 from slam.app.errors import EXIT_FAILED, AppError
 from slam.app.experiments import add_experiments
-from slam.app.sweep.stress import STRESSES
+from slam.app.sweep import STRESSES
 from xethru_protocol.system import StopFlag, StopRequestedError, flush_streams, open_closed_streams
 
 _TYPICAL_SEED = 19
@@ -411,7 +411,7 @@ _COMMANDS = (
         "and writes each run's summary and the statistics of each group. Stopped, the same "
         "command goes on where it was. All numbers are simulated.",
         "STRESS is one of: "
-        + "; ".join(f"{row.name}: {row.help}" for row in STRESSES.values())
+        + "; ".join(f"{name}: {stress.help}" for name, stress in STRESSES.items())
         + ".",
     ),
 )

@@ -1,8 +1,8 @@
-"""The experiments of `uwb-slam experiment NAME`: one row and one module each.
+"""The experiments of `uwb-slam experiment NAME`.
 
-Importing this package loads nothing heavy. The module of a row is imported when its experiment
-runs. Its ``run(arguments, stop)`` measures, writes progress to stderr, calls ``stop.check()`` now
-and then and returns a `Result`.
+Importing this package loads nothing heavy. The module of an experiment is imported when it runs:
+its ``run(arguments, stop)`` measures, writes progress to stderr, calls ``stop.check()`` now and
+then and returns a `Result`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from slam.app.commands.options import count, folder, seed
@@ -22,7 +21,7 @@ from xethru_protocol.system import StopFlag
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Option = tuple[str, Mapping[str, Any]]
+Option = tuple[str, dict[str, Any]]
 """A flag, and the keywords of ``add_argument`` for it."""
 Table = tuple[str, Sequence[str], Sequence[Sequence[str]]]
 """Title, header and rows."""
@@ -51,18 +50,22 @@ class Result:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Experiment:
-    """One row: what the experiment is called, what it shows in a line, where it lives."""
+    """What an experiment shows in a line, the module of this package that runs it, its options."""
 
-    name: str
     help: str
     module: str
     options: Sequence[Option]
 
 
+def table(title: str, columns: Mapping[str, Sequence[str]]) -> Table:
+    """Return a table of columns by their headers."""
+    return title, list(columns), list(zip(*columns.values(), strict=True))
+
+
 def add_experiments(experiment: argparse.ArgumentParser) -> None:
     names = experiment.add_subparsers(required=True, metavar="NAME", dest="name")
-    for row in EXPERIMENTS.values():
-        parser = names.add_parser(row.name, help=row.help, description=row.help)
+    for name, row in EXPERIMENTS.items():
+        parser = names.add_parser(name, help=row.help, description=row.help)
         parser.add_argument(
             "--out", type=folder, default=Path("out/experiments"), help="folder for the results"
         )
@@ -79,159 +82,140 @@ def run_experiment(arguments: argparse.Namespace, stop: StopFlag) -> None:
     AppError
         The folder or a file cannot be written, or the experiment failed.
     """
-    out: Path = arguments.out
+    name, out = arguments.name, arguments.out
     with naming(out):
         out.mkdir(parents=True, exist_ok=True)
-    result: Result = import_module(EXPERIMENTS[arguments.name].module).run(arguments, stop)
+    module = import_module(f"slam.app.experiments.{EXPERIMENTS[name].module}")
+    result: Result = module.run(arguments, stop)
     # heavy, see module text
     from slam.app.run.output import print_table, write_json
     from slam.app.run.pictures import INK, picture
 
-    write_json(out / f"{arguments.name}.json", result.numbers)
+    write_json(out / f"{name}.json", result.numbers)
     width_in, height_in = result.size_in
-    with picture(out / f"{arguments.name}.png", width_in=width_in, height_in=height_in) as figure:
+    with picture(out / f"{name}.png", width_in=width_in, height_in=height_in) as figure:
         figure.suptitle(result.title, fontsize=11, color=INK, x=0.01, ha="left")
         result.draw(figure)
-    for table in result.tables:
-        print_table(*table)
+    for each in result.tables:
+        print_table(*each)
 
 
-def _option(flag: str, **keywords: Any) -> Option:  # noqa: ANN401 - argparse's
-    return flag, keywords
+def _count(flag: str, default: int, what: str, **more: object) -> Option:
+    text = f"{what} (default: %(default)s)"
+    return flag, {"type": count, "default": default, "help": text} | more
 
 
 def _seed_of(what: str) -> Option:
-    return _option("--seed", type=seed, default=0, help=f"seed of {what} (default: %(default)s)")
+    return "--seed", {"type": seed, "default": 0, "help": f"seed of {what} (default: %(default)s)"}
 
 
 def _sweep_of(made_by: str, default: str) -> Option:
     text = f"result of {made_by} (default: %(default)s)"
-    return _option("--sweep", type=Path, default=Path(default), metavar="JSON", help=text)
+    return "--sweep", {"type": Path, "default": Path(default), "metavar": "JSON", "help": text}
 
 
-_ROWS: tuple[Experiment, ...] = (
-    Experiment(
-        name="figure7",
+EXPERIMENTS: Mapping[str, Experiment] = {
+    "figure7": Experiment(
         help="one frame from raw to peaks, and a target that moves away in 1 cm steps",
-        module="slam.app.experiments.figure7",
+        module="figure7",
         options=(
             _seed_of("the receiver noise"),
-            _option(
-                "--frames",
-                type=count,
-                default=20,
-                help="frames taken at each position of the target (default: %(default)s)",
-            ),
+            _count("--frames", 20, "frames taken at each position of the target"),
         ),
     ),
-    Experiment(
-        name="smoke",
+    "smoke": Experiment(
         help="observations in smoke and in clear air, raw and filtered",
-        module="slam.app.experiments.smoke",
+        module="smoke",
         options=(_seed_of("receiver noise and odometry drift"),),
     ),
-    Experiment(
-        name="filter",
+    "filter": Experiment(
         help="what window, minimum count and search radius of the outlier filter trade off",
-        module="slam.app.experiments.filter",
+        module="filter",
         options=(
             _seed_of("receiver noise and odometry drift"),
-            _option(
+            (
                 "--scene",
-                nargs="+",
-                default=["lab"],
-                help="names or files of scenes (default: lab); in two_rooms walls make most of "
-                "the fixes",
+                {
+                    "nargs": "+",
+                    "default": ["lab"],
+                    "help": "names or files of scenes (default: lab); in two_rooms walls make most "
+                    "of the fixes",
+                },
             ),
         ),
     ),
-    Experiment(
-        name="limits",
+    "limits": Experiment(
         help="range error, detection and resolution of the front ends beside their bounds",
-        module="slam.app.experiments.limits",
+        module="limits",
         options=(
             _seed_of("places, phases and noise"),
-            _option(
-                "--trials", type=count, default=2000, help="frames per cell (default: %(default)s)"
-            ),
+            _count("--trials", 2000, "frames per cell"),
         ),
     ),
-    Experiment(
-        name="recording",
+    "recording": Experiment(
         help="a real recording of a standing module beside emulated frames",
-        module="slam.app.experiments.recording",
+        module="recording",
         options=(
-            _option(
+            (
                 "--recording",
-                type=Path,
-                required=True,
-                metavar="DIR",
-                help="recording of a standing module's baseband frames, in any format "
-                "`xethru dump` reads",
+                {
+                    "type": Path,
+                    "required": True,
+                    "metavar": "DIR",
+                    "help": "recording of a standing module's baseband frames, in any format "
+                    "`xethru dump` reads",
+                },
             ),
-            _option("--radar", metavar="NAME", help="which radar of a recording of several"),
+            ("--radar", {"metavar": "NAME", "help": "which radar of a recording of several"}),
             _seed_of("the run drawn in full"),
-            _option(
-                "--runs",
-                type=count,
-                default=20,
-                help="emulated runs, with seeds from there on (default: %(default)s)",
-            ),
+            _count("--runs", 20, "emulated runs, with seeds from there on"),
         ),
     ),
-    Experiment(
-        name="step-cost",
+    "step-cost": Experiment(
         help="what a step of the robust filter costs against the size of the map",
-        module="slam.app.experiments.step_cost",
+        module="step_cost",
         options=(
-            _option(
+            (
                 "--landmarks",
-                nargs="+",
-                type=count,
-                default=[10, 20, 50, 100, 200, 500, 1000, 2000],
-                metavar="N",
-                help="sizes of the map (default: 10 20 50 100 200 500 1000 2000)",
+                {
+                    "nargs": "+",
+                    "type": count,
+                    "default": [10, 20, 50, 100, 200, 500, 1000, 2000],
+                    "metavar": "N",
+                    "help": "sizes of the map (default: 10 20 50 100 200 500 1000 2000)",
+                },
             ),
-            _option(
-                "--repetitions",
-                type=count,
-                default=7,
-                metavar="N",
-                help="how often every step is timed; the least counts (default: %(default)s)",
+            _count(
+                "--repetitions", 7, "how often every step is timed; the least counts", metavar="N"
             ),
         ),
     ),
-    Experiment(
-        name="consistency",
+    "consistency": Experiment(
         help="mean NEES and NIS of a sweep at ten times, against their bands",
-        module="slam.app.experiments.consistency",
+        module="sweep_results",
         options=(_sweep_of("`uwb-slam sweep`, like `make sweep`", "out/sweep.json"),),
     ),
-    Experiment(
-        name="stress",
+    "stress": Experiment(
         help="what each hardship of a sweep costs, in units of its clean runs",
-        module="slam.app.experiments.stress",
+        module="sweep_results",
         options=(_sweep_of("`uwb-slam sweep --stress ...`", "out/stress.json"),),
     ),
-    Experiment(
-        name="scenes",
+    "scenes": Experiment(
         help="what one preset does in each scene of a sweep",
-        module="slam.app.experiments.scenes",
+        module="sweep_results",
         options=(_sweep_of("`uwb-slam sweep --scene ...`", "out/scenes.json"),),
     ),
-    Experiment(
-        name="victoria-park",
+    "victoria-park": Experiment(
         help="the robust back end on real data, a car among trees, against GTSAM's batch solution",
-        module="slam.app.experiments.victoria_park",
+        module="victoria_park",
         options=(
-            _option(
+            (
                 "--steps",
-                type=count,
-                default=None,
-                help="take the first steps of the drive only (default: all 6968)",
+                {
+                    "type": count,
+                    "help": "take the first steps of the drive only (default: all 6968)",
+                },
             ),
         ),
     ),
-)
-
-EXPERIMENTS: Mapping[str, Experiment] = MappingProxyType({row.name: row for row in _ROWS})
+}

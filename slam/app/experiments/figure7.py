@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from emulator.scene.scene import PathSpec, RadarSpec, Scene, TargetSpec, load_scene
-from slam.app.experiments import Result
+from slam.app.experiments import Result, table
 from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, open_loopback
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label
-from slam.config import DetectionConfig, FrontEnd, SlamConfig, load_preset
+from slam.config import DetectionConfig, FrontEnd, load_preset, override
 from slam.frames import Detection, RadarFrame
 from slam.front_end import make_detector
 from slam.front_end.paper import PaperDetector
@@ -28,8 +28,13 @@ Array = NDArray[np.float64]
 STEP_M = 0.01
 FIRST_M, LAST_M = 0.5, 1.4
 ROD_AMPLITUDE_1M = 0.015
-# A peak this far from the truth, two and a half times the pulse's half width, is not the rod's.
 MATCH_M = 0.15
+"""A peak farther from the truth, two and a half times the pulse's half width, is not the rod's."""
+
+_COLOURS = {"paper": ODOMETRY, "matched_filter": ESTIMATE, "joint": LANDMARK}
+_SHOWN_TO_M = 1.7
+_MILLI = 1e3
+_WATER = LinearSegmentedColormap.from_list("water", ["#ffffff", "#9cc0ea", "#12408a"], N=20)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -102,13 +107,11 @@ class RangeErrors:
         return float(np.nanmax(np.abs(self.position_means_m))) if self.found else math.nan
 
     def numbers(self) -> dict[str, object]:
+        names = ("bias_m", "std_m", "noise_std_m", "worst_position_m")
         return {
             "found": self.found,
             "others_per_frame": self.others_per_frame,
-            "bias_m": _known(self.bias_m),
-            "std_m": _known(self.std_m),
-            "noise_std_m": _known(self.noise_std_m),
-            "worst_position_m": _known(self.worst_position_m),
+            **{name: _known(getattr(self, name)) for name in names},
             "position_means_m": [_known(value) for value in self.position_means_m.tolist()],
         }
 
@@ -117,94 +120,63 @@ def _known(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def measure_steps(
-    *,
-    seed: int,
-    frames_per_step: int,
-    ranges_m: Sequence[float] | None = None,
-    scene: Scene | None = None,
-    check: Callable[[], None] = lambda: None,
-) -> Steps:
-    """Take frames of a rod at every range, through an emulated module and its driver.
+def rod_ranges_m() -> list[float]:
+    n_steps = round((LAST_M - FIRST_M) / STEP_M)
+    return [FIRST_M + STEP_M * step for step in range(n_steps + 1)]
 
-    Parameters
-    ----------
-    seed
-        Of the receiver noise; every position has noise of its own.
-    frames_per_step
-        Frames taken at each position.
-    ranges_m
-        True ranges; from 0.5 to 1.4 m in 1 cm steps if not given.
-    scene
-        Whose receiver: noise, leakage and the like; the lab if not given.
-    check
-        Asked at every position; may raise to stop.
+
+def measure_steps(
+    ranges_m: Sequence[float], *, seed: int, frames_per_step: int, stop: StopFlag
+) -> Steps:
+    """Take frames of a rod at every true range, through an emulated module and its driver.
+
+    The receiver, with its noise, leakage and the like, is the lab's; every position has noise of
+    its own.
     """
-    room = load_scene("lab") if scene is None else scene
-    if ranges_m is None:
-        n_steps = round((LAST_M - FIRST_M) / STEP_M)
-        ranges_m = [FIRST_M + STEP_M * step for step in range(n_steps + 1)]
-    frames = []
+    lab, frames = load_scene("lab"), []
     for number, range_m in enumerate(ranges_m):
-        check()
         noise_seed = seed * len(ranges_m) + number
-        frames.append(_frames(_rod_at(room, range_m), noise_seed, frames_per_step, check))
+        with open_loopback(_rod_at(lab, range_m), noise_seed) as source:
+            source.start(RAW_CONFIG, FRAME_RATE_HZ)
+            scans = source.scans(frames_per_step, stop.check)
+            frames.append(tuple(scan.frames[0] for scan in scans))
     return Steps(ranges_m=np.array(ranges_m), frames=tuple(frames))
 
 
-def _rod_at(room: Scene, range_m: float) -> Scene:
+def _rod_at(lab: Scene, range_m: float) -> Scene:
     radar = RadarSpec(name="radar", serial="202305070901", x_m=0.0, y_m=0.0, yaw_deg=0.0)
     rod = TargetSpec(name="rod", kind="rod", x_m=range_m, y_m=0.0, amplitude_1m=ROD_AMPLITUDE_1M)
     return Scene(
         name="range_steps",
-        environment=room.environment,
+        environment=lab.environment,
         description="One radar and one rod.",
         path=PathSpec(),
-        noise=room.noise,
-        leakage=room.leakage,
-        clutter=room.clutter,
-        jitter=room.jitter,
+        noise=lab.noise,
+        leakage=lab.leakage,
+        clutter=lab.clutter,
+        jitter=lab.jitter,
         radars=(radar,),
         targets=(rod,),
     )
 
 
-def _frames(
-    scene: Scene, seed: int, count: int, check: Callable[[], None]
-) -> tuple[RadarFrame, ...]:
-    with open_loopback(scene, seed) as source:
-        source.start(RAW_CONFIG, FRAME_RATE_HZ)
-        return tuple(scan.frames[0] for scan in source.scans(count, check))
-
-
-def front_ends() -> Mapping[str, SlamConfig]:
-    """Return the preset ``paper`` with each front end in turn, by its name."""
-    paper = load_preset("paper")
-    detection = paper.detection
-    return {
-        str(front_end): paper.model_copy(
-            update={"detection": detection.model_copy(update={"front_end": front_end})}
-        )
-        for front_end in FrontEnd
-    }
-
-
-def range_errors(
-    steps: Steps, *, check: Callable[[], None] = lambda: None
-) -> dict[str, RangeErrors]:
-    """Return what each front end makes of the same frames, by its name."""
+def range_errors(steps: Steps, stop: StopFlag) -> dict[str, RangeErrors]:
+    """Return what each front end, under preset ``paper``, makes of the same frames, by its name."""
     errors = {}
-    for name, config in front_ends().items():
+    for front_end in FrontEnd:
+        config = override(load_preset("paper"), {"detection.front_end": str(front_end)})
         detections = []
         for frames in steps.frames:
-            check()
+            stop.check()
             # a detector may remember frames, and no position is the continuation of another
             detections.append(tuple(make_detector(config).detect_many(frames, [0.0] * len(frames))))
         residuals = [
             [_residual(found, true_m) for found in of_step]
             for of_step, true_m in zip(detections, steps.ranges_m.tolist(), strict=True)
         ]
-        errors[name] = RangeErrors(detections=tuple(detections), residuals_m=np.array(residuals))
+        errors[str(front_end)] = RangeErrors(
+            detections=tuple(detections), residuals_m=np.array(residuals)
+        )
     return errors
 
 
@@ -213,18 +185,11 @@ def _residual(detections: tuple[Detection, ...], true_m: float) -> float:
     return nearest if abs(nearest) <= MATCH_M else math.nan
 
 
-_COLOURS = {"paper": ODOMETRY, "matched_filter": ESTIMATE, "joint": LANDMARK}
-_SHOWN_TO_M = 1.7
-_MILLI = 1e3
-_WATER = LinearSegmentedColormap.from_list("water", ["#ffffff", "#9cc0ea", "#12408a"], N=20)
-
-
 def _draw(figure: Figure, steps: Steps, errors: Mapping[str, RangeErrors]) -> None:
     config = load_preset("paper").detection
-    middle = len(steps.ranges_m) // 2
     panels = figure.subplots(2, 2)
-    true_m = float(steps.ranges_m[middle])
-    frame = steps.frames[middle][0]
+    middle = len(steps.ranges_m) // 2
+    true_m, frame = float(steps.ranges_m[middle]), steps.frames[middle][0]
     _draw_raw(panels[0, 0], frame, true_m)
     _draw_smoothed(panels[0, 1], frame, true_m, config)
     _draw_positions(panels[1, 0], steps, errors[str(FrontEnd.PAPER)], config)
@@ -277,14 +242,8 @@ def _draw_smoothed(axes: Axes, frame: RadarFrame, true_m: float, config: Detecti
         label="least peak height",
     )
     found = detector.detect(frame)
-    axes.plot(
-        [each.range_m for each in found],
-        [_MILLI * each.amplitude for each in found],
-        linestyle="none",
-        marker="v",
-        color=LANDMARK,
-        label="detection",
-    )
+    heights = [_MILLI * each.amplitude for each in found]
+    axes.plot([each.range_m for each in found], heights, "v", color=LANDMARK, label="detection")
     for each in found:
         axes.annotate(
             f"{each.range_m:.3f} m, {_MILLI * (each.range_m - true_m):+.1f} mm off",
@@ -326,14 +285,8 @@ def _draw_positions(axes: Axes, steps: Steps, paper: RangeErrors, config: Detect
         for of_step, true_m in zip(paper.detections, steps.ranges_m.tolist(), strict=True)
         for each in of_step[0]
     ]
-    axes.plot(
-        *np.array(points).reshape(-1, 2).T,
-        linestyle="none",
-        marker="o",
-        markersize=2.6,
-        color=LANDMARK,
-        label="detection",
-    )
+    x, y = np.array(points).reshape(-1, 2).T
+    axes.plot(x, y, "o", markersize=2.6, color=LANDMARK, label="detection")
     axes.legend(loc="upper left", frameon=False, fontsize=8.5)
     label(
         axes,
@@ -350,8 +303,7 @@ def _draw_residuals(axes: Axes, steps: Steps, errors: Mapping[str, RangeErrors])
         axes.plot(
             np.repeat(steps.ranges_m, error.residuals_m.shape[1]),
             _MILLI * error.residuals_m.ravel(),
-            linestyle="none",
-            marker=".",
+            ".",
             markersize=2.0,
             alpha=0.25,
             color=_COLOURS[name],
@@ -378,36 +330,38 @@ def _draw_residuals(axes: Axes, steps: Steps, errors: Mapping[str, RangeErrors])
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
-    steps = measure_steps(seed=arguments.seed, frames_per_step=arguments.frames, check=stop.check)
-    errors = range_errors(steps, check=stop.check)
-    title = (
-        f"a rod moved away in {len(steps.ranges_m)} steps of 1 cm, {arguments.frames} frames each, "
-        f"seed {arguments.seed}: simulated numbers"
-    )
-    header = ("front end", "found", "others/frame", "bias", "std", "of it noise", "worst position")
-    rows = [
-        (
-            name,
-            f"{error.found:.3f}",
-            f"{error.others_per_frame:.3f}",
-            f"{_MILLI * error.bias_m:.2f} mm",
-            f"{_MILLI * error.std_m:.2f} mm",
-            f"{_MILLI * error.noise_std_m:.2f} mm",
-            f"{_MILLI * error.worst_position_m:.2f} mm",
-        )
-        for name, error in errors.items()
-    ]
+    seed, n_frames = arguments.seed, arguments.frames
+    steps = measure_steps(rod_ranges_m(), seed=seed, frames_per_step=n_frames, stop=stop)
+    errors = range_errors(steps, stop)
     return Result(
         numbers={
             "simulated": True,
-            "seed": arguments.seed,
-            "frames_per_step": arguments.frames,
+            "seed": seed,
+            "frames_per_step": n_frames,
             "true_ranges_m": steps.ranges_m.tolist(),
             "front_ends": {name: error.numbers() for name, error in errors.items()},
         },
         title="From raw frame to range: the paper's figure of raw observations, repeated on an "
-        f"emulated X4M300 (simulated, seed {arguments.seed})",
+        f"emulated X4M300 (simulated, seed {seed})",
         size_in=(9.8, 7.4),
         draw=lambda figure: _draw(figure, steps, errors),
-        tables=[(title, header, rows)],
+        tables=[
+            table(
+                f"a rod moved away in {len(steps.ranges_m)} steps of 1 cm, {n_frames} frames each, "
+                f"seed {seed}: simulated numbers",
+                {
+                    "front end": list(errors),
+                    "found": [f"{each.found:.3f}" for each in errors.values()],
+                    "others/frame": [f"{each.others_per_frame:.3f}" for each in errors.values()],
+                    "bias": [_mm(each.bias_m) for each in errors.values()],
+                    "std": [_mm(each.std_m) for each in errors.values()],
+                    "of it noise": [_mm(each.noise_std_m) for each in errors.values()],
+                    "worst position": [_mm(each.worst_position_m) for each in errors.values()],
+                },
+            )
+        ],
     )
+
+
+def _mm(length_m: float) -> str:
+    return f"{1e3 * length_m:.2f} mm"

@@ -8,7 +8,8 @@ way of walls. Explained means within ``EXPLAINED_M`` of the true distance from t
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from enum import Enum
 
@@ -18,14 +19,14 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from emulator.scene.scene import Scene
-from slam.app.experiments import Result
+from slam.app.experiments import Result, table
 from slam.app.odometry.track import NS_PER_S
 from slam.app.rig.emulated import rig_of, scene_and_config, true_landmarks_m
 from slam.app.run.output import share_text
 from slam.app.run.pictures import ESTIMATE, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label
 from slam.app.run.runner import execute
-from slam.app.sweep.run import loopback_source
-from slam.config import ClusteringConfig, SlamConfig, load_preset
+from slam.app.sweep.run import first_laps, loopback_source
+from slam.config import load_preset, override
 from slam.geometry import Rig, transform
 from slam.paper.clustering import CollectedState, filter_window
 from slam.paper.pipeline import UwbRadarSlam
@@ -76,6 +77,14 @@ SETTINGS = tuple(
 """One parameter at a time around Table I."""
 
 
+_PARAMETERS: Mapping[str, tuple[str, Callable[[Setting], float]]] = {
+    "window_size": ("window_size [states], and its latency", lambda s: s.window_size),
+    "min_opc": ("min_opc [fixes]", lambda s: s.min_opc),
+    "search_rad": ("search_rad [cm]", lambda s: 1e2 * s.search_rad_m),
+}
+"""What is varied: the name of the axis, and the number on it."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Seen:
     """What one lap saw.
@@ -103,15 +112,6 @@ class Seen:
     def count(self, origin: Origin) -> int:
         return sum(each is origin for of_state in self.origins for each in of_state)
 
-    def numbers(self) -> dict[str, object]:
-        return {
-            "scene": self.scene,
-            "states": len(self.states),
-            "true_fixes": self.count(Origin.TRUE),
-            "ghosts": self.count(Origin.GHOST),
-            "clutter": self.count(Origin.CLUTTER),
-        }
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
@@ -137,7 +137,7 @@ class Outcome:
     latency_s: float
 
 
-def drive(scene: str, *, seed: int, check: Callable[[], None] = lambda: None) -> Seen:
+def drive(scene: str, *, seed: int, stop: StopFlag) -> Seen:
     """Drive the first lap of a scene and return every state with all its fixes.
 
     Raises
@@ -146,12 +146,11 @@ def drive(scene: str, *, seed: int, check: Callable[[], None] = lambda: None) ->
         The scene cannot be used; one line.
     """
     loaded, config = scene_and_config(scene, "paper")
-    path = loaded.path.model_copy(update={"laps": loaded.path.laps[:1]})
-    lap = loaded.model_copy(update={"path": path})
+    lap = first_laps(loaded, 1)
     rig = rig_of(lap)
     # With a window of one state each comes out as it is collected.
-    alone = config.model_copy(update={"window": config.window.model_copy(update={"size": 1})})
-    record = execute(loopback_source(lap, "paper", UwbRadarSlam(alone, rig), seed, check=check))
+    alone = override(config, {"window.size": 1})
+    record = execute(loopback_source(lap, "paper", UwbRadarSlam(alone, rig), seed, stop=stop))
     return Seen(
         scene=lap.name,
         states=tuple(
@@ -193,24 +192,17 @@ def _origins(fixes: Sequence[Fix], pose: Array, rig: Rig, scene: Scene) -> tuple
     return tuple(origins)
 
 
-def outcomes(
-    seen: Seen,
-    settings: Sequence[Setting] = SETTINGS,
-    *,
-    check: Callable[[], None] = lambda: None,
-) -> tuple[Outcome, ...]:
-    """Return what each setting of the filter makes of the same states."""
-    return tuple(_outcome(seen, setting, check) for setting in settings)
-
-
-def _outcome(seen: Seen, setting: Setting, check: Callable[[], None]) -> Outcome:
-    clustering = _with(load_preset("paper"), setting)
+def outcome(seen: Seen, setting: Setting, stop: StopFlag) -> Outcome:
+    """Return what a setting of the filter makes of the states."""
+    clustering = load_preset("paper").clustering.model_copy(
+        update={"min_observations": setting.min_opc, "search_radius_m": setting.search_rad_m}
+    )
     kept = dict.fromkeys(Origin, 0)
     judged = dict.fromkeys(Origin, 0)
     errors_m: list[float] = []
     latencies_ns: list[int] = []
     for first in range(len(seen.states) - setting.window_size + 1):
-        check()
+        stop.check()
         window = seen.states[first : first + setting.window_size]
         filtered = filter_window(window, clustering)
         rejected = {id(fix) for fix in filtered.rejected}
@@ -234,12 +226,6 @@ def _outcome(seen: Seen, setting: Setting, check: Callable[[], None]) -> Outcome
     )
 
 
-def _with(config: SlamConfig, setting: Setting) -> ClusteringConfig:
-    return config.clustering.model_copy(
-        update={"min_observations": setting.min_opc, "search_radius_m": setting.search_rad_m}
-    )
-
-
 def _distances_m(points: Array, landmarks_m: Array) -> list[float]:
     """Return how far each point is from the nearest landmark; infinite where there is none."""
     gaps = np.linalg.norm(points[:, np.newaxis] - landmarks_m[np.newaxis], axis=2)
@@ -247,40 +233,32 @@ def _distances_m(points: Array, landmarks_m: Array) -> list[float]:
     return distances
 
 
-_Value = Callable[[Setting], float]
-
-_PARAMETERS: tuple[tuple[str, str, _Value], ...] = (
-    ("window_size", "window_size [states], and its latency", lambda setting: setting.window_size),
-    ("min_opc", "min_opc [fixes]", lambda setting: setting.min_opc),
-    ("search_rad", "search_rad [cm]", lambda setting: 1e2 * setting.search_rad_m),
-)
-
-
-def _draw_studies(figure: Figure, studies: Sequence[tuple[Seen, Sequence[Outcome]]]) -> None:
+def _draw(figure: Figure, studies: Sequence[tuple[Seen, Sequence[Outcome]]]) -> None:
     panels = figure.subplots(len(studies), len(_PARAMETERS), squeeze=False, sharey=True)
     for row, (seen, outcomes) in zip(panels, studies, strict=True):
-        for axes, (name, x_label, value) in zip(row, _PARAMETERS, strict=True):
-            _draw(axes, name, value, outcomes)
-            label(axes, f"{seen.scene}: {name}", x_label, "share [%]")
-    figure.legend(
-        *panels[0, 0].get_legend_handles_labels(),
-        loc="outside lower center",
-        ncols=4,
-        frameon=False,
+        for axes, name in zip(row, _PARAMETERS, strict=True):
+            _draw_varied(axes, name, outcomes)
+            label(axes, f"{seen.scene}: {name}", _PARAMETERS[name][0], "share [%]")
+    handles, names = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=4, frameon=False)
+
+
+def _draw_varied(axes: Axes, name: str, outcomes: Sequence[Outcome]) -> None:
+    _, value = _PARAMETERS[name]
+    others = [other for key, (_, other) in _PARAMETERS.items() if key != name]
+    varied = sorted(
+        (row for row in outcomes if all(other(row.setting) == other(TABLE_I) for other in others)),
+        key=lambda row: value(row.setting),
     )
-
-
-def _draw(axes: Axes, name: str, value: _Value, outcomes: Sequence[Outcome]) -> None:
-    varied = [row for row in outcomes if _differs_only_in(value, row.setting)]
-    varied.sort(key=lambda row: value(row.setting))
     x = [value(row.setting) for row in varied]
-    for shares, colour, what in (
-        ([row.true_kept for row in varied], ESTIMATE, "true fixes kept"),
-        ([row.ghosts_kept for row in varied], ODOMETRY, "ghosts kept (ranges of two landmarks)"),
-        ([row.clutter_kept for row in varied], TRUTH, "other false fixes kept"),
-        ([row.wrong_observations for row in varied], LANDMARK, "observations > 15 cm off"),
+    for field, colour, what in (
+        ("true_kept", ESTIMATE, "true fixes kept"),
+        ("ghosts_kept", ODOMETRY, "ghosts kept (ranges of two landmarks)"),
+        ("clutter_kept", TRUTH, "other false fixes kept"),
+        ("wrong_observations", LANDMARK, "observations > 15 cm off"),
     ):
-        percent = [float("nan") if share is None else 1e2 * share for share in shares]
+        shares = [getattr(row, field) for row in varied]
+        percent = [math.nan if share is None else 1e2 * share for share in shares]
         axes.plot(x, percent, marker="o", markersize=4, linewidth=1.4, color=colour, label=what)
     axes.axvline(value(TABLE_I), color=PALE_INK, linewidth=0.9, linestyle="--")
     axes.set_ylim(-4, 104)
@@ -288,60 +266,47 @@ def _draw(axes: Axes, name: str, value: _Value, outcomes: Sequence[Outcome]) -> 
         axes.set_xticks(x, [f"{row.setting.window_size}\n{row.latency_s:.1f} s" for row in varied])
 
 
-def _differs_only_in(value: _Value, setting: Setting) -> bool:
-    others = [other for _, _, other in _PARAMETERS if other is not value]
-    return all(other(setting) == other(TABLE_I) for other in others)
-
-
-_HEADER = (
-    "window, min_opc, search_rad",
-    "true kept",
-    "ghosts kept",
-    "others kept",
-    "observations",
-    "wrong",
-    "latency",
-)
-
-
 def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
     for scene in arguments.scene:
         scene_and_config(scene, "paper")  # a bad one is refused before the first is driven
     studies = []
     for scene in arguments.scene:
-        seen = drive(scene, seed=arguments.seed, check=stop.check)
-        studies.append((seen, outcomes(seen, check=stop.check)))
+        seen = drive(scene, seed=arguments.seed, stop=stop)
+        studies.append((seen, [outcome(seen, setting, stop) for setting in SETTINGS]))
     return Result(
         numbers={
             "simulated": True,
             "seed": arguments.seed,
             "scenes": [
-                seen.numbers() | {"settings": [asdict(row) for row in rows]}
+                {
+                    "scene": seen.scene,
+                    "states": len(seen.states),
+                    "true_fixes": seen.count(Origin.TRUE),
+                    "ghosts": seen.count(Origin.GHOST),
+                    "clutter": seen.count(Origin.CLUTTER),
+                    "settings": [asdict(row) for row in rows],
+                }
                 for seen, rows in studies
             ],
         },
         title="The paper's DBSCAN filter, one parameter varied at a time; dashed: Table I "
         f"(one lap, simulated, seed {arguments.seed})",
         size_in=(10.4, 1.3 + 3.1 * len(studies)),
-        draw=lambda figure: _draw_studies(figure, studies),
+        draw=lambda figure: _draw(figure, studies),
         tables=[
-            (
+            table(
                 f"{seen.scene}, one lap, seed {arguments.seed}: {seen.count(Origin.TRUE)} true "
                 f"fixes, {seen.count(Origin.GHOST)} ghosts, {seen.count(Origin.CLUTTER)} others: "
                 "simulated numbers",
-                _HEADER,
-                [
-                    (
-                        str(row.setting),
-                        share_text(row.true_kept),
-                        share_text(row.ghosts_kept),
-                        share_text(row.clutter_kept),
-                        str(row.n_observations),
-                        share_text(row.wrong_observations),
-                        f"{row.latency_s:.1f} s",
-                    )
-                    for row in rows
-                ],
+                {
+                    "window, min_opc, search_rad": [str(row.setting) for row in rows],
+                    "true kept": [share_text(row.true_kept) for row in rows],
+                    "ghosts kept": [share_text(row.ghosts_kept) for row in rows],
+                    "others kept": [share_text(row.clutter_kept) for row in rows],
+                    "observations": [str(row.n_observations) for row in rows],
+                    "wrong": [share_text(row.wrong_observations) for row in rows],
+                    "latency": [f"{row.latency_s:.1f} s" for row in rows],
+                },
             )
             for seen, rows in studies
         ],

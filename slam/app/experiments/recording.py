@@ -42,7 +42,7 @@ from emulator.loopback import LoopbackTransport
 from emulator.module.memory import Identity
 from emulator.scene.scene import ClutterSpec, JitterSpec, NoiseSpec, RadarSpec, Scene, TargetSpec
 from slam.app.errors import AppError
-from slam.app.experiments import Result
+from slam.app.experiments import Result, table
 from slam.app.run.pictures import ESTIMATE, INK, ODOMETRY, TRUTH, label
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
@@ -59,6 +59,34 @@ SEGMENT = 128
 """Frames of a spectrum's segments, and of the quietest stretch."""
 FLOOR_FROM_HZ = 6.0
 """The noise floor is read from here upwards; at 17 frames/s spectra end at 8.5 Hz."""
+
+TITLES: Mapping[str, str] = {
+    "amplitude": "strongest bin: mean amplitude",
+    "phase_rad": "strongest bin: phase, std [rad]",
+    "phase_white_rad": "  of it new with each frame [rad]",
+    "far_sigma": "ten farthest bins: std per component",
+    "far_lag_1": "  autocorrelation at one frame",
+    "far_white": "  of it new with each frame",
+    "far_floor": f"  floor of the spectrum, as white noise (> {FLOOR_FROM_HZ:.0f} Hz)",
+    "far_neighbours": "  correlation of neighbouring bins",
+    "far_neighbours_fast": "  the same of its fast part (third differences)",
+}
+"""Names and titles of the figures, in the table's order."""
+
+NOISE = NoiseSpec(rf_sigma=6.4e-5, iterations=16, pulses_per_step=300)
+"""1.5e-5 per baseband component (1 / 4.18 of RF), at an assumed working point.
+
+The flat part of the far bins' spectrum. The rest of the 2.1e-5 is the fast end of the clutter: with
+2.1e-5 of white noise beside the clutter, 2.4e-5 would be new with every frame.
+"""
+CLUTTER = ClutterSpec(sigma=2.25e-4, correlation_s=4.8)
+"""1.58e-4 per baseband component (0.70 of RF). In 30 s, the mean taken off, 1.4e-4 of it show."""
+JITTER = JitterSpec(white_rad=0.0056, slow_rad=0.032, slow_correlation_s=4.0)
+
+_RECORDED, _EMULATED, _QUIET = ODOMETRY, ESTIMATE, TRUTH
+_LONGEST_LAG_S = 4.0
+_LAGS = 24
+_MRAD_TICKS = (1, 2, 5, 10, 20, 50, 100)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -148,13 +176,12 @@ class SlowTime:
         start = int(np.argmin(total))
         return replace(self, iq=self.iq[start : start + SEGMENT])
 
-    def numbers(self) -> Mapping[str, float]:
+    def numbers(self) -> dict[str, float]:
         """Return the figures of the table, by the names in `TITLES`."""
         far = self.far
         frequency, density = self.spectrum(slice(-FAR_BINS, None))
         floor = float(np.sqrt((density[frequency >= FLOOR_FROM_HZ] ** 2).mean()))
         change = np.diff(self.phase_rad)
-        fast = np.diff(far, n=3, axis=0)
         return {
             "amplitude": float(self.amplitude[self.strongest]),
             "phase_rad": float(self.phase_rad.std()),
@@ -164,22 +191,8 @@ class SlowTime:
             "far_white": _component(np.diff(far, axis=0)) / np.sqrt(2),
             "far_floor": floor * np.sqrt(self.rate_hz / 2),
             "far_neighbours": _neighbours(far),
-            "far_neighbours_fast": _neighbours(fast),
+            "far_neighbours_fast": _neighbours(np.diff(far, n=3, axis=0)),
         }
-
-
-TITLES: Mapping[str, str] = {
-    "amplitude": "strongest bin: mean amplitude",
-    "phase_rad": "strongest bin: phase, std [rad]",
-    "phase_white_rad": "  of it new with each frame [rad]",
-    "far_sigma": "ten farthest bins: std per component",
-    "far_lag_1": "  autocorrelation at one frame",
-    "far_white": "  of it new with each frame",
-    "far_floor": f"  floor of the spectrum, as white noise (> {FLOOR_FROM_HZ:.0f} Hz)",
-    "far_neighbours": "  correlation of neighbouring bins",
-    "far_neighbours_fast": "  the same of its fast part (third differences)",
-}
-"""Names and titles of the figures, in the table's order."""
 
 
 def _component(values: NDArray[np.complex128]) -> float:
@@ -196,19 +209,6 @@ def _neighbours(values: NDArray[np.complex128]) -> float:
 def spread_of(values: Sequence[float]) -> tuple[float, float, float]:
     low, middle, high = np.percentile(values, (10, 50, 90))
     return float(low), float(middle), float(high)
-
-
-NOISE = NoiseSpec(rf_sigma=6.4e-5, iterations=16, pulses_per_step=300)
-"""1.5e-5 per baseband component (1 / 4.18 of RF), at an assumed working point.
-
-The flat part of the far bins' spectrum. The rest of the 2.1e-5 is the fast end of the clutter: with
-2.1e-5 of white noise beside the clutter, 2.4e-5 would be new with every frame.
-"""
-CLUTTER = ClutterSpec(sigma=2.25e-4, correlation_s=4.8)
-"""1.58e-4 per baseband component (0.70 of RF). In 30 s, the mean taken off, 1.4e-4 of it show."""
-JITTER = JitterSpec(white_rad=0.0056, slow_rad=0.032, slow_correlation_s=4.0)
-
-_SERIAL = "201709131504"
 
 
 def read_slow_time(path: Path, radar: str | None = None) -> SlowTime:
@@ -252,20 +252,16 @@ def equivalent_scene(recorded: SlowTime) -> Scene:
     label_m = recorded.first_bin_m + recorded.strongest * recorded.bin_length_m
     range_m = label_m * SPEED_OF_LIGHT_MPS / MODULE_SPEED_MPS
     amplitude = float(recorded.amplitude[recorded.strongest]) / echo_gain()
+    radar = RadarSpec(name="radar", serial="201709131504", x_m=0.0, y_m=0.0, yaw_deg=0.0)
+    reflector = TargetSpec(
+        name="reflector", kind="point", x_m=range_m, y_m=0.0, amplitude_1m=amplitude * range_m**2
+    )
     return Scene(
         name="static_reflector",
         environment="lab",
         description="One static reflector before a standing radar.",
-        radars=(RadarSpec(name="radar", serial=_SERIAL, x_m=0.0, y_m=0.0, yaw_deg=0.0),),
-        targets=(
-            TargetSpec(
-                name="reflector",
-                kind="point",
-                x_m=range_m,
-                y_m=0.0,
-                amplitude_1m=amplitude * range_m**2,
-            ),
-        ),
+        radars=(radar,),
+        targets=(reflector,),
         noise=NOISE,
         clutter=CLUTTER,
         jitter=JITTER,
@@ -318,12 +314,6 @@ def echo_gain() -> float:
         -0.5 * (at / (SIGMA_S * SAMPLING_RATE_HZ)) ** 2 + 2j * np.pi * cycles / samples * at
     )
     return float(abs(np.dot(taps.i_taps, pulse)) / taps.absolute_sum)
-
-
-_RECORDED, _EMULATED, _QUIET = ODOMETRY, ESTIMATE, TRUTH
-_LONGEST_LAG_S = 4.0
-_LAGS = 24
-_MRAD_TICKS = (1, 2, 5, 10, 20, 50, 100)
 
 
 def _draw(figure: Figure, recorded: SlowTime, emulated: Sequence[SlowTime]) -> None:
@@ -426,26 +416,16 @@ def _draw_increments(
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
-    """Emulate the recording's scene through a module and its driver, and compare the spectra."""
     recorded = read_slow_time(arguments.recording, arguments.radar)
     scene = equivalent_scene(recorded)
     emulated = []
-    for one in range(arguments.seed, arguments.seed + arguments.runs):
+    for seed in range(arguments.seed, arguments.seed + arguments.runs):
         stop.check()
-        emulated.append(emulate(scene, recorded, one))
+        emulated.append(emulate(scene, recorded, seed))
     figures = recorded.numbers()
     quiet = recorded.quietest().numbers()
-    spread = {name: spread_of([run.numbers()[name] for run in emulated]) for name in TITLES}
-    rows = [
-        (
-            title,
-            _three_digits(figures[name]),
-            _three_digits(spread[name][1]),
-            f"{_three_digits(spread[name][0])} ... {_three_digits(spread[name][2])}",
-            _three_digits(quiet[name]),
-        )
-        for name, title in TITLES.items()
-    ]
+    spread = {name: spread_of([one.numbers()[name] for one in emulated]) for name in TITLES}
+    text = _three_digits
     return Result(
         numbers={
             "recording": str(arguments.recording),
@@ -453,8 +433,8 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
             "rate_hz": recorded.rate_hz,
             "seed": arguments.seed,
             "runs": arguments.runs,
-            "recorded": dict(figures),
-            "recorded_quietest": dict(quiet),
+            "recorded": figures,
+            "recorded_quietest": quiet,
             "emulated": {
                 name: {"p10": low, "median": middle, "p90": high}
                 for name, (low, middle, high) in spread.items()
@@ -465,11 +445,18 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
         size_in=(12.6, 7.6),
         draw=lambda figure: _draw(figure, recorded, emulated),
         tables=[
-            (
+            table(
                 f"{len(recorded.iq)} recorded frames at {recorded.rate_hz:.2f} Hz, and "
                 f"{arguments.runs} emulated runs of as many, seeds from {arguments.seed}",
-                ("", "recorded", "emulated: median", "10 ... 90 %", "recorded, quietest 128"),
-                rows,
+                {
+                    "": list(TITLES.values()),
+                    "recorded": [text(figures[name]) for name in TITLES],
+                    "emulated: median": [text(spread[name][1]) for name in TITLES],
+                    "10 ... 90 %": [
+                        f"{text(spread[name][0])} ... {text(spread[name][2])}" for name in TITLES
+                    ],
+                    "recorded, quietest 128": [text(quiet[name]) for name in TITLES],
+                },
             )
         ],
     )

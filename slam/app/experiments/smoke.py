@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,12 +25,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from emulator.scene.scene import Scene
-from slam.app.experiments import Result
+from slam.app.experiments import Result, table
 from slam.app.rig.emulated import rig_of, scene_and_config, true_landmarks_m
 from slam.app.run.output import mm_text
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, TRUTH, label
 from slam.app.run.runner import RunRecord, execute
-from slam.app.sweep.run import loopback_source
+from slam.app.sweep.run import first_laps, loopback_source
 from slam.geometry import transform
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import Fix, Observation, StepResult
@@ -45,8 +45,8 @@ _PARTICLE_G_PER_M3 = 1.8e6
 _WAVELENGTH_M = 299_792_458.0 / 7.29e9
 _LIGHT_EXTINCTION_M2_PER_G = 8.7
 _LARGEST_RANGE_M = 1.5
-_LAB_LAPS = 2
 _DB_PER_NEPER_OF_POWER = 10 / math.log(10)
+_SHOWN = ("clear air", "smoke", "lab, clear air")
 
 
 def smoke_attenuation_db(range_m: float, g_per_m3: float = SMOKE_G_PER_M3) -> float:
@@ -95,77 +95,42 @@ class ObservedRun:
     truth_m: Array
     landmarks_m: Array
 
-    def numbers(self) -> dict[str, object]:
-        return {
-            "name": self.name,
-            "detections": self.n_detections,
-            "states_with_the_detections_of_clear_air": self.same_detections,
-            "raw_fixes": len(self.raw_m),
-            "filtered_observations": len(self.filtered_m),
-            "raw_rms_m": self.raw_rms_m,
-            "filtered_rms_m": self.filtered_rms_m,
-        }
 
-
-def drive_in_clear_air_and_smoke(
-    *,
-    seed: int,
-    laps: int | None = None,
-    check: Callable[[], None] = lambda: None,
-) -> tuple[ObservedRun, ...]:
+def drive_in_clear_air_and_smoke(seed: int, stop: StopFlag) -> list[ObservedRun]:
     """Return the runs: clear air, smoke, smoke under other receiver noise, and the lab.
 
     The first two share receiver noise and odometry, so what differs is the smoke's doing; the
-    third shows the effect of other receiver noise. The lab, in clear air, is there for
+    third shows the effect of other receiver noise. The lab, two laps in clear air, is there for
     its ghosts: with one landmark there are none.
-
-    Parameters
-    ----------
-    seed
-        Of the odometry's drift and the receivers' noise.
-    laps
-        How many laps to drive; in the smoke scene all, in the lab two if not given.
-    check
-        Asked at every scan; may raise to stop.
     """
     clear, config = scene_and_config("smoke", "paper")
     lab, lab_config = scene_and_config("lab", "paper")
-    clear, lab = _laps(clear, laps), _laps(lab, _LAB_LAPS if laps is None else laps)
-    smoke = in_smoke(clear)
-    cells = (
+    lab, smoke = first_laps(lab, 2), in_smoke(clear)
+    runs: list[ObservedRun] = []
+    for name, scene, settings, noise_seed in (
         ("clear air", clear, config, seed),
         ("smoke", smoke, config, seed),
         ("smoke, other noise", smoke, config, seed + 1),
         ("lab, clear air", lab, lab_config, seed),
-    )
-    runs: list[ObservedRun] = []
-    for name, scene, settings, noise_seed in cells:
+    ):
         slam = UwbRadarSlam(settings, rig_of(scene))
         record = execute(
-            loopback_source(scene, "paper", slam, seed, noise_seed=noise_seed, check=check)
+            loopback_source(scene, "paper", slam, seed, noise_seed=noise_seed, stop=stop)
         )
         if not runs:
             reference = record
         runs.append(_observed(name, scene, record, reference if scene is not lab else None))
-    return tuple(runs)
+    return runs
 
 
 def in_smoke(scene: Scene) -> Scene:
     """Return a scene whose targets echo as weakly as smoke can make them."""
     factor = 10 ** (-smoke_attenuation_db(_LARGEST_RANGE_M) / 20)
-    return scene.model_copy(
-        update={
-            "targets": tuple(
-                target.model_copy(update={"amplitude_1m": factor * target.amplitude_1m})
-                for target in scene.targets
-            )
-        }
+    targets = tuple(
+        target.model_copy(update={"amplitude_1m": factor * target.amplitude_1m})
+        for target in scene.targets
     )
-
-
-def _laps(scene: Scene, laps: int | None) -> Scene:
-    path = scene.path.model_copy(update={"laps": scene.path.laps[:laps]})
-    return scene.model_copy(update={"path": path})
+    return scene.model_copy(update={"targets": targets})
 
 
 def _observed(
@@ -192,15 +157,12 @@ def _observed(
 
 
 def _same(results: Sequence[StepResult], reference: Sequence[StepResult]) -> float:
-    ranges = {
-        result.t_ns: [(each.radar, each.range_m) for each in result.detections]
-        for result in reference
-    }
-    same = [
-        ranges.get(result.t_ns) == [(each.radar, each.range_m) for each in result.detections]
-        for result in results
-    ]
-    return float(np.mean(same))
+    theirs = {result.t_ns: _ranges(result) for result in reference}
+    return float(np.mean([theirs.get(result.t_ns) == _ranges(result) for result in results]))
+
+
+def _ranges(result: StepResult) -> list[tuple[int, float]]:
+    return [(each.radar, each.range_m) for each in result.detections]
 
 
 def _placed(poses: Array, points: Sequence[Sequence[Fix | Observation]]) -> Array:
@@ -220,9 +182,6 @@ def _rms_m(points: Array, landmarks_m: Array) -> float | None:
     return float(np.sqrt(np.mean(gaps**2)))
 
 
-_SHOWN = ("clear air", "smoke", "lab, clear air")
-
-
 def _draw_runs(figure: Figure, runs: Sequence[ObservedRun]) -> None:
     shown = [run for run in runs if run.name in _SHOWN]
     panels = figure.subplots(2, len(shown), sharex="col", sharey="col")
@@ -238,10 +197,9 @@ def _draw_runs(figure: Figure, runs: Sequence[ObservedRun]) -> None:
                 "x [m]" if axes is column[1] else "",
                 "y [m]" if run is shown[0] else "",
             )
-    handles = [*panels[0, 0].get_legend_handles_labels()[0]]
-    handles.append(panels[1, 0].get_lines()[-1])
+    raw, _ = panels[0, 0].get_legend_handles_labels()
     figure.legend(
-        handles,
+        [*raw, panels[1, 0].get_lines()[-1]],
         ["wheel odometry", "true path", "true landmark", "raw fix", "filtered observation"],
         loc="outside lower center",
         ncols=5,
@@ -251,71 +209,61 @@ def _draw_runs(figure: Figure, runs: Sequence[ObservedRun]) -> None:
     )
 
 
-def _draw(axes: Axes, run: ObservedRun, points: NDArray[np.float64], colour: str) -> None:
+def _draw(axes: Axes, run: ObservedRun, points: Array, colour: str) -> None:
     axes.set_aspect("equal", adjustable="box")
     axes.plot(*run.odometry_m.T, color=ODOMETRY, linewidth=0.8, label="odometry")
     axes.plot(*run.truth_m.T, color=TRUTH, linewidth=2.4, alpha=0.5, label="truth")
-    axes.plot(
-        *run.landmarks_m.T,
-        linestyle="none",
-        marker="+",
-        markersize=12,
-        markeredgewidth=1.4,
-        color=INK,
-        zorder=4,
-        label="landmark",
-    )
-    axes.plot(
-        *points.T,
-        linestyle="none",
-        marker=".",
-        markersize=3.0,
-        alpha=0.5,
-        color=colour,
-        label="seen",
-    )
+    x, y = run.landmarks_m.T
+    axes.plot(x, y, "+", markersize=12, markeredgewidth=1.4, color=INK, zorder=4, label="landmark")
+    x, y = points.T
+    axes.plot(x, y, ".", markersize=3.0, alpha=0.5, color=colour, label="seen")
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
-    runs = drive_in_clear_air_and_smoke(seed=arguments.seed, check=stop.check)
+    seed: int = arguments.seed
+    runs = drive_in_clear_air_and_smoke(seed, stop)
     radar_db = smoke_attenuation_db(_LARGEST_RANGE_M)
     light_db = light_attenuation_db(_LARGEST_RANGE_M)
-    title = (
-        f"seed {arguments.seed}: simulated numbers. Smoke of {SMOKE_G_PER_M3:g} g/m3 takes at most "
-        f"{radar_db:.4f} dB from a radar's echo 1.5 m away, and {light_db:.0f} dB from a lidar's"
-    )
-    header = (
-        "run",
-        "detections",
-        "states as in clear air",
-        "raw fixes",
-        "filtered",
-        "raw error",
-        "filtered error",
-    )
-    rows = [
-        (
-            row.name,
-            str(row.n_detections),
-            "-" if row.same_detections is None else f"{row.same_detections:.4f}",
-            str(len(row.raw_m)),
-            str(len(row.filtered_m)),
-            mm_text(row.raw_rms_m),
-            mm_text(row.filtered_rms_m),
-        )
-        for row in runs
-    ]
+    columns = {
+        "run": [row.name for row in runs],
+        "detections": [str(row.n_detections) for row in runs],
+        "states as in clear air": [
+            "-" if row.same_detections is None else f"{row.same_detections:.4f}" for row in runs
+        ],
+        "raw fixes": [str(len(row.raw_m)) for row in runs],
+        "filtered": [str(len(row.filtered_m)) for row in runs],
+        "raw error": [mm_text(row.raw_rms_m) for row in runs],
+        "filtered error": [mm_text(row.filtered_rms_m) for row in runs],
+    }
     return Result(
         numbers={
             "simulated": True,
-            "seed": arguments.seed,
+            "seed": seed,
             "smoke_g_per_m3": SMOKE_G_PER_M3,
             "attenuation_to_1_5_m_and_back_db": {"radar_at_most": radar_db, "light": light_db},
-            "runs": [row.numbers() for row in runs],
+            "runs": [
+                {
+                    "name": row.name,
+                    "detections": row.n_detections,
+                    "states_with_the_detections_of_clear_air": row.same_detections,
+                    "raw_fixes": len(row.raw_m),
+                    "filtered_observations": len(row.filtered_m),
+                    "raw_rms_m": row.raw_rms_m,
+                    "filtered_rms_m": row.filtered_rms_m,
+                }
+                for row in runs
+            ],
         },
         title="Observations on wheel-odometry poses, before and after the paper's DBSCAN filter "
-        f"(simulated, seed {arguments.seed})",
+        f"(simulated, seed {seed})",
         size_in=(10.4, 7.4),
         draw=lambda figure: _draw_runs(figure, runs),
-        tables=[(title, header, rows)],
+        tables=[
+            table(
+                f"seed {seed}: simulated numbers. Smoke of {SMOKE_G_PER_M3:g} g/m3 takes at most "
+                f"{radar_db:.4f} dB from a radar's echo 1.5 m away, and {light_db:.0f} dB from a "
+                "lidar's",
+                columns,
+            )
+        ],
     )

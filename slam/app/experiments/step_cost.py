@@ -21,7 +21,7 @@ from scipy.linalg.blas import dsyr2, dsyrk
 from threadpoolctl import threadpool_limits
 
 from slam.app.errors import UsageError
-from slam.app.experiments import Result
+from slam.app.experiments import Result, table
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label
 from slam.config import WheelNoise
 from slam.geometry import paper_rig
@@ -33,26 +33,17 @@ from xethru_protocol.system import StopFlag
 N_UPDATES = 4
 BAR_MS, BAR_LANDMARKS = 4.0, 1000
 SLOPE_FROM = 200
-
-# A large covariance is passed over every 11th step for the updates, every 15th for the motions.
-_CYCLE = 165
-_DENSITY_PER_M2 = 1.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reference:
-    """What other code takes at 1000 landmarks, as quoted: low and high [ms]."""
-
-    name: str
-    low_ms: float
-    high_ms: float
-
-
-REFERENCES = (
-    Reference(name="PythonRobotics, one update", low_ms=1604.0, high_ms=1604.0),
-    Reference(name="naive numpy, one update", low_ms=29.0, high_ms=29.0),
-    Reference(name="in-place dsyrk, one update", low_ms=0.4, high_ms=0.7),
+QUOTED_MS = (
+    ("PythonRobotics, one update", 1604.0, 1604.0),
+    ("naive numpy, one update", 29.0, 29.0),
+    ("in-place dsyrk, one update", 0.4, 0.7),
 )
+"""What other code takes at 1000 landmarks, as quoted: name, low and high."""
+
+_CYCLE = 165
+"""A large covariance is passed over every 11th step for the updates, every 15th for the motions."""
+_DENSITY_PER_M2 = 1.0
+_FEWEST = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -129,19 +120,21 @@ def stepper(state: State) -> Callable[[], None]:
     return step
 
 
-def study(
-    sizes: Sequence[int], *, repetitions: int, check: Callable[[], None]
-) -> tuple[StepCost, ...]:
-    """Return the cost of a step at each number of landmarks; ``check`` may raise in between."""
+def study(sizes: Sequence[int], repetitions: int, stop: StopFlag) -> list[StepCost]:
+    """Return the cost of a step at each number of landmarks."""
     costs = []
     with threadpool_limits(1):
         for n in sizes:
-            check()
             state = mapped_state(n)
-            per_step = _least_of_cycle(stepper(state), repetitions, check)
+            step = stepper(state)
+            for _ in range(_CYCLE):  # warm, and at the beginning of a cycle
+                step()
+            per_step = np.full(_CYCLE, np.inf)
+            for _ in range(repetitions):
+                stop.check()
+                per_step = np.minimum(per_step, [_cpu_ms(step) for _ in range(_CYCLE)])
             size = state.P.size
-            check()
-            at_once_ms = _passes_ms(size, repetitions)
+            stop.check()
             triangle_ms = _triangle_ms(size, repetitions)
             n_bytes = 2 * 8 * size * (size + 1) / 2
             costs.append(
@@ -150,12 +143,12 @@ def study(
                     size=size,
                     step_ms=float(np.mean(per_step)),
                     slowest_ms=float(np.max(per_step)),
-                    at_once_ms=at_once_ms,
+                    at_once_ms=_passes_ms(size, repetitions),
                     triangle_ms=triangle_ms,
                     triangle_gb_per_s=n_bytes / (1e6 * triangle_ms),
                 )
             )
-    return tuple(costs)
+    return costs
 
 
 def slope_of(costs: Sequence[StepCost]) -> float | None:
@@ -166,41 +159,6 @@ def slope_of(costs: Sequence[StepCost]) -> float | None:
     n = np.log([cost.n_landmarks for cost in large])
     ms = np.log([cost.step_ms for cost in large])
     return float(np.polyfit(n, ms, 1)[0])
-
-
-def numbers_of(costs: Sequence[StepCost], *, repetitions: int) -> dict[str, object]:
-    return {
-        "measured": "CPU time of one thread, one BLAS thread, the least of the repetitions of "
-        "every step; mean and slowest over a cycle of steps",
-        "step": f"predict, view of all landmarks, gate, {N_UPDATES} range updates; P is dense",
-        "repetitions": repetitions,
-        "cycle_steps": _CYCLE,
-        "machine": platform.machine(),
-        "python": platform.python_version(),
-        "numpy": np.__version__,
-        "scipy": scipy.__version__,
-        "bar": {"landmarks": BAR_LANDMARKS, "step_ms": BAR_MS, "slope": 2.0},
-        "slope": slope_of(costs),
-        "slope_from_landmarks": SLOPE_FROM,
-        "steps": [asdict(cost) for cost in costs],
-        "quoted": [{"landmarks": BAR_LANDMARKS} | asdict(row) for row in REFERENCES],
-    }
-
-
-def _least_of_cycle(
-    step: Callable[[], None], repetitions: int, check: Callable[[], None]
-) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Return the least time [ms] of each step of a cycle, shape (steps,)."""
-    least = np.full(_CYCLE, np.inf)
-    for _ in range(_CYCLE):  # warm, and at the beginning of a cycle
-        step()
-    for _ in range(repetitions):
-        check()
-        for place in range(_CYCLE):
-            began = time.thread_time_ns()
-            step()
-            least[place] = min(least[place], 1e-6 * (time.thread_time_ns() - began))
-    return least
 
 
 def _passes_ms(size: int, repetitions: int) -> float:
@@ -220,12 +178,13 @@ def _triangle_ms(size: int, repetitions: int) -> float:
 
 
 def _least_ms(work: Callable[[], object], repetitions: int) -> float:
-    least = math.inf
-    for _ in range(2 + repetitions):
-        began = time.thread_time_ns()
-        work()
-        least = min(least, 1e-6 * (time.thread_time_ns() - began))
-    return least
+    return min(_cpu_ms(work) for _ in range(2 + repetitions))
+
+
+def _cpu_ms(work: Callable[[], object]) -> float:
+    began = time.thread_time_ns()
+    work()
+    return 1e-6 * (time.thread_time_ns() - began)
 
 
 def _draw(figure: Figure, costs: Sequence[StepCost]) -> None:
@@ -249,16 +208,13 @@ def _draw(figure: Figure, costs: Sequence[StepCost]) -> None:
     for name, colour, style, what in series:
         ms = [getattr(cost, name) for cost in costs]
         axes.plot(n, ms, style, color=colour, linewidth=1.4, markersize=4, label=what)
-    left = float(n.min())
-    for reference in REFERENCES:
-        for quoted in {reference.low_ms, reference.high_ms}:
+    for name, low_ms, high_ms in QUOTED_MS:
+        for quoted in {low_ms, high_ms}:
             axes.axhline(quoted, color=PALE_INK, linewidth=0.9, linestyle=(0, (6, 3)))
-        text = f"{reference.low_ms:g}"
-        if reference.high_ms > reference.low_ms:
-            text += f" - {reference.high_ms:g}"
+        text = f"{low_ms:g}" if low_ms == high_ms else f"{low_ms:g} - {high_ms:g}"
         axes.annotate(
-            f"{reference.name}, n = {BAR_LANDMARKS}: {text} ms (quoted)",
-            (left, reference.low_ms),
+            f"{name}, n = {BAR_LANDMARKS}: {text} ms (quoted)",
+            (float(n.min()), low_ms),
             xytext=(0, -4),
             textcoords="offset points",
             va="top",
@@ -282,9 +238,6 @@ def _draw(figure: Figure, costs: Sequence[StepCost]) -> None:
     figure.legend(loc="outside lower center", ncols=1, frameon=False, fontsize=9)
 
 
-_FEWEST = 2
-
-
 def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
     """Time a step at every size.
 
@@ -298,35 +251,43 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
             f"--landmarks {min(arguments.landmarks)}: a step sees one landmark on each side, "
             f"give at least {_FEWEST}"
         )
-    costs = study(
-        sorted(set(arguments.landmarks)), repetitions=arguments.repetitions, check=stop.check
-    )
-    title = (
-        "One step of the robust filter: predict, view, gate, 4 range updates; CPU time, one BLAS "
-        f"thread, least of {arguments.repetitions}"
-    )
-    header = (
-        "landmarks",
-        "step",
-        "slowest step",
-        "every change at once",
-        "triangle read and written",
-    )
-    rows = [
-        (
-            str(cost.n_landmarks),
-            f"{cost.step_ms:.3f} ms",
-            f"{cost.slowest_ms:.3f} ms",
-            f"{cost.at_once_ms:.3f} ms",
-            f"{cost.triangle_ms:.3f} ms",
-        )
-        for cost in costs
-    ]
+    repetitions: int = arguments.repetitions
+    costs = study(sorted(set(arguments.landmarks)), repetitions, stop)
     return Result(
-        numbers=numbers_of(costs, repetitions=arguments.repetitions),
+        numbers={
+            "measured": "CPU time of one thread, one BLAS thread, the least of the repetitions of "
+            "every step; mean and slowest over a cycle of steps",
+            "step": f"predict, view of all landmarks, gate, {N_UPDATES} range updates; P is dense",
+            "repetitions": repetitions,
+            "cycle_steps": _CYCLE,
+            "machine": platform.machine(),
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+            "scipy": scipy.__version__,
+            "bar": {"landmarks": BAR_LANDMARKS, "step_ms": BAR_MS, "slope": 2.0},
+            "slope": slope_of(costs),
+            "slope_from_landmarks": SLOPE_FROM,
+            "steps": [asdict(cost) for cost in costs],
+            "quoted": [
+                {"landmarks": BAR_LANDMARKS, "name": name, "low_ms": low_ms, "high_ms": high_ms}
+                for name, low_ms, high_ms in QUOTED_MS
+            ],
+        },
         title="One step of the robust filter against the size of the map (CPU time, one BLAS "
         "thread)",
         size_in=(8.6, 6.2),
         draw=lambda figure: _draw(figure, costs),
-        tables=[(title, header, rows)],
+        tables=[
+            table(
+                "One step of the robust filter: predict, view, gate, 4 range updates; CPU time, "
+                f"one BLAS thread, least of {repetitions}",
+                {
+                    "landmarks": [str(cost.n_landmarks) for cost in costs],
+                    "step": [f"{cost.step_ms:.3f} ms" for cost in costs],
+                    "slowest step": [f"{cost.slowest_ms:.3f} ms" for cost in costs],
+                    "every change at once": [f"{cost.at_once_ms:.3f} ms" for cost in costs],
+                    "triangle read and written": [f"{cost.triangle_ms:.3f} ms" for cost in costs],
+                },
+            )
+        ],
     )

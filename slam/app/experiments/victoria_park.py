@@ -17,7 +17,7 @@ import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from slam.app.errors import AppError
-from slam.app.experiments import Result
+from slam.app.experiments import Result, table
 from slam.app.run.output import share_text
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, TRUTH, label
 from slam.app.sweep.bound import load_gtsam
@@ -44,6 +44,19 @@ from xethru_protocol.system import StopFlag
 Array = NDArray[np.float64]
 
 FILE = "victoria_park.txt"
+
+# A park is a hundred times wider than a room, and its trees are known to half a metre.
+# Nothing is left out as an outlier: a tree seen twice would be left without a place.
+PARK_RULE = RelinearisationRule(
+    turn_rad=0.02, shift_m=0.5, every=100, most_poses=10_000, outlier_sigmas=math.inf
+)
+
+# Wheels of which nothing is known: a tenth in distance and turn, a degree per two metres.
+UNKNOWN_WHEELS = WheelNoise(scale_sigma=0.1, turn_scale_sigma=0.1, curvature_sigma_rad_per_m=0.01)
+PERFECT_WHEELS = WheelNoise(scale_sigma=0.0, turn_scale_sigma=0.0, curvature_sigma_rad_per_m=0.0)
+
+_ISAM = "#2f9e44"
+_MAPS = ("true ids", "unknown ids")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -147,12 +160,7 @@ def range_bearing(x_m: float, y_m: float, covariance: Array, label: int | None) 
     """Return a relative position as range and bearing, its covariance to first order.
 
     With r = |(x, y)| and G = d(r, bearing) / d(x, y) = [[x/r, y/r], [-y/r^2, x/r^2]] the
-    covariance is G C G^T.
-
-    Raises
-    ------
-    ValueError
-        The point is at the origin, where it has no bearing.
+    covariance is G C G^T. Raises ValueError at the origin, where there is no bearing.
     """
     r = math.hypot(x_m, y_m)
     if r == 0.0:
@@ -164,19 +172,6 @@ def range_bearing(x_m: float, y_m: float, covariance: Array, label: int | None) 
         covariance=G @ covariance @ G.T,
         label=label,
     )
-
-
-_CALIBRATION_COLUMNS = np.arange(CALIBRATION.start, CALIBRATION.stop)
-
-# A park is a hundred times wider than a room, and its trees are known to half a metre.
-# Nothing is left out as an outlier: a tree seen twice would be left without a place.
-PARK_RULE = RelinearisationRule(
-    turn_rad=0.02, shift_m=0.5, every=100, most_poses=10_000, outlier_sigmas=math.inf
-)
-
-# Wheels of which nothing is known: a tenth in distance and turn, a degree per two metres.
-UNKNOWN_WHEELS = WheelNoise(scale_sigma=0.1, turn_scale_sigma=0.1, curvature_sigma_rad_per_m=0.01)
-PERFECT_WHEELS = WheelNoise(scale_sigma=0.0, turn_scale_sigma=0.0, curvature_sigma_rad_per_m=0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -205,25 +200,11 @@ class ParkRun:
     seconds: float
 
 
-def drive_back_end(
-    drive: Drive,
-    *,
-    with_ids: bool,
-    wheels: WheelNoise = PERFECT_WHEELS,
-    check: Callable[[], None] = lambda: None,
-) -> ParkRun:
+def drive_back_end(drive: Drive, wheels: WheelNoise, stop: StopFlag, *, with_ids: bool) -> ParkRun:
     """Run a drive through the robust back end's public interface.
 
-    Parameters
-    ----------
-    drive
-        The data; the noise of each step is in it.
-    with_ids
-        Whether the back end gets the id of the tree of each observation.
-    wheels
-        Standard deviations of the wheels' calibration errors; the reference's model has none.
-    check
-        Called once per step; may raise to stop.
+    ``wheels`` says how the wheels' calibration errs; the noise of each step is in the data. With
+    ``with_ids`` the back end gets the id of the tree of each observation.
     """
     began = time.process_time()
     back_end = RobustBackEnd(
@@ -232,7 +213,7 @@ def drive_back_end(
     given: list[tuple[int, int | None]] = []
     path = [back_end.pose]
     for step, points in enumerate(drive.seen):
-        check()
+        stop.check()
         if step > 0:
             back_end.predict(drive.increments[step - 1], drive.covariances[step - 1])
         given_points = points if with_ids else [replace(point, label=None) for point in points]
@@ -244,11 +225,12 @@ def drive_back_end(
         ]
         if step > 0:
             path.append(back_end.pose)
+    calibration = np.arange(CALIBRATION.start, CALIBRATION.stop)
     return ParkRun(
         poses=np.array(path),
         landmarks_m=back_end.state.landmarks_m.copy(),
         calibration=back_end.state.calibration.copy(),
-        calibration_sigmas=np.sqrt(np.diag(back_end.state.P.block(_CALIBRATION_COLUMNS))),
+        calibration_sigmas=np.sqrt(np.diag(back_end.state.P.block(calibration))),
         given=tuple(given),
         seconds=time.process_time() - began,
     )
@@ -281,7 +263,7 @@ class Reference:
     seconds: float
 
 
-def batch_reference(drive: Drive, check: Callable[[], None] = lambda: None) -> Reference:
+def batch_reference(drive: Drive, stop: StopFlag) -> Reference:
     """Solve for all poses and landmarks with GTSAM: ISAM2 for a start, Levenberg-Marquardt then.
 
     The start matters: odometry alone ends far enough away to lead into another valley.
@@ -290,27 +272,20 @@ def batch_reference(drive: Drive, check: Callable[[], None] = lambda: None) -> R
     began = time.process_time()
     pose_key, landmark_key = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L
     isam = gtsam.ISAM2(gtsam.ISAM2Params())
-    whole = gtsam.NonlinearFactorGraph()
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    start = gtsam.PriorFactorPose2(
-        pose_key(0), gtsam.Pose2(), gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
-    )
-    graph.add(start)
-    whole.add(start)
+    sure = gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
+    graph.add(gtsam.PriorFactorPose2(pose_key(0), gtsam.Pose2(), sure))
     values.insert(pose_key(0), gtsam.Pose2())
     pose = np.zeros(3)
     known: set[int] = set()
     causal: list[Array] = []
     for step, points in enumerate(drive.seen):
-        check()
+        stop.check()
         if step > 0:
             increment = drive.increments[step - 1]
             noise = gtsam.noiseModel.Gaussian.Covariance(drive.covariances[step - 1])
-            factor = gtsam.BetweenFactorPose2(
-                pose_key(step - 1), pose_key(step), gtsam.Pose2(*increment), noise
-            )
-            graph.add(factor)
-            whole.add(factor)
+            keys = pose_key(step - 1), pose_key(step)
+            graph.add(gtsam.BetweenFactorPose2(*keys, gtsam.Pose2(*increment), noise))
             pose = compose(pose, increment)
             values.insert(pose_key(step), gtsam.Pose2(*pose))
         for point in points:
@@ -321,29 +296,22 @@ def batch_reference(drive: Drive, check: Callable[[], None] = lambda: None) -> R
                 values.insert(landmark_key(point.label), place)
             # GTSAM orders bearing, range
             noise = gtsam.noiseModel.Gaussian.Covariance(point.covariance[::-1, ::-1])
-            factor = gtsam.BearingRangeFactor2D(
-                pose_key(step),
-                landmark_key(point.label),
-                gtsam.Rot2(point.bearing_rad),
-                point.range_m,
-                noise,
-            )
-            graph.add(factor)
-            whole.add(factor)
+            keys = pose_key(step), landmark_key(point.label)
+            bearing = gtsam.Rot2(point.bearing_rad)
+            graph.add(gtsam.BearingRangeFactor2D(*keys, bearing, point.range_m, noise))
         isam.update(graph, values)
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         pose = _vector(isam.calculateEstimatePose2(pose_key(step)))
         causal.append(pose)
+    whole = isam.getFactorsUnsafe()
     solution = gtsam.LevenbergMarquardtOptimizer(whole, isam.calculateEstimate()).optimize()
     labels = tuple(sorted(known))
+    poses = [_vector(solution.atPose2(pose_key(step))) for step in range(len(drive.seen))]
+    landmarks_m = [solution.atPoint2(landmark_key(label)) for label in labels]
     return Reference(
-        poses=np.array(
-            [_vector(solution.atPose2(pose_key(step))) for step in range(len(drive.seen))]
-        ),
+        poses=np.array(poses),
         causal=np.array(causal),
-        landmarks_m=np.array([solution.atPoint2(landmark_key(label)) for label in labels]).reshape(
-            -1, 2
-        ),
+        landmarks_m=np.array(landmarks_m).reshape(-1, 2),
         labels=labels,
         chi_square=2.0 * whole.error(solution),
         dof=2 * drive.n_observations - 2 * len(labels),
@@ -380,31 +348,10 @@ class PathScore:
     ate_m: float
     rmse_m: float
     max_m: float
-    n_landmarks: int | None = None
-    right_share: float | None = None
-    left_out: int | None = None
-    seconds: float | None = None
-
-
-def scores(drive: Drive, reference: Reference, runs: Mapping[str, ParkRun]) -> list[PathScore]:
-    rows = [
-        _score("odometry", odometry_path(drive), reference),
-        _score("ISAM2, true ids", reference.causal, reference),
-    ]
-    for name, run in runs.items():
-        has_ids = name.startswith("true ids")
-        rows.append(
-            _score(
-                f"robust, {name}",
-                run.poses,
-                reference,
-                n_landmarks=len(run.landmarks_m),
-                right_share=None if has_ids else right_share(run.given),
-                left_out=sum(given is None for _, given in run.given),
-                seconds=run.seconds,
-            )
-        )
-    return rows
+    n_landmarks: int | None
+    right_share: float | None
+    left_out: int | None
+    seconds: float | None
 
 
 def odometry_path(drive: Drive) -> Array:
@@ -426,36 +373,33 @@ def right_share(given: Sequence[tuple[int, int | None]]) -> float | None:
     taken = Counter(pair for pair in given if pair[1] is not None)
     if not taken:
         return None
-    landmark_of: dict[int, tuple[int, int | None]] = {}
-    tree_of: dict[int | None, tuple[int, int]] = {}
-    for (tree, landmark), n in taken.items():
-        landmark_of[tree] = max(landmark_of.get(tree, (0, None)), (n, landmark), key=_count)
-        tree_of[landmark] = max(tree_of.get(landmark, (0, -1)), (n, tree), key=_count)
+    landmark_of: dict[int, int | None] = {}
+    tree_of: dict[int | None, int] = {}
+    for (tree, landmark), _ in reversed(taken.most_common()):  # the most frequent is the last
+        landmark_of[tree] = landmark
+        tree_of[landmark] = tree
     right = sum(
         n
         for (tree, landmark), n in taken.items()
-        if landmark_of[tree][1] == landmark and tree_of[landmark][1] == tree
+        if landmark_of[tree] == landmark and tree_of[landmark] == tree
     )
     return right / taken.total()
 
 
-def _count(pair: tuple[int, int | None] | tuple[int, int]) -> int:
-    return pair[0]
-
-
-def _score(name: str, poses: Array, reference: Reference, **more: object) -> PathScore:
+def score(
+    name: str, poses: Array, reference: Reference, run: ParkRun | None = None, *, has_ids: bool
+) -> PathScore:
     away = np.hypot(*(poses - reference.poses)[:, :2].T)
     return PathScore(
         name=name,
         ate_m=ate_rmse_m(poses[:, :2], reference.poses[:, :2]),
         rmse_m=float(np.sqrt(np.mean(away**2))),
         max_m=float(away.max()),
-        **more,  # type: ignore[arg-type] # the caller's keywords are the fields' own
+        n_landmarks=None if run is None else len(run.landmarks_m),
+        right_share=None if run is None or has_ids else right_share(run.given),
+        left_out=None if run is None else sum(given is None for _, given in run.given),
+        seconds=None if run is None else run.seconds,
     )
-
-
-_ISAM = "#2f9e44"
-_MAPS = ("true ids", "unknown ids")
 
 
 def _draw(
@@ -510,22 +454,14 @@ def _map(axes: Axes, odometry: Array, reference: Reference, run: ParkRun) -> Non
     axes.plot(*run.poses[:, :2].T, color=ESTIMATE, linewidth=0.9, label="causal path")
     axes.plot(
         *reference.landmarks_m.T,
-        linestyle="none",
-        marker="o",
+        "o",
         markersize=5,
         markerfacecolor="none",
         color=INK,
         markeredgewidth=0.7,
         label="tree, batch",
     )
-    axes.plot(
-        *run.landmarks_m.T,
-        linestyle="none",
-        marker="x",
-        markersize=4,
-        color=LANDMARK,
-        label="landmark",
-    )
+    axes.plot(*run.landmarks_m.T, "x", markersize=4, color=LANDMARK, label="landmark")
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
@@ -533,7 +469,12 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
     if arguments.steps is not None:
         drive = drive.first(arguments.steps)
     sys.stderr.write("GTSAM: every step with ISAM2, then all of it in a batch\n")
-    reference = batch_reference(drive, stop.check)
+    reference = batch_reference(drive, stop)
+    odometry = odometry_path(drive)
+    rows = [
+        score("odometry", odometry, reference, has_ids=True),
+        score("ISAM2, true ids", reference.causal, reference, has_ids=True),
+    ]
     runs = {}
     for name, with_ids, wheels in (
         ("true ids, wheels as in the reference", True, PERFECT_WHEELS),
@@ -541,27 +482,9 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
         ("unknown ids", False, UNKNOWN_WHEELS),
     ):
         sys.stderr.write(f"robust back end, {name}\n")
-        runs[name] = drive_back_end(drive, with_ids=with_ids, wheels=wheels, check=stop.check)
-    rows = scores(drive, reference, runs)
-    title = (
-        f"Victoria Park, {len(drive.increments)} steps, {len(drive.labels)} trees seen "
-        f"{drive.n_observations} times: causal paths against GTSAM's batch solution (real data, "
-        "no ground truth)"
-    )
-    header = ("path", "ATE", "unaligned", "most", "landmarks", "right", "left out", "CPU time")
-    cells = [
-        (
-            row.name,
-            f"{row.ate_m:.2f} m",
-            f"{row.rmse_m:.2f} m",
-            f"{row.max_m:.2f} m",
-            "-" if row.n_landmarks is None else str(row.n_landmarks),
-            share_text(row.right_share),
-            "-" if row.left_out is None else str(row.left_out),
-            "-" if row.seconds is None else f"{row.seconds:.1f} s",
-        )
-        for row in rows
-    ]
+        run = drive_back_end(drive, wheels, stop, with_ids=with_ids)
+        rows.append(score(f"robust, {name}", run.poses, reference, run, has_ids=with_ids))
+        runs[name] = run
     return Result(
         numbers={
             "simulated": False,
@@ -582,6 +505,26 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
         title="Victoria Park (real data): causal paths of the robust back end against GTSAM's "
         "batch solution",
         size_in=(11.0, 9.2),
-        draw=lambda figure: _draw(figure, odometry_path(drive), reference, runs, rows),
-        tables=[(title, header, cells)],
+        draw=lambda figure: _draw(figure, odometry, reference, runs, rows),
+        tables=[
+            table(
+                f"Victoria Park, {len(drive.increments)} steps, {len(drive.labels)} trees seen "
+                f"{drive.n_observations} times: causal paths against GTSAM's batch solution (real "
+                "data, no ground truth)",
+                {
+                    "path": [row.name for row in rows],
+                    "ATE": [f"{row.ate_m:.2f} m" for row in rows],
+                    "unaligned": [f"{row.rmse_m:.2f} m" for row in rows],
+                    "most": [f"{row.max_m:.2f} m" for row in rows],
+                    "landmarks": [_or_dash(row.n_landmarks) for row in rows],
+                    "right": [share_text(row.right_share) for row in rows],
+                    "left out": [_or_dash(row.left_out) for row in rows],
+                    "CPU time": [_or_dash(row.seconds, ".1f", " s") for row in rows],
+                },
+            )
+        ],
     )
+
+
+def _or_dash(value: float | None, form: str = "", unit: str = "") -> str:
+    return "-" if value is None else f"{value:{form}}{unit}"

@@ -48,25 +48,33 @@ from slam.geometry import Mount, Rig, between, mount_at, pair_of, transform, wra
 from slam.robust.association import fix_of_pair
 from slam.robust.state import calibrated_motion, rotation
 
+Array = NDArray[np.float64]
+Pose = tuple[float, float, float]
+
+PURPOSE = "the known-association bound"
+GATE_SIGMAS = 4.0
+VIEW_HALF_ANGLE_RAD = 0.82
+"""Half of the field of view, 32.5 deg, and 0.25 rad where echoes are weak."""
+ALONE_RANGES = 20
+"""Of a radar without a partner: so many ranges are needed to place a landmark."""
+ALONE_SIGMA_M = 0.1
+START_SIGMA = 1e-6
+WALK_STEPS = 20
+POSE_THRESHOLD, CALIBRATION_THRESHOLD, LANDMARK_THRESHOLD_M = 0.01, 0.003, 0.01
+"""From which change on ISAM2 linearises a variable anew [m or rad; 1 or rad/m; m]."""
+RELINEARISE_EVERY = 10
+_PAPER_RANGE_SIGMA_M = 7.4e-3
+"""Of the paper's front end, which predicts none: 7.1 to 8.0 mm at 30 to 44 dB, whatever the SNR."""
+
 
 def load_gtsam(purpose: str) -> Any:  # noqa: ANN401 - types must not depend on an optional package
-    """Return the module ``gtsam``.
-
-    Raises
-    ------
-    AppError
-        It is not installed; one line with the purpose and how to install it.
-    """
+    """Return the module ``gtsam``; raise AppError if it is not installed."""
     try:
         return import_module("gtsam")
     except ImportError:
         raise AppError(
             f"{purpose} needs GTSAM, which is not installed: pip install 'xethru-hil[gtsam]'"
         ) from None
-
-
-Array = NDArray[np.float64]
-Pose = tuple[float, float, float]
 
 
 def wheel_residual(before: Pose, after: Pose, calibration: Pose, increment: Pose) -> Array:
@@ -131,18 +139,13 @@ def wheel_factor(
         before = (first.x(), first.y(), first.theta())
         after = (second.x(), second.y(), second.theta())
         s, w, kappa = values.atVector(calibration_key).tolist()
+        step = (before, after, (s, w, kappa), (ux, uy, ua))
         if jacobians is not None:
-            found = wheel_derivatives(before, after, (s, w, kappa), (ux, uy, ua))
-            for row, derivative in enumerate(found):
+            for row, derivative in enumerate(wheel_derivatives(*step)):
                 jacobians[row] = derivative
-        return wheel_residual(before, after, (s, w, kappa), (ux, uy, ua))
+        return wheel_residual(*step)
 
     return gtsam.CustomFactor(gtsam.noiseModel.Diagonal.Sigmas(sigmas), list(keys), error)
-
-
-GATE_SIGMAS = 4.0
-VIEW_HALF_ANGLE_RAD = 0.82
-"""Half of the field of view, 32.5 deg, and 0.25 rad where echoes are weak."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -175,24 +178,11 @@ def known_run(
     *,
     range_sigma_m: float,
     offset_sigma_m: float = 0.0,
-    gate_sigmas: float = GATE_SIGMAS,
 ) -> KnownRun:
-    """Return the data that SLAM had, with the ids of the true landmarks.
+    """Return the data that SLAM had, with the ids of the true landmarks, shape (n, 2), world frame.
 
-    Parameters
-    ----------
-    record
-        The run; one increment per result, from odometry's zero on.
-    rig
-        The mounts as SLAM knew them.
-    true_landmarks_m
-        Shape (n, 2), world frame.
-    range_sigma_m
-        Standard deviation of a range in results without ``range_sigmas_m``.
-    offset_sigma_m
-        Standard deviation of each radar's unknown range offset; widens the gate.
-    gate_sigmas
-        See the module's text.
+    ``range_sigma_m`` is the standard deviation of a range in results without ``range_sigmas_m``;
+    ``offset_sigma_m``, that of each radar's unknown range offset, widens the gate.
     """
     stamps_ns = np.array([result.t_ns for result in record.results], dtype=np.float64)
     odometry = _Track(stamps_ns, np.array([result.odometry_pose for result in record.results]))
@@ -215,7 +205,7 @@ def known_run(
             sigmas = np.array([sigma for _, sigma in frame])
             ids = true_ids(
                 np.array([detection.range_m for detection, _ in frame]),
-                gate_sigmas * np.hypot(sigmas, offset_sigma_m),
+                GATE_SIGMAS * np.hypot(sigmas, offset_sigma_m),
                 rig.mounts[radar],
                 truth.at(t_ns),
                 true_landmarks_m,
@@ -236,22 +226,12 @@ def known_run(
 
 
 def true_ids(
-    ranges_m: Array, gate_m: Array | float, mount: Mount, true_pose: Array, landmarks_m: Array
+    ranges_m: Array, gate_m: Array, mount: Mount, true_pose: Array, landmarks_m: Array
 ) -> Sequence[int | None]:
     """Return for each range of one frame the row of its true landmark, None for clutter.
 
-    Parameters
-    ----------
-    ranges_m
-        Shape (m,): what was measured.
-    gate_m
-        How far from the true range it may lie, shape (m,) or one for all.
-    mount
-        Where the radar sits on the robot.
-    true_pose
-        Shape (3,): the robot when the radar sampled.
-    landmarks_m
-        Shape (n, 2), the frame of ``true_pose``.
+    ``gate_m`` says how far from the true range each may lie. ``true_pose`` (3,) is the robot's
+    when the radar sampled; ``landmarks_m`` (n, 2) are in its frame.
     """
     if not len(landmarks_m):
         return [None] * len(ranges_m)
@@ -259,9 +239,7 @@ def true_ids(
     away = landmarks_m - np.array([antenna.x_m, antenna.y_m])
     off = wrap_angles(np.arctan2(away[:, 1], away[:, 0]) - antenna.yaw_rad)
     errors = np.abs(ranges_m[:, None] - np.hypot(away[:, 0], away[:, 1]))
-    allowed = (errors <= np.broadcast_to(gate_m, len(ranges_m))[:, None]) & (
-        np.abs(off) <= VIEW_HALF_ANGLE_RAD
-    )
+    allowed = (errors <= gate_m[:, None]) & (np.abs(off) <= VIEW_HALF_ANGLE_RAD)
     ids: list[int | None] = [None] * len(ranges_m)
     for i, landmark in zip(*linear_sum_assignment(np.where(allowed, errors, 1e3)), strict=True):
         if allowed[i, landmark]:
@@ -285,10 +263,6 @@ class _Track:
         return np.array([x, y, wrap_angle(heading)])
 
 
-ALONE_RANGES = 20
-ALONE_SIGMA_M = 0.1
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SeenFrom:
     """A range and where it was measured: step, and the antenna in the body frame of that step."""
@@ -301,14 +275,8 @@ class SeenFrom:
 def first_position(rig: Rig, seen: Sequence[SeenFrom], poses: Sequence[Array]) -> Array | None:
     """Return a landmark's first position in the map frame, shape (2,), or None where it is early.
 
-    Parameters
-    ----------
-    rig
-        Tells which radars are pairs.
-    seen
-        All its ranges so far, those of the newest step last.
-    poses
-        The estimated pose of every step, shape (3,) each.
+    ``seen`` holds all its ranges so far, those of the newest step last; ``poses`` the estimated
+    pose of every step, shape (3,) each.
     """
     newest = {item.known.radar: item for item in seen if item.step == seen[-1].step}
     for pair in rig.pairs():
@@ -352,14 +320,6 @@ def _from_many(seen: Sequence[SeenFrom], poses: Sequence[Array]) -> Array | None
     return np.asarray(fit.x)
 
 
-PURPOSE = "the known-association bound"
-START_SIGMA = 1e-6
-WALK_STEPS = 20
-POSE_THRESHOLD, CALIBRATION_THRESHOLD, LANDMARK_THRESHOLD_M = 0.01, 0.003, 0.01
-"""From which change on ISAM2 linearises a variable anew [m or rad; 1 or rad/m; m]."""
-RELINEARISE_EVERY = 10
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class KnownAssociation:
     """The paths of a run with true associations, map frame, one row per step.
@@ -389,16 +349,8 @@ def solve_known(
 ) -> KnownAssociation:
     """Return the paths of labelled data.
 
-    Parameters
-    ----------
-    run
-        See `known_run`.
-    rig
-        The mounts as SLAM knew them.
-    wheels
-        How odometry errs, by its specification.
-    offset_sigma_m
-        Standard deviation of each radar's unknown range offset; zero: calibrated.
+    ``rig`` and ``wheels`` are as SLAM knew them; ``offset_sigma_m`` is the standard deviation of
+    each radar's unknown range offset, zero if they are calibrated.
 
     Raises
     ------
@@ -445,8 +397,10 @@ class _Estimator:
                 self._X(0), gtsam.Pose2(), gtsam.noiseModel.Isotropic.Sigma(3, START_SIGMA)
             )
         )
-        sigmas = np.maximum(wheels.calibration_sigmas, 1e-7)
-        self._add_prior(self._C(0), np.zeros(3), sigmas)
+        self._values.insert(self._C(0), np.zeros(3))
+        self._sigmas = np.maximum(wheels.calibration_sigmas, 1e-7)
+        noise = gtsam.noiseModel.Diagonal.Sigmas(self._sigmas)
+        self._graph.add(gtsam.PriorFactorVector(self._C(0), np.zeros(3), noise))
         if self._has_offsets:
             for radar in range(len(rig.mounts)):
                 self._values.insert(self._B(radar), 0.0)
@@ -503,21 +457,14 @@ class _Estimator:
         self._graph = self._gtsam.NonlinearFactorGraph()
         self._values = self._gtsam.Values()
 
-    def _add_prior(self, key: int, mean: Array, sigmas: Array) -> None:
-        noise = self._gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-        self._values.insert(key, mean)
-        self._graph.add(self._gtsam.PriorFactorVector(key, mean, noise))
-
     def _walk(self, increment: Array) -> None:
         """Begin a new set of calibration errors where the old one has wandered for long enough."""
-        wheels = self._wheels
         distance_m = math.hypot(increment[0], increment[1])
-        self._walked += wheels.walk_variance(distance_m, float(increment[2]))
+        self._walked += self._wheels.walk_variance(distance_m, float(increment[2]))
         if self._walked == 0.0 or len(self._poses) % WALK_STEPS:
             return
         key, last = self._C(self._n_calibrations), self._C(self._n_calibrations - 1)
-        sigmas = math.sqrt(self._walked) * np.maximum(wheels.calibration_sigmas, 1e-7)
-        noise = self._gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        noise = self._gtsam.noiseModel.Diagonal.Sigmas(math.sqrt(self._walked) * self._sigmas)
         self._values.insert(key, self._calibration)
         self._graph.add(self._gtsam.BetweenFactorVector(last, key, np.zeros(3), noise))
         self._n_calibrations += 1
@@ -544,14 +491,10 @@ class _Estimator:
 
     def _add_range(self, seen: SeenFrom) -> None:
         gtsam, known = self._gtsam, seen.known
-        keys = [self._X(seen.step), self._L(known.landmark)]
+        keys, kind = [self._X(seen.step), self._L(known.landmark)], gtsam.RangeFactorWithTransform2D
         if self._has_offsets:
             keys.append(self._B(known.radar))
-        kind = (
-            gtsam.RangeFactorWithTransformBias2D
-            if self._has_offsets
-            else gtsam.RangeFactorWithTransform2D
-        )
+            kind = gtsam.RangeFactorWithTransformBias2D
         noise = gtsam.noiseModel.Isotropic.Sigma(1, known.sigma_m)
         sensor = gtsam.Pose2(seen.antenna.x_m, seen.antenna.y_m, seen.antenna.yaw_rad)
         self._graph.add(kind(*keys, known.range_m, noise, sensor))
@@ -574,10 +517,6 @@ def _isam_parameters(gtsam: Any) -> Any:  # noqa: ANN401 - GTSAM's own types
     return parameters
 
 
-_PAPER_RANGE_SIGMA_M = 7.4e-3
-"""Of the paper's front end, which predicts none: 7.1 to 8.0 mm at 30 to 44 dB, whatever the SNR."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoundSummary:
     """Errors of GTSAM with true associations: ISAM2's filtered path, and the full smoother's.
@@ -593,10 +532,6 @@ class BoundSummary:
     filtered_ate_rmse_m: float
     smoothed_ate_rmse_m: float
     nees_pose: tuple[tuple[float, float], ...]
-
-
-def require_gtsam() -> None:
-    load_gtsam(PURPOSE)
 
 
 def bound_of(record: RunRecord, scene: Scene, config: SlamConfig) -> BoundSummary:

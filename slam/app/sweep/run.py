@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache
 from importlib.util import find_spec
@@ -39,8 +39,8 @@ from slam.app.rig.emulated import (
 from slam.app.run.evaluation import Summary
 from slam.app.run.results import summary_of
 from slam.app.run.runner import RunRecord, RunSource, execute
+from slam.app.sweep import CLEAN, STRESSES, Stress
 from slam.app.sweep.bound import BoundSummary, bound_of
-from slam.app.sweep.stress import CLEAN, STRESSES, Stress
 from slam.config import ConfigError, SlamConfig, override
 from slam.evaluation import LANDMARK_MATCH_M
 from slam.frames import Detection, Detector, RadarFrame
@@ -48,16 +48,26 @@ from slam.front_end import make_detector
 from slam.geometry import transform
 from slam.pipelines import make_slam
 from slam.results import Slam
+from xethru_protocol.system import StopFlag
 
 # Streams of their own beside the radars' (serial numbers and purposes, below 2**51) and the
 # odometry's, 2**63.
 _STREAM = 1 << 62
 _OFFSETS, _SILENCE, _DROPPED, _OUTLIERS = (_STREAM + (part << 32) for part in range(4))
 
-# When a silence may begin, in parts of the run.
 _SILENCE_FROM, _SILENCE_TO = 0.15, 0.75
+"""When a silence may begin, in parts of the run."""
 _BLOCKS_PER_FRAME = 256
 """Of four words each: three words for each of at most 341 echoes of a frame."""
+CONFIDENT_M = 0.05
+"""Largest standard deviation, in any direction, of a landmark that claims to be known."""
+LARGEST = 1e12
+"""What stands for an infinite NEES or NIS."""
+NO_STOP = StopFlag()
+"""Of runs that no signal stops: it is never entered."""
+
+Key = tuple[str, str, tuple[tuple[str, str], ...], str, int | None]
+"""Scene, preset, settings, stress, seed."""
 
 
 def stressed_scene(scene: Scene, stress: Stress, seed: int) -> Scene:
@@ -97,39 +107,27 @@ def stressed_scene(scene: Scene, stress: Stress, seed: int) -> Scene:
 def stressed_scans(
     scans: Iterable[Scan], stress: Stress, seed: int, duration_ns: int
 ) -> Iterator[Scan]:
-    """Yield the scans without the frames that a row loses; a scan that lost all stays, empty.
+    """Yield the scans of a whole run without the frames that a row loses.
 
-    Parameters
-    ----------
-    scans
-        Of a whole run, nothing lost.
-    stress
-        Silence, losses and dead radars count.
-    seed
-        Of the run.
-    duration_ns
-        Of the run: silence is a part of it.
+    A scan that lost all stays, empty. Silence is a part of the run's ``duration_ns``.
     """
-    begin = _SILENCE_FROM + (_SILENCE_TO - _SILENCE_FROM) * float(
-        _uniforms(seed, _SILENCE, 0, 1)[0]
-    )
+    share, dead = stress.dropped_share, stress.dead_radars
+    where = float(_uniforms(seed, _SILENCE, 0, 1)[0])
+    begin = _SILENCE_FROM + (_SILENCE_TO - _SILENCE_FROM) * where
     silent_ns = (begin * duration_ns, (begin + stress.silent_share) * duration_ns)
+
+    def is_dropped(frame: RadarFrame) -> bool:
+        words = _uniforms(seed, _DROPPED + frame.radar, frame.counter, 1)
+        return float(words[0]) < share
+
     for scan in scans:
-        silent = silent_ns[0] <= scan.t_ns < silent_ns[1]
+        is_silent = silent_ns[0] <= scan.t_ns < silent_ns[1]
         frames = tuple(
             frame
             for frame in scan.frames
-            if not silent
-            and frame.radar not in stress.dead_radars
-            and not _is_dropped(frame, stress.dropped_share, seed)
+            if not (is_silent or frame.radar in dead or (share and is_dropped(frame)))
         )
         yield scan if len(frames) == len(scan.frames) else replace(scan, frames=frames)
-
-
-def _is_dropped(frame: RadarFrame, share: float, seed: int) -> bool:
-    if not share:
-        return False
-    return float(_uniforms(seed, _DROPPED + frame.radar, frame.counter, 1)[0]) < share
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -172,7 +170,9 @@ class OutlierDetector:
             replace(
                 detection,
                 range_m=self.min_range_m + span_m * where,
-                phase_rad=_phase_like(detection, phase),
+                phase_rad=math.nan
+                if math.isnan(detection.phase_rad)
+                else math.pi * (2 * phase - 1),
             )
             if chance < self.share
             else detection
@@ -183,11 +183,6 @@ class OutlierDetector:
         return tuple(sorted(mixed, key=lambda detection: detection.range_m))
 
 
-def _phase_like(detection: Detection, turns: float) -> float:
-    known = not math.isnan(detection.phase_rad)
-    return math.pi * (2 * turns - 1) if known else math.nan
-
-
 def _uniforms(seed: int, stream: int, block: int, count: int) -> NDArray[np.float64]:
     """Return numbers in [0, 1), selected by stream and block alone; shape (count,)."""
     philox = np.random.Philox(key=np.array([seed, stream], dtype=np.uint64), counter=block)
@@ -195,19 +190,13 @@ def _uniforms(seed: int, stream: int, block: int, count: int) -> NDArray[np.floa
     return (words >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
 
-CONFIDENT_M = 0.05
-"""Largest standard deviation, in any direction, of a landmark that claims to be known."""
-
-
 def false_landmarks(record: RunRecord, scene: Scene) -> tuple[int, int]:
     """Count the landmarks of the last map that have nothing within 15 cm; in all, and confident.
 
     Judged in the start frame and not aligned, since that is the frame of the claim: a map turned
     by an error of heading that it does not know of is false, too. Something is a target's surface,
-    a wall, or the side of a box. None are false where there is no state.
+    a wall, or the side of a box.
     """
-    if not record.results:
-        return 0, 0
     belief = record.results[-1].belief
     false = confident = 0
     for row, place in enumerate(belief.landmarks):
@@ -233,25 +222,11 @@ def distance_m(scene: Scene, point: NDArray[np.float64]) -> float:
     return min(distances, default=math.inf)
 
 
-LARGEST = 1e12
-"""What stands for an infinite NEES or NIS."""
-
-Key = tuple[str, str, tuple[tuple[str, str], ...], str, int | None]
-"""Scene, preset, settings, stress, seed."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
     """One run to do, complete: a worker on another machine needs no file of ours.
 
-    Attributes
-    ----------
-    scene, config
-        Loaded; `config` has the settings in it.
-    preset, settings, stress, seed
-        What the run is called by.
-    bound
-        Whether to compute the known-association bound on the same data.
+    ``config`` has the ``settings`` in it; ``bound`` asks for the known-association bound.
     """
 
     scene: Scene
@@ -271,17 +246,9 @@ class Case:
 class SweepRun(Summary):
     """The numbers of one run of a sweep: those of summary.json, and how it differs from others.
 
-    Attributes
-    ----------
-    settings
-        Settings of the preset that were replaced, dotted keys.
-    stress
-        Row of the stress table.
-    false, confident_false
-        Landmarks of the map where nothing stands, and those of them that claim to be known to
-        5 cm.
-    bound
-        The known-association bound on the same data, where it was asked for.
+    ``settings`` are those of the preset that were replaced, dotted keys; ``false`` and
+    ``confident_false`` count the landmarks of the map where nothing stands, and those of them that
+    claim to be known to 5 cm; ``bound`` is on the same data, where it was asked for.
     """
 
     settings: dict[str, str] = field(default_factory=dict)
@@ -293,10 +260,6 @@ class SweepRun(Summary):
     @property
     def key(self) -> Key:
         return (self.scene, self.preset, tuple(self.settings.items()), self.stress, self.seed)
-
-
-def no_stop() -> None:
-    """Do not stop."""
 
 
 def make_case(
@@ -334,6 +297,11 @@ def make_case(
     )
 
 
+def first_laps(scene: Scene, count: int) -> Scene:
+    path = scene.path.model_copy(update={"laps": scene.path.laps[:count]})
+    return scene.model_copy(update={"path": path})
+
+
 def loopback_source(
     scene: Scene,
     preset: str,
@@ -342,18 +310,17 @@ def loopback_source(
     *,
     noise_seed: int | None = None,
     stress: Stress = STRESSES[CLEAN],
-    check: Callable[[], None] = no_stop,
+    stop: StopFlag = NO_STOP,
 ) -> RunSource:
     """Return the emulated robot in this process: same driver, device and odometry text as the demo.
 
     ``seed`` is that of odometry and stress, and of the receivers' noise unless ``noise_seed`` is.
-    ``check`` is called once per scan; may raise to stop.
     """
     trajectory = scene.trajectory()
     duration_ns = trajectory.duration_ns
     radars = open_loopback(scene, seed if noise_seed is None else noise_seed)
     radars.start(RAW_CONFIG, FRAME_RATE_HZ)
-    scans = radars.scans(end_counter(duration_ns), check)
+    scans = radars.scans(end_counter(duration_ns), stop.check)
     return RunSource(
         info=SessionInfo(
             scene=scene.name,
@@ -372,29 +339,26 @@ def loopback_source(
     )
 
 
-def source_of(case: Case, *, check: Callable[[], None] = no_stop) -> RunSource:
+def source_of(case: Case, stop: StopFlag = NO_STOP) -> RunSource:
     """Return the source of a case; SLAM gets the scene's own rig and wheels, no stress."""
-    stress = STRESSES[case.stress]
+    stress, front_end = STRESSES[case.stress], None
+    if stress.outlier_share:
+        front_end = OutlierDetector(
+            detector=make_detector(case.config),
+            share=stress.outlier_share,
+            min_range_m=case.config.detection.min_range_m,
+            max_range_m=case.config.detection.max_range_m,
+            seed=case.seed,
+        )
+    slam = make_slam(case.config, rig_of(case.scene), wheels_of(case.scene), front_end)
     scene = stressed_scene(case.scene, stress, case.seed)
-    slam = make_slam(
-        case.config, rig_of(case.scene), wheels_of(case.scene), _front_end(case, stress)
-    )
-    return loopback_source(scene, case.preset, slam, case.seed, stress=stress, check=check)
+    return loopback_source(scene, case.preset, slam, case.seed, stress=stress, stop=stop)
 
 
-def run_case(
-    case: Case, program: str | None = None, *, check: Callable[[], None] = no_stop
-) -> SweepRun:
+def run_case(case: Case, program: str | None = None, *, stop: StopFlag = NO_STOP) -> SweepRun:
     """Run one case and return its numbers.
 
-    Parameters
-    ----------
-    case
-        What to run.
-    program
-        `program_version` of the caller, if that may be another machine.
-    check
-        Called once per scan; may raise to stop.
+    ``program`` is the `program_version` of the caller, if that may be another machine.
 
     Raises
     ------
@@ -406,7 +370,7 @@ def run_case(
             "a worker has another version of xethru-hil or its libraries than this machine; "
             "install the same on both"
         )
-    source = source_of(case, check=check)
+    source = source_of(case, stop)
     record = execute(source)
     summary = summary_of(source, record)
     if summary is None:
@@ -433,11 +397,10 @@ def finite(run: SweepRun) -> SweepRun:
     AppError
         Another number is not finite: SLAM has diverged.
     """
-    nis_mean = None if run.nis_mean is None else min(run.nis_mean, LARGEST)
     capped = replace(
         run,
         nees_pose=tuple((t_s, min(nees, LARGEST)) for t_s, nees in run.nees_pose),
-        nis_mean=nis_mean,
+        nis_mean=None if run.nis_mean is None else min(run.nis_mean, LARGEST),
         nis_times=tuple((t_s, min(nis, LARGEST), dof) for t_s, nis, dof in run.nis_times),
     )
     try:
@@ -465,16 +428,3 @@ def program_version() -> str:
         for path in sorted(folder.rglob("*.py")):
             digest.update(str(path.relative_to(folder)).encode() + path.read_bytes())
     return digest.hexdigest()
-
-
-def _front_end(case: Case, stress: Stress) -> OutlierDetector | None:
-    if not stress.outlier_share:
-        return None
-    limits = case.config.detection
-    return OutlierDetector(
-        detector=make_detector(case.config),
-        share=stress.outlier_share,
-        min_range_m=limits.min_range_m,
-        max_range_m=limits.max_range_m,
-        seed=case.seed,
-    )

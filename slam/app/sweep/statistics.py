@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,8 +11,8 @@ from scipy.special import gammaincinv
 
 from slam.app.run.evaluation import ratio
 from slam.app.run.output import mm_text, share_text
+from slam.app.sweep import CLEAN
 from slam.app.sweep.run import SweepRun
-from slam.app.sweep.stress import CLEAN
 
 _POSE_DOF = 3
 
@@ -32,9 +32,14 @@ def summarise_groups(runs: Sequence[SweepRun]) -> list[dict[str, Any]]:
 
 def group_name(group: dict[str, Any]) -> str:
     """Return what a group is called: scene, preset, settings and stress if there are any."""
-    settings = "".join(f", {key}={value}" for key, value in group["settings"].items())
-    stress = f", stress {group['stress']}" if group["stress"] != CLEAN else ""
-    return f"{group['scene']}, preset {group['preset']}{settings}{stress}"
+    variant = settings_text(group["settings"], group["stress"])
+    return f"{group['scene']}, preset {group['preset']}{variant}"
+
+
+def settings_text(settings: Mapping[str, str], stress: str = CLEAN) -> str:
+    """Return what a name continues with, empty for clean runs of a preset as it is."""
+    text = "".join(f", {key}={value}" for key, value in settings.items())
+    return text if stress == CLEAN else f"{text}, stress {stress}"
 
 
 def group_line(group: dict[str, Any]) -> str:
@@ -42,15 +47,13 @@ def group_line(group: dict[str, Any]) -> str:
     estimate, wheels, found = (
         group[key] for key in ("ate_rmse_m", "odometry_ate_rmse_m", "landmark_medians")
     )
-    low, high = group["anees_band_95"]
-    inside = sum(low <= value <= high for _, value in group["anees_pose"])
     beside = ""
     if group["bound"] is not None:
-        medians = [
+        filtered, smoothed = (
             mm_text(group["bound"][f"{path}_ate_rmse_m"]["median"])
             for path in ("filtered", "smoothed")
-        ]
-        beside = f"; known association: filtered median {medians[0]}, smoothed {medians[1]}"
+        )
+        beside = f"; known association: filtered median {filtered}, smoothed {smoothed}"
     return (
         f"{group_name(group)}, {group['runs']} seeds (simulated): "
         f"SLAM ATE median {mm_text(estimate['median'])} "
@@ -60,7 +63,7 @@ def group_line(group: dict[str, Any]) -> str:
         f"recall {share_text(found['recall'])}, rmse {mm_text(found['rmse_m'])}; "
         f"no duplicate in {group['without_duplicates']:.0%}, "
         f"{group['confident_false']} confident false landmarks; "
-        f"ANEES in band at {inside} of {len(group['anees_pose'])} times"
+        f"ANEES in band at {in_band(group)} of {len(group['anees_pose'])} times"
     )
 
 
@@ -149,21 +152,6 @@ def _median_of_known(values: Sequence[float | None]) -> float | None:
     return statistics.median(known) if known else None
 
 
-_HEADER = (
-    "stress",
-    "ATE median",
-    "p90",
-    "x clean",
-    "p90 x clean",
-    "of odometry",
-    "ANEES in band",
-    "no duplicate",
-    "recall",
-    "false per run",
-    "confident",
-)
-
-
 def stress_tables(groups: Sequence[dict[str, Any]]) -> list[tuple[dict[str, Any], list[Any]]]:
     """Return each clean group and all groups that differ from it by stress alone, itself first."""
     tables = []
@@ -198,24 +186,25 @@ def nis_in_band(group: dict[str, Any]) -> int:
 
 def stress_table(
     clean: dict[str, Any], rows: Sequence[dict[str, Any]]
-) -> tuple[str, Sequence[str], list[tuple[str, ...]]]:
+) -> tuple[str, Sequence[str], Sequence[Sequence[str]]]:
     """Return title, header and rows of a table of `stress_tables`, for `print_table`."""
+    ates = [row["ate_rmse_m"] for row in rows]
+    wheels = [row["odometry_ate_rmse_m"] for row in rows]
+    columns = {
+        "stress": [row["stress"] for row in rows],
+        "ATE median": [mm_text(ate["median"]) for ate in ates],
+        "p90": [mm_text(ate["p90"]) for ate in ates],
+        "x clean": [f"{times_clean(row, clean, 'median'):.2f}" for row in rows],
+        "p90 x clean": [f"{times_clean(row, clean, 'p90'):.2f}" for row in rows],
+        "of odometry": [
+            f"{ratio(ate['median'], wheel['median']):.3f}"
+            for ate, wheel in zip(ates, wheels, strict=True)
+        ],
+        "ANEES in band": [f"{in_band(row)} of {len(row['anees_pose'])}" for row in rows],
+        "no duplicate": [f"{row['without_duplicates']:.0%}" for row in rows],
+        "recall": [share_text(row["landmark_medians"]["recall"]) for row in rows],
+        "false per run": [f"{row['false_per_run']:.2f}" for row in rows],
+        "confident": [str(row["confident_false"]) for row in rows],
+    }
     title = f"{group_name(clean)}, {clean['runs']} seeds, the same in every row: simulated"
-    return title, _HEADER, [_row(group, clean) for group in rows]
-
-
-def _row(group: dict[str, Any], clean: dict[str, Any]) -> tuple[str, ...]:
-    ate, wheels = group["ate_rmse_m"], group["odometry_ate_rmse_m"]
-    return (
-        group["stress"],
-        mm_text(ate["median"]),
-        mm_text(ate["p90"]),
-        f"{times_clean(group, clean, 'median'):.2f}",
-        f"{times_clean(group, clean, 'p90'):.2f}",
-        f"{ratio(ate['median'], wheels['median']):.3f}",
-        f"{in_band(group)} of {len(group['anees_pose'])}",
-        f"{group['without_duplicates']:.0%}",
-        share_text(group["landmark_medians"]["recall"]),
-        f"{group['false_per_run']:.2f}",
-        str(group["confident_false"]),
-    )
+    return title, list(columns), list(zip(*columns.values(), strict=True))

@@ -11,11 +11,10 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -24,21 +23,16 @@ from pydantic import TypeAdapter, ValidationError
 
 from slam.app.errors import AppError, UsageError, naming
 from slam.app.run.output import print_table
-from slam.app.sweep.bound import require_gtsam
-from slam.app.sweep.run import (
-    Case,
-    SweepRun,
-    make_case,
-    program_version,
-    run_case,
-)
+from slam.app.sweep import CLEAN
+from slam.app.sweep.bound import PURPOSE, load_gtsam
+from slam.app.sweep.run import Case, SweepRun, make_case, program_version, run_case
 from slam.app.sweep.statistics import (
     group_line,
+    settings_text,
     stress_table,
     stress_tables,
     summarise_groups,
 )
-from slam.app.sweep.stress import CLEAN
 from slam.app.sweep.workers import ClusterLostError, dask_results, worker_results
 from xethru_protocol.system import PathInUseError, StopFlag, StopRequestedError, locked
 
@@ -55,19 +49,10 @@ _READER: TypeAdapter[_Contents] = TypeAdapter(_Contents)
 
 
 class PartFile:
-    """The file OUT.part: made new, or read and continued.
+    """The file OUT.part: an existing file that is begun if it is empty, or read and continued.
 
-    Parameters
-    ----------
-    path
-        An existing file; empty if there is nothing to go on with.
-    command
-        What the runs depend on, in words by name; must be what the file says.
-
-    Attributes
-    ----------
-    runs
-        Done so far, in the order in which they were.
+    ``command`` holds what the runs depend on, by name, and must be what the file says; ``runs``
+    are those done so far, in their order.
 
     Raises
     ------
@@ -92,13 +77,6 @@ class PartFile:
         self._end = len(head)
 
     def add(self, run: SweepRun) -> None:
-        """Append a run.
-
-        Raises
-        ------
-        AppError
-            The file cannot be written.
-        """
         text = json.dumps(asdict(run), allow_nan=False).encode()
         separator = b",\n" if self.runs else b"\n"
         with naming(self.path), self.path.open("r+b", buffering=0) as file:
@@ -144,24 +122,10 @@ def run_sweep(
 ) -> None:
     """Run all cells, write `{"runs": [...], "groups": [...]}`, print one line per group.
 
-    OUT.part holds the runs done so far, and the same command goes on with it.
-
-    Parameters
-    ----------
-    stop
-        Checked between runs.
-    out
-        The result file.
-    scenes, presets, n_seeds
-        What is run; None is the lab, and preset robust.
-    settings
-        Dotted keys of a preset and the values to try.
-    stresses
-        Rows beside the clean runs.
-    bound
-        Whether to compute the known-association bound, too.
-    jobs, dask
-        The number of processes, None for one per core; or the address of a scheduler.
+    OUT.part holds the runs done so far, and the same command goes on with it. The scene is the lab
+    and the preset robust, if none is given; ``settings`` are dotted keys of a preset and the values
+    to try. ``jobs`` is the number of processes, None for one per core; ``dask`` the address of a
+    scheduler that runs them instead.
 
     Raises
     ------
@@ -175,7 +139,7 @@ def run_sweep(
     # a wrong name ends the command before any run
     cases = _cases(scenes or ["lab"], presets, n_seeds, settings, stresses, bound=bound)
     if bound:
-        require_gtsam()
+        load_gtsam(PURPOSE)
     if out.is_dir():
         raise AppError(f"{out}: is a folder, must be a file")
     if out.exists() and not out.is_file():
@@ -193,8 +157,9 @@ def run_sweep(
                     f"{path}: another sweep is writing there; choose another --json"
                 ) from None
         part = PartFile(path, _command(cases, presets, n_seeds, settings, bound=bound))
-        results = partial(_results, jobs=jobs or cpu_count(), dask=dask, stop=stop)
-        _run(cases, part, out, results, stop)
+        done = {run.key for run in part.runs}
+        missing = [case for case in cases if case.key not in done]
+        _run(cases, part, _results(missing, jobs or cpu_count(), dask, stop), out)
 
 
 def _cases(
@@ -253,33 +218,25 @@ def _digest(*texts: str) -> str:
     return hashlib.sha256("\n".join(texts).encode()).hexdigest()
 
 
-def _run(
-    cases: Sequence[Case],
-    part: PartFile,
-    out: Path,
-    results: Callable[[Sequence[Case]], Iterator[SweepRun]],
-    stop: StopFlag,
-) -> None:
-    done = {run.key for run in part.runs}
-    missing = [case for case in cases if case.key not in done]
-    if done:
-        sys.stderr.write(f"{part.path}: {len(done)} of {len(cases)} runs are done, going on\n")
+def _run(cases: Sequence[Case], part: PartFile, results: Iterator[SweepRun], out: Path) -> None:
+    n_done = len(part.runs)
+    if n_done:
+        sys.stderr.write(f"{part.path}: {n_done} of {len(cases)} runs are done, going on\n")
 
     def left() -> str:
         return f"; {len(part.runs)} of {len(cases)} runs are in {part.path}" if part.runs else ""
 
     started = time.monotonic()
     try:
-        for run in results(missing):
+        for run in results:
             part.add(run)
             elapsed_s = time.monotonic() - started
             to_do = len(cases) - len(part.runs)
-            remaining_s = elapsed_s / (len(missing) - to_do) * to_do
+            remaining_s = elapsed_s / (len(part.runs) - n_done) * to_do
             sys.stderr.write(
                 f"{len(part.runs)} of {len(cases)}: {_run_line(run)}; {_clock(elapsed_s)} "
                 f"elapsed, {_clock(remaining_s)} remaining\n"
             )
-            stop.check()
     except StopRequestedError as stopped:
         raise StopRequestedError(stopped.received, left()) from None
     except BrokenExecutor:
@@ -289,10 +246,6 @@ def _run(
     finally:
         if not part.runs:
             part.path.unlink()
-    _finish(cases, part, out)
-
-
-def _finish(cases: Sequence[Case], part: PartFile, out: Path) -> None:
     by_key = {run.key: run for run in part.runs}
     runs = [by_key[case.key] for case in cases]
     groups = summarise_groups(runs)
@@ -308,10 +261,8 @@ def _finish(cases: Sequence[Case], part: PartFile, out: Path) -> None:
 
 
 def _run_line(run: SweepRun) -> str:
-    settings = "".join(f", {key}={value}" for key, value in run.settings.items())
-    stress = f", stress {run.stress}" if run.stress != CLEAN else ""
     return (
-        f"{run.scene}, {run.preset}{settings}{stress}, seed {run.seed}: "
+        f"{run.scene}, {run.preset}{settings_text(run.settings, run.stress)}, seed {run.seed}: "
         f"ATE {1e3 * run.ate_rmse_m:.1f} mm "
         f"({run.ate_ratio:.2f} of odometry's {1e3 * run.odometry_ate_rmse_m:.1f} mm)"
     )
@@ -328,16 +279,21 @@ def _clock(seconds: float) -> str:
 
 
 def _results(
-    cases: Sequence[Case], *, jobs: int, dask: str | None, stop: StopFlag
+    cases: Sequence[Case], jobs: int, dask: str | None, stop: StopFlag
 ) -> Iterator[SweepRun]:
     """Run cases here, on worker processes or on a cluster; results in the order of the cases."""
     if not cases:
         return
     if dask is None and jobs == 1:
         for case in cases:
-            yield run_case(case, check=stop.check)
+            yield run_case(case, stop=stop)
+            stop.check()
         return
-    with _workers(cases, jobs, dask) as results:
+    if dask is None:
+        workers = worker_results(run_case, [(case,) for case in cases], jobs)
+    else:
+        workers = dask_results(run_case, [(case, program_version()) for case in cases], dask)
+    with workers as results:
         while True:
             # Nothing is half-written while we wait, so a signal may end the waiting at once.
             with stop.at_once():
@@ -345,12 +301,4 @@ def _results(
             if run is None:
                 return
             yield run
-
-
-def _workers(
-    cases: Sequence[Case], jobs: int, dask: str | None
-) -> AbstractContextManager[Iterator[SweepRun]]:
-    if dask is None:
-        return worker_results(run_case, [(case,) for case in cases], jobs)
-    tasks = [(case, program_version()) for case in cases]
-    return dask_results(run_case, tasks, dask)
+            stop.check()

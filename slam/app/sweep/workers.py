@@ -26,6 +26,9 @@ from slam.app.rig.emulated import signal_at_parents_death
 
 _LEFT_TO_THE_PARENT = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 
+TIMEOUT_S = 10.0
+"""How long a scheduler may take to answer, and then a first worker to be there."""
+
 _Result = TypeVar("_Result")
 
 
@@ -35,16 +38,8 @@ def worker_results(
 ) -> Iterator[Iterator[_Result]]:
     """Start worker processes and hand out the results in the order of the tasks.
 
-    Leaving the block kills workers that are still at it.
-
-    Parameters
-    ----------
-    function
-        Called with the members of each task; importable by name, as it runs elsewhere.
-    tasks
-        At least one.
-    n_workers
-        Processes; never more than there are tasks.
+    At least one task; ``function``, importable by name, is called with the members of each. Leaving
+    the block kills workers that are still at it.
     """
     calls = (joblib.delayed(function)(*task) for task in tasks)
     with (
@@ -122,10 +117,6 @@ def _belong_to(parent: int) -> None:
         os._exit(1)
 
 
-TIMEOUT_S = 10.0
-"""How long a scheduler may take to answer, and then a first worker to be there."""
-
-
 class ClusterLostError(Exception):
     """The scheduler went away, or a task took every worker down that it was given to."""
 
@@ -134,18 +125,10 @@ class ClusterLostError(Exception):
 def dask_results(
     function: Callable[..., _Result], tasks: Sequence[tuple[object, ...]], address: str
 ) -> Iterator[Iterator[_Result]]:
-    """Hand tasks to a Dask cluster, and hand out the results in the order of the tasks.
+    """Hand tasks to the Dask scheduler at an address like "tcp://10.0.0.5:8786"; results in order.
 
-    Leaving the block cancels what is not done.
-
-    Parameters
-    ----------
-    function
-        Called with the members of each task; importable by name on every worker.
-    tasks
-        At least one.
-    address
-        Of the scheduler, as "tcp://10.0.0.5:8786".
+    ``function``, importable by name on every worker, is called with the members of each of the
+    tasks, of which there is at least one. Leaving the block cancels what is not done.
 
     Raises
     ------

@@ -13,11 +13,10 @@ from scipy.special import eval_genlaguerre
 from scipy.stats import ncx2
 
 from slam.app.cli import main
-from slam.app.experiments.limit_cells import (
-    BIN_LENGTH_M,
+from slam.app.experiments.limits import (
+    PULSE,
     SEPARATORS,
     detection_probability,
-    known_pulse,
     pair_covariance,
     ranging,
     resolution,
@@ -184,7 +183,6 @@ def test_an_echo_is_found_as_often_as_marcum_says(snr_db: float) -> None:
     assert low <= np.mean(hits) <= high
 
 
-PULSE = known_pulse(BIN_LENGTH_M)
 KNOWN_SIGMA, KNOWN_CARRIER = PULSE.envelope_sigma_bins, PULSE.carrier_rad_per_bin
 MIDDLE = 60
 
@@ -254,9 +252,9 @@ def test_what_counts_as_found_and_as_resolved() -> None:
     true_m = np.array([1.0, 1.0, 1.0, 1.0])
     found = [np.array([1.002]), np.array([0.998, 2.0]), np.array([]), np.array([1.2])]
     seen = ranging(found, true_m)
-    assert (seen.found, seen.others_per_frame) == (0.5, 0.5)
-    assert seen.bias_mm == pytest.approx(0.0)
-    assert seen.std_mm == pytest.approx(2 * math.sqrt(2))
+    assert (seen["found"], seen["others_per_frame"]) == (0.5, 0.5)
+    assert seen["bias_mm"] == pytest.approx(0.0)
+    assert seen["std_mm"] == pytest.approx(2 * math.sqrt(2))
 
     pairs = np.tile([1.0, 1.1], (4, 1))
     split = [
@@ -266,8 +264,8 @@ def test_what_counts_as_found_and_as_resolved() -> None:
         np.array([1.0, 1.1, 1.2]),
     ]
     told_apart = resolution(split, pairs)
-    assert (told_apart.resolved, told_apart.two_found) == (0.25, 0.5)
-    assert told_apart.rms_mm == pytest.approx(math.sqrt((100 + 100 + 0 + 900) / 4))
+    assert (told_apart["resolved"], told_apart["two_found"]) == (0.25, 0.5)
+    assert told_apart["rms_mm"] == pytest.approx(math.sqrt((100 + 100 + 0 + 900) / 4))
 
 
 def test_the_command_writes_table_picture_and_numbers(

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from emulator.scene.scene import Scene, load_scene
+from emulator.scene.scene import load_scene
 from hil_tests.paths import FIXTURES, REPOSITORY
 from hil_tests.unit.slam.app.sweep.sweep_runs import run_of
 from slam.app.cli import main
 from slam.app.experiments.figure7 import measure_steps, range_errors
-from slam.app.experiments.filter import Origin, Seen, Setting, drive, outcomes
+from slam.app.experiments.filter import Origin, Seen, Setting, drive, outcome
 from slam.app.experiments.recording import (
     FAR_BINS,
     SlowTime,
@@ -34,12 +34,14 @@ from slam.geometry import paper_rig, transform
 from slam.robust.association import antennas_of, sides_of, sure_landmarks, view
 from slam.robust.parameters import ContinuationRule, RangeNoise
 from slam.robust.state import Motion
+from xethru_protocol.system import StopFlag
 
 RANGES_M = (0.6, 0.61, 0.62, 0.9, 0.91, 0.92)
 
 
 def test_the_peaks_of_every_front_end_follow_a_rod_in_1_cm_steps() -> None:
-    errors = range_errors(measure_steps(seed=4, frames_per_step=6, ranges_m=RANGES_M))
+    steps = measure_steps(RANGES_M, seed=4, frames_per_step=6, stop=StopFlag())
+    errors = range_errors(steps, StopFlag())
     assert set(errors) == {"paper", "matched_filter", "joint"}
     for name, error in errors.items():
         assert error.found == 1.0, name
@@ -53,8 +55,9 @@ def test_the_peaks_of_every_front_end_follow_a_rod_in_1_cm_steps() -> None:
 
 
 def test_an_empty_room_gives_no_rod() -> None:
-    steps = measure_steps(seed=4, frames_per_step=2, ranges_m=[3.0])  # beyond what SLAM uses
-    for error in range_errors(steps).values():
+    # beyond what SLAM uses
+    steps = measure_steps([3.0], seed=4, frames_per_step=2, stop=StopFlag())
+    for error in range_errors(steps, StopFlag()).values():
         assert error.found == 0.0
         assert error.numbers()["bias_m"] is None
 
@@ -74,22 +77,16 @@ def test_a_scene_in_smoke_echoes_weaker_by_just_that_much() -> None:
     assert in_smoke(clear).model_copy(update={"targets": clear.targets}) == clear
 
 
-def short(scene: Scene, tmp_path: Path) -> str:
-    """Write the lab with a course of half a metre, so that it is driven in a moment."""
-    text = (FIXTURES / "scenes" / f"{scene.name}.toml").read_text()
-    lines = text.split("\n")
-    (row,) = (n for n, line in enumerate(lines) if line.startswith("waypoints_m"))
-    lines[row] = "waypoints_m = [[0.0, 0.0], [0.5, 0.0]]"
-    (row,) = (n for n, line in enumerate(lines) if line.startswith("laps"))
-    lines[row] = 'laps = ["forward"]'
-    path = tmp_path / "short.toml"
-    path.write_text("\n".join(lines))
-    return str(path)
-
-
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory: pytest.TempPathFactory) -> Seen:
-    return drive(short(load_scene("lab"), tmp_path_factory.mktemp("scene")), seed=0)
+    """Half a metre of the lab, so that it is driven in a moment."""
+    lines = (FIXTURES / "scenes" / "lab.toml").read_text().split("\n")
+    for key, value in (("waypoints_m", "[[0.0, 0.0], [0.5, 0.0]]"), ("laps", '["forward"]')):
+        (row,) = (n for n, line in enumerate(lines) if line.startswith(key))
+        lines[row] = f"{key} = {value}"
+    path = tmp_path_factory.mktemp("scene") / "short.toml"
+    path.write_text("\n".join(lines))
+    return drive(str(path), seed=0, stop=StopFlag())
 
 
 def test_a_true_fix_lies_where_a_landmark_is(seen: Seen) -> None:
@@ -105,14 +102,9 @@ def test_a_true_fix_lies_where_a_landmark_is(seen: Seen) -> None:
 
 
 def test_a_filter_that_asks_for_more_keeps_less(seen: Seen) -> None:
-    lax, table_i, strict, narrow = outcomes(
-        seen,
-        [
-            Setting(window_size=15, min_opc=1, search_rad_m=0.2),
-            Setting(window_size=15, min_opc=9, search_rad_m=0.2),
-            Setting(window_size=15, min_opc=15, search_rad_m=0.2),
-            Setting(window_size=15, min_opc=9, search_rad_m=0.025),
-        ],
+    lax, table_i, strict, narrow = (
+        outcome(seen, Setting(window_size=15, min_opc=count, search_rad_m=radius_m), StopFlag())
+        for count, radius_m in ((1, 0.2), (9, 0.2), (15, 0.2), (9, 0.025))
     )
     assert lax.true_kept == 1.0
     assert table_i.true_kept is not None

@@ -2,7 +2,6 @@
 
 import math
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -27,6 +26,7 @@ from slam.app.sweep.bound import (
     KnownAssociation,
     KnownRange,
     KnownRun,
+    Pose,
     SeenFrom,
     first_position,
     known_run,
@@ -55,18 +55,18 @@ def simulated(stress: str) -> Run:
     return simulate(LAB, 3, SIGMA_M, STRESSES[stress], labelled=True)
 
 
-def labelled(run: Run, n_steps: int, sigma_m: float) -> KnownRun:
+def known_range(radar: int, landmark: int, range_m: float) -> KnownRange:
+    return KnownRange(
+        radar=radar, landmark=landmark, range_m=range_m, sigma_m=SIGMA_M, motion=np.zeros(3)
+    )
+
+
+def labelled(run: Run, n_steps: int) -> KnownRun:
     return KnownRun(
         increments=run.increments[:n_steps],
         ranges=tuple(
             tuple(
-                KnownRange(
-                    radar=scan.radar,
-                    landmark=label,
-                    range_m=range_m,
-                    sigma_m=sigma_m,
-                    motion=np.zeros(3),
-                )
+                known_range(scan.radar, label, range_m)
                 for scan in scans
                 for range_m, label in zip(scan.ranges_m, scan.labels or (), strict=True)
             )
@@ -89,15 +89,7 @@ def exact_run(n_steps: int) -> tuple[KnownRun, Array, Array]:
                 dx, dy = point - (antenna.x_m, antenna.y_m)
                 off = math.remainder(math.atan2(dy, dx) - antenna.yaw_rad, math.tau)
                 if abs(off) < 0.56 and math.hypot(dx, dy) < 1.5:
-                    seen.append(
-                        KnownRange(
-                            radar=radar,
-                            landmark=landmark,
-                            range_m=math.hypot(dx, dy),
-                            sigma_m=SIGMA_M,
-                            motion=np.zeros(3),
-                        )
-                    )
+                    seen.append(known_range(radar, landmark, math.hypot(dx, dy)))
         ranges.append(tuple(seen))
     return KnownRun(increments=np.array(increments), ranges=tuple(ranges)), poses[1:], landmarks
 
@@ -167,7 +159,7 @@ def batch_of(run: KnownRun, bound: KnownAssociation, offset_sigma_m: float) -> S
 @pytest.mark.parametrize("stress", ["clean", "offsets20"])
 def test_the_smoother_is_ours_and_the_filtered_pose_ends_there(stress: str) -> None:
     pytest.importorskip("gtsam")
-    run = labelled(simulated(stress), N_STEPS, SIGMA_M)
+    run = labelled(simulated(stress), N_STEPS)
     offset_sigma_m = STRESSES[stress].offset_m
     bound = solve_known(
         run, paper_rig(), parameters_for(LAB, SIGMA_M).wheels, offset_sigma_m=offset_sigma_m
@@ -186,7 +178,7 @@ def test_the_smoother_is_ours_and_the_filtered_pose_ends_there(stress: str) -> N
 
 def test_the_filtered_path_knows_nothing_of_what_comes_later() -> None:
     pytest.importorskip("gtsam")
-    run = labelled(simulated("clean"), 90, SIGMA_M)
+    run = labelled(simulated("clean"), 90)
     short = KnownRun(increments=run.increments[:70], ranges=run.ranges[:70])
     wheels = parameters_for(LAB, SIGMA_M).wheels
     whole, part = (solve_known(data, paper_rig(), wheels) for data in (run, short))
@@ -197,7 +189,7 @@ def test_the_filtered_path_knows_nothing_of_what_comes_later() -> None:
 
 def test_a_radar_without_partner_finds_landmarks_too() -> None:
     pytest.importorskip("gtsam")
-    both = labelled(simulated("clean"), 130, SIGMA_M)
+    both = labelled(simulated("clean"), 130)
     alive = tuple(tuple(k for k in ranges if k.radar in (0, 2)) for ranges in both.ranges)
     run = KnownRun(increments=both.increments, ranges=alive)
     bound = solve_known(run, paper_rig(), parameters_for(LAB, SIGMA_M).wheels)
@@ -208,7 +200,7 @@ def test_a_radar_without_partner_finds_landmarks_too() -> None:
 
 def test_wandering_calibration_errors_get_sets_of_their_own() -> None:
     pytest.importorskip("gtsam")
-    run = labelled(simulated("clean"), 60, SIGMA_M)
+    run = labelled(simulated("clean"), 60)
     sigma = WheelNoise().scale_sigma
     wander = solve_known(run, paper_rig(), WheelNoise(walk_per_sqrt_m=0.5))
     still = solve_known(run, paper_rig(), WheelNoise())
@@ -223,30 +215,27 @@ def test_without_gtsam_one_line_says_what_to_do(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize("calibration", [(0.0, 0.0, 0.0), (0.02, -0.03, 0.01)])
-def test_derivatives_of_a_step_of_the_wheels(calibration: tuple[float, float, float]) -> None:
+def test_derivatives_of_a_step_of_the_wheels(calibration: Pose) -> None:
     before, after, increment = (1.0, -2.0, 3.1), (1.01, -1.98, -3.12), (0.02, 0.003, 0.05)
 
-    def moved(pose: tuple[float, float, float], change: Array) -> tuple[float, float, float]:
-        x, y, heading = compose(np.array(pose), change)
-        return (float(x), float(y), float(heading))
+    def moved(pose: Pose, change: Array) -> Pose:
+        return _three(compose(np.array(pose), change))
 
     found = wheel_derivatives(before, after, calibration, increment)
     h = 1e-6
     for column in range(3):
         unit = h * np.eye(3)[column]
-        plus = wheel_residual(moved(before, unit), after, calibration, increment)
-        minus = wheel_residual(moved(before, -unit), after, calibration, increment)
-        np.testing.assert_allclose(found[0][:, column], (plus - minus) / (2 * h), atol=1e-8)
-        plus = wheel_residual(before, moved(after, unit), calibration, increment)
-        minus = wheel_residual(before, moved(after, -unit), calibration, increment)
-        np.testing.assert_allclose(found[1][:, column], (plus - minus) / (2 * h), atol=1e-8)
-        more, less = (np.array(calibration) + sign * unit for sign in (1.0, -1.0))
-        plus = wheel_residual(before, after, _three(more), increment)
-        minus = wheel_residual(before, after, _three(less), increment)
-        np.testing.assert_allclose(found[2][:, column], (plus - minus) / (2 * h), atol=1e-8)
+        ways = (
+            lambda change: (moved(before, change), after, calibration),
+            lambda change: (before, moved(after, change), calibration),
+            lambda change: (before, after, _three(np.array(calibration) + change)),
+        )
+        for derivative, way in zip(found, ways, strict=True):
+            plus, minus = (wheel_residual(*way(sign * unit), increment) for sign in (1.0, -1.0))
+            np.testing.assert_allclose(derivative[:, column], (plus - minus) / (2 * h), atol=1e-8)
 
 
-def _three(values: Sequence[float] | Array) -> tuple[float, float, float]:
+def _three(values: Array) -> Pose:
     x, y, z = (float(value) for value in values)
     return (x, y, z)
 
@@ -259,10 +248,11 @@ def test_true_ids_go_to_the_nearest_in_range_one_each_within_the_gate() -> None:
     landmarks = np.array([[0.1, 2.0], [0.0, 2.0], [1.5, 2.0], [0.8, 2.7]])  # two ahead, at 0.7, 0.8
     ranges = np.array([0.81, 0.705, 0.76, 0.69, 1.3])
     # 0.69 is 0.01 off, 0.705 nearer; 0.76 is off everything; the third is behind, the last aside
-    assert true_ids(ranges, 0.03, MOUNT, POSE, landmarks) == [1, 0, None, None, None]
-    assert true_ids(ranges[3:4], 0.03, MOUNT, POSE, landmarks) == [0]
-    assert true_ids(ranges[3:4], 0.009, MOUNT, POSE, landmarks) == [None]
-    assert true_ids(ranges, 0.03, MOUNT, POSE, np.zeros((0, 2))) == [None] * 5
+    gate_m = np.full(5, 0.03)
+    assert true_ids(ranges, gate_m, MOUNT, POSE, landmarks) == [1, 0, None, None, None]
+    assert true_ids(ranges[3:4], gate_m[:1], MOUNT, POSE, landmarks) == [0]
+    assert true_ids(ranges[3:4], 0.3 * gate_m[:1], MOUNT, POSE, landmarks) == [None]
+    assert true_ids(ranges, gate_m, MOUNT, POSE, np.zeros((0, 2))) == [None] * 5
 
 
 def test_a_record_becomes_increments_and_ranges_at_their_own_times() -> None:
@@ -285,7 +275,11 @@ def test_a_record_becomes_increments_and_ranges_at_their_own_times() -> None:
         duration_ns=200,
         wall_s=1.0,
     )
-    run = known_run(record, Rig(mounts=(MOUNT,)), landmark, range_sigma_m=2e-3)
+
+    def known(record: RunRecord, **sigmas: float) -> KnownRun:
+        return known_run(record, Rig(mounts=(MOUNT,)), landmark, **sigmas)
+
+    run = known(record, range_sigma_m=2e-3)
     np.testing.assert_allclose(
         run.increments, [[0.1, 0, 0], [0.2, 0, 0], [0.1, 0.1, math.pi / 2]], atol=1e-15
     )
@@ -293,22 +287,14 @@ def test_a_record_becomes_increments_and_ranges_at_their_own_times() -> None:
     (only,) = run.ranges[0]
     assert (only.radar, only.landmark, only.range_m, only.sigma_m) == (0, 0, range_m, 2e-3)
     np.testing.assert_allclose(only.motion, [0.1, 0.0, 0.0], atol=1e-15)
-    tight = known_run(record, Rig(mounts=(MOUNT,)), landmark, range_sigma_m=2e-3, gate_sigmas=1.9)
-    assert tight.ranges[0] == ()
-    unsure = known_run(
-        record, Rig(mounts=(MOUNT,)), landmark, range_sigma_m=5e-4, offset_sigma_m=2e-2
-    )
-    assert len(unsure.ranges[0]) == 1
+    # the range is 4 mm off, and the gate four standard deviations
+    assert known(record, range_sigma_m=0.95e-3).ranges[0] == ()
+    assert len(known(record, range_sigma_m=5e-4, offset_sigma_m=2e-2).ranges[0]) == 1
     told = tuple(replace(r, range_sigmas_m=(3e-3, math.inf)[: len(r.detections)]) for r in results)
-    by_detection = known_run(
-        replace(record, results=told), Rig(mounts=(MOUNT,)), landmark, range_sigma_m=2e-3
-    )
-    assert [known.sigma_m for known in by_detection.ranges[0]] == [3e-3]
+    by_detection = known(replace(record, results=told), range_sigma_m=2e-3)
+    assert [item.sigma_m for item in by_detection.ranges[0]] == [3e-3]
     left_out = (replace(results[0], range_sigmas_m=(math.inf, 3e-3)), *results[1:])
-    nothing = known_run(
-        replace(record, results=left_out), Rig(mounts=(MOUNT,)), landmark, range_sigma_m=2e-3
-    )
-    assert nothing.ranges == ((), (), ())
+    assert known(replace(record, results=left_out), range_sigma_m=2e-3).ranges == ((), (), ())
 
 
 def test_ranges_of_one_radar_place_a_landmark_once_they_tell_it() -> None:
@@ -317,13 +303,7 @@ def test_ranges_of_one_radar_place_a_landmark_once_they_tell_it() -> None:
     seen = [
         SeenFrom(
             step=step,
-            known=KnownRange(
-                radar=0,
-                landmark=0,
-                range_m=float(np.hypot(*(landmark - pose[:2] - (0.0, 0.2)))),
-                sigma_m=SIGMA_M,
-                motion=np.zeros(3),
-            ),
+            known=known_range(0, 0, float(np.hypot(*(landmark - pose[:2] - (0.0, 0.2))))),
             antenna=MOUNT,
         )
         for step, pose in enumerate(poses)

@@ -211,15 +211,3 @@ def test_false_ones_are_counted_in_the_world_and_by_their_worst_direction() -> N
     places = [(2.1, 0.0), (2.2, 0.0), (2.2, 0.0), (-9.0, 9.0)]
     sigmas = [(0.01, 0.01), (0.01, 0.04), (0.01, 0.06), (0.2, 0.2)]
     assert false_landmarks(record(places, sigmas), ROOM) == (3, 1)
-
-
-def test_no_state_no_false_landmark() -> None:
-    empty = RunRecord(
-        results=(),
-        truth=np.zeros((0, 3)),
-        world_from_map=np.zeros(3),
-        n_frames=0,
-        duration_ns=0,
-        wall_s=1.0,
-    )
-    assert false_landmarks(empty, ROOM) == (0, 0)

@@ -12,8 +12,8 @@ from emulator.scene.scene import Scene, load_scene
 from emulator.scene.wheels import scene_odometry
 from slam.app.odometry.track import OdometryTrack
 from slam.app.records import Scan
+from slam.app.sweep import CLEAN, STRESSES, Stress
 from slam.app.sweep.run import OutlierDetector, stressed_scans, stressed_scene
-from slam.app.sweep.stress import CLEAN, STRESSES, Stress
 from slam.frames import Detection, RadarFrame
 
 PERIOD_NS = 200_000_000
@@ -138,7 +138,7 @@ def test_all_is_the_first_five_together() -> None:
     values = {
         field.name: max(getattr(STRESSES[name], field.name) for name in FIVE)
         for field in fields(Stress)
-        if field.name not in ("name", "help", "dead_radars")
+        if field.name not in ("help", "dead_radars")
     }
     assert {name: getattr(STRESSES["all"], name) for name in values} == values
     assert STRESSES["all"].dead_radars == frozenset()

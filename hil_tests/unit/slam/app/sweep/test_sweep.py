@@ -50,7 +50,7 @@ def options_of(out: Path, **changes: Any) -> dict[str, Any]:  # noqa: ANN401 - a
 
 
 def interrupted_after(count: int, calls: list[Key]) -> Callable[..., SweepRun]:
-    def run(case: Case, *, check: Callable[[], None]) -> SweepRun:
+    def run(case: Case, *, stop: StopFlag) -> SweepRun:
         if len(calls) == count:
             raise StopRequestedError(signal.SIGINT)
         calls.append(case.key)
