@@ -2,6 +2,7 @@
 
 import math
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -225,7 +226,7 @@ def test_derivatives_of_a_step_of_the_wheels(calibration: Pose) -> None:
     h = 1e-6
     for column in range(3):
         unit = h * np.eye(3)[column]
-        ways = (
+        ways: tuple[Callable[[Array], tuple[Pose, Pose, Pose]], ...] = (
             lambda change: (moved(before, change), after, calibration),
             lambda change: (before, moved(after, change), calibration),
             lambda change: (before, after, _three(np.array(calibration) + change)),
