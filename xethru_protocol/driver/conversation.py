@@ -56,29 +56,9 @@ class _Request:
 class Conversation:
     """Commands to one module and what comes from it.
 
-    Parameters
-    ----------
-    name
-        What to call the line in messages to people.
-    clock
-        Monotonic time [ns].
-    observer
-        Called with every command, answer, SYSTEM message, fault and warning; may be None.
-    take_data
-        Called with every message that is no answer, and the time its last byte was read [ns].
-
-    Attributes
-    ----------
-    listener
-        Called with every message from the module, frames included, and its time of arrival [ns].
-    statistics
-        What came over the line, since it was first opened.
-    fault_count
-        Damaged places seen on the line.
-    stray_count
-        Answers that belong to no request.
-    reboots, readies
-        SYSTEM BOOTING and READY messages seen.
+    ``name`` is what messages to people call the line. ``take_data`` is called with every message
+    that is no answer, and the time its last byte was read [ns]. ``clock`` and ``observer`` as of
+    `X4M300`; its properties describe the listener and the counters.
     """
 
     def __init__(
@@ -250,7 +230,7 @@ class Conversation:
             self._take_data(message, arrival_ns)
             return
         if self._is_answer(message):
-            self._reset_diagnosis()
+            self._damaged_since = self._rebooted_since = False
             if self._request is None:
                 self.stray_count += 1  # not kept: a faulty module may never stop sending them
             else:
@@ -258,7 +238,10 @@ class Conversation:
             if isinstance(message, m.Pong):
                 self._pongs_owed = max(self._pongs_owed - 1, 0)
         elif isinstance(message, m.System):
-            self._take_system(message)
+            self.readies += message.code == SystemCode.XTS_SPRS_READY
+            if message.code == SystemCode.XTS_SPRS_BOOTING:
+                self.reboots += 1
+                self._rebooted_since = True
         else:
             self._take_data(message, arrival_ns)
         if self._observer is not None and not _is_bulk(message):
@@ -271,13 +254,6 @@ class Conversation:
             request is not None and isinstance(message, request.row.replies)
         )
 
-    def _take_system(self, message: m.System) -> None:
-        if message.code == SystemCode.XTS_SPRS_BOOTING:
-            self.reboots += 1
-            self._rebooted_since = True
-        elif message.code == SystemCode.XTS_SPRS_READY:
-            self.readies += 1
-
     # --- the line -------------------------------------------------------------------------------
 
     def new_line(self, name: str) -> None:
@@ -289,7 +265,7 @@ class Conversation:
         self._request = None
         self._answer_owed = False
         self._pongs_owed = 0
-        self._reset_diagnosis()
+        self._damaged_since = self._rebooted_since = False
 
     def wind_down(self) -> None:
         """Read answers only from now on.
@@ -333,10 +309,6 @@ class Conversation:
     def report(self, direction: Literal["tx", "rx", "fault", "warning"], text: str) -> None:
         if self._observer is not None:
             self._observer(ProtocolRecord(t_ns=self._clock(), direction=direction, summary=text))
-
-    def _reset_diagnosis(self) -> None:
-        self._damaged_since = False
-        self._rebooted_since = False
 
 
 def _is_bulk(message: Response) -> bool:

@@ -196,17 +196,9 @@ class Files:
     def read(self, file_type: int, identifier: int, on_progress: OnProgress | None = None) -> bytes:
         """Read a file.
 
-        Parameters
-        ----------
-        file_type, identifier
-            What it is known by.
-        on_progress
-            Called with the bytes read so far and their total: at the start and after each chunk.
-
-        Raises
-        ------
-        DeviceError
-            If it does not exist, or the module cannot read it; `DeviceError.code` is a `FileError`.
+        ``on_progress`` is called with the bytes read so far and their total: at the start and after
+        each chunk. Raises `DeviceError`, whose code is a `FileError`, if the file does not exist or
+        the module cannot read it.
         """
         return self._call_once(read, file_type, identifier, on_progress)
 
@@ -215,19 +207,9 @@ class Files:
     ) -> None:
         """Create a file and write it; if that fails midway it is deleted again.
 
-        Parameters
-        ----------
-        file_type, identifier
-            What it will be known by; user-defined types begin at 80000000h.
-        data
-            Its content.
-        on_progress
-            Called with the bytes written so far and their total: at the start and after each chunk.
-
-        Raises
-        ------
-        DeviceError
-            If the file exists already, there is no room, or the module cannot write.
+        User-defined types begin at 80000000h. ``on_progress`` is called with the bytes written so
+        far and their total: at the start and after each chunk. Raises `DeviceError` if the file
+        exists already, there is no room, or the module cannot write.
         """
         self._call_once(write, file_type, identifier, data, on_progress)
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 from numpy.typing import NDArray
 
 from xethru_protocol.wire.errors import LocalProtocolError
@@ -28,7 +27,6 @@ _TAP_SUMS: Final = {3: 306, 4: 316}
 _NEIGHBOURS: Final = (-2.0, -1.0, -0.5, 0.5, 1.0, 2.0)
 
 Float32s = NDArray[np.float32]
-Float64s = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,10 +64,7 @@ class Lattice:
     ) -> "Lattice":
         """Lattice of a radar with these settings.
 
-        Raises
-        ------
-        LocalProtocolError
-            If the settings count nothing, or no filter is known for the centre frequency.
+        Raises `LocalProtocolError` if they count nothing, or no filter is known for the band.
 
         >>> lattice = Lattice.of(
         ...     iterations=16, pulses_per_step=300, dac_min=949, dac_max=1100, dac_step=0,
@@ -112,13 +107,7 @@ class Lattice:
         )
 
     def off_lattice(self, samples: Float32s) -> int:
-        """Count the samples that no chip counter can give; NaN and infinities are such.
-
-        Parameters
-        ----------
-        samples
-            Values as sent, shape (n,), float32.
-        """
+        """Count the values as sent, shape (n,), that no counter can give: also NaN, infinities."""
         # Nearly every frame is whole: one rounding to the lattice and back proves it. Bytes take
         # a fourth of array_equal's time; a -0.0, which differs from 0.0 there, is judged below.
         if samples.size == 0 or (
@@ -134,13 +123,7 @@ class Lattice:
         return int(bad)
 
     def nearest(self, samples: Float32s) -> Float32s:
-        """Return what the chip would give for samples: of the nearest counter it can hold.
-
-        Parameters
-        ----------
-        samples
-            Finite values, shape (n,), float32.
-        """
+        """Return what the chip gives for finite samples, shape (n,), by the nearest counter."""
         counters = np.rint((samples + self.dac_offset) * (self.tap_sum / self.quantum))
         counters = np.clip(counters, self.min_counter, self.max_counter).astype(np.float32)
         return _values(counters, self.quantum, self.dac_offset, self.tap_sum)
@@ -156,7 +139,9 @@ class Lattice:
     def _count_neighbours(self, samples: Float32s) -> int:
         """Count samples that a counter near the most likely one gives, or the fused arithmetic."""
         scale = float(self.tap_sum) / float(self.quantum)
-        middle: Float64s = np.rint((samples.astype(np.float64) + float(self.dac_offset)) * scale)
+        middle: NDArray[np.float64] = np.rint(
+            (samples.astype(np.float64) + float(self.dac_offset)) * scale
+        )
         # Beyond 2**24 the firmware's float32 skips counters.
         spacing = np.maximum(np.spacing(np.abs(middle).astype(np.float32)), np.float32(1.0))
         found = np.zeros(samples.shape, np.bool_)
@@ -184,7 +169,7 @@ def _values(
     return values
 
 
-Samples = npt.NDArray[np.float32] | npt.NDArray[np.complex64]
+Samples = Float32s | NDArray[np.complex64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -200,6 +185,11 @@ class FrameGeometry:
     downconversion: bool
 
     @property
+    def n_values(self) -> int:
+        """Numbers in a radar frame: one per RF bin, I and Q per baseband bin."""
+        return 2 * self.n_bins if self.downconversion else self.n_bins
+
+    @property
     def frame_bytes(self) -> int:
         """Bytes of one radar frame on the wire. Protocol reference 1.3, 6.1.
 
@@ -208,7 +198,7 @@ class FrameGeometry:
         ... ).frame_bytes
         5747
         """
-        return 9 + 14 + 4 * self.n_bins * (2 if self.downconversion else 1)
+        return 9 + 14 + 4 * self.n_values
 
     @classmethod
     def from_read_back(
@@ -249,26 +239,7 @@ class Frame:
     arrival_ns: int
 
 
-def rf_or_baseband(message: DataFloat, geometry: FrameGeometry) -> Samples | None:
-    """Return the samples of a radar frame, or None if the message has another geometry.
-
-    Radar frames have content id 0 (Protocol reference 6.1).
-    """
-    if message.content_id != 0:
-        return None
-    values = message.values
-    n = geometry.n_bins
-    if not geometry.downconversion:
-        return values if values.size == n else None
-    return _complex(values[:n], values[n:]) if values.size == 2 * n else None
-
-
-def baseband(message: BasebandIq) -> Samples:
-    """Return the samples of a profile's baseband message, shape (num_bins,), complex64."""
-    return _complex(message.i, message.q)
-
-
-def _complex(i: npt.NDArray[np.float32], q: npt.NDArray[np.float32]) -> npt.NDArray[np.complex64]:
+def _complex(i: Float32s, q: Float32s) -> NDArray[np.complex64]:
     iq = np.empty(i.size, np.complex64)
     iq.real = i
     iq.imag = q
@@ -351,13 +322,15 @@ class FrameQueue:
             self._take_radar_frame(message, arrival_ns)
 
     def _take_radar_frame(self, message: DataFloat, arrival_ns: int) -> None:
-        geometry = self.geometry
-        samples = None if geometry is None else rf_or_baseband(message, geometry)
-        if geometry is None or samples is None:
+        geometry, values = self.geometry, message.values
+        # radar frames have content id 0 (Protocol reference 6.1)
+        if geometry is None or message.content_id != 0 or values.size != geometry.n_values:
             self.discarded += 1
             return
         if self.lattice is not None:
-            self._statistics.off_lattice_samples += self.lattice.off_lattice(message.values)
+            self._statistics.off_lattice_samples += self.lattice.off_lattice(values)
+        n = geometry.n_bins
+        samples = _complex(values[:n], values[n:]) if geometry.downconversion else values
         self._queue(message.info, samples, geometry, arrival_ns)
 
     def _take_baseband(self, message: BasebandIq, arrival_ns: int) -> None:
@@ -369,7 +342,9 @@ class FrameQueue:
         )
         if geometry != self._baseband_geometry:
             self._baseband_geometry = geometry
-        self._queue(message.counter, baseband(message), self._baseband_geometry, arrival_ns)
+        self._queue(
+            message.counter, _complex(message.i, message.q), self._baseband_geometry, arrival_ns
+        )
 
     def _queue(
         self, counter: int, samples: Samples, geometry: FrameGeometry, arrival_ns: int

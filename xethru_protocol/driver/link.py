@@ -52,7 +52,7 @@ class CloseLine:
 
 @dataclass(frozen=True, slots=True)
 class OpenLine:
-    """Open a line in place of one that was closed; raises `PortUnavailable`."""
+    """Close the line and open another; raises `PortUnavailable`."""
 
     path: str
     baudrate: int

@@ -6,7 +6,6 @@
 import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
-from types import TracebackType
 from typing import ClassVar, Self
 
 from xethru_protocol.driver import raw_mode, reconnect
@@ -199,6 +198,7 @@ class RadarState:
             case CloseLine():
                 self._transport.close()
             case OpenLine(path, baudrate):
+                self._transport.close()
                 self._transport = self._open_port(path, baudrate)
                 self._link.bytes_per_s = capacity_bytes_per_s(self._transport)
             case SetLineRate(baudrate):
@@ -268,12 +268,7 @@ class X4M300(RadarState):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -293,13 +288,6 @@ class X4M300(RadarState):
 
     def request(self, command: Command[ReplyT], timeout_s: float = TIMEOUT_S) -> ReplyT:
         """Send a command and return the reply that its row in the message table names.
-
-        Parameters
-        ----------
-        command
-            Any command of the table.
-        timeout_s
-            How long to wait for the reply.
 
         Raises
         ------
@@ -335,15 +323,13 @@ class X4M300(RadarState):
     # --- the line -------------------------------------------------------------------------------
 
     def reset(self, *, wait: bool = False, timeout_s: float = reconnect.RESTART_S) -> None:
-        """Restart the module; what was configured is gone.
+        """Restart the module; what was configured is gone. Protocol reference 8.1.
 
         Parameters
         ----------
         wait
             False: return at its ACK; a USB port vanishes 0.5 s later. True: return when it is
             ready again, on a port of the same or another name.
-        timeout_s
-            How long to wait.
 
         Raises
         ------
@@ -351,10 +337,6 @@ class X4M300(RadarState):
             If it keeps its port and does not get ready in time.
         Disconnected
             If its port vanishes and it does not come back in time.
-
-        Notes
-        -----
-        Protocol reference 8.1.
         """
         self._call_once(reconnect.reset, wait=wait, timeout_s=timeout_s)
 
@@ -376,7 +358,8 @@ class X4M300(RadarState):
     def set_baud_rate(self, baudrate: int, *, force: bool = False) -> None:
         """Change the rate of a UART on both sides; lines without a rate accept it without effect.
 
-        The module answers at the old rate and forgets the new one at a restart.
+        The module answers at the old rate and forgets the new one at a restart. Protocol reference
+        4.10, 10, 16.
 
         Parameters
         ----------
@@ -390,10 +373,6 @@ class X4M300(RadarState):
             If the module does not list the rate.
         ResponseTimeout
             If the module is silent at the new rate; this side is back at the old one then.
-
-        Notes
-        -----
-        Protocol reference 4.10, 10, 16.
         """
         self._call_once(Link.set_baud_rate, baudrate, force=force)
 
@@ -402,7 +381,8 @@ class X4M300(RadarState):
     def configure_raw(self, config: RawConfig | None = None) -> FrameGeometry:
         """Bring the module from any state to raw radar mode, stopped.
 
-        Every setting is read back. Returns the geometry as the module quantised it.
+        Every setting is read back. Returns the geometry as the module quantised it. Protocol
+        reference 13.
 
         Raises
         ------
@@ -414,10 +394,6 @@ class X4M300(RadarState):
             If it reads back another value than was set; names the setting.
         ResponseTimeout
             If the port is no radar.
-
-        Notes
-        -----
-        Protocol reference 13.
         """
         return self._call(raw_mode.configure_raw, config)
 

@@ -131,18 +131,8 @@ def recover(link: Link, reconnects: int, error: Disconnected) -> Steps[None]:
 # --- inside -------------------------------------------------------------------------------------
 
 
-def _restore(link: Link) -> Steps[None]:
-    plan = link.plan
-    if plan is None:
-        return
-    try:
-        yield from plan.restore(link)
-    finally:
-        link.plan = plan  # also if the module vanished meanwhile
-
-
 def _find_again(link: Link, deadline_ns: int, timeout_s: float, *, restore: bool) -> Steps[None]:
-    lost = link.path
+    lost, plan = link.path, link.plan
     foreign: dict[str, int] = {}
     why = "no port of it"
     while True:
@@ -151,11 +141,13 @@ def _find_again(link: Link, deadline_ns: int, timeout_s: float, *, restore: bool
             asked_ns = foreign.get(path)
             if asked_ns is not None and link.clock() - asked_ns < _FOREIGN_NS:
                 continue
-            yield CloseLine()
             try:
                 if (yield from _open_ours(link, path)):
-                    if restore:
-                        yield from _restore(link)
+                    if restore and plan is not None:
+                        try:
+                            yield from plan.restore(link)
+                        finally:
+                            link.plan = plan  # also if the module vanished meanwhile
                     link.path = path
                     link.reconnects += 1
                     moved = "" if path == lost else f", formerly at {lost}"
@@ -190,8 +182,6 @@ def _open_ours(link: Link, path: str) -> Steps[bool]:
         else (POWER_UP_BAUD, wanted)
     )
     for baudrate in rates:
-        if baudrate != rates[0]:
-            yield CloseLine()
         yield OpenLine(path, baudrate)
         link.conversation.new_line(path)
         try:

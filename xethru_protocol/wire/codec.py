@@ -30,20 +30,11 @@ BuiltT = TypeVar("BuiltT", bound=Message)
 
 
 def encode(message: Message, *, bulk: bool | None = None) -> bytes:
-    """Payload of ``message``.
+    """Payload of ``message``; an `UnknownMessage` is sent as it is.
 
-    Parameters
-    ----------
-    message
-        Any message of the table, or an `UnknownMessage`, which is sent as it is.
-    bulk
-        True if the packet will travel in NoEscape framing, where an empty element list still
-        has its count; None: as a real module sends this message.
-
-    Raises
-    ------
-    LocalProtocolError
-        If a field does not fit its place on the wire.
+    ``bulk`` tells whether the packet will travel in NoEscape framing, where an empty element list
+    still has its count; None: as a real module sends this message. Raises `LocalProtocolError` if a
+    field does not fit its place on the wire.
 
     >>> from xethru_protocol.wire.messages import Ping
     >>> encode(Ping()).hex(" ")

@@ -31,15 +31,9 @@ Event = Response | Command[Response] | FramingFault | NeedData
 
 
 class Connection:
-    """One end of the line.
+    """One end of the line: HOST sends commands and receives responses, MODULE the reverse.
 
-    Parameters
-    ----------
-    role
-        HOST sends commands and receives responses, MODULE the reverse.
-    statistics
-        Where to count what is received, for example on from an earlier connection; None: in
-        new ones.
+    ``statistics`` may be those of an earlier connection, to count on from there.
 
     >>> from xethru_protocol.wire.messages import Ping, Pong
     >>> host, module = Connection(Role.HOST), Connection(Role.MODULE)
@@ -89,17 +83,8 @@ class Connection:
     def send(self, message: Message, framing: Framing | None = None) -> bytes:
         """Bytes that carry ``message``.
 
-        Parameters
-        ----------
-        message
-            Any message.
-        framing
-            None: as a real module or host frames this message (Protocol reference 1.3).
-
-        Raises
-        ------
-        LocalProtocolError
-            If a field does not fit its place on the wire.
+        ``framing`` None: as a real module or host frames this message (Protocol reference 1.3).
+        Raises `LocalProtocolError` if a field does not fit its place on the wire.
         """
         if framing is None:
             bulk = not isinstance(message, UnknownMessage) and ROWS[type(message)].bulk

@@ -318,9 +318,6 @@ class RestBytes:
         return {self.label or name: self.shown(value)}
 
 
-# ruff: noqa: ANN401 - a kind handles whatever type its field has
-
-
 def text_bytes(value: str | bytes) -> bytes:
     """Bytes of a text as it travels: one per character, and a terminating NUL."""
     return (value if isinstance(value, bytes) else value.encode("latin-1")) + b"\x00"

@@ -6,7 +6,7 @@ field loses all that follows, so a NoEscape header is judged by its length and a
 payload bytes, in the same way by every receiver (1.4).
 
 All positions are offsets in the stream; a buffer is given with the offset ``base`` of its first
-byte. No byte is searched twice by one finder, however the bytes arrive.
+byte.
 
 The receiver guarantees, for any bytes in any chunks:
 
@@ -88,14 +88,7 @@ def plausible(  # noqa: PLR0911 - one return per kind of message
 ) -> bool:
     """Whether a NoEscape packet may announce ``length`` payload bytes starting with ``head``.
 
-    Parameters
-    ----------
-    length
-        The header's length field.
-    head
-        The payload's first ``min(length, HEAD_BYTES)`` bytes.
-    direction
-        Who sent it.
+    ``head`` is the payload's first ``min(length, HEAD_BYTES)`` bytes.
 
     >>> head = bytes.fromhex("A0 12 00 00 00 00 2A 00 00 00 01 00 00 00")
     >>> plausible(18, head, Direction.FROM_MODULE), plausible(19, head, Direction.FROM_MODULE)
@@ -191,15 +184,10 @@ class Packet:
 
 
 def encode_normal(payload: bytes) -> bytes:
-    """Frame a payload with escapes and checksum.
+    """Frame a payload with escapes and checksum; `LocalProtocolError` if it is empty or too long.
 
     >>> encode_normal(bytes.fromhex("24 02 7D")).hex(" ")
     '7d 24 02 7f 7d 26 7e'
-
-    Raises
-    ------
-    LocalProtocolError
-        If the payload is empty or too long for any receiver.
     """
     if not 1 <= len(payload) < MAX_NORMAL_BYTES:
         raise LocalProtocolError(
@@ -212,15 +200,10 @@ def encode_normal(payload: bytes) -> bytes:
 
 
 def encode_no_escape(payload: bytes) -> bytes:
-    r"""Frame a payload behind its length.
+    r"""Frame a payload behind its length; `LocalProtocolError` if it is empty or too long.
 
     >>> encode_no_escape(b"\x01\x02\x03").hex(" ")
     '7c 7c 7c 7c 03 00 00 00 00 01 02 03'
-
-    Raises
-    ------
-    LocalProtocolError
-        If the payload is empty or longer than receivers believe.
     """
     if not 1 <= len(payload) <= MAX_LENGTH:
         raise LocalProtocolError(
@@ -469,12 +452,7 @@ _RUN_OF_7C = re.compile(rb"\x7c{9,}")
 class PacketReader:
     """Finds packets in received bytes: ``receive_data``, then ``next_packet`` until NEED_DATA.
 
-    Parameters
-    ----------
-    direction
-        Who sends the bytes: it decides which NoEscape headers are plausible.
-    statistics
-        Where to count; None: in new ones.
+    ``direction``, who sends the bytes, decides which NoEscape headers are plausible.
 
     >>> reader = PacketReader()
     >>> reader.receive_data(bytes.fromhex("7D 10 6D 7E"))

@@ -82,7 +82,7 @@ def frame_area(
     Raises
     ------
     LocalProtocolError
-        If the start lies behind the end (the module answers ERROR 17).
+        If the start lies behind the end (the module answers ERROR 17), or a limit is not finite.
 
     >>> frame_area(0.2, 9.4).n_bins, frame_area(0.2, 9.4, downconversion=True).n_bins
     (1431, 181)
