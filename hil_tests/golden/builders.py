@@ -130,15 +130,9 @@ BUILDERS: dict[str, Callable[[Fields], m.Message]] = {
     "GETMODE": lambda fields: m.GetMode(),
     "MOD_LOADAPP": lambda fields: m.LoadApp(profile_id=_number(fields["profile_id"])),
     "NOISEMAP_SETCONTROL": lambda fields: m.NoiseMapSetControl(control=fields["control"]),
-    "OUTPUT_SETCONTROL": lambda fields: m.OutputSetControl(
-        feature=_number(fields["feature"]), control=fields["control"]
-    ),
-    "IOPIN_SETCONTROL": lambda fields: m.IoPinSetControl(
-        pin_id=fields["pin_id"], pin_setup=fields["pin_setup"], pin_feature=fields["pin_feature"]
-    ),
-    "IOPIN_SETVALUE": lambda fields: m.IoPinSetValue(
-        pin_id=fields["pin_id"], pin_value=fields["pin_value"]
-    ),
+    "OUTPUT_SETCONTROL": _plain(m.OutputSetControl),
+    "IOPIN_SETCONTROL": _plain(m.IoPinSetControl),
+    "IOPIN_SETVALUE": _plain(m.IoPinSetValue),
     "DIR SYSTEM_GET_INFO": lambda fields: m.SystemGetInfo(item=fields["info_code"]),
     "DIR GET_PROFILEID": lambda fields: m.GetProfileId(),
     "DIR SETBAUDRATE": lambda fields: m.SetBaudRate(baudrate=fields["baudrate"]),

@@ -12,6 +12,7 @@ import pytest
 
 from hil_tests.golden.builders import BUILDERS, message_of
 from hil_tests.golden.vectors import ABOUT, Vector, load, load_hand_made
+from hil_tests.property.wire_streams import read_all
 from xethru_protocol.wire.codec import decode_command, decode_response, describe
 from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.framing import (
@@ -21,7 +22,6 @@ from xethru_protocol.wire.framing import (
     Framing,
     FramingFault,
     Packet,
-    PacketReader,
 )
 from xethru_protocol.wire.messages import DeleteNoiseMap, Message, UnknownMessage, X4DriverSet
 from xethru_protocol.wire.table import ROWS
@@ -38,14 +38,8 @@ INVALID = [v for v in VECTORS if not v.valid]
 
 
 def packets_of(vector: Vector, chunk: int = 1 << 20) -> list[Packet | FramingFault]:
-    reader = PacketReader(Direction.FROM_HOST if vector.from_host else Direction.FROM_MODULE)
-    found: list[Packet | FramingFault] = []
-    for begin in range(0, len(vector.wire), chunk):
-        reader.receive_data(vector.wire[begin : begin + chunk])
-        while (item := reader.next_packet()) is not NEED_DATA:
-            assert isinstance(item, Packet | FramingFault)
-            found.append(item)
-    return found
+    direction = Direction.FROM_HOST if vector.from_host else Direction.FROM_MODULE
+    return read_all(vector.wire, range(chunk, len(vector.wire), chunk), direction=direction)
 
 
 def received(vector: Vector) -> Message:

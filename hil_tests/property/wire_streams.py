@@ -1,8 +1,18 @@
-"""Hypothesis strategies for packets and damaged streams, and a slow oracle receiver."""
+"""Strategies for packets and damaged streams, the receiver on such, and a slow oracle of it."""
+
+from collections.abc import Iterable
 
 from hypothesis import strategies as st
 
-from xethru_protocol.wire.framing import encode_no_escape, encode_normal
+from xethru_protocol.wire.framing import (
+    Direction,
+    FramingFault,
+    NeedData,
+    Packet,
+    PacketReader,
+    encode_no_escape,
+    encode_normal,
+)
 
 _NASTY = st.sampled_from([0x7C, 0x7D, 0x7E, 0x7F, 0x00, 0x01, 0x0E, 0x10, 0x12, 0xA0])
 
@@ -47,6 +57,34 @@ GARBAGE = st.lists(_NASTY, max_size=14).map(bytes) | st.integers(1, 14).map(lamb
 STREAMS = st.lists(packets() | _damaged() | GARBAGE | st.binary(max_size=9), max_size=9).map(
     b"".join
 )
+
+
+def drain(reader: PacketReader) -> list[Packet | FramingFault]:
+    """Take what a receiver has found by now."""
+    found: list[Packet | FramingFault] = []
+    while not isinstance(item := reader.next_packet(), NeedData):
+        found.append(item)
+    return found
+
+
+def read_all(
+    data: bytes,
+    cuts: Iterable[int] = (),
+    *,
+    direction: Direction = Direction.FROM_MODULE,
+    ended: bool = False,
+) -> list[Packet | FramingFault]:
+    """Read a stream that comes in pieces; ``ended``: nothing comes behind it."""
+    reader = PacketReader(direction)
+    found: list[Packet | FramingFault] = []
+    previous = 0
+    for cut in [*sorted(cuts), len(data)]:
+        reader.receive_data(data[previous:cut])
+        previous = cut
+        if ended and cut == len(data):
+            reader.end_data()
+        found += drain(reader)
+    return found
 
 
 def oracle(data: bytes) -> list[tuple[int, bytes]]:

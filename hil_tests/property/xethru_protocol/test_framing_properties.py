@@ -6,18 +6,9 @@ from unittest import mock
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from hil_tests.property.wire_streams import STREAMS, oracle, packets
+from hil_tests.property.wire_streams import STREAMS, oracle, packets, read_all
 from xethru_protocol.wire import framing
-from xethru_protocol.wire.framing import (
-    NEED_DATA,
-    FramingFault,
-    Packet,
-    PacketReader,
-    encode_no_escape,
-    encode_normal,
-)
-
-Found = list[Packet | FramingFault]
+from xethru_protocol.wire.framing import FramingFault, Packet, encode_no_escape, encode_normal
 
 
 def marking_windows(size: int) -> AbstractContextManager[object]:
@@ -25,22 +16,7 @@ def marking_windows(size: int) -> AbstractContextManager[object]:
     return mock.patch.multiple(framing, _NEAR=2, _WORTH_MARKING=3, _WINDOW=size)
 
 
-def read_all(data: bytes, cuts: list[int], *, ended: bool = False) -> Found:
-    reader = PacketReader()
-    found: Found = []
-    previous = 0
-    for cut in [*sorted(cuts), len(data)]:
-        reader.receive_data(data[previous:cut])
-        previous = cut
-        if ended and cut == len(data):
-            reader.end_data()
-        while (item := reader.next_packet()) is not NEED_DATA:
-            assert isinstance(item, Packet | FramingFault)
-            found.append(item)
-    return found
-
-
-def packets_in(found: Found) -> list[tuple[int, bytes]]:
+def packets_in(found: list[Packet | FramingFault]) -> list[tuple[int, bytes]]:
     return [(item.offset, item.payload) for item in found if isinstance(item, Packet)]
 
 
@@ -50,7 +26,7 @@ def packets_in(found: Found) -> list[tuple[int, bytes]]:
 def test_any_chunking_gives_the_same_events(stream: bytes, data: st.DataObject | None) -> None:
     cuts = [] if data is None else data.draw(st.lists(st.integers(0, len(stream)), max_size=6))
     for ended in (False, True):
-        whole = read_all(stream, [], ended=ended)
+        whole = read_all(stream, ended=ended)
         assert read_all(stream, list(range(len(stream))), ended=ended) == whole
         assert read_all(stream, cuts, ended=ended) == whole
 
@@ -58,7 +34,7 @@ def test_any_chunking_gives_the_same_events(stream: bytes, data: st.DataObject |
 @settings(max_examples=600)
 @given(STREAMS)
 def test_packets_are_those_of_the_rescan_rule(stream: bytes) -> None:
-    assert packets_in(read_all(stream, [])) == oracle(stream)
+    assert packets_in(read_all(stream)) == oracle(stream)
 
 
 @settings(max_examples=400)
@@ -66,7 +42,7 @@ def test_packets_are_those_of_the_rescan_rule(stream: bytes) -> None:
 def test_marking_terminators_in_windows_changes_nothing(
     stream: bytes, size: int, cuts: list[int]
 ) -> None:
-    expected = read_all(stream, [], ended=True)
+    expected = read_all(stream, ended=True)
     with marking_windows(size):
         assert read_all(stream, [cut for cut in cuts if cut < len(stream)], ended=True) == expected
 
@@ -114,7 +90,7 @@ def _stops_at(stream: bytes, start: int) -> int:
 
 @given(st.lists(packets(), max_size=6))
 def test_intact_packets_are_all_found_without_a_fault(sent: list[bytes]) -> None:
-    found = read_all(b"".join(sent), [])
+    found = read_all(b"".join(sent))
     assert len(found) == len(sent)
     assert all(isinstance(item, Packet) for item in found)
 
@@ -129,7 +105,7 @@ def test_intact_packets_are_all_found_without_a_fault(sent: list[bytes]) -> None
 )
 def test_garbage_without_start_bytes_hides_nothing(parts: list[tuple[bytes, bytes]]) -> None:
     stream = b"".join(junk + packet for junk, packet in parts)
-    found = read_all(stream, [])
+    found = read_all(stream)
     offsets, at = [], 0
     for junk, packet in parts:
         offsets.append(at + len(junk))
@@ -139,6 +115,6 @@ def test_garbage_without_start_bytes_hides_nothing(parts: list[tuple[bytes, byte
 
 @given(st.binary(min_size=1, max_size=200))
 def test_what_is_framed_is_read_back(payload: bytes) -> None:
-    assert packets_in(read_all(encode_normal(payload), [])) == [(0, payload)]
+    assert packets_in(read_all(encode_normal(payload))) == [(0, payload)]
     frame = b"\xa0\x10" + bytes(8) + len(payload).to_bytes(4, "little") + payload
-    assert packets_in(read_all(encode_no_escape(frame), [])) == [(0, frame)]
+    assert packets_in(read_all(encode_no_escape(frame))) == [(0, frame)]

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hil_tests.property.fuzz_corpus import corpus
-from hil_tests.property.wire_streams import STREAMS, oracle
+from hil_tests.property.wire_streams import STREAMS, drain, oracle, read_all
 from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.framing import (
     NEED_DATA,
@@ -39,14 +39,10 @@ def read(
     for cut in [*cuts, len(stream)]:
         reader.receive_data(stream[previous:cut])
         previous = cut
-        while (item := reader.next_packet()) is not NEED_DATA:
-            assert isinstance(item, Packet | FramingFault)
-            found.append(item)
+        found += drain(reader)
         assert reader.buffered <= LARGEST_PACKET
     reader.end_data()
-    while (item := reader.next_packet()) is not NEED_DATA:
-        assert isinstance(item, Packet | FramingFault)
-        found.append(item)
+    found += drain(reader)
     assert reader.buffered == 0
     return found, reader.statistics
 
@@ -101,12 +97,8 @@ SHORT = [
 @pytest.mark.parametrize("file", SHORT, ids=lambda file: file.stem)
 def test_nasty_stream_holds_the_packets_of_the_rescan_rule(file: Path) -> None:
     stream = file.read_bytes()
-    reader = PacketReader()
-    reader.receive_data(stream)
-    found = []
-    while (item := reader.next_packet()) is not NEED_DATA:
-        found += [(item.offset, item.payload)] if isinstance(item, Packet) else []
-    assert found == oracle(stream)
+    found = [item for item in read_all(stream) if isinstance(item, Packet)]
+    assert [(packet.offset, packet.payload) for packet in found] == oracle(stream)
 
 
 @pytest.mark.parametrize(

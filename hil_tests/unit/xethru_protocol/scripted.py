@@ -1,7 +1,7 @@
 """A line to a module that says what a test wrote down, on a virtual clock."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -108,17 +108,25 @@ class PlainModule:
     """A module with the read-backs of the golden vectors for 0.2 ... 9.4 m; it keeps settings.
 
     ``stream`` is what it sends behind the read-back of the frame rate; a ``serial`` of None is
-    one it refuses to tell.
+    one it refuses to tell. ``instead`` has other answers to single commands or to all of a type.
     """
 
-    def __init__(self, serial: str | None = "123456789012") -> None:
+    def __init__(
+        self,
+        serial: str | None = "123456789012",
+        instead: Mapping[m.Message | type[m.Message], Sequence[m.Message | bytes]] | None = None,
+    ) -> None:
         self.serial = serial
+        self.instead = instead or {}
         self.stream: tuple[m.Message, ...] = ()
         self.settings: dict[X4Setting, m.X4Value] = {}
 
     def __call__(  # noqa: PLR0911 - one return per command
         self, command: m.Message
     ) -> Sequence[m.Message | bytes]:
+        for key in (command, type(command)):
+            if key in self.instead:
+                return self.instead[key]
         match command:
             case m.Ping():
                 return [READY]

@@ -20,6 +20,7 @@ from xethru_protocol.wire.errors import (
 )
 
 Said = Sequence[m.Message | bytes]
+GET_FPS = m.X4DriverGet(setting=X4Setting.FPS)
 
 
 def test_raw_mode_follows_the_recipe_of_the_reference(driver_on: DriverOn) -> None:
@@ -52,12 +53,7 @@ def test_raw_mode_follows_the_recipe_of_the_reference(driver_on: DriverOn) -> No
 
 
 def test_firmware_without_modes_is_tolerated(driver_on: DriverOn) -> None:
-    plain = PlainModule()
-
-    def xep(command: m.Message) -> Said:
-        return [m.Error(code=1)] if isinstance(command, m.SetMode) else plain(command)
-
-    radar, _ = driver_on(xep)
+    radar, _ = driver_on(PlainModule(instead={m.SetMode: [m.Error(code=1)]}))
     assert radar.configure_raw().n_bins == 1431
 
 
@@ -77,14 +73,8 @@ def test_start_returns_the_real_rate_and_warns_above_the_possible(driver_on: Dri
 def test_start_returns_the_timers_rate_where_the_read_back_has_a_fraction(
     driver_on: DriverOn,
 ) -> None:
-    plain = PlainModule()
-
-    def module(command: m.Message) -> Said:
-        if command == m.X4DriverGet(setting=X4Setting.FPS):
-            return [m.ReplyFloat(content_id=X4Setting.FPS, values=(50.5,))]
-        return plain(command)
-
-    radar, _ = driver_on(module)
+    answer = m.ReplyFloat(content_id=X4Setting.FPS, values=(50.5,))
+    radar, _ = driver_on(PlainModule(instead={GET_FPS: [answer]}))
     assert radar.start(50.5) == 50.0
 
 
@@ -92,14 +82,8 @@ def test_start_returns_the_timers_rate_where_the_read_back_has_a_fraction(
 def test_rate_that_is_none_is_the_modules_fault(
     driver_on: DriverOn, values: tuple[float, ...]
 ) -> None:
-    plain = PlainModule()
-
-    def module(command: m.Message) -> Said:
-        if command == m.X4DriverGet(setting=X4Setting.FPS):
-            return [m.ReplyFloat(content_id=X4Setting.FPS, values=values)]
-        return plain(command)
-
-    radar, _ = driver_on(module)
+    answer = m.ReplyFloat(content_id=X4Setting.FPS, values=values)
+    radar, _ = driver_on(PlainModule(instead={GET_FPS: [answer]}))
     with pytest.raises(RemoteProtocolError, match="the port reads back"):
         radar.start(17.0)
 
@@ -174,16 +158,13 @@ def test_frames_of_the_last_stream_are_no_part_of_the_next(driver_on: DriverOn) 
 
 
 def test_baseband_frames_become_complex(driver_on: DriverOn) -> None:
-    plain = PlainModule()
-
-    def module(command: m.Message) -> Said:
-        match command:
-            case m.X4DriverGet(setting=X4Setting.FRAMEAREA):
-                return [m.ReplyFloat(content_id=X4Setting.FRAMEAREA, values=(0.25, 0.375))]
-            case m.X4DriverGet(setting=X4Setting.FRAMEBINCOUNT):
-                return [m.ReplyInt(content_id=X4Setting.FRAMEBINCOUNT, values=(3,))]
-        return plain(command)
-
+    area, count = X4Setting.FRAMEAREA, X4Setting.FRAMEBINCOUNT
+    module = PlainModule(
+        instead={
+            m.X4DriverGet(setting=area): [m.ReplyFloat(content_id=area, values=(0.25, 0.375))],
+            m.X4DriverGet(setting=count): [m.ReplyInt(content_id=count, values=(3,))],
+        }
+    )
     radar, line = driver_on(module)
     geometry = radar.configure_raw(RawConfig(downconversion=True))
     line.say(m.DataFloat(info=1, values=np.array([1, 2, 3, 4, 5, 6], np.float32)))
@@ -211,42 +192,37 @@ def test_profile_baseband_messages_are_frames_with_their_own_geometry(driver_on:
     assert (got.geometry.range_start_m, got.geometry.bin_length_m) == (0.25, 0.5)
 
 
-def test_frames_of_another_length_are_discarded_and_counted(driver_on: DriverOn) -> None:
+@pytest.mark.parametrize(
+    "other",
+    [frame(1, bins=99), m.DataFloat(content_id=4, info=1, values=np.zeros(1431, np.float32))],
+    ids=["length", "content id"],
+)
+def test_data_that_are_no_radar_frames_are_discarded_and_counted(
+    driver_on: DriverOn, other: m.DataFloat
+) -> None:
     radar, line = driver_on()
     radar.configure_raw()
-    line.say(frame(1, bins=99), frame(2))
-    assert radar.read_frame().counter == 2
-    assert radar.frames_discarded == 1
-
-
-def test_data_with_a_content_id_are_no_radar_frames(driver_on: DriverOn) -> None:
-    radar, line = driver_on()
-    radar.configure_raw()
-    line.say(m.DataFloat(content_id=4, info=1, values=np.zeros(1431, np.float32)), frame(2))
+    line.say(other, frame(2))
     assert radar.read_frame(math.inf).counter == 2  # without a limit
     assert radar.frames_discarded == 1
 
 
 def test_what_arrives_before_a_reply_is_sorted_and_nothing_is_lost(driver_on: DriverOn) -> None:
-    plain = PlainModule()
-
-    def chatty(command: m.Message) -> Said:
-        if isinstance(command, m.X4DriverGet):
-            return [
-                frame(1),
-                m.System(code=0x11),
-                m.DataString(text="debug"),
-                b"\x01\x02",
-                frame(2),
-                m.ReplyFloat(content_id=X4Setting.FPS, values=(1.0,)),
-                frame(3),
-            ]
-        return plain(command)
-
-    radar, line = driver_on(plain)
+    module = PlainModule()
+    radar, _ = driver_on(module)
     radar.configure_raw()
-    line._answer = chatty
-    reply = radar.request(m.X4DriverGet(setting=X4Setting.FPS))
+    module.instead = {
+        GET_FPS: [
+            frame(1),
+            m.System(code=0x11),
+            m.DataString(text="debug"),
+            b"\x01\x02",
+            frame(2),
+            m.ReplyFloat(content_id=X4Setting.FPS, values=(1.0,)),
+            frame(3),
+        ]
+    }
+    reply = radar.request(GET_FPS)
     assert reply.values == (1.0,)
     assert [f.counter for f in radar.frames(3)] == [1, 2, 3]
     assert radar.fault_count == 1
@@ -394,9 +370,12 @@ def test_closing_stops_the_radar_also_in_the_middle_of_a_packet(driver_on: Drive
         radar.start(17.0)
         line.say(b"\x7c\x7c\x7c\x7c\x6a\x16\x00\x00\x00\xa0")
         radar._pump(0.0)
+        line.say(bytes(5736))  # the rest of it
         line.received.clear()
     assert [type(c) for c in line.received] == [m.X4DriverSet, m.SetMode]
     assert line.closed
+    assert radar.fault_count == 0
+    assert radar.statistics.clean
 
 
 def test_closing_a_dead_module_tells_and_does_not_raise(driver_on: DriverOn) -> None:
@@ -427,5 +406,6 @@ def test_observer_hears_everything_but_frames(driver_on: DriverOn) -> None:
 def test_reset_returns_at_the_ack(driver_on: DriverOn) -> None:
     radar, line = driver_on()
     radar.reset()
+    assert line.now_ns < 1_000_000
     radar.close()
     assert [type(c) for c in line.received] == [m.ModReset]

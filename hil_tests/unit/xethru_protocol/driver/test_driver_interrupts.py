@@ -17,18 +17,6 @@ from xethru_protocol.wire.codes import PongCode
 Said = Sequence[m.Message | bytes]
 
 
-def test_what_is_cut_by_closing_is_no_damage(driver_on: DriverOn) -> None:
-    radar, line = driver_on()
-    with radar:
-        radar.configure_raw()
-        radar.start(17.0)
-        line.say(b"\x7c\x7c\x7c\x7c\x6a\x16\x00\x00\x00\xa0")
-        radar._pump(0.0)
-        line.say(bytes(5736))
-    assert radar.fault_count == 0
-    assert radar.statistics.clean
-
-
 class Interrupted(BaseException):
     """As KeyboardInterrupt, which a test runner would take for its own."""
 

@@ -8,6 +8,7 @@ import termios
 import threading
 import tty
 from collections.abc import Callable, Coroutine, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,16 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[PtyMach
     with PtyMachine(tmp_path) as machine:
         machine.plug("home", OURS)
         yield machine
+
+
+@pytest.fixture
+def pty_pair() -> Iterator[tuple[int, str]]:
+    """Return the descriptor of one end, and the path of the other."""
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    yield master, os.ttyname(slave)
+    os.close(master)
+    os.close(slave)
 
 
 def return_as(machine: PtyMachine, name: str) -> threading.Timer:
@@ -129,29 +140,25 @@ async def test_waiting_task_can_be_cancelled_and_stops_no_other(machine: PtyMach
 
 
 @in_loop
-async def test_cancelled_read_loses_no_bytes() -> None:
+async def test_cancelled_read_loses_no_bytes(pty_pair: tuple[int, str]) -> None:
     """Also on a line that never pauses, where a read lets other tasks have their turn."""
-    master, slave = pty.openpty()
-    line = AsyncSerialTransport(os.ttyname(slave))
-    try:
-        os.write(master, b"first")
+    other_end, path = pty_pair
+    with closing(AsyncSerialTransport(path)) as line:
+        os.write(other_end, b"first")
         reading = asyncio.create_task(line.read(60.0))
         await asyncio.sleep(0)  # it lets us have our turn
         reading.cancel()
         with pytest.raises(asyncio.CancelledError):
             await reading
         assert await line.read(seconds(1)) == b"first"
-    finally:
-        line.close()
-        os.close(master)
-        os.close(slave)
 
 
 @pytest.mark.parametrize("cancel", [False, True])
 @in_loop
-async def test_no_timer_outlives_the_read_that_set_it(cancel: bool) -> None:
-    master, slave = pty.openpty()
-    line = AsyncSerialTransport(os.ttyname(slave))
+async def test_no_timer_outlives_the_read_that_set_it(
+    pty_pair: tuple[int, str], cancel: bool
+) -> None:
+    other_end, path = pty_pair
     loop = asyncio.get_running_loop()
     set_timer = loop.call_later
     timers: list[asyncio.TimerHandle] = []
@@ -161,7 +168,7 @@ async def test_no_timer_outlives_the_read_that_set_it(cancel: bool) -> None:
         return timers[-1]
 
     loop.call_later = call_later  # type: ignore[method-assign, assignment]
-    try:
+    with closing(AsyncSerialTransport(path)) as line:
         reading = asyncio.create_task(line.read(60.0))
         while not timers:
             await asyncio.sleep(0)
@@ -170,13 +177,9 @@ async def test_no_timer_outlives_the_read_that_set_it(cancel: bool) -> None:
             with pytest.raises(asyncio.CancelledError):
                 await reading
         else:
-            os.write(master, b"!")
+            os.write(other_end, b"!")
             assert await reading == b"!"
         assert [timer.cancelled() for timer in timers] == [True]
-    finally:
-        line.close()
-        os.close(master)
-        os.close(slave)
 
 
 @in_loop
@@ -202,53 +205,41 @@ async def test_answer_to_a_cancelled_command_is_dropped(machine: PtyMachine) -> 
         assert (await radar.request(m.SystemGetInfo(item=6))).text == OURS
 
 
-def test_asynchronous_line_that_takes_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+@in_loop
+async def test_asynchronous_line_that_takes_nothing_is_given_up(
+    pty_pair: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("xethru_protocol.transport._WRITE_TIMEOUT_S", 0.3)
-    master, slave = pty.openpty()
-    tty.setraw(slave)
+    line = AsyncSerialTransport(pty_pair[1])
+    ticks = 0
 
-    async def use() -> None:
-        line = AsyncSerialTransport(os.ttyname(slave))
-        ticks = 0
+    async def tick() -> None:
+        nonlocal ticks
+        while True:
+            ticks += 1
+            await asyncio.sleep(0)
 
-        async def tick() -> None:
-            nonlocal ticks
-            while True:
-                ticks += 1
-                await asyncio.sleep(0)
-
-        ticking = asyncio.create_task(tick())
-        with pytest.raises(Disconnected, match="takes no data any more"):
-            await line.write(bytes(1 << 20))
-        ticking.cancel()
-        assert ticks > 3  # the loop went on meanwhile
-        line.close()
-        line.close()
-
-    asyncio.run(use())
-    os.close(master)
-    os.close(slave)
+    ticking = asyncio.create_task(tick())
+    with pytest.raises(Disconnected, match="takes no data any more"):
+        await line.write(bytes(1 << 20))
+    ticking.cancel()
+    assert ticks > 3  # the loop went on meanwhile
+    line.close()
+    line.close()
 
 
-def test_long_asynchronous_writes_wait_for_room() -> None:
-    master, slave = pty.openpty()
-    tty.setraw(slave)
+@in_loop
+async def test_long_asynchronous_writes_wait_for_room(pty_pair: tuple[int, str]) -> None:
+    other_end, path = pty_pair
     data = bytes(range(256)) * 400
-
-    async def use() -> bytes:
-        line = AsyncSerialTransport(os.ttyname(slave))
+    with closing(AsyncSerialTransport(path)) as line:
         writing = asyncio.create_task(line.write(data))
         got = bytearray()
         while len(got) < len(data):
             await asyncio.sleep(0.001)
-            got += os.read(master, 4096)
+            got += os.read(other_end, 4096)
         await writing
-        line.close()
-        return bytes(got)
-
-    assert asyncio.run(use()) == data
-    os.close(master)
-    os.close(slave)
+    assert got == data
 
 
 def test_rate_is_that_of_the_port(machine: PtyMachine) -> None:

@@ -51,12 +51,6 @@ def settings_sent(line: ScriptedTransport) -> list[tuple[str, m.X4Value]]:
 # --- reset --------------------------------------------------------------------------------------
 
 
-def test_reset_returns_at_the_ack_unless_told_to_wait(driver_on: DriverOn) -> None:
-    radar, line = driver_on()
-    radar.reset()
-    assert line.now_ns < 1_000_000
-
-
 def test_reset_waits_for_ready_on_a_port_that_stays(driver_on: DriverOn) -> None:
     plain = PlainModule()
 
@@ -256,14 +250,9 @@ def test_module_without_a_number_is_known_by_its_port_only(
 def test_module_that_came_back_in_safe_mode_is_taken_and_told_of(
     plugged: DriverOn, machine: Machine
 ) -> None:
-    broken = PlainModule(None)  # the profile layer, which knows the number, is not started
-
-    def safe_mode(command: m.Message) -> Said:
-        if isinstance(command, m.Ping):
-            return [m.Pong(value=PongCode.XTS_SPRP_SAFEMODE)]
-        return broken(command)
-
-    machine.plug(HOME, safe_mode)
+    safe = m.Pong(value=PongCode.XTS_SPRP_SAFEMODE)
+    # the profile layer, which knows the number, is not started
+    machine.plug(HOME, PlainModule(None, {m.Ping: [safe]}))
     radar, line = plugged(reconnect_s=9.0)
     radar.configure_raw()
     unplug(line)
@@ -315,11 +304,7 @@ def test_module_in_a_restart_loop_is_given_up(plugged: DriverOn, machine: Machin
 def test_module_that_refuses_its_settings_after_a_return_says_so(
     plugged: DriverOn, machine: Machine
 ) -> None:
-    plain = PlainModule()
-    machine.plug(
-        HOME,
-        lambda c: [m.Error(code=5)] if isinstance(c, m.X4DriverInit) else plain(c),
-    )
+    machine.plug(HOME, PlainModule(instead={m.X4DriverInit: [m.Error(code=5)]}))
     radar, line = plugged(reconnect_s=9.0)
     radar.configure_raw()
     unplug(line)

@@ -129,18 +129,12 @@ def test_lattice_is_that_of_the_settings(driver_on: DriverOn) -> None:
     ids=lambda setting: setting.name,
 )
 def test_every_setting_is_read_back(driver_on: DriverOn, setting: X4Setting) -> None:
-    plain = PlainModule()
-
-    def forgetful(command: m.Message) -> Said:
-        if command == m.X4DriverGet(setting=setting):
-            if setting is X4Setting.FRAMEAREAOFFSET:
-                return [m.ReplyFloat(content_id=setting, values=(0.25,))]
-            if setting in BYTE_SETTINGS:
-                return [m.ReplyByte(content_id=setting, values=b"\x7b")]
-            return [m.ReplyInt(content_id=setting, values=(123,))]
-        return plain(command)
-
-    radar, _ = driver_on(forgetful)
+    other: m.Response = m.ReplyInt(content_id=setting, values=(123,))
+    if setting is X4Setting.FRAMEAREAOFFSET:
+        other = m.ReplyFloat(content_id=setting, values=(0.25,))
+    elif setting in BYTE_SETTINGS:
+        other = m.ReplyByte(content_id=setting, values=b"\x7b")
+    radar, _ = driver_on(PlainModule(instead={m.X4DriverGet(setting=setting): [other]}))
     with pytest.raises(RemoteProtocolError, match=rf"reads back {setting.name} as (123|0\.25)"):
         radar.configure_raw()
 

@@ -1,34 +1,29 @@
 """Which samples a chip can send: every counter tried, the reference's numbers, emulated frames."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from emulator.chip.chip import CaptureSettings, Chip
 from xethru_protocol.driver.frames import Lattice
-from xethru_protocol.wire.codes import X4Setting
+from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.wire.errors import LocalProtocolError
 
 
-def lattice(
-    *,
-    iterations: int = 16,
-    pulses_per_step: int = 300,
-    dac_min: int = 949,
-    dac_max: int = 1100,
-    dac_step: int = 0,
-    downconversion: bool = False,
-    tx_center_frequency: int = 3,
-) -> Lattice:
-    return Lattice.of(
-        iterations=iterations,
-        pulses_per_step=pulses_per_step,
-        dac_min=dac_min,
-        dac_max=dac_max,
-        dac_step=dac_step,
-        downconversion=downconversion,
-        tx_center_frequency=tx_center_frequency,
-    )
+def lattice(**changes: Any) -> Lattice:  # noqa: ANN401 - numbers and a bool
+    """Lattice of the vendor's working point, but for some settings."""
+    settings: dict[str, Any] = {
+        "iterations": 16,
+        "pulses_per_step": 300,
+        "dac_min": 949,
+        "dac_max": 1100,
+        "dac_step": 0,
+        "downconversion": False,
+        "tx_center_frequency": 3,
+    }
+    return Lattice.of(**settings | changes)
 
 
 def float32s(*values: float) -> NDArray[np.float32]:
@@ -146,36 +141,26 @@ class _EveryCounter:
         return rng.integers(0, most + 1, (counters.size, capture.n_samples))
 
 
-@pytest.mark.parametrize("downconversion", [0, 1])
+@pytest.mark.parametrize("downconversion", [False, True])
 @pytest.mark.parametrize("tx_center_frequency", [3, 4])
 @pytest.mark.parametrize(
     "sweep",
     [(16, 300, 949, 1100, 0), (8, 10, 0, 2047, 0), (16, 500, 0, 2047, 0), (64, 87, 949, 1100, 1)],
 )
 def test_emulated_frames_are_on_the_lattice(
-    sweep: tuple[int, int, int, int, int], tx_center_frequency: int, downconversion: int
+    sweep: tuple[int, int, int, int, int], tx_center_frequency: int, downconversion: bool
 ) -> None:
-    iterations, pulses_per_step, dac_min, dac_max, dac_step = sweep
-    chip = Chip(_EveryCounter())
-    for setting, value in (
-        (X4Setting.ITERATIONS, iterations),
-        (X4Setting.PULSESPERSTEP, pulses_per_step),
-        (X4Setting.DACMIN, dac_min),
-        (X4Setting.DACMAX, dac_max),
-        (X4Setting.DACSTEP, dac_step),
-        (X4Setting.TXCENTERFREQUENCY, tx_center_frequency),
-        (X4Setting.DOWNCONVERSION, downconversion),
-    ):
-        chip.set(setting, value)
-    where = lattice(
-        iterations=iterations,
-        pulses_per_step=pulses_per_step,
-        dac_min=dac_min,
-        dac_max=dac_max,
-        dac_step=dac_step,
-        downconversion=downconversion != 0,
+    names = ("iterations", "pulses_per_step", "dac_min", "dac_max", "dac_step")
+    config = RawConfig(
+        **dict(zip(names, sweep, strict=True)),  # type: ignore[arg-type] # all are integer fields
+        downconversion=downconversion,
         tx_center_frequency=tx_center_frequency,
     )
+    chip = Chip(_EveryCounter())
+    for setting, value in config.settings():
+        chip.set(setting, value)
+    where = config.lattice
+    assert where is not None
     for _ in range(3):
         assert where.off_lattice(chip.next_frame().values) == 0
 

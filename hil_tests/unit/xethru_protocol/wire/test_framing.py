@@ -2,21 +2,22 @@
 
 import re
 import sys
+from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
 import numpy as np
 import pytest
 
+from hil_tests.property.wire_streams import drain
+from hil_tests.property.wire_streams import read_all as read
 from xethru_protocol.wire import framing
 from xethru_protocol.wire.errors import LocalProtocolError
 from xethru_protocol.wire.framing import (
     MAX_NORMAL_WIRE_BYTES,
     NEED_DATA,
     FaultKind,
-    Framing,
     FramingFault,
-    NeedData,
     Packet,
     PacketReader,
     encode_no_escape,
@@ -33,34 +34,12 @@ def frame(counter: int = 0, bins: int = 1431, seed: int = 0) -> bytes:
     return encode_no_escape(header + values.tobytes())
 
 
-def read(data: bytes, *, ended: bool = False) -> list[Packet | FramingFault]:
-    reader = PacketReader()
-    reader.receive_data(data)
-    if ended:
-        reader.end_data()
-    return drain(reader)
-
-
-def drain(reader: PacketReader) -> list[Packet | FramingFault]:
-    found: list[Packet | FramingFault] = []
-    while not isinstance(item := reader.next_packet(), NeedData):
-        found.append(item)
-    return found
-
-
 def payloads(found: list[Packet | FramingFault]) -> list[bytes]:
     return [item.payload for item in found if isinstance(item, Packet)]
 
 
 def faults(found: list[Packet | FramingFault]) -> list[tuple[FaultKind, int]]:
     return [(item.kind, item.offset) for item in found if isinstance(item, FramingFault)]
-
-
-def test_packet_tells_framing_payload_and_place() -> None:
-    assert read(ACK + frame(bins=1))[0] == Packet(framing=Framing.NORMAL, payload=b"\x10", offset=0)
-    packet = read(ACK + frame(bins=1))[1]
-    assert isinstance(packet, Packet)
-    assert (packet.framing, len(packet.payload), packet.offset) == (Framing.NO_ESCAPE, 18, 4)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -134,16 +113,16 @@ def test_frames_are_not_copied_out_of_a_chunk_that_holds_them() -> None:
     assert span[1] is stream
 
 
-@pytest.mark.parametrize("payload", [b"", bytes(7999)])
-def test_normal_packets_that_no_receiver_takes_are_refused(payload: bytes) -> None:
-    with pytest.raises(LocalProtocolError, match="Normal packet carries"):
-        encode_normal(payload)
-
-
-@pytest.mark.parametrize("payload", [b"", bytes(65536)])
-def test_noescape_packets_that_no_receiver_takes_are_refused(payload: bytes) -> None:
-    with pytest.raises(LocalProtocolError, match="NoEscape packet carries"):
-        encode_no_escape(payload)
+@pytest.mark.parametrize(
+    ("frame_payload", "longest"), [(encode_normal, 7998), (encode_no_escape, 65535)]
+)
+def test_packets_that_no_receiver_takes_are_refused(
+    frame_payload: Callable[[bytes], bytes], longest: int
+) -> None:
+    for payload in (b"", bytes(longest + 1)):
+        with pytest.raises(LocalProtocolError):
+            frame_payload(payload)
+    assert payloads(read(encode_normal(bytes(7998)))) == [bytes(7998)]
 
 
 @pytest.mark.parametrize("size", [0, 1, 7, 63, 64, 65, 1431, 5738])

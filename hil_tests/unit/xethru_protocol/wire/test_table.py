@@ -1,10 +1,12 @@
 """What a row of the message table can say, and how wrong messages and codes are named."""
 
+from dataclasses import replace
 from enum import IntEnum
-from typing import Annotated
+from typing import Annotated, Any
 
 import pytest
 
+from hil_tests.golden.builders import message_of
 from hil_tests.golden.test_protocol_vectors import KNOWN
 from hil_tests.golden.vectors import Vector
 from xethru_protocol.wire import fields
@@ -98,19 +100,16 @@ def test_replies_are_read_without_their_trailer(vector: Vector) -> None:
         assert cut == whole
 
 
+def example(name: str) -> Any:  # noqa: ANN401 - rows differ in type
+    """Return the message of the first vector of this name."""
+    return next(message_of(vector) for vector in KNOWN if vector.message == name)
+
+
 @pytest.mark.parametrize(
     ("message", "reason"),
     [
         (
-            m.PresenceMovingList(
-                counter=1,
-                state=1,
-                movement_slow=(1.0, 2.0),
-                movement_fast=(1.0,),
-                detection_distance_m=(),
-                detection_rcs=(),
-                detection_velocity=(),
-            ),
+            replace(example("PRESENCE_MOVINGLIST"), movement_slow=(1.0, 2.0), movement_fast=()),
             "movement_slow and movement_fast must have one length",
         ),
         (m.InjectFrame(counter=1, values=(1.0, 2.0, 3.0)), "of whole entries"),
@@ -120,22 +119,7 @@ def test_replies_are_read_without_their_trailer(vector: Vector) -> None:
         (m.HilReply(datatype=0x99, hil_command=0x10), "no such element type"),
         (m.BootloaderWritePage(page=0x10000, data=b""), "page=65536"),
         (
-            m.PulseDopplerByte(
-                counter=1,
-                matrix_counter=1,
-                range_idx=0,
-                range_bins=1,
-                frequency_count=3,
-                pulsedoppler_instance=0,
-                byte_step_start_db=0.0,
-                byte_step_size_db=1.0,
-                fps=17.0,
-                fps_decimated=17.0,
-                frequency_start_hz=0.0,
-                frequency_step_hz=1.0,
-                range_m=1.0,
-                levels=b"\x01",
-            ),
+            replace(example("PULSEDOPPLER_BYTE"), frequency_count=3, levels=b"\x01"),
             "frequency_count is 3",
         ),
     ],
