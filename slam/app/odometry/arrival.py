@@ -38,21 +38,17 @@ _LATE_BREAK_NS = 10 * NS_PER_S
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockLine:
-    """A clock against the host's: when it shows `nominal_ns`, the host shows `host_ns(nominal)`.
+    """A clock against the host's.
 
-    Attributes
-    ----------
-    origin_ns
-        Host time when the clock shows 0.
-    slope
-        By how much its seconds are longer than the host's, in parts of one.
+    `origin_ns` is the host's time when it shows 0; `slope` by how much its seconds are longer than
+    the host's, in parts of one.
     """
 
     origin_ns: int
     slope: float = 0.0
 
     def host_ns(self, nominal_ns: int) -> int:
-        """Return the host's time.
+        """Return the host's time when the clock shows `nominal_ns`.
 
         >>> ClockLine(origin_ns=1000, slope=1e-6).host_ns(5_000_000)
         5001005
@@ -78,11 +74,7 @@ class LowerEnvelope:
     """Follows one clock by the readings that arrived soonest.
 
     Of each second of arrivals the reading with the least delay is kept, for `WINDOW_S` seconds.
-
-    Parameters
-    ----------
-    drift, drift_sigma
-        Slope to expect, and its standard deviation.
+    `drift` is the slope to expect, `drift_sigma` its standard deviation.
     """
 
     def __init__(self, *, drift: float = 0.0, drift_sigma: float = DRIFT_SIGMA) -> None:
@@ -199,26 +191,22 @@ def _lower_hull(points: list[tuple[int, int]]) -> list[tuple[int, int]]:
     for point in points:
         if hull and hull[-1][0] == point[0]:
             continue  # the lower one came first, as the points are sorted
-        while len(hull) > 1 and _is_left_turn_missing(hull[-2], hull[-1], point):
+        while len(hull) > 1 and not _turns_left(hull[-2], hull[-1], point):
             hull.pop()
         hull.append(point)
     return hull
 
 
-def _is_left_turn_missing(a: tuple[int, int], b: tuple[int, int], c: tuple[int, int]) -> bool:
-    return (b[0] - a[0]) * (c[1] - a[1]) <= (b[1] - a[1]) * (c[0] - a[0])
+def _turns_left(a: tuple[int, int], b: tuple[int, int], c: tuple[int, int]) -> bool:
+    return (b[0] - a[0]) * (c[1] - a[1]) > (b[1] - a[1]) * (c[0] - a[0])
 
 
 class ArrivalClock:
     """Stamps the frames of one radar with the host's time at which they were taken.
 
     A counter that begins anew, as after a restart of the module, begins a new line; what is known
-    of the drift is kept, for it is the same crystal.
-
-    Parameters
-    ----------
-    rate_hz
-        The chip's real frame rate, as read back.
+    of the drift is kept, for it is the same crystal. `rate_hz` is the chip's real frame rate, as
+    read back.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -253,20 +241,13 @@ class ArrivalClock:
     def stamp_ns(self, counter: int, arrival_ns: int) -> int:
         """Return when a frame was taken, host time; later than the frame before it.
 
-        Parameters
-        ----------
-        counter
-            As the module sent it.
-        arrival_ns
-            Host time when its last byte was read.
+        `arrival_ns` is the host's time when its last byte was read.
         """
         if self._last_counter is not None and self._is_another_count(counter, arrival_ns):
-            known = self._envelope.baseline_ns >= _KNOWN_AFTER_NS
-            self._envelope = (
-                LowerEnvelope(drift=self._envelope.line.slope, drift_sigma=KNOWN_DRIFT_SIGMA)
-                if known
-                else LowerEnvelope()
-            )
+            before, self._envelope = self._envelope, LowerEnvelope()
+            if before.baseline_ns >= _KNOWN_AFTER_NS:
+                drift = before.line.slope
+                self._envelope = LowerEnvelope(drift=drift, drift_sigma=KNOWN_DRIFT_SIGMA)
             self.restarts += 1
         self._last_counter = counter
         nominal_ns = frame_time_ns(counter, self._rate_hz)

@@ -2,14 +2,10 @@
 
 Session time is the odometry's own clock. Its relation to the host's clock follows from when lines
 arrive, or is known beforehand; it places radar frames, which are stamped with the host's time.
-
-`parse_source` turns what the user wrote into a `LineSource`; `read_lines` gives its lines with the
-host's time at which each one came, so that a thread can follow any of them alike.
 """
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
 import re
@@ -18,10 +14,10 @@ import socket
 import stat
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,12 +46,8 @@ _MOST_WARNINGS = 5
 class LiveOdometry:
     """Turns lines into poses, and reports what is wrong with them.
 
-    Parameters
-    ----------
-    name
-        What to call the source in messages to people.
-    clock
-        Its clock against the host's, if known; None: from when lines arrive.
+    `name` is that of the source in messages, `clock` its clock against the host's, if known; None:
+    from when lines arrive.
 
     Attributes
     ----------
@@ -102,14 +94,7 @@ class LiveOdometry:
         return self._envelope.line.nominal_ns(host_ns)
 
     def take(self, line: str, arrival_ns: int) -> tuple[TumSample | None, str]:
-        """Take one line.
-
-        Parameters
-        ----------
-        line
-            TUM text; empty lines and comments are skipped.
-        arrival_ns
-            Host time when it came.
+        """Take a line, of TUM text or empty or a comment, with the host time when it came.
 
         Returns
         -------
@@ -176,15 +161,10 @@ class LiveOdometry:
             trouble += f": {self._trouble}" if self._trouble else ""
         self.ended, self.trouble = True, trouble
 
-    def dead(self, now_ns: int, since_ns: int) -> str:
+    def silence(self, now_ns: int, since_ns: int) -> str:
         """Return why no more poses can be expected, "" if they can.
 
-        Parameters
-        ----------
-        now_ns
-            Host time.
-        since_ns
-            Host time from which on poses are expected.
+        Host times; poses are expected from `since_ns` on.
         """
         newest_ns = max(since_ns, self._newest_host_ns or since_ns)
         if self.ended or now_ns - newest_ns <= SILENCE_S * NS_PER_S:
@@ -280,15 +260,8 @@ class LineSource:
 
 
 def parse_source(text: str) -> LineSource:
-    """Return the source that a text means.
+    """Return the source that a text means; UsageError if it means none.
 
-    Raises
-    ------
-    UsageError
-        It means none; one line with what is allowed.
-
-    Examples
-    --------
     >>> parse_source("tcp://127.0.0.1:5005")
     LineSource(kind=<SourceKind.TCP: 'TCP socket'>, place='127.0.0.1', number=5005)
     >>> parse_source("serial:/dev/ttyUSB0@57600").name
@@ -297,31 +270,21 @@ def parse_source(text: str) -> LineSource:
     if text == "-":
         return LineSource(kind=SourceKind.STDIN, place="-")
     scheme, colon, rest = text.partition(":")
-    if colon and scheme in _SCHEMES:
-        return _SCHEMES[scheme](text, rest)
+    match scheme if colon else "":
+        case "tcp":
+            host, _, port = rest.removeprefix("//").rpartition(":")
+            number = int(port) if re.fullmatch(r"[0-9]{1,5}", port) else 0
+            if not rest.startswith("//") or not host or not 0 < number < 1 << 16:
+                raise UsageError(f"odometry {text}: must be tcp://HOST:PORT")
+            return LineSource(kind=SourceKind.TCP, place=host.strip("[]"), number=number)
+        case "unix":
+            return LineSource(kind=SourceKind.UNIX, place=rest)
+        case "serial":
+            path, at, baud = rest.partition("@")
+            if not path or (at and not re.fullmatch(r"[1-9][0-9]{0,7}", baud)):
+                raise UsageError(f"odometry {text}: must be serial:PORT or serial:PORT@BAUD")
+            return LineSource(kind=SourceKind.SERIAL, place=path, number=int(baud or BAUD))
     return _path_source(text)
-
-
-def _tcp_source(text: str, rest: str) -> LineSource:
-    host, _, port = rest.removeprefix("//").rpartition(":")
-    number = int(port) if re.fullmatch(r"[0-9]{1,5}", port) else 0
-    if not rest.startswith("//") or not host or not 0 < number < 1 << 16:
-        raise UsageError(f"odometry {text}: must be tcp://HOST:PORT")
-    return LineSource(kind=SourceKind.TCP, place=host.strip("[]"), number=number)
-
-
-def _serial_source(text: str, rest: str) -> LineSource:
-    path, at, baud = rest.partition("@")
-    if not path or (at and not re.fullmatch(r"[1-9][0-9]{0,7}", baud)):
-        raise UsageError(f"odometry {text}: must be serial:PORT or serial:PORT@BAUD")
-    return LineSource(kind=SourceKind.SERIAL, place=path, number=int(baud or BAUD))
-
-
-_SCHEMES: Mapping[str, Callable[[str, str], LineSource]] = {
-    "tcp": _tcp_source,
-    "unix": lambda _, rest: LineSource(kind=SourceKind.UNIX, place=rest),
-    "serial": _serial_source,
-}
 
 
 def _path_source(text: str) -> LineSource:
@@ -342,127 +305,37 @@ def _path_source(text: str) -> LineSource:
     return LineSource(kind=kind, place=text, number=BAUD if kind is SourceKind.SERIAL else 0)
 
 
-class _Bytes(Protocol):
-    def read(self) -> bytes | None:
-        """Return what came, None if nothing did in a while, b"" at the end."""
-
-    def close(self) -> None:
-        """Close the source."""
-
-
 def read_lines(source: LineSource, is_stopped: Callable[[], bool]) -> Iterator[tuple[str, int]]:
     """Yield every line with the host's monotonic time [ns] at which its end was read.
 
     The last line may lack its end. Bytes that are no text come as replacement characters.
-
-    Parameters
-    ----------
-    source
-        What to read.
-    is_stopped
-        Asked a few times a second; then reading ends.
+    `is_stopped` is called a few times a second; reading ends when it returns True.
 
     Raises
     ------
     OdometryError
         It cannot be opened, or breaks off; one line.
     """
-    stream = _open(source)
     pending = b""
     try:
-        while not is_stopped():
-            data = stream.read()
-            if data is None:
-                continue
-            now_ns = time.monotonic_ns()
-            if not data:
-                if pending:
-                    yield pending.decode(errors="replace"), now_ns
-                return
-            *lines, pending = (pending + data).split(b"\n")
-            for line in lines:
-                yield line.decode(errors="replace"), now_ns
-            if len(pending) > _LONGEST_LINE:
-                raise OdometryError(
-                    f"odometry from {source.name}: {len(pending)} bytes without a line end; "
-                    "TUM text is expected"
-                )
-    except (OSError, XeThruError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise OdometryError(f"odometry from {source.name}: {reason}") from None
-    finally:
-        stream.close()
-
-
-class _Descriptor:
-    """Bytes of anything that has a file descriptor and poll() understands, or a regular file."""
-
-    def __init__(self, fd: int, close: Callable[[], None]) -> None:
-        self._fd, self._close = fd, close
-        self._poll = select.poll()
-        self._poll.register(fd, select.POLLIN)
-
-    def read(self) -> bytes | None:
-        if not self._poll.poll(_POLL_S * 1000):
-            return None
-        try:
-            return os.read(self._fd, _CHUNK_BYTES)
-        except (BlockingIOError, InterruptedError):
-            return None
-
-    def close(self) -> None:
-        self._close()
-
-
-class _Fifo:
-    """A FIFO: it ends when the last writer closes it, not while there is no writer yet."""
-
-    def __init__(self, path: str) -> None:
-        self._fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-        self._bytes = _Descriptor(self._fd, lambda: os.close(self._fd))
-        self._spoke = False
-
-    def read(self) -> bytes | None:
-        data = self._bytes.read()
-        if data == b"" and not self._spoke:
-            time.sleep(_POLL_S)  # poll() returns at once as long as no writer was there
-            return None
-        self._spoke = self._spoke or bool(data)
-        return data
-
-    def close(self) -> None:
-        self._bytes.close()
-
-
-class _Serial:
-    def __init__(self, path: str, baud: int) -> None:
-        self._port = SerialTransport(path, baud)
-
-    def read(self) -> bytes | None:
-        return self._port.read(_POLL_S) or None
-
-    def close(self) -> None:
-        self._port.close()
-
-
-def _open(source: LineSource) -> _Bytes:
-    try:
-        match source.kind:
-            case SourceKind.STDIN:
-                return _Descriptor(sys.stdin.fileno(), lambda: None)
-            case SourceKind.FILE:
-                fd = os.open(source.place, os.O_RDONLY)
-                return _Descriptor(fd, lambda: os.close(fd))
-            case SourceKind.FIFO:
-                return _Fifo(source.place)
-            case SourceKind.SERIAL:
-                return _Serial(source.place, source.number)
-            case SourceKind.UNIX:
-                line = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-                return _connected(line, lambda: line.connect(source.place))
-            case SourceKind.TCP:
-                line = socket.create_connection((source.place, source.number), _CONNECT_S)
-                return _connected(line, lambda: None)
+        with _opened(source) as read:
+            while not is_stopped():
+                data = read()
+                if data is None:
+                    continue
+                now_ns = time.monotonic_ns()
+                if not data:
+                    if pending:
+                        yield pending.decode(errors="replace"), now_ns
+                    return
+                *lines, pending = (pending + data).split(b"\n")
+                for line in lines:
+                    yield line.decode(errors="replace"), now_ns
+                if len(pending) > _LONGEST_LINE:
+                    raise OdometryError(
+                        f"odometry from {source.name}: {len(pending)} bytes without a line end; "
+                        "TUM text is expected"
+                    )
     except UnicodeError:  # as the codec of host names has it
         raise OdometryError(f"odometry from {source.name}: is no name of a host") from None
     except (OSError, XeThruError) as error:
@@ -470,11 +343,54 @@ def _open(source: LineSource) -> _Bytes:
         raise OdometryError(f"odometry from {source.name}: {reason}") from None
 
 
-def _connected(line: socket.socket, connect: Callable[[], None]) -> _Descriptor:
-    with contextlib.ExitStack() as unless_it_works:
-        unless_it_works.callback(line.close)
-        line.settimeout(_CONNECT_S)
-        connect()
-        line.setblocking(False)
-        unless_it_works.pop_all()
-    return _Descriptor(line.fileno(), line.close)
+@contextmanager
+def _opened(source: LineSource) -> Iterator[Callable[[], bytes | None]]:
+    """Hold a source open; the function returns what came, None if nothing did, b"" at the end."""
+    with ExitStack() as held:
+        match source.kind:
+            case SourceKind.SERIAL:
+                port = held.enter_context(closing(SerialTransport(source.place, source.number)))
+                yield lambda: port.read(_POLL_S) or None
+                return
+            case SourceKind.STDIN:
+                fd = sys.stdin.fileno()
+            case SourceKind.FILE | SourceKind.FIFO:
+                fd = os.open(source.place, os.O_RDONLY | os.O_NONBLOCK)
+                held.callback(os.close, fd)
+            case SourceKind.UNIX:
+                line = held.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
+                line.settimeout(_CONNECT_S)
+                line.connect(source.place)
+                line.setblocking(False)
+                fd = line.fileno()
+            case SourceKind.TCP:
+                address = (source.place, source.number)
+                line = held.enter_context(socket.create_connection(address, _CONNECT_S))
+                line.setblocking(False)
+                fd = line.fileno()
+        yield _Descriptor(fd, is_fifo=source.kind is SourceKind.FIFO).read
+
+
+class _Descriptor:
+    """Anything that has a file descriptor and poll() understands, or a regular file.
+
+    A FIFO ends when the last writer closes it, not while there is no writer yet.
+    """
+
+    def __init__(self, fd: int, *, is_fifo: bool) -> None:
+        self._fd, self._waits_for_writer = fd, is_fifo
+        self._poll = select.poll()
+        self._poll.register(fd, select.POLLIN)
+
+    def read(self) -> bytes | None:
+        if not self._poll.poll(_POLL_S * 1000):
+            return None
+        try:
+            data = os.read(self._fd, _CHUNK_BYTES)
+        except (BlockingIOError, InterruptedError):
+            return None
+        if not data and self._waits_for_writer:
+            time.sleep(_POLL_S)  # poll() returns at once as long as no writer was there
+            return None
+        self._waits_for_writer = False
+        return data

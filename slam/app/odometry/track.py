@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from slam.app.errors import AppError, OdometryError
 from slam.geometry import wrap_angle
+from xethru_protocol.system import read_bounded
 
 NS_PER_S = 1_000_000_000
 _FIELDS = 8
@@ -57,15 +58,7 @@ class TumSample:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trajectory:
-    """Poses over time.
-
-    Attributes
-    ----------
-    stamps_ns
-        Shape (n,), int64, ascending.
-    poses
-        Shape (n, 3), float64: x [m], y [m], heading [rad].
-    """
+    """Poses over time, shape (n, 3): x [m], y [m], heading [rad]; stamps ascending, shape (n,)."""
 
     stamps_ns: NDArray[np.int64]
     poses: NDArray[np.float64]
@@ -80,8 +73,6 @@ def parse_tum_line(line: str) -> TumSample:
         Fewer or more than eight numbers, a number that is not finite, a stamp that cannot be
         seconds, a quaternion without length.
 
-    Examples
-    --------
     >>> parse_tum_line("12.000000005 1.5 -2 0 0 0 0 1")
     TumSample(t_ns=12000000005, x_m=1.5, y_m=-2.0, qz=0.0, qw=1.0)
     """
@@ -133,14 +124,10 @@ def read_tum(path: Path) -> Trajectory:
         The file cannot be read, holds no pose, goes back in time, or has a malformed line.
     """
     try:
-        with path.open("rb") as file:
-            content = file.read(_MAX_BYTES + 1)
-        text = content.decode("utf-8")
+        text = read_bounded(path, _MAX_BYTES).decode()
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not a text file"
         raise TumError(f"{path}: cannot read: {reason}") from None
-    if len(content) > _MAX_BYTES:
-        raise TumError(f"{path}: longer than {_MAX_BYTES >> 20} MiB, so it is no trajectory")
     samples = []
     for number, line in enumerate(text.splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
@@ -181,9 +168,7 @@ class OdometryTrack:
         # Unwrapped, so that interpolation across +-pi takes the short way round.
         self._heading_rad: list[float] = []
         self._turns_rad = 0.0  # what unwrapping adds to the newest heading
-        for number, sample in enumerate(samples, start=1):
-            if self._stamps_ns and sample.t_ns <= self._stamps_ns[-1]:
-                raise OdometryError(f"odometry: line {number} is not later than the line before")
+        for sample in samples:
             self.append(sample)
         if not self._samples:
             raise OdometryError("odometry: the source sent no pose")
@@ -217,16 +202,11 @@ class OdometryTrack:
         return self._stamps_ns[after] - self._stamps_ns[after - 1]
 
     def append(self, sample: TumSample) -> None:
-        """Take a sample later than all before it.
-
-        Raises
-        ------
-        OdometryError
-            It is not later.
-        """
+        """Take a sample; OdometryError if it is not later than all before it."""
         if self._samples:
             if sample.t_ns <= self._stamps_ns[-1]:
-                raise OdometryError("odometry: a pose is not later than the one before")
+                number = len(self._samples) + 1
+                raise OdometryError(f"odometry: line {number} is not later than the line before")
             self._turns_rad += _unwrapping(self._samples[-1].heading_rad, sample.heading_rad)
         self._samples.append(sample)
         self._stamps_ns.append(sample.t_ns)
@@ -234,13 +214,7 @@ class OdometryTrack:
 
     @classmethod
     def from_lines(cls, lines: Iterable[str]) -> OdometryTrack:
-        """Parse TUM lines.
-
-        Raises
-        ------
-        OdometryError
-            A malformed line, no line at all, or time that does not go forward.
-        """
+        """Parse TUM lines; OdometryError if one is malformed or not later, or there is none."""
         samples = []
         for number, line in enumerate(lines, start=1):
             try:
@@ -250,20 +224,12 @@ class OdometryTrack:
         return cls(samples)
 
     def pose_at(self, t_ns: int) -> NDArray[np.float64]:
-        """Interpolate the pose at one time.
+        """Return the pose at a session time: x [m], y [m], heading [rad] in [-pi, pi), odom frame.
 
-        Parameters
-        ----------
-        t_ns
-            Session time [ns].
-
-        Returns
-        -------
-        Shape (3,): x [m], y [m], heading [rad] in [-pi, pi), odometry frame. Position and heading
-        are linear between two samples; at a sample's own time they are the sample's. That is exact
-        on straight legs and for turns on the spot. On an arc the position half way between samples
-        is chord / 2 * tan(turn / 4) off, 0.12 mm for 1 cm and 5.6 degrees; an arc instead would
-        help only there, and fits no wheel that stops or starts between samples either.
+        Position and heading are linear between two samples. That is exact on straight legs and for
+        turns on the spot. On an arc the position half way between samples is
+        chord / 2 * tan(turn / 4) off, 0.12 mm for 1 cm and 5.6 degrees; an arc instead would help
+        only there, and fits no wheel that stops or starts between samples either.
 
         Raises
         ------

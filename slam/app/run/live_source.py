@@ -440,7 +440,7 @@ class LiveSource:
                 raise AppError(f"radar {', '.join(silent)}: no frame in {START_LIMIT_S:g} s")
             if self._odometry.ended and not self._odometry.has_pose:
                 raise AppError(self._odometry.trouble)
-            if text := self._odometry.dead(now_ns, self._began_ns):
+            if text := self._odometry.silence(now_ns, self._began_ns):
                 raise AppError(text)
             if silent or not self._odometry.has_pose:
                 continue
@@ -579,7 +579,7 @@ class LiveSource:
         if self.ticks.ended:
             trouble = self._odometry.trouble
             self.ended = AppError(trouble) if trouble else "odometry ended"
-        elif text := self._odometry.dead(now_ns, self._began_ns):
+        elif text := self._odometry.silence(now_ns, self._began_ns):
             self.ended = AppError(text)
         elif self.ticks.alive:
             self._all_lost_ns = None

@@ -94,10 +94,10 @@ def test_poses_are_known_between_samples_that_are_near_only() -> None:
 )
 def test_a_source_without_new_poses_is_dead_after_a_while(lines: tuple[str], words: str) -> None:
     odometry, _ = fed(*lines)
-    assert odometry.dead(10 * NS_PER_S, 0) == ""
-    assert words in odometry.dead(11 * NS_PER_S, 0)
+    assert odometry.silence(10 * NS_PER_S, 0) == ""
+    assert words in odometry.silence(11 * NS_PER_S, 0)
     odometry.end("")
-    assert odometry.dead(11 * NS_PER_S, 0) == ""  # the end is known, which is something else
+    assert odometry.silence(11 * NS_PER_S, 0) == ""  # the end is known, which is something else
 
 
 def test_its_clock_is_told_by_arrivals_through_a_burst_and_jitter() -> None:

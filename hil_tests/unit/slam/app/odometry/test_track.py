@@ -1,5 +1,6 @@
-"""Odometry input: the same floats on every path, interpolation the short way round."""
+"""TUM text and odometry: exact stamps, the same floats on every path, the short way round."""
 
+import contextlib
 import math
 import socket
 import threading
@@ -7,11 +8,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from slam.app.errors import OdometryError
-from slam.app.odometry.track import OdometryTrack, TumSample, format_tum_line, read_odometry_socket
+from slam.app.odometry import track
+from slam.app.odometry.track import (
+    OdometryTrack,
+    Trajectory,
+    TumError,
+    TumSample,
+    format_tum_line,
+    parse_tum_line,
+    read_odometry_socket,
+    read_tum,
+    write_tum,
+)
 from slam.geometry import wrap_angle
 
 
@@ -20,14 +32,14 @@ def lines_of(rows: list[tuple[int, float, float, float]]) -> list[str]:
 
 
 def test_at_a_samples_own_time_the_pose_is_the_sample() -> None:
-    track = OdometryTrack.from_lines(lines_of([(0, 0.1, 0.2, 0.3), (10**9, 1 / 3, -2.0, 0.5)]))
-    assert track.pose_at(10**9)[:2].tolist() == [1 / 3, -2.0]
-    assert track.pose_at(0)[:2].tolist() == [0.1, 0.2]
+    drive = OdometryTrack.from_lines(lines_of([(0, 0.1, 0.2, 0.3), (10**9, 1 / 3, -2.0, 0.5)]))
+    assert drive.pose_at(10**9)[:2].tolist() == [1 / 3, -2.0]
+    assert drive.pose_at(0)[:2].tolist() == [0.1, 0.2]
 
 
 def test_between_two_samples_it_is_linear() -> None:
-    track = OdometryTrack.from_lines(lines_of([(0, 0.0, 0.0, 0.0), (10**9, 4.0, -8.0, 1.0)]))
-    np.testing.assert_allclose(track.pose_at(250_000_000), [1.0, -2.0, 0.25])
+    drive = OdometryTrack.from_lines(lines_of([(0, 0.0, 0.0, 0.0), (10**9, 4.0, -8.0, 1.0)]))
+    np.testing.assert_allclose(drive.pose_at(250_000_000), [1.0, -2.0, 0.25])
 
 
 @given(st.floats(-0.4, 0.4), st.floats(0.001, 0.1))
@@ -40,13 +52,13 @@ def test_on_an_arc_it_is_off_by_no_more_than_the_arcs_height(turn_rad: float, ar
         return chord_m * math.cos(turned / 2), chord_m * math.sin(turned / 2), turned
 
     end = on_arc(1.0)
-    track = OdometryTrack.from_lines(lines_of([(0, 0.0, 0.0, 0.0), (1000, *end)]))
+    drive = OdometryTrack.from_lines(lines_of([(0, 0.0, 0.0, 0.0), (1000, *end)]))
     height_m = math.hypot(end[0], end[1]) / 2 * math.tan(abs(turn_rad) / 4)
     for part in (0.1, 0.25, 0.5, 0.9):
-        x_m, y_m, heading_rad = track.pose_at(round(1000 * part))
+        x_m, y_m, heading_rad = drive.pose_at(round(1000 * part))
         assert heading_rad == pytest.approx(part * turn_rad, abs=1e-12)
         assert math.dist((x_m, y_m), on_arc(part)[:2]) <= height_m + 1e-12
-    assert math.dist(track.pose_at(500)[:2], on_arc(0.5)[:2]) == pytest.approx(height_m, abs=1e-12)
+    assert math.dist(drive.pose_at(500)[:2], on_arc(0.5)[:2]) == pytest.approx(height_m, abs=1e-12)
 
 
 @pytest.mark.parametrize("turn_rad", [0.4, -0.4])
@@ -58,10 +70,10 @@ def test_heading_crosses_half_a_turn_the_short_way(turn_rad: float) -> None:
         TumSample(t_ns=t_ns, x_m=0, y_m=0, qz=math.sin(h / 2), qw=math.cos(h / 2))
         for t_ns, h in ((0, start), (100, end))
     ]
-    track = OdometryTrack(samples)
+    drive = OdometryTrack(samples)
     for part in (20, 50, 75):
         expected = math.remainder(start + turn_rad * part / 100, math.tau)
-        heading_rad = float(track.pose_at(part)[2])
+        heading_rad = float(drive.pose_at(part)[2])
         assert heading_rad == pytest.approx(expected)
         assert -math.pi <= heading_rad < math.pi
 
@@ -75,10 +87,10 @@ def test_the_same_text_gives_the_same_floats(values: list[float]) -> None:
 
 
 def test_a_time_far_outside_is_refused() -> None:
-    track = OdometryTrack.from_lines(lines_of([(0, 0, 0, 0), (10**9, 1, 0, 0)]))
-    np.testing.assert_array_equal(track.pose_at(1_400_000_000), [1.0, 0.0, 0.0])
+    drive = OdometryTrack.from_lines(lines_of([(0, 0, 0, 0), (10**9, 1, 0, 0)]))
+    np.testing.assert_array_equal(drive.pose_at(1_400_000_000), [1.0, 0.0, 0.0])
     with pytest.raises(OdometryError, match=r"covers 0.00 .. 1.00 s, but a frame came at 1.60 s"):
-        track.pose_at(1_600_000_000)
+        drive.pose_at(1_600_000_000)
 
 
 @pytest.mark.parametrize(
@@ -89,9 +101,7 @@ def test_a_time_far_outside_is_refused() -> None:
         ["1 0 0 0 0 0 0 1", "0 0 0 0 0 0 0 1"],
     ],
 )
-def test_bad_odometry_is_one_line(
-    lines: list[str],
-) -> None:
+def test_bad_odometry_is_an_error(lines: list[str]) -> None:
     with pytest.raises(OdometryError):
         OdometryTrack.from_lines(lines)
 
@@ -112,10 +122,10 @@ def test_the_socket_gives_what_was_sent_however_it_was_cut(tmp_path: Path) -> No
 
     thread = threading.Thread(target=serve)
     thread.start()
-    track = read_odometry_socket(path)
+    drive = read_odometry_socket(path)
     thread.join()
     server.close()
-    assert track.samples == OdometryTrack.from_lines(lines).samples
+    assert drive.samples == OdometryTrack.from_lines(lines).samples
 
 
 def test_a_missing_or_silent_socket_is_named(tmp_path: Path) -> None:
@@ -134,11 +144,82 @@ def test_a_track_that_grows_unwraps_like_numpy_to_the_last_bit(headings: list[fl
         TumSample(t_ns=t_ns, x_m=0.0, y_m=0.0, qz=math.sin(h / 2), qw=math.cos(h / 2))
         for t_ns, h in enumerate(headings)
     ]
-    track = OdometryTrack(samples[:1])
+    drive = OdometryTrack(samples[:1])
     for sample in samples[1:]:
-        track.append(sample)
+        drive.append(sample)
     unwrapped = np.unwrap([sample.heading_rad for sample in samples])
     for row, heading_rad in enumerate(unwrapped):
-        assert track.pose_at(row)[2] == wrap_angle(float(heading_rad))
+        assert drive.pose_at(row)[2] == wrap_angle(float(heading_rad))
     with pytest.raises(OdometryError, match="not later"):
-        track.append(samples[-1])
+        drive.append(samples[-1])
+
+
+finite = st.floats(-1e6, 1e6, allow_subnormal=False)
+
+
+def test_stamp_has_every_nanosecond_of_the_text() -> None:
+    # 2**53 ns is 104 days: a float would lose this last digit
+    assert parse_tum_line("1732155000.123456789 0 0 0 0 0 0 1").t_ns == 1_732_155_000_123_456_789
+
+
+@pytest.mark.parametrize(
+    ("qz", "qw", "heading_rad"),
+    [
+        (0.0, 1.0, 0.0),
+        (math.sqrt(0.5), math.sqrt(0.5), math.pi / 2),
+        (-0.5, math.sqrt(0.75), -math.pi / 3),
+        (0.5, -math.sqrt(0.75), 5 * math.pi / 3),  # q and -q are the same turn
+        (-math.sqrt(0.75), -0.5, -4 * math.pi / 3),
+    ],
+)
+def test_heading_is_twice_the_quaternion_angle(qz: float, qw: float, heading_rad: float) -> None:
+    assert parse_tum_line(f"0 0 0 0 0 0 {qz!r} {qw!r}").heading_rad == pytest.approx(heading_rad)
+
+
+@given(st.integers(-(2**62), 2**62), finite, finite, st.floats(-3.1, 3.1))
+def test_a_line_gives_back_what_was_written(t_ns: int, x: float, y: float, heading: float) -> None:
+    sample = parse_tum_line(format_tum_line(t_ns, np.array([x, y, heading])))
+    assert (sample.t_ns, sample.x_m, sample.y_m) == (t_ns, x, y)
+    assert sample.heading_rad == pytest.approx(heading, abs=1e-12)
+
+
+@given(st.text(max_size=60))
+def test_any_text_is_a_sample_or_a_tum_error(text: str) -> None:
+    with contextlib.suppress(TumError):
+        assert isinstance(parse_tum_line(text), TumSample)
+
+
+number_like = st.one_of(
+    st.floats().map(repr),
+    st.integers(-(2**80), 2**80).map(str),
+    st.decimals().map(str),
+    st.from_regex(r"[+-]?[0-9]{1,4}(\.[0-9]{0,12})?[eE][+-]?[0-9]{1,20}", fullmatch=True),
+)
+
+
+@given(st.lists(number_like, min_size=8, max_size=8))
+@example(["1e9999999", *"0000001"])
+@example(["-1e99999999999999999999", *"0000001"])
+@example(["1e-9999999", *"0000001"])
+def test_eight_number_like_fields_are_an_int64_stamp_or_a_tum_error(fields: list[str]) -> None:
+    with contextlib.suppress(TumError):
+        sample = parse_tum_line(" ".join(fields))
+        assert -(2**63) < sample.t_ns < 2**63
+        assert all(map(math.isfinite, (sample.x_m, sample.y_m, sample.heading_rad)))
+
+
+def test_files_round_trip_and_skip_comments(tmp_path: Path) -> None:
+    path = tmp_path / "t.tum"
+    poses = np.array([[0.1, 0.2, 0.3], [1 / 3, -2.0, -3.0]])
+    write_tum(path, Trajectory(stamps_ns=np.array([5, 199_261_498]), poses=poses))
+    path.write_text("# a comment\n\n" + path.read_text())
+    back = read_tum(path)
+    np.testing.assert_array_equal(back.stamps_ns, [5, 199_261_498])
+    np.testing.assert_array_equal(back.poses[:, :2], poses[:, :2])
+    np.testing.assert_allclose(back.poses[:, 2], poses[:, 2], atol=1e-15)
+
+
+def test_endless_input_is_no_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(track, "_MAX_BYTES", 1000)
+    with pytest.raises(TumError):
+        read_tum(Path("/dev/zero"))
