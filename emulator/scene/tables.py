@@ -46,8 +46,8 @@ def load_table(
     *,
     folder: str,
     what: str,
-    error: type[ValueError],
-    unknown: type[ValueError],
+    error: type[Exception],
+    unknown: type[Exception],
 ) -> TableT:
     """Return the model in a TOML file, or in a shipped one of a folder of fixtures by its name.
 
@@ -73,7 +73,7 @@ def load_table(
     return parse_table(model, content, source=text, error=error)
 
 
-def parse_table(model: type[TableT], text: str, *, source: str, error: type[ValueError]) -> TableT:
+def parse_table(model: type[TableT], text: str, *, source: str, error: type[Exception]) -> TableT:
     """Return the model in TOML text; raise ``error`` naming the source otherwise."""
     try:
         return model.model_validate(tomllib.loads(text))

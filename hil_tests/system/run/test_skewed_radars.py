@@ -31,6 +31,7 @@ from slam.app.run.runner import run_slam
 from slam.config import FrontEnd, SampleTime, load_preset, override
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import StepResult
+from xethru_protocol.system import StopFlag
 
 NO_SKEW_MS = (0.0, 0.0, 0.0, 0.0)
 RECIPE_MS = (0.0, 190.0, 100.0, 150.0)
@@ -158,7 +159,7 @@ def test_through_ports_stamps_and_samples_are_those_in_process(tmp_path: Path) -
         ]
 
     with EmulatorProcess(str(path), 0) as emulator:
-        emulator.wait_until_ready(lambda: None)
+        emulator.wait_until_ready(StopFlag())
         assert [device.start_skew_ns for device in emulator.devices] == [
             round(skew_ms * 1e6) for skew_ms in RECIPE_MS
         ]

@@ -108,7 +108,7 @@ def run_demo(
             emulator = stack.enter_context(EmulatorProcess(scene, seed))
             from slam.app.view.panels import RerunView  # a second, while the emulator starts
 
-            emulator.wait_until_ready(stop.check)
+            emulator.wait_until_ready(stop)
             odometry = read_odometry_socket(emulator.odometry_socket)
             link_log = LinkLog()
             rig = rig_of(loaded)

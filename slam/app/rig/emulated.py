@@ -15,10 +15,10 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from platform import python_version
-from types import TracebackType
 from typing import IO, Self
 
 import numpy as np
@@ -32,12 +32,13 @@ from emulator.module.memory import Identity
 from emulator.scene.scene import Scene, SceneError, UnknownSceneError, load_scene
 from slam.app.errors import AppError, EmulatorError, UsageError
 from slam.app.odometry.track import NS_PER_S
-from slam.app.rig.sources import RadarLink, RigSource
+from slam.app.rig.files import RigWheels
+from slam.app.rig.sources import RadarLink, RecordObserver, RigSource
 from slam.config import ConfigError, SlamConfig, WheelNoise, load_preset
 from slam.geometry import Mount, Rig, transform
-from xethru_protocol.driver.conversation import ProtocolRecord
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.system import StopFlag
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.x4 import real_frame_rate
 
@@ -47,8 +48,8 @@ _PR_SET_PDEATHSIG = 1
 def signal_at_parents_death(which: signal.Signals) -> Callable[[], None] | None:
     """Return what a process calls to get a signal when its parent dies; None except on Linux.
 
-    Strictly, when the thread that started it ends. The call is a single system call, as a
-    `preexec_fn` must be.
+    Strictly, when the thread that started it ends. It is a single system call, as a `preexec_fn`
+    must be.
     """
     if sys.platform != "linux":
         return None
@@ -77,13 +78,7 @@ class EmulatorProcess:
     The group keeps Ctrl-C for us: we stop reading first and end the emulator afterwards. It removes
     its links when it ends; if it was killed, we remove them.
 
-    Parameters
-    ----------
-    scene
-        Name or file of the scene.
-    seed
-        Seed of noise and odometry.
-
+    `scene` is its name or its file.
     """
 
     def __init__(self, scene: str, seed: int) -> None:
@@ -111,12 +106,7 @@ class EmulatorProcess:
             self._cleanup = self._cleanup.pop_all()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.end()
 
     def end(self) -> None:
@@ -130,15 +120,14 @@ class EmulatorProcess:
         except subprocess.TimeoutExpired:
             return None
         how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
-        return f"the emulator ended {how}{self._last_message()}"
+        self._errors.seek(0)
+        lines = self._errors.read().decode(errors="replace").split("\n")
+        messages = [line.strip() for line in lines if line.strip()]
+        last = f": {messages[-1]}" if messages else ""
+        return f"the emulator ended {how}{last}"
 
-    def wait_until_ready(self, check: Callable[[], None]) -> None:
+    def wait_until_ready(self, stop: StopFlag) -> None:
         """Read the ready line, which names ports and odometry socket.
-
-        Parameters
-        ----------
-        check
-            Called again and again while waiting; may raise to stop.
 
         Raises
         ------
@@ -150,7 +139,7 @@ class EmulatorProcess:
         line = b""
         give_up = time.monotonic() + READY_LIMIT_S
         while not line.endswith(b"\n"):
-            check()
+            stop.check()
             if time.monotonic() > give_up:
                 raise EmulatorError(f"the emulator was not ready after {READY_LIMIT_S:g} s")
             if select.select([output], [], [], _POLL_S)[0]:
@@ -174,12 +163,6 @@ class EmulatorProcess:
         except (ValueError, KeyError, TypeError):
             raise EmulatorError(f"the emulator's ready line is unknown: {line[:200]!r}") from None
 
-    def _last_message(self) -> str:
-        self._errors.seek(0)
-        lines = self._errors.read().decode(errors="replace").split("\n")
-        said = [line.strip() for line in lines if line.strip()]
-        return f": {said[-1]}" if said else ""
-
     def _end(self) -> None:
         if self._process.stdout is not None:
             self._process.stdout.close()
@@ -189,9 +172,6 @@ class EmulatorProcess:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        self._remove_links()
-
-    def _remove_links(self) -> None:
         left = [Path(device.path) for device in self.devices]
         left += [Path(path) for path in (self.odometry_socket, self._control_socket) if path]
         for path in left:
@@ -206,9 +186,6 @@ RAW_CONFIG = RawConfig(frame_area_m=(0.2, 9.4))
 """The paper's set-up: 1431 range bins from 0.2 to 9.4 module metres."""
 
 _VERSIONED = ("xethru-hil", "numpy", "scipy", "scikit-learn", "mcap", "rosbags", "rerun-sdk")
-
-RecordObserver = Callable[[str, ProtocolRecord], None]
-"""Gets a radar's name and what happened on its link."""
 
 
 def scene_and_config(scene: str, preset: str) -> tuple[Scene, SlamConfig]:
@@ -250,16 +227,8 @@ def wheels_of(scene: Scene) -> WheelNoise:
 
     Standard deviations, as a data sheet gives them; what was drawn for a run stays unknown.
     """
-    spec = scene.odometry
-    return WheelNoise(
-        along_m_per_sqrt_m=spec.along_sigma_m_per_sqrt_m,
-        across_m_per_sqrt_m=spec.across_sigma_m_per_sqrt_m,
-        heading_rad_per_sqrt_m=spec.heading_sigma_rad_per_sqrt_m,
-        heading_rad_per_rad=spec.heading_sigma_rad_per_rad,
-        scale_sigma=spec.scale_sigma,
-        turn_scale_sigma=spec.turn_scale_sigma,
-        curvature_sigma_rad_per_m=spec.curvature_sigma_rad_per_m,
-    )
+    keys = set(RigWheels.model_fields)  # the same keys
+    return RigWheels.model_construct(**scene.odometry.model_dump(include=keys)).noise
 
 
 def true_landmarks_m(scene: Scene) -> NDArray[np.float64]:
@@ -290,15 +259,16 @@ def open_ports(
     """
     links: list[RadarLink] = []
     by_name = {device.name: device for device in devices}
-    try:
+    with contextlib.ExitStack() as unless_it_works:
         for mount in rig.mounts:
             device = by_name.get(mount.name)
             if device is None:
                 raise AppError(f"radar {mount.name}: the emulator serves {sorted(by_name)}")
             try:
-                driver = X4M300.open(device.path, observer=_named(observer, mount.name))
+                driver = X4M300.open(device.path, observer=partial(observer, mount.name))
             except XeThruError as error:
                 raise AppError(f"radar {mount.name} at {device.path}: {error}") from error
+            unless_it_works.callback(driver.close)
             links.append(
                 RadarLink(
                     mount=mount,
@@ -308,10 +278,7 @@ def open_ports(
                     start_skew_ns=device.start_skew_ns,
                 )
             )
-    except BaseException:
-        for link in links:
-            link.driver.close()
-        raise
+        unless_it_works.pop_all()
     return RigSource(links)
 
 
@@ -347,7 +314,3 @@ def end_counter(duration_ns: int) -> int:
 
 def versions() -> dict[str, str]:
     return {"python": python_version()} | {name: version(name) for name in _VERSIONED}
-
-
-def _named(observer: RecordObserver, name: str) -> Callable[[ProtocolRecord], None]:
-    return lambda record: observer(name, record)

@@ -15,35 +15,31 @@ from __future__ import annotations
 import json
 import math
 import os
-import tomllib
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, StrictFloat, StrictInt, ValidationError
+from pydantic import Field, StrictFloat
 
+from emulator.scene.tables import Table, load_table
 from slam.app.errors import AppError, naming
-from slam.app.rig.sources import RadarLink
+from slam.app.rig.sources import RadarLink, RecordObserver
 from slam.config import WheelNoise
 from slam.geometry import Mount, Rig
 from xethru_protocol.driver.conversation import ProtocolRecord
 from xethru_protocol.driver.radar import X4M300, known_ports
-from xethru_protocol.system import read_bounded
 from xethru_protocol.transport import find_ports
 from xethru_protocol.wire.codes import InfoItem
 from xethru_protocol.wire.errors import XeThruError
 from xethru_protocol.wire.messages import SystemGetInfo
 
-_Sigma = Annotated[StrictFloat | StrictInt, Field(ge=0, le=10, allow_inf_nan=False)]
-_Number = Annotated[StrictFloat | StrictInt, Field(ge=-1000, le=1000, allow_inf_nan=False)]
+_Sigma = Annotated[StrictFloat, Field(ge=0, le=10, allow_inf_nan=False)]
+_Number = Annotated[StrictFloat, Field(ge=-1000, le=1000, allow_inf_nan=False)]
 
 
-class RigRadar(BaseModel):
+class RigRadar(Table):
     """One radar: who it is, where it sits, what is known of its errors."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: Annotated[str, Field(min_length=1, max_length=80)]
     serial: Annotated[str, Field(pattern=r"^[0-9]{12}$")]
@@ -55,14 +51,12 @@ class RigRadar(BaseModel):
     gain_db: _Number = 0.0
 
 
-class RigWheels(BaseModel):
+class RigWheels(Table):
     """How the robot's odometry errs, from its data sheet or a test drive; see `WheelNoise`.
 
     The keys are those of a scene's table ``odometry``. White noise grows with the square root of
     the way and with the angle turned; the three other standard deviations are of errors that stay.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     along_sigma_m_per_sqrt_m: _Sigma = WheelNoise().along_m_per_sqrt_m
     across_sigma_m_per_sqrt_m: _Sigma = WheelNoise().across_m_per_sqrt_m
@@ -75,20 +69,18 @@ class RigWheels(BaseModel):
     @property
     def noise(self) -> WheelNoise:
         return WheelNoise(
-            along_m_per_sqrt_m=float(self.along_sigma_m_per_sqrt_m),
-            across_m_per_sqrt_m=float(self.across_sigma_m_per_sqrt_m),
-            heading_rad_per_sqrt_m=float(self.heading_sigma_rad_per_sqrt_m),
-            heading_rad_per_rad=float(self.heading_sigma_rad_per_rad),
-            scale_sigma=float(self.scale_sigma),
-            turn_scale_sigma=float(self.turn_scale_sigma),
-            curvature_sigma_rad_per_m=float(self.curvature_sigma_rad_per_m),
+            along_m_per_sqrt_m=self.along_sigma_m_per_sqrt_m,
+            across_m_per_sqrt_m=self.across_sigma_m_per_sqrt_m,
+            heading_rad_per_sqrt_m=self.heading_sigma_rad_per_sqrt_m,
+            heading_rad_per_rad=self.heading_sigma_rad_per_rad,
+            scale_sigma=self.scale_sigma,
+            turn_scale_sigma=self.turn_scale_sigma,
+            curvature_sigma_rad_per_m=self.curvature_sigma_rad_per_m,
         )
 
 
-class RigFile(BaseModel):
+class RigFile(Table):
     """The whole file: one `[[radars]]` table per radar, and `[wheels]` where more is known."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     radars: Annotated[tuple[RigRadar, ...], Field(min_length=1, max_length=64)]
     wheels: RigWheels = RigWheels()
@@ -99,10 +91,10 @@ class RigFile(BaseModel):
             mounts=tuple(
                 Mount(
                     name=radar.name,
-                    x_m=float(radar.x_m),
-                    y_m=float(radar.y_m),
+                    x_m=radar.x_m,
+                    y_m=radar.y_m,
                     yaw_rad=math.radians(radar.yaw_deg),
-                    range_offset_m=float(radar.range_offset_m),
+                    range_offset_m=radar.range_offset_m,
                     phase_offset_rad=math.radians(radar.phase_offset_deg),
                 )
                 for radar in self.radars
@@ -118,18 +110,7 @@ def load_rig(path: Path) -> RigFile:
     AppError
         One line with file, key and what is allowed.
     """
-    try:
-        table = tomllib.loads(read_bounded(path).decode())
-    except OSError as error:
-        raise AppError(f"{path}: cannot read the rig file: {error.strerror or error}") from None
-    except ValueError as error:  # neither UTF-8 nor TOML
-        raise AppError(f"{path}: not valid TOML: {error}") from None
-    except RecursionError:
-        raise AppError(f"{path}: no rig file: brackets within brackets without end") from None
-    try:
-        rig = RigFile.model_validate(table)
-    except ValidationError as error:
-        raise AppError(f"{path}: {_one_line(error)}") from None
+    rig = load_table(RigFile, path, folder="rigs", what="rig", error=AppError, unknown=AppError)
     for key in ("name", "serial"):
         values = [getattr(radar, key) for radar in rig.radars]
         twice = sorted({value for value in values if values.count(value) > 1})
@@ -158,67 +139,45 @@ def write_rig(path: Path, rig: RigFile) -> None:
         path.write_text("\n\n".join(tables) + "\n", encoding="utf-8")
 
 
-def _one_line(error: ValidationError) -> str:
-    first = error.errors(include_url=False)[0]
-    key = "".join(
-        f"[{part}]" if isinstance(part, int) else f".{part}"
-        for part in first["loc"]
-        if part not in ("float", "int")
-    ).removeprefix(".")
-    if first["type"] == "extra_forbidden":
-        tables: dict[str, type[BaseModel]] = {"radars": RigRadar, "wheels": RigWheels}
-        model = tables[str(first["loc"][0])] if len(first["loc"]) > 1 else RigFile
-        return f"{key}: unknown key; allowed are {', '.join(model.model_fields)}"
-    if first["type"] == "missing":
-        return f"{key}: missing; this key is required"
-    return f"{key}: {first['msg']}, got {first['input']!r}"
-
-
-NamedObserver = Callable[[str, ProtocolRecord], None]
-"""Gets a radar's name, and what happened on its link."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class _Module:
-    port: str
-    serial: str
-    driver: X4M300
-    link_log: _LinkLog
+    """A module at a port; what happens on its link is passed on once its radar's name is known."""
 
-
-class _LinkLog:
-    """Passes on what happens on a link, as soon as the name of its radar is known."""
-
-    def __init__(self, observer: NamedObserver) -> None:
-        self._observer = observer
-        self._name: str | None = None
+    def __init__(self, port: str, observer: RecordObserver, held: ExitStack) -> None:
+        self.port = port
+        self._observer, self._name = observer, ""
         self._early: list[ProtocolRecord] = []
-
-    def take(self, record: ProtocolRecord) -> None:
-        if self._name is None:
-            self._early.append(record)
-        else:
-            self._observer(self._name, record)
+        try:
+            self.driver = X4M300.open(port, observer=self._take)
+            held.callback(self.driver.close)
+            self.driver.ping()
+            request = SystemGetInfo(item=InfoItem.XTID_SSIC_SERIALNUMBER)
+            self.serial = self.driver.request(request).text
+        except XeThruError as error:
+            raise AppError(f"{port}: {error}") from None
 
     def name(self, name: str) -> None:
         self._name = name
         for record in self._early:
             self._observer(name, record)
 
+    def _take(self, record: ProtocolRecord) -> None:
+        if self._name:
+            self._observer(self._name, record)
+        else:
+            self._early.append(record)
+
 
 def open_rig(
     rig: RigFile,
     rig_path: Path,
     ports: Sequence[str] | None,
-    observer: NamedObserver,
+    observer: RecordObserver,
     note: Callable[[str], None],
 ) -> tuple[RadarLink, ...]:
     """Open the modules of a rig.
 
     Parameters
     ----------
-    rig, rig_path
-        The rig file.
     ports
         Where the modules are; None: wherever this machine has modules or running emulators.
     observer
@@ -246,13 +205,11 @@ def open_rig(
         modules = []
         for port in dict.fromkeys(candidates):
             try:
-                module = _ask(port, observer, unless_it_works)
+                modules.append(_Module(port, observer, unless_it_works))
             except AppError as error:
                 if ports is not None:
                     raise
                 note(f"passed over: {error}")
-                continue
-            modules.append(module)
         links = _match(rig, rig_path, modules, is_named=ports is not None, note=note)
         kept = {link.driver for link in links}
         for module in modules:
@@ -266,20 +223,6 @@ def are_emulated(links: Sequence[RadarLink]) -> bool:
     """Return whether any of these modules is that of a running emulator."""
     emulated = {os.path.realpath(port.path) for port in find_ports() if port.kind == "emulated"}
     return any(os.path.realpath(link.port) in emulated for link in links)
-
-
-def _ask(port: str, observer: NamedObserver, unless_it_works: ExitStack) -> _Module:
-    """Open a port and ask the module behind it for its serial number."""
-    link_log = _LinkLog(observer)
-    try:
-        driver = X4M300.open(port, observer=link_log.take)
-        unless_it_works.callback(driver.close)
-        request = SystemGetInfo(item=InfoItem.XTID_SSIC_SERIALNUMBER)
-        driver.ping()
-        serial = driver.request(request).text
-    except XeThruError as error:
-        raise AppError(f"{port}: {error}") from None
-    return _Module(port=port, serial=serial, driver=driver, link_log=link_log)
 
 
 def _match(
@@ -313,7 +256,7 @@ def _match(
     links = []
     for radar, mount in zip(rig.radars, rig.rig.mounts, strict=True):
         module = by_serial[radar.serial]
-        module.link_log.name(radar.name)
+        module.name(radar.name)
         note(f"radar {radar.name}: serial number {radar.serial}, at {module.port}")
         links.append(
             RadarLink(
@@ -321,7 +264,7 @@ def _match(
                 port=module.port,
                 serial=radar.serial,
                 driver=module.driver,
-                gain_db=float(radar.gain_db),
+                gain_db=radar.gain_db,
             )
         )
     return tuple(links)
@@ -338,11 +281,10 @@ def _missing_text(
     text = f"{rig_path}: {are} {named} not found"
     if not modules:
         return f"{text}: no module answered"
-    looked = ", ".join(f"{module.serial} at {module.port}" for module in modules)
-    if foreign:
-        stranger = ", ".join(f"{module.serial} at {module.port}" for module in foreign)
-        return (
-            f"{text}; instead there is {stranger}: "
-            "if a module was replaced, write its serial number into the rig file"
-        )
-    return f"{text}; there are {looked}: is it plugged in?"
+    found = ", ".join(f"{module.serial} at {module.port}" for module in foreign or modules)
+    if not foreign:
+        return f"{text}; there are {found}: is it plugged in?"
+    return (
+        f"{text}; instead there is {found}: "
+        "if a module was replaced, write its serial number into the rig file"
+    )

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from types import TracebackType
 from typing import Literal, Self, cast
 
 import numpy as np
@@ -21,6 +20,7 @@ from slam.app.odometry.track import NS_PER_S
 from slam.app.records import RadarInfo, Scan
 from slam.frames import RadarFrame
 from slam.geometry import Mount
+from xethru_protocol.driver.conversation import ProtocolRecord
 from xethru_protocol.driver.frames import Frame
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
@@ -32,6 +32,10 @@ TRUE_PER_MODULE_METRE = LIGHT_MPS / MODULE_SPEED_MPS
 
 SILENCE_S = 5.0
 _POLL_S = 0.25
+
+
+RecordObserver = Callable[[str, ProtocolRecord], None]
+"""Gets a radar's name and what happened on its link."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,9 +89,7 @@ def radar_frame(
     Parameters
     ----------
     radar
-        Index of the radar in the rig.
-    frame
-        What the driver read; its geometry is in module metres.
+        Its index in the rig.
     rate_hz
         The chip's real frame rate, as read back.
     start_skew_ns
@@ -138,12 +140,7 @@ class RigSource:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -234,20 +231,19 @@ class RigSource:
             frames = []
             for radar, head in enumerate(heads):
                 if head is not None and expected[radar] - 1 == tick:
-                    frames.append(self._radar_frame(radar, head))
+                    info = self.radars[radar]
+                    frames.append(
+                        radar_frame(
+                            radar,
+                            head,
+                            info.rate_hz,
+                            start_skew_ns=info.start_skew_ns,
+                            limits=self._limits,
+                        )
+                    )
                     heads[radar] = None
             t_ns = frame_time_ns(tick, self.radars[frames[0].radar].rate_hz)
             yield Scan(counter=tick, t_ns=t_ns, frames=tuple(frames))
-
-    def _radar_frame(self, radar: int, frame: Frame) -> RadarFrame:
-        info = self.radars[radar]
-        return radar_frame(
-            radar,
-            frame,
-            info.rate_hz,
-            start_skew_ns=info.start_skew_ns,
-            limits=self._limits,
-        )
 
     def _next_frame(self, radar: int, expected: int, check: Callable[[], None]) -> Frame:
         link = self._links[radar]

@@ -25,6 +25,7 @@ from slam.app.rig.emulated import (
 from slam.app.session.log import SessionLog
 from slam.app.session.reader import open_session
 from xethru_protocol.recordings import read_chunks, read_note, read_recording
+from xethru_protocol.system import StopFlag
 from xethru_protocol.wire.messages import DataFloat
 
 
@@ -35,10 +36,6 @@ def fake_emulator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     script.touch(mode=stat.S_IRWXU)
     monkeypatch.setattr(sys, "executable", str(script))
     return script
-
-
-def no_stop() -> None:
-    """Do not stop."""
 
 
 @pytest.mark.parametrize(
@@ -53,7 +50,7 @@ def no_stop() -> None:
 def test_a_bad_start_is_one_line(fake_emulator: Path, does: str) -> None:
     fake_emulator.write_text(f"#!/bin/sh\n{does}\n")
     with EmulatorProcess("lab", 0) as emulator, pytest.raises(EmulatorError) as caught:
-        emulator.wait_until_ready(no_stop)
+        emulator.wait_until_ready(StopFlag())
     assert "\n" not in str(caught.value)
 
 
@@ -64,7 +61,7 @@ def test_no_ready_line_in_time(fake_emulator: Path, monkeypatch: pytest.MonkeyPa
         EmulatorProcess("lab", 0) as emulator,
         pytest.raises(EmulatorError, match=r"not ready after 0\.3 s"),
     ):
-        emulator.wait_until_ready(no_stop)
+        emulator.wait_until_ready(StopFlag())
 
 
 def test_one_that_ignores_sigterm_is_killed(
@@ -88,7 +85,7 @@ def test_the_arguments_are_those_of_the_emulators_command_line(
     said = tmp_path / "arguments"
     fake_emulator.write_text(f'#!/bin/sh\necho "$@" > {said}\n')
     with EmulatorProcess("scene.toml", 42) as emulator, pytest.raises(EmulatorError):
-        emulator.wait_until_ready(no_stop)
+        emulator.wait_until_ready(StopFlag())
     assert said.read_text() == "-P -m emulator.cli serve scene.toml --pace asap --seed 42\n"
 
 
