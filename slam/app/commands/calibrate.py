@@ -55,9 +55,7 @@ _GAIN_LIMIT_DB = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class CalibrationReport:
-    """The results that are printed."""
-
+class _Report:
     drive: Drive
     calibration: Calibration
     gains: GainEstimate
@@ -74,24 +72,15 @@ def run_calibrate(
     rig: Path | None,
     as_json: bool,
 ) -> None:
-    """Calibrate from a session file and print the table; write the rig file if asked for.
-
-    Raises
-    ------
-    AppError
-        The session, the reflectors or the scene of the truth cannot be used; the rig file cannot
-        be written.
-    StopRequestedError
-        A signal arrived.
-    """
-    known = None if reflectors is None else read_reflectors(reflectors)
+    """Calibrate from a session file and print the table; write the rig file if asked for."""
+    known = None if reflectors is None else _read_reflectors(reflectors)
     scene = None if truth is None else _scene(truth)
     recorded = open_session(session)
     # before minutes of work: what can be refused already
     _planted(recorded.rig, scene)
     if rig is not None:
         _check_rig_place(rig, session)
-    report = report_of(drive_of(recorded, stop), known)
+    report = _report_of(_drive_of(recorded, stop), known)
     if recorded.cut_at_byte is not None:
         sys.stderr.write(f"{session}: cut at byte {recorded.cut_at_byte}; read up to there\n")
     planted = _planted(report.drive.rig, scene)
@@ -100,17 +89,11 @@ def run_calibrate(
     else:
         sys.stdout.write("".join(f"{line}\n" for line in _lines(report, planted)))
     if rig is not None:
-        write_rig(rig, rig_file(recorded.info, report))
+        write_rig(rig, _rig_file(recorded.info, report))
 
 
-def drive_of(session: RecordedSession, stop: StopFlag) -> Drive:
-    """Read a session once and detect its echoes.
-
-    Raises
-    ------
-    AppError
-        The file is damaged, or holds no odometry or no frame.
-    """
+def _drive_of(session: RecordedSession, stop: StopFlag) -> Drive:
+    """Read a session once and detect its echoes."""
     frames: list[RadarFrame] = []
     samples: list[TumSample] = []
     detections: list[Detection] = []
@@ -136,26 +119,21 @@ def drive_of(session: RecordedSession, stop: StopFlag) -> Drive:
         raise AppError(f"{session.path}: holds no radar frame; record a longer drive")
     if len(samples) < 2:
         raise AppError(f"{session.path}: holds no odometry to speak of; record a longer drive")
-    return drive_from(session.rig, OdometryTrack(samples), detections)
-
-
-def drive_from(rig: Rig, odometry: OdometryTrack, detections: Iterable[Detection]) -> Drive:
-    """Put odometry and detections of a run together."""
-    samples = odometry.samples
+    track = OdometryTrack(samples).samples
     return make_drive(
-        rig,
-        np.array([sample.t_ns for sample in samples], dtype=np.int64),
-        np.array([(sample.x_m, sample.y_m, sample.heading_rad) for sample in samples]),
-        RangeSet.of(list(detections)),
+        session.rig,
+        np.array([sample.t_ns for sample in track], dtype=np.int64),
+        np.array([(sample.x_m, sample.y_m, sample.heading_rad) for sample in track]),
+        RangeSet.of(detections),
     )
 
 
-def report_of(drive: Drive, known_m: Array | None) -> CalibrationReport:
+def _report_of(drive: Drive, known_m: Array | None) -> _Report:
     """Calibrate, and find out what the drive does not determine."""
     with threadpool_limits(limits=1):
         calibration = calibrate(drive, known_m=known_m)
         names = [mount.name for mount in drive.rig.mounts]
-        return CalibrationReport(
+        return _Report(
             drive=drive,
             calibration=calibration,
             gains=estimate_gains(drive, calibration),
@@ -165,7 +143,7 @@ def report_of(drive: Drive, known_m: Array | None) -> CalibrationReport:
         )
 
 
-def read_reflectors(name: str) -> Array:
+def _read_reflectors(name: str) -> Array:
     """Return known reflectors, shape (k, 2) [m], from a TOML file or a scene.
 
     The file holds `[[reflectors]]` tables with x_m and y_m, in a frame in which the robot starts
@@ -203,7 +181,7 @@ def _is_number(value: object) -> bool:
     return math.isfinite(value)
 
 
-def rig_file(info: SessionInfo, report: CalibrationReport) -> RigFile:
+def _rig_file(info: SessionInfo, report: _Report) -> RigFile:
     """Return the calibrated rig as a file; what the drive does not determine stays nominal."""
     is_known = report.calibration.offset_sigmas_m <= OFFSET_LIMIT_M
     radars = []
@@ -259,7 +237,7 @@ def _planted(rig: Rig, scene: Scene | None) -> Mapping[str, tuple[float, float]]
     }
 
 
-def _facts(report: CalibrationReport, planted: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
+def _facts(report: _Report, planted: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
     calibration, gains = report.calibration, report.gains
     radars = []
     for index, mount in enumerate(report.drive.rig.mounts):
@@ -299,11 +277,11 @@ def _facts(report: CalibrationReport, planted: Mapping[str, tuple[float, float]]
     }
 
 
-def _used(report: CalibrationReport) -> int:
+def _used(report: _Report) -> int:
     return int(np.count_nonzero(report.calibration.landmark != UNASSIGNED))
 
 
-def _lines(report: CalibrationReport, planted: Mapping[str, tuple[float, float]]) -> Iterable[str]:
+def _lines(report: _Report, planted: Mapping[str, tuple[float, float]]) -> Iterable[str]:
     calibration, gains = report.calibration, report.gains
     fit = "" if math.isnan(calibration.sigma_m) else f", to {1e3 * calibration.sigma_m:.2f} mm rms"
     yield (

@@ -40,31 +40,6 @@ from xethru_protocol.system import StopFlag
 _OUTPUTS = ("session.mcap", "session.rrd", "report.html", *RESULTS)
 
 
-class WireTap:
-    """Keeps the bytes of every port of a rig until a session log takes them.
-
-    Modules report their settings before there is a log, which needs these answers.
-    """
-
-    def __init__(self, rig_source: RigSource) -> None:
-        self._waiting: list[tuple[str, Literal["rx", "tx"], bytes, int]] = []
-        self._log: SessionLog | None = None
-        rig_source.listen(self._on_bytes)
-
-    def attach(self, log: SessionLog) -> None:
-        """Write what came so far, and everything from now on."""
-        self._log = log
-        for row in self._waiting:
-            log.on_wire(*row)
-        self._waiting = []
-
-    def _on_bytes(self, radar: str, way: Literal["rx", "tx"], data: bytes, host_ns: int) -> None:
-        if self._log is None:
-            self._waiting.append((radar, way, data, host_ns))
-        else:
-            self._log.on_wire(radar, way, data, host_ns)
-
-
 def run_demo(
     stop: StopFlag,
     *,
@@ -77,25 +52,8 @@ def run_demo(
 ) -> None:
     """Run the emulated robot through its scene and write everything into one folder.
 
-    The folder is locked until the run ends.
-
-    Parameters
-    ----------
-    stop
-        Checked between two scans, and between the steps after the last one.
-    out, seed, scene, preset
-        As on the command line.
-    wire
-        Whether to record the ports' raw bytes.
-    rerun
-        Where the run is watched live, see `LiveView`.
-
-    Raises
-    ------
-    AppError
-        Something failed; one line. What was recorded until then is complete and readable.
-    StopRequestedError
-        A signal arrived; the same holds.
+    The folder is locked until the run ends. After an error or a signal, what was recorded until
+    then is complete and readable.
     """
     loaded, config = scene_and_config(scene, preset)
     with ExitStack() as held:
@@ -113,7 +71,9 @@ def run_demo(
             link_log = LinkLog()
             rig = rig_of(loaded)
             rig_source = stack.enter_context(open_ports(emulator.devices, rig, link_log.on_record))
-            tap = WireTap(rig_source) if wire else None
+            early_bytes: list[tuple[str, Literal["rx", "tx"], bytes, int]] = []
+            if wire:  # the log needs the modules' answers before it can begin
+                rig_source.listen(lambda *row: early_bytes.append(row))
             rig_source.start(RAW_CONFIG, FRAME_RATE_HZ)
             trajectory = loaded.trajectory()
             source = RunSource(
@@ -137,8 +97,10 @@ def run_demo(
                 *([live.observer(info)] if live is not None else []),
                 view,
             ]
-            if tap is not None:
-                tap.attach(log)
+            for row in early_bytes:
+                log.on_wire(*row)
+            if wire:
+                rig_source.listen(log.on_wire)
             with saying_what_is_left(kept):
                 record = execute(source, sinks)
         with saying_what_is_left(kept):

@@ -7,7 +7,7 @@ import json
 import math
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from datetime import UTC, datetime
 from html import escape
 from pathlib import Path
@@ -38,8 +38,8 @@ from slam.app.run.pictures import (
     LANDMARK,
     ODOMETRY,
     PALE_INK,
+    draw_map,
     label,
-    map_figure,
     svg_of,
 )
 from slam.app.run.replay import recorded_source
@@ -53,21 +53,11 @@ from xethru_protocol.system import StopFlag
 _KEPT_WARNINGS = 200
 
 
-class ReportSeries(NamedTuple):
+class _Series(NamedTuple):
     """Numbers over the states of a run, each of shape (n_states,); NaN if there is none.
 
-    Attributes
-    ----------
-    t_s
-        Time since the first scan [s].
-    slam_error_m, odometry_error_m
-        Distance of the position to the truth, from the start pose, not aligned.
-    nis_per_dof, nis_dof
-        Of the gated associations together.
-    nees_per_dof
-        Of the pose, over 3.
-    n_landmarks
-        Landmarks of the map.
+    Errors are the position's distance to the truth, from the start pose, not aligned; the NIS is of
+    the gated associations together, the NEES of the pose.
     """
 
     t_s: NDArray[np.float64]
@@ -79,7 +69,7 @@ class ReportSeries(NamedTuple):
     n_landmarks: NDArray[np.float64]
 
 
-class ReportData(SessionObserver):
+class _ReportData(SessionObserver):
     """Collects what the report of a run shows.
 
     Attributes
@@ -141,8 +131,8 @@ class ReportData(SessionObserver):
     def close(self) -> None:
         self._note(self.links.end(self.end_ns))
 
-    def series(self) -> ReportSeries:
-        return ReportSeries(*np.array(self._rows, dtype=np.float64).reshape(-1, 7).T)
+    def series(self) -> _Series:
+        return _Series(*np.array(self._rows, dtype=np.float64).reshape(-1, 7).T)
 
     def _note(self, changes: Iterable[LinkChange]) -> None:
         self.changes += [(self.seconds(change.t_ns), change) for change in changes]
@@ -170,32 +160,20 @@ summary { cursor: pointer; }
 """
 
 
-@dataclass(slots=True)
-class Page:
-    """Collects the parts of a page, in order.
+class _Page:
+    """Collects the parts of a page, in order."""
 
-    Parameters
-    ----------
-    title
-        Of window and page.
-    """
-
-    title: str
-    _parts: list[str] = field(default_factory=list)
+    def __init__(self, title: str) -> None:
+        self._title = escape(title)
+        self._parts: list[str] = []
 
     def heading(self, text: str) -> None:
         self._parts.append(f"<h2>{escape(text)}</h2>")
 
-    def note(self, text: str) -> None:
-        """Add a sentence that explains."""
-        self._parts.append(f'<p class="note">{escape(text)}</p>')
-
-    def origin(self, text: str) -> None:
-        """State where all data come from, prominently."""
-        self._parts.append(f'<p class="origin">{escape(text)}</p>')
+    def note(self, text: str, kind: str = "note") -> None:
+        self._parts.append(f'<p class="{kind}">{escape(text)}</p>')
 
     def picture(self, svg: str, alt: str) -> None:
-        """Add a picture, embedded in the page."""
         data = base64.b64encode(svg.encode()).decode()
         self._parts.append(
             f'<img alt="{escape(alt, quote=True)}" src="data:image/svg+xml;base64,{data}">'
@@ -211,7 +189,6 @@ class Page:
         self._parts.append(f"<table>{''.join(lines)}</table>")
 
     def table(self, names: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-        """Add a table with a line of column names."""
         head = "".join(f"<th>{escape(name)}</th>" for name in names)
         lines = [f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows]
         self._parts.append(
@@ -224,28 +201,24 @@ class Page:
             f"<details><summary>{escape(summary)}</summary><pre>{escape(text)}</pre></details>"
         )
 
-    def settings(self, summary: str, values: Mapping[str, object]) -> None:
-        """Add settings, a line each, shown on demand; nested ones have dotted names."""
-        self.details(summary, "\n".join(f"{key} = {value}" for key, value in _flat("", values)))
-
     def text(self) -> str:
-        title = escape(self.title)
         return (
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
             '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-            f"<title>{title}</title>\n<style>\n{_STYLE}</style>\n</head>\n<body>\n"
-            f"<h1>{title}</h1>\n" + "\n".join(self._parts) + "\n</body>\n</html>\n"
+            f"<title>{self._title}</title>\n<style>\n{_STYLE}</style>\n</head>\n<body>\n"
+            f"<h1>{self._title}</h1>\n" + "\n".join(self._parts) + "\n</body>\n</html>\n"
         )
 
 
-def _flat(prefix: str, values: Mapping[str, object]) -> list[tuple[str, object]]:
-    rows: list[tuple[str, object]] = []
+def _lines_of(values: Mapping[str, object], prefix: str = "") -> list[str]:
+    """Return settings, a line each; nested ones have dotted names."""
+    lines = []
     for key, value in values.items():
         if isinstance(value, Mapping):
-            rows += _flat(f"{prefix}{key}.", value)
+            lines += _lines_of(value, f"{prefix}{key}.")
         else:
-            rows.append((f"{prefix}{key}", value))
-    return rows
+            lines.append(f"{prefix}{key} = {value}")
+    return lines
 
 
 _BAND = "#dfe3e8"
@@ -261,7 +234,7 @@ _BAR = 0.7
 _TIME = "time since the first scan [s]"
 
 
-def draw_errors(figure: Figure, series: ReportSeries) -> None:
+def _draw_errors(figure: Figure, series: _Series) -> None:
     """Draw the position errors in mm, where the truth is known, and the number of landmarks."""
     has_truth = bool(np.isfinite(series.slam_error_m).any())
     panels = figure.subplots(2 if has_truth else 1, 1, sharex=True, squeeze=False).ravel()
@@ -278,7 +251,7 @@ def draw_errors(figure: Figure, series: ReportSeries) -> None:
     panels[-1].yaxis.set_major_locator(MaxNLocator(integer=True))
 
 
-def draw_consistency(figure: Figure, series: ReportSeries) -> None:
+def _draw_consistency(figure: Figure, series: _Series) -> None:
     """Draw NIS and NEES over their degrees of freedom, with the 95 % band of each state."""
     has_truth = bool(np.isfinite(series.nees_per_dof).any())
     panels = figure.subplots(2 if has_truth else 1, 1, sharex=True, squeeze=False).ravel()
@@ -300,7 +273,7 @@ def draw_consistency(figure: Figure, series: ReportSeries) -> None:
     panels[-1].set_xlabel(_TIME)
 
 
-def draw_links(
+def _draw_links(
     figure: Figure, names: Sequence[str], changes: Sequence[tuple[float, LinkChange]], end_s: float
 ) -> None:
     """Draw a bar per radar, coloured by the state of its link."""
@@ -338,29 +311,18 @@ def _scale(axes: Axes, values: NDArray[np.float64]) -> None:
         axes.set_ylim(0.0, max(4.0, 1.2 * float(np.percentile(known, 99))))
 
 
-REPORT_NAME = "report.html"
-
-
 def run_report(stop: StopFlag, *, session: Path, out: Path | None) -> None:
-    """Replay a session and write its report; beside the session if `out` is None.
-
-    Raises
-    ------
-    AppError
-        The session cannot be replayed, or the page not be written.
-    StopRequestedError
-        A signal arrived; nothing was written.
-    """
+    """Replay a session and write its report; beside the session if `out` is None."""
     recorded = open_session(session_file(session))
-    page = out or recorded.path.with_name(REPORT_NAME)
+    page = out or recorded.path.with_name("report.html")
     refuse_overwriting(recorded.path, page)
-    text = report_text(recorded, stop)
+    text = _report_text(recorded, stop)
     with naming(page):
         page.write_text(text, encoding="utf-8")
     sys.stdout.write(f"{page}\n")
 
 
-def report_text(session: RecordedSession, stop: StopFlag) -> str:
+def _report_text(session: RecordedSession, stop: StopFlag) -> str:
     """Return the report of a session; the same session gives the same text.
 
     Raises
@@ -369,18 +331,35 @@ def report_text(session: RecordedSession, stop: StopFlag) -> str:
         The session cannot be replayed, or no state was estimated in it.
     """
     source = recorded_source(session, stop)
-    data = ReportData(session.info)
+    data = _ReportData(session.info)
     record = execute(source, [Progress(session.info, None, source.lost_frames), data])
     if not record.results:
         raise AppError(f"{session.path}: no state was estimated, the robot did not move")
     info = session.info
     summary = summary_of(source, record)
     seed = "" if info.seed is None else f", seed {info.seed}"
-    page = Page(f"{info.scene}, preset {info.preset}{seed}")
-    page.origin("simulated data" if info.simulated else "measured data")
+    page = _Page(f"{info.scene}, preset {info.preset}{seed}")
+    page.note("simulated data" if info.simulated else "measured data", kind="origin")
     page.note(_what_it_is(session, data))
     _write_numbers(page, source, record, summary)
-    _write_figures(page, info, record, summary, data)
+    series = data.series()
+    page.heading("Map and trajectory")
+    page.picture(
+        svg_of(draw_map, info, record, summary, height_in=6.6), "map with paths and landmarks"
+    )
+    page.heading("Errors over time" if record.has_truth else "Over time")
+    page.picture(
+        svg_of(_draw_errors, series, height_in=4.4),
+        "position errors and number of landmarks over time",
+    )
+    page.heading("Consistency")
+    page.note(
+        "Errors over their own covariance. A consistent filter stays inside the grey "
+        "band 95 % of the time; of one run, states are not independent."
+    )
+    page.picture(
+        svg_of(_draw_consistency, series, height_in=4.4), "NIS and NEES over time with their bands"
+    )
     _write_landmarks(page, info, record)
     _write_links(page, info, data)
     _write_parameters(page, info)
@@ -388,7 +367,7 @@ def report_text(session: RecordedSession, stop: StopFlag) -> str:
 
 
 def _write_numbers(
-    page: Page, source: RunSource, record: RunRecord, summary: Summary | None
+    page: _Page, source: RunSource, record: RunRecord, summary: Summary | None
 ) -> None:
     page.heading("Numbers")
     lost_frames = source.lost_frames()
@@ -409,36 +388,7 @@ def _write_numbers(
     )
 
 
-def _write_figures(
-    page: Page, info: SessionInfo, record: RunRecord, summary: Summary | None, data: ReportData
-) -> None:
-    series = data.series()
-    page.heading("Map and trajectory")
-    page.picture(
-        svg_of(
-            lambda figure: map_figure(figure, info, record, summary),
-            width_in=9.5,
-            height_in=6.6,
-        ),
-        "map with paths and landmarks",
-    )
-    page.heading("Errors over time" if record.has_truth else "Over time")
-    page.picture(
-        svg_of(lambda figure: draw_errors(figure, series), width_in=9.5, height_in=4.4),
-        "position errors and number of landmarks over time",
-    )
-    page.heading("Consistency")
-    page.note(
-        "Errors over their own covariance. A consistent filter stays inside the grey "
-        "band 95 % of the time; of one run, states are not independent."
-    )
-    page.picture(
-        svg_of(lambda figure: draw_consistency(figure, series), width_in=9.5, height_in=4.4),
-        "NIS and NEES over time with their bands",
-    )
-
-
-def _write_landmarks(page: Page, info: SessionInfo, record: RunRecord) -> None:
+def _write_landmarks(page: _Page, info: SessionInfo, record: RunRecord) -> None:
     belief = record.results[-1].belief
     page.heading("Landmarks")
     if not belief.landmark_ids:
@@ -461,7 +411,7 @@ def _write_landmarks(page: Page, info: SessionInfo, record: RunRecord) -> None:
     page.table(names, rows)
 
 
-def _write_links(page: Page, info: SessionInfo, data: ReportData) -> None:
+def _write_links(page: _Page, info: SessionInfo, data: _ReportData) -> None:
     page.heading("Links")
     rows = []
     for radar in info.radars:
@@ -485,8 +435,10 @@ def _write_links(page: Page, info: SessionInfo, data: ReportData) -> None:
     names = [radar.name for radar in info.radars]
     page.picture(
         svg_of(
-            lambda figure: draw_links(figure, names, data.changes, data.duration_s),
-            width_in=9.5,
+            _draw_links,
+            names,
+            data.changes,
+            data.duration_s,
             height_in=0.9 + 0.35 * len(names),
         ),
         "state of each link over time",
@@ -502,7 +454,7 @@ def _write_links(page: Page, info: SessionInfo, data: ReportData) -> None:
         page.details(f"Warnings: {data.n_warnings}", "\n".join(lines))
 
 
-def _write_parameters(page: Page, info: SessionInfo) -> None:
+def _write_parameters(page: _Page, info: SessionInfo) -> None:
     page.heading("Parameters")
     page.table(
         ["radar", "x [m]", "y [m]", "boresight [deg]", "range offset [mm]", "from [m]", "bins"],
@@ -520,13 +472,17 @@ def _write_parameters(page: Page, info: SessionInfo) -> None:
         ],
     )
     page.note("Mounts in the robot's frame: x forward, y left. First bin in module metres.")
-    page.settings("SLAM", json.loads(info.config_json or "{}"))
-    page.settings("Wheels, as SLAM assumes", info.wheels)
-    page.settings("Radars", {radar.name: asdict(radar) for radar in info.radars})
-    page.settings("Versions of the run", info.versions)
+    settings: dict[str, Mapping[str, object]] = {
+        "SLAM": json.loads(info.config_json or "{}"),
+        "Wheels, as SLAM assumes": info.wheels,
+        "Radars": {radar.name: asdict(radar) for radar in info.radars},
+        "Versions of the run": info.versions,
+    }
+    for name, values in settings.items():
+        page.details(name, "\n".join(_lines_of(values)))
 
 
-def _what_it_is(session: RecordedSession, data: ReportData) -> str:
+def _what_it_is(session: RecordedSession, data: _ReportData) -> str:
     info = session.info
     parts = [f"{session.path.name}: {data.duration_s:.1f} s of {len(info.radars)} radars"]
     if info.started_unix_ns is not None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 
@@ -177,8 +179,6 @@ def summarise(
     ----------
     record
         The run; its truth is known.
-    scene, preset, seed
-        Its names.
     rig
         The mounts that SLAM uses; decides which true landmarks count.
     true_landmarks_m
@@ -222,15 +222,20 @@ def summarise(
 
 def _nees(record: RunRecord, truth_in_map: NDArray[np.float64]) -> tuple[tuple[float, float], ...]:
     """Return (its time [s], its NEES) of the last state at or before each of the ten times."""
-    stamps_ns = np.array([result.t_ns for result in record.results])
     values = []
-    for part in NEES_AT:
-        t_ns = record.start_ns + round(part * record.duration_ns)
-        row = max(int(np.searchsorted(stamps_ns, t_ns, side="right")) - 1, 0)
-        belief = record.results[row].belief
+    for row in _rows_at(record, range(len(record.results))):
+        result = record.results[row]
+        belief = result.belief
         nees = nees_pose(belief.pose, belief.pose_covariance, truth_in_map[row])
-        values.append((int(stamps_ns[row]) / NS_PER_S, nees))
+        values.append((result.t_ns / NS_PER_S, nees))
     return tuple(values)
+
+
+def _rows_at(record: RunRecord, rows: Sequence[int]) -> list[int]:
+    """Return of each of the ten times the last of these rows at or before it, or the first."""
+    stamps_ns = [record.results[row].t_ns for row in rows]
+    times_ns = [record.start_ns + round(part * record.duration_ns) for part in NEES_AT]
+    return [rows[max(bisect_right(stamps_ns, t_ns) - 1, 0)] for t_ns in times_ns]
 
 
 def _true_nis(record: RunRecord, true_landmarks_m: NDArray[np.float64]) -> list[Nis]:
@@ -252,10 +257,5 @@ def _nis_times(record: RunRecord, nis: list[Nis]) -> tuple[tuple[float, float, i
     judged = [row for row, (_, dof) in enumerate(nis) if dof]
     if not judged:
         return ()
-    stamps_ns = np.array([record.results[row].t_ns for row in judged])
-    values = []
-    for part in NEES_AT:
-        t_ns = record.start_ns + round(part * record.duration_ns)
-        place = max(int(np.searchsorted(stamps_ns, t_ns, side="right")) - 1, 0)
-        values.append((int(stamps_ns[place]) / NS_PER_S, *nis[judged[place]]))
-    return tuple(values)
+    rows = _rows_at(record, judged)
+    return tuple((record.results[row].t_ns / NS_PER_S, *nis[row]) for row in rows)

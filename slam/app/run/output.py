@@ -30,8 +30,6 @@ class Progress(SessionObserver):
 
     Parameters
     ----------
-    info
-        Its radars are counted.
     duration_ns
         Session time the run will cover; None if unknown.
     lost_frames, also
@@ -72,7 +70,6 @@ class Progress(SessionObserver):
         self._snapshot = snapshot
 
     def on_log(self, line: LogLine) -> None:
-        """Show warnings about the link at once."""
         if line.warning:
             who = line.radar if line.radar in _NO_RADARS else f"radar {line.radar}"
             self._write(f"warning: {who}: {line.text}\n")
@@ -85,7 +82,6 @@ class Progress(SessionObserver):
             self._stream.flush()
 
     def line(self) -> str:
-        """Return the line as it would be shown now."""
         wall_s = max(self._clock() - self._started, 1e-9)
         rate = self._n_frames / self._n_radars / wall_s
         text = f"scene time {self._t_ns / NS_PER_S:6.1f} "
@@ -125,7 +121,6 @@ Row = tuple[str, str, str]
 
 
 def print_table(title: str, header: Sequence[str] | None, rows: Sequence[Sequence[str]]) -> None:
-    """Write a table to stdout; see `table_text`."""
     sys.stdout.write(table_text(title, header, rows))
     sys.stdout.flush()
 
@@ -213,17 +208,15 @@ def _landmark_row(landmarks: LandmarkSummary) -> Row:
 
 
 def mm_text(length_m: float | None) -> str:
-    """Return a length in millimetres, or a dash."""
     return "-" if length_m is None else f"{1e3 * length_m:.1f} mm"
 
 
 def share_text(value: float | None) -> str:
-    """Return a share of one, or a dash."""
     return "-" if value is None else f"{value:.2f}"
 
 
 def run_rows(info: SessionInfo, record: RunRecord, lost_frames: int) -> list[Row]:
-    """Return time, way driven, last pose and landmarks of a run."""
+    """Return what is known without the truth: time, way driven, last pose and landmarks."""
     duration_s = record.duration_ns / NS_PER_S
     speed = f"{record.n_frames} frames used, {lost_frames} lost between counters"
     rows = [("time", f"{duration_s:.1f} s", f"{speed}, {len(info.radars)} radars")]

@@ -48,11 +48,6 @@ def picture(path: Path, *, width_in: float, height_in: float, dpi: int = 100) ->
 
     Its colours are cut to a palette of 256, which makes the file a third of the size. No software
     version or date goes into it: the same figure gives the same bytes.
-
-    Raises
-    ------
-    AppError
-        The file cannot be written.
     """
     with matplotlib.rc_context(STYLE):
         figure = Figure(
@@ -68,20 +63,28 @@ def picture(path: Path, *, width_in: float, height_in: float, dpi: int = 100) ->
             few.save(path, format="png", optimize=True)
 
 
-def svg_of(draw: Callable[[Figure], None], *, width_in: float, height_in: float) -> str:
-    """Return what `draw` puts on a figure as the text of an SVG, the same for the same figure."""
+def svg_of(draw: Callable[..., None], *arguments: object, height_in: float) -> str:
+    """Return what `draw(figure, *arguments)` draws as an SVG, the same for the same arguments."""
     with matplotlib.rc_context(STYLE | {"svg.hashsalt": "xethru-hil"}):
-        figure = Figure(figsize=(width_in, height_in), layout="constrained", facecolor="white")
+        figure = Figure(figsize=(9.5, height_in), layout="constrained", facecolor="white")
         FigureCanvasSVG(figure)
-        draw(figure)
+        draw(figure, *arguments)
         drawn = io.StringIO()
         figure.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
     return drawn.getvalue()
 
 
-def label(axes: Axes, title: str, x_label: str, y_label: str) -> None:
-    """Give a panel its title, its axes' names with units, and a quiet grid."""
-    axes.set_title(title, loc="left", fontsize=10, color=INK)
+def label(
+    axes: Axes,
+    title: str,
+    x_label: str,
+    y_label: str,
+    *,
+    fontsize: int = 10,
+    pad: float | None = None,
+) -> None:
+    """Give a panel its title, its axes' names with units, and a pale grid."""
+    axes.set_title(title, loc="left", fontsize=fontsize, color=INK, pad=pad)
     axes.set_xlabel(x_label)
     axes.set_ylabel(y_label)
     axes.grid(color=GRID, linewidth=0.8)
@@ -96,23 +99,11 @@ CHI2_95_TWO_DOF = -2.0 * math.log(1.0 - 0.95)
 def ellipse_95(
     center_m: NDArray[np.float64], covariance_m2: NDArray[np.float64], n_points: int = 33
 ) -> NDArray[np.float64]:
-    """Return the closed 95 % contour of a planar Gaussian.
+    """Return the closed 95 % contour of a planar Gaussian, shape (n_points, 2).
 
-    Parameters
-    ----------
-    center_m
-        Shape (2,).
-    covariance_m2
-        Shape (2, 2). Its root comes from the eigenvectors, so a singular one gives a line.
-    n_points
-        Number of points, the first repeated at the end.
+    The first point is repeated at the end. The root of the covariance comes from the eigenvectors,
+    so a singular one gives a line.
 
-    Returns
-    -------
-    Shape (n_points, 2), same frame as the arguments.
-
-    Examples
-    --------
     >>> outline = ellipse_95(np.zeros(2), np.diag([4.0, 1.0]), n_points=5)
     >>> np.abs(outline).max(axis=0).round(3)
     array([4.895, 2.448])
@@ -133,23 +124,7 @@ def rotate_covariances(
     return np.asarray(rotation @ covariances_m2 @ rotation.T)
 
 
-def draw_map(
-    path: Path,
-    info: SessionInfo,
-    record: RunRecord,
-    summary: Summary | None,
-) -> None:
-    """Draw the map of a run into a PNG file; see `map_figure`."""
-    with picture(path, width_in=9.0, height_in=6.6, dpi=150) as figure:
-        map_figure(figure, info, record, summary)
-
-
-def map_figure(
-    figure: Figure,
-    info: SessionInfo,
-    record: RunRecord,
-    summary: Summary | None,
-) -> None:
+def draw_map(figure: Figure, info: SessionInfo, record: RunRecord, summary: Summary | None) -> None:
     """Draw the map of a run; without `summary`, no truth is drawn.
 
     Estimate and odometry are drawn where they began, at the robot's first pose, without the
@@ -162,8 +137,6 @@ def map_figure(
     odometry = transform(odom_place, _xy_m([row.odometry_pose for row in record.results]))
     axes = figure.add_subplot()
     axes.set_aspect("equal", adjustable="datalim")
-    axes.grid(color=GRID, linewidth=0.8)
-    axes.set_axisbelow(True)
     for number, line in enumerate(info.outlines_m):
         name = "wall or box" if number == 0 else None
         axes.plot(*line.T, color=INK, linewidth=1.6, alpha=0.45, label=name)
@@ -187,14 +160,34 @@ def map_figure(
         name = "estimated wall" if number == 0 else None
         axes.plot(*transform(place, ends_m).T, color=LANDMARK, linewidth=2.0, label=name)
     _draw_landmarks(axes, record.results[-1].belief, place)
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("y [m]")
     axes.margins(0.06)
-    axes.tick_params(length=0)
     if summary is None:
-        _write_plain_title(axes, info, estimate)
+        length_m = float(np.linalg.norm(np.diff(estimate, axis=0), axis=1).sum())
+        title = (
+            f"{info.scene}, preset {info.preset}{' (simulated)' if info.simulated else ''}: "
+            f"{length_m:.1f} m driven, no truth to compare with"
+        )
+        note = "map frame: the origin is the robot's first pose"
     else:
-        _write_title(axes, summary)
+        title = (
+            f"{summary.scene}, preset {summary.preset}, seed {summary.seed} (simulated): "
+            f"ATE {1e3 * summary.ate_rmse_m:.1f} mm, "
+            f"{summary.ate_ratio:.2f} of odometry's {1e3 * summary.odometry_ate_rmse_m:.1f} mm"
+        )
+        note = (
+            "drawn from the start pose, while the ATE is after SE(2) alignment; "
+            f"last state {1e3 * summary.final_error_m:.0f} mm off"
+        )
+    label(axes, title, "x [m]", "y [m]", fontsize=11, pad=24)
+    axes.annotate(
+        note,
+        xy=(0.0, 1.0),
+        xytext=(0.0, 8.0),
+        xycoords="axes fraction",
+        textcoords="offset points",
+        fontsize=8.5,
+        color=PALE_INK,
+    )
     # beside the axes, below a title that may be longer than they are wide
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, handlelength=1.6)
 
@@ -257,46 +250,3 @@ def _world_from_odom(record: RunRecord) -> NDArray[np.float64]:
 def _first_pose(record: RunRecord) -> NDArray[np.float64]:
     pose: NDArray[np.float64] = record.results[0].belief.pose
     return compose(record.world_from_map, pose)
-
-
-def _write_plain_title(axes: Axes, info: SessionInfo, estimate: NDArray[np.float64]) -> None:
-    length_m = float(np.linalg.norm(np.diff(estimate, axis=0), axis=1).sum())
-    axes.set_title(
-        f"{info.scene}, preset {info.preset}{' (simulated)' if info.simulated else ''}: "
-        f"{length_m:.1f} m driven, no truth to compare with",
-        loc="left",
-        fontsize=11,
-        color=INK,
-        pad=24,
-    )
-    axes.annotate(
-        "map frame: the origin is the robot's first pose",
-        xy=(0.0, 1.0),
-        xytext=(0.0, 8.0),
-        xycoords="axes fraction",
-        textcoords="offset points",
-        fontsize=8.5,
-        color=PALE_INK,
-    )
-
-
-def _write_title(axes: Axes, summary: Summary) -> None:
-    axes.set_title(
-        f"{summary.scene}, preset {summary.preset}, seed {summary.seed} (simulated): "
-        f"ATE {1e3 * summary.ate_rmse_m:.1f} mm, "
-        f"{summary.ate_ratio:.2f} of odometry's {1e3 * summary.odometry_ate_rmse_m:.1f} mm",
-        loc="left",
-        fontsize=11,
-        color=INK,
-        pad=24,
-    )
-    axes.annotate(
-        "drawn from the start pose, while the ATE is after SE(2) alignment; "
-        f"last state {1e3 * summary.final_error_m:.0f} mm off",
-        xy=(0.0, 1.0),
-        xytext=(0.0, 8.0),
-        xycoords="axes fraction",
-        textcoords="offset points",
-        fontsize=8.5,
-        color=PALE_INK,
-    )

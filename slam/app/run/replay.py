@@ -33,15 +33,10 @@ from slam.results import PoseAt, Slam, StepResult
 from xethru_protocol.system import StopFlag
 
 
-class RecordedSlam:
+class _RecordedSlam:
     """Steps a pipeline with recorded detections instead of frames.
 
-    Parameters
-    ----------
-    slam
-        The pipeline.
-    detections
-        By the time of the scan [ns]; a scan without entry has none.
+    They are by the time of the scan [ns]; a scan without entry has none.
     """
 
     def __init__(self, slam: Slam, detections: Mapping[int, Sequence[Detection]]) -> None:
@@ -57,15 +52,7 @@ class RecordedSlam:
 
 
 def run_replay(stop: StopFlag, *, session: Path, out: Path) -> None:
-    """Replay a session, write its results into a folder and print its table.
-
-    Raises
-    ------
-    AppError
-        The session cannot be read, or its folder not be written; one line.
-    StopRequestedError
-        A signal arrived.
-    """
+    """Replay a session, write its results into a folder and print its table."""
     recorded = open_session(session)
     comparison = Comparison()
     source = recorded_source(recorded, stop, comparison)
@@ -80,13 +67,7 @@ def run_replay(stop: StopFlag, *, session: Path, out: Path) -> None:
 
 
 def recorded_config(session: RecordedSession) -> SlamConfig:
-    """Return the settings of the run.
-
-    Raises
-    ------
-    AppError
-        This version does not know them, or they cannot be read.
-    """
+    """Return the settings of the run; raise AppError if this version cannot read them."""
     try:
         tables = json.loads(session.info.config_json)
         if isinstance(tables, dict):
@@ -110,14 +91,7 @@ def recorded_source(
 ) -> RunSource:
     """Return a session as the source of a run that steps SLAM as the recorded one did.
 
-    Parameters
-    ----------
-    session
-        What was recorded.
-    stop
-        Checked once per scan.
-    comparison
-        Gets every recorded state, before the replay begins.
+    `comparison` gets every recorded state, before the replay begins.
 
     Raises
     ------
@@ -152,7 +126,7 @@ def recorded_source(
     return RunSource(
         info=session.info,
         rig=session.rig,
-        slam=RecordedSlam(slam, session.detections()) if session.info.has_detections else slam,
+        slam=_RecordedSlam(slam, session.detections()) if session.info.has_detections else slam,
         scans=scans,
         odometry=odometry,
         truth_at=scans.truth_at,
@@ -212,7 +186,6 @@ class Comparison(SessionObserver):
         self._first_other_ns: int | None = None
 
     def expect(self, snapshot: Snapshot) -> None:
-        """Take a recorded state."""
         self._expected[snapshot.t_ns] = _digest(snapshot)
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
@@ -225,7 +198,6 @@ class Comparison(SessionObserver):
             self._first_other_ns = snapshot.t_ns
 
     def verdict(self) -> str:
-        """Return the outcome as text for the user."""
         if not self._expected:
             return "no states are recorded, so there are none to compare with"
         if self._n_same == len(self._expected):

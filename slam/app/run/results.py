@@ -7,7 +7,7 @@ import math
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from slam.app.errors import AppError, naming
 from slam.app.odometry.track import NS_PER_S, Trajectory, read_tum, write_tum
 from slam.app.records import SessionInfo
-from slam.app.run.evaluation import Summary, summarise
+from slam.app.run.evaluation import LandmarkSummary, Summary, summarise
 from slam.app.run.output import Row, print_result
 from slam.app.run.runner import RunRecord, RunSource
 from slam.evaluation import associate_times, ate_rmse_m
@@ -30,12 +30,7 @@ def finish(
 ) -> None:
     """Write a run's results into an existing folder and print its table; `also` are more rows.
 
-    Raises
-    ------
-    AppError
-        A file cannot be written; the table is printed nevertheless.
-    StopRequestedError
-        A signal arrived between two files.
+    If a file cannot be written, the table is printed nevertheless.
     """
     stop.check()
     summary = summary_of(source, record)
@@ -76,10 +71,11 @@ def _write(
     write_trajectories(out, record)
     stop.check()
     if record.results:
-        from slam.app.run.pictures import draw_map  # loads matplotlib, half a second
+        # loads matplotlib, half a second
+        from slam.app.run.pictures import draw_map, picture
 
-        with naming(path := out / "map.png"):
-            draw_map(path, info, record, summary)
+        with picture(out / "map.png", width_in=9.0, height_in=6.6, dpi=150) as figure:
+            draw_map(figure, info, record, summary)
         stop.check()
 
 
@@ -101,39 +97,23 @@ def _summary_without_truth(info: SessionInfo, record: RunRecord) -> str:
     """Return the text of summary.json with null for everything that needs the truth."""
     duration_s = record.duration_ns / NS_PER_S
     n_landmarks = len(record.results[-1].belief.landmark_ids) if record.results else 0
-    fields = {
+    unknown: dict[str, object] = {row.name: None for row in fields(Summary)}
+    del unknown["nis_times"]
+    known = {
         "scene": info.scene,
         "preset": info.preset,
         "seed": info.seed,
         "frames": record.n_frames,
         "duration_s": duration_s,
         "realtime_factor": duration_s / record.wall_s,
-        "ate_rmse_m": None,
-        "ate_icp_rmse_m": None,
-        "odometry_ate_rmse_m": None,
-        "final_error_m": None,
-        "landmarks": {
-            "true": None,
-            "estimated": n_landmarks,
-            "precision": None,
-            "recall": None,
-            "duplicates": None,
-            "rmse_m": None,
-        },
-        "nees_pose": None,
-        "nis_mean": None,
+        "landmarks": {row.name: None for row in fields(LandmarkSummary)}
+        | {"estimated": n_landmarks},
     }
-    return json.dumps(fields, indent=2, allow_nan=False)
+    return json.dumps(unknown | known, indent=2, allow_nan=False)
 
 
 def prepare_folder(out: Path, names: tuple[str, ...], held: ExitStack) -> None:
-    """Make a folder, lock it, and remove an earlier run's files so that no two runs mix.
-
-    Raises
-    ------
-    AppError
-        It cannot be made, or another run writes there.
-    """
+    """Make a folder, lock it, and remove an earlier run's files so that no two runs mix."""
     with naming(out):
         out.mkdir(parents=True, exist_ok=True)
         try:
@@ -162,12 +142,8 @@ _TOLERANCE_NS = NS_PER_S // 100
 def evaluate(estimate: Path, reference: Path) -> dict[str, float | int | str | None]:
     """Return the ATE of one TUM file against another, with the numbers of poses.
 
-    The ATE is None where positions are so large that it overflows.
-
-    Raises
-    ------
-    AppError
-        A file cannot be read, or the two have fewer than two stamps in common.
+    The ATE is None where positions are so large that it overflows. Two files with fewer than two
+    stamps in common raise AppError.
     """
     est, ref = read_tum(estimate), read_tum(reference)
     est_rows, ref_rows = associate_times(est.stamps_ns, ref.stamps_ns, _TOLERANCE_NS)
@@ -197,7 +173,6 @@ def _finite_ate_m(
 
 
 def run_evaluate(stop: StopFlag, *, estimate: Path, reference: Path, as_json: bool) -> None:
-    """Print the ATE as a line, or as one JSON object."""
     result = evaluate(estimate, reference)
     if as_json:
         sys.stdout.write(json.dumps(result, allow_nan=False) + "\n")

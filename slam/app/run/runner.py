@@ -58,7 +58,6 @@ class LinkLog(SessionObserver):
             self.pass_on(line)
 
     def on_record(self, radar: str, record: ProtocolRecord) -> None:
-        """Log one command, answer, SYSTEM message or fault of a radar's link."""
         text = f"{record.direction} {record.summary}"
         self.log(radar, text, warning=record.direction == "fault")
 
@@ -75,7 +74,6 @@ class LinkLog(SessionObserver):
             sink.on_log(line)
 
     def on_scan(self, scan: Scan) -> None:
-        """Take over session time."""
         self._t_ns = scan.t_ns
 
 
@@ -86,11 +84,9 @@ class RunSource:
     Attributes
     ----------
     info
-        Describes the run; SLAM gets the frames of its radars without their gains.
+        SLAM gets the frames of its radars without their gains.
     rig
         The mounts that SLAM uses.
-    slam, scans, odometry
-        The pipeline and its input.
     truth_at
         For sinks and results only.
     lost_frames
@@ -183,9 +179,9 @@ def run_slam(
 ) -> RunRecord:
     """Feed scans to SLAM as they come, and scans and states to the observers.
 
-    A scan that is not `used` goes to the observers only. BLAS runs on one thread, as in every
-    other path, so that results are the same bits. Truth goes to the observers only; they get
-    frames as received, SLAM gets them without each radar's gain, if `gains_db` has any.
+    A scan that is not `used` goes to the observers only, and so does the truth. BLAS runs on one
+    thread, as everywhere else, so that results are the same bits. Observers get frames as received,
+    SLAM gets them without each radar's gain, if `gains_db` has any.
 
     Raises
     ------
@@ -206,7 +202,7 @@ def run_slam(
             results.append(result)
             truths.append(truth)
             assert world_from_map is not None
-            snapshot = make_snapshot(result, counter_at.pop(result.t_ns), truth, world_from_map)
+            snapshot = _snapshot(result, counter_at.pop(result.t_ns), truth, world_from_map)
             for observer in observers:
                 observer.on_snapshot(snapshot)
 
@@ -222,7 +218,7 @@ def run_slam(
                 world_from_map = np.nan_to_num(truth_at(np.array([scan.t_ns]))[0])
             counter_at[scan.t_ns] = scan.counter
             n_frames += len(scan.frames)
-            frames = [less_gain(f, gains_db[f.radar]) if gains_db else f for f in scan.frames]
+            frames = [_less_gain(f, gains_db[f.radar]) if gains_db else f for f in scan.frames]
             take(slam.step(frames, odometry.pose_at, scan.t_ns))
         take(slam.flush())
     return RunRecord(
@@ -237,7 +233,7 @@ def run_slam(
     )
 
 
-def less_gain(frame: RadarFrame, gain_db: float) -> RadarFrame:
+def _less_gain(frame: RadarFrame, gain_db: float) -> RadarFrame:
     """Return a frame as a radar without gain would give it, with its limits scaled, too."""
     if gain_db == 0.0:
         return frame
@@ -249,13 +245,12 @@ def less_gain(frame: RadarFrame, gain_db: float) -> RadarFrame:
     return replace(frame, samples=frame.samples * scale, limits=limits)
 
 
-def make_snapshot(
+def _snapshot(
     result: StepResult,
     counter: int,
     truth: NDArray[np.float64],
     world_from_map: NDArray[np.float64],
 ) -> Snapshot:
-    """Reduce a result of the pipeline to what logs and viewers show."""
     belief = result.belief
     rows = range(len(belief.landmark_ids))
     return Snapshot(
@@ -304,7 +299,7 @@ class LinkCount:
     ----------
     frames, lost, faults
         Frames that came; counters missing between them; warnings in the log of its link.
-    last_counter, last_t_ns
+    last_counter
         Of its newest frame; None before the first.
     longest_gap
         Most frames lost in a row.
@@ -316,26 +311,16 @@ class LinkCount:
     lost: int = 0
     faults: int = 0
     last_counter: int | None = None
-    last_t_ns: int | None = None
     longest_gap: int = 0
     state: LinkState | None = None
 
 
-@dataclass(slots=True)
 class LinkStates:
-    """Follows the links of all radars.
+    """Follows the links of all radars, given in the order of the frames' radar index."""
 
-    Parameters
-    ----------
-    radars
-        In the order of the frames' radar index.
-    """
-
-    radars: tuple[RadarInfo, ...]
-    counts: dict[str, LinkCount] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.counts = {radar.name: LinkCount() for radar in self.radars}
+    def __init__(self, radars: Sequence[RadarInfo]) -> None:
+        self.radars = radars
+        self.counts = {radar.name: LinkCount() for radar in radars}
 
     def on_scan(self, scan: Scan) -> Iterator[LinkChange]:
         """Yield the changes in one tick; a radar without a frame in it is silent.
@@ -355,12 +340,11 @@ class LinkStates:
             count.frames += 1
             count.lost += gap
             count.longest_gap = max(count.longest_gap, gap)
-            count.last_counter, count.last_t_ns = frame.counter, frame.t_ns
+            count.last_counter = frame.counter
             state = LinkState.FRAMES_LOST if gap else LinkState.STREAMING
             yield from self._change(radar.name, frame.t_ns, state)
 
     def on_log(self, line: LogLine) -> Iterator[LinkChange]:
-        """Yield the change that follows from a line of the log, if any."""
         count = self.counts.get(line.radar)
         if count is None:
             return  # a line about something else than a radar
@@ -371,7 +355,6 @@ class LinkStates:
             yield from self._change(line.radar, line.t_ns, LinkState.SETTING_UP)
 
     def end(self, t_ns: int) -> Iterator[LinkChange]:
-        """Yield the end of every link."""
         for radar in self.radars:
             yield from self._change(radar.name, t_ns, LinkState.ENDED)
 

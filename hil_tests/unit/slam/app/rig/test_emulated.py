@@ -11,7 +11,6 @@ from hil_tests.patience import wait_until
 from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.sessions import session_info
 from slam.app.cli import main
-from slam.app.commands.demo import WireTap
 from slam.app.errors import EmulatorError
 from slam.app.records import Scan, SessionInfo
 from slam.app.rig import emulated as emulator_process
@@ -99,7 +98,8 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Scan]
     scene, _ = scene_and_config(str(write_short_scene(folder)), "paper")
     path = folder / "session.mcap"
     with open_loopback(scene, 3) as source:
-        tap = WireTap(source)
+        early = []
+        source.listen(lambda *row: early.append(row))
         source.start(RAW_CONFIG, FRAME_RATE_HZ)
         info = SessionInfo(
             scene="short",
@@ -110,7 +110,9 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Scan]
             versions={},
         )
         log = SessionLog(path, info)
-        tap.attach(log)
+        for row in early:
+            log.on_wire(*row)
+        source.listen(log.on_wire)
         scans = []
         for scan in source.scans(N_SCANS, lambda: None):
             log.on_scan(scan)
