@@ -7,7 +7,7 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -23,25 +23,26 @@ from slam.app.sweep.run import make_case, run_case
 pytestmark = pytest.mark.slow
 
 
-def sweep(tmp_path: Path, jobs: int) -> dict[str, Any]:
-    scene, out = write_short_scene(tmp_path), tmp_path / f"sweep{jobs}.json"
-    command = [sys.executable, "-m", "slam.app.cli", "sweep", "--scene", str(scene)]
-    command += ["--preset", "paper"]
-    command += ["--seeds", "3", "--jobs", str(jobs), "--json", str(out)]
-    run = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert run.stdout.startswith("short, preset paper, 3 seeds (simulated): SLAM ATE median")
+SWEEP = (sys.executable, "-m", "slam.app.cli", "sweep", "--preset", "paper", "--scene")
+
+
+def sweep(scene: Path, out: Path, *options: str) -> dict[str, Any]:
+    """Return the result of a command, without what depends on the clock."""
+    command = [*SWEEP, str(scene), "--json", str(out), *options]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.startswith("short, preset paper, ")
     result: dict[str, Any] = json.loads(out.read_text())
+    assert run.stderr.count(" elapsed, ") == run.stderr.count("\n") == len(result["runs"])
+    for row in (*result["runs"], *result["groups"]):
+        del row["realtime_factor"]
     return result
 
 
 def test_one_and_two_processes_give_the_same_numbers(tmp_path: Path) -> None:
-    alone, together = sweep(tmp_path, 1), sweep(tmp_path, 2)
-    for result in (alone, together):
-        for run in result["runs"]:
-            del run["realtime_factor"]
-        for group in result["groups"]:
-            del group["realtime_factor"]
-    assert alone == together
+    scene = write_short_scene(tmp_path)
+    alone = sweep(scene, tmp_path / "1.json", "--seeds", "3", "--jobs", "1")
+    assert alone == sweep(scene, tmp_path / "2.json", "--seeds", "3", "--jobs", "2")
     assert [run["seed"] for run in alone["runs"]] == [0, 1, 2]
     (group,) = alone["groups"]
     errors = [run["ate_rmse_m"] for run in alone["runs"]]
@@ -53,9 +54,16 @@ def test_one_and_two_processes_give_the_same_numbers(tmp_path: Path) -> None:
 
 def test_ctrl_c_ends_a_sweep_and_its_workers(tmp_path: Path) -> None:
     scene = write_short_scene(tmp_path)
-    command = [sys.executable, "-m", "slam.app.cli", "sweep", "--seeds", "50"]
-    command += ["--scene", str(scene), "--preset", "paper"]
-    command += ["--jobs", "2", "--json", str(tmp_path / "o.json")]
+    command = [
+        *SWEEP,
+        str(scene),
+        "--seeds",
+        "50",
+        "--jobs",
+        "2",
+        "--json",
+        str(tmp_path / "o.json"),
+    ]
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, process_group=0
     )
@@ -138,22 +146,9 @@ def scheduler_address(scheduler: subprocess.Popen[str]) -> str:
     raise AssertionError("the scheduler ended without a word")
 
 
-def sweep_on(scene: Path, out: Path, where: Sequence[str]) -> dict[str, Any]:
-    command = [sys.executable, "-m", "slam.app.cli", "sweep", "--scene", str(scene)]
-    command += ["--preset", "paper"]
-    command += ["--seeds", "1", "--stress", "dropped", "--json", str(out), *where]
-    run = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert run.returncode == 0, run.stderr
-    assert run.stderr.count(" elapsed, ") == run.stderr.count("\n") == 2
-    result: dict[str, Any] = json.loads(out.read_text())
-    for row in (*result["runs"], *result["groups"]):
-        del row["realtime_factor"]  # of the wall clock
-    return result
-
-
 def test_a_cluster_gives_what_one_machine_gives(tmp_path: Path) -> None:
     pytest.importorskip("distributed")
-    scene = write_short_scene(tmp_path)
+    scene, stressed = write_short_scene(tmp_path), ("--seeds", "1", "--stress", "dropped")
     with ExitStack() as stack:
         scheduler = stack.enter_context(dask("scheduler", *QUIET, "--port", "0"))
         address = scheduler_address(scheduler)
@@ -161,6 +156,6 @@ def test_a_cluster_gives_what_one_machine_gives(tmp_path: Path) -> None:
         for name in ("a", "b"):
             folder = str(tmp_path / name)
             stack.enter_context(dask(*worker, "--name", name, "--local-directory", folder))
-        clustered = sweep_on(scene, tmp_path / "cluster.json", ["--dask", address])
-    assert clustered == sweep_on(scene, tmp_path / "alone.json", ["--jobs", "1"])
+        clustered = sweep(scene, tmp_path / "cluster.json", *stressed, "--dask", address)
+    assert clustered == sweep(scene, tmp_path / "alone.json", *stressed, "--jobs", "1")
     assert [run["stress"] for run in clustered["runs"]] == ["clean", "dropped"]

@@ -3,7 +3,6 @@
 import asyncio
 import inspect
 from collections.abc import Callable, Iterator
-from types import TracebackType
 from typing import Any, Protocol, Self, cast
 
 from hil_tests.unit.xethru_protocol.scripted import Answer, PlainModule, ScriptedTransport
@@ -58,13 +57,8 @@ class Blocking:
         self.runner.run(self.target.__aenter__())
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.runner.run(self.target.__aexit__(kind, error, trace))
+    def __exit__(self, *reason: object) -> None:
+        self.runner.run(self.target.__aexit__(*reason))
 
     def _iterate(self, items: Any) -> Iterator[Any]:  # noqa: ANN401 - an asynchronous generator
         async def take() -> Any:  # noqa: ANN401 - as above

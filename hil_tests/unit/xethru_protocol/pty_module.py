@@ -10,7 +10,6 @@ import threading
 import tty
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from hil_tests.unit.xethru_protocol.scripted import PlainModule, frame
@@ -118,12 +117,7 @@ class PtyModule:
         self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *reason: object) -> None:
         self._stop.set()
         self._thread.join()
         self._unplug()
@@ -200,7 +194,7 @@ class PtyMachine:
         self._plugged[name] = self._cleanup.enter_context(module)
 
     def unplug(self, name: str) -> None:
-        self._plugged.pop(name).__exit__(None, None, None)
+        self._plugged.pop(name).__exit__()
 
     def received(self, name: str) -> list[m.Message]:
         return list(self._plugged[name].received)
@@ -208,10 +202,5 @@ class PtyMachine:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *reason: object) -> None:
         self._cleanup.close()

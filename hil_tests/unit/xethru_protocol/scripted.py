@@ -1,6 +1,7 @@
 """A line to a module that says what a test wrote down, on a virtual clock."""
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -83,6 +84,15 @@ class ScriptedTransport:
     def _check_open(self) -> None:
         if self.closed or self.gone:
             raise Disconnected(f"{self.name} was disconnected")
+
+
+def framed(payload: bytes) -> bytes:
+    """Frame a payload as Protocol reference 1.1 says, without the product's encoder."""
+    checksum = 0x7D
+    for byte in payload:
+        checksum ^= byte
+    content = re.sub(rb"[\x7d-\x7f]", b"\x7f\\g<0>", payload + bytes([checksum]))
+    return b"\x7d" + content + b"\x7e"
 
 
 def frame(counter: int, bins: int = 1431) -> m.DataFloat:

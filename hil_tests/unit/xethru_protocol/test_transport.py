@@ -15,10 +15,11 @@ from pathlib import Path
 
 import pytest
 import serial
+from serial.tools.list_ports_common import ListPortInfo
 
 from hil_tests.patience import wait_until
 from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.transport import SerialTransport
+from xethru_protocol.transport import SerialTransport, find_ports
 from xethru_protocol.wire.errors import Disconnected, LocalProtocolError, PortUnavailable
 
 
@@ -43,27 +44,32 @@ def line() -> Iterator[Line]:
     line.unplug()
 
 
-def test_bytes_go_both_ways(line: Line) -> None:
+@pytest.fixture
+def port(line: Line) -> Iterator[SerialTransport]:
     port = SerialTransport(line.path)
+    yield port
+    port.close()
+
+
+def test_bytes_go_both_ways(line: Line, port: SerialTransport) -> None:
     os.write(line.master, bytes(range(256)))
     assert port.read(1.0) == bytes(range(256))
     assert port.read(0.0) == b""
     port.write(b"\x7d\x10\x6d\x7e")
     assert os.read(line.master, 99) == b"\x7d\x10\x6d\x7e"
     assert port.name == line.path
-    port.close()
 
 
-def test_one_program_at_a_time(line: Line) -> None:
-    port = SerialTransport(line.path)
+def test_one_program_at_a_time(line: Line, port: SerialTransport) -> None:
     with pytest.raises(PortUnavailable, match=f"port {line.path} is in use by another program"):
         SerialTransport(line.path)
     port.close()
     SerialTransport(line.path).close()
 
 
-def test_unplugged_port_is_disconnected_and_can_be_closed(line: Line) -> None:
-    port = SerialTransport(line.path)
+def test_unplugged_port_is_disconnected_and_can_be_closed(
+    line: Line, port: SerialTransport
+) -> None:
     line.unplug()
     with pytest.raises(Disconnected, match="was disconnected"):
         port.read(1.0)
@@ -75,17 +81,14 @@ def test_unplugged_port_is_disconnected_and_can_be_closed(line: Line) -> None:
         port.read(0.0)
 
 
-def test_read_waits_for_what_comes_in_time(line: Line) -> None:
-    port = SerialTransport(line.path)
+def test_read_waits_for_what_comes_in_time(line: Line, port: SerialTransport) -> None:
     timer = threading.Timer(0.1, os.write, (line.master, b"late"))
     timer.start()
     assert port.read(math.inf) == b"late"
     timer.join()
-    port.close()
 
 
-def test_long_writes_wait_for_room(line: Line) -> None:
-    port = SerialTransport(line.path)
+def test_long_writes_wait_for_room(line: Line, port: SerialTransport) -> None:
     data = bytes(range(256)) * 400
     got = bytearray()
 
@@ -99,20 +102,18 @@ def test_long_writes_wait_for_room(line: Line) -> None:
     port.write(data)
     reader.join()
     assert bytes(got) == data
-    port.close()
 
 
-def test_line_that_takes_nothing_is_given_up(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_line_that_takes_nothing_is_given_up(
+    port: SerialTransport, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("xethru_protocol.transport._WRITE_TIMEOUT_S", 0.1)
-    port = SerialTransport(line.path)
     with pytest.raises(Disconnected, match="takes no data any more; is the module hanging"):
         port.write(bytes(1 << 20))
-    port.close()
 
 
-def test_frame_is_read_in_few_pieces_never_byte_by_byte(line: Line) -> None:
+def test_frame_is_read_in_few_pieces_never_byte_by_byte(line: Line, port: SerialTransport) -> None:
     """Field measurement: pyserial's read(1) carries 49 frames/s, reads of all there is 43 900."""
-    port = SerialTransport(line.path)
     os.write(line.master, bytes(5747))  # a radar frame; one read of a tty gives at most 4095
     sizes: list[int] = []
 
@@ -124,7 +125,6 @@ def test_frame_is_read_in_few_pieces_never_byte_by_byte(line: Line) -> None:
         wait_until(is_full)
         sizes.append(len(port.read(1.0)))
     assert len(sizes) == 2
-    port.close()
 
 
 def test_every_byte_passes_unchanged_although_the_line_was_not_raw() -> None:
@@ -157,8 +157,7 @@ def test_port_without_modem_lines_is_opened_and_closed(line: Line) -> None:
     port.close()
 
 
-def test_line_is_pending_data_first_then_disconnected(line: Line) -> None:
-    port = SerialTransport(line.path)
+def test_line_is_pending_data_first_then_disconnected(line: Line, port: SerialTransport) -> None:
     os.write(line.master, b"last words")
     assert port.read(0.5) == b"last words"
     line.unplug()
@@ -171,8 +170,7 @@ def test_line_is_pending_data_first_then_disconnected(line: Line) -> None:
         port.fileno()
 
 
-def test_only_a_uart_has_a_limit(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
-    port = SerialTransport(line.path)
+def test_only_a_uart_has_a_limit(port: SerialTransport, monkeypatch: pytest.MonkeyPatch) -> None:
     assert port.bytes_per_s == math.inf
     for real, limit in [
         ("/dev/ttyUSB0", 11520.0),
@@ -181,7 +179,6 @@ def test_only_a_uart_has_a_limit(line: Line, monkeypatch: pytest.MonkeyPatch) ->
     ]:
         monkeypatch.setattr("os.path.realpath", lambda path, real=real: real)
         assert port.bytes_per_s == limit
-    port.close()
 
 
 def test_descriptors_above_1023_work(line: Line) -> None:
@@ -205,19 +202,30 @@ def test_descriptors_above_1023_work(line: Line) -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
+def test_only_known_usb_ids_are_modules(monkeypatch: pytest.MonkeyPatch) -> None:
+    listed = []
+    for path, vendor_id, product_id in [
+        ("/dev/ttyACM1", 0x03EB, 0x2404),
+        ("/dev/ttyACM0", 0x03EB, 0x6124),
+        ("/dev/ttyACM2", 0x2341, 0x0043),
+        ("/dev/ttyS0", None, None),
+    ]:
+        listed.append(ListPortInfo(path))
+        listed[-1].vid, listed[-1].pid = vendor_id, product_id
+    monkeypatch.setattr("xethru_protocol.transport.list_ports.comports", lambda: listed)
+    monkeypatch.setattr("xethru_protocol.transport._emulated_ports", lambda folder: iter(()))
+    assert [found.path for found in find_ports()] == ["/dev/ttyACM0", "/dev/ttyACM1"]
+
+
 def test_missing_port_says_where_to_look(tmp_path: Path) -> None:
     with pytest.raises(PortUnavailable, match=r"there is no port .*/radar; 'xethru list'"):
         SerialTransport(str(tmp_path / "radar"))
 
 
-@pytest.mark.parametrize("kind", ["file", "folder"])
-def test_what_is_no_port_is_called_so(tmp_path: Path, kind: str) -> None:
-    path = tmp_path
-    if kind == "file":
-        path = tmp_path / "notes.txt"
-        path.write_text("hello")
-    with pytest.raises(PortUnavailable, match="is not a serial port"):
-        SerialTransport(str(path))
+def test_what_is_no_port_is_called_so(tmp_path: Path) -> None:
+    for path in (__file__, str(tmp_path)):
+        with pytest.raises(PortUnavailable, match="is not a serial port"):
+            SerialTransport(path)
 
 
 def test_a_rate_beyond_all_sense_is_no_port(line: Line) -> None:

@@ -91,16 +91,27 @@ def test_reset_sends_that_and_nothing_else(module: PtyModule) -> None:
     assert module.received == [m.ModReset()]
 
 
-def test_list_shows_running_emulators_only(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def emulated_ports(capsys: pytest.CaptureFixture[str]) -> list[dict[str, Any]]:
+    assert main(["list", "--json"]) == 0
+    (found,) = lines_of(capsys)
+    return [port for port in found["ports"] if port["kind"] == "emulated"]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the folder in which emulators are registered."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    folder = tmp_path / "xethru"
-    folder.mkdir()
-    port = tmp_path / "left"
+    (tmp_path / "xethru").mkdir()
+    return tmp_path / "xethru"
+
+
+def test_list_shows_running_emulators_only(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    port = folder / "left"
     port.touch()
     here = {"path": str(port), "name": "left", "serial": "42", "tcp": None}
-    gone = {"path": str(tmp_path / "gone"), "name": "gone", "serial": "43", "tcp": None}
+    gone = {"path": str(folder / "gone"), "name": "gone", "serial": "43", "tcp": None}
     running = {"ready": True, "pid": 1, "devices": [here, gone]}
     (folder / "1.json").write_text(json.dumps(running))
     (folder / "2.json").write_text(json.dumps(running | {"pid": 1 << 22}))  # above any pid
@@ -108,9 +119,7 @@ def test_list_shows_running_emulators_only(
     for number, pid in enumerate(["1e999", str(1 << 70), "-1", "0"], start=4):
         word = json.dumps(running | {"pid": "PID"}).replace('"PID"', pid)
         (folder / f"{number}.json").write_text(word)
-    assert main(["list", "--json"]) == 0
-    (found,) = lines_of(capsys)
-    assert [port for port in found["ports"] if port["kind"] == "emulated"] == [
+    assert emulated_ports(capsys) == [
         {"path": str(port), "kind": "emulated", "description": "emulated left", "serial": "42"}
     ]
 
@@ -119,14 +128,9 @@ def test_list_shows_running_emulators_only(
     "path", ["x" * 5000, "\0", "\ud800", "a\nb"], ids=["long", "NUL", "surrogate", "line end"]
 )
 def test_list_passes_over_what_can_be_no_path(
-    path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    path: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    folder = tmp_path / "xethru"
-    folder.mkdir()
     device = {"path": path, "name": "left", "serial": "42"}
     (folder / "1.json").write_text(json.dumps({"pid": 1, "devices": [device]}))
     (folder / "2.json").write_text("[" * 100_000)
-    assert main(["list", "--json"]) == 0
-    (found,) = lines_of(capsys)
-    assert [port for port in found["ports"] if port["kind"] == "emulated"] == []
+    assert emulated_ports(capsys) == []

@@ -11,6 +11,7 @@ import pytest
 
 from hil_tests.golden.test_protocol_vectors import KNOWN
 from hil_tests.golden.vectors import ABOUT, Vector, load
+from hil_tests.unit.xethru_protocol.scripted import framed
 from xethru_protocol.cli import main
 
 VECTORS = load()
@@ -80,15 +81,6 @@ def test_an_ack_is_its_code_alone(
     wire = framed(bytes.fromhex(payload))
     (found,) = decoded(capsys, tmp_path, [wire.hex()], "--from", sender)
     assert found["message"] == message
-
-
-def framed(payload: bytes) -> bytes:
-    """Frame a payload without special bytes in it."""
-    checksum = 0x7D
-    for byte in payload:
-        checksum ^= byte
-    assert not {0x7D, 0x7E, 0x7F} & {*payload, checksum}
-    return b"\x7d" + payload + bytes((checksum,)) + b"\x7e"
 
 
 def test_statistics_are_one_json_object_on_standard_error(

@@ -1,12 +1,11 @@
 """How ``xethru`` ends when its output is closed or full, and what it says when a module hangs."""
 
 import io
+import json
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,6 @@ import pytest
 from hil_tests.patience import seconds, wait_until
 from hil_tests.unit.xethru_protocol.pty_module import PtyModule
 from xethru_protocol.cli import main, output
-from xethru_protocol.cli import output as session
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings import describe_recording
 from xethru_protocol.wire.errors import Disconnected, ResponseTimeout
@@ -81,36 +79,53 @@ def test_a_dash_is_standard_input() -> None:
     assert (result.returncode, result.stdout, result.stderr) == (0, 2 * ACK, "")
 
 
-# --- a terminal that closes -----------------------------------------------------------------------
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+@pytest.mark.parametrize("command", ["list", "info", "ping", "stream", "doctor"])
+def test_what_cannot_be_printed_is_one_line(command: str) -> None:
+    with PtyModule() as module:
+        port = "" if command == "list" else f"--port {module.path}"
+        result = shell(f"{XETHRU} {command} {port} >/dev/full")
+        assert module.fps == 0
+    text = "standard output cannot be written: No space left on device"
+    assert (result.returncode, result.stderr) == (1, f"xethru {command}: {text}\n")
 
 
 @pytest.mark.parametrize(
-    ("before", "code"),
-    [(signal.SIG_DFL, 129), (signal.SIG_IGN, 0)],
-    ids=["without nohup", "with nohup"],
+    ("number", "before", "code"),
+    [
+        (signal.SIGINT, signal.SIG_DFL, 130),
+        (signal.SIGTERM, signal.SIG_DFL, 143),
+        (signal.SIGHUP, signal.SIG_DFL, 129),
+        (signal.SIGHUP, signal.SIG_IGN, 0),
+    ],
+    ids=["SIGINT", "SIGTERM", "SIGHUP", "SIGHUP with nohup"],
 )
-def test_the_module_is_stopped_when_the_terminal_closes(
-    before: signal.Handlers, code: int, tmp_path: Path
+def test_a_signal_leaves_a_complete_recording_and_a_stopped_module(
+    number: signal.Signals, before: signal.Handlers, code: int, tmp_path: Path
 ) -> None:
     out = tmp_path / "recording"
-    command = [*XETHRU.split(), "record", "--out", str(out), "--count", "100", "--port"]
+    command = [*XETHRU.split(), "record", "--out", str(out), "--count", "100", "--json", "--port"]
     with (
         PtyModule() as module,
         subprocess.Popen(
             [*command, module.path],
             stderr=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
             preexec_fn=lambda: signal.signal(signal.SIGHUP, before),
         ) as process,
     ):
         files = "xethru_datafloat_*"
         wait_until(lambda: any(path.stat().st_size for path in out.glob(files)), process)
-        process.send_signal(signal.SIGHUP)
-        _, errors = process.communicate(timeout=seconds(10))
+        process.send_signal(number)
+        printed, errors = process.communicate(timeout=seconds(10))
         assert module.fps == 0
     assert (process.returncode, errors) == (code, b"")
+    summary = json.loads(printed)
+    assert summary["ended_by"] == ("signal" if code else "count")
+    assert summary["link"]["frames_lost"] == 0
     kept = describe_recording(out)  # complete: no faults
-    assert (kept.faults, kept.messages["DATA FLOAT"] == 100) == ((), code == 0)
+    assert (kept.faults, kept.messages) == ((), {"DATA FLOAT": summary["messages"]})
+    assert summary["messages"] == 100 or code
 
 
 @pytest.mark.parametrize("name", ["line\nend", "tab\tbell\a", "\udcff\udcfe", "größer ☃"])
@@ -135,6 +150,9 @@ def test_results_that_the_terminal_has_no_letters_for(monkeypatch: pytest.Monkey
 # --- a module that hangs ------------------------------------------------------------------------
 
 
+STOP_FAILED = "the module was not stopped: no answer"
+
+
 class Driver:
     """A driver whose module can be stopped at the end, or not."""
 
@@ -149,53 +167,37 @@ class Driver:
 
     def __exit__(self, *reason: object) -> None:
         if not self._stops:
-            self.warnings.append("the module was not stopped: no answer")
+            self.warnings.append(STOP_FAILED)
 
 
-@contextmanager
-def opened(driver: Driver, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+LOST = "2 frames lost, 1 damaged place on the line"
+SILENT = ResponseTimeout("no frame came")
+
+
+@pytest.mark.parametrize(
+    ("driver", "cause", "raised", "text", "warned"),
+    [
+        (
+            *(Driver(), SILENT, output.CommandFailed),
+            *(r"^no frame came \(and it could not be stopp", []),
+        ),
+        (Driver(), Disconnected("unplugged"), Disconnected, "^unplugged$", []),
+        (Driver("slow", stops=True), SILENT, ResponseTimeout, "^no frame came$", ["slow"]),
+        (Driver(), KeyboardInterrupt(), KeyboardInterrupt, "^$", [STOP_FAILED, LOST]),
+    ],
+    ids=["cause first", "a vanished port", "a warning of before", "a warning after a signal"],
+)
+def test_what_is_reported_of_a_module_that_cannot_be_stopped(
+    driver: Driver,
+    cause: BaseException,
+    raised: type[BaseException],
+    text: str,
+    warned: list[str],
+    *,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     monkeypatch.setattr(X4M300, "open", lambda port, baudrate: driver)
-    with session.module_at("port", 115200):
-        yield
-
-
-def test_the_cause_comes_first_and_in_one_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with (
-        pytest.raises(session.CommandFailed, match=r"^no frame came \(and it could not be stopp"),
-        opened(Driver(), monkeypatch),
-    ):
-        raise ResponseTimeout("no frame came")
-    assert capsys.readouterr().err == ""
-
-
-def test_of_a_vanished_port_only_that_is_reported(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(Disconnected, match=r"^unplugged$"), opened(Driver(), monkeypatch):
-        raise Disconnected("unplugged")
-    assert capsys.readouterr().err == ""
-
-
-def test_a_warning_of_before_is_no_failure_to_stop(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    radar = Driver("30 frames/s are many", stops=True)
-    with (
-        pytest.raises(ResponseTimeout, match=r"^no frame came$"),
-        opened(radar, monkeypatch),
-    ):
-        raise ResponseTimeout("no frame came")
-    assert capsys.readouterr().err == "xethru: 30 frames/s are many\n"
-
-
-def test_after_a_signal_it_is_a_warning(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(KeyboardInterrupt), opened(Driver(), monkeypatch):
-        raise KeyboardInterrupt
-    assert capsys.readouterr().err == (
-        "xethru: the module was not stopped: no answer\n"
-        "xethru: 2 frames lost, 1 damaged place on the line\n"
-    )
+    with pytest.raises(raised, match=text), output.module_at("port", 115200):
+        raise cause
+    assert capsys.readouterr().err == "".join(f"xethru: {line}\n" for line in warned)

@@ -197,6 +197,7 @@ def test_a_full_disk_keeps_what_is_there(module: PtyModule, tmp_path: Path) -> N
     assert "cannot be written: File too large; kept 3 messages in" in line
     assert json.loads(result.stdout)["ended_by"] == "failure"
     assert counters(out) == [0, 1, 2]
+    assert describe_recording(out).faults == ()
 
 
 # --- progress -------------------------------------------------------------------------------------

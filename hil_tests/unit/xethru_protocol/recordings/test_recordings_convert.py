@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from hil_tests.paths import FIXTURES
@@ -31,7 +30,6 @@ from xethru_protocol.recordings import (
     recording_facts,
     recording_format,
 )
-from xethru_protocol.recordings.mcap import FLOAT_ARRAY, pack_array
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import X4Setting
 from xethru_protocol.wire.connection import Connection, Role
@@ -314,18 +312,6 @@ def test_a_session_of_one_radar_is_a_recording(n_radars: int, tmp_path: Path) ->
     assert list(read_recording(tmp_path / "s.mcap")) == [
         (m.DataFloat(info=frame.counter, values=frame.samples), frame.t_ns) for frame in sent
     ]
-
-
-def test_a_file_of_several_radars_is_refused(tmp_path: Path) -> None:
-    with (tmp_path / "x.mcap").open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        for name in ("left", "right"):
-            channel = writer.register_channel(f"/radar/{name}/frame", "cdr", 0)
-            writer.add_message(channel, 0, pack_array(FLOAT_ARRAY, np.zeros(2, np.float32)), 0)
-        writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates in part
-    with pytest.raises(RecordingError, match=r"several radars \(left, right\)"):
-        list(read_recording(tmp_path / "x.mcap"))
 
 
 def test_a_target_that_is_there_or_unknown_is_refused(tmp_path: Path) -> None:

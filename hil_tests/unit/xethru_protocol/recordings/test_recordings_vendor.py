@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import struct
 from datetime import UTC
 from pathlib import Path
@@ -246,12 +245,6 @@ def test_directories_without_session_id_are_not_taken_for_one_recording(
     assert found == frame(1)
 
 
-def test_a_directory_with_a_recording_is_not_written_into(tmp_path: Path) -> None:
-    shutil.copytree(RECORDINGS / "iq", tmp_path / "old")
-    with pytest.raises(RecordingError, match="already holds a recording"):
-        RecordingWriter(tmp_path / "old")
-
-
 def test_a_limit_that_leaves_no_room_is_refused() -> None:
     with pytest.raises(RecordingError, match="must be positive, not 0"):
         Split(records=0)
@@ -281,18 +274,6 @@ def test_records_have_the_values_and_times_that_were_written() -> None:
         np.testing.assert_allclose(message.q, np.arange(1, 11) * counter * -2e-3, rtol=1e-6)
         assert message.range_offset_m == np.float32(0.4)
         assert message.carrier_frequency_hz == np.float32(7.29e9)
-
-
-def test_a_data_file_alone_has_no_times(tmp_path: Path) -> None:
-    (file,) = (RECORDINGS / "iq").glob("*_iq_*.dat")
-    shutil.copy(file, tmp_path)
-    assert [t_ns for _, t_ns in read_recording(tmp_path / file.name)] == [None] * 40
-
-
-def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
-    for path in (tmp_path / "nothing", tmp_path):
-        with pytest.raises(RecordingError):
-            list(read_recording(path))
 
 
 @pytest.mark.skipif(

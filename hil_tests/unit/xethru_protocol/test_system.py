@@ -1,0 +1,199 @@
+"""Signals, locks and files that never end.
+
+A signal sets a flag between steps, raises at once while waiting, and ends a loop; nohup is
+respected. A lock has one owner at a time, leaves no trace and is gone with its owner.
+"""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from emulator.faults.plan import FaultPlanError, load_plan
+from emulator.scene.scene import SceneError, load_scene
+from hil_tests.patience import seconds
+from slam.app.cli import main
+from xethru_protocol.system import (
+    PathInUseError,
+    StopFlag,
+    StopRequestedError,
+    locked,
+    read_bounded,
+)
+
+ENDLESS = "/dev/zero"
+
+
+@pytest.mark.parametrize(
+    ("which", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+)
+def test_a_signal_raises_at_the_next_check_only(which: signal.Signals, code: int) -> None:
+    with StopFlag() as stop:
+        stop.check()
+        os.kill(os.getpid(), which)
+        done = "work goes on until the check"
+        with pytest.raises(StopRequestedError, match=f"stopped by {which.name}") as caught:
+            stop.check()
+    assert done
+    assert caught.value.exit_code == code
+
+
+def test_while_waiting_a_signal_raises_where_it_arrives() -> None:
+    with StopFlag() as stop:
+        threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGTERM)).start()
+        with pytest.raises(StopRequestedError), stop.at_once():
+            pytest.fail(f"it waited to the end: {threading.Event().wait(seconds(10))}")
+
+
+@pytest.mark.parametrize(
+    ("which", "handler"),
+    [(signal.SIGINT, signal.SIG_DFL), (signal.SIGHUP, signal.SIG_IGN)],
+)
+def test_a_second_signal_gets_the_systems_default(
+    which: signal.Signals, handler: signal.Handlers
+) -> None:
+    """But for a terminal that closes: it sends two SIGHUP, and the stop stays clean."""
+    before = signal.getsignal(which)
+    with StopFlag() as stop:
+        os.kill(os.getpid(), which)
+        assert signal.getsignal(which) is handler
+        with pytest.raises(StopRequestedError):
+            stop.check()
+    assert signal.getsignal(which) is before
+
+
+def test_a_second_signal_gets_the_previous_handler() -> None:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    stop = StopFlag("previous")
+
+    def twice() -> None:
+        with stop:
+            signal.raise_signal(signal.SIGINT)
+            assert stop.received is signal.SIGINT
+            signal.raise_signal(signal.SIGINT)
+
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            twice()
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_every_signal_ends_an_attached_loop(number: signal.Signals) -> None:
+    ended: list[str] = []
+    with StopFlag("same") as stop:
+        os.kill(os.getpid(), number)
+        stop.attach(lambda: ended.append("loop"))
+        assert ended == ["loop"]  # for the signal that came before
+        os.kill(os.getpid(), number)
+        assert ended == ["loop", "loop"]
+        stop.detach()
+        os.kill(os.getpid(), number)
+    assert (stop.requested, len(ended)) == (True, 2)
+
+
+def test_nohup_is_respected() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with StopFlag() as stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            stop.check()
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_a_signal_before_waiting_begins_is_not_lost() -> None:
+    with StopFlag() as stop:
+        os.kill(os.getpid(), signal.SIGINT)
+        with pytest.raises(StopRequestedError), stop.at_once():
+            pytest.fail("must not begin to wait")
+
+
+class StopFlagWithASlowCheck(StopFlag):
+    """A signal comes just after the check found nothing, where a lost one would go unseen."""
+
+    def check(self) -> None:
+        first = self.received is None
+        super().check()
+        if first:
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_a_signal_just_after_the_check_is_not_lost() -> None:
+    with StopFlagWithASlowCheck() as stop:
+        with pytest.raises(StopRequestedError), stop.at_once():
+            pytest.fail("must not begin to wait")
+        assert not stop._at_once
+
+
+def test_one_owner_at_a_time_and_no_trace(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_text("content")
+    with locked(tmp_path), locked(file):
+        with pytest.raises(PathInUseError, match="in use"), locked(tmp_path):
+            pytest.fail("held twice")
+        with pytest.raises(PathInUseError), locked(file):
+            pytest.fail("held twice")
+    with locked(tmp_path), locked(file):
+        pass
+    assert list(tmp_path.iterdir()) == [file]
+    assert file.read_text() == "content"
+
+
+def test_a_killed_owner_holds_nothing(tmp_path: Path) -> None:
+    code = (
+        "import pathlib, sys, time\n"
+        "from xethru_protocol.system import locked\n"
+        "with locked(pathlib.Path(sys.argv[1])): print(flush=True); time.sleep(60)\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE
+    ) as owner:
+        assert owner.stdout is not None
+        owner.stdout.readline()
+        with pytest.raises(PathInUseError), locked(tmp_path):
+            pytest.fail("held twice")
+        owner.send_signal(signal.SIGKILL)
+    with locked(tmp_path):
+        pass
+
+
+def test_what_is_not_there_is_the_systems_error(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), locked(tmp_path / "missing"):
+        pytest.fail("nothing to hold")
+
+
+def test_a_file_of_the_most_bytes_is_read_and_one_more_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "f"
+    path.write_bytes(bytes(2 << 20))
+    assert len(read_bounded(path, 2 << 20)) == 2 << 20
+    with pytest.raises(OSError, match="longer than 1 MiB") as caught:
+        read_bounded(path, (2 << 20) - 1)
+    assert caught.value.errno == errno.EFBIG
+
+
+def test_a_pipe_is_read_to_its_end(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    writer = threading.Thread(target=pipe.write_bytes, args=(b"x" * 100_000,))
+    writer.start()
+    assert read_bounded(pipe) == b"x" * 100_000
+    writer.join()
+
+
+@pytest.mark.skipif(not Path(ENDLESS).exists(), reason=f"no {ENDLESS} here")
+def test_what_never_ends_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SceneError, match="longer than"):
+        load_scene(ENDLESS)
+    with pytest.raises(FaultPlanError, match="longer than"):
+        load_plan(ENDLESS)
+    assert main(["demo", "--scene", ENDLESS, "--out", str(tmp_path)]) == 1
+    assert "longer than" in capsys.readouterr().err
