@@ -1,8 +1,14 @@
 """Driver of one X4M300, blocking (`X4M300`) or with asyncio (`async_radar.AsyncX4M300`)."""
 
-from xethru_protocol.driver.conversation import Listener, Observer, ProtocolRecord, RawListener
 from xethru_protocol.driver.frames import Frame, FrameGeometry
-from xethru_protocol.driver.link import ModuleInfo, RawConfig
+from xethru_protocol.driver.link import (
+    Listener,
+    ModuleInfo,
+    Observer,
+    ProtocolRecord,
+    RawConfig,
+    RawListener,
+)
 from xethru_protocol.driver.radar import X4M300, known_ports
 
 __all__ = [

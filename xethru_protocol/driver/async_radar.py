@@ -21,13 +21,13 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from typing import Self
 
 from xethru_protocol.driver import raw_mode, reconnect
-from xethru_protocol.driver.conversation import Observer
 from xethru_protocol.driver.files import AsyncFiles
 from xethru_protocol.driver.frames import DEFAULT_FRAMES, Frame, FrameGeometry
 from xethru_protocol.driver.link import (
     TIMEOUT_S,
     Link,
     ModuleInfo,
+    Observer,
     P,
     Procedure,
     RawConfig,

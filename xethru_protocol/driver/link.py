@@ -3,26 +3,39 @@
 Whatever needs the line is a generator: it yields steps and returns its result. `X4M300` carries
 the steps out on a line that blocks, `AsyncX4M300` on one that is awaited. `raw_mode`, `profiles`,
 `files` and `reconnect` hold more such generators.
+
+The module answers commands in order and without sequence numbers, and sends frames and SYSTEM
+messages whenever it likes (Protocol reference 3). What arrives is sorted at once: answers go to
+the one outstanding request, all else to the reader of the stream; faults are counted.
 """
 
 import math
 from collections import deque
 from collections.abc import Awaitable, Callable, Generator, Sequence
 from dataclasses import dataclass, fields
-from typing import Concatenate, NamedTuple, ParamSpec, Protocol, TypeAlias, TypeVar
+from typing import Concatenate, Literal, NamedTuple, ParamSpec, Protocol, TypeAlias, TypeVar
 
-from xethru_protocol.driver.conversation import FRAMES, Conversation, Observer
 from xethru_protocol.driver.frames import FrameQueue, Lattice
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire import x4
-from xethru_protocol.wire.codes import InfoItem, PongCode, SensorMode, X4Setting
+from xethru_protocol.wire.codec import describe
+from xethru_protocol.wire.codes import (
+    InfoItem,
+    PongCode,
+    SensorMode,
+    SystemCode,
+    X4Setting,
+    error_name,
+)
+from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.errors import (
     DeviceError,
     LocalProtocolError,
     RemoteProtocolError,
     ResponseTimeout,
 )
-from xethru_protocol.wire.table import Command, Response
+from xethru_protocol.wire.framing import NEED_DATA, FramingFault, LinkStatistics
+from xethru_protocol.wire.table import ROWS, Command, Response, Row
 
 
 class Read(NamedTuple):  # several per frame: twice as fast to make as a frozen dataclass
@@ -198,6 +211,207 @@ class ModuleInfo:
     mode: str | None
 
 
+FRAMES = (m.DataFloat, m.BasebandIq)  # a tuple is the faster argument of isinstance
+_ENDLESS_S = 1e9
+_ANSWERS = (m.Ack, m.Error, m.Pong, m.ReplyByte, m.ReplyInt, m.ReplyFloat, m.ReplyString)
+# The module answers PINGs that waited for it one right after the other; a PONG that stays out
+# this long after the last one was never sent.
+_SETTLED_NS = 250_000_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProtocolRecord:
+    """One line of the protocol log: everything on the wire but frames."""
+
+    t_ns: int
+    direction: Literal["tx", "rx", "fault", "warning"]
+    summary: str
+
+
+Observer = Callable[[ProtocolRecord], None]
+Listener = Callable[[Response, int], None]
+RawListener = Callable[[Literal["rx", "tx"], bytes, int], None]
+
+
+class Conversation:
+    """Commands to one module and what comes from it.
+
+    ``name`` is what messages to people call the line. ``take_data`` is called with every message
+    that is no answer, and the time its last byte was read [ns]. ``clock`` and ``observer`` as of
+    `X4M300`; its properties describe the listener and the counters.
+
+    Attributes
+    ----------
+    answers
+        Those that came since the last question.
+    expected
+        What would answer it besides ERROR; empty if nobody waits for an answer.
+    answer_owed
+        Whether the answer of a request that was given up may still come. The module answers in
+        order, so a PING brings both sides into step again: all before its PONG belongs to nothing
+        any more (Protocol reference 13).
+    pongs_owed
+        PONGs that are due.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        clock: Callable[[], int],
+        observer: Observer | None,
+        take_data: Listener,
+    ) -> None:
+        self.name = name
+        self.listener: Listener | None = None
+        self.statistics = LinkStatistics()
+        self.fault_count = 0
+        self.stray_count = 0
+        self.reboots = 0
+        self.readies = 0
+        self._clock = clock
+        self._observer = observer
+        self._take_data = take_data
+        self._connection = Connection(Role.HOST, self.statistics)
+        self.answers: deque[Response] = deque()
+        self.expected: tuple[type[Response], ...] = ()
+        self.answer_owed = False
+        self.pongs_owed = 0
+        self._winding_down = False
+        self._damaged_since = False  # since the last frame or answer
+        self._rebooted_since = False
+
+    def ask(self, command: Command[Response]) -> bytes:
+        """Return the bytes that ask ``command``, whose answer is kept from now on.
+
+        An answer that arrived before belongs to no request and is dropped. Raises
+        `LocalProtocolError` if the protocol cannot express the command; nothing is asked then.
+        """
+        data = self._connection.send(command)
+        self.stray_count += len(self.answers)
+        self.answers.clear()
+        self.expected = ROWS[type(command)].replies
+        if isinstance(command, m.Ping):
+            self.pongs_owed += 1
+        else:
+            self.answer_owed = True  # also if this is left by an interrupt
+        if self._observer is not None:
+            self.report("tx", summary(command))
+        return data
+
+    def receive(self, data: bytes, arrival_ns: int) -> None:
+        connection = self._connection
+        try:
+            connection.receive_data(data)
+            while (event := connection.next_event()) is not NEED_DATA:
+                if isinstance(event, Response):
+                    self._sort(event, arrival_ns)
+                elif isinstance(event, FramingFault) and not self._winding_down:
+                    self.fault_count += 1
+                    self._damaged_since = True
+                    self.report("fault", f"{event.kind.value} at byte {event.offset}")
+        except Exception:  # of a listener or an observer
+            raise
+        except BaseException:  # an interrupt, perhaps while the receiver moved its bytes
+            self._connection = Connection(Role.HOST, self.statistics)
+            raise
+
+    def _sort(self, message: Response, arrival_ns: int) -> None:
+        if self.listener is not None:
+            self.listener(message, arrival_ns)
+        if isinstance(message, FRAMES):
+            self._damaged_since = self._rebooted_since = False
+            self._take_data(message, arrival_ns)
+            return
+        # some firmware answers with a message that other firmware sends unasked
+        if isinstance(message, (_ANSWERS, self.expected)):
+            self._damaged_since = self._rebooted_since = False
+            if not self.expected:
+                self.stray_count += 1  # not kept: a faulty module may never stop sending them
+            else:
+                self.answers.append(message)
+            if isinstance(message, m.Pong):
+                self.pongs_owed = max(self.pongs_owed - 1, 0)
+        elif isinstance(message, m.System):
+            self.readies += message.code == SystemCode.XTS_SPRS_READY
+            if message.code == SystemCode.XTS_SPRS_BOOTING:
+                self.reboots += 1
+                self._rebooted_since = True
+        else:
+            self._take_data(message, arrival_ns)
+        if self._observer is not None and not _is_bulk(message):
+            self.report("rx", summary(message))
+
+    def new_line(self, name: str) -> None:
+        """Begin anew on a line that was just opened: no answer is due and no packet half-read."""
+        self.name = name
+        self.statistics.junk_bytes += self._connection.buffered  # the rest of them never came
+        self._connection = Connection(Role.HOST, self.statistics)
+        self.answers.clear()
+        self.expected = ()
+        self.answer_owed = False
+        self.pongs_owed = 0
+        self._damaged_since = self._rebooted_since = False
+
+    def wind_down(self) -> None:
+        """Read answers only from now on.
+
+        An interrupt may have come while bytes were taken in, so what is half-read is forgotten;
+        the rest of a packet that was cut so looks like damage and is neither reported nor counted.
+        """
+        self._winding_down = True
+        self._connection = Connection(Role.HOST)
+        self.answers.clear()
+
+    def deadline_ns(self, timeout_s: float) -> int:
+        """Time of the clock [ns] at which a timeout is over; an infinite one takes 30 years."""
+        return self._clock() + round(min(timeout_s, _ENDLESS_S) * 1e9)
+
+    def silence(
+        self,
+        what: str,
+        timeout_s: float,
+        likely: str = "is it an X4M300, powered and not in its bootloader?",
+    ) -> ResponseTimeout:
+        """Error for something that did not come, with the likeliest reason and remedy.
+
+        Judged by what came since the last frame or answer: what was before that explains nothing.
+        ``likely`` is the reason given when nothing came at all.
+        """
+        missing = f"no {what} from {self.name} within {timeout_s:g} s"
+        if self._rebooted_since:
+            return ResponseTimeout(
+                f"{missing}: the module restarted meanwhile and forgot its settings; begin again"
+            )
+        if self._damaged_since:
+            return ResponseTimeout(
+                f"{missing}, but bytes that are no XeThru packets; "
+                "is it another device, or another baud rate?"
+            )
+        return ResponseTimeout(f"{missing}; {likely}")
+
+    def report(self, direction: Literal["tx", "rx", "fault", "warning"], text: str) -> None:
+        if self._observer is not None:
+            self._observer(ProtocolRecord(t_ns=self._clock(), direction=direction, summary=text))
+
+
+def _is_bulk(message: Response) -> bool:
+    row = ROWS.get(type(message))
+    return row is not None and row.bulk
+
+
+def summary(message: m.Message) -> str:
+    """One line about a message, for logs and errors.
+
+    >>> from xethru_protocol.wire.messages import X4DriverSet
+    >>> from xethru_protocol.wire.codes import X4Setting
+    >>> summary(X4DriverSet(setting=X4Setting.FPS, value=17.0))
+    'X4DRIVER_SET id=FPS value=17.0'
+    """
+    name, shown = describe(message)
+    parts = (f"{key}={value}" for key, value in shown.items() if value is not None)
+    return " ".join([name, *parts])
+
+
 class Plan(Protocol):
     """What the user configured."""
 
@@ -289,7 +503,7 @@ class Link:
     # --- commands ---------------------------------------------------------------------------------
 
     def request(self, command: Command[ReplyT], timeout_s: float = TIMEOUT_S) -> Steps[ReplyT]:
-        if self.conversation.out_of_step and not isinstance(command, m.Ping):
+        if self.conversation.answer_owed and not isinstance(command, m.Ping):
             # the answer to an abandoned request may still come: all before this PONG is dropped
             yield from self._exchange(m.Ping(), timeout_s)
         reply = yield from self._exchange(command, timeout_s)
@@ -299,13 +513,68 @@ class Link:
     def _exchange(self, command: Command[Response], timeout_s: float) -> Steps[Response]:
         yield from self.take_stale_input()
         conversation = self.conversation
+        row = ROWS[type(command)]
+        deadline_ns = conversation.deadline_ns(timeout_s)
+        answer: Response | None
         try:
-            yield Write(conversation.ask(command, timeout_s))
-            while (answer := conversation.answer()) is None:
-                yield Read(conversation.wait_s())
+            yield Write(conversation.ask(command))
+            if isinstance(command, m.Ping):
+                answer = yield from self._pong(deadline_ns)
+            else:
+                content_id = row.content_id(command) if row.content_id else None
+                answer = yield from self._answer(row, content_id, deadline_ns)
         finally:  # also after a cancellation or an interrupt
-            conversation.give_up()
+            conversation.expected = ()
+        if answer is None:
+            raise conversation.silence(f"answer to {summary(command)}", timeout_s)
+        conversation.answer_owed = False
+        if isinstance(answer, m.Error):
+            meaning = error_name(answer.code, row.errors)
+            raise DeviceError(answer.code, summary(command), meaning)
         return answer
+
+    def _answer(self, row: Row, content_id: int | None, deadline_ns: int) -> Steps[Response | None]:
+        conversation = self.conversation
+        while True:
+            while conversation.answers:
+                answer = conversation.answers.popleft()
+                if isinstance(answer, m.Error):
+                    return answer
+                if isinstance(answer, row.replies) and (
+                    content_id is None or getattr(answer, "content_id", None) == content_id
+                ):
+                    return answer
+                conversation.stray_count += 1
+            left_s = self.left_s(deadline_ns)
+            if left_s <= 0:
+                return None
+            yield Read(left_s)
+
+    def _pong(self, deadline_ns: int) -> Steps[m.Pong | None]:
+        """Return the last PONG that is due: a late one describes an earlier state.
+
+        PONGs do not echo the seed. So the PONGs due are counted, and one is taken for the last
+        if no other follows soon, since a module that was off does not answer PINGs of that time.
+        """
+        conversation = self.conversation
+        pong: m.Pong | None = None
+        until_ns = deadline_ns
+        while True:
+            while conversation.answers:
+                answer = conversation.answers.popleft()
+                if isinstance(answer, m.Pong):
+                    conversation.stray_count += pong is not None
+                    pong = answer
+                    until_ns = min(deadline_ns, self.clock() + _SETTLED_NS)
+                else:  # PING has no errors: those are of another command, too
+                    conversation.stray_count += 1
+            left_s = self.left_s(until_ns)
+            if left_s <= 0 or (pong is not None and conversation.pongs_owed == 0):
+                break
+            yield Read(left_s)
+        if pong is not None:
+            conversation.pongs_owed = 0
+        return pong
 
     def take_stale_input(self) -> Steps[None]:
         for _ in range(_STALE_READS):

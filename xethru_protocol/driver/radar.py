@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import ClassVar, Self
 
 from xethru_protocol.driver import raw_mode, reconnect
-from xethru_protocol.driver.conversation import Listener, Observer, RawListener
 from xethru_protocol.driver.files import Files
 from xethru_protocol.driver.frames import DEFAULT_FRAMES, Frame, FrameGeometry
 from xethru_protocol.driver.link import (
@@ -17,11 +16,14 @@ from xethru_protocol.driver.link import (
     TIMEOUT_S,
     CloseLine,
     Link,
+    Listener,
     ModuleInfo,
+    Observer,
     OpenLine,
     P,
     Procedure,
     RawConfig,
+    RawListener,
     Read,
     ReplyT,
     SetLineRate,

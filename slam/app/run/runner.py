@@ -28,7 +28,7 @@ from slam.app.records import (
 from slam.frames import RadarFrame
 from slam.geometry import Rig
 from slam.results import Slam, StepResult
-from xethru_protocol.driver.conversation import ProtocolRecord
+from xethru_protocol.driver.link import ProtocolRecord
 
 
 def unknown_truth(stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:

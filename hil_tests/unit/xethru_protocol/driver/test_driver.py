@@ -8,8 +8,7 @@ import pytest
 
 from hil_tests.unit.xethru_protocol.both_drivers import DriverOn
 from hil_tests.unit.xethru_protocol.scripted import READY, PlainModule, frame
-from xethru_protocol.driver.conversation import ProtocolRecord
-from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.link import ProtocolRecord, RawConfig
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import PongCode, SensorMode, X4Setting
 from xethru_protocol.wire.errors import (

@@ -63,7 +63,7 @@ def test_answers_to_nothing_are_counted_and_not_kept(driver_on: DriverOn) -> Non
     line.say(*[m.Ack()] * 1000, frame(1))
     radar.read_frame()
     assert radar.stray_count == 1000
-    assert not radar._link.conversation._answers
+    assert not radar._link.conversation.answers
 
 
 def test_warnings_are_kept_up_to_a_thousand(driver_on: DriverOn) -> None:

@@ -16,7 +16,7 @@ from slam.app.rig import files as rig_match
 from slam.app.rig.files import RigFile, RigRadar, RigWheels, load_rig, open_rig, write_rig
 from slam.app.rig.sources import RadarLink
 from slam.config import WheelNoise
-from xethru_protocol.driver.conversation import Observer, ProtocolRecord
+from xethru_protocol.driver.link import Observer, ProtocolRecord
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire.errors import Disconnected, PortUnavailable
 
