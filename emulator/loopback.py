@@ -10,8 +10,6 @@ from __future__ import annotations
 from emulator.device import Device
 from xethru_protocol.wire.errors import Disconnected
 
-__all__ = ["LoopbackTransport"]
-
 NS_PER_S = 1_000_000_000
 
 
@@ -19,14 +17,7 @@ class LoopbackTransport:
     """An `xethru_protocol.transport.Transport` wired straight to a device.
 
     Every read returns at most one packet, which the device makes at that moment: nothing is in
-    flight between device and host.
-
-    Parameters
-    ----------
-    device
-        The module at the other end; under `Pace.ASAP` reads never wait.
-    name
-        What errors and logs call this port.
+    flight between device and host. After `close`, `read` and `write` raise `Disconnected`.
     """
 
     def __init__(self, device: Device, name: str = "loopback") -> None:
@@ -45,13 +36,7 @@ class LoopbackTransport:
         return self._now_ns
 
     def read(self, timeout_s: float) -> bytes:
-        """Return the next packet, or ``b""`` once the timeout has passed in virtual time.
-
-        Raises
-        ------
-        Disconnected
-            After `close`.
-        """
+        """Return the next packet, or ``b""`` once the timeout has passed in virtual time."""
         self._check_open()
         deadline_ns = self._now_ns + max(round(timeout_s * NS_PER_S), 0)
         while True:
@@ -66,13 +51,6 @@ class LoopbackTransport:
             self._now_ns = max(wake_ns, self._now_ns)
 
     def write(self, data: bytes) -> None:
-        """Hand bytes to the device.
-
-        Raises
-        ------
-        Disconnected
-            After `close`.
-        """
         self._check_open()
         self._device.receive_data(data, self._now_ns)
 

@@ -27,7 +27,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.chip.downconversion import CHANNELS, DECIMATION, LEAD_SAMPLES, TAP_COUNT, downconvert
+from emulator.chip.downconversion import CHANNELS, LEAD_SAMPLES, TAP_COUNT, downconvert
 from xethru_protocol.wire import x4
 from xethru_protocol.wire.codes import ErrorCode, X4Error, X4Setting
 from xethru_protocol.wire.messages import REGISTERS, DataFloat, X4Value
@@ -43,16 +43,11 @@ DAC_LEVELS = 2048
 
 
 class Timeline:
-    """Frame counters and their scene times since the last INIT.
+    """Frame counters (unbounded, on the wire 32 bits) and their scene times since INIT.
 
     INIT makes counter 0 scene time 0. Within a segment of constant rate, counter k lies at
     ``start + frame_time_ns(k - first, rate)``; another rate begins a new segment at the next
     counter. A pause changes nothing: the counter goes on where it was.
-
-    Attributes
-    ----------
-    next_counter
-        Counter of the next frame; unbounded here, 32 bits on the wire.
 
     Examples
     --------
@@ -114,7 +109,7 @@ class ModuleClock:
 
     @property
     def rate(self) -> float:
-        """Return the module's seconds per true second."""
+        """The module's seconds per true second."""
         return 1.0 + self.ppm * 1e-6
 
     def scene_times_ns(self, nominal_ns: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -179,16 +174,15 @@ class EchoSource(Protocol):
     ) -> NDArray[np.int64]:
         """Return raw RF chip counters of a block of frames.
 
-        The result depends on the arguments and the source's own scene and seed alone: never on
-        the block size, the order of calls or the wall clock.
+        The result depends on the arguments and the source's own scene and seed alone.
 
         Parameters
         ----------
         frame_counters
-            Shape (n_frames,), the frames' counters; they select the noise.
+            Shape (n_frames,); they select the noise.
         scene_times_ns
-            Shape (n_frames,), int64, [ns]: nominal scene time of each counter, without the
-            radar's start skew and clock error (which the source adds itself).
+            Shape (n_frames,), int64: nominal scene time of each counter, without the radar's
+            start skew and clock error (which the source adds itself).
 
         Returns
         -------
@@ -198,13 +192,7 @@ class EchoSource(Protocol):
 
 
 class Refusal(Exception):  # noqa: N818 - a refusal is an answer of the module, not an error of ours
-    """A command the module answers with ERROR.
-
-    Attributes
-    ----------
-    code
-        The u32 of the ERROR reply, an `ErrorCode` or `X4Error` (their numbers overlap).
-    """
+    """A command the module answers with ERROR: an `ErrorCode` or `X4Error` (they overlap)."""
 
     def __init__(self, code: int) -> None:
         super().__init__(f"refused with ERROR {code}")
@@ -224,20 +212,10 @@ class ChipSettings:
 
     Attributes
     ----------
-    fps
-        Requested frame rate, float32 value.
-    pulses_per_step
-        Low 16 bits of what was set.
-    iterations
-        Low 8 bits of what was set.
     downconversion
         0 for RF frames, anything else for baseband.
-    start_m
-        Requested frame area start, float32 value, module metres.
-    end_m
-        Requested frame area end, after shortening to the chip's maximum.
-    offset_m
-        Frame area offset, float32 value, module metres.
+    start_m, end_m
+        Requested frame area, shortened to the chip's maximum, module metres.
     dac_step
         Exponent of the DAC step, 0...3.
     dac_max
@@ -326,10 +304,7 @@ def _set_prf_div(settings: ChipSettings, value: X4Value) -> ChipSettings:
     return replace(settings, prf_div=divider)
 
 
-Setter = Callable[[ChipSettings, X4Value], ChipSettings]
-"""(settings, value) -> changed settings, or `Refusal`."""
-
-SETTERS: dict[X4Setting, Setter] = {
+SETTERS: dict[X4Setting, Callable[[ChipSettings, X4Value], ChipSettings]] = {
     X4Setting.FPS: _set_fps,
     X4Setting.PULSESPERSTEP: lambda s, v: replace(s, pulses_per_step=_integer(v) & 0xFFFF),
     X4Setting.ITERATIONS: lambda s, v: replace(s, iterations=_integer(v) & 0xFF),
@@ -511,7 +486,7 @@ class Chip:
         return getter(self)
 
     def read_register(self, space: X4Setting, address: int) -> int:
-        """Return one register's byte, 0 where none is known; `Refusal` when the chip is off."""
+        """Return a register's byte, 0 where none is known; raise `Refusal` if the chip is off."""
         self._check_powered()
         address &= 0xFF
         if space is X4Setting.PIFREGISTER and address in COUPLED:
@@ -520,7 +495,7 @@ class Chip:
         return self._registers[space].get(address, 0)
 
     def write_register(self, space: X4Setting, address: int, value: int) -> None:
-        """Write one register's byte; `Refusal` when the chip is off."""
+        """Write a register's byte, or raise `Refusal` if the chip is off."""
         self._check_powered()
         address &= 0xFF
         if space is X4Setting.PIFREGISTER and address in COUPLED:
@@ -597,8 +572,8 @@ def _capture(settings: ChipSettings, area: x4.FrameArea) -> CaptureSettings:
     # an absurd offset can label bins far outside the 1536 samples there are
     first_index = min(area.first_index, x4.FRAME_SAMPLES - 1)
     if settings.downconversion:
-        first_sample = DECIMATION * first_index - LEAD_SAMPLES
-        n_samples = DECIMATION * (area.n_bins - 1) + TAP_COUNT
+        first_sample = x4.BASEBAND_DECIMATION * first_index - LEAD_SAMPLES
+        n_samples = x4.BASEBAND_DECIMATION * (area.n_bins - 1) + TAP_COUNT
     else:
         first_sample = first_index
         n_samples = area.n_bins

@@ -25,9 +25,6 @@ from numpy.typing import NDArray
 
 from xethru_protocol.wire.x4 import BASEBAND_DECIMATION
 
-__all__ = ["CHANNELS", "DECIMATION", "LEAD_SAMPLES", "TAP_COUNT", "ChannelTaps", "downconvert"]
-
-DECIMATION = BASEBAND_DECIMATION
 TAP_COUNT = 32
 LEAD_SAMPLES = 16
 """RF samples that the window of line L reaches before sample 8 L."""
@@ -83,8 +80,7 @@ def downconvert(
         Shape (n_frames, 8 * (n_lines - 1) + 32), int64; sample 0 lies
         ``LEAD_SAMPLES`` before the RF sample of the first line.
     first_line
-        Index of the first line in the captured frame, or its parity: it selects the
-        sign.
+        Index of the first line in the captured frame; its parity selects the sign.
 
     Returns
     -------
@@ -92,10 +88,9 @@ def downconvert(
     (n_frames, n_lines), int64.
     """
     windows = np.lib.stride_tricks.sliding_window_view(rf_counters, TAP_COUNT, axis=1)
-    windows = windows[:, ::DECIMATION]
+    windows = windows[:, ::BASEBAND_DECIMATION]
     # integer matrix products never reach BLAS: exact and the same on every machine
-    both = np.array([taps.i_taps, taps.i_taps[::-1]], dtype=np.int64).T
-    lines = windows @ both
+    lines = windows @ np.array([taps.i_taps, taps.i_taps[::-1]], dtype=np.int64).T
     signs = np.array([taps.line_sign**parity for parity in (0, 1)], dtype=np.int64)
     lines *= signs[(first_line + np.arange(lines.shape[1])) % 2][:, np.newaxis]
     return lines[:, :, 0], lines[:, :, 1]

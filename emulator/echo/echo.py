@@ -112,6 +112,13 @@ from emulator.echo.walls import (
 from emulator.scene.scene import RadarSpec, Scene
 from xethru_protocol.wire import x4
 
+SPEED_OF_LIGHT_MPS = 299_792_458.0
+_SAMPLES_PER_M = 2 * x4.SAMPLING_RATE_HZ / SPEED_OF_LIGHT_MPS
+_SAMPLES_PER_MODULE_M = 2 * x4.SAMPLING_RATE_HZ / x4.MODULE_SPEED_MPS
+
+# Assumed: the X4 documents its power steps by name only (off, low, medium, high); 3 dB apart.
+_TX_AMPLITUDE = {0: 0.0, 1: math.sqrt(0.5), 2: 1.0, 3: math.sqrt(2.0)}
+
 
 class ScenePaths:
     """The paths of one radar of a scene. What does not move is worked out once."""
@@ -168,14 +175,6 @@ def _together(terms: list[Reflections]) -> Reflections:
         amplitude=np.concatenate([term.amplitude for term in terms], axis=1),
         phase_rad=np.concatenate(phases, axis=-1),
     )
-
-
-SPEED_OF_LIGHT_MPS = 299_792_458.0
-_SAMPLES_PER_M = 2 * x4.SAMPLING_RATE_HZ / SPEED_OF_LIGHT_MPS
-_SAMPLES_PER_MODULE_M = 2 * x4.SAMPLING_RATE_HZ / x4.MODULE_SPEED_MPS
-
-# Assumed: the X4 documents its power steps by name only (off, low, medium, high); 3 dB apart.
-_TX_AMPLITUDE = {0: 0.0, 1: math.sqrt(0.5), 2: 1.0, 3: math.sqrt(2.0)}
 
 
 class SceneEcho:
@@ -241,15 +240,8 @@ class SceneEcho:
 
 
 def echo_source(scene: Scene, radar_index: int, seed: int) -> EchoSource:
-    """Return the echo source of one of the scene's radars.
+    """Return the echo source of ``scene.radars[radar_index]``.
 
-    Parameters
-    ----------
-    scene
-        The scene; its order of radars changes only which index means which radar.
-    radar_index
-        Index into ``scene.radars``.
-    seed
-        0 ... 2**64 - 1; selects receiver noise, clutter and jitter.
+    The seed, 0 ... 2**64 - 1, selects receiver noise, clutter and jitter.
     """
     return SceneEcho(scene, scene.radars[radar_index], seed)

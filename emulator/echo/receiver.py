@@ -78,6 +78,18 @@ _SCALE = (151 / 315) ** -0.5 / UNITS_PER_SIGMA
 # Knot indices must not be negative, while a clock that is early may ask for a time before 0.
 _FIRST_KNOT = 1 << 40
 
+_JITTER_INSTANTS_PER_KNOT = 16
+_MOST_INSTANTS_KEPT = 64
+_COUNTERS_AT_ONCE = 256
+
+GRIDS = ((0.054, 0.16), (0.239, 0.24), (1.205, 0.60))
+"""Spacing of the clutter's knots in correlation times, and share of the variance, fastest first."""
+_CLUTTER_INSTANTS_PER_KNOT = 4
+_SCATTERER_SAMPLES = 8
+_SCATTERERS = 256
+_REACH = 4
+"""Scatterers on either side that a sample receives: 32 samples, four envelope deviations."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KnotGrid:
@@ -98,8 +110,6 @@ class SlowNoise:
         How many processes.
     instants_per_knot
         Instants in a spacing of the fastest grid.
-    seed, serial, purpose
-        What selects their values: the run's seed, the module, and what they are for.
     """
 
     def __init__(
@@ -174,11 +184,6 @@ def _cubic_weights(u: float, scale: float) -> tuple[float, float, float, float]:
     )
 
 
-_JITTER_INSTANTS_PER_KNOT = 16
-_MOST_INSTANTS_KEPT = 64
-_COUNTERS_AT_ONCE = 256
-
-
 class CarrierJitter:
     """The jitter of one radar."""
 
@@ -202,7 +207,7 @@ class CarrierJitter:
     def phases_rad(
         self, frame_counters: NDArray[np.int64], scene_times_ns: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Return what to add to the carrier's phase of every echo of each frame.
+        """Return what to add to the phase of each frame's carrier, shape (n_frames,) [rad].
 
         Parameters
         ----------
@@ -210,10 +215,6 @@ class CarrierJitter:
             Shape (n_frames,), int64; they select the white part.
         scene_times_ns
             Shape (n_frames,), int64: when this radar truly took each frame.
-
-        Returns
-        -------
-        Shape (n_frames,), float64, rad.
         """
         white = [0.0] * len(frame_counters)
         if self._spec.white_rad > 0:
@@ -246,16 +247,6 @@ class CarrierJitter:
         return self._slow_rad[instant]
 
 
-GRIDS = ((0.054, 0.16), (0.239, 0.24), (1.205, 0.60))
-"""Spacing of the knots in correlation times, and share of the variance, of the three processes."""
-
-_SCATTERER_SAMPLES = 8
-_SCATTERERS = 256
-_REACH = 4
-"""Scatterers on either side that a sample receives: 32 samples, four envelope deviations."""
-_CLUTTER_INSTANTS_PER_KNOT = 4
-
-
 class ClutterField:
     """The clutter of one radar, as a function of scene time and range."""
 
@@ -274,10 +265,7 @@ class ClutterField:
             serial=serial,
             purpose=Purpose.CLUTTER,
         )
-        self._line_of: tuple[int, _Row] | None = None
-        self._line_now = (np.empty(0), np.empty(0))
-        self._answers: dict[int, NDArray[np.float64]] = {}
-        self._row: _Row | None = None
+        self._answers: dict[tuple[int, _Row], NDArray[np.float64]] = {}
 
     def add_to(
         self,
@@ -286,17 +274,7 @@ class ClutterField:
         capture: CaptureSettings,
         gain: float,
     ) -> None:
-        """Add the clutter to frames in place.
-
-        Parameters
-        ----------
-        signal
-            Shape (n_frames, capture.n_samples), float64, normalised units.
-        scene_times_ns
-            Shape (n_frames,), int64: when this radar truly took each frame.
-        gain
-            Amplitude of the transmitter at its power setting times the receiver's gain.
-        """
+        """Add the clutter to frames in place; arguments are those of `Receiver.counters`."""
         strength = self._sigma * gain
         if strength == 0.0:
             return
@@ -307,25 +285,20 @@ class ClutterField:
         for frame, time_ns in zip(signal, scene_times_ns.tolist(), strict=True):
             instant, fraction = self._scatterers.instant_before(time_ns)
             if instant != at:
-                start, rise = self._line(instant, row)
-                start, at = start * strength, instant
+                start, end = self._answers_at(instant, row), self._answers_at(instant + 1, row)
+                rise, start, at = end - start, start * strength, instant
             np.multiply(rise, strength * fraction, out=clutter)
             np.add(clutter, start, out=clutter)
             np.add(frame, clutter, out=frame)
 
-    def _line(self, instant: int, row: _Row) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the unit clutter at an instant and by how much it rises until the next."""
-        if (instant, row) != self._line_of:
-            start, end = (self._answers_at(number, row) for number in (instant, instant + 1))
-            self._line_now, self._line_of = (start, end - start), (instant, row)
-            self._answers = {instant + 1: end}
-            self._row = row
-        return self._line_now
-
     def _answers_at(self, instant: int, row: _Row) -> NDArray[np.float64]:
-        if row == self._row and instant in self._answers:
-            return self._answers[instant]
-        return row.answers(self._scatterers.values_at(instant))
+        """Return the unit clutter at an instant; two are kept for the frames that follow."""
+        key = (instant, row)
+        if key not in self._answers:
+            if len(self._answers) == 2:
+                del self._answers[next(iter(self._answers))]
+            self._answers[key] = row.answers(self._scatterers.values_at(instant))
+        return self._answers[key]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -351,16 +324,9 @@ class _Row:
         )
 
     def answers(self, scatterers: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what scatterers answer.
+        """Return what scatterers answer, shape (n_samples,), of the variance of the scatterers.
 
-        Parameters
-        ----------
-        scatterers
-            Shape (2 * _SCATTERERS,), float64: real parts, then imaginary parts.
-
-        Returns
-        -------
-        Shape (n_samples,), float64, variance 1 for scatterers of variance 1.
+        ``scatterers`` has the shape (2 * _SCATTERERS,): real parts, then imaginary parts.
         """
         first_cell, lead = divmod(self.first_sample, _SCATTERER_SAMPLES)
         n_cells = -(-(lead + self.n_samples) // _SCATTERER_SAMPLES)
@@ -385,7 +351,7 @@ def _near_scatterers(first_cell: int, n_cells: int) -> NDArray[np.int64]:
 def _kernels() -> dict[int, NDArray[np.float64]]:
     """Return the pulse by carrier setting, each of shape (4 * _REACH, 8).
 
-    Rows as in `_heard`, columns by the sample's place in its cell.
+    Rows as in `_near_scatterers`, columns by the sample's place in its cell.
     """
     step = np.arange(2 * _REACH)[:, np.newaxis]
     distance = np.arange(_SCATTERER_SAMPLES) + _SCATTERER_SAMPLES * (_REACH - 1 - step)

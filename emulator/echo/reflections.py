@@ -41,6 +41,12 @@ CARRIER_CYCLES_PER_SAMPLE = {
 }
 """TX centre frequency setting -> carrier / sampling rate as a fraction: 7.290 and 8.748 GHz."""
 
+BEAM_EXPONENT = math.log(math.sqrt(0.5)) / math.log(math.cos(math.radians(65 / 2)))
+"""n of the two-way amplitude pattern cos(angle)**n: 2.0354."""
+NEAREST_M = 0.05
+"""Amplitude laws are held from here inwards."""
+_RANGE_EXPONENT = {"rod": 1.5, "point": 2.0, "cylinder": 1.0}
+
 _SIGMA_SAMPLES = SIGMA_S * SAMPLING_RATE_HZ
 HALF_WINDOW = math.ceil(6 * _SIGMA_SAMPLES)
 """Samples evaluated on either side of a pulse; beyond, it is below 1.6e-8 of its amplitude."""
@@ -69,14 +75,13 @@ def _envelope_series() -> list[NDArray[np.float64]]:
 _ENVELOPE = _envelope_series()
 
 
-def _carrier(fraction: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _carrier(cycles: int, samples: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return cosine and sine of the carrier at whole samples; the phase is reduced in integers."""
-    cycles, samples = fraction
     phase_rad = math.tau * ((cycles * _OFFSETS) % samples) / samples
     return np.cos(phase_rad), np.sin(phase_rad)
 
 
-_CARRIER = {setting: _carrier(fraction) for setting, fraction in CARRIER_CYCLES_PER_SAMPLE.items()}
+_CARRIER = {setting: _carrier(*ratio) for setting, ratio in CARRIER_CYCLES_PER_SAMPLE.items()}
 
 
 def sum_of_pulses(
@@ -88,7 +93,7 @@ def sum_of_pulses(
     tx_center_frequency: int,
     shape: tuple[int, int],
 ) -> NDArray[np.float64]:
-    """Return frames that are sums of pulses.
+    """Return frames that are sums of pulses, of a shape (n_frames, n_samples), float64.
 
     Parameters
     ----------
@@ -102,14 +107,6 @@ def sum_of_pulses(
         Shape (p,), float64: peak of the envelope.
     phase_rad
         Shape (p,), float64: phase of the carrier at the pulse's centre.
-    tx_center_frequency
-        A key of ``CARRIER_CYCLES_PER_SAMPLE``.
-    shape
-        (n_frames, n_samples) of the result.
-
-    Returns
-    -------
-    Shape ``shape``, float64.
     """
     n_frames, n_samples = shape
     # Half a window of padding on either side takes every pulse that reaches into the frame.
@@ -144,13 +141,6 @@ def sum_of_pulses(
     return padded.reshape(n_frames, width)[:, padding : padding + n_samples]
 
 
-BEAM_EXPONENT = math.log(math.sqrt(0.5)) / math.log(math.cos(math.radians(65 / 2)))
-"""n of the two-way amplitude pattern cos(angle)**n: 2.0354."""
-NEAREST_M = 0.05
-"""Amplitude laws are held from here inwards."""
-_RANGE_EXPONENT = {"rod": 1.5, "point": 2.0, "cylinder": 1.0}
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Reflections:
     """Paths from transmitter to receiver, frame by frame.
@@ -174,12 +164,11 @@ class Reflections:
 class Scatterers:
     """Reflectors that send an echo everywhere: points, rods, cylinders, people.
 
-    Arrays have the shape (k,), or (n_frames, k) for what moves.
+    Arrays have the shape (k,), or (n_frames, k) for what moves; x and y are those of their axes,
+    world frame.
 
     Attributes
     ----------
-    x_m, y_m
-        Positions of their axes, world frame.
     strength
         Echo on boresight at 1 m, normalised units.
     exponent
@@ -204,15 +193,7 @@ class Scatterers:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Viewpoint:
-    """Where a radar's phase centre is and where it looks: shape (n_frames, 1) each, world frame.
-
-    Attributes
-    ----------
-    x_m, y_m
-        Phase centre.
-    boresight_x, boresight_y
-        Unit vector.
-    """
+    """A radar's phase centre and boresight (a unit vector): shape (n_frames, 1), world frame."""
 
     x_m: NDArray[np.float64]
     y_m: NDArray[np.float64]

@@ -25,7 +25,7 @@ with at most one mirror each way. All formulas and their sources are in ``emulat
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,18 +34,34 @@ from scipy.special import fresnel
 from emulator.echo.reflections import NEAREST_M, Reflections, Scatterers, Viewpoint, beam_gain
 from emulator.scene.scene import MIRROR_AMPLITUDE_1M, ObjectSpec, WallSpec
 
+Array = NDArray[np.float64]
 
-def edge_wave(
-    detour_m: NDArray[np.float64], wavelength_m: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+TOUCHING_M = 0.02
+"""Ends that come this near to another face meet it: plans are not drawn to the millimetre."""
+ON_THE_FACE_M = 1e-3
+"""What is nearer to a face than this stands on it: neither before it nor behind."""
+WEAKEST_LEG = 1e-3
+"""A leg by way of a mirror counts from this share of a free one on boresight: -60 dB."""
+_RIGHT_ANGLE_TOLERANCE = math.sin(math.radians(1.0))
+_PARALLEL = math.sin(math.radians(5.0))
+_LEGS_TIMES_FACES = 200_000  # of one block of `passing`: bounds its memory
+_WEAKEST_CORNER = 1e-2  # of one whose edges are far: the rest is deep in Fresnel's shadow
+
+
+def edge_wave(detour_m: Array, wavelength_m: float) -> tuple[Array, Array]:
     """Return magnitude and phase [rad] of Q for detours >= 0 of any shape."""
-    f, g = _auxiliary(_parameter(detour_m, wavelength_m))
-    # Q = (g - j f) / (1 - j)
+    v = _parameter(detour_m, wavelength_m)
+    sine, cosine = fresnel(v)
+    turn = 0.5 * np.pi * v * v
+    s, c = 0.5 - sine, 0.5 - cosine
+    cos, sin = np.cos(turn), np.sin(turn)
+    # the auxiliary functions of the Fresnel integrals (DLMF 7.4): Q = (g - j f) / (1 - j)
+    f, g = s * cos - c * sin, c * cos + s * sin
     return np.sqrt(0.5 * (f * f + g * g)), np.arctan2(g - f, g + f)
 
 
 def past_edge(
-    detour_m: NDArray[np.float64], beyond: NDArray[np.bool_], wavelength_m: float
+    detour_m: Array, beyond: NDArray[np.bool_], wavelength_m: float
 ) -> NDArray[np.complex128]:
     """Return E: what passes an edge, at the carrier, any shape.
 
@@ -62,28 +78,9 @@ def past_edge(
     return np.where(beyond, 1 - dark, dark)
 
 
-def _parameter(detour_m: NDArray[np.float64], wavelength_m: float) -> NDArray[np.float64]:
-    v: NDArray[np.float64] = np.sqrt(np.maximum(detour_m, 0.0) * (4 / wavelength_m))
+def _parameter(detour_m: Array, wavelength_m: float) -> Array:
+    v: Array = np.sqrt(np.maximum(detour_m, 0.0) * (4 / wavelength_m))
     return v
-
-
-def _auxiliary(v: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the auxiliary functions f and g of the Fresnel integrals (DLMF 7.4)."""
-    sine, cosine = fresnel(v)
-    turn = 0.5 * np.pi * v * v
-    s, c = 0.5 - sine, 0.5 - cosine
-    cos, sin = np.cos(turn), np.sin(turn)
-    return s * cos - c * sin, c * cos + s * sin
-
-
-Array = NDArray[np.float64]
-
-TOUCHING_M = 0.02
-"""Ends that come this near to another face meet it: plans are not drawn to the millimetre."""
-ON_THE_FACE_M = 1e-3
-"""What is nearer to a face than this stands on it: neither before it nor behind."""
-_RIGHT_ANGLE_TOLERANCE = math.sin(math.radians(1.0))
-_LEGS_TIMES_FACES = 200_000  # of one block of `passing`: bounds its memory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -151,38 +148,24 @@ class Faces:
         return len(self.length_m)
 
     def along(self, x: Array, y: Array) -> Array:
-        """Return coordinates along t [m]; the last axis of x and y is that of the faces, or 1."""
+        """Return coordinates along t; here and below, the last axis is that of the faces, or 1."""
         return (x - self.a_x) * self.t_x + (y - self.a_y) * self.t_y
 
     def height(self, x: Array, y: Array) -> Array:
-        """Return coordinates along n [m]; the last axis of x and y is that of the faces, or 1."""
         return (y - self.a_y) * self.t_x - (x - self.a_x) * self.t_y
 
     def at(self, along_m: Array) -> tuple[Array, Array]:
-        """Return x and y [m] of points on the faces' lines; the last axis is that of the faces."""
+        """Return x and y of points on the faces' lines."""
         return self.a_x + along_m * self.t_x, self.a_y + along_m * self.t_y
 
     def mirrored(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Return x and y [m] of mirror images; the last axis is that of the faces."""
         twice = 2 * self.height(x, y)
         return x + twice * self.t_y, y - twice * self.t_x
 
     def take(self, index: NDArray[np.int64]) -> Faces:
         """Return some of the faces, in the order asked for; closures stay behind."""
-        return Faces(
-            a_x=self.a_x[index],
-            a_y=self.a_y[index],
-            b_x=self.b_x[index],
-            b_y=self.b_y[index],
-            t_x=self.t_x[index],
-            t_y=self.t_y[index],
-            length_m=self.length_m[index],
-            reflection=self.reflection[index],
-            transmission=self.transmission[index],
-            body=self.body[index],
-            outward_only=self.outward_only[index],
-            closures=(),
-        )
+        arrays = (each.name for each in fields(self) if each.name != "closures")
+        return Faces(**{name: getattr(self, name)[index] for name in arrays}, closures=())
 
 
 def faces_of(walls: tuple[WallSpec, ...], objects: tuple[ObjectSpec, ...]) -> Faces:
@@ -228,7 +211,7 @@ def _clockwise_corners(box: ObjectSpec) -> list[tuple[float, float]]:
 
 
 def _with_closures(faces: Faces) -> Faces:
-    upright = np.abs(_outer(faces.t_x, faces.t_x) + _outer(faces.t_y, faces.t_y))
+    upright = np.abs(np.outer(faces.t_x, faces.t_x) + np.outer(faces.t_y, faces.t_y))
     # A box has no inner corners of its own.
     meets = (upright < _RIGHT_ANGLE_TOLERANCE) & (faces.body[:, np.newaxis] != faces.body)
     ends = [(faces.a_x[:, np.newaxis], faces.a_y[:, np.newaxis])]
@@ -256,10 +239,6 @@ def _with_closures(faces: Faces) -> Faces:
             for face, other in np.argwhere(touches).tolist()
         )
     return replace(faces, closures=tuple(found))
-
-
-def _outer(one: Array, other: Array) -> Array:
-    return one[:, np.newaxis] * other
 
 
 def closed_ends(faces: Faces, height_m: Array) -> NDArray[np.bool_]:
@@ -332,10 +311,6 @@ def passing(
 def length(dx: Array, dy: Array) -> Array:
     """Return lengths of vectors, any shape; not ``hypot``, whose last bit is the platform's."""
     return np.sqrt(dx * dx + dy * dy)
-
-
-_PARALLEL = math.sin(math.radians(5.0))
-_WEAKEST_CORNER = 1e-2  # of one whose edges are far: the rest is deep in Fresnel's shadow
 
 
 def face_reflections(faces: Faces, view: Viewpoint, wavelength_m: float) -> Reflections:
@@ -413,8 +388,8 @@ class CornerPairs:
 
 def corner_pairs(faces: Faces) -> CornerPairs:
     """Return the pairs of faces of different bodies that reflect and are not parallel."""
-    cross = faces.t_x[:, np.newaxis] * faces.t_y - faces.t_y[:, np.newaxis] * faces.t_x
-    reflect = (faces.reflection[:, np.newaxis] * faces.reflection) > 0
+    cross = np.outer(faces.t_x, faces.t_y) - np.outer(faces.t_y, faces.t_x)
+    reflect = np.outer(faces.reflection, faces.reflection) > 0
     apart = faces.body[:, np.newaxis] != faces.body
     first, second = np.nonzero(apart & reflect & (np.abs(cross) > _PARALLEL))
     one, two = faces.take(first), faces.take(second)
@@ -531,10 +506,6 @@ def _cos_angle(view: Viewpoint, x: Array, y: Array) -> Array:
     return cosine
 
 
-WEAKEST_LEG = 1e-3
-"""A leg by way of a mirror counts from this share of a free one on boresight: -60 dB."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Legs:
     """Ways from the radar to the target: shape (n_frames, n_targets, n_legs) each.
@@ -553,7 +524,7 @@ class _Legs:
 def direct_share(
     faces: Faces, scatterers: Scatterers, view: Viewpoint, wavelength_m: float
 ) -> Array:
-    """Return what share of the amplitude gets from the radar to each scatterer: (n_frames, k)."""
+    """Return the share of the amplitude that gets from the radar to scatterers, (n_frames, k)."""
     x, y = _targets(scatterers, view)
     share = passing(
         faces,

@@ -1,4 +1,4 @@
-"""What a module keeps: its identity, files in flash, what survives resets, counted resets.
+"""What a module keeps: its identity, files in flash, what survives resets.
 
 Files are as long as they were created; erased bytes are FF. Assumed: sizes add up to the storage
 without overhead, and a write may change erased and written bytes alike.
@@ -17,28 +17,20 @@ from emulator.module.modes import Start
 from emulator.module.settings import ProfileSettings
 from xethru_protocol.wire.codes import FORMAT_KEY, FileError, InfoItem
 
+MAX_FILES = 20
+MAX_OPEN = 10
+ERASED = b"\xff"
+
+FileKey = tuple[int, int]
+"""Type and identifier of a file."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Identity:
     """The strings a stock X4M300 with sensor firmware answers.
 
-    Attributes
-    ----------
-    serial
-        Serial number, 12 digits.
-    item_number
-        Novelda item number, form ``000ddd-ddd``.
-    xep_version
-        Version of the base firmware inside it.
-    dsp_library
-        Last entry of the version list; name and version are assumed, the reference gives none.
-    build
-        Source revision, 40 hexadecimal digits.
-
-    Raises
-    ------
-    ValueError
-        When the serial number is not 12 digits.
+    The DSP library's name and version are assumed; the reference gives none. `ValueError` is
+    raised unless the serial number has 12 digits.
 
     Source: protocol reference 4.10, table of system info items.
     """
@@ -91,24 +83,8 @@ class Identity:
         return texts.get(item)
 
 
-MAX_FILES = 20
-MAX_OPEN = 10
-ERASED = b"\xff"
-
-FileKey = tuple[int, int]
-"""Type and identifier of a file."""
-
-
 class FileSystem:
-    """Files of one module.
-
-    Parameters
-    ----------
-    storage_bytes
-        Size of all files together.
-    files
-        Content as it was saved; none is open.
-    """
+    """Files of one module; what the firmware answers with an ERROR raises `Refusal`."""
 
     def __init__(self, storage_bytes: int, files: Mapping[FileKey, bytes] | None = None) -> None:
         self._storage_bytes = storage_bytes
@@ -121,7 +97,6 @@ class FileSystem:
         return {key: bytes(data) for key, data in self._files.items()}
 
     def names(self) -> list[FileKey]:
-        """Return type and identifier of all files, oldest first."""
         return list(self._files)
 
     def create(self, key: FileKey, length: int) -> None:
@@ -220,14 +195,10 @@ class SavedState:
 
     Attributes
     ----------
-    start
-        Last profile, and whether it ran.
     profiles
         Settings of each profile as of its last start, by profile id.
     files
         Content of the file system; noise maps and the crash dump are files.
-    certification
-        Whether the module starts in certification mode.
     """
 
     start: Start = field(default_factory=Start)
@@ -245,42 +216,3 @@ class Memory(Protocol):
         ...
 
     def save(self, state: SavedState) -> None: ...
-
-
-SAFE_MODE_FAULTS = 10
-"""Consecutive faults that start safe mode."""
-BOOTLOADER_FAULTS = 15
-"""Faults that are still answered with safe mode; the next one ends in the bootloader."""
-
-
-class FaultCounter:
-    """Consecutive faults of one module.
-
-    Parameters
-    ----------
-    memory_ns
-        Time without fault after which the count begins anew.
-    """
-
-    def __init__(self, memory_ns: int) -> None:
-        self._memory_ns = memory_ns
-        self._last_ns: int | None = None
-        self.count = 0
-
-    @property
-    def safe(self) -> bool:
-        return self.count >= SAFE_MODE_FAULTS
-
-    @property
-    def needs_bootloader(self) -> bool:
-        return self.count > BOOTLOADER_FAULTS
-
-    def fault(self, now_ns: int) -> None:
-        if self._last_ns is not None and now_ns - self._last_ns >= self._memory_ns:
-            self.count = 0
-        self.count += 1
-        self._last_ns = now_ns
-
-    def clear(self) -> None:
-        self.count = 0
-        self._last_ns = None

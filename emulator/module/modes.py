@@ -1,14 +1,11 @@
 """The mode machine of an X4M300, and which commands it takes in which state.
 
-`TRANSITIONS` is the machine; ``python -m emulator.module.modes`` prints it as a Mermaid state
-diagram, and the table of commands. The reference leaves open what follows here from assumptions:
-MANUAL and REG unload the profile (their GETs answer as if none were loaded), IDLE pauses a profile
-that was loaded but never run, and is refused like RUN when none is loaded. The direct jump from RUN
-to MANUAL is an option.
+``python -m emulator.module.modes`` prints `TRANSITIONS` as a Mermaid state diagram, and the table
+of commands. Assumed: MANUAL and REG unload the profile (their GETs answer as if none were loaded);
+IDLE pauses a profile that was loaded but never run, and is refused like RUN when none is loaded.
 
 Rows and columns of the table are those of protocol reference 8.3, with columns for certification
-mode (as MANUAL), the bare base firmware (2) and the bootloader (4.12) added. What the reference
-leaves open is an option; a verdict names it.
+mode (as MANUAL), the bare base firmware (2) and the bootloader (4.12) added.
 
 Source: protocol reference 2, 4.2, 4.3, 8.2, 8.3 and 8.5.
 """
@@ -99,12 +96,9 @@ STREAMING = frozenset(s for s, mode in _MODES.items() if mode is SensorMode.XTID
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Start:
-    """What a module remembers of its modes over a reset.
+    """What a module remembers over a reset: the state to enter (RUN, LOADED, STOPPED), a profile.
 
-    Attributes
-    ----------
-    state
-        RUN, LOADED or STOPPED; what the next power-up enters.
+    The default is a stock X4M300, whose profile runs.
     """
 
     state: State = State.RUN
@@ -112,13 +106,7 @@ class Start:
 
 
 class ModeMachine:
-    """Mode and profile of one module, as a stock X4M300 powers up: its profile runs.
-
-    Attributes
-    ----------
-    profile_id
-        Loaded profile, 0 for none.
-    """
+    """Mode and loaded profile (0 for none) of one module."""
 
     def __init__(self, options: DeviceOptions, start: Start) -> None:
         self._options = options
@@ -178,13 +166,7 @@ class ModeMachine:
 
 
 def state_diagram() -> str:
-    """Return the machine as a Mermaid state diagram; refused requests are its notes.
-
-    Examples
-    --------
-    >>> print(state_diagram().splitlines()[1])
-        [*] --> RUN: power-up as shipped, or was running
-    """
+    """Return the machine as a Mermaid state diagram; refused requests are its notes."""
     lines = [
         "stateDiagram-v2",
         "    [*] --> RUN: power-up as shipped, or was running",
@@ -337,7 +319,7 @@ def group_of(command: m.Message) -> Group:
 
 
 def check_permission(command: m.Message, state: State, options: DeviceOptions) -> None:
-    """Return if a command is taken in a state; raise `Refusal` or `Silence` if not."""
+    """Raise `Refusal` or `Silence` if a command is not taken in a state."""
     verdict = PERMISSIONS[group_of(command)][state]
     if verdict is Verdict.TAKEN:
         return
@@ -354,13 +336,7 @@ def check_permission(command: m.Message, state: State, options: DeviceOptions) -
 
 
 def permission_table() -> str:
-    """Return the table as Markdown, a row per group and a column per state.
-
-    Examples
-    --------
-    >>> permission_table().splitlines()[0].split("|")[2]
-    ' RUN '
-    """
+    """Return the table as Markdown, a row per group and a column per state."""
     lines = [
         "| Commands | " + " | ".join(state.name for state in _ORDER) + " |",
         "|" + "---|" * (len(_ORDER) + 1),

@@ -17,7 +17,7 @@ from enum import Enum, auto
 from typing import NamedTuple
 
 from emulator.chip.chip import Chip, Refusal
-from emulator.module.memory import FaultCounter, FileSystem, Identity, Memory, SavedState
+from emulator.module.memory import FileSystem, Identity, Memory, SavedState
 from emulator.module.modes import ModeMachine, State
 from emulator.module.pins import IoPins
 from emulator.module.settings import DEFAULT_BAUDRATE, DeviceOptions, ProfileSettings
@@ -34,6 +34,10 @@ CRASH_DUMP = (int(FileType.CRASH_DUMP), 0)
 NOISE_MAPS = ((int(FileType.NOISEMAP_SLOW), 0), (int(FileType.NOISEMAP_FAST), 0))
 NS_PER_S = 1_000_000_000
 NS_PER_MIN = 60 * NS_PER_S
+SAFE_MODE_FAULTS = 10
+"""Consecutive faults that start safe mode."""
+BOOTLOADER_FAULTS = 15
+"""Faults that are still answered with safe mode; the next one ends in the bootloader."""
 BAUDRATE_DELAY_NS = NS_PER_S // 2
 """From the ACK of SETBAUDRATE to the switch."""
 
@@ -104,7 +108,8 @@ class Module:
         self.certification = saved.certification
         self.parameter_file_name = saved.parameter_file_name
         self.pins = IoPins(base_firmware=self.options.firmware == "xep")
-        self.faults = FaultCounter(self.options.watchdog_memory_ns)
+        self._faults = 0  # in a row
+        self._last_fault_ns = 0
         self.noise_maps: Callable[[], tuple[bytes, bytes]] = _placeholder_noise_maps
         self.now_ns = 0
         self.restart: Restart | None
@@ -128,8 +133,8 @@ class Module:
         self._power_up_parts(into_bootloader=into_bootloader)
 
     def power_cycle(self, now_ns: int) -> None:
-        """Restart at once, as after a power cut; faults are no longer counted."""
-        self.faults.clear()
+        """Restart at once, as after a power cut, which ends a series of faults."""
+        self._faults = 0
         self.restart = Restart(at_ns=now_ns)
 
     def advance(self, now_ns: int) -> None:
@@ -159,22 +164,26 @@ class Module:
 
     def request_restart(self, *, into_bootloader: bool = False) -> None:
         """Restart as the host commands, which ends a series of faults."""
-        self.faults.clear()
+        self._faults = 0
         self.restart = Restart(into_bootloader=into_bootloader)
 
     def crash(self, reason: str, now_ns: int) -> None:
         """Fail as by a watchdog or a hard fault: leave a crash dump and restart at once."""
         if self.state is State.BOOTLOADER or self.asleep:
             return
-        self.faults.fault(now_ns)
-        dump = f"{reason}\nat {now_ns} ns\nfault {self.faults.count} in a row\n".encode()
+        if now_ns - self._last_fault_ns >= self.options.watchdog_memory_ns:
+            self._faults = 0
+        self._faults += 1
+        self._last_fault_ns = now_ns
+        dump = f"{reason}\nat {now_ns} ns\nfault {self._faults} in a row\n".encode()
         self.files.close_all()
         with suppress(Refusal):  # no room for a dump: the firmware has nowhere else to put it
             self.files.replace(CRASH_DUMP, dump)
         self.save()
-        self.restart = Restart(into_bootloader=self.faults.needs_bootloader, at_ns=now_ns)
-        if self.faults.needs_bootloader:
-            self.faults.clear()
+        into_bootloader = self._faults > BOOTLOADER_FAULTS
+        self.restart = Restart(into_bootloader=into_bootloader, at_ns=now_ns)
+        if into_bootloader:
+            self._faults = 0
 
     def load_profile(self, profile_id: int) -> None:
         """Load a profile with its own last settings, or raise `Refusal`."""
@@ -236,7 +245,7 @@ class Module:
     def _first_state(self, into_bootloader: bool) -> State | None:
         if into_bootloader:
             return State.BOOTLOADER
-        if self.faults.safe:
+        if self._faults >= SAFE_MODE_FAULTS:
             return State.SAFE
         if self.options.firmware == "xep":
             return State.XEP

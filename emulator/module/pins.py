@@ -1,8 +1,7 @@
 """The IO pins: what each is set up as, what drives it, and the level it shows.
 
-Levels are electrical: 1 is high. A pin's function is active or not; an active-low pin shows the
-opposite. As shipped all pins are disabled, and their control is not saved: every reset restores
-that (assumed; the reference names only messages as kept).
+Levels are electrical: 1 is high. As shipped all pins are disabled, and their control is not saved:
+every reset restores that (assumed; the reference names only messages as kept).
 
 Source: protocol reference 4.8 and 5.1.
 """
@@ -45,18 +44,7 @@ _DATASHEET: dict[int, PinControl] = {
 
 
 class IoPins:
-    """The pins of one module.
-
-    Parameters
-    ----------
-    base_firmware
-        True for the base firmware: more pins, but nothing drives them.
-
-    Attributes
-    ----------
-    presence
-        `PresenceState` of the running profile; it drives PRESENCE and NO_PRESENCE.
-    """
+    """The pins of one module; the base firmware has more, but nothing drives them."""
 
     def __init__(self, *, base_firmware: bool = False) -> None:
         self._base_firmware = base_firmware
@@ -65,11 +53,11 @@ class IoPins:
         self.reset()
 
     def reset(self) -> None:
-        """Disable all pins."""
         self._controls: dict[int, PinControl] = {}
         self._values: dict[int, int] = {}
 
     def follow(self, presence: int, direction: int) -> None:
+        """Take over what the running profile reports."""
         self.presence = presence
         self.movement = presence == PresenceState.PRESENCE and direction != PresenceDirection.STILL
 

@@ -31,7 +31,7 @@ DEFAULT_BAUDRATE = 115_200
 BITS_PER_BYTE = 10
 """Start, eight data bits, stop."""
 _FALLING = b"\x01\x00"
-_CHARACTERS = tuple(bytes((0, *(byte >> bit & 1 for bit in range(8)), 1)) for byte in range(256))
+_LEVELS = tuple(bytes((0, *(byte >> bit & 1 for bit in range(8)), 1)) for byte in range(256))
 
 _BASEBAND = frozenset({OutputFeature.BASEBAND_IQ, OutputFeature.BASEBAND_AMPLITUDE_PHASE})
 _RIVALS: dict[int, OutputFeature] = {
@@ -70,7 +70,7 @@ class DeviceOptions:
         "sensor": a stock X4M300. "xep": the bare base firmware, which has no profiles and no
         modes.
     profiles
-        Profiles that LOADAPP accepts (4.3).
+        What LOADAPP accepts (4.3).
     default_output
         The presence message that is on in a module as shipped (15, question 3).
     port_on_reset
@@ -146,46 +146,32 @@ class DeviceOptions:
 # --- bits on the serial line
 
 
-def line_levels(data: bytes) -> bytes:
-    """Return the levels of bytes sent one right after the other, one per bit time.
+def received_bytes(data: bytes, sent_baud: int, read_baud: int) -> bytes:
+    """Return what arrives of bytes sent one right after the other; nothing at a rate of 0.
 
-    Eight data bits, least significant first, no parity; an idle line is high.
-
-    Examples
-    --------
-    >>> line_levels(bytes([0x55])).hex(" ")
-    '00 01 00 01 00 01 00 01 00 01'
-    """
-    return b"".join(map(_CHARACTERS.__getitem__, data))
-
-
-def sampled(levels: bytes, sent_baud: int, read_baud: int) -> bytes:
-    """Return the bytes a receiver makes of line levels.
-
-    It waits for a falling edge, looks in the middle of its own bit time whether the line is still
-    low, else it was no start bit; then it takes eight bits, each in its middle, and the stop bit,
-    which it does not judge, as a terminal in raw mode does not. Then it waits for the line to be
-    high and to fall again.
-
-    Parameters
-    ----------
-    levels
-        One per bit time of the sender.
-    sent_baud, read_baud
-        Rates of sender and receiver, bit/s.
+    Eight data bits, least significant first, no parity; an idle line is high. The receiver waits
+    for a falling edge, looks in the middle of its own bit time whether the line is still low, else
+    it was no start bit; then it takes eight bits, each in its middle, and the stop bit, which it
+    does not judge, as a terminal in raw mode does not. Then it waits for the line to be high and to
+    fall again.
 
     Examples
     --------
     At half the rate, bits 3, 5 and 7 of the line are data bits 0 to 2 of 00, then comes its stop
     bit and the idle line.
 
-    >>> sampled(line_levels(bytes([0x00])), 115200, 57600).hex()
+    >>> received_bytes(bytes([0x00]), 115200, 57600).hex()
     'f8'
     """
+    if sent_baud == read_baud:
+        return data
+    if sent_baud <= 0 or read_baud <= 0:
+        return b""
     # an edge lies at the beginning of a sent bit: the samples' places behind it are always the same
     middles = [(2 * bit + 1) * sent_baud // (2 * read_baud) for bit in range(BITS_PER_BYTE)]
     data_bits = itemgetter(*middles[1:9])
     start, stop = middles[0], middles[9]
+    levels = b"".join(map(_LEVELS.__getitem__, data))  # one per bit time of the sender
     line = b"\x01" + levels + b"\x01" * (stop + 2)
     received = bytearray()
     at = line.find(_FALLING)
@@ -198,15 +184,6 @@ def sampled(levels: bytes, sent_baud: int, read_baud: int) -> bytes:
         received.append(sum(level << place for place, level in enumerate(bits)))
         at = line.find(_FALLING, edge + stop)
     return bytes(received)
-
-
-def received_bytes(data: bytes, sent_baud: int, read_baud: int) -> bytes:
-    """Return what arrives of bytes sent one right after the other; nothing at a rate of 0."""
-    if sent_baud == read_baud:
-        return data
-    if sent_baud <= 0 or read_baud <= 0:
-        return b""
-    return sampled(line_levels(data), sent_baud, read_baud)
 
 
 # --- messages that are on
@@ -274,14 +251,6 @@ class ProfileSettings:
     ----------
     zone_m
         Actual detection zone, start and end, on the grid [module metres].
-    sensitivity
-        0...9.
-    tx_center_frequency
-        Band: 3 low, 4 high.
-    led
-        `LedMode`.
-    noise_map_control
-        `NoiseMapControl` bits.
     noise_map_interval_min
         Interval at which the noise map is stored, 0 for never [min].
     outputs
@@ -305,7 +274,7 @@ class ProfileSettings:
         return replace(self, outputs=dict(self.outputs), debug_outputs=dict(self.debug_outputs))
 
     def after_reset(self) -> ProfileSettings:
-        """Return a copy without the messages that every reset switches off."""
+        """Return a copy without the messages that a reset switches off."""
         return replace(
             self,
             outputs=_without_volatile(self.outputs),

@@ -66,13 +66,6 @@ Powers = dict[MatrixInstance, NDArray[np.float64]]
 class ProfileSweep:
     """Baseband frames of one zone, each selected by its counter.
 
-    Parameters
-    ----------
-    zone_m
-        Detection zone, start and end, on the grid of the bins [module metres].
-    tx_center_frequency
-        Band, 3 or 4.
-
     Attributes
     ----------
     range_m
@@ -104,7 +97,6 @@ class ProfileSweep:
             self.range_m < end_m + tolerance_m
         )
         self.timeline = self._chip.timeline
-        self.tx_center_frequency = tx_center_frequency
         self.carrier_hz = x4.CARRIER_HZ[tx_center_frequency]
 
     @property
@@ -118,7 +110,7 @@ class ProfileSweep:
         return self.timeline.next_counter
 
     def frame(self, counter: int) -> NDArray[np.complex128]:
-        """Return I + jQ of one frame, shape (n_bins,); float32 values, exactly."""
+        """Return I + jQ of one frame, shape (n_bins,); its float32 values, exactly."""
         self.timeline.next_counter = counter
         values = self._chip.next_frame().values.astype(np.float64)
         iq: NDArray[np.complex128] = values[: self.n_bins] + 1j * values[self.n_bins :]
@@ -131,8 +123,6 @@ class Matrix:
 
     Attributes
     ----------
-    instance
-        Its number on the wire.
     decimation
         Frames averaged to one pulse.
     pulses
@@ -248,13 +238,7 @@ class NoiseMap:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredMap:
-    """A noise map kept over restarts, valid for one zone and band.
-
-    Attributes
-    ----------
-    zone_m
-        Detection zone it was made in [module metres].
-    """
+    """A noise map kept over restarts, valid for one zone [module metres] and band."""
 
     zone_m: tuple[float, float]
     tx_center_frequency: int

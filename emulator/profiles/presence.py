@@ -68,8 +68,6 @@ class Detection:
     ----------
     distance_m
         Module metres.
-    excess_db
-        Largest excess of the run over the noise map.
     velocity_mps
         Radial velocity, positive away; 0 for a person who does not walk.
     """
@@ -97,7 +95,7 @@ def excess_over(noise_map: NoiseMap, power: Powers, matrix: Matrix) -> NDArray[n
 
 
 def threshold_db(sensitivity: int) -> float:
-    """Return the excess from which a bin is occupied, 14 ... 5 dB for 0 ... 9."""
+    """Return the excess from which a bin is occupied."""
     return _QUIETEST_THRESHOLD_DB - sensitivity
 
 
@@ -167,9 +165,8 @@ def _runs(occupied: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
     if len(bins) == 0:
         return
     breaks = np.flatnonzero(np.diff(bins) > _BRIDGED_BINS)
-    firsts = [int(bins[0]), *(int(bins[index + 1]) for index in breaks)]
-    lasts = [*(int(bins[index]) for index in breaks), int(bins[-1])]
-    yield from zip(firsts, lasts, strict=True)
+    for run in np.split(bins, breaks + 1):
+        yield int(run[0]), int(run[-1])
 
 
 def _mean_power(frames: NDArray[np.complex128]) -> NDArray[np.float64]:
@@ -230,16 +227,9 @@ def _centroid(power: NDArray[np.float64], centre: int) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Presence:
-    """What the profile knows after a tick.
+    """What the profile knows after a tick: who is in the zone, and where it moves.
 
-    Attributes
-    ----------
-    state
-        Initialising until matrices and noise map are there, then presence or none.
-    detections
-        Who is in the zone; those that move right now come first.
-    movement_slow, movement_fast
-        0...100 per interval of the zone, the average in front.
+    It initialises until matrices and noise map are there. Movement is that of `movement_list`.
     """
 
     state: PresenceState
@@ -251,15 +241,10 @@ class Presence:
 class PresenceProcessing:
     """Matrices, noise map and detection of one run of the profile.
 
-    Parameters
-    ----------
-    noise_map
-        The map to begin with; an incomplete one is created from the first matrices.
-
     Attributes
     ----------
     noise_map
-        As it is now.
+        As it is now; an incomplete one is created from the first matrices.
     power
         The matrices of the last tick, as far as they were full.
     """

@@ -153,8 +153,6 @@ def matrix_reports(
 
     Parameters
     ----------
-    feature
-        A key of `MATRIX_REPORTS`.
     power
         Shape (n_bins, matrix.pulses), of pulse-Doppler or noise map; a snapshot.
     counter
@@ -197,14 +195,8 @@ def matrix_reports(
 class ProfileRun:
     """A profile from RUN to STOP, or from one pause to the next.
 
-    Parameters
-    ----------
-    settings
-        Called for what to send; it may change at any time.
-    zero_ns
-        Device time of scene time 0, ns.
-    sampling_hz
-        Sampling frequency that baseband messages claim.
+    ``settings`` is asked for what to send, ``zero_ns`` is the device time of scene time 0, and
+    ``sampling_hz`` what baseband messages claim.
     """
 
     def __init__(
@@ -228,10 +220,6 @@ class ProfileRun:
         self._taken = 0  # frames so far
         self._ready: deque[Response] = deque()
         self._spread: dict[tuple[int, Matrix], deque[Response]] = {}
-
-    @property
-    def silent(self) -> bool:
-        return self._next_index() is None and not self._ready
 
     def next_due_ns(self) -> int | None:
         if self._ready:
@@ -340,7 +328,7 @@ class ProfileRun:
                 self._ready.append(waiting.popleft())
 
     def _jump(self, time_ns: int) -> None:
-        """Skip frames whose messages are not sent, if many."""
+        """Skip frames whose messages are not sent, if there are many."""
         if not self.processing.noise_map.complete:
             return
         cycles = 0
@@ -359,15 +347,7 @@ def _next_multiple(taken: int, period: int) -> int:
 
 
 class ProfileStream(MessageStream):
-    """Messages of a module in RUN.
-
-    Parameters
-    ----------
-    pace
-        Whether anything may be dropped.
-    scene_time_zero_ns
-        Device time of scene time 0, and of power-up [ns].
-    """
+    """Messages of a module in RUN; ``scene_time_zero_ns`` is the device time of power-up, too."""
 
     def __init__(
         self,
@@ -445,7 +425,7 @@ class ProfileStream(MessageStream):
         elif self._was_silent:
             run.pass_before(now_ns)
             self._keep_created_map()
-        self._was_silent = run.silent
+        self._was_silent = run.next_due_ns() is None
 
     def _start(self, now_ns: int, noise_map: NoiseMap | None = None) -> None:
         settings = self._module.profile
@@ -472,7 +452,7 @@ class ProfileStream(MessageStream):
         )
         self._creating = not self._run.processing.noise_map.complete
         self._paused = False
-        self._was_silent = self._run.silent
+        self._was_silent = self._run.next_due_ns() is None
 
     def _first_map(self, sweep: ProfileSweep) -> NoiseMap:
         settings = self._module.profile

@@ -23,6 +23,16 @@ from pydantic import Field, model_validator
 
 from emulator.scene.tables import Number, Table
 
+AMPLITUDE_OF_1_M2 = 0.06
+"""Echo of 1 m**2 on boresight at 1 m, normalised units at TX power 2.
+
+Assumed: a scene's rod of 0.015 is a cylinder of 1 cm radius seen over one Fresnel zone of 20 cm,
+2 pi a h**2 / wavelength = 0.06 m**2, and amplitude goes with the root of the cross section."""
+
+Metres = Annotated[Number, Field(ge=-1000, le=1000)]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
+_Seconds = Annotated[Number, Field(ge=0, le=86_400)]
+
 # A turn smaller than this is straight on; a U-turn within it of -180 deg is taken as +180 deg.
 _ANGLE_TOLERANCE_RAD = 1e-9
 
@@ -36,8 +46,8 @@ class Trajectory:
     knot_times_ns
         Shape (k,), int64, strictly increasing, first 0.
     knot_poses
-        Shape (k, 3), float64: x [m], y [m], heading [rad, counter-clockwise,
-        continuous: never wrapped], world frame.
+        Shape (k, 3), float64: x [m], y [m], heading [rad, counter-clockwise, never wrapped],
+        world frame.
     carried_ns
         From when to when the robot is carried and its wheels stand; None where it never is.
     """
@@ -52,11 +62,9 @@ class Trajectory:
         return int(self.knot_times_ns[-1])
 
     def poses(self, t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the true pose at each time; before 0 and after the end the robot stands still.
+        """Return the true pose at each time, shape (n, 3), as ``knot_poses``.
 
-        Returns
-        -------
-        Shape (n, 3), float64: x [m], y [m], heading [rad, not wrapped], world frame.
+        Before 0 and after the end the robot stands still.
         """
         times = np.clip(np.asarray(t_ns, dtype=np.int64), 0, self.duration_ns)
         if len(self.knot_times_ns) == 1:
@@ -77,18 +85,9 @@ def drive(
 ) -> Trajectory:
     """Return the trajectory of a robot that visits the stops in order, turning on the spot.
 
-    It starts at the first stop with heading zero and takes the shorter way round at each turn;
-    a U-turn goes counter-clockwise. Leg and turn times are rounded to whole nanoseconds,
-    at least one.
-
-    Parameters
-    ----------
-    stops_m
-        At least one (x, y) [m], world frame. Equal neighbours are one stop.
-    speed_mps
-        Speed on the legs, > 0.
-    turn_rate_rad_per_s
-        Turn rate on the spot, > 0.
+    It starts at the first stop (of at least one, world frame) with heading zero and takes the
+    shorter way round at each turn; a U-turn goes counter-clockwise. Leg and turn times are rounded
+    to whole nanoseconds, at least one. Equal neighbours are one stop.
 
     >>> path = drive([(0, 0), (2, 0), (2, 2)], speed_mps=0.05, turn_rate_rad_per_s=math.pi / 6)
     >>> path.duration_ns  # 40 s along x, 3 s turning left, 40 s along y
@@ -125,17 +124,8 @@ def drive(
 def carried(path: Trajectory, *, at_ns: int, skips_ns: int, takes_ns: int) -> Trajectory:
     """Return a path of which a stretch is skipped: the robot is picked up and set down after it.
 
-    Parameters
-    ----------
-    at_ns, skips_ns
-        When it is lifted, and how much of the drive is left out from there.
-    takes_ns
-        Time in the air, moving straight and turning evenly to the other end of the stretch.
-
-    Raises
-    ------
-    ValueError
-        The stretch does not end before the drive does.
+    It is in the air for ``takes_ns``, moving straight and turning evenly. `ValueError` is raised
+    when the stretch does not end before the drive does.
     """
     down_ns = at_ns + skips_ns
     if not 0 < at_ns < down_ns < path.duration_ns:
@@ -159,17 +149,6 @@ def carried(path: Trajectory, *, at_ns: int, skips_ns: int, takes_ns: int) -> Tr
     )
 
 
-AMPLITUDE_OF_1_M2 = 0.06
-"""Echo of 1 m**2 on boresight at 1 m, normalised units at TX power 2.
-
-Assumed: a scene's rod of 0.015 is a cylinder of 1 cm radius seen over one Fresnel zone of 20 cm,
-2 pi a h**2 / wavelength = 0.06 m**2, and amplitude goes with the root of the cross section."""
-
-
-_Metres = Annotated[Number, Field(ge=-1000, le=1000)]
-_Seconds = Annotated[Number, Field(ge=0, le=86_400)]
-
-
 class PersonSpec(Table):
     """One person, in the world frame.
 
@@ -180,10 +159,8 @@ class PersonSpec(Table):
     the chest (half of its travel). The reflection phase is fixed by the name.
     """
 
-    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
-    waypoints_m: Annotated[
-        tuple[tuple[_Metres, _Metres], ...], Field(min_length=1, max_length=1000)
-    ]
+    name: Name
+    waypoints_m: Annotated[tuple[tuple[Metres, Metres], ...], Field(min_length=1, max_length=1000)]
     speed_mps: Annotated[Number, Field(ge=1e-3, le=10)] = 1.0
     walk: Literal["once", "to_and_fro", "round"] = "once"
     enters_s: _Seconds = 0.0

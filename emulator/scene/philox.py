@@ -25,7 +25,6 @@ from scipy.special import ndtri
 from xethru_protocol.wire.x4 import FRAME_SAMPLES
 
 MAX_SAMPLES = FRAME_SAMPLES
-"""Samples of the longest frame the X4 can take (protocol reference 9.1)."""
 
 _TABLE_BITS = 16
 _QUANTILES = (np.arange(1 << _TABLE_BITS) + 0.5) / (1 << _TABLE_BITS)
@@ -104,18 +103,9 @@ def standard_normals(count: int, *, seed: int, stream: int) -> NDArray[np.float6
 
 
 def counter_normals(counters: NDArray[np.int64], *, seed: int, stream: int) -> NDArray[np.float64]:
-    """Return one normal for each counter, selected by the counter alone.
+    """Return one normal for each counter: shape (n,), mean 0, variance 1.
 
-    Parameters
-    ----------
-    counters
-        Shape (n,), int64, each >= 0, in any order.
-    seed, stream
-        Key of the stream, each 0 ... 2**64 - 1.
-
-    Returns
-    -------
-    Shape (n,), float64, mean 0, variance 1.
+    ``counters`` is as in `frame_noise_units`; each selects its normal alone.
     """
     units = np.empty(len(counters), dtype=np.int32)
     for start, stop in _runs(counters):
@@ -152,13 +142,7 @@ _UNIFORMS_PER_NORMAL = 12  # their sum has variance 1
 
 
 class Rng:
-    """One stream of random numbers.
-
-    Parameters
-    ----------
-    seed, stream
-        Key of the stream, each 0 ... 2**64 - 1.
-    """
+    """One stream of random numbers."""
 
     def __init__(self, seed: int, stream: int = 0) -> None:
         self._bits = _philox(seed, stream)

@@ -14,29 +14,31 @@ import math
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import (
-    Field,
-    StrictBool,
-    StrictInt,
-    field_validator,
-    model_validator,
-)
+from pydantic import Field, StrictBool, StrictInt, field_validator, model_validator
 
 from emulator.chip.chip import ModuleClock
-from emulator.scene.motion import AMPLITUDE_OF_1_M2, PersonSpec, Trajectory, carried, drive
+from emulator.scene.motion import (
+    AMPLITUDE_OF_1_M2,
+    Metres,
+    Name,
+    PersonSpec,
+    Trajectory,
+    carried,
+    drive,
+)
 from emulator.scene.tables import Number, Table, load_table
 
 MIRROR_AMPLITUDE_1M = AMPLITUDE_OF_1_M2 * math.sqrt(math.pi)
 """Echo of a large perfect mirror on boresight at 1 m: 0.106, as strong as pi R**2 at R."""
 SHORTEST_FACE_M = 0.01
+LONGEST_DRIVE_S = 24 * 3600
+MOST_ODOMETRY_LINES = 500_000
+"""A day at the default rate; all lines are computed before the ports open."""
 
-
-Metres = Annotated[Number, Field(ge=-1000, le=1000)]
 Degrees = Annotated[Number, Field(ge=-360, le=360)]
 Sigma = Annotated[Number, Field(ge=0, le=1)]
 Seconds = Annotated[Number, Field(gt=0, le=86_400)]
 CorrelationTime = Annotated[Number, Field(ge=1e-3, le=86_400)]
-Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
 
 
 class RadarSpec(Table):
@@ -105,7 +107,7 @@ class _Surface(Table):
 
     @property
     def reflection(self) -> float:
-        """Return the magnitude of the reflection coefficient, 0 ... 1."""
+        """The magnitude of the reflection coefficient, 0 ... 1."""
         return self.amplitude_1m / MIRROR_AMPLITUDE_1M
 
     @model_validator(mode="after")
@@ -261,11 +263,6 @@ class LeakageSpec(Table):
 
     amplitude: Annotated[Number, Field(ge=0, le=10)] = 0.06
     range_m: Metres = 0.05
-
-
-LONGEST_DRIVE_S = 24 * 3600
-MOST_ODOMETRY_LINES = 500_000
-"""A day at the default rate; all lines are computed before the ports open."""
 
 
 class SceneError(ValueError):

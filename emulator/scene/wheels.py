@@ -20,21 +20,13 @@ The TUM lines are canonical: every reader, live or later, computes with the same
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emulator.scene.philox import standard_normals
 from emulator.scene.scene import OdometrySpec, Scene
-
-__all__ = [
-    "ODOMETRY_STREAM",
-    "drift",
-    "odometry_times_ns",
-    "scene_odometry",
-    "tum_line",
-]
 
 ODOMETRY_STREAM = 1 << 63
 """Noise stream of the wheels; the radars' streams are their serial numbers, below 10**12."""
@@ -62,8 +54,6 @@ def drift(
     ----------
     true_poses
         Shape (n, 3), float64: x [m], y [m], heading [rad, continuous], any frame.
-    seed
-        Selects the run.
     unseen
         Shape (n - 1,): steps during which the wheels stood, whatever the robot did.
 
@@ -137,9 +127,4 @@ def scene_odometry(scene: Scene, seed: int) -> tuple[str, ...]:
         lifted_ns, down_ns = trajectory.carried_ns
         unseen = (times[1:] > lifted_ns) & (times[:-1] < down_ns)
     poses = drift(trajectory.poses(times), scene.odometry, seed=seed, unseen=unseen)
-    return _tum_lines(times, poses)
-
-
-def _tum_lines(times_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> tuple[str, ...]:
-    rows: Iterable[tuple[int, list[float]]] = zip(times_ns.tolist(), poses.tolist(), strict=True)
-    return tuple(tum_line(t_ns, pose) for t_ns, pose in rows)
+    return tuple(map(tum_line, times.tolist(), poses.tolist()))
