@@ -10,7 +10,6 @@ import argparse
 import contextlib
 import json
 import math
-import os
 import socket
 import sys
 from collections.abc import Callable, Sequence
@@ -18,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from emulator.chip import Pace
-from xethru_protocol.system import StopFlag
+from xethru_protocol.system import StopFlag, flush_streams
 
 if TYPE_CHECKING:
     from emulator.faults.kind import Kind
@@ -26,7 +25,55 @@ if TYPE_CHECKING:
 TIMEOUT_S = 10.0
 _INTERRUPTED = 130
 """Exit code after SIGINT, as of a shell."""
+MOST_BARE = 64
+LAST_PORT = 65535
+_LINKS = {"usb": (0, 1000), "uart": (600, 10_000_000)}
+"""Links and the numbers they take: latency in ms, baud rate."""
 
+_SERVE_HELP = """\
+Each radar of the scene becomes a stock X4M300 on a pseudo-terminal, published as a link in the
+link directory. One JSON line on stdout says that all ports are ready:
+
+  {"ready":true,"scene_time_zero_ns":N,"odometry":"PATH or null",
+   "control":"PATH","devices":[{"name":"...","path":"...","serial":"...","start_skew_ns":N,
+                                "tcp":PORT or null}]}
+
+scene_time_zero_ns is the monotonic time of scene time 0; the odometry path is a unix socket that
+gives every client the wheel odometry as TUM lines, the control path one for `xethru-emulator ctl`.
+start_skew_ns is when, in scene time, the module takes its frame of counter 0; radars are not
+synchronised, and a host needs it where it cannot tell from when frames arrive.
+Ctrl-C, SIGTERM or SIGHUP ends it: links, sockets and a directory of its own are removed, exit 0.
+
+pace realtime: frames at their deadlines; a host that does not keep up loses frames as on the
+real module. pace asap: as fast as the host reads, nothing is lost.
+
+--tcp: each module on a TCP port, too, for one client at a time: a second one is hung up on, and so
+is one that comes while a host has the module's pseudo-terminal open. While a client is connected,
+the pseudo-terminal takes and sends nothing.
+
+--link usb: bytes pass at once; usb:MS: transfers of at most 512 bytes, MS milliseconds under way.
+--link uart: ten bits per byte at the speed that the host sets its terminal to; a host at another
+speed than the module's (115200 after power-up, then what SETBAUDRATE set) receives and sends
+garbage. uart:BAUD: the host's side runs at BAUD, whatever its terminal is set to.
+
+--port-on-reset vanish: a reset takes the port away for two seconds, as USB does: whoever has it
+open sees it hang up, its name is gone. rename: it returns as NAME-2, NAME-3 and so on; running
+emulators' ports are found with `xethru list`.
+"""
+
+_PLAY_HELP = """\
+Plays a recording at the port of an emulated X4M300, every message byte-exact: a directory of
+ModuleConnector, a wire capture (.xtwire), MCAP or .npz. Same ready line as serve. A session of
+several radars gets a port for each, named as in the session; they loop in step.
+
+Playing begins anew for every host that opens the port: at once when the host starts the radar
+(FPS above 0, or SETMODE RUN), else half a second after it opened the port or sent its last
+command. It ends when the last host closes the port. Nothing is dropped: a host that reads slowly
+makes the recording wait. Meanwhile the module answers every command; FPS, mode and geometry
+settings are acknowledged and change nothing about what is played; the number of bins reads back as
+recorded. Recorded answers are left out. (Where the system cannot tell
+who opens a port, a host's first command counts as opening it.)
+"""
 _PROXY_HELP = (
     "A pseudo-terminal that leads to a real module: the same ready line as serve, the same faults. "
     "While no fault is armed no byte is changed. Ends with exit 1 when the module's port vanishes."
@@ -220,66 +267,11 @@ def _print(text: str) -> None:
         sys.stdout.flush()  # what fails shall fail here, not when the interpreter ends
 
 
-def _forget_output() -> None:
-    """Keep the interpreter from trying to write again what could not be written."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
 def _failed(text: str, *, exit_code: int = 1) -> int:
-    if sys.stderr is not None:
-        sys.stderr.write(f"xethru-emulator: {text}\n")
+    if sys.stderr is not None:  # started with stderr closed
+        line = " ".join(text.split())
+        sys.stderr.write(f"xethru-emulator: {line}\n")
     return exit_code
-
-
-MOST_BARE = 64
-LAST_PORT = 65535
-_LINKS = {"usb": (0, 1000), "uart": (600, 10_000_000)}
-"""Links and the numbers they take: latency in ms, baud rate."""
-
-_SERVE_HELP = """\
-Each radar of the scene becomes a stock X4M300 on a pseudo-terminal, published as a link in the
-link directory. One JSON line on stdout says that all ports are ready:
-
-  {"ready":true,"scene_time_zero_ns":N,"odometry":"PATH or null",
-   "control":"PATH","devices":[{"name":"...","path":"...","serial":"...","start_skew_ns":N,
-                                "tcp":PORT or null}]}
-
-scene_time_zero_ns is the monotonic time of scene time 0; the odometry path is a unix socket that
-gives every client the wheel odometry as TUM lines, the control path one for `xethru-emulator ctl`.
-start_skew_ns is when, in scene time, the module takes its frame of counter 0; radars are not
-synchronised, and a host needs it where it cannot tell from when frames arrive.
-Ctrl-C, SIGTERM or SIGHUP ends it: links, sockets and a directory of its own are removed, exit 0.
-
-pace realtime: frames at their deadlines; a host that does not keep up loses frames as on the
-real module. pace asap: as fast as the host reads, nothing is lost.
-
---tcp: each module on a TCP port, too, for one client at a time: a second one is hung up on, and so
-is one that comes while a host has the module's pseudo-terminal open. While a client is connected,
-the pseudo-terminal takes and sends nothing.
-
---link usb: bytes pass at once; usb:MS: transfers of at most 512 bytes, MS milliseconds under way.
---link uart: ten bits per byte at the speed that the host sets its terminal to; a host at another
-speed than the module's (115200 after power-up, then what SETBAUDRATE set) receives and sends
-garbage. uart:BAUD: the host's side runs at BAUD, whatever its terminal is set to.
-
---port-on-reset vanish: a reset takes the port away for two seconds, as USB does: whoever has it
-open sees it hang up, its name is gone. rename: it returns as NAME-2, NAME-3 and so on; running
-emulators' ports are found with `xethru list`.
-"""
-
-_PLAY_HELP = """\
-Plays a recording at the port of an emulated X4M300, every message byte-exact: a directory of
-ModuleConnector, a wire capture (.xtwire), MCAP or .npz. Same ready line as serve. A session of
-several radars gets a port for each, named as in the session; they loop in step.
-
-Playing begins anew for every host that opens the port: at once when the host starts the radar
-(FPS above 0, or SETMODE RUN), else half a second after it opened the port or sent its last
-command. It ends when the last host closes the port. Nothing is dropped: a host that reads slowly
-makes the recording wait. Meanwhile the module answers every command; FPS, mode and geometry
-settings are acknowledged and change nothing about what is played; the number of bins reads back as
-recorded. Recorded answers are left out. (Where the system cannot tell
-who opens a port, a host's first command counts as opening it.)
-"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -293,10 +285,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return _INTERRUPTED
     except BrokenPipeError:  # the reader of our output has closed it
-        _forget_output()
+        flush_streams()
         return 0
     except OSError as error:
-        _forget_output()
+        flush_streams()
         return _failed(f"stdout: cannot write: {error.strerror}")
 
 
@@ -310,19 +302,12 @@ def _run(arguments: argparse.Namespace, stop: StopFlag) -> int:
     try:
         start[arguments.command](arguments, stop, _warn)
     except serving.CannotServeError as error:
-        _print_line(str(error))
-        return error.exit_code
+        return _failed(str(error), exit_code=error.exit_code)
     return 0
 
 
 def _warn(text: str) -> None:
-    _print_line(f"warning: {text}")
-
-
-def _print_line(text: str) -> None:
-    if sys.stderr is not None:  # started with stderr closed
-        line = " ".join(text.split())
-        sys.stderr.write(f"xethru-emulator: {line}\n")
+    _failed(f"warning: {text}")
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:

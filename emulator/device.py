@@ -11,8 +11,7 @@ Source: protocol reference 8.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from emulator.chip import Pace
 from emulator.chip.chip import Chip, EchoSource, ModuleClock
@@ -46,6 +45,27 @@ from xethru_protocol.wire.messages import (
     X4DriverWriteI2c,
 )
 
+ACK_TO_RESET_NS = 500_000_000
+"""From the ACK of MOD_RESET to the restart. Protocol reference 8.1."""
+RESET_TO_READY_NS = 2_000_000_000
+"""Until the transmitter starts and the queued BOOTING and READY leave. Protocol reference 8.1."""
+NORMAL_START = 0x7D
+NORMAL_BUFFER = 8000
+"""Bytes of a Normal packet, escapes included, that a module can send (protocol reference 1.1)."""
+LARGEST_POOL_BLOCK = 7000
+"""Payload bytes of the largest command that a module processes (protocol reference 1.1)."""
+_LONG_COMMANDS = (
+    InjectFrame,
+    SetFileData,
+    SetParameterFile,
+    UnknownMessage,
+    X4DriverWrite,
+    X4DriverWriteI2c,
+)
+
+ASAP_BLOCK = 32
+# Radars in step refill at the same moment: four blocks of 8 cost 2 ms, four of 32 cost 7 ms.
+REALTIME_BLOCK = 8
 _CLOCK_TOLERANCE_NS = 2
 
 
@@ -148,43 +168,6 @@ class CombinedStream(MessageStream):
         self._due_ns = self._active.next_due_ns()
 
 
-NORMAL_START = 0x7D
-NORMAL_BUFFER = 8000
-"""Bytes of a Normal packet, escapes included, that a module can send (protocol reference 1.1)."""
-
-LARGEST_POOL_BLOCK = 7000
-"""Payload bytes of the largest command that a module processes (protocol reference 1.1)."""
-_LONG_COMMANDS = (
-    InjectFrame,
-    SetFileData,
-    SetParameterFile,
-    UnknownMessage,
-    X4DriverWrite,
-    X4DriverWriteI2c,
-)
-
-ASAP_BLOCK = 32
-# Radars in step refill at the same moment: four blocks of 8 cost 2 ms, four of 32 cost 7 ms.
-REALTIME_BLOCK = 8
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BootTiming:
-    """How long a restart takes. Protocol reference 8.1.
-
-    Attributes
-    ----------
-    ack_to_reset_ns
-        From the ACK of MOD_RESET to the restart.
-    reset_to_ready_ns
-        From the restart to the moment the transmitter starts and the queued BOOTING and READY
-        leave.
-    """
-
-    ack_to_reset_ns: int = 500_000_000
-    reset_to_ready_ns: int = 2_000_000_000
-
-
 def _is_oversized(command: Command[Response]) -> bool:
     """Whether a command fits no block of the firmware's message pool; it drops those silently."""
     return isinstance(command, _LONG_COMMANDS) and len(encode(command)) > LARGEST_POOL_BLOCK
@@ -209,13 +192,6 @@ class ByteDevice(Protocol):
         ...
 
 
-class _Held(NamedTuple):
-    """A reply that takes its time; further commands wait behind it."""
-
-    due_ns: int
-    reply: Response
-
-
 class Device:
     """A module as its port sees it.
 
@@ -229,22 +205,16 @@ class Device:
         Damaged packets received so far; like the firmware, the module does not answer them.
     """
 
-    def __init__(
-        self, module: Module, stream: MessageStream, outbox: Outbox, *, boot: BootTiming
-    ) -> None:
-        self._module = module
+    def __init__(self, module: Module, stream: MessageStream, outbox: Outbox) -> None:
+        self.module = module
         self._stream = stream
         self._outbox = outbox
-        self._boot = boot
         self._connection = Connection(Role.MODULE)
         self._reset_ns: int | None = None
         self._ready_ns: int | None = None
-        self._held: _Held | None = None
+        # a reply that takes its time, and until when; further commands wait behind it
+        self._held: tuple[int, Response] | None = None
         self.faults_seen = 0
-
-    @property
-    def module(self) -> Module:
-        return self._module
 
     @property
     def wants_data(self) -> bool:
@@ -254,26 +224,26 @@ class Device:
     @property
     def listens(self) -> bool:
         """Whether it receives: not while it starts or sleeps."""
-        return self._ready_ns is None and not self._module.asleep
+        return self._ready_ns is None and not self.module.asleep
 
     def crash(self, reason: str, now_ns: int) -> None:
         """Fail as by a watchdog or a hard fault and restart at once; the module counts it."""
         self.advance(now_ns)
-        self._module.crash(reason, now_ns)
+        self.module.crash(reason, now_ns)
         self.advance(now_ns)
 
     def power_cycle(self, now_ns: int) -> None:
         """Restart at once, as after a power cut."""
         self.advance(now_ns)
-        self._module.power_cycle(now_ns)
+        self.module.power_cycle(now_ns)
         self.advance(now_ns)
 
     def port_present(self, now_ns: int) -> bool:
         """Whether the port is there; a restart takes it away if the options say so."""
-        if self._module.options.port_on_reset == "stay":
+        if self.module.options.port_on_reset == "stay":
             return True
         if self._reset_ns is not None and now_ns >= self._reset_ns:
-            return now_ns >= self._reset_ns + self._boot.reset_to_ready_ns
+            return now_ns >= self._reset_ns + RESET_TO_READY_NS
         return self._ready_ns is None or now_ns >= self._ready_ns
 
     def receive_data(self, data: bytes, now_ns: int) -> None:
@@ -285,7 +255,7 @@ class Device:
         self._carry_out_commands(now_ns)
 
     def _carry_out_commands(self, now_ns: int) -> None:
-        while self._held is None and not self._module.asleep:
+        while self._held is None and not self.module.asleep:
             event = self._connection.next_event()
             if isinstance(event, NeedData):
                 return
@@ -296,58 +266,58 @@ class Device:
                 self.faults_seen += 1
 
     def _carry_out(self, command: Command[Response], now_ns: int) -> None:
-        reply = answer(self._module, command)
-        for notice in self._module.notices:
+        reply = answer(self.module, command)
+        for notice in self.module.notices:
             self._outbox.put(MessageKind.DEBUG, notice, now_ns)
-        self._module.notices.clear()
-        delay_ns, self._module.reply_delay_ns = self._module.reply_delay_ns, 0
+        self.module.notices.clear()
+        delay_ns, self.module.reply_delay_ns = self.module.reply_delay_ns, 0
         if reply is not None and delay_ns:
-            self._held = _Held(now_ns + delay_ns, reply)
+            self._held = now_ns + delay_ns, reply
         elif reply is not None:
             self._outbox.put(MessageKind.REPLY, reply, now_ns)
         self._plan_restart(now_ns)
         self._stream.command_done(command, now_ns)
 
     def _plan_restart(self, now_ns: int) -> None:
-        restart = self._module.restart
+        restart = self.module.restart
         if restart is None:
             return
         if restart.at_ns is not None:
             self._reset_ns = restart.at_ns
         elif self._reset_ns is None:
-            self._reset_ns = now_ns + self._boot.ack_to_reset_ns
+            self._reset_ns = now_ns + ACK_TO_RESET_NS
 
     def advance(self, now_ns: int) -> None:
         """Let time pass: restart when due, and queue the frames that fell due."""
-        self._module.advance(now_ns)
+        self.module.advance(now_ns)
         self._plan_restart(now_ns)
         if self._reset_ns is not None and now_ns >= self._reset_ns:
             self._restart(self._reset_ns)
         if self._ready_ns is not None and now_ns >= self._ready_ns:
             self._ready_ns = None
-            if self._module.state is not State.BOOTLOADER:
+            if self.module.state is not State.BOOTLOADER:
                 for code in (SystemCode.XTS_SPRS_BOOTING, SystemCode.XTS_SPRS_READY):
                     self._outbox.put(MessageKind.REPLY, System(code=code), now_ns)
-        if self._held is not None and now_ns >= self._held.due_ns:
-            held, self._held = self._held, None
-            self._outbox.put(MessageKind.REPLY, held.reply, now_ns)
+        if self._held is not None and now_ns >= self._held[0]:
+            (_, reply), self._held = self._held, None
+            self._outbox.put(MessageKind.REPLY, reply, now_ns)
             self._carry_out_commands(now_ns)
         if self._sends:
             self._outbox.refill_on_time(self._stream, now_ns)
 
     def _restart(self, reset_ns: int) -> None:
-        restart = self._module.restart
-        self._ready_ns = reset_ns + self._boot.reset_to_ready_ns
+        restart = self.module.restart
+        self._ready_ns = reset_ns + RESET_TO_READY_NS
         self._reset_ns = None
         self._held = None
         self._outbox.clear()
         self._connection = Connection(Role.MODULE)
-        self._module.power_up(into_bootloader=restart is not None and restart.into_bootloader)
+        self.module.power_up(into_bootloader=restart is not None and restart.into_bootloader)
         self._stream.restarted(self._ready_ns)
 
     @property
     def _sends(self) -> bool:
-        return not self._module.asleep and self._module.state is not State.BOOTLOADER
+        return not self.module.asleep and self.module.state is not State.BOOTLOADER
 
     def next_packet(self, now_ns: int) -> bytes | None:
         """Return the next packet for the line, complete; None if there is nothing to send now."""
@@ -357,7 +327,7 @@ class Device:
         if message is None:
             return None
         if isinstance(message, PresenceSingle):
-            self._module.pins.follow(message.state, message.direction)
+            self.module.pins.follow(message.state, message.direction)
         packet = self._connection.send(message)
         # the firmware escapes into a buffer and loses what does not fit
         return packet[:NORMAL_BUFFER] if packet[0] == NORMAL_START else packet
@@ -368,8 +338,8 @@ class Device:
         What merely waits for the line to take it needs no waking and is not counted.
         """
         candidates = [self._reset_ns, self._ready_ns]
-        candidates.append(None if self._held is None else self._held.due_ns)
-        if self._module.restart is not None and self._reset_ns is None:
+        candidates.append(None if self._held is None else self._held[0])
+        if self.module.restart is not None and self._reset_ns is None:
             candidates.append(now_ns)  # a fault from outside
         if self._sends:
             candidates.append(self._outbox.wake_ns(self._stream, now_ns))
@@ -389,7 +359,6 @@ def radar_device(
     *,
     scene_time_zero_ns: int = 0,
     clock: ModuleClock | None = None,
-    boot: BootTiming | None = None,
     options: DeviceOptions | None = None,
     memory: Memory | None = None,
 ) -> Device:
@@ -425,4 +394,4 @@ def radar_device(
     chip_stream = ChipStream(module, pace=pace, clock=clock, scene_time_zero_ns=scene_time_zero_ns)
     stream = CombinedStream(chip_stream, profile)
     outbox = LosslessOutbox() if pace is Pace.ASAP else FirmwareOutbox()
-    return Device(module, stream, outbox, boot=boot or BootTiming())
+    return Device(module, stream, outbox)

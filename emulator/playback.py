@@ -23,11 +23,12 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from emulator.chip.chip import Chip
-from emulator.device import BootTiming, Device
+from emulator.device import Device
 from emulator.echo.echo import echo_source
 from emulator.module.memory import Identity
 from emulator.module.module import LosslessOutbox, MessageStream, Module
@@ -53,8 +54,17 @@ from xethru_protocol.wire.messages import (
 )
 from xethru_protocol.wire.table import ROWS, UnknownMessage
 
+NS_PER_S = 1_000_000_000
 SLOWEST_RATE = 1e-6
 """Least rate above 0 that a playback in progress takes; a year for half a minute."""
+QUIET_NS = NS_PER_S // 2
+NOMINAL_PERIOD_NS = NS_PER_S // 17
+"""Spacing of records that carry no time: the profile's nominal 17 messages per second."""
+_LONGEST_S = 20 * 86400  # the system waits at most 24 days for anything
+_ONLY_NAME = "player"
+_PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+_SERIAL = re.compile(r"[0-9]{12}")
+_NO_SERIAL = "0" * 12
 _UNKNOWN = "unknown"
 _ANSWERS = frozenset(
     (
@@ -65,31 +75,6 @@ _ANSWERS = frozenset(
         ResponseCode.XTS_SPR_HIL,
     )
 )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlayState:
-    """What a playback is doing.
-
-    Attributes
-    ----------
-    playing
-        Whether a host has the port and something is left to play.
-    position_ns
-        Time of the recording that has been reached, ns since its first message; below its
-        beginning in the gap between two rounds.
-    rate
-        Multiple of real time; 0 for as fast as the port takes it.
-    kinds
-        Which kinds it plays, as from `kind_of`; None for all.
-    """
-
-    playing: bool
-    paused: bool
-    position_ns: int
-    rate: float
-    loop: bool
-    kinds: frozenset[str] | None
 
 
 class PlayClock:
@@ -238,39 +223,24 @@ _KINDS = frozenset(
 ) | {_UNKNOWN}
 
 
-NS_PER_S = 1_000_000_000
-QUIET_NS = NS_PER_S // 2
-NOMINAL_PERIOD_NS = NS_PER_S // 17
-"""Spacing of records that carry no time: the profile's nominal 17 messages per second."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TimedMessage:
+class TimedMessage(NamedTuple):
     """A message and its time since the first one of the recording, ns."""
 
     time_ns: int
     message: Response
 
 
-def schedule(
-    messages: Iterable[tuple[Response, int | None]], rate: float
-) -> Iterator[TimedMessage]:
+def schedule(messages: Iterable[tuple[Response, int | None]]) -> Iterator[TimedMessage]:
     """Yield the messages of a recording with the time at which each is played.
 
-    ``messages`` come in order with the recording's own time of each, ns, or None; at ``rate`` 0
-    all are played at once. Times never decrease: a message whose stamp runs backwards is played
-    at once.
-
-    Raises
-    ------
-    OverflowError
-        When a rate near 0 puts a message beyond all time.
+    ``messages`` come in order with the recording's own time of each, ns, or None. Times never
+    decrease: a message whose stamp runs backwards is played at once.
 
     Examples
     --------
     >>> from xethru_protocol.wire.messages import Ack
-    >>> [item.time_ns for item in schedule([(Ack(), 5), (Ack(), 1005), (Ack(), 905)], rate=2.0)]
-    [0, 500, 500]
+    >>> [item.time_ns for item in schedule([(Ack(), 5), (Ack(), 1005), (Ack(), 905)])]
+    [0, 1000, 1000]
     """
     elapsed_ns = 0
     previous_ns: int | None = None
@@ -281,7 +251,7 @@ def schedule(
             else:
                 elapsed_ns += max(stamp_ns - previous_ns, 0)
         previous_ns = stamp_ns
-        yield TimedMessage(time_ns=round(elapsed_ns / rate) if rate else 0, message=message)
+        yield TimedMessage(elapsed_ns, message)
 
 
 class PlayStream(MessageStream):
@@ -296,9 +266,9 @@ class PlayStream(MessageStream):
     Parameters
     ----------
     timed
-        What to play, as from `schedule` at rate 1; gone through anew for every host and round,
-        one message ahead, so that it need not lie in memory. A seek and a new filter go through
-        it from the beginning, too, up to where it stands.
+        What to play, as from `schedule`; gone through anew for every host and round, one message
+        ahead, so that it need not lie in memory. A seek and a new filter go through it from the
+        beginning, too, up to where it stands.
     loop_gap_ns
         Time of the recording between the last message and the first when playing in a loop; None
         to play once.
@@ -376,15 +346,21 @@ class PlayStream(MessageStream):
         self._coming = iter(())
         self._next = None
 
-    def state(self, now_ns: int) -> PlayState:
-        return PlayState(
-            playing=self._listening and self._next is not None,
-            paused=self._clock.paused,
-            position_ns=self._clock.position_ns(now_ns),
-            rate=self._clock.rate,
-            loop=self._loop,
-            kinds=self._kinds.newest,
-        )
+    def state(self, now_ns: int) -> dict[str, Any]:
+        """Return what it is doing, as JSON-able values.
+
+        ``playing``: a host has the port and something is left to play. ``position_s``, since the
+        first message, lies below 0 in the gap between two rounds.
+        """
+        kinds = self._kinds.newest
+        return {
+            "playing": self._listening and self._next is not None,
+            "paused": self._clock.paused,
+            "position_s": self._clock.position_ns(now_ns) / NS_PER_S,
+            "rate": self._clock.rate,
+            "loop": self._loop,
+            "kinds": None if kinds is None else sorted(kinds),
+        }
 
     def pause(self, now_ns: int) -> None:
         """Stand still: no message becomes due until `resume`, not even one the line made wait."""
@@ -494,11 +470,14 @@ def _starts_radar(command: Command[Response]) -> bool:
     return False
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlayedFrames:
-    """What is known of the radar frames of a recording.
+class PlayedChip(Chip):
+    """A chip whose frames come from a recording.
 
-    Attributes
+    It takes every setting. FRAMEBINCOUNT answers the recorded frames' bins, RF or baseband as
+    DOWNCONVERSION was set, since a frame does not say which it is (protocol reference 6.1).
+    FRAMEAREA answers the recorded area, if known, else the requested start and as many bins.
+
+    Parameters
     ----------
     n_values
         float32 values per frame: bins of RF, or twice the bins of baseband.
@@ -506,42 +485,24 @@ class PlayedFrames:
         Frame area as the recorded module read it back last [module metres]; None if unknown.
     """
 
-    n_values: int
-    area_m: tuple[float, float] | None
-
-
-class PlayedChip(Chip):
-    """A chip whose frames come from a recording.
-
-    It takes every setting. FRAMEBINCOUNT answers the recorded frames' bins, RF or baseband as
-    DOWNCONVERSION was set, since a frame does not say which it is (protocol reference 6.1).
-    FRAMEAREA answers the recorded area, if known, else the requested start and as many bins.
-    """
-
-    def __init__(self, frames: PlayedFrames) -> None:
-        self._frames = frames
+    def __init__(self, n_values: int, area_m: tuple[float, float] | None) -> None:
+        self._n_values = n_values
+        self._area_m = area_m
         super().__init__(echo_source(empty_room(), 0, 0))
 
     def get(self, setting: X4Setting) -> X4Value:
         downconverted = bool(self.settings.downconversion)
-        n_bins = self._frames.n_values // 2 if downconverted else self._frames.n_values
+        n_bins = self._n_values // 2 if downconverted else self._n_values
         if setting is X4Setting.FRAMEBINCOUNT:
             return n_bins
         if setting is X4Setting.FRAMEAREA:
-            if self._frames.area_m is not None:
-                return self._frames.area_m
+            if self._area_m is not None:
+                return self._area_m
             start_m = self.area.start_m
             bin_m = x4.BASEBAND_BIN_M if downconverted else x4.RF_BIN_M
             end_m = start_m + bin_m * (n_bins - 1 if downconverted else n_bins)
             return start_m, float(np.float32(end_m))
         return super().get(setting)
-
-
-_ONLY_NAME = "player"
-_PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
-_SERIAL = re.compile(r"[0-9]{12}")
-_NO_SERIAL = "0" * 12
-_LONGEST_S = 20 * 86400  # the system waits at most 24 days for anything
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -585,7 +546,6 @@ def played_radars(
     recording: Path,
     options: PlayOptions,
     *,
-    identity: Identity | None = None,
     on_fault: Callable[[RecordingFault], None],
     warn: Callable[[str], None] = lambda line: None,
 ) -> tuple[PlayedRadar, ...]:
@@ -599,8 +559,6 @@ def played_radars(
     ----------
     recording
         Anything that `read_recording` takes, and sessions of several radars.
-    identity
-        Identity of every module; None: a stock one with the recorded serial number.
     on_fault
         Called with what could not be read; the rest plays.
     warn
@@ -622,11 +580,21 @@ def played_radars(
     names = _port_names([survey.facts.name for survey in playing])
     played = []
     for name, survey in zip(names, playing, strict=True):
-        who = identity or Identity(serial=_serial(survey.facts))
-        device, stream = _player(
-            recording, survey, who, options, zero_ns=zero_ns, end_ns=end_ns, warn=warn
+        offset_ns = survey.offset_ns(zero_ns)
+        stream = PlayStream(
+            _Program(recording, survey.facts.name, offset_ns, warn),
+            # rounds of all radars are equally long, so that a loop keeps them in step
+            loop_gap_ns=end_ns - offset_ns - survey.lasts_ns + NOMINAL_PERIOD_NS,
+            rate=options.rate,
+            from_ns=options.from_ns,
+            kinds=options.kinds,
         )
-        played.append(PlayedRadar(name=name, serial=who.serial, device=device, stream=stream))
+        stream.set_loop(options.loop, 0)
+        serial = survey.facts.serial or ""
+        serial = serial if _SERIAL.fullmatch(serial) else _NO_SERIAL
+        module = Module(Identity(serial=serial), _chip(recording, survey, warn))
+        device = Device(module, stream, LosslessOutbox())
+        played.append(PlayedRadar(name=name, serial=serial, device=device, stream=stream))
     return tuple(played)
 
 
@@ -641,19 +609,12 @@ class _Survey:
         self.plays = False
         self.first_ns: int | None = None
         self.lasts_ns = 0
-        self._frame_sizes: Counter[int] = Counter()
-        self._area_m = facts.area_m
+        self.frame_sizes: Counter[int] = Counter()
+        self.area_m = facts.area_m
         records = read_recording(recording, on_fault, radar=facts.name)
-        for timed in schedule(self._played(records), rate=1.0):
+        for timed in schedule(self._played(records)):
             self.plays = True
             self.lasts_ns = timed.time_ns
-
-    @property
-    def frames(self) -> PlayedFrames | None:
-        """The radar frames, None without any; of several sizes the most frequent counts."""
-        if not self._frame_sizes:
-            return None
-        return PlayedFrames(n_values=self._frame_sizes.most_common(1)[0][0], area_m=self._area_m)
 
     def offset_ns(self, zero_ns: int) -> int:
         """How much later than the recording this radar begins, ns."""
@@ -664,9 +625,9 @@ class _Survey:
             self.messages += 1
             match message:
                 case DataFloat(content_id=0):
-                    self._frame_sizes[message.values.size] += 1
+                    self.frame_sizes[message.values.size] += 1
                 case ReplyFloat(content_id=X4Setting.FRAMEAREA, values=(start_m, end_m)):
-                    self._area_m = start_m, end_m  # overrides the description of the radar
+                    self.area_m = start_m, end_m  # overrides the description of the radar
             if not is_answer(message):
                 if not self.plays:
                     self.first_ns = stamp_ns
@@ -689,33 +650,16 @@ def _check(recording: Path, surveys: Iterable[_Survey], zero_ns: int, options: P
         )
 
 
-def _player(
-    recording: Path,
-    survey: _Survey,
-    identity: Identity,
-    options: PlayOptions,
-    *,
-    zero_ns: int,
-    end_ns: int,
-    warn: Callable[[str], None],
-) -> tuple[Device, PlayStream]:
-    frames, offset_ns = survey.frames, survey.offset_ns(zero_ns)
-    if frames is not None and frames.area_m is None:
+def _chip(recording: Path, survey: _Survey, warn: Callable[[str], None]) -> Chip:
+    if not survey.frame_sizes:
+        return Chip(echo_source(empty_room(), 0, 0))
+    if survey.area_m is None:
         warn(
             f"{recording} does not say where its radar frames lie in range: bins count from the "
             "start of the frame area that the host sets"
         )
-    stream = PlayStream(
-        _Program(recording, survey.facts.name, offset_ns, warn),
-        # rounds of all radars are equally long, so that a loop keeps them in step
-        loop_gap_ns=end_ns - offset_ns - survey.lasts_ns + NOMINAL_PERIOD_NS,
-        rate=options.rate,
-        from_ns=options.from_ns,
-        kinds=options.kinds,
-    )
-    stream.set_loop(options.loop, 0)
-    chip = Chip(echo_source(empty_room(), 0, 0)) if frames is None else PlayedChip(frames)
-    return Device(Module(identity, chip), stream, LosslessOutbox(), boot=BootTiming()), stream
+    # of several sizes the most frequent counts
+    return PlayedChip(survey.frame_sizes.most_common(1)[0][0], survey.area_m)
 
 
 def _port_names(names: Sequence[str | None]) -> list[str]:
@@ -725,11 +669,6 @@ def _port_names(names: Sequence[str | None]) -> list[str]:
     if all(name is not None and _PLAIN_NAME.fullmatch(name) for name in names):
         return [str(name) for name in names]
     return [f"radar{index}" for index in range(len(names))]
-
-
-def _serial(facts: RadarFacts) -> str:
-    serial = facts.serial or ""
-    return serial if _SERIAL.fullmatch(serial) else _NO_SERIAL
 
 
 @dataclass(frozen=True, slots=True)
@@ -745,8 +684,8 @@ class _Program:
         try:
             records = read_recording(self.recording, _reported_already, radar=self.radar)
             played = (item for item in records if not is_answer(item[0]))
-            for item in schedule(played, rate=1.0):
-                yield TimedMessage(time_ns=item.time_ns + self.offset_ns, message=item.message)
+            for item in schedule(played):
+                yield TimedMessage(item.time_ns + self.offset_ns, item.message)
         except RecordingError as error:  # it was moved or changed meanwhile
             self.warn(str(error))
 

@@ -11,14 +11,13 @@ from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TextIO
 
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source
-from emulator.faults.faulty_device import FaultyDevice
-from emulator.faults.kind import InnerDevice
-from emulator.faults.plan import FaultPlan, FaultPlanError, TruthLog, load_plan
+from emulator.faults.faulty_device import FaultyDevice, InnerDevice
+from emulator.faults.plan import FaultPlan, FaultPlanError, Injected, load_plan
 from emulator.module.memory import Identity, Memory
-from emulator.module.module import Module
 from emulator.module.settings import DeviceOptions
 from emulator.playback import PlayOptions, PlayStream, played_radars
 from emulator.ports.control import Control, ControlSocket
@@ -29,17 +28,24 @@ from emulator.ports.folders import (
     make_state_directory,
     socket_path,
 )
-from emulator.ports.module_ports import DevicePorts, LinkOptions, NamedDevice, open_ports
-from emulator.ports.odometry import OdometryFeed
+from emulator.ports.module_ports import DevicePorts, LinkOptions, NamedDevice
 from emulator.ports.proxy import ModuleLine, open_module
 from emulator.ports.pty import LinkError, PortWatch
 from emulator.ports.server import Server, Service
+from emulator.ports.sockets import OdometryFeed
 from emulator.ports.tcp import is_loopback
 from emulator.scene.scene import SceneError, UnknownSceneError, empty_room, load_scene
 from emulator.scene.wheels import scene_odometry
 from xethru_protocol.recordings import RecordingError
 from xethru_protocol.recordings.wire_capture import Way, WireCapture
-from xethru_protocol.system import StopFlag
+from xethru_protocol.system import StopFlag, flush_streams
+
+NS_PER_MS = 1_000_000
+SOCKET_NAME = "odometry.sock"
+CONTROL_NAME = "control.sock"
+PROXY_NAME = "proxy"
+Warn = Callable[[str], None]
+"""Gets a warning in one line."""
 
 
 class FaultSession:
@@ -50,7 +56,7 @@ class FaultSession:
     scenario
         Name or path; None: no faults until the control socket adds some.
     truth
-        File of the truth log, made anew; None: kept in memory only.
+        File of the truth log, made anew; None: none is written.
     zero_ns
         Device time from which the scenario counts.
 
@@ -73,18 +79,21 @@ class FaultSession:
         self._plan = FaultPlan() if scenario is None else load_plan(scenario)
         self._zero_ns = zero_ns
         self._cleanup = cleanup
+        self._truth: TextIO | None = None
         self.devices: dict[str, FaultyDevice] = {}
-        self.truth = TruthLog()
         if truth is not None:
             try:
                 # by lines: a fault is in the file as soon as it is injected
-                stream = cleanup.enter_context(truth.open("w", buffering=1, encoding="utf-8"))
+                self._truth = cleanup.enter_context(truth.open("w", buffering=1, encoding="utf-8"))
             except OSError as error:
                 raise LinkError(f"{truth}: cannot write the truth log: {error.strerror}") from error
-            self.truth = TruthLog(stream.write)
+
+    def _note(self, injected: Injected) -> None:
+        if self._truth is not None:
+            self._truth.write(injected.line())
 
     def wrap(self, device: InnerDevice, name: str) -> FaultyDevice:
-        faulty = FaultyDevice(device, name, self._plan, self.truth, zero_ns=self._zero_ns)
+        faulty = FaultyDevice(device, name, self._plan, self._note, zero_ns=self._zero_ns)
         self.devices[name] = faulty
         return faulty
 
@@ -98,17 +107,14 @@ class FaultSession:
                         f"there are {', '.join(self.devices)}"
                     )
 
-    def control(self, path: Path, players: Mapping[str, PlayStream] | None = None) -> ControlSocket:
+    def control(
+        self, folder: Path, players: Mapping[str, PlayStream] | None = None
+    ) -> ControlSocket:
         """Open the control socket; `LinkError` if it cannot be had."""
+        path = socket_path(folder, self._cleanup, CONTROL_NAME)
         offered = ControlSocket(path, Control(self.devices, players))
         self._cleanup.callback(offered.close)
         return offered
-
-
-NS_PER_MS = 1_000_000
-SOCKET_NAME = "odometry.sock"
-CONTROL_NAME = "control.sock"
-PROXY_NAME = "proxy"
 
 
 class CannotServeError(Exception):
@@ -123,10 +129,6 @@ class CannotServeError(Exception):
     def __init__(self, message: str, *, exit_code: int = 1) -> None:
         super().__init__(message)
         self.exit_code = exit_code
-
-
-Warn = Callable[[str], None]
-"""Gets a warning in one line."""
 
 
 def serve(options: Namespace, stop: StopFlag, warn: Warn) -> None:
@@ -171,11 +173,11 @@ def serve(options: Namespace, stop: StopFlag, warn: Warn) -> None:
                         device=faulty,
                         start_skew_ns=radar.clock.skew_ns,
                         present=faulty.port_present,
-                        uart_baud=partial(_uart_baud, device.module),
+                        uart_baud=partial(getattr, device.module, "uart_baudrate"),
                     )
                 )
             session.check_names()
-            control = session.control(socket_path(folder, cleanup, CONTROL_NAME))
+            control = session.control(folder)
             feed = None
             if not options.bare:
                 feed = OdometryFeed(
@@ -185,14 +187,12 @@ def serve(options: Namespace, stop: StopFlag, warn: Warn) -> None:
                     scene_time_zero_ns=zero_ns,
                 )
                 cleanup.callback(feed.close)
-            ports = open_ports(devices, folder, links, cleanup)
+            ports = DevicePorts(devices, folder, links, cleanup)
         except UnknownSceneError as error:
             raise CannotServeError(str(error), exit_code=2) from error
         except (SceneError, LinkError, FaultPlanError) as error:
             raise CannotServeError(str(error)) from error
-        services: list[Service] = [control] if feed is None else [feed, control]
-        ready = _ready_line(ports, zero_ns, None if feed is None else feed.path, control.path)
-        _run(ports, services, ready, stop, cleanup)
+        _run(ports, [control], stop, cleanup, zero_ns=zero_ns, control=control.path, feed=feed)
 
 
 def play(options: Namespace, stop: StopFlag, warn: Warn) -> None:
@@ -226,8 +226,8 @@ def play(options: Namespace, stop: StopFlag, warn: Warn) -> None:
                 for one in radars
             ]
             players = {radar.name: radar.stream for radar in radars}
-            control = session.control(socket_path(folder, cleanup, CONTROL_NAME), players)
-            ports = open_ports(devices, folder, LinkOptions(), cleanup)
+            control = session.control(folder, players)
+            ports = DevicePorts(devices, folder, LinkOptions(), cleanup)
         except (RecordingError, LinkError) as error:
             raise CannotServeError(str(error)) from error
         watches = [
@@ -240,8 +240,9 @@ def play(options: Namespace, stop: StopFlag, warn: Warn) -> None:
         ]
         for watch in watches:
             cleanup.callback(watch.close)
-        ready = _ready_line(ports, time.monotonic_ns(), None, control.path)
-        _run(ports, [*watches, control], ready, stop, cleanup)
+        zero_ns = time.monotonic_ns()
+        services = [*watches, control]
+        _run(ports, services, stop, cleanup, zero_ns=zero_ns, control=control.path)
 
 
 def proxy(options: Namespace, stop: StopFlag, warn: Warn) -> None:
@@ -278,15 +279,15 @@ def proxy(options: Namespace, stop: StopFlag, warn: Warn) -> None:
             faulty = session.wrap(module, PROXY_NAME)
             session.check_names()
             folder = cleanup.enter_context(link_folder(options.link_dir))
-            control = session.control(socket_path(folder, cleanup, CONTROL_NAME))
+            control = session.control(folder)
             named = NamedDevice(
                 name=PROXY_NAME, serial="", device=faulty, present=faulty.port_present
             )
-            ports = open_ports([named], folder, LinkOptions(), cleanup)
+            ports = DevicePorts([named], folder, LinkOptions(), cleanup)
         except (RecordingError, LinkError, FaultPlanError) as error:
             raise CannotServeError(str(error)) from error
-        ready = _ready_line(ports, zero_ns, None, control.path)
-        _run(ports, [module, control], ready, stop, cleanup)
+        services: list[Service] = [module, control]
+        _run(ports, services, stop, cleanup, zero_ns=zero_ns, control=control.path)
     if lost:
         raise CannotServeError(f"{options.port}: the module's port vanished")
 
@@ -317,49 +318,40 @@ def _memory(state_dir: Path | None, warn: Warn) -> Callable[[str], Memory] | Non
     return lambda serial: DirectoryMemory(state_dir, serial, warn)
 
 
-def _uart_baud(module: Module) -> int:
-    return module.uart_baudrate
-
-
-def _ready_line(
-    ports: DevicePorts, zero_ns: int, odometry: Path | None, control: Path | None = None
-) -> dict[str, object]:
-    return {
-        "ready": True,
-        "scene_time_zero_ns": zero_ns,
-        "odometry": None if odometry is None else os.fspath(odometry),
-        "control": None if control is None else os.fspath(control),
-        "devices": ports.entries(),
-    }
-
-
 def _run(
     ports: DevicePorts,
     services: Sequence[Service],
-    ready: dict[str, object],
     stop: StopFlag,
     cleanup: contextlib.ExitStack,
+    *,
+    zero_ns: int,
+    control: Path,
+    feed: OdometryFeed | None = None,
 ) -> None:
     if stop.requested:
         return  # do not announce ports that go away at once
-    server = Server(ports.ports, [*services, *ports.services])
+    ready = {
+        "ready": True,
+        "scene_time_zero_ns": zero_ns,
+        "odometry": None if feed is None else os.fspath(feed.path),
+        "control": os.fspath(control),
+        "devices": ports.entries(),
+    }
+    feeds = [] if feed is None else [feed]
+    server = Server(ports.ports, [*feeds, *services, *ports.services])
     cleanup.callback(server.close)
     stop.attach(server.stop)
     cleanup.callback(stop.detach)  # a second signal must not reach a loop that is being closed
     announcement = Announcement(ready)
     cleanup.callback(announcement.close)
     ports.moved = lambda: announcement.update({**ready, "devices": ports.entries()})
-    _print_ready_line(ready)
+    if sys.stdout is not None:  # else it was started with stdout closed
+        try:
+            sys.stdout.write(json.dumps(ready, separators=(",", ":")) + "\n")
+            sys.stdout.flush()
+        except OSError as error:  # ports that were not announced are of no use
+            flush_streams()
+            raise CannotServeError(
+                f"stdout: cannot write the ready line: {error.strerror}"
+            ) from error
     server.run()
-
-
-def _print_ready_line(ready: dict[str, object]) -> None:
-    if sys.stdout is None:  # started with stdout closed: serve without a word
-        return
-    try:
-        sys.stdout.write(json.dumps(ready, separators=(",", ":")) + "\n")
-        sys.stdout.flush()
-    except OSError as error:
-        # ports that were not announced are of no use; the interpreter must not flush again
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise CannotServeError(f"stdout: cannot write the ready line: {error.strerror}") from error

@@ -15,12 +15,10 @@ from collections.abc import Sequence
 import pytest
 
 from emulator.chip import Pace
-from emulator.chip.chip import EchoSource
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source
-from emulator.faults.faulty_device import FaultyDevice, fault
-from emulator.faults.kind import InnerDevice
-from emulator.faults.plan import FaultPlan, TruthLog
+from emulator.faults.faulty_device import FaultyDevice, InnerDevice, fault
+from emulator.faults.plan import FaultPlan, Injected
 from emulator.module.memory import Identity
 from emulator.scene.scene import empty_room
 from xethru_protocol.driver.link import RawConfig
@@ -58,9 +56,7 @@ class _Line:
         self._owner.device.receive_data(data, self._owner.clock_ns())
 
     def close(self) -> None:
-        if self._open:
-            self._open = False
-            self._owner.device.port_closed(self._owner.clock_ns())
+        self._open = False
 
     def _check(self) -> None:
         if not self._open or not self._owner.device.port_present(self._owner.clock_ns()):
@@ -74,31 +70,22 @@ class FaultyLine:
     ----------
     inner
         The module; a stock one in an empty room if None.
-    plan
-        Faults from the start on.
-    source
-        What a stock module sees; receiver noise and leakage if None.
 
     Attributes
     ----------
     device
         The module with its faults.
     truth
-        What was injected.
+        What was injected, in order.
     """
 
-    def __init__(
-        self,
-        inner: InnerDevice | None = None,
-        plan: FaultPlan | None = None,
-        source: EchoSource | None = None,
-    ) -> None:
-        self.truth = TruthLog()
+    def __init__(self, inner: InnerDevice | None = None) -> None:
+        self.truth: list[Injected] = []
         self._now_ns = 0
         if inner is None:
-            echoes = echo_source(empty_room(), 0, 0) if source is None else source
+            echoes = echo_source(empty_room(), 0, 0)
             inner = radar_device(Identity(serial=SERIAL), echoes, Pace.REALTIME)
-        self.device: FaultyDevice = FaultyDevice(inner, "radar_1", plan, self.truth, zero_ns=0)
+        self.device = FaultyDevice(inner, "radar_1", FaultPlan(), self.truth.append)
 
     def clock_ns(self) -> int:
         return self._now_ns
@@ -131,7 +118,6 @@ class FaultyLine:
         del baudrate
         if not self.device.port_present(self._now_ns):
             raise PortUnavailable(f"{path}: no such port")
-        self.device.port_opened(self._now_ns)
         return _Line(self)
 
     def ports(self) -> Sequence[str]:

@@ -2,27 +2,22 @@
 
 While no fault is armed every byte passes unchanged. What happens depends on the bytes, the times
 and the seed only.
-
->>> from emulator.faults.plan import fault_spec
->>> fault_spec("counter_jump", frames=3).row.layer.value
-'stream'
 """
 
 from __future__ import annotations
 
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
+from emulator.device import ByteDevice, Device
 from emulator.faults.kind import (
     Action,
     CommandEffect,
     Context,
-    EmulatedInside,
-    InnerDevice,
     Kind,
     MomentEffect,
     PacketClass,
@@ -36,38 +31,50 @@ from emulator.faults.kind import (
     classify,
     command_bytes,
 )
-from emulator.faults.line import LineQueue, Watch
-from emulator.faults.plan import FaultPlan, FaultSpec, Injected, TruthLog, fault_spec
+from emulator.faults.line import BOOTING, LineQueue, Watch
+from emulator.faults.plan import FaultPlan, FaultSpec, Injected, fault_spec
 from emulator.scene.philox import Rng
 from xethru_protocol.wire.messages import Command, ModReset, Response
 from xethru_protocol.wire.table import ROWS, UnknownMessage
 
 NS_PER_S = 1_000_000_000
+PACKETS_PER_CALL = 32
+_RETRY_NS = 10_000_000
+"""How much later a call goes on that found only packets to lose: time must pass meanwhile."""
+
+
+class InnerDevice(ByteDevice, Protocol):
+    """A module whose port may go away."""
+
+    def port_present(self, now_ns: int) -> bool: ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Opportunity:
-    """Something that a fault could hit; ``time_ns`` counts from the start of the scenario."""
+    """Something that a fault could hit: a packet to the host, a command to the module, or a moment.
+
+    ``time_ns`` counts from the start of the scenario; ``command`` is that which comes, or which a
+    reply answers.
+    """
 
     time_ns: int
+    counter: int | None
     packet_class: PacketClass | None = None
-    counter: int | None = None
     command: Command[Response] | None = None
-    to_module: bool = False
 
 
 class Armed:
-    """One fault of one radar.
+    """One fault of one radar, each of which has random numbers of its own.
 
     Parameters
     ----------
-    radar
-        Name of the radar: every radar has its own chance.
     seed
         For a fault without its own.
 
     Attributes
     ----------
+    injected
+        How often.
     since_ns, first_counter, packets_since
         Time, frame counter and packets since it was injected last.
     """
@@ -79,7 +86,7 @@ class Armed:
         self.parameters: Parameters = spec.kind_parameters()
         stream = zlib.crc32(radar.encode()) << 32 | number
         self.rng = Rng(seed if spec.seed is None else spec.seed, stream)
-        self.firings = 0
+        self.injected = 0
         self.since_ns = 0
         self.first_counter: int | None = None
         self.packets_since = 0
@@ -87,7 +94,7 @@ class Armed:
 
     @property
     def spent(self) -> bool:
-        return 0 < self.spec.count <= self.firings
+        return 0 < self.spec.count <= self.injected
 
     def over(self, time_ns: int) -> bool:
         until_s = self.spec.until_s
@@ -97,23 +104,18 @@ class Armed:
 
     def concerns(self, opportunity: Opportunity) -> bool:
         """Whether it is the sort of thing that the fault hits, now or later."""
-        spec = self.spec
-        target = self.target
-        if opportunity.to_module != (target is Target.COMMAND):
-            return False
-        if target is Target.MOMENT:
-            fits = opportunity.packet_class is None
-        elif target is Target.FRAME:
-            fits = opportunity.packet_class is PacketClass.FRAME
-        elif target is Target.REPLY:
-            fits = opportunity.packet_class is PacketClass.REPLY
-        elif target is Target.PACKET:
-            fits = opportunity.packet_class is not None and spec.packet in (
-                "any",
-                opportunity.packet_class.value,
-            )
-        else:
-            fits = True
+        spec, packet_class = self.spec, opportunity.packet_class
+        match self.target:
+            case Target.PACKET:
+                fits = packet_class is not None and spec.packet in ("any", packet_class.value)
+            case Target.FRAME:
+                fits = packet_class is PacketClass.FRAME
+            case Target.REPLY:
+                fits = packet_class is PacketClass.REPLY
+            case Target.COMMAND:
+                fits = packet_class is None and opportunity.command is not None
+            case Target.MOMENT:
+                fits = packet_class is None and opportunity.command is None
         return fits and (spec.command is None or _is_command(opportunity.command, spec.command))
 
     @property
@@ -141,12 +143,6 @@ class Armed:
             return False
         return spec.probability >= 1 or self.rng.chance(spec.probability)
 
-    def fired(self, now_ns: int, counter: int | None) -> None:
-        self.firings += 1
-        self.since_ns = now_ns
-        self.first_counter = counter
-        self.packets_since = 0
-
     def next_ns(self, time_ns: int) -> int | None:
         """Return when time alone makes it due, on the scenario's clock; None if never."""
         if self.target is not Target.MOMENT or self.over(time_ns):
@@ -163,129 +159,50 @@ def _is_command(command: Command[Response] | None, wanted: str | int) -> bool:
     return isinstance(command, UnknownMessage) and command.code == wanted
 
 
-def spoiled_pieces(
-    armed: Armed,
-    pieces: Sequence[Piece],
-    opportunity: Opportunity,
-    watch: Watch,
-    now_ns: int,
-    *,
-    fires: bool,
-) -> Sequence[Piece] | None:
-    """Return the pieces with a fault in them; None if it found nothing to spoil."""
-    context = Context(
-        now_ns=now_ns,
-        since_ns=now_ns if fires else armed.since_ns,
-        firings=armed.firings + fires,
-        packets_since=0 if fires else armed.packets_since + 1,
-        first_counter=watch.counter if fires else armed.first_counter,
-        packet_class=cast("PacketClass", opportunity.packet_class),
-        command=opportunity.command,
-        previous_frame=watch.previous_frame,
-        lattice=watch.lattice,
-    )
-    effect = cast("PacketEffect", armed.kind.effect)
-    result: list[Piece] = []
-    applied = False
-    for piece in pieces:
-        spoiled = effect(piece.data, armed.parameters, armed.rng, context)
-        applied |= spoiled is not None
-        result += [
-            Piece(
-                part.data,
-                delay_ns=piece.delay_ns + part.delay_ns,
-                aside=piece.aside or part.aside,
-                behind=piece.behind + part.behind,
-            )
-            for part in ([Piece(piece.data)] if spoiled is None else spoiled)
-        ]
-    return result if applied else None
-
-
-class Power:
-    """Power and watchdog of one module.
-
-    A module that is not emulated here, as one behind a proxy, can only be asked to reset itself.
-
-    Attributes
-    ----------
-    restarting
-        Whether a module that was asked to reset has not sent BOOTING yet; its bytes are dropped.
-    """
-
-    def __init__(self, module: InnerDevice) -> None:
-        self._module = module
-        self._inside = module if isinstance(module, EmulatedInside) else None
-        self.restarting = False
-
-    @property
-    def listens(self) -> bool:
-        return not self.restarting and (self._inside is None or self._inside.listens)
-
-    def crash(self, reason: str, now_ns: int) -> None:
-        """Restart the module as by a fault, which it counts towards safe mode."""
-        if self._inside is None:
-            self._reset(now_ns)
-        else:
-            self._inside.crash(reason, now_ns)
-
-    def cycle(self, now_ns: int) -> None:
-        """Cut the power and give it back, which makes the module forget its faults."""
-        if self._inside is None:
-            self._reset(now_ns)
-        else:
-            self._inside.power_cycle(now_ns)
-
-    def _reset(self, now_ns: int) -> None:
-        self.restarting = True
-        self._module.receive_data(command_bytes(ModReset()), now_ns)
-
-
-PACKETS_PER_CALL = 32
-_RETRY_NS = 10_000_000
-"""How much later a call goes on that found only packets to lose: time must pass meanwhile."""
-
-
 class FaultyDevice:
     """A module and its faults, as one device.
 
     Parameters
     ----------
+    inner
+        Can only be asked to reset itself if it is not emulated here but behind a proxy.
     name
         Of the radar, as scenarios and the truth log call it.
-    plan
-        None: no faults until some are added.
-    truth
-        None: a log of its own, in memory.
+    note
+        Called with every fault that is injected.
     zero_ns
-        Device time from which the scenario counts; its first call if None.
+        Device time from which the scenario counts.
+
+    Attributes
+    ----------
+    injected
+        How often each kind was injected so far, cleared faults included.
     """
 
     def __init__(
         self,
         inner: InnerDevice,
         name: str,
-        plan: FaultPlan | None = None,
-        truth: TruthLog | None = None,
+        plan: FaultPlan,
+        note: Callable[[Injected], object] = lambda injected: None,
         *,
-        zero_ns: int | None = None,
+        zero_ns: int = 0,
     ) -> None:
         self.inner = inner
         self.name = name
-        plan = plan or FaultPlan()
-        self.truth = TruthLog() if truth is None else truth
+        self.armed: list[Armed] = []
+        self.injected: Counter[str] = Counter()
+        self._note = note
         self._seed = plan.seed
         self._zero_ns = zero_ns
-        self._armed: list[Armed] = []
         self._numbered = 0
         self._watch = Watch()
         self._queue = LineQueue()
         self._actions: list[tuple[int, Action]] = []
         self._sent_bytes = 0
-        self._injected: Counter[str] = Counter()
         self._away = False
         self._back_ns: int | None = None
-        self._power = Power(inner)
+        self._restarting = False  # a module that was asked to reset has not sent BOOTING yet
         self._cut_next: Unplug | None = None
         self._again_ns: int | None = None
         self._passed = 0  # bytes of a half command that the module has already
@@ -298,29 +215,19 @@ class FaultyDevice:
     def add(self, spec: FaultSpec) -> int:
         """Arm a fault; return the number by which `clear` knows it."""
         self._numbered += 1
-        self._armed.append(Armed(self._numbered, spec, self.name, self._seed))
+        self.armed.append(Armed(self._numbered, spec, self.name, self._seed))
         return self._numbered
 
     def clear(self, number: int | None = None) -> int:
         """Disarm one fault, or all; return how many that were."""
-        before = len(self._armed)
-        self._armed = [armed for armed in self._armed if number not in (None, armed.number)]
-        return before - len(self._armed)
-
-    @property
-    def armed(self) -> Sequence[Armed]:
-        return tuple(self._armed)
-
-    @property
-    def injected_by_kind(self) -> dict[str, int]:
-        """How often each kind was injected so far, cleared faults included."""
-        return dict(self._injected)
+        before = len(self.armed)
+        self.armed = [armed for armed in self.armed if number not in (None, armed.number)]
+        return before - len(self.armed)
 
     # --- the port -------------------------------------------------------------------------------
 
     def port_present(self, now_ns: int) -> bool:
-        present = getattr(self.inner, "port_present", None)
-        return not self._away and (present is None or bool(present(now_ns)))
+        return not self._away and self.inner.port_present(now_ns)
 
     def unplug(self, now_ns: int, away_ns: int | None = None) -> None:
         """Take the port away, for good or for a while; what was under way is lost."""
@@ -334,19 +241,24 @@ class FaultyDevice:
         if self._away:
             self._away = False
             self._back_ns = None
-            self._power.cycle(now_ns)
+            if isinstance(self.inner, Device):
+                self.inner.power_cycle(now_ns)
+            else:
+                self._ask_to_reset(now_ns)
 
     def restart(self, now_ns: int, reason: str = "watchdog") -> None:
         """Restart the module without having been asked, as after a fault that it counts."""
         self._watch.restarted()
         self._queue.clear()
-        self._power.crash(reason, now_ns)
+        if isinstance(self.inner, Device):
+            self.inner.crash(reason, now_ns)
+        else:
+            self._ask_to_reset(now_ns)
 
-    def port_opened(self, now_ns: int) -> None:
-        self.inner.port_opened(now_ns)
-
-    def port_closed(self, now_ns: int) -> None:
-        self.inner.port_closed(now_ns)
+    def _ask_to_reset(self, now_ns: int) -> None:
+        """Reset a module that is not emulated here; its bytes are dropped until BOOTING."""
+        self._restarting = True
+        self.inner.receive_data(command_bytes(ModReset()), now_ns)
 
     # --- from the host --------------------------------------------------------------------------
 
@@ -356,18 +268,20 @@ class FaultyDevice:
 
     def receive_data(self, data: bytes, now_ns: int) -> None:
         self.advance(now_ns)
-        if self._away or not self._power.listens:
+        if self._away or self._restarting:
             return
-        holds = any(armed.target is Target.COMMAND for armed in self._armed)
+        if isinstance(self.inner, Device) and not self.inner.listens:
+            return
+        holds = any(armed.target is Target.COMMAND for armed in self.armed)
         begun = self._passed
-        for piece in self._watch.host_pieces(data):
-            fresh, touched = piece.data[begun:], begun > 0
-            begun = max(begun - len(piece.data), 0)
-            if piece.command is not None and holds and not touched:
-                self._command(piece.command, piece.data, now_ns)
+        for piece, command in self._watch.host_pieces(data):
+            fresh, touched = piece[begun:], begun > 0
+            begun = max(begun - len(piece), 0)
+            if command is not None and holds and not touched:
+                self._command(command, piece, now_ns)
                 continue
-            if piece.command is not None:
-                self._watch.command_sent(piece.command)
+            if command is not None:
+                self._watch.command_sent(command)
             if holds:
                 self.inner.receive_data(fresh, now_ns)
         rest = self._watch.incomplete_command
@@ -381,12 +295,9 @@ class FaultyDevice:
 
     def _command(self, command: Command[Response], data: bytes, now_ns: int) -> None:
         opportunity = Opportunity(
-            time_ns=self._scenario_ns(now_ns),
-            counter=self._watch.counter,
-            command=command,
-            to_module=True,
+            time_ns=now_ns - self._zero_ns, counter=self._watch.counter, command=command
         )
-        for armed in self._armed:
+        for armed in self.armed:
             if not armed.concerns(opportunity) or not armed.due(opportunity):
                 continue
             effect = cast("CommandEffect", armed.kind.effect)
@@ -394,7 +305,7 @@ class FaultyDevice:
             handling = effect(data, armed.parameters, armed.rng, context)
             if handling is None:
                 continue
-            self._note(armed, now_ns)
+            self._fired(armed, now_ns)
             if handling.command is not None:
                 self._watch.command_sent(handling.command)
             if handling.to_module:
@@ -407,9 +318,12 @@ class FaultyDevice:
     # --- to the host ----------------------------------------------------------------------------
 
     def advance(self, now_ns: int) -> None:
-        time_ns = self._scenario_ns(now_ns)
-        if self._armed:
-            self._moments(now_ns, time_ns)
+        if self.armed:
+            opportunity = Opportunity(time_ns=now_ns - self._zero_ns, counter=self._watch.counter)
+            for armed in self.armed:
+                if armed.concerns(opportunity) and armed.due(opportunity):
+                    self._start(armed, now_ns)
+            self._disarm_what_is_over(now_ns)
         if self._actions:
             due = [action for due_ns, action in self._actions if due_ns <= now_ns]
             self._actions = [entry for entry in self._actions if entry[0] > now_ns]
@@ -432,7 +346,7 @@ class FaultyDevice:
             if fresh is None:
                 return None
             packet = self._through(fresh, now_ns)
-            if self._power.restarting:
+            if self._restarting:
                 break
         if packet is not None:
             self._sent_bytes += len(packet)
@@ -441,18 +355,13 @@ class FaultyDevice:
         return None
 
     def wake_ns(self, now_ns: int) -> int | None:
-        time_ns = self._scenario_ns(now_ns)
-        waits = self._armed or self._actions or self._queue
-        if not waits and self._again_ns is None and self._back_ns is None:
-            return self.inner.wake_ns(now_ns)
-        moments = [armed.next_ns(time_ns) for armed in self._armed]
-        zero_ns = now_ns - time_ns
+        moments = [armed.next_ns(now_ns - self._zero_ns) for armed in self.armed]
         candidates = [
             self.inner.wake_ns(now_ns),
             self._again_ns,
             self._back_ns,
             self._queue.wake_ns(),
-            *(zero_ns + moment_ns for moment_ns in moments if moment_ns is not None),
+            *(self._zero_ns + moment_ns for moment_ns in moments if moment_ns is not None),
             *(due_ns for due_ns, _ in self._actions),
         ]
         return min((due_ns for due_ns in candidates if due_ns is not None), default=None)
@@ -461,10 +370,10 @@ class FaultyDevice:
         """Take one packet through the faults; return bytes to send at once."""
         packet_class = classify(packet)
         command: Command[Response] | None = None
-        if self._power.restarting:
-            if not self._watch.is_booting(packet):
+        if self._restarting:
+            if packet != BOOTING:
                 return None
-            self._power.restarting = False
+            self._restarting = False
         if packet_class is PacketClass.REPLY:
             command, silent = self._watch.answered()
             if silent:
@@ -472,10 +381,10 @@ class FaultyDevice:
         self._watch.sent(packet, packet_class)
         if self._cut_next is not None and packet_class is PacketClass.FRAME:
             return self._cut_off(packet, self._cut_next, now_ns)
-        if not self._armed and not self._queue:
+        if not self.armed and not self._queue:
             return packet
         opportunity = Opportunity(
-            time_ns=self._scenario_ns(now_ns),
+            time_ns=now_ns - self._zero_ns,
             packet_class=packet_class,
             counter=self._watch.counter,
             command=command,
@@ -485,7 +394,7 @@ class FaultyDevice:
 
     def _spoil(self, packet: bytes, opportunity: Opportunity, now_ns: int) -> Sequence[Piece]:
         pieces: Sequence[Piece] = [Piece(packet)]
-        for armed in self._armed:
+        for armed in self.armed:
             if not armed.concerns(opportunity):
                 continue
             fires = armed.due(opportunity)
@@ -493,18 +402,29 @@ class FaultyDevice:
                 if fires:
                     self._start(armed, now_ns)
                 continue
-            lasts = armed.kind.lasting and armed.firings > 0
+            lasts = armed.kind.lasting and armed.injected > 0
             if not fires and not lasts:
                 continue
-            spoiled = spoiled_pieces(armed, pieces, opportunity, self._watch, now_ns, fires=fires)
+            context = Context(
+                now_ns=now_ns,
+                since_ns=now_ns if fires else armed.since_ns,
+                firings=armed.injected + fires,
+                packets_since=0 if fires else armed.packets_since + 1,
+                first_counter=self._watch.counter if fires else armed.first_counter,
+                packet_class=cast("PacketClass", opportunity.packet_class),
+                command=opportunity.command,
+                previous_frame=self._watch.previous_frame,
+                lattice=self._watch.lattice,
+            )
+            spoiled = _spoiled(armed, pieces, context)
             if spoiled is None:
                 continue
             pieces = spoiled
             if fires:
-                self._note(armed, now_ns)
+                self._fired(armed, now_ns)
             else:
                 armed.packets_since += 1
-        self._armed = [armed for armed in self._armed if not armed.over(opportunity.time_ns)]
+        self._disarm_what_is_over(now_ns)
         return pieces
 
     def _cut_off(self, packet: bytes, cut: Unplug, now_ns: int) -> bytes:
@@ -515,16 +435,12 @@ class FaultyDevice:
 
     # --- moments --------------------------------------------------------------------------------
 
-    def _moments(self, now_ns: int, time_ns: int) -> None:
-        opportunity = Opportunity(time_ns=time_ns, counter=self._watch.counter)
-        for armed in self._armed:
-            if armed.concerns(opportunity) and armed.due(opportunity):
-                self._start(armed, now_ns)
-        self._armed = [armed for armed in self._armed if not armed.over(time_ns)]
+    def _disarm_what_is_over(self, now_ns: int) -> None:
+        self.armed = [armed for armed in self.armed if not armed.over(now_ns - self._zero_ns)]
 
     def _start(self, armed: Armed, now_ns: int) -> None:
         effect = cast("MomentEffect", armed.kind.effect)
-        self._note(armed, now_ns)
+        self._fired(armed, now_ns)
         for action in effect(armed.parameters, armed.rng):
             delay_ns = action.delay_ns if isinstance(action, Restart) else 0
             self._actions.append((now_ns + delay_ns, action))
@@ -541,10 +457,13 @@ class FaultyDevice:
                 self._watch.command_sent(command, silent=True)
                 self.inner.receive_data(command_bytes(command), now_ns)
 
-    def _note(self, armed: Armed, now_ns: int) -> None:
-        armed.fired(now_ns, self._watch.counter)
-        self._injected[armed.kind.name] += 1
-        self.truth.note(
+    def _fired(self, armed: Armed, now_ns: int) -> None:
+        armed.injected += 1
+        armed.since_ns = now_ns
+        armed.first_counter = self._watch.counter
+        armed.packets_since = 0
+        self.injected[armed.kind.name] += 1
+        self._note(
             Injected(
                 t_ns=now_ns,
                 radar=self.name,
@@ -555,25 +474,29 @@ class FaultyDevice:
             )
         )
 
-    def _scenario_ns(self, now_ns: int) -> int:
-        if self._zero_ns is None:
-            self._zero_ns = now_ns
-        return now_ns - self._zero_ns
 
-
-class Injection:
-    """A fault that was armed within a block."""
-
-    def __init__(self, armed: Armed) -> None:
-        self._armed = armed
-
-    @property
-    def injected(self) -> int:
-        return self._armed.firings
+def _spoiled(armed: Armed, pieces: Sequence[Piece], context: Context) -> Sequence[Piece] | None:
+    """Return the pieces with a fault in them; None if it found nothing to spoil."""
+    effect = cast("PacketEffect", armed.kind.effect)
+    result: list[Piece] = []
+    applied = False
+    for piece in pieces:
+        spoiled = effect(piece.data, armed.parameters, armed.rng, context)
+        applied |= spoiled is not None
+        result += [
+            Piece(
+                part.data,
+                delay_ns=piece.delay_ns + part.delay_ns,
+                aside=piece.aside or part.aside,
+                behind=piece.behind + part.behind,
+            )
+            for part in ([Piece(piece.data)] if spoiled is None else spoiled)
+        ]
+    return result if applied else None
 
 
 @contextmanager
-def fault(device: FaultyDevice, kind: str, **keys: Any) -> Iterator[Injection]:  # noqa: ANN401 - validated
+def fault(device: FaultyDevice, kind: str, **keys: Any) -> Iterator[Armed]:  # noqa: ANN401 - validated
     """Arm a fault within a block; it is cleared at its end.
 
     Parameters
@@ -590,6 +513,6 @@ def fault(device: FaultyDevice, kind: str, **keys: Any) -> Iterator[Injection]: 
     number = device.add(fault_spec(kind, **keys))
     armed = device.armed[-1]
     try:
-        yield Injection(armed)
+        yield armed
     finally:
         device.clear(number)

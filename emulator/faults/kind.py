@@ -16,12 +16,11 @@ import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.device import ByteDevice
 from emulator.scene.philox import Rng
 from emulator.scene.tables import Table
 from xethru_protocol.driver.frames import Lattice
@@ -36,6 +35,8 @@ from xethru_protocol.wire.framing import (
     unescape,
 )
 from xethru_protocol.wire.messages import Command, Response
+
+Samples = NDArray[np.float32]
 
 _FRAME = struct.Struct("<4sIxBBIII")
 _PAYLOAD = struct.Struct("<BBIII")
@@ -61,14 +62,6 @@ class PacketClass(Enum):
     """BOOTING, READY and the like. Protocol reference 5."""
     DATA = "data"
     """Anything else: profile output, strings, and bytes that are no packet."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FrameParts:
-    """A radar frame taken apart; ``samples`` float32, shape (n,), read-only."""
-
-    counter: int
-    samples: NDArray[np.float32]
 
 
 def classify(packet: bytes) -> PacketClass:
@@ -100,15 +93,12 @@ def frame_counter(packet: bytes) -> int | None:
     return counter if is_frame else None
 
 
-def frame_parts(packet: bytes) -> FrameParts | None:
-    """Return counter and samples of a radar frame; None for anything else."""
-    counter = frame_counter(packet)
-    if counter is None:
-        return None
-    return FrameParts(counter=counter, samples=np.frombuffer(packet, "<f4", offset=_FRAME.size))
+def frame_samples(packet: bytes) -> Samples:
+    """Return the samples of a radar frame, shape (n,), read-only."""
+    return np.frombuffer(packet, "<f4", offset=_FRAME.size)
 
 
-def frame_packet(counter: int, samples: NDArray[np.float32]) -> bytes:
+def frame_packet(counter: int, samples: Samples) -> bytes:
     """Return a radar frame in NoEscape framing; the counter wraps at 2**32."""
     head = _PAYLOAD.pack(
         ResponseCode.XTS_SPR_DATA,
@@ -133,32 +123,6 @@ def response_bytes(message: Response) -> bytes:
 
 def command_bytes(command: Command[Response]) -> bytes:
     return Connection(Role.HOST).send(command)
-
-
-class InnerDevice(ByteDevice, Protocol):
-    """A module as its port sees it: see `emulator.device.Device`."""
-
-    def port_opened(self, now_ns: int) -> None: ...
-
-    def port_closed(self, now_ns: int) -> None: ...
-
-
-@runtime_checkable
-class EmulatedInside(Protocol):
-    """What an emulated module has beyond that: its inside can be made to fail."""
-
-    @property
-    def listens(self) -> bool:
-        """Whether it receives: not while it starts or sleeps."""
-        ...
-
-    def crash(self, reason: str, now_ns: int) -> None:
-        """Restart at once as after a fault, which counts towards safe mode."""
-        ...
-
-    def power_cycle(self, now_ns: int) -> None:
-        """Restart at once as after a power cut, which forgets the faults."""
-        ...
 
 
 class Layer(Enum):
@@ -290,10 +254,20 @@ Action = Restart | Unplug | SendToModule
 PacketEffect = Callable[[bytes, Any, Rng, Context], Pieces]
 CommandEffect = Callable[[bytes, Any, Rng, Context], Handling | None]
 MomentEffect = Callable[[Any, Rng], Sequence[Action]]
-
-
 Effect = PacketEffect | CommandEffect | MomentEffect
 EffectT = TypeVar("EffectT", bound=Callable[..., Any])
+
+
+def changed_frame(packet: bytes, change: Callable[[Samples], Samples | None]) -> Pieces:
+    """Return a radar frame with other samples.
+
+    None for anything else, for a frame without samples, and if ``change`` returns None.
+    """
+    counter = frame_counter(packet)
+    if counter is None or not frame_samples(packet).size:
+        return None
+    samples = change(frame_samples(packet))
+    return None if samples is None else [Piece(frame_packet(counter, samples))]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

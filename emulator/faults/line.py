@@ -8,7 +8,6 @@ from __future__ import annotations
 import heapq
 from collections import deque
 from collections.abc import Iterable
-from typing import NamedTuple
 
 from emulator.faults.kind import PacketClass, Piece, frame_counter, response_bytes
 from xethru_protocol.driver.frames import Lattice
@@ -85,7 +84,7 @@ class LineQueue:
 
 
 _MOST_PENDING = 64  # a module takes no more commands than it can answer
-_BOOTING = response_bytes(System(code=SystemCode.XTS_SPRS_BOOTING))
+BOOTING = response_bytes(System(code=SystemCode.XTS_SPRS_BOOTING))
 _LATTICE_SETTINGS = {
     X4Setting.ITERATIONS: "iterations",
     X4Setting.PULSESPERSTEP: "pulses_per_step",
@@ -97,18 +96,6 @@ _LATTICE_SETTINGS = {
 }
 
 
-class HostPiece(NamedTuple):
-    """Bytes from the host; ``command`` is the one they are, None for damaged ones."""
-
-    data: bytes
-    command: Command[Response] | None
-
-
-class _Pending(NamedTuple):
-    command: Command[Response]
-    silent: bool
-
-
 class Watch:
     """What passed one port so far.
 
@@ -116,17 +103,17 @@ class Watch:
     ----------
     counter
         Of the last radar frame; None before the first.
-    frame, previous_frame
-        The last radar frame from the module and the one before it, as bytes.
+    previous_frame
+        The radar frame before the last one, as bytes.
     """
 
     def __init__(self) -> None:
         self.counter: int | None = None
-        self.frame: bytes | None = None
         self.previous_frame: bytes | None = None
+        self._frame: bytes | None = None
         self._settings: dict[str, int] = {}
         self._lattice: Lattice | None = None
-        self._pending: deque[_Pending] = deque(maxlen=_MOST_PENDING)
+        self._pending: deque[tuple[Command[Response], bool]] = deque(maxlen=_MOST_PENDING)
         self._reader = PacketReader(Direction.FROM_HOST)
         self._unjudged = bytearray()
 
@@ -147,8 +134,11 @@ class Watch:
         """Bytes from the host that are not judged yet."""
         return bytes(self._unjudged)
 
-    def host_pieces(self, data: bytes) -> list[HostPiece]:
-        """Cut bytes of the host into commands and others; an incomplete command waits for more."""
+    def host_pieces(self, data: bytes) -> list[tuple[bytes, Command[Response] | None]]:
+        """Cut bytes of the host into commands and others; an incomplete command waits for more.
+
+        With each piece comes the command that it is, None for damaged ones.
+        """
         self._unjudged += data
         self._reader.receive_data(data)
         pieces = []
@@ -156,15 +146,14 @@ class Watch:
             end = len(self._unjudged) - self._reader.buffered
             piece = bytes(self._unjudged[:end])
             del self._unjudged[:end]
-            whole = isinstance(found, Packet)
             command = decode_command(found.payload) if isinstance(found, Packet) else None
-            if piece or whole:
-                pieces.append(HostPiece(piece, command))
+            if piece or command is not None:
+                pieces.append((piece, command))
         return pieces
 
     def command_sent(self, command: Command[Response], *, silent: bool = False) -> None:
         """Note that the module got a command; ``silent`` if the host shall not see its answer."""
-        self._pending.append(_Pending(command, silent))
+        self._pending.append((command, silent))
         if isinstance(command, X4DriverInit):
             self._settings.clear()
             self._lattice = None
@@ -176,23 +165,16 @@ class Watch:
 
     def answered(self) -> tuple[Command[Response] | None, bool]:
         """Return the command that a reply answers, and whether the host shall not see it."""
-        if not self._pending:
-            return None, False
-        pending = self._pending.popleft()
-        return pending.command, pending.silent
+        return self._pending.popleft() if self._pending else (None, False)
 
     def sent(self, packet: bytes, packet_class: PacketClass) -> None:
         if packet_class is PacketClass.FRAME:
-            self.previous_frame, self.frame = self.frame, packet
+            self.previous_frame, self._frame = self._frame, packet
             self.counter = frame_counter(packet)
-        elif self.is_booting(packet):
+        elif packet == BOOTING:
             self.restarted()
 
     def restarted(self) -> None:
         self._pending.clear()
         self._settings.clear()
         self._lattice = None
-
-    @staticmethod
-    def is_booting(packet: bytes) -> bool:
-        return packet == _BOOTING

@@ -26,8 +26,7 @@ The truth log is JSON lines, one object per injected fault: ``t_ns`` (device tim
 from __future__ import annotations
 
 import json
-from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -43,12 +42,7 @@ from pydantic import (
 
 from emulator.faults.kind import Kind, Parameters, Target
 from emulator.faults.kinds import KINDS
-from emulator.scene.tables import (
-    Table,
-    finite,
-    load_table,
-    one_line,
-)
+from emulator.scene.tables import Table, finite, load_table, one_line
 from xethru_protocol.wire.messages import Command
 from xethru_protocol.wire.table import ROWS
 
@@ -60,6 +54,7 @@ _LIMITS = {
     "enum": "one_of",
     "pattern": "pattern",
 }
+_COMMANDS = frozenset(row.name for message, row in ROWS.items() if issubclass(message, Command))
 
 
 def described(kind: Kind) -> dict[str, Any]:
@@ -100,12 +95,9 @@ def _toml(value: object) -> str:
     return f'"{value}"' if isinstance(value, str) else repr(value)
 
 
-_KEPT = 100_000  # records in memory; a log on disk has no such end
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Injected:
-    """One injected fault; see the module for the fields."""
+    """One record of the truth log; see the module for the fields."""
 
     t_ns: int
     radar: str
@@ -114,34 +106,8 @@ class Injected:
     counter: int | None
     offset: int
 
-
-class TruthLog:
-    """What was injected, in order.
-
-    Parameters
-    ----------
-    write
-        Called with every record as a line of JSON, line end included; None: kept in memory only.
-
-    Attributes
-    ----------
-    records
-        The last 100 000.
-    """
-
-    def __init__(self, write: Callable[[str], object] | None = None) -> None:
-        self._write = write
-        self.records: deque[Injected] = deque(maxlen=_KEPT)
-        self.counts: Counter[str] = Counter()
-
-    def note(self, injected: Injected) -> None:
-        self.records.append(injected)
-        self.counts[injected.kind] += 1
-        if self._write is not None:
-            self._write(json.dumps(asdict(injected), separators=(",", ":")) + "\n")
-
-
-_COMMANDS = frozenset(row.name for message, row in ROWS.items() if issubclass(message, Command))
+    def line(self) -> str:
+        return json.dumps(asdict(self), separators=(",", ":")) + "\n"
 
 
 class FaultPlanError(ValueError):

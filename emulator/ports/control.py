@@ -23,9 +23,7 @@ from __future__ import annotations
 
 import json
 import selectors
-import socket
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +33,12 @@ from emulator.playback import PlayStream, kinds
 from emulator.ports.sockets import SocketClient, SocketService
 
 NS_PER_S = 1_000_000_000
+MOST_CLIENTS = 16
+LONGEST_LINE = 65_536
+"""Bytes; a client that sends more without a line end is hung up on."""
+MOST_UNREAD = 1 << 20
+"""Bytes of answers that wait for a client; then it is hung up on."""
+_READ = 65_536
 _LONGEST_S = 86_400.0 * 365
 _KEYS = ("verb", "radar", "fault", "id", "seconds", "value", "kinds")
 
@@ -95,32 +99,16 @@ class Control:
     # --- verbs ----------------------------------------------------------------------------------
 
     def _state(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
-        return {
-            "t_ns": now_ns,
-            "radars": {
-                device.name: {
-                    "present": device.port_present(now_ns),
-                    "faults": _faults(device),
-                    "injected": device.injected_by_kind,
-                    "playback": self._playback(device.name, now_ns),
-                }
-                for device in self._named(asked)
-            },
-        }
-
-    def _playback(self, name: str, now_ns: int) -> dict[str, Any] | None:
-        player = self._players.get(name)
-        if player is None:
-            return None
-        state = player.state(now_ns)
-        return {
-            "playing": state.playing,
-            "paused": state.paused,
-            "position_s": state.position_ns / NS_PER_S,
-            "rate": state.rate,
-            "loop": state.loop,
-            "kinds": None if state.kinds is None else sorted(state.kinds),
-        }
+        radars = {}
+        for device in self._named(asked):
+            player = self._players.get(device.name)
+            radars[device.name] = {
+                "present": device.port_present(now_ns),
+                "faults": _faults(device),
+                "injected": device.injected,
+                "playback": None if player is None else player.state(now_ns),
+            }
+        return {"t_ns": now_ns, "radars": radars}
 
     def _fault_add(self, asked: Mapping[str, Any], now_ns: int) -> dict[str, Any]:
         spec = parse_fault(asked.get("fault"))
@@ -215,7 +203,7 @@ def _faults(device: FaultyDevice) -> list[dict[str, Any]]:
             "id": armed.number,
             "kind": armed.kind.name,
             "parameters": armed.parameters.model_dump(),
-            "injected": armed.firings,
+            "injected": armed.injected,
             "count": armed.spec.count,
         }
         for armed in device.armed
@@ -233,32 +221,14 @@ def _number(asked: Mapping[str, Any], key: str, most: float) -> float:
     return float(value)
 
 
-MOST_CLIENTS = 16
-LONGEST_LINE = 65_536
-"""Bytes; a client that sends more without a line end is hung up on."""
-MOST_UNREAD = 1 << 20
-"""Bytes of answers that wait for a client; then it is hung up on."""
-_READ = 65_536
-
-
-@dataclass(slots=True, kw_only=True, eq=False)
-class _Client(SocketClient):
-    asked: bytes = b""
-
-
-class ControlSocket(SocketService[_Client]):
+class ControlSocket(SocketService):
     """The socket on which `Control` answers lines; only its owner can connect."""
 
     def __init__(self, path: Path, control: Control) -> None:
         super().__init__(path, "control", most_clients=MOST_CLIENTS, private=True)
         self._control = control
 
-    def _admit(self, connection: socket.socket, now_ns: int) -> None:
-        client = _Client(connection=connection)
-        self._clients.append(client)
-        self._watch(client)
-
-    def _ready(self, client: _Client, events: int, now_ns: int) -> None:
+    def _ready(self, client: SocketClient, events: int, now_ns: int) -> None:
         if events & selectors.EVENT_READ:
             self._read(client, now_ns)
         if client.unsent and not self._send(client):
@@ -268,7 +238,7 @@ class ControlSocket(SocketService[_Client]):
         else:
             self._drop(client)
 
-    def _read(self, client: _Client, now_ns: int) -> None:
+    def _read(self, client: SocketClient, now_ns: int) -> None:
         try:
             data = client.connection.recv(_READ)
         except BlockingIOError:
@@ -276,9 +246,9 @@ class ControlSocket(SocketService[_Client]):
         except OSError:
             data = b""
         client.reads = bool(data)
-        *lines, client.asked = (client.asked + data).split(b"\n")
+        *lines, client.begun = (client.begun + data).split(b"\n")
         for line in lines:
             if line.strip():
                 client.unsent += self._control.answer(line, now_ns)
-        if len(client.asked) > LONGEST_LINE or len(client.unsent) > MOST_UNREAD:
+        if len(client.begun) > LONGEST_LINE or len(client.unsent) > MOST_UNREAD:
             client.reads, client.unsent = False, b""

@@ -18,12 +18,21 @@ from typing import ClassVar
 from emulator.module.settings import BITS_PER_BYTE, received_bytes
 
 NS_PER_S = 1_000_000_000
+LARGEST_TRANSFER = 512
+"""Bytes, on USB."""
+MOST_UNDER_WAY = 65536
+"""Bytes in one direction on USB; more wait at the sender."""
+SLICE_NS = 4_000_000
+"""A UART's bytes are handed over in pieces of so much line time, as adapters do."""
+UART_MOST_UNDER_WAY = 4096
+"""Bytes of a host; what it writes beyond waits on its side, as in its driver's buffer."""
 
 
 class Flight:
     """Pieces of bytes under way in one direction, in order, each with its time of arrival."""
 
-    def __init__(self) -> None:
+    def __init__(self, most_at_once: int | None = None) -> None:
+        self._most_at_once = most_at_once
         self._pieces: deque[tuple[int, bytes]] = deque()
         self._size = 0
 
@@ -31,16 +40,17 @@ class Flight:
         self._pieces.append((due_ns, piece))
         self._size += len(piece)
 
-    def take(self, now_ns: int, *, most: int | None = None) -> bytes:
-        """Return what has arrived, of at most so many pieces."""
+    def take(self, now_ns: int) -> bytes:
+        """Return what has arrived and was not taken before, of at most ``most_at_once`` pieces."""
         arrived: list[bytes] = []
-        while self._pieces and self._pieces[0][0] <= now_ns and len(arrived) != most:
+        while self._pieces and self._pieces[0][0] <= now_ns and len(arrived) != self._most_at_once:
             arrived.append(self._pieces.popleft()[1])
         data = b"".join(arrived)
         self._size -= len(data)
         return data
 
     def next_ns(self) -> int | None:
+        """Return when more arrives; None if nothing is under way."""
         return self._pieces[0][0] if self._pieces else None
 
     def clear(self) -> None:
@@ -61,11 +71,10 @@ class Line(ABC):
 
     waits_for_host: ClassVar[bool]
     """Whether bytes for which the host's side has no room wait; if not, they are lost."""
-    _pieces_at_once: ClassVar[int | None] = None
 
-    def __init__(self) -> None:
-        self._to_host = Flight()
-        self._to_module = Flight()
+    def __init__(self, most_at_once: int | None = None) -> None:
+        self.to_host = Flight(most_at_once)
+        self.to_module = Flight(most_at_once)
 
     @property
     @abstractmethod
@@ -78,73 +87,43 @@ class Line(ABC):
         """Whether more should be read from the host."""
 
     @abstractmethod
-    def from_module(self, packet: bytes, now_ns: int) -> None:
-        """Take a packet of the module."""
+    def from_module(self, packet: bytes, now_ns: int) -> None: ...
 
     @abstractmethod
-    def from_host(self, data: bytes, now_ns: int) -> None:
-        """Take bytes of the host."""
-
-    def to_host(self, now_ns: int) -> bytes:
-        """Return what has reached the host's side and was not returned before."""
-        return self._to_host.take(now_ns, most=self._pieces_at_once)
-
-    def to_module(self, now_ns: int) -> bytes:
-        """Return what has reached the module and was not returned before."""
-        return self._to_module.take(now_ns, most=self._pieces_at_once)
-
-    def to_host_ns(self) -> int | None:
-        """Return when more reaches the host's side; None if nothing is under way."""
-        return self._to_host.next_ns()
-
-    def to_module_ns(self) -> int | None:
-        """Return when more reaches the module; None if nothing is under way."""
-        return self._to_module.next_ns()
+    def from_host(self, data: bytes, now_ns: int) -> None: ...
 
     def clear(self) -> None:
         """Lose all that is under way: the line is cut."""
-        self._to_host.clear()
-        self._to_module.clear()
-
-
-LARGEST_TRANSFER = 512
-MOST_UNDER_WAY = 65536
-"""Bytes in one direction; more wait at the sender."""
+        self.to_host.clear()
+        self.to_module.clear()
 
 
 class UsbLine(Line):
     """A line that delays every transfer by ``latency_ns`` in either direction."""
 
     waits_for_host = True  # the host's controller fetches bytes when it has room for them
-    _pieces_at_once = 1
 
     def __init__(self, latency_ns: int) -> None:
-        super().__init__()
+        super().__init__(most_at_once=1)
         self._latency_ns = latency_ns
 
     @property
     def takes_packet(self) -> bool:
-        return len(self._to_host) < MOST_UNDER_WAY
+        return len(self.to_host) < MOST_UNDER_WAY
 
     @property
     def takes_bytes(self) -> bool:
-        return len(self._to_module) < MOST_UNDER_WAY
+        return len(self.to_module) < MOST_UNDER_WAY
 
     def from_module(self, packet: bytes, now_ns: int) -> None:
-        self._send_off(self._to_host, packet, now_ns)
+        self._send_off(self.to_host, packet, now_ns)
 
     def from_host(self, data: bytes, now_ns: int) -> None:
-        self._send_off(self._to_module, data, now_ns)
+        self._send_off(self.to_module, data, now_ns)
 
     def _send_off(self, flight: Flight, data: bytes, now_ns: int) -> None:
         for begin in range(0, len(data), LARGEST_TRANSFER):
             flight.put(now_ns + self._latency_ns, data[begin : begin + LARGEST_TRANSFER])
-
-
-SLICE_NS = 4_000_000
-"""Bytes are handed over in pieces of so much line time, as adapters do."""
-UART_MOST_UNDER_WAY = 4096
-"""Bytes of a host; what it writes beyond waits on its side, as in its driver's buffer."""
 
 
 class UartLine(Line):
@@ -168,29 +147,28 @@ class UartLine(Line):
 
     @property
     def takes_packet(self) -> bool:
-        return self._to_host.is_empty  # a UART has no room for two
+        return self.to_host.is_empty  # a UART has no room for two
 
     @property
     def takes_bytes(self) -> bool:
-        return len(self._to_module) < UART_MOST_UNDER_WAY
+        return len(self.to_module) < UART_MOST_UNDER_WAY
 
     def from_module(self, packet: bytes, now_ns: int) -> None:
-        sent, read = self._module_baud(), self._baud_of_host()
-        _send(self._to_host, packet, now_ns, sent, read)
+        _send(self.to_host, packet, now_ns, self._module_baud(), self._baud_of_host())
 
     def from_host(self, data: bytes, now_ns: int) -> None:
         """Take bytes of the host; they follow on those it wrote before."""
         begin_ns = max(now_ns, self._host_done_ns)
         sent, read = self._baud_of_host(), self._module_baud()
-        self._host_done_ns = _send(self._to_module, data, begin_ns, sent, read)
+        self._host_done_ns = _send(self.to_module, data, begin_ns, sent, read)
 
     def flush_output(self) -> None:
         """Lose what the host wrote and did not send yet, as it asked for."""
-        self._to_module.clear()
+        self.to_module.clear()
         self._host_done_ns = 0
 
     def clear(self) -> None:
-        self._to_host.clear()
+        self.to_host.clear()
         self.flush_output()
 
     def _baud_of_host(self) -> int:

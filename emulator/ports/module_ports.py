@@ -13,7 +13,7 @@ import contextlib
 import os
 import selectors
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -22,8 +22,11 @@ from emulator.device import ByteDevice
 from emulator.module.settings import DEFAULT_BAUDRATE
 from emulator.ports.lines import UartLine, UsbLine
 from emulator.ports.pty import LinkError, PortWatch, PtyLink
-from emulator.ports.server import Port, Service
+from emulator.ports.server import Port, Service, wait_for
 from emulator.ports.tcp import TcpLink
+
+LOOK_AGAIN_NS = 20_000_000
+"""How often to look whether the port is back; a host looks less often."""
 
 
 class DeviceSide:
@@ -50,10 +53,6 @@ class DeviceSide:
 
     def wake_ns(self, now_ns: int) -> int | None:
         return self._device.wake_ns(now_ns) if self._has_it() else None
-
-
-LOOK_AGAIN_NS = 20_000_000
-"""How often to look whether the port is back; a host looks less often."""
 
 
 class Plug(Service):
@@ -91,7 +90,6 @@ class Plug(Service):
         self._selector: selectors.BaseSelector | None = None
 
     def register(self, selector: selectors.BaseSelector) -> None:
-        """Remember the loop's selector: a port that goes away is no longer waited for."""
         self._selector = selector
 
     def advance(self, now_ns: int) -> None:
@@ -106,14 +104,13 @@ class Plug(Service):
 
     def _take_away(self) -> None:
         if self._selector is not None:
-            with contextlib.suppress(KeyError):  # not waited for just now
-                self._selector.unregister(self._link.fileno())
+            wait_for(self._selector, self._link.fileno(), 0)
         self._link.close()
         if self._tcp is not None:
             self._tcp.hang_up()
 
     def _bring_back(self) -> None:
-        path: Path = self._first_path
+        path = self._first_path
         if self._renames:
             path = path.with_name(f"{path.name}-{self._returns + 2}")
         try:
@@ -124,10 +121,6 @@ class Plug(Service):
         if self._watch is not None:
             self._watch.follow(self._link.terminal)
         self._moved()
-
-
-def _power_up_baud() -> int:
-    return DEFAULT_BAUDRATE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,7 +142,7 @@ class NamedDevice:
     device: ByteDevice
     start_skew_ns: int | None = None
     present: Callable[[int], bool] | None = None
-    uart_baud: Callable[[], int] = _power_up_baud
+    uart_baud: Callable[[], int] = lambda: DEFAULT_BAUDRATE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -178,20 +171,35 @@ class LinkOptions:
     tcp_host: str = "127.0.0.1"
 
 
-@dataclass(slots=True, kw_only=True)
 class DevicePorts:
-    """Everything that leads to the modules of one emulator.
+    """Everything that leads to the modules of one emulator; closed with ``cleanup``.
 
     Attributes
     ----------
     moved
         Called when a port came back, maybe under another name.
+
+    Raises
+    ------
+    LinkError
+        When a line cannot be had.
     """
 
-    ports: list[Port] = field(default_factory=list)
-    services: list[Service] = field(default_factory=list)
-    moved: Callable[[], None] = field(default=lambda: None)
-    _lines: list[tuple[NamedDevice, PtyLink, TcpLink | None]] = field(default_factory=list)
+    def __init__(
+        self,
+        devices: Sequence[NamedDevice],
+        folder: Path,
+        options: LinkOptions,
+        cleanup: contextlib.ExitStack,
+    ) -> None:
+        self.ports: list[Port] = []
+        self.services: list[Service] = []
+        self.moved: Callable[[], None] = lambda: None
+        self._lines: list[tuple[NamedDevice, PtyLink, TcpLink | None]] = []
+        for index, named in enumerate(devices):
+            base = options.tcp_base
+            tcp_port = base + index if base else base
+            self._add(named, folder / named.name, tcp_port, options, cleanup)
 
     def entries(self) -> list[dict[str, object]]:
         return [
@@ -205,7 +213,7 @@ class DevicePorts:
             for named, link, tcp in self._lines
         ]
 
-    def add(
+    def _add(
         self,
         named: NamedDevice,
         path: Path,
@@ -213,16 +221,10 @@ class DevicePorts:
         options: LinkOptions,
         cleanup: contextlib.ExitStack,
     ) -> None:
-        """Open the lines to one more module.
-
-        Raises
-        ------
-        LinkError
-            When one cannot be had.
-        """
         line = _line(named, options)
         flushed = line.flush_output if isinstance(line, UartLine) else None
-        link = cleanup.enter_context(PtyLink(path, flushed=flushed))
+        link = PtyLink(path, flushed=flushed)
+        cleanup.callback(link.close)
         if isinstance(line, UartLine) and options.host_baud is None:
             line.host_baud = link.host_baud
         tcp, watch = None, None
@@ -232,14 +234,15 @@ class DevicePorts:
             cleanup.callback(watch.close)
             tcp = TcpLink(options.tcp_host, tcp_port, admits=partial(_is_free, link, watch))
             cleanup.callback(tcp.close)
-            device = DeviceSide(named.device, partial(_is_closed, tcp))
-            guest = DeviceSide(named.device, partial(_is_open, tcp))
+            has_client = partial(_is_open, tcp)
+            device = DeviceSide(named.device, lambda: not has_client())
+            guest = DeviceSide(named.device, has_client)
             self.ports.append(Port(tcp, guest, _line(named, options)))
             self.services += [watch, tcp]
         self.ports.append(Port(link, device, line))
         plug = Plug(
             link,
-            named.present or _always,
+            named.present or (lambda now_ns: True),
             tcp=tcp,
             watch=watch,
             renames=options.port_on_reset == "rename",
@@ -247,27 +250,6 @@ class DevicePorts:
         )
         self.services.append(plug)
         self._lines.append((named, link, tcp))
-
-
-def open_ports(
-    devices: Sequence[NamedDevice],
-    folder: Path,
-    options: LinkOptions,
-    cleanup: contextlib.ExitStack,
-) -> DevicePorts:
-    """Open the lines to all modules; what was opened is closed with ``cleanup``.
-
-    Raises
-    ------
-    LinkError
-        When one cannot be had.
-    """
-    opened = DevicePorts()
-    for index, named in enumerate(devices):
-        base = options.tcp_base
-        tcp_port = base + index if base else base
-        opened.add(named, folder / named.name, tcp_port, options, cleanup)
-    return opened
 
 
 def _line(named: NamedDevice, options: LinkOptions) -> UsbLine | UartLine | None:
@@ -280,13 +262,5 @@ def _is_open(link: PtyLink | TcpLink) -> bool:
     return link.fileno() >= 0
 
 
-def _is_closed(link: TcpLink) -> bool:
-    return link.fileno() < 0
-
-
 def _is_free(link: PtyLink, watch: PortWatch) -> bool:
     return _is_open(link) and not watch.in_use
-
-
-def _always(now_ns: int) -> bool:
-    return True

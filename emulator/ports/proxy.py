@@ -16,10 +16,8 @@ from pathlib import Path
 from typing import Literal
 
 from emulator.ports.pty import LinkError
-from emulator.ports.server import Service
+from emulator.ports.server import Service, wait_for
 from xethru_protocol.wire.framing import Direction, NeedData, PacketReader
-
-__all__ = ["ModuleLine", "open_module"]
 
 Tap = Callable[[Literal["rx", "tx"], bytes], None]
 HOLD_NS = 50_000_000
@@ -47,7 +45,6 @@ class ModuleLine(Service):
         self._tap = tap
         self._gone = gone
         self._selector: selectors.BaseSelector | None = None
-        self._watched = selectors.EVENT_READ
         self._unsent = b""
         self._reader = PacketReader(Direction.FROM_MODULE)
         self._unjudged = bytearray()
@@ -87,12 +84,6 @@ class ModuleLine(Service):
     def wake_ns(self, now_ns: int) -> int | None:
         return None if self._since_ns is None else self._since_ns + HOLD_NS
 
-    def port_opened(self, now_ns: int) -> None:
-        """Change nothing: the module does not see who uses the proxy."""
-
-    def port_closed(self, now_ns: int) -> None:
-        """Change nothing."""
-
     def port_present(self, now_ns: int) -> bool:
         return self._alive
 
@@ -100,7 +91,7 @@ class ModuleLine(Service):
 
     def register(self, selector: selectors.BaseSelector) -> None:
         self._selector = selector
-        selector.register(self._descriptor, selectors.EVENT_READ, self._ready)
+        self._watch()
 
     def close(self) -> None:
         self._selector = None
@@ -155,20 +146,11 @@ class ModuleLine(Service):
             return
         wanted = selectors.EVENT_WRITE if self._unsent else 0
         wanted |= selectors.EVENT_READ if self._waiting < MOST_WAITING else 0
-        if wanted == self._watched:
-            return
-        if not wanted:
-            self._selector.unregister(self._descriptor)
-        elif self._watched:
-            self._selector.modify(self._descriptor, wanted, self._ready)
-        else:
-            self._selector.register(self._descriptor, wanted, self._ready)
-        self._watched = wanted
+        wait_for(self._selector, self._descriptor, wanted, self._ready)
 
     def _lost(self) -> None:
-        if self._selector is not None and self._watched:
-            self._selector.unregister(self._descriptor)
-        self._watched = 0
+        if self._selector is not None:
+            wait_for(self._selector, self._descriptor, 0)
         self._alive = False
         self._unsent = b""
         self._gone()

@@ -16,19 +16,27 @@ import termios
 import tty
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 
 from emulator.ports.server import Service
 
 _IN_CLOSE_WRITE = 0x08
 _IN_CLOSE_NOWRITE = 0x10
 _IN_OPEN = 0x20
-_IN_NONBLOCK = os.O_NONBLOCK
 _EVENT = struct.Struct("iIII")  # watch, mask, cookie, length of a name (none for a device)
 
 
-def _ignore(now_ns: int) -> None:
-    pass
+LARGEST_READ = 4096  # what the line discipline hands out at once, and a bit
+# Linux: the speed as a number, which tcgetattr() does not give for rates without a constant
+_TCGETS2, _TERMIOS2 = 0x802C542A, struct.Struct("=4IB19B2I")
+_SPEEDS = {
+    getattr(termios, name): int(name[1:])
+    for name in dir(termios)
+    if name[0] == "B" and name[1:].isdigit()
+}
+
+
+class LinkError(Exception):
+    """A port that could not be published; the message names it and the remedy."""
 
 
 class PortWatch(Service):
@@ -49,14 +57,18 @@ class PortWatch(Service):
         self,
         terminal: str,
         *,
-        opened: Callable[[int], None] = _ignore,
-        closed: Callable[[int], None] = _ignore,
+        opened: Callable[[int], None] = lambda now_ns: None,
+        closed: Callable[[int], None] = lambda now_ns: None,
     ) -> None:
         self._opened = opened
         self._closed = closed
         self._hosts = 0
         self._watch = -1
-        self._fd = _inotify()
+        try:
+            start = ctypes.CDLL(None, use_errno=True).inotify_init1
+            self._fd = int(start(os.O_NONBLOCK | os.O_CLOEXEC))
+        except AttributeError:
+            self._fd = -1  # not Linux
         if self.works and not self.follow(terminal):
             self.close()
 
@@ -106,29 +118,6 @@ class PortWatch(Service):
             self._hosts -= 1
             if not self._hosts:
                 self._closed(now_ns)
-
-
-def _inotify() -> int:
-    """Return a descriptor of file events; -1 where the system has none."""
-    try:
-        start = ctypes.CDLL(None, use_errno=True).inotify_init1
-    except AttributeError:
-        return -1  # not Linux
-    return int(start(_IN_NONBLOCK | os.O_CLOEXEC))
-
-
-LARGEST_READ = 4096  # what the line discipline hands out at once, and a bit
-# Linux: the speed as a number, which tcgetattr() does not give for rates without a constant
-_TCGETS2, _TERMIOS2 = 0x802C542A, struct.Struct("=4IB19B2I")
-_SPEEDS = {
-    getattr(termios, name): int(name[1:])
-    for name in dir(termios)
-    if name[0] == "B" and name[1:].isdigit()
-}
-
-
-class LinkError(Exception):
-    """A port that could not be published; the message names it and the remedy."""
 
 
 class PtyLink:
@@ -233,17 +222,6 @@ class PtyLink:
         except OSError:
             pass  # removed or replaced by others: not ours to remove
         self._close_descriptors()
-
-    def __enter__(self) -> PtyLink:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _ask_for_packets(self) -> bool:
         try:

@@ -23,6 +23,25 @@ LONGEST_WAIT_S = 86400.0
 """The system waits no longer than 24 days; a playback at a small rate may ask for years."""
 
 
+def wait_for(
+    selector: selectors.BaseSelector,
+    descriptor: int,
+    events: int,
+    ready: Callable[[int, int], None] | None = None,
+) -> None:
+    """Wait for these events and no others, 0: for none; one system call if that is a change.
+
+    ``ready`` is called with ``(events, now_ns)``.
+    """
+    key = selector.get_map().get(descriptor)
+    if key is None and events:
+        selector.register(descriptor, events, ready)
+    elif key is not None and not events:
+        selector.unregister(descriptor)
+    elif key is not None and key.events != events:
+        selector.modify(descriptor, events, ready)
+
+
 class ByteLink(Protocol):
     """What the server needs of a line: see `emulator.ports.pty.PtyLink`."""
 
@@ -84,7 +103,7 @@ class Port:
     def advance(self, now_ns: int) -> None:
         self.device.advance(now_ns)
         while self._line is not None and self.device.wants_data:
-            data = self._line.to_module(now_ns)
+            data = self._line.to_module.take(now_ns)
             if not data:
                 return
             self.device.receive_data(data, now_ns)
@@ -94,13 +113,16 @@ class Port:
             return self.device.wake_ns(now_ns)
         candidates = [self.device.wake_ns(now_ns)]
         if not self._blocked:
-            candidates.append(self._line.to_host_ns())
+            candidates.append(self._line.to_host.next_ns())
         if self.device.wants_data:
-            candidates.append(self._line.to_module_ns())
+            candidates.append(self._line.to_module.next_ns())
         return min((time_ns for time_ns in candidates if time_ns is not None), default=None)
 
-    def room(self) -> None:
-        self._blocked = False
+    def ready(self, events: int, now_ns: int) -> None:
+        if events & selectors.EVENT_WRITE:
+            self._blocked = False
+        if events & selectors.EVENT_READ:
+            self.receive(now_ns)
 
     def cut(self) -> None:
         """Forget what was half sent: the line is unplugged, and the next host begins afresh."""
@@ -131,7 +153,7 @@ class Port:
         """Return a packet, or what of one has passed the line by now."""
         if self._line is None:
             return self.device.next_packet(now_ns)
-        data = self._line.to_host(now_ns)
+        data = self._line.to_host.take(now_ns)
         if data:
             return data
         while self._line.takes_packet:
@@ -139,7 +161,7 @@ class Port:
             if packet is None:
                 break
             self._line.from_module(packet, now_ns)
-        return self._line.to_host(now_ns)
+        return self._line.to_host.take(now_ns)
 
 
 class Server:
@@ -164,7 +186,6 @@ class Server:
         self._stopped = False
         self._busy = True
         self._selector = selectors.DefaultSelector()
-        self._keys = self._selector.get_map()  # a view: services register and unregister, too
         self._wake_fd, self._waker_fd = os.pipe()
         os.set_blocking(self._wake_fd, False)
         os.set_blocking(self._waker_fd, False)
@@ -202,7 +223,9 @@ class Server:
                 port.cut()
                 continue
             self._busy |= port.send(now_ns)
-            self._watch(port)
+            descriptor = port.link.fileno()
+            if descriptor >= 0:  # else the host left while we wrote
+                wait_for(self._selector, descriptor, port.events, port.ready)
 
     def _wait_s(self, longest_wait_s: float | None) -> float:
         if self._busy:
@@ -214,29 +237,6 @@ class Server:
         if longest_wait_s is not None:
             waits_s.append(longest_wait_s)
         return min([*waits_s, LONGEST_WAIT_S])
-
-    def _watch(self, port: Port) -> None:
-        """Keep the selector's interest in a port up to date, at one system call per change."""
-        descriptor, events = port.link.fileno(), port.events
-        if descriptor < 0:  # the host left while we wrote
-            return
-        key = self._keys.get(descriptor)
-        known = 0 if key is None else key.events
-        if events == known:
-            return
-
-        def ready(now_events: int, now_ns: int) -> None:
-            if now_events & selectors.EVENT_WRITE:
-                port.room()
-            if now_events & selectors.EVENT_READ:
-                port.receive(now_ns)
-
-        if not known:
-            self._selector.register(descriptor, events, ready)
-        elif events:
-            self._selector.modify(descriptor, events, ready)
-        else:
-            self._selector.unregister(descriptor)
 
     def _woken(self, events: int, now_ns: int) -> None:
         with contextlib.suppress(BlockingIOError):  # woken twice for one byte

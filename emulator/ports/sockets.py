@@ -1,4 +1,4 @@
-"""Unix sockets beside the radars' ports: a listener and its clients, as a service of the loop."""
+"""Unix sockets beside the radars' ports: a listener with clients, and odometry over one."""
 
 from __future__ import annotations
 
@@ -9,32 +9,45 @@ import selectors
 import socket
 import stat
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Generic, TypeVar
 
+from emulator.chip import Pace
 from emulator.ports.pty import LinkError
-from emulator.ports.server import Service
+from emulator.ports.server import Service, wait_for
 
+NS_PER_S = 1_000_000_000
 RETRY_NS = 1_000_000_000
 """How long new clients wait when descriptors have run out and no client of ours leaves."""
+MOST_ODOMETRY_CLIENTS = 64
+SEND_SIZE = 65536
 _EXHAUSTED = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class SocketClient:
-    """A connection; ``reads`` until the client closes its direction."""
+    """A connection.
+
+    Attributes
+    ----------
+    reads
+        Until the client closes its direction.
+    begun
+        What it sent of a line without end.
+    next_line
+        Index of the odometry line that it gets next.
+    """
 
     connection: socket.socket
     unsent: bytes = b""
     reads: bool = True
-    watched: int = 0
+    begun: bytes = b""
+    next_line: int = 0
 
 
-ClientT = TypeVar("ClientT", bound=SocketClient)
-
-
-class SocketService(Service, Generic[ClientT]):
+class SocketService(Service):
     """A listening unix socket.
 
     Parameters
@@ -55,12 +68,14 @@ class SocketService(Service, Generic[ClientT]):
     def __init__(self, path: Path, name: str, *, most_clients: int, private: bool = False) -> None:
         self.path = path
         self._most_clients = most_clients
-        self._clients: list[ClientT] = []
+        self._clients: list[SocketClient] = []
         self._selector: selectors.BaseSelector | None = None
         self._accept_again_ns: int | None = None
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
-            _remove_stale_socket(path)
+            with contextlib.suppress(FileNotFoundError):
+                if stat.S_ISSOCK(path.lstat().st_mode):
+                    path.unlink()
             self._listener.bind(os.fspath(path))
             self._identity = _identity(path)
             if private:
@@ -73,12 +88,8 @@ class SocketService(Service, Generic[ClientT]):
             raise LinkError(f"{path}: cannot offer the {name} socket: {reason}") from error
 
     @abstractmethod
-    def _admit(self, connection: socket.socket, now_ns: int) -> None:
-        """Enter a new client into ``_clients`` and watch it."""
-
-    @abstractmethod
-    def _ready(self, client: ClientT, events: int, now_ns: int) -> None:
-        """Read from a client, or write to it."""
+    def _ready(self, client: SocketClient, events: int, now_ns: int) -> None:
+        """Read from a client, or write to it; ``events`` is 0 for one that has just come."""
 
     def register(self, selector: selectors.BaseSelector) -> None:
         self._selector = selector
@@ -118,10 +129,12 @@ class SocketService(Service, Generic[ClientT]):
         connection.setblocking(False)
         if len(self._clients) >= self._most_clients:
             connection.close()
-        else:
-            self._admit(connection, now_ns)
+            return
+        client = SocketClient(connection=connection)
+        self._clients.append(client)
+        self._ready(client, 0, now_ns)
 
-    def _send(self, client: ClientT) -> bool:
+    def _send(self, client: SocketClient) -> bool:
         """Send what the line takes; return False if the client is gone."""
         try:
             client.unsent = client.unsent[client.connection.send(client.unsent) :]
@@ -132,27 +145,18 @@ class SocketService(Service, Generic[ClientT]):
             return False
         return True
 
-    def _watch(self, client: ClientT) -> None:
+    def _watch(self, client: SocketClient) -> None:
         """Wait for room when something is unsent, and for bytes until there will be no more."""
-        wanted = selectors.EVENT_READ if client.reads else 0
-        wanted |= selectors.EVENT_WRITE if client.unsent else 0
-        if self._selector is None or client.watched == wanted:
-            return
+        if self._selector is not None:
+            wanted = selectors.EVENT_READ if client.reads else 0
+            wanted |= selectors.EVENT_WRITE if client.unsent else 0
+            wait_for(
+                self._selector, client.connection.fileno(), wanted, partial(self._ready, client)
+            )
 
-        def ready(events: int, now_ns: int) -> None:
-            self._ready(client, events, now_ns)
-
-        if not wanted:
-            self._selector.unregister(client.connection)
-        elif client.watched:
-            self._selector.modify(client.connection, wanted, ready)
-        else:
-            self._selector.register(client.connection, wanted, ready)
-        client.watched = wanted
-
-    def _drop(self, client: ClientT) -> None:
-        if client.watched and self._selector is not None:
-            self._selector.unregister(client.connection)
+    def _drop(self, client: SocketClient) -> None:
+        if self._selector is not None:
+            wait_for(self._selector, client.connection.fileno(), 0)
         client.connection.close()
         self._clients.remove(client)
         if self._accept_again_ns is not None:
@@ -164,7 +168,91 @@ def _identity(path: Path) -> tuple[int, int]:
     return status.st_dev, status.st_ino
 
 
-def _remove_stale_socket(path: Path) -> None:
-    with contextlib.suppress(FileNotFoundError):
-        if stat.S_ISSOCK(path.lstat().st_mode):
-            path.unlink()
+class OdometryFeed(SocketService):
+    """The robot's wheel odometry, as TUM lines.
+
+    Every client gets all lines from the first one. Under `Pace.ASAP` they come at once; under
+    `Pace.REALTIME` each when its stamp is due. After the last line the connection is closed.
+
+    Parameters
+    ----------
+    lines
+        TUM lines without line ends, in time order; the stamp is exact decimal seconds.
+    scene_time_zero_ns
+        Device time of scene time 0, ns.
+    """
+
+    def __init__(
+        self, path: Path, lines: Sequence[str], pace: Pace, *, scene_time_zero_ns: int = 0
+    ) -> None:
+        super().__init__(path, "odometry", most_clients=MOST_ODOMETRY_CLIENTS)
+        self._lines = [f"{line}\n".encode() for line in lines]
+        realtime = pace is Pace.REALTIME
+        self._due_ns = [scene_time_zero_ns + stamp_ns(line) if realtime else 0 for line in lines]
+
+    def advance(self, now_ns: int) -> None:
+        super().advance(now_ns)
+        for client in list(self._clients):
+            if not client.unsent:
+                self._serve(client, now_ns)
+
+    def wake_ns(self, now_ns: int) -> int | None:
+        wakes = [
+            self._due_ns[client.next_line]
+            for client in self._clients
+            if not client.unsent and client.next_line < len(self._lines)
+        ]
+        if (accept_again_ns := super().wake_ns(now_ns)) is not None:
+            wakes.append(accept_again_ns)
+        return min(wakes, default=None)
+
+    def _ready(self, client: SocketClient, events: int, now_ns: int) -> None:
+        if events & selectors.EVENT_READ:
+            # one that closed only its own direction still listens; one that hung up is found out
+            # by the next line sent to it
+            try:
+                client.reads = bool(client.connection.recv(4096))  # what it sends is ignored
+            except BlockingIOError:
+                pass
+            except OSError:
+                client.reads = False
+        if events & selectors.EVENT_WRITE or not client.unsent:
+            self._serve(client, now_ns)
+        else:
+            self._watch(client)
+
+    def _serve(self, client: SocketClient, now_ns: int) -> None:
+        while True:
+            if not client.unsent:
+                client.unsent = self._due_lines(client, now_ns)
+            if not client.unsent:
+                break
+            if not self._send(client):
+                return
+            if client.unsent:
+                break
+        if not client.unsent and client.next_line == len(self._lines):
+            self._drop(client)
+        else:
+            self._watch(client)
+
+    def _due_lines(self, client: SocketClient, now_ns: int) -> bytes:
+        first = last = client.next_line
+        size = 0
+        while last < len(self._lines) and self._due_ns[last] <= now_ns and size < SEND_SIZE:
+            size += len(self._lines[last])
+            last += 1
+        client.next_line = last
+        return b"".join(self._lines[first:last])
+
+
+def stamp_ns(line: str) -> int:
+    """Return the stamp of a TUM line in ns, exactly.
+
+    Examples
+    --------
+    >>> stamp_ns("12.345678901 0 0 0 0 0 0 1")
+    12345678901
+    """
+    seconds, _, fraction = line.split(" ", 1)[0].partition(".")
+    return int(seconds) * NS_PER_S + int(fraction.ljust(9, "0")[:9] or 0)

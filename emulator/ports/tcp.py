@@ -14,7 +14,7 @@ import socket
 from collections.abc import Callable
 
 from emulator.ports.pty import LinkError
-from emulator.ports.server import Service
+from emulator.ports.server import Service, wait_for
 
 LARGEST_READ = 4096  # as a pseudo-terminal hands out at once
 BACKLOG = 16
@@ -117,8 +117,7 @@ class TcpLink(Service):
         if client is None:
             return
         if self._selector is not None:
-            with contextlib.suppress(KeyError):  # not waited for yet
-                self._selector.unregister(client)
+            wait_for(self._selector, client.fileno(), 0)
         client.close()
 
     def close(self) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 from pydantic import Field
 
 from emulator.faults.kind import Context, Layer, Parameters, Piece, Pieces, Target, kind
@@ -16,43 +14,39 @@ _CALM = bytes(code for code in range(256) if code not in b"\x7c\x7d\x7e\x7f")
 
 
 class _At(Parameters):
-    at: Annotated[
-        int | None, Field(ge=0, le=65_535, description="byte of the packet; random if not given")
-    ] = None
+    at: int | None = Field(
+        None, ge=0, le=65_535, description="byte of the packet; random if not given"
+    )
 
     def place(self, data: bytes, rng: Rng) -> int:
         return rng.below(len(data)) if self.at is None else min(self.at, len(data) - 1)
 
 
 class _Several(_At):
-    bytes: Annotated[int, Field(ge=1, le=4096, description="how many bytes")] = 1
+    bytes: int = Field(1, ge=1, le=4096, description="how many bytes")
 
 
 class _Flip(_At):
-    bits: Annotated[int, Field(ge=1, le=64, description="how many bits, anywhere from `at` on")] = 1
+    bits: int = Field(1, ge=1, le=64, description="how many bits, anywhere from `at` on")
 
 
 class _Burst(Parameters):
-    enter: Annotated[float, Field(ge=0, le=1, description="chance per byte that it starts")] = 0.01
-    leave: Annotated[float, Field(gt=0, le=1, description="chance per byte that it ends")] = 0.2
-    flip: Annotated[float, Field(gt=0, le=1, description="chance per bit within it")] = 0.3
+    enter: float = Field(0.01, ge=0, le=1, description="chance per byte that it starts")
+    leave: float = Field(0.2, gt=0, le=1, description="chance per byte that it ends")
+    flip: float = Field(0.3, gt=0, le=1, description="chance per bit within it")
 
 
 class _Gap(Parameters):
-    gap_us: Annotated[float, Field(ge=0, le=100_000, description="pause between writes, us")] = 0.0
+    gap_us: float = Field(0.0, ge=0, le=100_000, description="pause between writes, us")
 
 
 class _Split(_Gap):
-    bytes: Annotated[int, Field(ge=1, le=65_536, description="bytes per write")] = 4095
+    bytes: int = Field(4095, ge=1, le=65_536, description="bytes per write")
 
 
 class _Baud(Parameters):
-    sent: Annotated[int, Field(ge=300, le=4_000_000, description="rate of the sender, baud")] = (
-        921_600
-    )
-    heard: Annotated[int, Field(ge=300, le=4_000_000, description="rate of the host, baud")] = (
-        115_200
-    )
+    sent: int = Field(921_600, ge=300, le=4_000_000, description="rate of the sender, baud")
+    heard: int = Field(115_200, ge=300, le=4_000_000, description="rate of the host, baud")
 
 
 def _cut(data: bytes, size: int, gap_us: float) -> Pieces:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import replace
-from typing import Annotated, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -31,27 +31,24 @@ _LONGEST_WAIT = 20.0  # multiples of the delay that a heavy tail reaches at most
 
 
 class _Code(Parameters):
-    code: Annotated[int, Field(ge=0, le=2**32 - 1, description="error code of the answer")] = 1
+    code: int = Field(1, ge=0, le=2**32 - 1, description="error code of the answer")
 
 
 class _SystemCode(Parameters):
-    code: Annotated[int, Field(ge=0, le=2**32 - 1, description="SYSTEM code")] = (
-        SystemCode.XTS_SPRS_BOOTING.value
+    code: int = Field(
+        SystemCode.XTS_SPRS_BOOTING.value, ge=0, le=2**32 - 1, description="SYSTEM code"
     )
 
 
 class _Slow(Parameters):
-    delay_ms: Annotated[
-        float, Field(ge=0, le=600_000, description="how late the answer is, ms")
-    ] = 500.0
-    tail: Annotated[
-        Literal["fixed", "uniform", "heavy"],
-        Field(description="fixed; uniform: 0 ... 2 delays; heavy: Pareto, 1 ... 20 delays"),
-    ] = "fixed"
+    delay_ms: float = Field(500.0, ge=0, le=600_000, description="how late the answer is, ms")
+    tail: Literal["fixed", "uniform", "heavy"] = Field(
+        "fixed", description="fixed; uniform: 0 ... 2 delays; heavy: Pareto, 1 ... 20 delays"
+    )
 
 
 class _Step(Parameters):
-    step: Annotated[float, Field(gt=0, le=10, description="step to which values are cut")] = 0.25
+    step: float = Field(0.25, gt=0, le=10, description="step to which values are cut")
 
 
 def _cut(value: float, step: float) -> float:

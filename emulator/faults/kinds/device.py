@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated
 
 import numpy as np
 from pydantic import Field
@@ -19,8 +18,7 @@ from emulator.faults.kind import (
     SendToModule,
     Target,
     Unplug,
-    frame_packet,
-    frame_parts,
+    changed_frame,
     kind,
     response_bytes,
 )
@@ -37,39 +35,63 @@ from xethru_protocol.wire.messages import (
     X4DriverSet,
 )
 
-_NS_PER_S = 1_000_000_000
+_NS_PER_US, _NS_PER_MS, _NS_PER_S = 1_000, 1_000_000, 1_000_000_000
 
 
 class _Away(Parameters):
-    away_s: Annotated[float, Field(ge=0.01, le=86_400, description="how long it is away, s")] = 1.0
+    away_s: float = Field(1.0, ge=0.01, le=86_400, description="how long it is away, s")
 
 
 class _MidFrame(_Away):
-    part: Annotated[float, Field(gt=0, lt=1, description="part of the frame that is sent")] = 0.5
+    part: float = Field(0.5, gt=0, lt=1, description="part of the frame that is sent")
 
 
 class _Loop(Parameters):
-    restarts: Annotated[int, Field(ge=1, le=100, description="how many in a row")] = 3
-    period_s: Annotated[float, Field(ge=3, le=3600, description="from one to the next, s")] = 4.0
+    restarts: int = Field(3, ge=1, le=100, description="how many in a row")
+    period_s: float = Field(4.0, ge=3, le=3600, description="from one to the next, s")
 
 
 class _Version(Parameters):
-    version: Annotated[str, Field(max_length=60, description="version that it reports")] = "0.0.1"
+    version: str = Field("0.0.1", max_length=60, description="version that it reports")
 
 
 class _Serial(Parameters):
-    serial: Annotated[
-        str, Field(pattern=r"^[0-9]{12}$", description="serial number that it reports")
-    ] = "000000000001"
+    serial: str = Field(
+        "000000000001", pattern=r"^[0-9]{12}$", description="serial number that it reports"
+    )
 
 
 class _Profile(Parameters):
-    profile: Annotated[int, Field(ge=0, le=2**31 - 1, description="profile id that it reports")] = 0
+    profile: int = Field(0, ge=0, le=2**31 - 1, description="profile id that it reports")
 
 
 class _Drift(Parameters):
-    bins: Annotated[int, Field(ge=-200, le=200, description="bins by which echoes end up off")] = 4
-    seconds: Annotated[float, Field(gt=0, le=86_400, description="time that takes, s")] = 10.0
+    bins: int = Field(4, ge=-200, le=200, description="bins by which echoes end up off")
+    seconds: float = Field(10.0, gt=0, le=86_400, description="time that takes, s")
+
+
+class _Offset(Parameters):
+    offset_ms: float = Field(20.0, ge=0, le=60_000, description="how late, ms")
+
+
+class _Ppm(Parameters):
+    ppm: float = Field(50.0, gt=0, le=100_000, description="how slow the clock is, ppm")
+
+
+class _Walk(Parameters):
+    sigma_us: float = Field(200.0, gt=0, le=100_000, description="one step, us")
+
+
+class _Poll(Parameters):
+    period_ms: float = Field(16.0, gt=0, le=1000, description="from poll to poll, ms")
+
+
+class _Silence(Parameters):
+    seconds: float = Field(0.0, ge=0, le=86_400, description="how long, s; 0: for ever")
+
+
+_ARRIVAL = "nothing; the arrival times show it"
+_TIMING = "Frames carry no time; only when they arrive shows it."
 
 
 def _info_reply(item: InfoItem, text: str, context: Context) -> Pieces:
@@ -78,34 +100,6 @@ def _info_reply(item: InfoItem, text: str, context: Context) -> Pieces:
         return None
     content_id = DirCode.XTS_SDC_SYSTEM_GET_INFO
     return [Piece(response_bytes(ReplyString(content_id=content_id, info=item, text=text)))]
-
-
-_NS_PER_MS = 1_000_000
-_NS_PER_US = 1_000
-
-
-class _Offset(Parameters):
-    offset_ms: Annotated[float, Field(ge=0, le=60_000, description="how late, ms")] = 20.0
-
-
-class _Ppm(Parameters):
-    ppm: Annotated[float, Field(gt=0, le=100_000, description="how slow the clock is, ppm")] = 50.0
-
-
-class _Walk(Parameters):
-    sigma_us: Annotated[float, Field(gt=0, le=100_000, description="one step, us")] = 200.0
-
-
-class _Poll(Parameters):
-    period_ms: Annotated[float, Field(gt=0, le=1000, description="from poll to poll, ms")] = 16.0
-
-
-class _Silence(Parameters):
-    seconds: Annotated[float, Field(ge=0, le=86_400, description="how long, s; 0: for ever")] = 0.0
-
-
-_ARRIVAL = "nothing; the arrival times show it"
-_TIMING = "Frames carry no time; only when they arrive shows it."
 
 
 @kind(Layer.DEVICE, Target.MOMENT, "1 reconnect", _Away)
@@ -187,14 +181,13 @@ def stream_stopped(wanted: Parameters, rng: Rng) -> Sequence[Action]:
 )
 def range_offset_drift(packet: bytes, wanted: _Drift, rng: Rng, context: Context) -> Pieces:
     """Echoes wander in range, as with temperature."""
-    parts = frame_parts(packet)
-    if parts is None or parts.samples.size == 0:
-        return None
     passed_s = (context.now_ns - context.since_ns) / _NS_PER_S
     shift = round(wanted.bins * min(passed_s / wanted.seconds, 1.0))
     # what moves in at an end is not known: the end bin again
-    source = np.clip(np.arange(parts.samples.size) - shift, 0, parts.samples.size - 1)
-    return [Piece(frame_packet(parts.counter, parts.samples[source]))]
+    return changed_frame(
+        packet,
+        lambda samples: samples[np.clip(np.arange(samples.size) - shift, 0, samples.size - 1)],
+    )
 
 
 @kind(Layer.TIME, Target.PACKET, _ARRIVAL, _Offset, lasting=True, hidden=_TIMING)

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from emulator.faults.kind import (
@@ -17,9 +15,9 @@ from emulator.faults.kind import (
     Parameters,
     Piece,
     Pieces,
+    Samples,
     Target,
-    frame_packet,
-    frame_parts,
+    changed_frame,
     kind,
     normal_payload,
     response_bytes,
@@ -40,10 +38,23 @@ from xethru_protocol.wire.messages import Ack, DataString
 _SPECIAL = (START, END, ESCAPE)
 _UNKNOWN_CODE = 0xB7
 _UNKNOWN_CONTENT = struct.pack("<BI", 0x50, 0x0DDBA11)
+_LOST_REPLY = "ResponseTimeout where a reply was waited for"
 
 
 class _Cut(Parameters):
-    keep: Annotated[int, Field(ge=1, le=65_535, description="bytes that are sent")] = 3
+    keep: int = Field(3, ge=1, le=65_535, description="bytes that are sent")
+
+
+class _Samples(Parameters):
+    samples: int = Field(1, ge=1, le=1536, description="how many samples")
+
+
+class _Bins(Parameters):
+    more: int = Field(-1, ge=-1536, le=1536, description="bins more than asked for")
+
+
+class _Length(Parameters):
+    more: int = Field(1, ge=-65_535, le=65_535, description="what is added to the length field")
 
 
 def _whole_normal(packet: bytes) -> bytes | None:
@@ -55,40 +66,26 @@ def _changed(packet: bytes, changed: bytes) -> Pieces:
     return None if _whole_normal(packet) is None else [Piece(changed)]
 
 
-_LOST_REPLY = "ResponseTimeout where a reply was waited for"
-
-
-class _Samples(Parameters):
-    samples: Annotated[int, Field(ge=1, le=1536, description="how many samples")] = 1
-
-
-class _Bins(Parameters):
-    more: Annotated[int, Field(ge=-1536, le=1536, description="bins more than asked for")] = -1
-
-
-class _Length(Parameters):
-    more: Annotated[
-        int, Field(ge=-65_535, le=65_535, description="what is added to the length field")
-    ] = 1
-
-
 def _replaced(
     packet: bytes,
     wanted: _Samples,
     rng: Rng,
-    replace: Callable[[NDArray[np.float32]], NDArray[np.float32]],
+    replace: Callable[[Samples], Samples],
 ) -> Pieces:
     """Return a frame of which some samples, chosen at random, are replaced."""
-    parts = frame_parts(packet)
-    if parts is None or parts.samples.size < wanted.samples:
-        return None
-    places: set[int] = set()
-    while len(places) < wanted.samples:
-        places.add(rng.below(parts.samples.size))
-    chosen = sorted(places)
-    samples = parts.samples.copy()
-    samples[chosen] = replace(samples[chosen])
-    return [Piece(frame_packet(parts.counter, samples))]
+
+    def change(samples: Samples) -> Samples | None:
+        if samples.size < wanted.samples:
+            return None
+        places: set[int] = set()
+        while len(places) < wanted.samples:
+            places.add(rng.below(samples.size))
+        chosen = sorted(places)
+        changed = samples.copy()
+        changed[chosen] = replace(changed[chosen])
+        return changed
+
+    return changed_frame(packet, change)
 
 
 @kind(Layer.FRAME, Target.REPLY, f"1 fault 'wrong checksum'; {_LOST_REPLY}")
@@ -247,7 +244,7 @@ def off_lattice_samples(packet: bytes, wanted: _Samples, rng: Rng, context: Cont
     half = np.float32(lattice.quantum / lattice.tap_sum / 2)
     highest = np.float32(lattice.highest)
 
-    def between(samples: NDArray[np.float32]) -> NDArray[np.float32]:
+    def between(samples: Samples) -> Samples:
         # between two chip counters, whatever the sample was
         return (samples + np.where(samples + half > highest, -half, half)).astype(np.float32)
 
@@ -281,14 +278,12 @@ def in_range_samples(packet: bytes, wanted: _Samples, rng: Rng, context: Context
 @kind(Layer.FRAME, Target.FRAME, "1 frame discarded, 1 frame lost", _Bins)
 def wrong_bin_count(packet: bytes, wanted: _Bins, rng: Rng, context: Context) -> Pieces:
     """A frame has another number of bins than the settings make."""
-    parts = frame_parts(packet)
-    if parts is None or wanted.more == 0 or parts.samples.size + wanted.more < 1:
-        return None
-    return [
-        Piece(
-            frame_packet(parts.counter, np.resize(parts.samples, parts.samples.size + wanted.more))
-        )
-    ]
+
+    def resized(samples: Samples) -> Samples | None:
+        n_bins = samples.size + wanted.more
+        return np.resize(samples, n_bins) if wanted.more and n_bins >= 1 else None
+
+    return changed_frame(packet, resized)
 
 
 @kind(Layer.FRAME, Target.FRAME, "1 fault 'implausible NoEscape header', 1 frame lost", _Length)

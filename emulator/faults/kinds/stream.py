@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from emulator.faults.kind import (
@@ -16,59 +14,68 @@ from emulator.faults.kind import (
     Parameters,
     Piece,
     Pieces,
+    Samples,
     Target,
+    changed_frame,
+    frame_counter,
     frame_packet,
-    frame_parts,
+    frame_samples,
     kind,
 )
 from emulator.scene.philox import Rng
 
 _WRAP = 1 << 32
 _NS_PER_S = 1_000_000_000
+_CYCLES_PER_BIN = 7.29 / 23.328  # carrier of the pulse over the sampling rate, Hz / Hz
 
 
 class _Frames(Parameters):
-    frames: Annotated[int, Field(ge=1, le=2**31 - 2, description="how many frames")] = 1
+    frames: int = Field(1, ge=1, le=2**31 - 2, description="how many frames")
 
 
 class _Copies(Parameters):
-    copies: Annotated[int, Field(ge=1, le=1000, description="how many more")] = 1
+    copies: int = Field(1, ge=1, le=1000, description="how many more")
 
 
 class _Slower(Parameters):
-    percent: Annotated[float, Field(gt=0, le=900, description="how much longer a period is, %")] = (
-        10.0
-    )
+    percent: float = Field(10.0, gt=0, le=900, description="how much longer a period is, %")
 
 
 class _Seconds(Parameters):
-    seconds: Annotated[float, Field(gt=0, le=86_400, description="how long, s")] = 1.5
+    seconds: float = Field(1.5, gt=0, le=86_400, description="how long, s")
 
 
 class _Level(Parameters):
-    level: Annotated[
-        float, Field(gt=0, lt=1, description="part of the frame's largest amplitude that is left")
-    ] = 0.5
+    level: float = Field(
+        0.5, gt=0, lt=1, description="part of the frame's largest amplitude that is left"
+    )
 
 
 class _DeadBins(Parameters):
-    first: Annotated[int, Field(ge=0, le=1535, description="first dead bin")] = 0
-    bins: Annotated[int, Field(ge=1, le=1536, description="how many")] = 8
+    first: int = Field(0, ge=0, le=1535, description="first dead bin")
+    bins: int = Field(8, ge=1, le=1536, description="how many")
 
 
 class _Amplitude(Parameters):
-    amplitude: Annotated[
-        float, Field(ge=-1, le=1, description="what is added, full scale of the DAC is +-1")
-    ] = 0.01
+    amplitude: float = Field(
+        0.01, ge=-1, le=1, description="what is added, full scale of the DAC is +-1"
+    )
 
 
-def _renumbered(packet: bytes, number: Callable[[int], int]) -> Pieces:
-    parts = frame_parts(packet)
-    return None if parts is None else [Piece(frame_packet(number(parts.counter), parts.samples))]
+class _Clutter(Parameters):
+    bin: int = Field(20, ge=0, le=1535, description="bin of its middle")
+    amplitude: float = Field(0.05, gt=0, le=1, description="full scale of the DAC is 1")
+    bins: float = Field(4.0, gt=0, le=200, description="standard deviation, bins")
 
 
-def _since_first(counter: int, context: Context) -> int:
-    return counter - (counter if context.first_counter is None else context.first_counter)
+class _Pulses(Parameters):
+    pulses: int = Field(5, ge=1, le=1000, description="pulses per frame")
+    amplitude: float = Field(0.05, gt=0, le=1, description="full scale of the DAC is 1")
+
+
+class _Fading(Parameters):
+    depth_db: float = Field(12.0, gt=0, le=60, description="deepest, dB")
+    period_s: float = Field(5.0, gt=0, le=3600, description="from fade to fade, s")
 
 
 _BACK = "A counter that goes back looks like a chip that was restarted, which loses nothing."
@@ -76,35 +83,23 @@ _CONTENT = "The samples are values that the chip can give; only the scene shows 
 _TIMING = "Frames carry no time; only when they arrive shows it."
 
 
-_CYCLES_PER_BIN = 7.29 / 23.328  # carrier of the pulse over the sampling rate, Hz / Hz
-
-
-class _Clutter(Parameters):
-    bin: Annotated[int, Field(ge=0, le=1535, description="bin of its middle")] = 20
-    amplitude: Annotated[float, Field(gt=0, le=1, description="full scale of the DAC is 1")] = 0.05
-    bins: Annotated[float, Field(gt=0, le=200, description="standard deviation, bins")] = 4.0
-
-
-class _Pulses(Parameters):
-    pulses: Annotated[int, Field(ge=1, le=1000, description="pulses per frame")] = 5
-    amplitude: Annotated[float, Field(gt=0, le=1, description="full scale of the DAC is 1")] = 0.05
-
-
-class _Fading(Parameters):
-    depth_db: Annotated[float, Field(gt=0, le=60, description="deepest, dB")] = 12.0
-    period_s: Annotated[float, Field(gt=0, le=3600, description="from fade to fade, s")] = 5.0
-
-
-def _with_echo(
-    packet: bytes, context: Context, echo: Callable[[int], NDArray[np.float64]]
-) -> Pieces:
-    """Return a frame with something added to its n samples, rounded to values of the chip."""
-    parts = frame_parts(packet)
-    if parts is None or context.lattice is None or parts.samples.size == 0:
+def _renumbered(packet: bytes, number: Callable[[int], int]) -> Pieces:
+    counter = frame_counter(packet)
+    if counter is None:
         return None
-    seen = parts.samples + echo(parts.samples.size)
-    samples = context.lattice.nearest(seen.astype(np.float32))
-    return [Piece(frame_packet(parts.counter, samples))]
+    return [Piece(frame_packet(number(counter), frame_samples(packet)))]
+
+
+def _since_first(counter: int, context: Context) -> int:
+    return counter - (counter if context.first_counter is None else context.first_counter)
+
+
+def _distorted(packet: bytes, context: Context, distort: Callable[[Samples], Samples]) -> Pieces:
+    """Return a frame with other samples, rounded to values of the chip."""
+    lattice = context.lattice
+    if lattice is None:
+        return None
+    return changed_frame(packet, lambda samples: lattice.nearest(distort(samples)))
 
 
 @kind(Layer.STREAM, Target.FRAME, "frames_lost += frames", _Frames, lasting=True)
@@ -202,81 +197,73 @@ def stall(packet: bytes, wanted: _Seconds, rng: Rng, context: Context) -> Pieces
 @kind(Layer.STREAM, Target.FRAME, "nothing", _Level, hidden=_CONTENT)
 def saturation(packet: bytes, wanted: _Level, rng: Rng, context: Context) -> Pieces:
     """The amplitudes of a frame are clipped."""
-    parts = frame_parts(packet)
-    if parts is None or context.lattice is None or parts.samples.size == 0:
-        return None
-    limit = wanted.level * np.abs(parts.samples).max()
-    clipped = context.lattice.nearest(np.clip(parts.samples, -limit, limit))
-    return [Piece(frame_packet(parts.counter, clipped))]
+
+    def clipped(samples: Samples) -> Samples:
+        limit = wanted.level * np.abs(samples).max()
+        return np.clip(samples, -limit, limit)
+
+    return _distorted(packet, context, clipped)
 
 
 @kind(Layer.STREAM, Target.FRAME, "nothing", _DeadBins, hidden=_CONTENT)
 def dead_bins(packet: bytes, wanted: _DeadBins, rng: Rng, context: Context) -> Pieces:
     """Bins of a frame are stuck at one value."""
-    parts = frame_parts(packet)
-    if parts is None or wanted.first >= parts.samples.size:
-        return None
-    samples = parts.samples.copy()
-    # stuck at a value that the chip can give
-    samples[wanted.first : wanted.first + wanted.bins] = samples[wanted.first]
-    return [Piece(frame_packet(parts.counter, samples))]
+
+    def stuck(samples: Samples) -> Samples | None:
+        if wanted.first >= samples.size:
+            return None
+        dead = samples.copy()
+        # at a value that the chip can give
+        dead[wanted.first : wanted.first + wanted.bins] = samples[wanted.first]
+        return dead
+
+    return changed_frame(packet, stuck)
 
 
 @kind(Layer.STREAM, Target.FRAME, "nothing", _Amplitude, lasting=True, hidden=_CONTENT)
 def dc_step(packet: bytes, wanted: _Amplitude, rng: Rng, context: Context) -> Pieces:
     """All samples are moved by the same amount from now on."""
-    parts = frame_parts(packet)
-    if parts is None or context.lattice is None:
-        return None
-    moved = context.lattice.nearest(parts.samples + np.float32(wanted.amplitude))
-    return [Piece(frame_packet(parts.counter, moved))]
+    return _distorted(packet, context, lambda samples: samples + np.float32(wanted.amplitude))
 
 
 @kind(Layer.STREAM, Target.FRAME, "nothing", hidden=_CONTENT)
 def stale_frame(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A frame carries the samples of the one before."""
-    parts = frame_parts(packet)
-    before = None if context.previous_frame is None else frame_parts(context.previous_frame)
-    if parts is None or before is None or before.samples.size != parts.samples.size:
+    before = context.previous_frame
+    if before is None or len(before) != len(packet):
         return None
-    return [Piece(frame_packet(parts.counter, before.samples))]
+    return changed_frame(packet, lambda samples: frame_samples(before))
 
 
 @kind(Layer.ENVIRONMENT, Target.FRAME, "nothing", _Clutter, lasting=True, hidden=_CONTENT)
 def strong_clutter(packet: bytes, wanted: _Clutter, rng: Rng, context: Context) -> Pieces:
     """A strong reflector stands in one place."""
 
-    def clutter(n: int) -> NDArray[np.float64]:
-        bins = np.arange(n) - wanted.bin
+    def with_clutter(samples: Samples) -> Samples:
+        bins = np.arange(samples.size) - wanted.bin
         envelope = np.exp(-0.5 * (bins / wanted.bins) ** 2)
-        wave: NDArray[np.float64] = (
-            wanted.amplitude * envelope * np.cos(2 * math.pi * _CYCLES_PER_BIN * bins)
-        )
-        return wave
+        wave = wanted.amplitude * envelope * np.cos(2 * math.pi * _CYCLES_PER_BIN * bins)
+        return np.asarray(samples + wave, np.float32)
 
-    return _with_echo(packet, context, clutter)
+    return _distorted(packet, context, with_clutter)
 
 
 @kind(Layer.ENVIRONMENT, Target.FRAME, "nothing", _Pulses, lasting=True, hidden=_CONTENT)
 def interference(packet: bytes, wanted: _Pulses, rng: Rng, context: Context) -> Pieces:
     """Every frame has pulses at random bins."""
 
-    def pulses(n: int) -> NDArray[np.float64]:
-        samples = np.zeros(n)
+    def with_pulses(samples: Samples) -> Samples:
+        pulses = np.zeros(samples.size)
         for _ in range(wanted.pulses):
-            samples[rng.below(n)] += wanted.amplitude * (2 * rng.below(2) - 1)
-        return samples
+            pulses[rng.below(samples.size)] += wanted.amplitude * (2 * rng.below(2) - 1)
+        return (samples + pulses).astype(np.float32)
 
-    return _with_echo(packet, context, pulses)
+    return _distorted(packet, context, with_pulses)
 
 
 @kind(Layer.ENVIRONMENT, Target.FRAME, "nothing", _Fading, lasting=True, hidden=_CONTENT)
 def fading(packet: bytes, wanted: _Fading, rng: Rng, context: Context) -> Pieces:
     """All echoes fade and come back."""
-    parts = frame_parts(packet)
-    if parts is None or context.lattice is None:
-        return None
     phase = (context.now_ns - context.since_ns) / _NS_PER_S / wanted.period_s
     loss_db = wanted.depth_db * (1 - math.cos(2 * math.pi * phase)) / 2
-    faded = parts.samples * np.float32(10 ** (-loss_db / 20))
-    return [Piece(frame_packet(parts.counter, context.lattice.nearest(faded)))]
+    return _distorted(packet, context, lambda samples: samples * np.float32(10 ** (-loss_db / 20)))

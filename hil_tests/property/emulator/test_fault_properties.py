@@ -10,11 +10,10 @@ from hypothesis import strategies as st
 from emulator.chip import Pace
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source
-from emulator.faults.faulty_device import FaultyDevice
+from emulator.faults.faulty_device import FaultyDevice, InnerDevice
 from emulator.faults.kind import (
     Context,
     Handling,
-    InnerDevice,
     Kind,
     PacketClass,
     Piece,
@@ -23,7 +22,7 @@ from emulator.faults.kind import (
     frame_packet,
 )
 from emulator.faults.kinds import KINDS
-from emulator.faults.plan import FaultPlan, TruthLog, fault_spec
+from emulator.faults.plan import FaultPlan, Injected, fault_spec
 from emulator.module.memory import Identity
 from emulator.scene.philox import Rng
 from emulator.scene.scene import empty_room
@@ -93,7 +92,7 @@ def transcript(device: InnerDevice, chunk: int = 7) -> list[tuple[int, bytes]]:
 
 
 def test_without_a_plan_every_byte_is_the_same() -> None:
-    assert transcript(FaultyDevice(module(), "radar_1")) == transcript(module())
+    assert transcript(FaultyDevice(module(), "radar_1", FaultPlan())) == transcript(module())
 
 
 @pytest.mark.parametrize(
@@ -107,10 +106,12 @@ def test_a_fault_that_never_fires_changes_no_byte(kind: str) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_one_seed_gives_the_same_bytes(kind: str) -> None:
     plan = FaultPlan(seed=5, fault=(fault_spec(kind, probability=0.5, count=0),))
-    truths = TruthLog(), TruthLog()
-    first, second = (transcript(FaultyDevice(module(), "radar_1", plan, truth)) for truth in truths)
+    truths: tuple[list[Injected], list[Injected]] = [], []
+    first, second = (
+        transcript(FaultyDevice(module(), "radar_1", plan, truth.append)) for truth in truths
+    )
     assert first == second
-    assert truths[0].records == truths[1].records
+    assert truths[0] == truths[1]
 
 
 def test_another_seed_or_radar_gives_other_bytes() -> None:
@@ -124,9 +125,9 @@ def test_another_seed_or_radar_gives_other_bytes() -> None:
 
 def test_a_plan_for_another_radar_changes_nothing() -> None:
     plan = FaultPlan(fault=(fault_spec("silent", radar=["other"]),))
-    truth = TruthLog()
-    assert transcript(FaultyDevice(module(), "radar_1", plan, truth)) == transcript(module())
-    assert not truth.records
+    device = FaultyDevice(module(), "radar_1", plan)
+    assert transcript(device) == transcript(module())
+    assert not device.injected
 
 
 def effect_of(kind: Kind, packet: bytes, seed: int) -> Any:  # noqa: ANN401 - of either sort

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emulator.chip.chip import Chip
-from emulator.device import BootTiming, Device
+from emulator.device import Device
 from emulator.loopback import LoopbackTransport
 from emulator.module.module import LosslessOutbox, Module
 from emulator.playback import QUIET_NS, PlayClock, PlayStream, TimedMessage
@@ -252,4 +252,4 @@ def test_bytes_are_those_of_the_recording_under_any_control() -> None:
 
 
 def player(stream: PlayStream) -> Device:
-    return Device(Module(IDENTITY, Chip(RampSource())), stream, LosslessOutbox(), boot=BootTiming())
+    return Device(Module(IDENTITY, Chip(RampSource())), stream, LosslessOutbox())

@@ -9,7 +9,6 @@ import pytest
 from numpy.typing import NDArray
 
 from emulator.loopback import LoopbackTransport
-from emulator.module.memory import Identity
 from emulator.playback import PlayOptions, played_radars
 from hil_tests.device.serving import Served, emulator, open_radar
 from hil_tests.paths import REPOSITORY
@@ -136,8 +135,7 @@ def test_real_time_is_kept(recording: Path, recorded: list[BasebandIq]) -> None:
     """At ten times the recorded speed, 30 s take 3 s, by the clock of the module's own line."""
     (radar,) = played_radars(
         recording,
-        PlayOptions(rate=10, loop=False),
-        identity=Identity(serial="123456789012"),
+        PlayOptions(rate=10),
         on_fault=lambda fault: pytest.fail(fault.reason),
     )
     line = LoopbackTransport(radar.device)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from emulator.chip import Pace
 from emulator.chip.chip import CaptureSettings
-from emulator.device import BootTiming, Device, radar_device
+from emulator.device import Device, radar_device
 from emulator.module.memory import Identity
 from emulator.ports.server import Server
 from hil_tests.patience import seconds
@@ -107,7 +107,7 @@ class BareHost:
 
 
 def ramp_device(pace: Pace = Pace.ASAP, source: RampSource | None = None) -> Device:
-    return radar_device(IDENTITY, source or RampSource(), pace, boot=BootTiming())
+    return radar_device(IDENTITY, source or RampSource(), pace)
 
 
 class PortHost:

@@ -8,7 +8,7 @@ import pytest
 
 from emulator.chip import Pace
 from emulator.chip.chip import ModuleClock
-from emulator.device import BootTiming, radar_device
+from emulator.device import radar_device
 from emulator.module.memory import Identity
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource, ramp_device
 from xethru_protocol.wire import messages as m
@@ -201,15 +201,6 @@ def test_reset_of_a_running_module_restores_its_profile(host: BareHost) -> None:
     assert len(host.hear()) == 2
     assert mode_of(host) == 0x01
     assert host.ask(m.GetProfileId()) == m.ReplyInt(values=(PRESENCE_2,))
-
-
-def test_boot_timing_is_an_argument() -> None:
-    boot = BootTiming(ack_to_reset_ns=5, reset_to_ready_ns=7)
-    host = BareHost(radar_device(IDENTITY, RampSource(), Pace.ASAP, boot=boot))
-    host.ask(m.ModReset())
-    assert host.device.wake_ns(0) == 5
-    host.device.advance(5)
-    assert host.device.wake_ns(5) == 12
 
 
 @pytest.mark.parametrize("pace", list(Pace))

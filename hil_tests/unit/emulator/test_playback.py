@@ -11,7 +11,6 @@ import pytest
 
 from emulator.device import Device
 from emulator.loopback import LoopbackTransport
-from emulator.module.memory import Identity
 from emulator.playback import PlayOptions, played_radars
 from hil_tests.paths import FIXTURES
 from hil_tests.unit.emulator.doubles import BareHost
@@ -27,7 +26,6 @@ from xethru_protocol.recordings import (
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import X4Setting
 
-IDENTITY = Identity(serial="123456789012")
 RECORDINGS = FIXTURES / "recordings"
 SECOND = 1_000_000_000
 
@@ -35,8 +33,7 @@ SECOND = 1_000_000_000
 def device_of(recording: Path, rate: float = 0, warnings: list[str] | None = None) -> Device:
     (radar,) = played_radars(
         recording,
-        PlayOptions(rate=rate, loop=False),
-        identity=IDENTITY,
+        PlayOptions(rate=rate),
         on_fault=lambda fault: pytest.fail(fault.reason),
         warn=lambda line: None if warnings is None else warnings.append(line),
     )
@@ -59,12 +56,7 @@ def test_a_recording_of_nothing_is_refused(tmp_path: Path) -> None:
     recording = copy_of_the_vendors_recording(tmp_path)
     next(recording.glob("*baseband_iq*.dat")).write_bytes(b"")
     with pytest.raises(RecordingError):
-        played_radars(
-            recording,
-            PlayOptions(rate=0, loop=False),
-            identity=IDENTITY,
-            on_fault=lambda fault: None,
-        )
+        played_radars(recording, PlayOptions(rate=0), on_fault=lambda fault: None)
 
 
 def test_radar_frames_come_byte_for_byte_without_escapes() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from emulator.chip.chip import Chip
-from emulator.device import BootTiming, Device
+from emulator.device import Device
 from emulator.module.module import LosslessOutbox, Module
 from emulator.playback import PlayStream, schedule
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource
@@ -18,11 +18,10 @@ RECORDS = [m.Pong(value=value) for value in range(5)]
 
 def player(rate: float = 1.0, gap_ns: int | None = None) -> BareHost:
     stamps = [10 * SECOND + index * SECOND for index in range(5)]
-    stream = PlayStream(
-        tuple(schedule(zip(RECORDS, stamps, strict=True), rate)), loop_gap_ns=gap_ns
-    )
+    timed = tuple(schedule(zip(RECORDS, stamps, strict=True)))
+    stream = PlayStream(timed, loop_gap_ns=gap_ns, rate=rate)
     module = Module(IDENTITY, Chip(RampSource()))
-    return BareHost(Device(module, stream, LosslessOutbox(), boot=BootTiming()))
+    return BareHost(Device(module, stream, LosslessOutbox()))
 
 
 def heard_at(host: BareHost, now_ns: int) -> list[m.Message]:
@@ -108,11 +107,11 @@ def test_a_loop_goes_on() -> None:
 
 
 def test_records_without_time_come_at_the_nominal_rate() -> None:
-    times = [item.time_ns for item in schedule([(record, None) for record in RECORDS], 2.0)]
-    assert times == pytest.approx([index * SECOND / 34 for index in range(5)], abs=2)
+    times = [item.time_ns for item in schedule([(record, None) for record in RECORDS])]
+    assert times == pytest.approx([index * SECOND / 17 for index in range(5)], abs=2)
 
 
 def test_time_that_runs_backwards_is_not_waited_for() -> None:
     stamps = [5, 9, 3, 4, None]
-    times = [item.time_ns for item in schedule(zip(RECORDS, stamps, strict=True), 1.0)]
+    times = [item.time_ns for item in schedule(zip(RECORDS, stamps, strict=True))]
     assert times == [0, 4, 4, 5, 5 + SECOND // 17]

@@ -180,7 +180,7 @@ def test_every_kind_is_tested() -> None:
 def check(
     radar: X4M300, line: FaultyLine, wanted: Expected, timeouts: int = 0, refusals: int = 0
 ) -> None:
-    n = len(line.truth.records)
+    n = len(line.truth)
     seen = radar.statistics
     assert {kind: seen.faults[kind] for kind in wanted.faults} == {
         kind: n * count for kind, count in wanted.faults.items()
@@ -214,7 +214,7 @@ def test_faults_of_answers_are_counted(kind: str, faulty_line: FaultyLine) -> No
                 timeouts += 1
             except DeviceError as error:
                 refusals += error.code == 7
-    assert injection.injected == faulty_line.truth.counts[kind] == 3
+    assert injection.injected == faulty_line.device.injected[kind] == 3
     faulty_line.sleep(10.0)
     radar.ping()
     assert radar.request(ASKED).values == (pulses,)
@@ -229,7 +229,7 @@ def test_faults_of_a_stream_are_counted(kind: str, faulty_line: FaultyLine) -> N
     count = 1 if KINDS[kind].lasting and "every" not in wanted.keys else 3
     with fault(faulty_line.device, kind, **{"count": count, **wanted.keys}) as injection:
         frames = list(radar.frames(75))
-    assert injection.injected == faulty_line.truth.counts[kind] == count
+    assert injection.injected == faulty_line.device.injected[kind] == count
     check(radar, faulty_line, wanted)
     hidden = not (wanted.faults or wanted.lost or wanted.off_lattice or wanted.unknown)
     assert bool(KINDS[kind].hidden) == (hidden and not wanted.discarded)
@@ -293,7 +293,7 @@ def test_a_module_that_vanishes_is_found_again(kind: str, faulty_line: FaultyLin
             began_ns = faulty_line.clock_ns()
             list(radar.frames(10))
             assert faulty_line.clock_ns() - began_ns < 5e9
-    assert radar.reconnects == faulty_line.truth.counts[kind] == 2
+    assert radar.reconnects == faulty_line.device.injected[kind] == 2
     assert len(before) == 5
     assert radar.frames_lost == 0
 
@@ -308,7 +308,7 @@ def test_a_watchdog_reboot_is_counted(faulty_line: FaultyLine) -> None:
         ):
             list(radar.frames(200, timeout_s=4.0))
         assert radar.reboots - reboots == 1
-        assert faulty_line.truth.counts["watchdog_reboot"] == n
+        assert faulty_line.device.injected["watchdog_reboot"] == n
 
 
 def test_a_brown_out_loop_is_counted(faulty_line: FaultyLine) -> None:
@@ -388,7 +388,7 @@ def test_what_a_module_tells_of_itself_can_be_wrong(faulty_line: FaultyLine) -> 
     assert (true.version, true.serial_number) != (told.version, told.serial_number)
     assert radar.info() == true
     assert true.serial_number == SERIAL
-    assert sorted(faulty_line.truth.counts.values()) == [1, 1, 1]
+    assert sorted(faulty_line.device.injected.values()) == [1, 1, 1]
 
 
 def test_a_lost_mode_shows_when_it_is_asked_for(faulty_line: FaultyLine) -> None:
@@ -397,7 +397,7 @@ def test_a_lost_mode_shows_when_it_is_asked_for(faulty_line: FaultyLine) -> None
         list(radar.frames(20))
     assert radar.request(m.GetMode()).values == bytes((SensorMode.XTID_SM_STOP,))
     assert radar.stray_count == 0
-    assert faulty_line.truth.counts["mode_lost"] == 1
+    assert faulty_line.device.injected["mode_lost"] == 1
 
 
 def test_a_stopped_stream_shows_when_its_rate_is_asked_for(faulty_line: FaultyLine) -> None:
@@ -420,4 +420,4 @@ def test_a_silent_radar_loses_its_messages(faulty_line: FaultyLine) -> None:
             radar.read_frame(1.0)
         with pytest.raises(ResponseTimeout):
             radar.ping()
-    assert faulty_line.truth.counts["silent"] == 2
+    assert faulty_line.device.injected["silent"] == 2

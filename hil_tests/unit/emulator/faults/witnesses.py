@@ -31,7 +31,7 @@ def changed(frames: list[Frame], true: list[Frame]) -> dict[int, int]:
 
 
 def hit(line: FaultyLine) -> list[int | None]:
-    return [record.counter for record in line.truth.records]
+    return [record.counter for record in line.truth]
 
 
 def arrivals_s(frames: list[Frame]) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -108,7 +108,7 @@ def wandering(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
 
 
 def at_polls(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
-    since_s = line.truth.records[0].t_ns * 1e-9
+    since_s = line.truth[0].t_ns * 1e-9
     polls = (arrivals_s(frames) - since_s) / 0.016
     np.testing.assert_allclose(polls, np.rint(polls), atol=1e-4)
     late = arrivals_s(frames) - arrivals_s(true[:75])

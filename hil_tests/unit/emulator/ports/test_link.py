@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import select
 import termios
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -25,7 +26,7 @@ def read_exactly(descriptor: int, count: int) -> bytes:
 
 def test_every_byte_passes_unchanged_for_a_client_that_sets_nothing_up(tmp_path: Path) -> None:
     every_byte = bytes(range(256))
-    with PtyLink(tmp_path / "radar") as link:
+    with closing(PtyLink(tmp_path / "radar")) as link:
         client = os.open(link.path, os.O_RDWR | os.O_NOCTTY)
         try:
             assert link.write(memoryview(every_byte)) == 256
@@ -42,7 +43,7 @@ def test_every_byte_passes_unchanged_for_a_client_that_sets_nothing_up(tmp_path:
 
 
 def test_the_line_stays_raw_over_reopening(tmp_path: Path) -> None:
-    with PtyLink(tmp_path / "radar") as link:
+    with closing(PtyLink(tmp_path / "radar")) as link:
         for _ in range(2):
             client = os.open(link.path, os.O_RDWR | os.O_NOCTTY)
             local_modes = termios.tcgetattr(client)[3]
@@ -51,7 +52,7 @@ def test_the_line_stays_raw_over_reopening(tmp_path: Path) -> None:
 
 
 def test_a_full_line_takes_nothing_and_does_not_block(tmp_path: Path) -> None:
-    with PtyLink(tmp_path / "radar") as link:
+    with closing(PtyLink(tmp_path / "radar")) as link:
         block, taken = memoryview(bytes(65536)), 0
         # the kernel moves bytes on between its buffers: room may appear once more, not for ever
         for _ in range(200):
@@ -63,7 +64,7 @@ def test_dangling_and_foreign_links_are_replaced_files_are_not(tmp_path: Path) -
     dangling, precious = tmp_path / "radar", tmp_path / "notes"
     dangling.symlink_to("/dev/pts/99999")
     precious.write_text("keep me")
-    with PtyLink(dangling) as link:
+    with closing(PtyLink(dangling)) as link:
         assert dangling.resolve() == Path(link.terminal)
         with pytest.raises(LinkError, match=r"notes: exists and is no link"):
             PtyLink(precious)
@@ -74,7 +75,7 @@ def test_dangling_and_foreign_links_are_replaced_files_are_not(tmp_path: Path) -
 
 def test_a_link_somebody_replaced_is_not_removed(tmp_path: Path) -> None:
     path = tmp_path / "radar"
-    with PtyLink(path), PtyLink(path) as second:
+    with closing(PtyLink(path)), closing(PtyLink(path)):
         pass
     assert not path.is_symlink()
     first = PtyLink(path)

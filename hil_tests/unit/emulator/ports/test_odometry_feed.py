@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from emulator.chip import Pace
-from emulator.ports.odometry import MOST_CLIENTS, OdometryFeed, stamp_ns
 from emulator.ports.pty import LinkError
+from emulator.ports.sockets import MOST_ODOMETRY_CLIENTS, OdometryFeed, stamp_ns
 
 LINES = tuple(f"{index}.500000000 0.1 0.2 0 0 0 0.0 1.0" for index in range(5))
 SECOND = 1_000_000_000
@@ -132,7 +132,7 @@ def test_one_client_too_many_is_sent_away(folder: Path) -> None:
     feed = OdometryFeed(folder / "o", LINES, Pace.REALTIME)
     loop = Loop(feed)
     clients = []
-    for _ in range(MOST_CLIENTS + 1):
+    for _ in range(MOST_ODOMETRY_CLIENTS + 1):
         clients.append(connect(feed))
         loop.turn(0)
     assert received(clients[-1]) == b""

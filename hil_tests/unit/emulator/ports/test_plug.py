@@ -15,7 +15,7 @@ import pytest
 from emulator.chip import Pace
 from emulator.device import radar_device
 from emulator.module.settings import DeviceOptions
-from emulator.ports.module_ports import DevicePorts, LinkOptions, NamedDevice, open_ports
+from emulator.ports.module_ports import DevicePorts, LinkOptions, NamedDevice
 from emulator.ports.server import Server
 from hil_tests.patience import seconds
 from hil_tests.unit.emulator.doubles import IDENTITY, RampSource
@@ -43,7 +43,7 @@ class Bench:
             device=device,
             present=lambda now_ns: device.port_present(now_ns) and not self.pulled,
         )
-        self.opened: DevicePorts = open_ports([named], folder, links, cleanup)
+        self.opened = DevicePorts([named], folder, links, cleanup)
         self.opened.moved = lambda: self.told.append(str(self.opened.entries()[0]["path"]))
         self.server = Server(self.opened.ports, self.opened.services, clock_ns=lambda: self.now_ns)
         cleanup.callback(self.server.close)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from emulator.ports.module_ports import DevicePorts, LinkOptions, NamedDevice, open_ports
+from emulator.ports.module_ports import DevicePorts, LinkOptions, NamedDevice
 from emulator.ports.pty import LinkError
 from emulator.ports.server import Server
 from hil_tests.patience import wait_until
@@ -33,7 +33,7 @@ class Bench:
             for index in (1, 2)
         ]
         self.cleanup = cleanup
-        self.opened: DevicePorts = open_ports(devices, folder, LinkOptions(tcp_base=0), cleanup)
+        self.opened = DevicePorts(devices, folder, LinkOptions(tcp_base=0), cleanup)
         self.server = Server(self.opened.ports, self.opened.services, clock_ns=lambda: 0)
         cleanup.callback(self.server.close)
 
@@ -178,7 +178,7 @@ def test_a_port_that_is_taken_is_one_clear_line(bench: Bench, tmp_path: Path) ->
             contextlib.ExitStack() as cleanup,
             pytest.raises(LinkError, match=rf"127.0.0.1:{port}: cannot listen: .*{why}.*--tcp"),
         ):
-            open_ports(devices, tmp_path, LinkOptions(tcp_base=port), cleanup)
+            DevicePorts(devices, tmp_path, LinkOptions(tcp_base=port), cleanup)
     assert not (tmp_path / "other").is_symlink()
 
 
@@ -189,7 +189,7 @@ def test_a_port_that_is_taken_is_one_clear_line(bench: Bench, tmp_path: Path) ->
 def test_an_address_that_cannot_be_is_one_clear_line(host: str, why: str, tmp_path: Path) -> None:
     devices = [NamedDevice(name="other", serial="3", device=ramp_device())]
     with contextlib.ExitStack() as cleanup, pytest.raises(LinkError) as caught:
-        open_ports(devices, tmp_path, LinkOptions(tcp_base=0, tcp_host=host), cleanup)
+        DevicePorts(devices, tmp_path, LinkOptions(tcp_base=0, tcp_host=host), cleanup)
     said = str(caught.value)
     assert said.startswith(f"{host}:0: cannot listen: ")
     assert said.endswith("; choose another --tcp or --tcp-host")

@@ -8,6 +8,7 @@ import select
 import termios
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -237,13 +238,13 @@ def test_usb_transfers_are_delayed_and_short() -> None:
     assert bench.heard() == [m.Pong(value=0xAAEEAEEA)]
     line = UsbLine(0)
     line.from_module(bytes(1300), 0)
-    assert [len(line.to_host(0)) for _ in range(4)] == [512, 512, 276, 0]
+    assert [len(line.to_host.take(0)) for _ in range(4)] == [512, 512, 276, 0]
 
 
 @pytest.fixture
 def link(tmp_path: Path) -> Iterator[PtyLink]:
     flushes: list[str] = []
-    with PtyLink(tmp_path / "radar", flushed=lambda: flushes.append("flushed")) as made:
+    with closing(PtyLink(tmp_path / "radar", flushed=lambda: flushes.append("flushed"))) as made:
         made.flushes = flushes  # type: ignore[attr-defined] # for the test
         yield made
 

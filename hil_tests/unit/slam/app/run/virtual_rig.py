@@ -16,7 +16,7 @@ from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport
 from emulator.module.memory import Identity
-from emulator.ports.odometry import stamp_ns
+from emulator.ports.sockets import stamp_ns
 from emulator.scene.scene import Scene
 from emulator.scene.wheels import scene_odometry
 from slam.app.odometry.track import TumSample
