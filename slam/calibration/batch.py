@@ -1,13 +1,11 @@
 """The terms of a batch problem over a robot's drive: odometry, single ranges, priors.
 
-A problem is a list of terms. Each maps the state vector to residuals, divided by their standard
-deviations already, and their Jacobian; the answer minimises the sum of the terms' costs. Method:
-Gauss-Newton on the normal equations with Levenberg and Marquardt's damping, robust kernels by
-reweighting (Triggs et al., "Bundle adjustment - a modern synthesis", 2000, sections 4.3 and 6).
+A problem is a list of terms; the answer minimises the sum of their costs. Method: Gauss-Newton on
+the normal equations with Levenberg and Marquardt's damping, robust kernels by reweighting (Triggs
+et al., "Bundle adjustment - a modern synthesis", 2000, sections 4.3 and 6).
 
-The unknowns are eliminated in the order of the state vector. With poses in time order first and
-what all of them share (landmarks, calibration) last, the factor is banded with a narrow border,
-and the work is linear in the number of poses.
+The unknowns are eliminated in the order of the state vector: the factor is banded with a narrow
+border, and the work is linear in the number of poses.
 
 A state vector holds, in this order: n poses [x m, y m, heading rad] in time order, heading
 continuous; k landmarks [x m, y m]; the three constants of the wheels [scale, turn scale,
@@ -26,6 +24,12 @@ from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import SuperLU, splu
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+# Scale of a robust term that keeps 95 % of the efficiency under Gaussian noise.
+CAUCHY_SCALE = 2.385
+# Share of the diagonal that is added to the normal equations, at first and at least.
+_DAMPING, _LEAST_DAMPING = 1e-4, 1e-12
 
 
 class SingularProblemError(ValueError):
@@ -46,10 +50,6 @@ class Term(Protocol):
         """Return their derivatives, shape (m, n_state)."""
 
 
-CAUCHY_SCALE = 2.385
-"""Scale of a robust term that keeps 95 % of the efficiency under Gaussian noise."""
-
-
 def _costs(residuals: Array, scale: float | None) -> Array:
     """Return c^2 / 2 ln(1 + r^2 / c^2), Cauchy's cost for the scale c; r^2 / 2 without one."""
     if scale is None:
@@ -64,16 +64,11 @@ def _weights(residuals: Array, scale: float | None) -> Array:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Damping:
-    """When the iteration stops and how it is held back."""
+class Stop:
+    """When the iteration ends."""
 
-    # Share of the diagonal that is added to the normal equations, at first and at least
-    initial: float = 1e-4
-    least: float = 1e-12
     most_iterations: int = 60  # linear solves, refused steps included
-    # The iteration has converged once an accepted step lowers the cost by less than this share of
-    # it
-    relative_decrease: float = 1e-9
+    relative_decrease: float = 1e-9  # least share of the cost that an accepted step must gain
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -81,11 +76,9 @@ class Solution:
     """The most likely state and how well it is known."""
 
     state: Array  # shape (n,)
-    cost: float  # sum over all residuals, and `costs` that of every accepted state, descending
-    costs: tuple[float, ...]
+    cost: float  # sum over all residuals
     # Shape (n, n), weighted normal matrix at `state`, without damping
     information: csc_array[np.float64]
-    converged: bool  # false where `most_iterations` came first
 
     def covariance(self, indices: Sequence[int] | NDArray[np.intp]) -> Array:
         """Return the joint posterior covariance of some entries of the state, shape (k, k).
@@ -102,7 +95,7 @@ class Solution:
         return (block + block.T) / 2
 
 
-def minimise(start: Array, terms: Sequence[Term], damping: Damping | None = None) -> Solution:
+def minimise(start: Array, terms: Sequence[Term], stop: Stop | None = None) -> Solution:
     """Return the state of least cost near a start.
 
     Raises
@@ -110,11 +103,9 @@ def minimise(start: Array, terms: Sequence[Term], damping: Damping | None = None
     SingularProblemError
         The terms together do not bound every direction of the state.
     """
-    rule = damping or Damping()
+    rule = stop or Stop()
     state = np.array(start, dtype=np.float64)
-    cost = _cost(terms, state)
-    costs = [cost]
-    share, converged = rule.initial, False
+    cost, share = _cost(terms, state), _DAMPING
     information, gradient = _normal_equations(terms, state)
     for _ in range(rule.most_iterations):
         diagonal = information.diagonal()
@@ -126,25 +117,16 @@ def minimise(start: Array, terms: Sequence[Term], damping: Damping | None = None
             curved = np.asarray(information @ step)
             decrease = -float(gradient @ step) - float(step @ curved) / 2
             if decrease <= rule.relative_decrease * cost:
-                converged = True  # not even the quadratic model promises anything
-                break
+                break  # not even the quadratic model promises anything
             share = max(10 * share, 1e-8)
             continue
         gained = cost - trial_cost
         state, cost = trial, trial_cost
-        costs.append(cost)
         information, gradient = _normal_equations(terms, state)
-        share = max(share / 10, rule.least)
+        share = max(share / 10, _LEAST_DAMPING)
         if gained <= rule.relative_decrease * cost:
-            converged = True
             break
-    return Solution(
-        state=state,
-        cost=cost,
-        costs=tuple(costs),
-        information=information,
-        converged=converged,
-    )
+    return Solution(state=state, cost=cost, information=information)
 
 
 def _cost(terms: Sequence[Term], state: Array) -> float:
@@ -168,19 +150,12 @@ def _normal_equations(terms: Sequence[Term], state: Array) -> tuple[csc_array[np
 def _factor(matrix: csc_array[np.float64]) -> SuperLU:
     """Factor a symmetric positive definite matrix without changing its order."""
     try:
-        return splu(
-            matrix,
-            permc_spec="NATURAL",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
+        options = {"SymmetricMode": True}
+        return splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=options)
     except RuntimeError as error:
         raise SingularProblemError(
             "the problem leaves a direction of the state without any bound"
         ) from error
-
-
-Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -218,7 +193,6 @@ class Layout:
 class PriorTerm:
     """Entries of the state with independent priors; indices, means, sigmas of shape (m,)."""
 
-    layout: Layout
     indices: Indices
     means: Array
     sigmas: Array
@@ -298,13 +272,8 @@ class OdometryTerm:
         poses = state[self.layout.poses].reshape(-1, 3)
         step_x, step_y, turn = np.diff(poses, axis=0).T
         cosine, sine = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
-        return (
-            cosine * step_x + sine * step_y,
-            cosine * step_y - sine * step_x,
-            turn,
-            cosine,
-            sine,
-        )
+        dx, dy = cosine * step_x + sine * step_y, cosine * step_y - sine * step_x
+        return dx, dy, turn, cosine, sine
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

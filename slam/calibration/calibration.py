@@ -2,9 +2,9 @@
 
 Batch maximum a posteriori over all poses, landmarks, wheel constants, range offsets and mount
 positions, from odometry steps and single ranges z = |l - p - R m| + b (`slam.calibration.batch`).
-Association is found along the way: single ranges are followed and placed radar by radar
-(`slam.calibration.tracks`), then predicted ranges choose, with gates that narrow as the offsets
-become known, under a robust cost; the last round is least squares on the ranges that are left.
+Association: single ranges are followed and placed radar by radar (`slam.calibration.tracks`), then
+predicted ranges choose, with gates that narrow as the offsets become known, under a robust cost;
+the last round is least squares on the ranges that are left.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from slam.calibration.batch import (
     CAUCHY_SCALE,
-    Damping,
     Layout,
     OdometryTerm,
     PriorTerm,
     RangeTerm,
     Solution,
+    Stop,
     Term,
     minimise,
 )
@@ -50,6 +50,23 @@ Indices = NDArray[np.intp]
 
 # Samples closer than this are joined into one step.
 _LEAST_STEP_NS = 100_000_000
+_STAGE_NS = 40_000_000_000
+_ROUGH = Stop(relative_decrease=1e-5, most_iterations=25)
+_GATES_M = (0.03, 0.012)
+_GATE_SIGMAS = 4.0
+_LEAST_GATE_M = 1e-3
+_LEAST_RANGES = 20
+_ASSUMED_SIGMA_M = 5e-3
+_LEAST_SIGMA_M = 1e-4
+_ROUNDS_AT_LAST_GATE = 3
+# Two landmarks are one if they are this close, given how well their distance is known (99.9 %).
+_MERGE_CHI2 = 13.8
+_MERGE_WITHIN_M = 0.3
+_MERGE_FLOOR_M = 0.03
+_MERGE_VETO_FRAMES = 10
+_MAP_ORIGIN_SIGMA = 1e-6
+# Bounds a landmark that the drive leaves open along an arc.
+_SOMEWHERE_M = 30.0
 # The lab's white noise; constants wide enough for a bad floor.
 UNKNOWN_WHEELS = WheelNoise(
     scale_sigma=0.03, turn_scale_sigma=0.03, curvature_sigma_rad_per_m=0.02, floor_rad=1e-5
@@ -74,7 +91,7 @@ class Drive:
     """A recorded drive, ready for calibration."""
 
     rig: Rig  # nominal mounts; their range offsets are not removed from the ranges
-    path: PathNodes  # odometry, odometry frame
+    path: PathNodes  # odometry frame
     # Shape (n_nodes - 1, 3), standard deviation of each step's white noise in the body frame: along
     # [m], across [m], turn [rad]
     step_sigmas: Array
@@ -99,14 +116,11 @@ class Calibration:
 
     @property
     def offset_sigmas_m(self) -> Array:
-        result: Array = np.sqrt(np.diag(self.covariance_m2)[0::3])
-        return result
+        return np.asarray(np.sqrt(np.diag(self.covariance_m2)[0::3]))
 
     @property
     def mount_sigmas_m(self) -> Array:
-        variances = np.diag(self.covariance_m2).reshape(-1, 3)
-        result: Array = np.sqrt(variances[:, 1:])
-        return result
+        return np.asarray(np.sqrt(np.diag(self.covariance_m2).reshape(-1, 3)[:, 1:]))
 
 
 def make_drive(
@@ -120,7 +134,6 @@ def make_drive(
     """Cut odometry into steps for the batch.
 
     ``poses`` (n, 3) are odometry samples, x [m], y [m], heading [rad] in any turn, odometry frame.
-    The white noise of each sample's step adds up over the samples of a node's step.
     """
     poses = poses.copy()
     poses[:, 2] = np.unwrap(poses[:, 2])
@@ -144,25 +157,6 @@ def steps_of(poses: Array) -> Array:
     step_x, step_y, turn = np.diff(poses, axis=0).T
     cosine, sine = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
     return np.column_stack([cosine * step_x + sine * step_y, cosine * step_y - sine * step_x, turn])
-
-
-_STAGE_NS = 40_000_000_000
-_ROUGH = Damping(relative_decrease=1e-5, most_iterations=25)
-_GATES_M = (0.03, 0.012)
-_GATE_SIGMAS = 4.0
-_LEAST_GATE_M = 1e-3
-_LEAST_RANGES = 20
-_ASSUMED_SIGMA_M = 5e-3
-_LEAST_SIGMA_M = 1e-4
-_ROUNDS_AT_LAST_GATE = 3
-# Two landmarks are one if they are this close, given how well their distance is known (99.9 %).
-_MERGE_CHI2 = 13.8
-_MERGE_WITHIN_M = 0.3
-_MERGE_FLOOR_M = 0.03
-_MERGE_VETO_FRAMES = 10
-_MAP_ORIGIN_SIGMA = 1e-6
-# Bounds a landmark that the drive leaves open along an arc.
-_SOMEWHERE_M = 30.0
 
 
 def calibrate(
@@ -212,14 +206,14 @@ class _Estimator:
             gates = np.clip(_GATE_SIGMAS * self._sigmas(), _LEAST_GATE_M, _GATES_M[-1])
             landmark = self._assign(model, landmark, gates)
             model, landmark = self._without_poor(model, landmark)
-            model, solution = self._solve(model, landmark, None, Damping())
+            model, solution = self._solve(model, landmark, None, Stop())
         return self._result(model, landmark, solution)
 
     def _growing(self) -> tuple[_Model, Indices]:
         """Take in followed echoes in the order of time.
 
-        The wheels' constants are known after the first of them, so that later echoes are placed
-        from a path that has not drifted far.
+        The wheels' constants are known after the first of them: later echoes are placed from a path
+        that has not drifted far.
         """
         ranges, path = self._drive.ranges, _at_origin(self._drive.path)
         model = _Model(
@@ -251,9 +245,8 @@ class _Estimator:
         for radar, rows in followed:
             placed = place(sights[rows], range_m[rows] - model.radars[radar, 0])
             if placed is not None:
-                point_m, covariance_m2 = placed
                 tracks.append(
-                    Track(radar=radar, rows=rows, point_m=point_m, covariance_m2=covariance_m2)
+                    Track(radar=radar, rows=rows, point_m=placed[0], covariance_m2=placed[1])
                 )
         return tuple(tracks)
 
@@ -335,22 +328,20 @@ class _Estimator:
         )
 
     def _solve(
-        self, model: _Model, landmark: Indices, cauchy_scale: float | None, damping: Damping
+        self, model: _Model, landmark: Indices, cauchy_scale: float | None, stop: Stop
     ) -> tuple[_Model, Solution]:
         layout = self._layout(model)
         term = self._range_term(layout, landmark, cauchy_scale)
-        solution = minimise(model.state(), [*self._fixed_terms(layout), term], damping)
+        solution = minimise(model.state(), [*self._fixed_terms(layout), term], stop)
         state = solution.state
         self._learn_sigma(np.abs(term.residuals(state)) * term.sigma_m, landmark != UNASSIGNED)
-        return (
-            _Model(
-                poses=state[layout.poses].reshape(-1, 3),
-                landmarks=state[layout.landmarks].reshape(-1, 2),
-                wheels=state[layout.wheels],
-                radars=state[layout.radars].reshape(-1, 3),
-            ),
-            solution,
+        solved = _Model(
+            poses=state[layout.poses].reshape(-1, 3),
+            landmarks=state[layout.landmarks].reshape(-1, 2),
+            wheels=state[layout.wheels],
+            radars=state[layout.radars].reshape(-1, 3),
         )
+        return solved, solution
 
     def _learn_sigma(self, errors_m: Array, used: NDArray[np.bool_]) -> None:
         """Scale the front end's sigmas to what its ranges show, where nothing overlaps."""
@@ -396,7 +387,6 @@ class _Estimator:
                 sigmas=self._drive.step_sigmas,
             ),
             PriorTerm(
-                layout=layout,
                 indices=indices,
                 means=np.concatenate([np.zeros(3), known.ravel(), found, np.zeros(3), radar_means]),
                 sigmas=np.concatenate(

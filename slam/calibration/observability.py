@@ -8,8 +8,8 @@ n lies between 1.5 (rod) and 2 (point), B is the exponent of the beam. A gain co
 cannot be told from stronger reflectors, so gains are given relative to their mean; between radars
 that never see one reflector in common not even that. Yaw acts through the beam alone, weakly.
 
-The covariance of all offsets and mounts is split into its principal directions. One whose standard
-deviation exceeds the limit is named by the unknowns that take part in it.
+Of the covariance of all offsets and mounts, a principal direction whose standard deviation exceeds
+the limit is named by the unknowns that take part in it.
 """
 
 from __future__ import annotations
@@ -35,6 +35,17 @@ _STRENGTH_SIGMA = 10.0
 _WIDEST_RAD = math.radians(45)
 _HUBER = 1.345
 _ROUNDS = 8
+
+OFFSET_LIMIT_M = 1e-3
+# An unknown takes part in a direction with at least this share of the largest component.
+_TAKES_PART = 0.4
+_STANDS_M, _STANDS_RAD = 0.02, 0.05
+_KINDS = ("offset", "mount x", "mount y")
+_REMEDY = {
+    "mount y": "drive closer and farther past reflectors, and turn on the spot",
+    "mount x": "turn on the spot among reflectors",
+    "offset": "drive past more reflectors, nearer and farther",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -114,26 +125,14 @@ def _robust(design: Array, measured: Array, means: Array, sigmas: Array) -> tupl
     return answer, covariance
 
 
-OFFSET_LIMIT_M = 1e-3
-# An unknown takes part in a direction with at least this share of the largest component.
-_TAKES_PART = 0.4
-_STANDS_M, _STANDS_RAD = 0.02, 0.05
-_KINDS = ("offset", "mount x", "mount y")
-_REMEDY = {
-    "mount y": "drive closer and farther past reflectors, and turn on the spot",
-    "mount x": "turn on the spot among reflectors",
-    "offset": "drive past more reflectors, nearer and farther",
-}
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class WeakDirection:
     """A combination of offsets and mounts that the drive leaves open."""
 
     sigma_m: float  # standard deviation along the direction
     direction: Array  # shape (3 r,), unit vector: offset, mount x, mount y of each radar
-    words: str  # which unknowns cannot be told apart, in one sentence
-    remedy: str  # A drive that would determine it
+    description: str  # which unknowns are not determined, in one sentence
+    remedy: str  # a drive that would determine it
 
 
 def weak_directions(
@@ -147,14 +146,11 @@ def weak_directions(
         if sigma_m <= limit_m:
             break
         direction: Array = vectors[:, index]
-        words, remedy = _words(direction, names, sigma_m)
-        found.append(
-            WeakDirection(sigma_m=sigma_m, direction=direction, words=words, remedy=remedy)
-        )
+        found.append(_weak_direction(direction, names, sigma_m))
     return tuple(found)
 
 
-def _words(direction: Array, names: Sequence[str], sigma_m: float) -> tuple[str, str]:
+def _weak_direction(direction: Array, names: Sequence[str], sigma_m: float) -> WeakDirection:
     share = np.abs(direction).reshape(-1, 3)
     parts = share >= _TAKES_PART * share.max()
     by_kind = {
@@ -165,37 +161,38 @@ def _words(direction: Array, names: Sequence[str], sigma_m: float) -> tuple[str,
     size = f"({1e3 * sigma_m:.1f} mm)"
     mounts = [kind for kind in ("mount y", "mount x") if by_kind[kind]]
     remedy = _REMEDY[mounts[0] if mounts else "offset"]
-    if len(present) == 1 and int(parts.sum()) == 1:
-        return f"the drive does not tell the {present[0]} {size}", remedy
-    if len(present) == 1:
-        return f"the drive tells only combinations of the {present[0]} {size}", remedy
-    words = f"the drive cannot tell the {present[0]} from the {_joined(present[1:])} {size}"
-    return words, remedy
+    if len(present) > 1:
+        text = f"the drive cannot tell the {present[0]} from the {_joined(present[1:])} {size}"
+    elif int(parts.sum()) == 1:
+        text = f"the drive does not tell the {present[0]} {size}"
+    else:
+        text = f"the drive tells only combinations of the {present[0]} {size}"
+    return WeakDirection(sigma_m=sigma_m, direction=direction, description=text, remedy=remedy)
 
 
-def _joined(words: Sequence[str]) -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+def _joined(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def poor_drive(drive: Drive, calibration: Calibration) -> tuple[str, ...]:
     """Return why a drive is too poor for a calibration; empty where it is not."""
-    said = []
+    reasons = []
     spread = np.ptp(drive.path.poses, axis=0)
     if max(spread[0], spread[1]) < _STANDS_M and spread[2] < _STANDS_RAD:
-        said.append("the robot stood still: nothing moves a range but its noise; drive a course")
+        reasons.append("the robot stood still: nothing moves a range but its noise; drive a course")
     n_landmarks = len(np.unique(calibration.landmark[calibration.landmark != UNASSIGNED]))
     if n_landmarks == 0:
-        said.append("no reflector could be followed: put some 0.5 to 1.5 m beside the course")
+        reasons.append("no reflector could be followed: put some 0.5 to 1.5 m beside the course")
     elif n_landmarks == 1:
-        said.append("only one reflector was followed: put more around the course")
+        reasons.append("only one reflector was followed: put more around the course")
     used = drive.ranges.radar[calibration.landmark != UNASSIGNED]
     if n_landmarks:
-        said += [
+        reasons += [
             f"{mount.name} followed no reflector: turn it towards some"
             for radar, mount in enumerate(drive.rig.mounts)
             if not np.any(used == radar)
         ]
-    return tuple(said)
+    return tuple(reasons)
 
 
 def unseen_reflectors(calibration: Calibration, n_known: int) -> tuple[str, ...]:
@@ -204,6 +201,6 @@ def unseen_reflectors(calibration: Calibration, n_known: int) -> tuple[str, ...]
     if 2 * seen >= n_known:
         return ()
     return (
-        f"only {seen} of {n_known} known reflectors are heard: do their places belong to this "
+        f"only {seen} of {n_known} known reflectors were detected: do their places belong to this "
         "drive, in a frame in which it starts at the origin and looks along x?",
     )

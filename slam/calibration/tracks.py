@@ -1,8 +1,7 @@
 """Which range is of which reflector, before and while the offsets become known.
 
-One radar that moves sees a still reflector at ranges that bend: the track of one radar already
-places it, up to the radar's unknown offset. So no two radars need to agree before the offsets are
-known, as pairs of ranges would require (20 mm between two radars turn a bearing by 5 degrees).
+The track of one moving radar places a still reflector, up to the radar's unknown offset, so no two
+radars need to agree before the offsets are known (20 mm between two turn a bearing by 5 degrees).
 """
 
 from __future__ import annotations
@@ -33,6 +32,23 @@ _MOST_RMS_M = 0.008
 _MOST_SPREAD_M = 0.2
 HALF_VIEW_RAD = math.radians(60)
 _OFFSET_SIGMA_M = 0.03
+
+UNASSIGNED = -1
+
+_SAME_REFLECTOR_M = 0.15
+_KNOWN_REFLECTOR_M = 0.3
+# A track placed worse than this joins a reflector but makes none.
+_PLACED_M = 0.035
+# Two tracks of one radar in the same frames are two reflectors.
+_SHARED_FRAMES = 5
+_LEAST_PER_RADAR = 12
+_LEAST_ASSOCIATED_RANGES = 30
+_LEAST_SHARE = 0.2
+
+_HALF_VIEW_COS = math.cos(HALF_VIEW_RAD)
+_PULSE_SIGMA_M = PulseModel().sigma_m
+_MOST_BEND_M = 0.004
+BEAM_EXPONENT = math.log(math.sqrt(0.5)) / math.log(math.cos(math.radians(65 / 2)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -83,8 +99,7 @@ class PathNodes:
         node, fraction = self.between(t_ns)
         following = np.minimum(node + 1, len(self.t_ns) - 1)
         part = fraction[:, np.newaxis]
-        result: Array = (1 - part) * self.poses[node] + part * self.poses[following]
-        return result
+        return np.asarray((1 - part) * self.poses[node] + part * self.poses[following])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -216,24 +231,6 @@ def place(sights: Array, range_m: Array) -> tuple[Array, Array] | None:
     return unknown[:2], covariance
 
 
-UNASSIGNED = -1
-
-_SAME_REFLECTOR_M = 0.15
-_KNOWN_REFLECTOR_M = 0.3
-# A track placed worse than this joins a reflector but makes none.
-_PLACED_M = 0.035
-# Two tracks of one radar in the same frames are two reflectors.
-_SHARED_FRAMES = 5
-_LEAST_PER_RADAR = 12
-_LEAST_ASSOCIATED_RANGES = 30
-_LEAST_SHARE = 0.2
-
-_HALF_VIEW_COS = math.cos(HALF_VIEW_RAD)
-_PULSE_SIGMA_M = PulseModel().sigma_m
-_MOST_BEND_M = 0.004
-BEAM_EXPONENT = math.log(math.sqrt(0.5)) / math.log(math.cos(math.radians(65 / 2)))
-
-
 def group_tracks(
     tracks: Sequence[Track], ranges: RangeSet, known_m: Array
 ) -> tuple[Array, Indices]:
@@ -275,14 +272,10 @@ def _seen_together(first: Track, second: Track, ranges: RangeSet) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Assignment:
-    """Which landmark each range belongs to, and the effect of its neighbours.
+    """Which landmark each range belongs to, and the effect of its neighbours."""
 
-    ``landmark`` (n,): index, or UNASSIGNED; ``bend_m`` (n,): standard deviation that echoes of
-    other landmarks add.
-    """
-
-    landmark: Indices
-    bend_m: Array
+    landmark: Indices  # shape (n,), or UNASSIGNED
+    bend_m: Array  # shape (n,), standard deviation that echoes of other landmarks add
 
 
 def assign(
@@ -329,15 +322,12 @@ def echo_law(distance_m: Array, cosine: Array) -> Array:
     R^-1.75 lies between a long rod's 1.5 and a point's 2; the beam is the two-way cosine power
     whose -3 dB width is 65 degrees (paper, section Hardware).
     """
-    result: Array = np.maximum(cosine, 0.0) ** BEAM_EXPONENT * np.maximum(distance_m, 0.05) ** -1.75
-    return result
+    beam = np.maximum(cosine, 0.0) ** BEAM_EXPONENT
+    return np.asarray(beam * np.maximum(distance_m, 0.05) ** -1.75)
 
 
 def strengths(ranges: RangeSet, sights: Array, landmarks_m: Array, landmark: Indices) -> Array:
-    """Return the amplitude of each landmark, reduced by `echo_law` to 1 m; shape (k,).
-
-    The median over its ranges; 0 where it has none.
-    """
+    """Return the median amplitude of each landmark, reduced by `echo_law` to 1 m; 0 without any."""
     result = np.zeros(len(landmarks_m))
     for index in range(len(landmarks_m)):
         rows = np.flatnonzero(landmark == index)
@@ -360,24 +350,21 @@ def _seen(sights: Array, landmarks_m: Array) -> tuple[Array, Array]:
 def _bends(distance: Array, amplitude: Array, own: Indices) -> Array:
     """Return by how much the other echoes move the peak of each own one, rms, shape (n,).
 
-    A matched filter turns Gaussian pulses of width s into ones of sqrt(2) s; a neighbour of
-    relative amplitude a at distance D moves the peak by a D exp(-D^2 / 4 s^2) times the cosine of
-    its carrier's phase, to first order in a. The phase turns by a whole turn in 2 cm of motion.
+    Behind a matched filter, a neighbour of relative amplitude a at distance D moves the peak by
+    a D exp(-D^2 / 4 s^2) times the cosine of its carrier's phase, to first order in a.
     """
     every = np.arange(len(own))
     apart = np.maximum(np.abs(distance - distance[every, own][:, np.newaxis]), _PULSE_SIGMA_M)
     relative = amplitude / np.maximum(amplitude[every, own][:, np.newaxis], 1e-12)
     move = relative * apart * np.exp(-(apart**2) / (4 * _PULSE_SIGMA_M**2))
     move[every, own] = 0.0
-    result: Array = np.sqrt((move**2).sum(axis=1) / 2)
-    return result
+    return np.asarray(np.sqrt((move**2).sum(axis=1) / 2))
 
 
 def well_seen(ranges: RangeSet, landmark: Indices, n_landmarks: int) -> NDArray[np.bool_]:
     """Return which landmarks have enough ranges to be trusted, shape (n_landmarks,).
 
-    Two radars (where there are two) must have followed it, and not much less often than others:
-    what only one radar saw, or few times, is as likely a misplaced piece of another echo.
+    What only one radar saw, or few times, is as likely a misplaced piece of another echo.
     """
     n_radars = int(ranges.radar.max(initial=0)) + 1
     counts = np.zeros((n_landmarks, n_radars), dtype=np.intp)
@@ -392,7 +379,7 @@ def well_seen(ranges: RangeSet, landmark: Indices, n_landmarks: int) -> NDArray[
 
 
 def covisible(ranges: RangeSet, landmark: Indices, first: int, second: int) -> int:
-    """Return in how many frames of a radar both landmarks met a range."""
+    """Return in how many frames of a radar both landmarks have a range."""
     frames = [
         set(zip(ranges.t_ns[rows].tolist(), ranges.radar[rows].tolist(), strict=True))
         for rows in (np.flatnonzero(landmark == index) for index in (first, second))

@@ -268,7 +268,7 @@ def _facts(report: _Report, planted: Mapping[str, tuple[float, float]]) -> dict[
             {
                 "sigma_m": weak.sigma_m,
                 "direction": weak.direction.tolist(),
-                "words": weak.words,
+                "words": weak.description,
                 "remedy": weak.remedy,
             }
             for weak in report.weak
@@ -320,7 +320,7 @@ def _lines(report: _Report, planted: Mapping[str, tuple[float, float]]) -> Itera
         )
     yield from report.poor
     if marked:
-        yield from dict.fromkeys(weak.words for weak in report.weak)
+        yield from dict.fromkeys(weak.description for weak in report.weak)
         for remedy in dict.fromkeys(weak.remedy for weak in report.weak):
             yield f"remedy: {remedy}"
 

@@ -9,12 +9,12 @@ from scipy.sparse import csr_array
 
 from slam.calibration.batch import (
     CAUCHY_SCALE,
-    Damping,
     Layout,
     OdometryTerm,
     PriorTerm,
     RangeTerm,
     SingularProblemError,
+    Stop,
     Term,
     _costs,
     _weights,
@@ -55,7 +55,7 @@ def prior_term(seed: int) -> PriorTerm:
     random = np.random.default_rng(seed)
     indices = random.permutation(LAYOUT.size)[:9]
     return PriorTerm(
-        layout=LAYOUT, indices=indices, means=random.normal(size=9), sigmas=random.uniform(1, 2, 9)
+        indices=indices, means=random.normal(size=9), sigmas=random.uniform(1, 2, 9)
     )
 
 
@@ -106,7 +106,6 @@ def test_a_linear_problem_has_the_answer_and_covariance_of_the_normal_equations(
     expected, residue, *_ = np.linalg.lstsq(term.matrix, term.right)
     np.testing.assert_allclose(solution.state, expected, atol=1e-9)
     assert solution.cost == pytest.approx(float(residue[0]) / 2)
-    assert solution.converged
     inverse = np.linalg.inv(term.matrix.T @ term.matrix)
     np.testing.assert_allclose(solution.covariance([3, 1]), inverse[np.ix_([3, 1], [3, 1])])
 
@@ -143,16 +142,17 @@ class Arctangent:
         return csr_array(np.diag(1 / (1 + state**2)))
 
 
-def test_cost_never_rises_where_undamped_gauss_newton_diverges() -> None:
+def test_cost_falls_where_undamped_gauss_newton_diverges() -> None:
     solution = minimise(np.array([3.0]), [Arctangent()])
     assert solution.state[0] == pytest.approx(0.0, abs=1e-6)
-    assert list(solution.costs) == sorted(solution.costs, reverse=True)
-    assert len(solution.costs) > 2
+    costs = [
+        minimise(np.array([3.0]), [Arctangent()], Stop(most_iterations=n)).cost for n in range(9)
+    ]
+    assert costs == sorted(costs, reverse=True)
+    assert costs[-1] < costs[0] == np.arctan(3.0) ** 2 / 2
 
 
-def test_an_unbounded_direction_is_an_error_and_too_few_iterations_are_told() -> None:
+def test_an_unbounded_direction_is_an_error() -> None:
     half = Linear(matrix=np.array([[1.0, 0.0]]), right=np.array([1.0]))
-    with pytest.raises(SingularProblemError, match="without any bound"):
+    with pytest.raises(SingularProblemError):
         minimise(np.zeros(2), [half])
-    rushed = minimise(np.array([3.0]), [Arctangent()], Damping(most_iterations=1))
-    assert not rushed.converged

@@ -127,7 +127,7 @@ def reported(true: Array, noise: float, random: np.random.Generator) -> Array:
 
 def words(of: Drive, found: Calibration) -> str:
     names = [mount.name for mount in of.rig.mounts]
-    return "\n".join(weak.words for weak in weak_directions(found, names))
+    return "\n".join(weak.description for weak in weak_directions(found, names))
 
 
 def test_exact_ranges_and_odometry_give_the_exact_offsets() -> None:
