@@ -45,9 +45,8 @@ from slam.app.rig.emulated import (
     true_landmarks_m,
     wheels_of,
 )
-from slam.app.run.runner import run_slam
+from slam.app.run.runner import make_slam, run_slam
 from slam.app.session.log import SessionLog
-from slam.pipelines import make_slam
 from xethru_protocol.driver.radar import X4M300
 
 ROOT = REPOSITORY

@@ -23,10 +23,9 @@ from slam.app.rig.emulated import (
     versions,
     wheels_of,
 )
-from slam.app.run.runner import RunRecord, run_slam
+from slam.app.run.runner import RunRecord, make_slam, run_slam
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import settings_text
-from slam.pipelines import make_slam
 
 STARTED_UNIX_NS = 1_790_000_000_000_000_000
 LOST_RADAR, LOST_COUNTER = 1, 40

@@ -29,12 +29,11 @@ from slam.app.rig.emulated import (
 from slam.app.rig.sources import RigSource
 from slam.app.run.output import Progress
 from slam.app.run.results import RESULTS, finish, prepare_folder, saying_what_is_left
-from slam.app.run.runner import LinkLog, RunSource, execute
+from slam.app.run.runner import LinkLog, RunSource, execute, make_slam
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import settings_text
 from slam.app.view.viewer import LiveView
 from slam.config import SlamConfig
-from slam.pipelines import make_slam
 from xethru_protocol.system import StopFlag
 
 _OUTPUTS = ("session.mcap", "session.rrd", "report.html", *RESULTS)

@@ -23,12 +23,11 @@ from slam.app.rig.sources import RigSource, sampler_limits
 from slam.app.run.live_source import Inbox, LiveLog, LiveSource, drift_text, reading
 from slam.app.run.output import Progress, Row
 from slam.app.run.results import RESULTS, finish, prepare_folder
-from slam.app.run.runner import RunRecord, RunSource, execute
+from slam.app.run.runner import RunRecord, RunSource, execute, make_slam
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import settings_text
 from slam.app.view.viewer import LiveView
 from slam.config import ConfigError, load_preset
-from slam.pipelines import make_slam
 from xethru_protocol.system import StopFlag, StopRequestedError
 
 _SESSION = "session.mcap"

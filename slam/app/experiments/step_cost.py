@@ -27,7 +27,7 @@ from slam.config import WheelNoise
 from slam.geometry import paper_rig
 from slam.robust.association import antennas_of, rows_of, sides_of, sure_landmarks, view
 from slam.robust.parameters import ContinuationRule, RangeNoise
-from slam.robust.state import State, SymmetricMatrix, at_rest, calibrated_motion, predict
+from slam.robust.state import State, SymmetricMatrix, calibrated_motion, predict
 from xethru_protocol.system import StopFlag
 
 N_UPDATES = 4
@@ -100,7 +100,7 @@ def stepper(state: State) -> Callable[[], None]:
     sides = sides_of(rig)
     radars = np.array([radar for side in sides for radar in side], dtype=np.intp)
     R = np.full(N_UPDATES, noise.sigma_m**2)
-    mounts = antennas_of(rig, (), at_rest())
+    mounts = antennas_of(rig, (), np.zeros(3))
     seen = view(state, mounts)
     nearest = [int(np.argmin(seen.ranges_m[radar, :2])) for radar in radars]
     landmarks = np.array(nearest, dtype=np.intp)

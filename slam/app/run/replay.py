@@ -23,12 +23,11 @@ from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.records import LogLine, Scan, SessionObserver, Snapshot
 from slam.app.run.output import Progress
 from slam.app.run.results import RESULTS, finish, prepare_folder, saying_what_is_left
-from slam.app.run.runner import LinkLog, RunSource, execute
+from slam.app.run.runner import LinkLog, RunSource, execute, make_slam
 from slam.app.session.messages import state_row
 from slam.app.session.reader import RecordedSession, open_session
 from slam.config import ConfigError, SlamConfig, WheelNoise, without_removed_keys
 from slam.frames import Detection, RadarFrame
-from slam.pipelines import make_slam
 from slam.results import PoseAt, Slam, StepResult
 from xethru_protocol.system import StopFlag
 

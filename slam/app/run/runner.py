@@ -25,10 +25,26 @@ from slam.app.records import (
     Snapshot,
     TruthAt,
 )
-from slam.frames import RadarFrame
+from slam.config import BackEnd, SlamConfig, WheelNoise
+from slam.frames import Detector, RadarFrame
 from slam.geometry import Rig
+from slam.paper.pipeline import UwbRadarSlam
 from slam.results import Slam, StepResult
+from slam.robust.pipeline import RobustSlam
 from xethru_protocol.driver.link import ProtocolRecord
+
+
+def make_slam(
+    config: SlamConfig, rig: Rig, wheels: WheelNoise, detector: Detector | None = None
+) -> Slam:
+    """Return the pipeline that ``config.back_end`` names.
+
+    ``wheels`` is the robot's odometry noise; preset ``paper`` has numbers of its own. ``detector``
+    replaces the front end that the configuration names.
+    """
+    if config.back_end is BackEnd.ROBUST:
+        return RobustSlam(config, rig, wheels, detector)
+    return UwbRadarSlam(config, rig, detector)
 
 
 def unknown_truth(stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:

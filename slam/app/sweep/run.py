@@ -38,7 +38,7 @@ from slam.app.rig.emulated import (
 )
 from slam.app.run.evaluation import Summary
 from slam.app.run.results import summary_of
-from slam.app.run.runner import RunRecord, RunSource, execute
+from slam.app.run.runner import RunRecord, RunSource, execute, make_slam
 from slam.app.sweep import CLEAN, STRESSES, Stress
 from slam.app.sweep.bound import BoundSummary, bound_of
 from slam.config import ConfigError, SlamConfig, override
@@ -46,7 +46,6 @@ from slam.evaluation import LANDMARK_MATCH_M
 from slam.frames import Detection, Detector, RadarFrame
 from slam.front_end import make_detector
 from slam.geometry import transform
-from slam.pipelines import make_slam
 from slam.results import Slam
 from xethru_protocol.system import StopFlag
 

@@ -9,12 +9,12 @@ import pytest
 from numpy.typing import NDArray
 
 from slam.app.rig.emulated import scene_and_config, wheels_of
+from slam.app.run.runner import make_slam
 from slam.config import RobustConfig, SlamConfig, WheelNoise, load_preset, override
 from slam.evaluation import nees_pose
 from slam.frames import Detection, RadarFrame
 from slam.geometry import between, compose, paper_rig, transform
 from slam.paper.pipeline import UwbRadarSlam
-from slam.pipelines import make_slam
 from slam.results import Belief, PoseAt
 from slam.robust.pipeline import RobustSlam, back_end_parameters, belief_of
 
@@ -235,7 +235,8 @@ def test_a_tick_without_frames_goes_on_by_odometry() -> None:
     assert slam.flush() == ()
 
 
-def test_another_front_end_can_be_brought_and_is_told_each_radars_range_offset() -> None:
+@pytest.mark.parametrize("preset", ["paper", "robust"])
+def test_a_front_end_of_ones_own_gets_the_range_offset_of_each_radar(preset: str) -> None:
     class Fixed:
         def detect(self, frame: RadarFrame, range_offset_m: float = 0.0) -> tuple[Detection, ...]:
             range_m = 0.7 - range_offset_m
@@ -257,7 +258,8 @@ def test_another_front_end_can_be_brought_and_is_told_each_radars_range_offset()
         )
 
     mounts = [replace(mount, range_offset_m=0.01 * k) for k, mount in enumerate(RIG.mounts)]
-    slam = make_slam(ROBUST, replace(RIG, mounts=tuple(mounts)), WheelNoise(), Fixed())
+    config = override(load_preset(preset), {"window.size": 1})
+    slam = make_slam(config, replace(RIG, mounts=tuple(mounts)), WheelNoise(), Fixed())
     slam.step([frame(0, 2)], straight, 0)
     (result,) = slam.step([frame(TICK_NS, 2), frame(TICK_NS, 1)], straight, TICK_NS)
     assert [found.radar for found in result.detections] == [2, 1]

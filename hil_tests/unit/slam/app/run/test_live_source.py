@@ -39,12 +39,11 @@ from slam.app.run.live_source import (
     TickAssembler,
     reading,
 )
-from slam.app.run.runner import RunRecord, run_slam
+from slam.app.run.runner import RunRecord, make_slam, run_slam
 from slam.config import load_preset
 from slam.evaluation import ate_rmse_m
 from slam.frames import RadarFrame
 from slam.geometry import Mount
-from slam.pipelines import make_slam
 from xethru_protocol.driver.frames import Frame, FrameGeometry
 from xethru_protocol.system import StopFlag
 from xethru_protocol.wire.errors import Disconnected, ResponseTimeout
