@@ -10,14 +10,10 @@ normal n, from wherever the antenna q = p + R m is:
 
     z = d - n . q + b + v,     H = [e_th: 0, e_p: -n, e_phi: -(J n) . q, e_d: 1, b: 1].
 
-A radar that sampled a fraction f of a step after the pose was at ``m' = f d + Rot(f a) m``,
-boresight ``yaw' = yaw + f a`` (f < 0: before it).
-
 Known landmarks come first, one to one. A landmark takes part if it may be in view and if the prior
-alone, without the noise of a range, predicts its ranges more surely than a range measures them.
-Where the map is less sure than that, a single range proves nothing, and only tracklets decide. For
-each landmark one option is chosen, a range of some of the radars of the side, or of none, at the
-cost
+alone, without the noise of a range, predicts its ranges more surely than a range measures them;
+else only tracklets decide. For each landmark one option is chosen, a range of some of the radars of
+the side, or of none, at the cost
 
     nu^T S^-1 nu + ln det(2 pi S) + 2 m ln(clutter density) - 2 m ln(Pd / (1 - Pd))
 
@@ -39,7 +35,7 @@ from numpy.typing import NDArray
 from slam.geometry import Rig, wrap_angles
 from slam.results import PredictedRange
 from slam.robust.parameters import ContinuationRule, RangeNoise
-from slam.robust.state import Array, Indices, Motion, State, quarter_turn, rotation
+from slam.robust.state import Array, Indices, State, quarter_turn, rotation
 
 # No radar ranges as far; keeps squares finite whatever a front end says.
 LONGEST_M = 1e6
@@ -53,14 +49,12 @@ class RangeScan:
 
     radar: int  # index of the mount in the rig
     ranges_m: tuple[float, ...]  # ranges in true metres
-    # When it sampled, in steps after the pose: 0 with it, -0.5 half a step before it
-    sampled_after: float = 0.0
     # Which target each range is of, where that is known; it replaces association
     labels: tuple[int, ...] | None = None
     # Standard deviation of each range, where the front end predicts it
     sigmas_m: tuple[float, ...] | None = None
     # Reported motion from the pose to the sample, (dx, dy) [m] and turn [rad] in the body frame of
-    # the pose. It replaces ``sampled_after``, which is limited to one step.
+    # the pose; None: sampled at the pose
     moved: tuple[float, float, float] | None = None
     # Ranges of echoes that several targets may share: no evidence of where anything is, nor that
     # nothing is there
@@ -74,7 +68,6 @@ class RangeScan:
         return otherwise_m if self.sigmas_m is None else self.sigmas_m[index]
 
     def with_added_sigma(self, sigma_m: float) -> RangeScan:
-        """Return the scan with a standard deviation added to each range's."""
         if self.sigmas_m is None or not sigma_m:
             return self
         return replace(self, sigmas_m=tuple(math.hypot(s, sigma_m) for s in self.sigmas_m))
@@ -107,32 +100,23 @@ class Antennas:
     has_frame: NDArray[np.bool_]
 
 
-def antennas_of(
-    rig: Rig, scans: Sequence[RangeScan], motion: Motion, calibration: Array | None = None
-) -> Antennas:
+def antennas_of(rig: Rig, scans: Sequence[RangeScan], calibration: Array) -> Antennas:
     """Return where the antennas were; a radar without a scan stays at its mount.
 
     ``calibration`` (3,), s, w and kappa, corrects reported motions; over less than a step the
     curvature has no effect.
     """
-    s, w = (0.0, 0.0) if calibration is None else calibration[:2].tolist()
+    s, w = calibration[:2].tolist()
     mounts = rig.mounts
     position = np.array([[mount.x_m, mount.y_m] for mount in mounts])
     yaw = np.array([mount.yaw_rad for mount in mounts])
     has_frame = np.zeros(len(mounts), dtype=bool)
     for scan in scans:
         has_frame[scan.radar] = True
-        f = scan.sampled_after
         if scan.moved is not None:
             turn = scan.moved[2] / (1.0 + w)
             way = np.array(scan.moved[:2]) / (1.0 + s)
             position[scan.radar] = way + rotation(turn) @ position[scan.radar]
-            yaw[scan.radar] += turn
-        elif f != 0.0:
-            # The part of the step before a pose ends there: go back along it from its end.
-            turn = f * motion.turn_rad
-            forward = motion.step_m if f > 0 else rotation(-motion.turn_rad) @ motion.step_m
-            position[scan.radar] = f * forward + rotation(turn) @ position[scan.radar]
             yaw[scan.radar] += turn
     return Antennas(position_m=position, yaw_rad=yaw, has_frame=has_frame)
 
@@ -157,7 +141,6 @@ class View:
         )
 
     def without(self, rows: Sequence[int]) -> View:
-        """Return a view in which the landmarks in some rows are out of reach."""
         if not rows:
             return self
         ranges = self.ranges_m.copy()
@@ -166,7 +149,6 @@ class View:
 
 
 def view(state: State, antennas: Antennas) -> View:
-    """Return the view of everything mapped; O(n + w), the covariance is not touched."""
     R = rotation(state.heading_rad)
     body = (state.landmarks_m - state.position_m) @ R
     offsets = body[None, :, :] - antennas.position_m[:, None, :]
@@ -208,7 +190,6 @@ class Rows:
 
 
 def rows_of(state: State, seen: View, radars: Indices, landmarks: Indices) -> Rows:
-    """Return the rows of some (radar, landmark) pairs, shapes (k,) and (k,)."""
     known, place = np.unique(landmarks, return_inverse=True)
     n_offsets = len(state.offsets_m)
     at = np.concatenate(
@@ -319,15 +300,15 @@ class SureLandmarks:
         )
 
     def with_added_sigma(self, shape_sigmas_m: Array) -> SureLandmarks:
-        """Add a standard deviation per row of the map to the predictions."""
+        """Add standard deviations, one per row of the map, to the predictions."""
         added = np.square(shape_sigmas_m[self.rows.landmarks])
         return self if not added.any() else replace(self, prior=self.prior + np.diag(added))
 
     def unanswered(self, scans: Sequence[RangeScan], noise: RangeNoise, within_m: float) -> Indices:
-        """Return the rows of those near whose predicted ranges no radar has an echo.
+        """Return the rows of those with no echo within four standard deviations of a prediction.
 
-        Near is within four standard deviations, or ``BLUR_M`` more from a blurred echo. Those whose
-        ranges are less certain than ``within_m`` are left out: they may be out of view.
+        ``BLUR_M`` more counts for a blurred echo. Those whose ranges are less certain than
+        ``within_m`` are left out: they may be out of view.
         """
         scan_of = {scan.radar: scan for scan in scans}
         per_landmark = len(self.rows.radars) // len(self.landmarks)
@@ -401,7 +382,6 @@ def continue_tracks(
 def labelled(
     scans: Sequence[RangeScan], state: State, landmark_of_label: Mapping[int, int]
 ) -> list[Continuation]:
-    """Return the associations by label; ids of landmarks by label are given."""
     rows = {id_: row for row, id_ in enumerate(state.landmark_ids)}
     return [
         Continuation(row=rows[landmark_of_label[label]], radar=scan.radar, index=index)

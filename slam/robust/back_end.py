@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.geometry import Rig
 from slam.results import MapLandmark, MapWall, PredictedRange, UpdateReport
@@ -15,7 +14,6 @@ from slam.robust.association import (
     Antennas,
     Continuation,
     RangeScan,
-    SureLandmarks,
     View,
     antennas_of,
     continue_tracks,
@@ -34,11 +32,12 @@ from slam.robust.initialisation import (
     UnassignedRanges,
     assign,
     find_tracklets,
-    guesses_of,
     initialise_landmark,
     match,
     named_rows,
+    pair_guesses,
     range_bearing_rows,
+    single_guesses,
     update_with_point,
 )
 from slam.robust.kidnapping import Evidence, Localisation, evidence, forget, merge_landmarks
@@ -46,7 +45,7 @@ from slam.robust.map import Existence, Roundness
 from slam.robust.parameters import BackEndParameters, PointRule
 from slam.robust.run_log import RunLog
 from slam.robust.smoother import is_due, relinearise
-from slam.robust.state import Array, State, at_rest, calibrated_motion, predict
+from slam.robust.state import Array, State, calibrated_motion, predict
 from slam.robust.walls import WallKeeper
 
 
@@ -68,69 +67,14 @@ def huber_weighted_sigmas_m(
     return np.where(excess > 1.0, np.sqrt(np.maximum(S * excess - prior_variances, 0.0)), sigmas_m)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True)
 class Matches:
-    """Ranges of known landmarks among the scans of one side."""
+    """Ranges of known landmarks among the scans of one time."""
 
-    continued: Sequence[Continuation] = ()  # which range is of which landmark
+    continued: list[Continuation] = field(default_factory=list)
     # The ranges of every landmark that took part, measured or not
-    predicted: Sequence[PredictedRange] = ()
-    evidence: Sequence[Evidence] = ()  # for or against the present pose, by landmark
-
-
-def match_known_landmarks(  # noqa: PLR0917 - scans, where they were taken, and the belief
-    scans: Sequence[RangeScan],
-    seen: View,
-    antennas: Antennas,
-    state: State,
-    existence: Existence,
-    parameters: BackEndParameters,
-) -> Matches:
-    """Find the ranges of known landmarks on one side; count hits and misses."""
-    noise, rule, limits = parameters.ranges, parameters.continuation, parameters.map
-    radars = [scan.radar for scan in scans]
-    near = landmarks_in_view(state, seen, radars, noise, rule) if radars else None
-    if near is None:
-        return Matches()
-    sure = near.surer_than(rule.tight_sigmas * noise.sigma_m)
-    shape_sigmas_m = state.feature_shape_sigmas_m
-    near = near.with_added_sigma(shape_sigmas_m)
-    found_evidence = evidence(near, seen, scans, state, parameters)
-    inside = seen.inside(noise, -limits.view_inset_rad, -limits.view_inset_m)[radars]
-    known = () if sure is None else sure.landmarks
-    # Too unsure for single ranges: a miss only where no echo at all is near the prediction.
-    for row in np.setdiff1d(near.unanswered(scans, noise, limits.view_inset_m), known).tolist():
-        if inside[:, row].all():
-            existence.miss(state.feature_ids[row])
-    if sure is None:
-        return Matches(evidence=found_evidence)
-    predicted = predicted_ranges(state, sure, antennas)
-    found = continue_tracks(sure.with_added_sigma(shape_sigmas_m), scans, noise, rule)
-    _count(found, sure, scans, seen, inside, state, existence)
-    return Matches(continued=found, predicted=predicted, evidence=found_evidence)
-
-
-def _count(  # noqa: PLR0917 - what was found, and what could have been
-    found: Sequence[Continuation],
-    sure: SureLandmarks,
-    scans: Sequence[RangeScan],
-    seen: View,
-    inside: NDArray[np.bool_],
-    state: State,
-    existence: Existence,
-) -> None:
-    """Count hits of landmarks that were found, and misses of those that all radars should see."""
-    ids = state.feature_ids
-    count = Counter(continuation.row for continuation in found)
-    for row in count:
-        existence.hit(ids[row])
-    in_all_views = inside[:, sure.landmarks].all(axis=0)
-    for row in sure.landmarks[in_all_views].tolist():
-        hidden = any(scan.may_hide(float(seen.ranges_m[scan.radar, row])) for scan in scans)
-        if row not in count and not hidden:
-            existence.miss(ids[row])
-    whole = max(len(scans), 2)
-    existence.seen_whole(ids[row] for row, n in count.items() if n >= whole)
+    predicted: list[PredictedRange] = field(default_factory=list)
+    evidence: list[Evidence] = field(default_factory=list)  # for or against the present pose
 
 
 class RobustBackEnd:
@@ -153,11 +97,9 @@ class RobustBackEnd:
             window, parameters.ranges.sigma_m, scale, scale * rule.lever_m
         )
         self._existence = Existence(parameters.map)
-        self._log = RunLog(parameters.wheels, None if parameters.relinearisation else window)
-        self._motion = at_rest()
+        self._log = RunLog(parameters.wheels)
         self._walls = WallKeeper(self.state, parameters)
-        round_rule = parameters.roundness
-        self._roundness = None if round_rule is None else Roundness(round_rule)
+        self._roundness = Roundness(parameters.roundness)
         self._silent = np.zeros(len(rig.mounts), dtype=np.intp)
         self._landmark_of_label: dict[int, int] = {}
         self._n_updates = 0
@@ -209,16 +151,13 @@ class RobustBackEnd:
         """
         wheels = self.parameters.wheels
         motion = calibrated_motion(increment, self.state.calibration, wheels, covariance)
-        self._log.add_motion(
-            increment, motion.covariance, motion.walk_variance, self.state.calibration
-        )
+        self._log.add_motion(increment, motion)
         predict(self.state, motion, wheels)
         self._unassigned.move(motion)
-        self._motion = motion
 
     def update(self, scans: Sequence[RangeScan]) -> UpdateReport:
         """Take in the scans of one time; a radar without a frame is absent, not empty."""
-        antennas = antennas_of(self.rig, scans, self._motion, self.state.calibration)
+        antennas = antennas_of(self.rig, scans, self.state.calibration)
         self._silent = np.where(antennas.has_frame, 0, self._silent + 1)
         was_lost = self._localisation.is_lost
         widened = [
@@ -226,7 +165,10 @@ class RobustBackEnd:
         ]
         matches, seen = self._associate(scans, widened, antennas)
         continued, nis = self._correct(matches.continued, seen, scans, antennas)
-        carried = self._begin_submap_if_carried()
+        carried = self._localisation.surprise.is_carried
+        if carried:
+            self._localisation.begin_submap(self.state, self._existence, self._log)
+            self._unassigned.clear()
         used = {(radar, index) for radar, index, _ in continued}
         self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
         initialised, seen_again = self._initialise_landmarks()
@@ -255,19 +197,18 @@ class RobustBackEnd:
     ) -> tuple[int | None, ...]:
         """Take in ranges and bearings of points seen from the newest pose.
 
-        A labelled point is of the landmark with that label, and new if there is none. The others
-        are assigned by distance. Returns one landmark id per point, None for an ambiguous one left
-        out.
+        If all points have labels, each is of the landmark with its label, or new; else they are
+        assigned by distance. Returns one landmark id per point, None for an ambiguous one left out.
         """
         rule = rule or PointRule()
         state = self.state
         rows = named_rows(state, points, self._landmark_of_label)
         if rows is None:
             rows = assign(state, points, rule.gate, rule.new_gate, rule.reach_m)
-        found: list[int | None] = []
-        for point, row in zip(points, rows, strict=True):
-            landmark_id = None if row is None else self._see_point(point, row)
-            found.append(landmark_id)
+        found = [
+            None if row is None else self._see_point(point, row)
+            for point, row in zip(points, rows, strict=True)
+        ]
         if is_due(self._log, self.state, self.parameters):
             self.relinearise()
         self._log.set_causal(state.pose)
@@ -304,9 +245,10 @@ class RobustBackEnd:
     def _smooth_if_due(self) -> bool:
         """Give landmarks their radii and solve for all poses; return whether that worked."""
         relinearised = False
-        if self._roundness is not None and self._is_located():
-            hits = self._existence.hits
-            relinearised = self._roundness.give(self.state, self._log, self.parameters, hits)
+        if self._is_located():
+            relinearised = self._roundness.give(
+                self.state, self._log, self.parameters, self._existence
+            )
         if relinearised or is_due(self._log, self.state, self.parameters):
             relinearised |= self.relinearise()
         return relinearised
@@ -315,31 +257,57 @@ class RobustBackEnd:
         self, scans: Sequence[RangeScan], widened: Sequence[RangeScan], antennas: Antennas
     ) -> tuple[Matches, View]:
         """Find the ranges of known landmarks among the ``widened`` scans, and judge the pose."""
-        state = self.state
+        state, matches = self.state, Matches()
         seen = view(state, antennas)
         if not state.feature_ids:
-            return Matches(), seen
+            return matches, seen
         seen = self._walls.look(seen, antennas)
         seen = self._localisation.without_old_map(seen, state)
-        of_sides = [
-            match_known_landmarks(
-                [scan for scan in widened if scan.radar in side],
-                seen,
-                antennas,
-                state,
-                self._existence,
-                self.parameters,
-            )
-            for side in self._sides
-        ]
-        found = [each for matches in of_sides for each in matches.continued]
-        for_pose = [each for matches in of_sides for each in matches.evidence]
+        for side in self._sides:
+            if of_side := [scan for scan in widened if scan.radar in side]:
+                self._match_known_landmarks(of_side, seen, antennas, matches)
         if any(scan.labels is not None for scan in scans):
-            found = labelled(scans, state, self._landmark_of_label)
+            matches.continued = labelled(scans, state, self._landmark_of_label)
         else:
-            self._localisation.look(for_pose, state, self._log)
-        predicted = [each for matches in of_sides for each in matches.predicted]
-        return Matches(continued=found, predicted=predicted, evidence=for_pose), seen
+            self._localisation.look(matches.evidence, state, self._log)
+        return matches, seen
+
+    def _match_known_landmarks(
+        self, scans: Sequence[RangeScan], seen: View, antennas: Antennas, matches: Matches
+    ) -> None:
+        """Add the ranges of known landmarks on one side; count hits and misses."""
+        state, existence = self.state, self._existence
+        noise, rule = self.parameters.ranges, self.parameters.continuation
+        limits = self.parameters.map
+        radars = [scan.radar for scan in scans]
+        near = landmarks_in_view(state, seen, radars, noise, rule)
+        if near is None:
+            return
+        sure = near.surer_than(rule.tight_sigmas * noise.sigma_m)
+        shape_sigmas_m, ids = state.feature_shape_sigmas_m, state.feature_ids
+        near = near.with_added_sigma(shape_sigmas_m)
+        matches.evidence += evidence(near, seen, scans, state, self.parameters)
+        inside = seen.inside(noise, -limits.view_inset_rad, -limits.view_inset_m)[radars]
+        in_all_views = inside.all(axis=0)
+        known = () if sure is None else sure.landmarks
+        # Too unsure for single ranges: a miss only where no echo at all is near the prediction.
+        for row in np.setdiff1d(near.unanswered(scans, noise, limits.view_inset_m), known).tolist():
+            if in_all_views[row]:
+                existence.miss(ids[row])
+        if sure is None:
+            return
+        matches.predicted += predicted_ranges(state, sure, antennas)
+        found = continue_tracks(sure.with_added_sigma(shape_sigmas_m), scans, noise, rule)
+        matches.continued += found
+        count = Counter(continuation.row for continuation in found)
+        for row in count:
+            existence.hit(ids[row])
+        for row in sure.landmarks[in_all_views[sure.landmarks]].tolist():
+            hidden = any(scan.may_hide(float(seen.ranges_m[scan.radar, row])) for scan in scans)
+            if row not in count and not hidden:
+                existence.miss(ids[row])
+        whole = max(len(scans), 2)
+        existence.seen_whole(ids[row] for row, n in count.items() if n >= whole)
 
     def _correct(
         self,
@@ -387,13 +355,6 @@ class RobustBackEnd:
         state.update(rows.at, rows.H, innovations_m, variances)
         return continued, nis
 
-    def _begin_submap_if_carried(self) -> bool:
-        carried = self._localisation.surprise.is_carried
-        if carried:
-            self._localisation.begin_submap(self.state, self._existence, self._log)
-            self._unassigned.clear()
-        return carried
-
     def _initialise_landmarks(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Make tracklets of unassigned ranges; each becomes a landmark or updates one.
 
@@ -411,7 +372,10 @@ class RobustBackEnd:
             window = rule.window if len(radars) > 1 else rule.single_window
             frames = self._unassigned.slots(radars, window)
             noise = self.parameters.ranges
-            guesses = guesses_of(frames[0], radars, noise, rule)
+            if len(radars) == 1:
+                guesses = single_guesses(frames[0])
+            else:
+                guesses = pair_guesses(frames[0], noise, rule)
             if not guesses:
                 continue
             lost = self._localisation.is_lost

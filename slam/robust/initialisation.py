@@ -5,8 +5,6 @@ odometry by a small Kalman filter on its position in the newest body frame; each
 unused range nearest to the prediction, if it passes the gate. The guess is accepted if enough
 frames hold it and its residuals are as small as those of a point at rest: clutter has no past, and
 a ghost, the fix of two ranges of different targets, does not stay at rest while the robot moves.
-A range is used once: ranges assigned to landmarks are left out, and so are those of earlier
-tracklets.
 
 A point b with noise n and known dependence D_b on the radars' range offsets measures
 
@@ -37,18 +35,22 @@ from slam.robust.association import LONGEST_M, Antennas, RangeScan, fix_of_pair
 from slam.robust.parameters import MapRule, RangeNoise, TrackletRule, chi_square_limit
 from slam.robust.state import POSITION, Array, Indices, Motion, State, rotation
 
+_SEED_MARGIN_RAD = 0.05
+_MEMBER_MARGIN_RAD = 0.1
+_SINGLE_BEARINGS_RAD = (0.0, -0.25, 0.25, -0.5, 0.5)
+_SINGLE_SPREAD_RAD = 0.2
+_SINGLE_RANGE_SIGMA_M = 0.05
+_FORBIDDEN = 1e9
+
 
 @dataclass(frozen=True, slots=True)
 class UnassignedRange:
-    """One unused range: as measured, its target's label where known, its standard deviation.
-
-    ``alone`` tells whether no other echo overlaps its own.
-    """
+    """One range that is of no landmark and no tracklet yet."""
 
     range_m: float
-    label: int | None
+    label: int | None  # of its target, where known
     sigma_m: float
-    alone: bool = True
+    alone: bool = True  # whether no other echo overlaps its own
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -61,25 +63,23 @@ class SeenFrame:
     path_m: float
     turned_rad: float
     antennas: Antennas  # in the odometry frame
+    mounts_m: Array  # shape (r, 2), the antennas in the body frame of the pose
     unused: tuple[list[UnassignedRange], ...]  # one list per radar; a range that is used is removed
 
 
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """One radar's share of one earlier frame, in the newest body frame.
+    """One radar's share of one earlier frame."""
 
-    ``x_m, y_m, yaw_rad`` is the antenna then, ``drift`` the variance [m^2] that odometry since then
-    adds to a range, ``back`` how many frames ago, ``radar`` the radar's index.
-    """
-
-    back: int
+    back: int  # how many frames ago
     radar: int
+    # The antenna then, in the newest body frame
     x_m: float
     y_m: float
     yaw_rad: float
-    drift: float
+    drift: float  # variance [m^2] that odometry since then adds to a range
     unused: list[UnassignedRange]
-    antenna_then: tuple[float, float]
+    antenna_then: tuple[float, float]  # in the body frame of then
 
 
 class UnassignedRanges:
@@ -94,7 +94,6 @@ class UnassignedRanges:
     ) -> None:
         self._sigma_m = sigma_m
         self._frames: deque[SeenFrame] = deque(maxlen=capacity)
-        self._bodies: deque[Antennas] = deque(maxlen=capacity)
         self._drift_per_m = drift_per_m
         self._drift_per_rad_m = drift_per_rad_m
         self._pose = np.zeros(3)
@@ -110,7 +109,6 @@ class UnassignedRanges:
     def clear(self) -> None:
         """Forget all frames: they were taken at another place."""
         self._frames.clear()
-        self._bodies.clear()
 
     def keep(
         self,
@@ -133,7 +131,6 @@ class UnassignedRanges:
                 if (scan.radar, index) not in used and 0.0 < range_m < LONGEST_M
             )
         turn = rotation(self._pose[2])
-        self._bodies.append(antennas)
         self._frames.append(
             SeenFrame(
                 pose_index=pose_index,
@@ -145,6 +142,7 @@ class UnassignedRanges:
                     yaw_rad=antennas.yaw_rad + self._pose[2],
                     has_frame=antennas.has_frame,
                 ),
+                mounts_m=antennas.position_m,
                 unused=unused,
             )
         )
@@ -153,7 +151,6 @@ class UnassignedRanges:
         return self._frames[-1]
 
     def pose_index(self, back: int) -> int:
-        """Return the index of the pose ``back`` frames ago."""
         return self._frames[-1 - back].pose_index
 
     def slots(self, radars: Sequence[int], window: int) -> list[list[Slot]]:
@@ -162,12 +159,12 @@ class UnassignedRanges:
         R = rotation(now.pose[2])
         frames: list[list[Slot]] = []
         for back in range(min(window, len(self._frames))):
-            frame, body = self._frames[-1 - back], self._bodies[-1 - back]
+            frame = self._frames[-1 - back]
             way, turn = now.path_m - frame.path_m, now.turned_rad - frame.turned_rad
             drift = (self._drift_per_m * way) ** 2 + (self._drift_per_rad_m * turn) ** 2
             places = ((frame.antennas.position_m - now.pose[:2]) @ R).tolist()
             yaws = (frame.antennas.yaw_rad - now.pose[2]).tolist()
-            then = body.position_m.tolist()
+            then = frame.mounts_m.tolist()
             frames.append(
                 [
                     Slot(
@@ -189,15 +186,12 @@ class UnassignedRanges:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BodyPoint:
-    """A point in the newest body frame.
+    """A point in the newest body frame."""
 
-    ``point_m`` (2,), ``covariance`` (2, 2), ``by_offsets`` (2, r): d(point) / d(range offsets);
-    ``outward`` (2,): away from where it was seen from, where the axis of a round target lies.
-    """
-
-    point_m: Array
-    covariance: Array
-    by_offsets: Array
+    point_m: Array  # shape (2,)
+    covariance: Array  # shape (2, 2)
+    by_offsets: Array  # shape (2, r), d(point) / d(range offsets)
+    # shape (2,): away from where it was seen from, where the axis of a round target lies
     outward: Array | None = None
 
 
@@ -286,7 +280,6 @@ def update_with_point(state: State, row: int, point: BodyPoint) -> float:
 
 
 def initialise_landmark(state: State, point: BodyPoint) -> int:
-    """Append a point to the map; return the new landmark's id."""
     R = rotation(state.heading_rad)
     at = np.arange(state.offsets.stop)
     columns = state.P.columns(at)
@@ -296,13 +289,6 @@ def initialise_landmark(state: State, point: BodyPoint) -> int:
     cross = columns @ G.T
     corner = G @ cross[at] + R @ point.covariance @ R.T
     return state.augment(state.position_m + R @ point.point_m, cross, (corner + corner.T) / 2)
-
-
-_SEED_MARGIN_RAD = 0.05
-_MEMBER_MARGIN_RAD = 0.1
-_SINGLE_BEARINGS_RAD = (0.0, -0.25, 0.25, -0.5, 0.5)
-_SINGLE_SPREAD_RAD = 0.2
-_SINGLE_RANGE_SIGMA_M = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -360,12 +346,6 @@ class Tracklet(Followed):
 
 F = TypeVar("F", bound=Followed)
 G = TypeVar("G")
-
-
-def guesses_of(
-    newest: Sequence[Slot], radars: Sequence[int], noise: RangeNoise, rule: TrackletRule
-) -> list[Guess]:
-    return single_guesses(newest) if len(radars) == 1 else pair_guesses(newest, noise, rule)
 
 
 def pair_guesses(newest: Sequence[Slot], noise: RangeNoise, rule: TrackletRule) -> list[Guess]:
@@ -430,7 +410,7 @@ class Tracker:
         self._offsets_known = max(self._offset_variances, default=0.0) <= (0.1 * noise.sigma_m) ** 2
 
     def follow(self, guess: Guess, frames: Sequence[Sequence[Slot]]) -> Tracklet:
-        """Return the ranges that follow a guess; twice, the second time from the first result."""
+        """Return the ranges that follow a guess; found twice, again from the first result."""
         first = self._walk(guess, frames)
         again = Guess(point_m=first.point_m, covariance=guess.covariance, label=guess.label)
         second = self._walk(again, frames)
@@ -569,7 +549,7 @@ def is_consistent(followed: Followed, n_radars: int, rule: TrackletRule) -> bool
 def best_first(
     guesses: Sequence[G], follow: Callable[[G], F], accepts: Callable[[F], bool]
 ) -> list[F]:
-    """Return what guesses lead to, best first; the ranges are taken out of the frames."""
+    """Return what is accepted, best first; its ranges are taken out of the frames."""
     found: list[F] = []
     waiting = list(guesses)
     while waiting:
@@ -614,28 +594,20 @@ def find_tracklets(
     return best_first(guesses, lambda guess: tracker.follow(guess, frames), accepts)
 
 
-_FORBIDDEN = 1e9
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RangeBearing:
-    """One point: range [m] and bearing [rad] in the body frame, covariance (2, 2).
-
-    ``label`` names the target where that is known.
-    """
+    """One point: range and bearing in the body frame, covariance (2, 2)."""
 
     range_m: float
     bearing_rad: float
     covariance: Array
-    label: int | None = None
+    label: int | None = None  # of the target, where known
 
     @property
     def values(self) -> Array:
-        """Return [range m, bearing rad]."""
         return np.array([self.range_m, self.bearing_rad])
 
     def body_point(self, n_radars: int) -> BodyPoint:
-        """Return the point in the body frame, its covariance to first order."""
         c, s = math.cos(self.bearing_rad), math.sin(self.bearing_rad)
         G = np.array([[c, -self.range_m * s], [s, self.range_m * c]])
         return BodyPoint(
@@ -683,21 +655,13 @@ def assign(
     n = len(state.landmark_ids)
     cost = np.full((len(points), n + len(points)), _FORBIDDEN)
     nearest = np.full(len(points), math.inf)
-    R = rotation(state.heading_rad)
     for i, point in enumerate(points):
         cost[i, n + i] = gate
-        place = state.position_m + R @ point.body_point(0).point_m
-        away = state.landmarks_m - place
-        for row in np.flatnonzero(np.hypot(away[:, 0], away[:, 1]) <= reach_m):
+        for row in near_rows(state, point.body_point(0), reach_m):
             distance = range_bearing_rows(state, int(row), point).mahalanobis_sq
             nearest[i] = min(nearest[i], distance)
             if distance < gate:
                 cost[i, row] = distance
-    rows: list[int | None] = []
+    new = [-1 if distance > new_gate else None for distance in nearest.tolist()]
     columns = linear_sum_assignment(cost)[1].tolist()
-    for column, distance in zip(columns, nearest.tolist(), strict=True):
-        if column < n:
-            rows.append(column)
-        else:
-            rows.append(-1 if distance > new_gate else None)
-    return rows
+    return [column if column < n else new[i] for i, column in enumerate(columns)]

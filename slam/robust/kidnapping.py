@@ -5,14 +5,12 @@ prediction with the detection probability; where it is not, by chance only: with
 span L, with 1 - exp(-n w / L) for a gate of width w. The log likelihood ratios are summed from each
 of several moments at which the robot may have been carried, and the largest sum counts (a
 cumulative sum test, Page, Biometrika 41, 1954, with few moments). Landmarks mapped after that
-moment were put where the robot was believed to be: they give no evidence. One landmark that was
-taken away proves nothing about the robot: the evidence of each is bounded, so that several must be
-missing.
+moment give no evidence, and the evidence of each is bounded, so that several must be missing.
 
-Once the evidence suffices, all measurements since the robot was carried are forgotten, perhaps
-being of other landmarks than they were assigned to, and a new *submap* begins: the error of the
-pose is zero by definition, new landmarks belong to the submap, and those of the old map stay in the
-state. All errors keep their correlations; wheels' calibration and range offsets are shared.
+Once the evidence suffices, all measurements since the robot was carried are forgotten, and a new
+*submap* begins: the error of the pose is zero by definition, new landmarks belong to the submap,
+and those of the old map stay in the state. All errors keep their correlations; wheels' calibration
+and range offsets are shared.
 
 A submap and the old map are joined by a motion T that lays landmarks of one on those of the other.
 Two pairs of landmarks with equal distances give a T, all pairs that then lie together test it. Its
@@ -52,13 +50,17 @@ from slam.robust.state import (
     rotation,
 )
 
+# Far more than what is left to know of T once it is found; sets nothing.
+_FREE_RAD, _FREE_M = 1.0, 1.0
+_SURROUNDINGS_M = 1.5
+
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Evidence of a landmark in nats: positive if the robot is not where the map has it."""
+    """Evidence of a landmark."""
 
     landmark_id: int
-    evidence: float
+    evidence: float  # in nats, positive if the robot is not where the map has it
 
 
 def evidence(
@@ -109,10 +111,6 @@ class _Hypothesis:
     def score(self) -> float:
         return sum(self.votes.values())
 
-    def score_without_one(self) -> float:
-        """Return the score without the largest vote."""
-        return self.score() - max(self.votes.values(), default=0.0)
-
 
 class Surprise:
     """The running evidence that the robot is not where the map has it."""
@@ -127,14 +125,8 @@ class Surprise:
         return max((one.score() for one in self._hypotheses), default=0.0)
 
     @property
-    def first_pose(self) -> int:
-        """Return the first pose after the robot was carried, by the best hypothesis."""
-        return max(self._hypotheses, key=_Hypothesis.score).first_pose
-
-    @property
-    def known_before(self) -> frozenset[int]:
-        """Return the landmarks that were known before that."""
-        return max(self._hypotheses, key=_Hypothesis.score).known_before
+    def best(self) -> _Hypothesis:
+        return max(self._hypotheses, key=_Hypothesis.score)
 
     @property
     def is_suspicious(self) -> bool:
@@ -143,7 +135,7 @@ class Surprise:
         One alone may be hidden or not be a point: were that enough, it could neither be deleted nor
         solved for again, and would count on.
         """
-        scores = (one.score_without_one() for one in self._hypotheses)
+        scores = (one.score() - max(one.votes.values(), default=0.0) for one in self._hypotheses)
         return max(scores, default=0.0) > self._rule.suspicious
 
     @property
@@ -167,26 +159,17 @@ class Surprise:
         self._hypotheses.clear()
 
 
-# Far more than what is left to know of T once it is found; sets nothing.
-_FREE_RAD, _FREE_M = 1.0, 1.0
-_SURROUNDINGS_M = 1.5
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Join:
-    """A motion that lays a submap on the old map.
+    """A motion that lays a submap on the old map."""
 
-    ``motion`` (3,) is applied from the left to all of the submap; ``pairs`` are rows (landmark of
-    the old map, landmark of the submap); ``evidence`` is in nats over that all of them are new.
-    """
-
-    motion: Array
-    pairs: tuple[tuple[int, int], ...]
-    evidence: float
+    motion: Array  # shape (3,), applied from the left to all of the submap
+    pairs: tuple[tuple[int, int], ...]  # rows: landmark of the old map, landmark of the submap
+    evidence: float  # in nats, against that all landmarks of the submap are new
 
 
 def begin_submap(state: State, pose: Array) -> None:
-    """Make the pose free of uncertainty, in place; nothing else is forgotten."""
+    """Make the pose certain, in place; nothing else is forgotten."""
     T = state.additive_transform()
     P = T @ state.P.full() @ T.T
     P[:3, :] = 0.0
@@ -372,29 +355,19 @@ def apply_join(state: State, join: Join, submap: Collection[int], sigma_m: float
 
 
 class Localisation:
-    """Whether the robot is where the map has it; submaps and relocation.
-
-    Attributes
-    ----------
-    surprise
-        The evidence against the pose.
-    is_lost
-        Whether the place of the robot on the map is unknown. It stays so where nothing of the map
-        is left: then there is no way back.
-    old_map
-        Ids of the old map's landmarks while there is a submap; else empty.
-    """
+    """Whether the robot is where the map has it; submaps and relocation."""
 
     def __init__(self, parameters: BackEndParameters) -> None:
         self.parameters = parameters
         self.surprise = Surprise(parameters.surprise)
         self._first_pose = 0
+        # Whether the place of the robot on the map is unknown; for good, if nothing of it is left
         self.is_lost = False
+        # Ids of the old map's landmarks while there is a submap
         self.old_map: frozenset[int] = frozenset()
 
     @property
     def lost_covariance(self) -> Array:
-        """Return the covariance of an unknown pose, shape (3, 3)."""
         sigma_m = self.parameters.relocation.lost_position_m
         return np.diag([sigma_m**2, sigma_m**2, math.pi**2 / 3.0])
 
@@ -407,14 +380,13 @@ class Localisation:
         self.surprise.look(evidence, log.n_poses - 1, state.feature_ids)
 
     def begin_submap(self, state: State, existence: Existence, log: RunLog) -> None:
-        """Begin a submap at the present pose, and forget all measurements since the pose was wrong.
+        """Begin a submap at the present pose; forget all measurements since the pose was wrong.
 
         Landmarks mapped since are removed; the rest is solved for without the ranges since then. A
         submap that exists already is deleted: only the old map is left.
         """
-        first = self.surprise.first_pose
-        log.forget_from(first)
-        known = self.old_map if self.is_lost else self.surprise.known_before
+        log.forget_from(self.surprise.best.first_pose)
+        known = self.old_map if self.is_lost else self.surprise.best.known_before
         for id_ in state.feature_ids:
             if id_ not in known:
                 forget(id_, state, existence, log)

@@ -11,17 +11,15 @@ Points and walls
         point at b:     r = |b - a|
         wall (phi, d):  r = d - n . a,   n = [cos phi, sin phi]
 
-    A corner of two walls returns the pulse by way of both, and the length of that way is twice the
-    distance to the apex: for ranges, a corner is a point. Both laws have two unknowns, so the
-    difference of their chi-squares is twice the logarithm of the likelihood ratio (and that of
-    their BIC). Over a short displacement, or at a great distance, it is near zero, and nothing is
-    decided. Source: Leonard and Durrant-Whyte, "Directed Sonar Sensing for Mobile Robot
-    Navigation", 1992, chapter 2.
+    For ranges, a corner of two walls is a point. Both laws have two unknowns, so the difference of
+    their chi-squares is twice the logarithm of the likelihood ratio (and that of their BIC). Over a
+    short displacement, or at a great distance, it is near zero. Source: Leonard and Durrant-Whyte,
+    "Directed Sonar Sensing for Mobile Robot Navigation", 1992, chapter 2.
 Round targets
     The range is r = |c - a| - R, with c the axis and R the radius: a law between a point's (R = 0)
-    and a wall's. Over a few frames no radius shows, and the point that fits lies on the surface;
-    the farther the robot drives, the more ranges miss it. The ranges of the last frames are laid
-    along odometry alone, for poses that the ranges have corrected already follow the wrong law.
+    and a wall's. Over a few frames no radius shows, and the point that fits lies on the surface.
+    The ranges of the last frames are laid along odometry alone, for poses that the ranges have
+    corrected already follow the wrong law.
     Odometry errs so that it looks like a radius: a scale error s stretches the way, x^2 / 2 r, by
     as much as R = 2 s r does, and a curvature kappa bends it by kappa x^2 / 2. Both are unknowns of
     the fit, with the radars' offsets and the wheels' white noise, each with its prior. Turns are
@@ -35,7 +33,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence, Set
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -46,6 +43,15 @@ from slam.robust.parameters import BackEndParameters, MapRule, RoundnessRule, ch
 from slam.robust.run_log import LoggedSightings, RunLog
 from slam.robust.smoother import give_radius
 from slam.robust.state import Array, Indices, State, quarter_turn
+
+# Gauss-Newton steps of a fit of a law and of a radius
+_STEPS, _RADIUS_STEPS = 8, 6
+_DAMPING = 1e-6
+# A radius off by e misses ranges up to 30 degrees from the middle one by e (1 - cos 30 deg), all
+# alike: to the hundred of one passage that is as noise ten times as large.
+_SHAPE_SIGMA_PER_RADIUS_SIGMA = 1.3
+# Steps that the way of an arc is cut into
+_KNOTS = 8
 
 
 @dataclass(slots=True)
@@ -73,7 +79,6 @@ class Existence:
         self._records[landmark_id].score -= self._rule.miss
 
     def lost(self) -> list[int]:
-        """Return the ids of landmarks whose score is below the floor."""
         return [id_ for id_, record in self._records.items() if record.score < self._rule.least]
 
     def hits(self, landmark_id: int) -> int:
@@ -119,14 +124,11 @@ class Existence:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Merge:
-    """Landmarks by row, the older first, and how likely the statement is.
+    """Pairs of landmarks that may be one, and how likely that is."""
 
-    ``log_likelihood`` is ln N(l_i - l_j; 0, S), that of several merges their joint one.
-    """
-
-    pairs: tuple[tuple[int, int], ...]
+    pairs: tuple[tuple[int, int], ...]  # by row, the older first
     mahalanobis_sq: float
-    log_likelihood: float
+    log_likelihood: float  # ln N(l_i - l_j; 0, S), of several pairs the joint one
 
 
 def merge_rows(
@@ -155,10 +157,7 @@ def judge(state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float) -> M
 
 
 def apply_merge(state: State, pairs: tuple[tuple[int, int], ...], sigma_m: float) -> None:
-    """State that pairs of landmarks are one, and marginalise the second of each.
-
-    The covariance changes in Joseph's form: the statement is nearly free of noise.
-    """
+    """State that pairs of landmarks are one, and marginalise the second of each."""
     at, H, residual, R = merge_rows(state, pairs, sigma_m)
     PHt = state.P.columns(at) @ H.T
     S = H @ PHt[at] + R
@@ -200,10 +199,7 @@ def find_merge(
 def _candidates(
     state: State, existence: Existence, rule: MapRule, old_map: Set[int]
 ) -> list[Merge]:
-    """Return all merges of two landmarks within reach that pass the gate, none of the old map.
-
-    Only pairs that are near touch the covariance, all of them at once.
-    """
+    """Return all merges of two landmarks within reach that pass the gate, none of the old map."""
     if len(state.landmark_ids) < 2:
         return []
     near = cKDTree(state.landmarks_m).query_pairs(rule.merge_reach_m, output_type="ndarray")
@@ -271,18 +267,6 @@ def _share_landmark(one: Merge, other: Merge) -> bool:
     return any(row in mine for pair in other.pairs for row in pair)
 
 
-_STEPS = 8
-_DAMPING = 1e-6
-
-
-class Law(Enum):
-    """The law that the ranges of a reflector follow."""
-
-    POINT = "point"
-    WALL = "wall"
-    UNDECIDED = "undecided"
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sightings:
     """Ranges of one reflector from several places."""
@@ -310,21 +294,8 @@ class Fit:
     extra: Array
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Verdict:
-    """Chi-squares of the two laws, each at its best."""
-
-    point: float
-    wall: float
-
-    def law(self, margin: float) -> Law:
-        if self.wall - self.point >= margin:
-            return Law.POINT
-        return Law.WALL if self.point - self.wall >= margin else Law.UNDECIDED
-
-
-def compare(sightings: Sightings, toward_rad: float) -> Verdict:
-    """Fit both laws to the same ranges.
+def compare(sightings: Sightings, toward_rad: float) -> tuple[float, float]:
+    """Return the least chi-square of the same ranges under the law of a point, and of a wall.
 
     ``toward_rad`` is roughly the direction of the reflector, in the frame of the antennas.
     """
@@ -333,7 +304,7 @@ def compare(sightings: Sightings, toward_rad: float) -> Verdict:
     n = np.array([math.cos(toward_rad), math.sin(toward_rad)])
     point = _least(sightings, np.array([*(middle + range_m * n)]), _point_law)
     wall = _least(sightings, np.array([toward_rad, range_m + float(n @ middle)]), _wall_law)
-    return Verdict(point=point.chi_square, wall=wall.chi_square)
+    return point.chi_square, wall.chi_square
 
 
 def fit_wall(sightings: Sightings, start: Array) -> Fit:
@@ -408,13 +379,6 @@ def _offset_part(sightings: Sightings) -> tuple[Array, Array, tuple[int, ...]]:
     part = (sightings.radars[:, None] == np.array(used)[None, :]).astype(np.float64)
     covariance = sightings.offset_covariance[np.ix_(used, used)] + 1e-12 * np.eye(len(used))
     return part, np.asarray(np.linalg.inv(covariance)), tuple(used)
-
-
-# A radius off by e misses ranges up to 30 degrees from the middle one by e (1 - cos 30 deg), all
-# alike: to the hundred of one passage that is as noise ten times as large.
-_SHAPE_SIGMA_PER_RADIUS_SIGMA = 1.3
-_RADIUS_STEPS = 6
-_KNOTS = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -543,20 +507,13 @@ class Roundness:
         self._sigmas_m: dict[int, float] = {}
 
     def give(
-        self,
-        state: State,
-        log: RunLog,
-        parameters: BackEndParameters,
-        hits: Callable[[int], int],
+        self, state: State, log: RunLog, parameters: BackEndParameters, existence: Existence
     ) -> bool:
-        """Give landmarks the radii that are evident; return whether all poses were solved for.
-
-        ``hits`` returns how many frames hit a landmark so far.
-        """
+        """Give landmarks the radii that are evident; return whether all poses were solved for."""
         solved = False
         rule = self._rule
         for row, id_ in enumerate(state.landmark_ids):
-            count = hits(id_)
+            count = existence.hits(id_)
             if count - self._hits.get(id_, 0) < rule.every or log.is_condensed(id_):
                 continue
             self._hits[id_] = count
@@ -581,12 +538,11 @@ class Roundness:
     def _is_news(self, id_: int, radius: Radius) -> bool:
         """Return whether a radius is worth a solution over all poses."""
         limit = chi_square_limit(radius.dof, self._rule.excess_sigmas)
-        before_m = self._sigmas_m.get(id_)
         if radius.chi_square > limit:
             return False
-        if before_m is None:
+        if id_ not in self._sigmas_m:
             return self._is_likely(radius)
-        return radius.sigma_m < self._rule.sharper * before_m
+        return radius.sigma_m < self._rule.sharper * self._sigmas_m[id_]
 
     def _is_likely(self, radius: Radius) -> bool:
         least_m = self._rule.sigmas * radius.sigma_m

@@ -1,7 +1,7 @@
 """Parameters of the robust back end: noise of wheels and radars, and the rules of its decisions.
 
 The noise comes from specifications of the robot and of the front end; the rules are the same for
-every scene. Lengths in metres, angles in radians.
+every scene.
 """
 
 from __future__ import annotations
@@ -39,15 +39,12 @@ class RangeNoise:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ContinuationRule:
-    """When single ranges may continue a track.
+    """When single ranges may continue a track."""
 
-    ``view_margin_rad`` widens the field of view. A landmark takes part while its predicted ranges
-    are surer than ``tight_sigmas`` range standard deviations. ``gates`` bounds the squared
-    Mahalanobis distance by the number of ranges, the last one for all higher numbers.
-    """
-
-    view_margin_rad: float = 0.25
+    view_margin_rad: float = 0.25  # widens the field of view
+    # A landmark takes part while its predicted ranges are surer than so many range deviations
     tight_sigmas: float = 1.0
+    # Bounds on d^2 by the number of ranges, the last one for all higher numbers
     gates: tuple[float, ...] = (9.0, 13.8)
 
 
@@ -221,15 +218,11 @@ class RelocationRule:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointRule:
-    """How points with range and bearing find their landmarks.
+    """How points with range and bearing find their landmarks."""
 
-    ``gate`` bounds d^2 of a match (2 dof, 99 %); what is farther than ``new_gate`` from every
-    landmark is new; ``reach_m`` limits the search.
-    """
-
-    gate: float = 9.21
-    new_gate: float = 25.0
-    reach_m: float = 20.0
+    gate: float = 9.21  # bound on d^2 of a match (2 dof, 99 %)
+    new_gate: float = 25.0  # d^2 to every landmark from which on a point is new
+    reach_m: float = 20.0  # limit of the search
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -243,6 +236,6 @@ class BackEndParameters:
     map: MapRule = field(default_factory=MapRule)
     surprise: SurpriseRule = field(default_factory=SurpriseRule)
     relocation: RelocationRule = field(default_factory=RelocationRule)
-    walls: WallRule | None = field(default_factory=WallRule)
-    roundness: RoundnessRule | None = field(default_factory=RoundnessRule)
-    relinearisation: RelinearisationRule | None = field(default_factory=RelinearisationRule)
+    walls: WallRule = field(default_factory=WallRule)
+    roundness: RoundnessRule = field(default_factory=RoundnessRule)
+    relinearisation: RelinearisationRule = field(default_factory=RelinearisationRule)

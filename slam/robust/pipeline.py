@@ -26,8 +26,8 @@ Array = NDArray[np.float64]
 class RobustSlam:
     """Ranges of all radars, each at its own time, into the robust back end; nothing is delayed.
 
-    The map frame is the body frame at the first odometry pose. The belief's errors are additive, as
-    everywhere outside ``slam.robust``; it holds the reported landmarks, and their ids stay.
+    The belief's errors are additive, as everywhere outside ``slam.robust``; it holds the reported
+    landmarks, and their ids stay.
     """
 
     def __init__(
@@ -42,12 +42,7 @@ class RobustSlam:
     def step(
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
-        """Take in the frames and odometry around one time; return the state if the robot has moved.
-
-        There is at most one frame per radar, each with the time it was taken at; a radar whose
-        frame was lost is absent, and without any there is odometry alone. ``pose_at`` is asked for
-        the pose at ``t_ns``, the time of the state, and at the time of every frame.
-        """
+        """Return the state if the robot has moved; without any frame there is odometry alone."""
         stamps_ns = {frame.radar: frame.t_ns for frame in frames}
         detect = partial(detect_all, self._detector, frames, self.rig)
         return self._take(detect, stamps_ns, pose_at, t_ns)
@@ -55,11 +50,7 @@ class RobustSlam:
     def step_detections(
         self, detections: Sequence[Detection], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
-        """Do what ``step`` does, from ranges that some other front end found.
-
-        Every radar counts as one with a frame; without a detection it looked at ``t_ns`` and saw
-        nothing.
-        """
+        """Do what ``step`` does; a radar without a detection looked at ``t_ns`` and saw nothing."""
         stamps_ns = dict.fromkeys(range(len(self.rig.mounts)), t_ns)
         stamps_ns |= {detection.radar: detection.t_ns for detection in detections}
         return self._take(lambda: tuple(detections), stamps_ns, pose_at, t_ns)
@@ -108,10 +99,7 @@ class RobustSlam:
         )
 
     def _sigma_m(self, detection: Detection) -> float:
-        """Return the standard deviation of a range; infinite for one to be left out.
-
-        A front end that predicts none is taken to be as good as ``range_sigma_m``.
-        """
+        """Return the standard deviation of a range; infinite for one to be left out."""
         config = self.config.robust
         if math.isnan(detection.sigma_m):
             return config.range_sigma_m
@@ -128,10 +116,7 @@ class RobustSlam:
         sigmas_m: Sequence[float],
         moved: Mapping[int, Array | None],
     ) -> list[RangeScan]:
-        """Return the scan of every radar with a frame, the ranges that are unfit as blurred.
-
-        ``moved`` has the motion of the robot from the state to each radar's own sample.
-        """
+        """Return the scan of every radar with a frame, the ranges that are unfit as blurred."""
         fit: dict[int, list[tuple[float, float]]] = {radar: [] for radar in moved}
         blurred: dict[int, list[float]] = {radar: [] for radar in moved}
         for detection, sigma_m in zip(detections, sigmas_m, strict=True):

@@ -1,12 +1,11 @@
 """The log of one run: the measurements of a solution over all poses.
 
-Of a long run the last poses are kept one by one; the measurements of older ones are condensed into
-a prior on the first pose kept, the calibration, the offsets and the landmarks.
+The measurements of poses that are kept no longer are condensed into a prior on the first pose kept,
+the calibration, the offsets and the landmarks.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 
@@ -14,11 +13,15 @@ import numpy as np
 
 from slam.config import WheelNoise
 from slam.geometry import compose, wrap_angle
-from slam.robust.state import Array, Indices, State, calibrated_motion, rotation
+from slam.robust.state import Array, Indices, Motion, State, rotation
 
-# Standard deviations below these are taken as these, so that information stays finite.
-_LEAST_CALIBRATION = 1e-7
-_LEAST_OFFSET_M = 1e-7
+# Standard deviations of calibration and offsets below this are taken as this, so that information
+# stays finite.
+_LEAST_SIGMA = 1e-7
+# Standard deviations of a step that the wheels did not measure.
+_CARRIED_M, _CARRIED_RAD = 100.0, 10.0
+# No frame gives more used ranges than that.
+_MOST_RANGES_PER_POSE = 24
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -107,8 +110,8 @@ def start_prior(
     pose_sigma: float = 1e-6,
 ) -> Prior:
     """Return the prior of a run that starts at the origin of its own map."""
-    calibration = np.maximum(calibration_sigmas, _LEAST_CALIBRATION)
-    offsets = np.maximum(offset_sigmas_m, _LEAST_OFFSET_M)
+    calibration = np.maximum(calibration_sigmas, _LEAST_SIGMA)
+    offsets = np.maximum(offset_sigmas_m, _LEAST_SIGMA)
     sigmas = np.concatenate([np.full(3, pose_sigma), calibration, offsets])
     size = len(sigmas) + 2 * n_landmarks
     information = np.zeros((size, size))
@@ -123,14 +126,13 @@ class Condensed:
         self._prior = prior
         self._ids = list(landmark_ids)
 
-    @property
-    def landmark_ids(self) -> tuple[int, ...]:
-        return tuple(self._ids)
+    def knows(self, landmark_id: int) -> bool:
+        return landmark_id in self._ids
 
     def of(self, landmark_ids: Sequence[int], n_walls: int = 0) -> Prior:
-        """Return the prior of a map: landmarks it does not know have no information.
+        """Return the prior of a map, the last ``n_walls`` of whose ids are walls'.
 
-        The last ``n_walls`` of the ids are walls'.
+        Landmarks it does not know have no information.
 
         Raises
         ------
@@ -152,8 +154,7 @@ class Condensed:
     def rename(self, gone: int, kept: int) -> None:
         """Use all information about one landmark for another, which is the same point.
 
-        With l_gone = l_kept their errors differ by a constant: e_gone = e_kept + d,
-        d = mean_kept - mean_gone.
+        Their errors differ by a constant: e_gone = e_kept + d, d = mean_kept - mean_gone.
         """
         if gone not in self._ids:
             return
@@ -203,12 +204,6 @@ def _columns(rows: Sequence[int], head: int) -> Indices:
     return np.stack([first, first + 1], axis=-1).ravel()
 
 
-# Standard deviations of a step that the wheels did not measure.
-_CARRIED_M, _CARRIED_RAD = 100.0, 10.0
-# No frame gives more used ranges than that.
-_MOST_RANGES_PER_POSE = 24
-
-
 @dataclass(slots=True)
 class _Ranges:
     poses: list[int] = field(default_factory=list)
@@ -229,7 +224,6 @@ class _Points:
 
 
 def _keep(table: _Ranges | _Points, at: Sequence[int]) -> None:
-    """Drop all rows of a table but some."""
     for name in (column.name for column in fields(table)):
         values = getattr(table, name)
         setattr(table, name, [values[i] for i in at])
@@ -254,13 +248,11 @@ class LoggedSightings:
 class RunLog:
     """Increments, used ranges and points, with the trajectory they were last solved for.
 
-    Landmarks are named by id; merges rename, deletions drop what belonged to the landmark. With
-    ``most_unsolved``, for runs whose poses are never solved for, only the last so many are kept.
+    Landmarks are named by id; merges rename, deletions drop what belonged to the landmark.
     """
 
-    def __init__(self, wheels: WheelNoise, most_unsolved: int | None = None) -> None:
+    def __init__(self, wheels: WheelNoise) -> None:
         self._wheels = wheels
-        self._most_unsolved = most_unsolved
         self._first = 0
         self._condensed: Condensed | None = None
         self._increments: list[Array] = []
@@ -270,7 +262,8 @@ class RunLog:
         self._ranges = _Ranges()
         self._points = _Points()
         self._names: dict[int, int | None] = {}
-        self._since_solved = 0
+        self.since_solved = 0
+        """How many steps ago the trajectory was last solved for, or that was tried."""
         self._stored_pose: Array = np.zeros(3)
 
     @property
@@ -282,19 +275,16 @@ class RunLog:
     def n_kept(self) -> int:
         return len(self._causal)
 
-    def add_motion(
-        self, increment: Array, covariance: Array, walk_variance: float, calibration: Array
-    ) -> None:
-        """Append a step as reported; it extends the stored trajectory."""
+    def add_motion(self, increment: Array, motion: Motion) -> None:
+        """Append a step as reported; ``motion`` is the step as the calibration corrects it."""
         self._increments.append(np.array(increment, dtype=np.float64))
-        self._covariances.append(covariance)
-        self._walks.append(walk_variance)
-        self._stored_pose = _step(self._stored_pose, increment, calibration, self._wheels)
+        self._covariances.append(motion.covariance)
+        self._walks.append(motion.walk_variance)
+        heading = float(self._stored_pose[2])
+        moved = self._stored_pose[:2] + rotation(heading) @ motion.step_m
+        self._stored_pose = np.array([moved[0], moved[1], wrap_angle(heading + motion.turn_rad)])
         self._causal.append(self._stored_pose)
-        self._since_solved += 1
-        if self._most_unsolved is not None and self.n_kept > 2 * self._most_unsolved:
-            self._forget_to(self.n_poses - self._most_unsolved)
-            self._names.clear()
+        self.since_solved += 1
 
     def set_causal(self, pose: Array) -> None:
         """Store the filter's newest pose, its measurements included."""
@@ -304,14 +294,6 @@ class RunLog:
         """Return how far [m], and by what angle [rad], a pose is from the stored trajectory."""
         away = pose - self._stored_pose
         return float(np.hypot(away[0], away[1])), abs(wrap_angle(float(away[2])))
-
-    @property
-    def since_solved(self) -> int:
-        """Return how many steps ago the trajectory was last solved for, or tried."""
-        return self._since_solved
-
-    def tried(self) -> None:
-        self._since_solved = 0
 
     def forget_from(self, pose: int) -> None:
         """Forget all measurements from a pose on; the steps stay."""
@@ -341,10 +323,10 @@ class RunLog:
         sigma_m: float,
         alone: bool = True,
     ) -> None:
-        """Append a range used; ``antenna`` is in the body frame of the pose.
+        """Append a range used.
 
-        ``sigma_m`` is that used in the filter, with association sigma and Huber's weight; ``alone``
-        tells whether no other echo overlaps its own.
+        ``antenna`` is in the body frame of the pose, ``sigma_m`` that used in the filter, with
+        association sigma and Huber's weight; ``alone``: no other echo overlaps its own.
 
         Raises
         ------
@@ -376,23 +358,20 @@ class RunLog:
             self._condensed.rename(gone, kept)
 
     def drop(self, landmark_id: int) -> None:
-        """Leave out all of a landmark's measurements from now on.
-
-        Those of condensed poses cannot be told apart any more: the landmark is marginalised there.
-        """
+        """Leave out all of a landmark's measurements; it is marginalised from condensed poses."""
         self._names[landmark_id] = None
         if self._condensed is not None:
             self._condensed.drop(landmark_id)
 
     def is_condensed(self, landmark_id: int) -> bool:
-        return self._condensed is not None and landmark_id in self._condensed.landmark_ids
+        return self._condensed is not None and self._condensed.knows(landmark_id)
 
     def sightings(
-        self, landmark_id: int, window: int, calibration: Array, most_turn_rad: float = math.inf
+        self, landmark_id: int, window: int, calibration: Array, most_turn_rad: float
     ) -> LoggedSightings:
-        """Return the ranges of a landmark over the last ``window`` poses, of echoes all alone.
+        """Return the ranges of a landmark over the last poses, of echoes all alone.
 
-        Fewer poses, if the robot turned by more than ``most_turn_rad`` since.
+        These are ``window`` poses, fewer if the robot turned by more than ``most_turn_rad`` since.
         """
         first = max(self.n_poses - 1 - window, self._first)
         steps = np.array(self._increments[first - self._first :]).reshape(-1, 3)
@@ -468,27 +447,27 @@ class RunLog:
         for the whole run; the other keeps the filter's own past.
         """
         shape = (len(self._causal), 3) if problem.is_walking else (1, 3)
-        calibration = np.broadcast_to(state.calibration, shape).copy()
+        poses = np.array(self._causal)
+        poses[-1] = state.pose
+        causal = Estimate(
+            poses=poses,
+            calibration=np.broadcast_to(state.calibration, shape).copy(),
+            offsets_m=state.offsets_m.copy(),
+            landmarks_m=state.features,
+        )
         chained = _chain(self._causal[0], problem.increments, state.calibration)
-        common = {
-            "calibration": calibration,
-            "offsets_m": state.offsets_m.copy(),
-            "landmarks_m": state.features,
-        }
-        causal = np.array(self._causal)
-        causal[-1] = state.pose
-        return [Estimate(poses=causal, **common), Estimate(poses=chained, **common)]
+        return [causal, replace(causal, poses=chained)]
 
     def solved(self, estimate: Estimate) -> None:
         self._causal = list(estimate.poses)
         self._stored_pose = estimate.poses[-1].copy()
-        self._since_solved = 0
+        self.since_solved = 0
 
     def condense(self, prior: Prior, landmark_ids: Sequence[int], n_steps: int) -> None:
         """Forget the first ``n_steps`` poses kept; ``prior`` replaces their measurements.
 
         Its landmarks are those of ``landmark_ids``, the present map. Measurements of landmarks that
-        are gone go with it, and so do old names.
+        are gone are dropped.
         """
         self._condensed = Condensed(prior, landmark_ids)
         rows = {id_: id_ for id_ in landmark_ids}
@@ -497,18 +476,13 @@ class RunLog:
             table.landmarks = names.tolist()
             _keep(table, np.flatnonzero(names >= 0).tolist())
         self._names.clear()
-        self._forget_to(self._first + n_steps)
-
-    def _forget_to(self, pose: int) -> None:
         for kept in (self._increments, self._covariances, self._walks, self._causal):
-            del kept[: pose - self._first]
-        self._first = pose
+            del kept[:n_steps]
+        self._first += n_steps
         for table in (self._ranges, self._points):
-            _keep(table, np.flatnonzero(np.array(table.poses) >= pose).tolist())
+            _keep(table, np.flatnonzero(np.array(table.poses) >= self._first).tolist())
 
-    def _rows_of(
-        self, ids: list[int], rows: dict[int, int]
-    ) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+    def _rows_of(self, ids: list[int], rows: dict[int, int]) -> Indices:
         """Return the present row of each id, -1 for landmarks that are gone."""
         final: dict[int, int] = {}
         for id_ in set(ids):
@@ -517,12 +491,6 @@ class RunLog:
                 name = self._names[name]
             final[id_] = -1 if name is None else rows.get(name, -1)
         return np.array([final[id_] for id_ in ids], dtype=np.intp)
-
-
-def _step(pose: Array, increment: Array, calibration: Array, wheels: WheelNoise) -> Array:
-    motion = calibrated_motion(increment, calibration, wheels)
-    moved = pose[:2] + rotation(float(pose[2])) @ motion.step_m
-    return np.array([moved[0], moved[1], wrap_angle(float(pose[2]) + motion.turn_rad)])
 
 
 def _chain(first: Array, increments: Array, calibration: Array) -> Array:

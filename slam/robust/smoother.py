@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,15 +44,12 @@ from slam.robust.state import (
     rotation,
 )
 
-X, POSE_HEADING, AFTER_POSE = slice(0, 2), 2, 3
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PriorTerms:
-    """Half the derivatives of a prior's cost, additive errors: shapes (m, m) and (m,)."""
-
-    information: Array
-    gradient: Array
+X, POSE_HEADING = slice(0, 2), 2
+# Columns of the border
+POSE, CALIBRATION = slice(0, 3), slice(3, 6)
+BORDER_HEAD = 6
+_LEAST_WALK_SHARE = 1e-5
+_UNKNOWN = 100.0
 
 
 def first_values(estimate: Estimate) -> Array:
@@ -72,7 +69,8 @@ def prior_cost(prior: Prior, values: Array, n_offsets: int) -> float:
     return float(e @ (prior.information @ e + 2.0 * prior.gradient))
 
 
-def prior_terms(prior: Prior, values: Array, n_offsets: int) -> PriorTerms:
+def prior_terms(prior: Prior, values: Array, n_offsets: int) -> tuple[Array, Array]:
+    """Return half the derivatives of a prior's cost by additive errors: (m, m) and (m,)."""
     e, turned = _errors(prior, values, n_offsets)
     pulled = prior.information @ e
     back = rotation(-wrap_angle(float(values[POSE_HEADING] - prior.mean[POSE_HEADING])))
@@ -81,10 +79,7 @@ def prior_terms(prior: Prior, values: Array, n_offsets: int) -> PriorTerms:
     half = _right(prior.information, back, by_heading, points)
     information = _right(half.T, back, by_heading, points)
     gradient = _right((pulled + prior.gradient)[None, :], back, by_heading, points)[0]
-    return PriorTerms(
-        information=(information + information.T) / 2,
-        gradient=gradient,
-    )
+    return (information + information.T) / 2, gradient
 
 
 def prior_about(
@@ -142,7 +137,7 @@ def _right(rows: Array, turn: Array, by_heading: Array, points: slice) -> Array:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Rows:
-    """White scalar rows of measurements: residual and derivatives."""
+    """White scalar rows of measurements: residual and derivatives; shapes (m,) unless said."""
 
     poses: Indices
     landmarks: Indices
@@ -177,13 +172,8 @@ def motion_residuals(problem: Problem, estimate: Estimate, roots: Array) -> Step
     gone = np.diff(poses[:, :2], axis=0)
     along = c * gone[:, 0] + sn * gone[:, 1]
     across = -sn * gone[:, 0] + c * gone[:, 1]
-    residual = np.column_stack(
-        [
-            along - d[:, 0],
-            across - d[:, 1],
-            wrap_angles(np.diff(poses[:, 2]) - a),
-        ]
-    )
+    turned = wrap_angles(np.diff(poses[:, 2]) - a)
+    residual = np.column_stack([along - d[:, 0], across - d[:, 1], turned])
     by_before = np.zeros((k, 3, 3))
     by_before[:, 0, 0], by_before[:, 0, 1], by_before[:, 0, 2] = -c, -sn, across
     by_before[:, 1, 0], by_before[:, 1, 1], by_before[:, 1, 2] = sn, -c, -along
@@ -279,10 +269,6 @@ def _point_rows(problem: Problem, estimate: Estimate) -> Rows:
     )
 
 
-POSE, CALIBRATION = slice(0, 3), slice(3, 6)
-BORDER_HEAD = 6
-
-
 class NormalEquations:
     """Normal equations ``[A, B; B^T, C] x = -[g, h]``: band A, border C."""
 
@@ -297,7 +283,7 @@ class NormalEquations:
         self.h = np.zeros(n_border)
 
     def add_steps(self, steps: Steps) -> None:
-        """Add motions whose calibration is one constant, in the border."""
+        """Add motions with one constant calibration, in the border."""
         before, after, by = steps.by_before, steps.by_after, steps.by_calibration
         self._add_pairs(before, after, steps.residual)
         transposed = by.transpose(0, 2, 1)
@@ -427,33 +413,23 @@ def eliminate(equations: NormalEquations) -> Eliminated:
 def solve(equations: NormalEquations) -> tuple[Array, Array]:
     """Return the change of the chain (k, size) and of the border."""
     left = eliminate(equations)
-    border = -_solve_positive(left.information, left.gradient)
+    L = np.linalg.cholesky(left.information)
+    border = -np.asarray(np.linalg.solve(L.T, np.linalg.solve(L, left.gradient)))
     chain, _ = dtbtrs(left.factor, -(left.y + left.W @ border)[:, None], uplo="L", trans="T")
     if not (np.isfinite(chain).all() and np.isfinite(border).all()):
         raise np.linalg.LinAlgError("the normal equations are singular")
     return chain.reshape(-1, left.size), border
 
 
-def _solve_positive(matrix: Array, right: Array) -> Array:
-    L = np.linalg.cholesky(matrix)
-    return np.asarray(np.linalg.solve(L.T, np.linalg.solve(L, right)))
-
-
-_LEAST_WALK_SHARE = 1e-5
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Solution:
-    """The least-squares estimate and its information.
-
-    ``information`` is the Schur complement on (last pose, its calibration, offsets, landmarks),
-    additive errors, shape (6 + r + 2 n,) squared; ``cost`` the sum of squared white residuals,
-    counted from where the prior was taken.
-    """
+    """The least-squares estimate and its information."""
 
     estimate: Estimate
+    # shape (6 + r + 2 n,) squared: the Schur complement on last pose, its calibration, offsets and
+    # landmarks, additive errors
     information: Array
-    cost: float
+    cost: float  # sum of squared white residuals, counted from where the prior was taken
 
 
 class Smoother:
@@ -461,12 +437,13 @@ class Smoother:
 
     def __init__(self, problem: Problem, rule: RelinearisationRule) -> None:
         self._problem, self._rule = problem, rule
-        self._roots = _inverse_roots(problem.covariances)
+        # W with W C W^T = I, shape (k, 3, 3)
+        self._roots = np.asarray(np.linalg.inv(np.linalg.cholesky(problem.covariances)))
         least = _LEAST_WALK_SHARE * np.sqrt(problem.walks.max(axis=0, initial=0.0))
         self._walk_roots = 1.0 / np.sqrt(problem.walks + least**2 + 1e-300)
 
     def solve(self, start: Estimate, tolerance: float = 1e-2) -> Solution | None:
-        """Return the least-squares solution reached from a start, or None if it failed.
+        """Return the solution reached from a start, or None if it failed.
 
         The search ends when the cost decreases by less than ``tolerance``.
         """
@@ -501,14 +478,11 @@ class Smoother:
 
     def cost(self, estimate: Estimate, limit: float = math.inf) -> float:
         """Return the sum of squared white residuals, each measurement's capped at ``limit``."""
-        steps, rows = (
-            motion_residuals(self._problem, estimate, self._roots),
-            measurement_residuals(self._problem, estimate),
-        )
+        steps = motion_residuals(self._problem, estimate, self._roots)
+        rows = measurement_residuals(self._problem, estimate)
         total = float(np.sum(np.minimum(rows.residual**2, limit**2)))
         total += float(np.sum(steps.residual**2))
-        walk = self._walk_residual(estimate)
-        total += float(np.sum(walk**2))
+        total += float(np.sum(self._walk_residual(estimate) ** 2))
         n_offsets = len(estimate.offsets_m)
         return total + prior_cost(self._problem.prior, first_values(estimate), n_offsets)
 
@@ -520,30 +494,18 @@ class Smoother:
         the same Schur complement: nothing is lost there, and nothing counts twice.
         """
         part = Smoother(self._problem.beginning(n_steps), self._rule)
-        calibration = estimate.calibration
-        if len(calibration) > 1:
-            calibration = calibration[: n_steps + 1]
-        beginning = Estimate(
+        beginning = replace(
+            estimate,
             poses=estimate.poses[: n_steps + 1],
-            calibration=calibration,
-            offsets_m=estimate.offsets_m,
-            landmarks_m=estimate.landmarks_m,
+            calibration=estimate.calibration[: n_steps + 1],
         )
         left = eliminate(part._equations(beginning, limit))
-        values = first_values(
-            Estimate(
-                poses=beginning.poses[-1:],
-                calibration=calibration[-1:],
-                offsets_m=estimate.offsets_m,
-                landmarks_m=estimate.landmarks_m,
-            )
+        newest = replace(
+            beginning, poses=beginning.poses[-1:], calibration=beginning.calibration[-1:]
         )
+        n_offsets, n_walls = len(estimate.offsets_m), self._problem.n_walls
         return prior_about(
-            left.information,
-            left.gradient,
-            values,
-            len(estimate.offsets_m),
-            self._problem.n_walls,
+            left.information, left.gradient, first_values(newest), n_offsets, n_walls
         )
 
     def _walk_residual(self, estimate: Estimate) -> Array:
@@ -552,8 +514,8 @@ class Smoother:
         return np.asarray(np.diff(estimate.calibration, axis=0) * self._walk_roots)
 
     def _equations(self, estimate: Estimate, limit: float) -> NormalEquations:
-        problem = self._problem
-        n_border = BORDER_HEAD + len(estimate.offsets_m) + 2 * len(estimate.landmarks_m)
+        problem, n_offsets = self._problem, len(estimate.offsets_m)
+        n_border = BORDER_HEAD + n_offsets + 2 * len(estimate.landmarks_m)
         size = 6 if problem.is_walking else 3
         equations = NormalEquations(len(problem.increments), size, n_border)
         steps = motion_residuals(self._problem, estimate, self._roots)
@@ -563,10 +525,8 @@ class Smoother:
             equations.add_steps(steps)
         rows = measurement_residuals(self._problem, estimate)
         weight = np.abs(rows.residual) <= limit
-        equations.add_rows(rows, weight, len(estimate.offsets_m))
-        n_offsets = len(estimate.offsets_m)
-        prior = prior_terms(problem.prior, first_values(estimate), n_offsets)
-        equations.add_prior(prior.information, prior.gradient)
+        equations.add_rows(rows, weight, n_offsets)
+        equations.add_prior(*prior_terms(problem.prior, first_values(estimate), n_offsets))
         return equations
 
 
@@ -591,21 +551,9 @@ def _moved(estimate: Estimate, change: tuple[Array, Array], share: float) -> Est
     )
 
 
-def _inverse_roots(covariances: Array) -> Array:
-    """Return matrices W with W C W^T = I, shape (k, 3, 3)."""
-    if not len(covariances):
-        return np.zeros((0, 3, 3))
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)))
-
-
-_UNKNOWN = 100.0
-
-
 def is_due(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
     """Return whether the pose is too far from the stored trajectory, or too many poses are kept."""
     rule = parameters.relinearisation
-    if rule is None:
-        return False
     if log.since_solved < rule.every:
         return False
     if log.n_kept > rule.most_poses:
@@ -619,10 +567,8 @@ def is_due(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
 def relinearise(log: RunLog, state: State, parameters: BackEndParameters) -> bool:
     """Solve for all poses and replace the belief by the result; return whether it worked."""
     rule = parameters.relinearisation
-    if rule is None:
-        return False
-    log.tried()
-    smoother, start = _all_poses(log, state, parameters, rule)
+    log.since_solved = 0
+    smoother, start = _all_poses(log, state, parameters)
     solution = smoother.solve(start)
     if solution is not None and not is_determined(solution.information):
         solution = None
@@ -651,11 +597,8 @@ def give_radius(
     The cost of the solution over all poses must fall by ``margin``. Then that solution replaces the
     belief.
     """
-    rule = parameters.relinearisation
-    if rule is None:
-        return False
     row, radius_m = candidate
-    smoother, start = _all_poses(log, state, parameters, rule)
+    smoother, start = _all_poses(log, state, parameters)
     solution = smoother.solve(start)
     if solution is None:
         return False
@@ -666,7 +609,7 @@ def give_radius(
     state.landmarks_m[row] += (radius_m - before_m) * away / max(float(np.hypot(*away)), 1e-6)
     if radius_m:
         state.radii_m[id_] = radius_m
-    smoother, start = _all_poses(log, state, parameters, rule)
+    smoother, start = _all_poses(log, state, parameters)
     solution = smoother.solve(start)
     fits = solution is not None and solution.cost <= least
     if solution is not None and fits and is_determined(solution.information):
@@ -691,7 +634,7 @@ def is_determined(information: Array) -> bool:
 
 
 def _all_poses(
-    log: RunLog, state: State, parameters: BackEndParameters, rule: RelinearisationRule
+    log: RunLog, state: State, parameters: BackEndParameters
 ) -> tuple[Smoother, Estimate]:
     """Return the problem of all poses and the better of the values to start from."""
     prior = start_prior(
@@ -700,7 +643,7 @@ def _all_poses(
         len(state.feature_ids),
     )
     problem = log.problem(state, prior)
-    smoother = Smoother(problem, rule)
+    smoother = Smoother(problem, parameters.relinearisation)
     return smoother, min(log.starts(state, problem), key=smoother.cost)
 
 
@@ -714,19 +657,12 @@ def _replace(state: State, solution: Solution) -> None:
     n = len(state.landmark_ids)
     state.landmarks_m = estimate.landmarks_m[:n].copy()
     state.walls = estimate.landmarks_m[n:].copy()
-    state.P = SymmetricMatrix(invariant_covariance(state, solution.information))
-
-
-def invariant_covariance(state: State, information: Array) -> Array:
-    """Return the covariance of the right-invariant error from the information of additive ones.
-
-    The smoother orders (x, y, heading, ...), the filter (heading, x, y, ...);
-    e_p = e_add,p - J p e_th, landmarks likewise.
-    """
-    additive = np.linalg.inv(information)
+    # The smoother orders (x, y, heading, ...), the filter (heading, x, y, ...)
+    additive = np.linalg.inv(solution.information)
     order = np.concatenate([[2, 0, 1], np.arange(3, len(additive))])
     additive = additive[np.ix_(order, order)]
+    # e_p = e_add,p - J p e_th, landmarks likewise
     T = state.additive_transform()
     T[1:, HEADING] *= -1.0
     P = T @ additive @ T.T
-    return np.asarray((P + P.T) / 2)
+    state.P = SymmetricMatrix(np.asarray((P + P.T) / 2))

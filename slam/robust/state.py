@@ -26,13 +26,13 @@ and to first order, with J = [0, -1; 1, 0], heading noise n_a and step noise n_d
 
 That is the identity, two rows and a change of rank two: O(m^2), in place.
 
-A change of low rank reads and writes the whole triangle and computes next to nothing with it, so
-in a large map memory is what it costs. Changes of large matrices are therefore kept as factors,
+A change of low rank reads and writes the whole triangle, so in a large map memory is what it costs.
+Changes of large matrices are therefore kept as factors,
 
     P = L + A B^T + B A^T - G G^T,
 
-L the stored triangle, and carried out together: many changes, one pass. Columns and blocks, which
-are all that a step of the filter reads, come out as if that had been done.
+L the stored triangle, and carried out together. Columns and blocks, which are all that a step of
+the filter reads, come out as if that had been done.
 """
 
 from __future__ import annotations
@@ -54,18 +54,20 @@ Indices = NDArray[np.intp]
 # Up to this size the triangle lies in a core's cache: a pass is cheaper than putting it off.
 _PROMPT_SIZE = 500
 # How much is put off of either kind: so little that carrying it out takes no longer than a step
-# may (n = 1000), and with four updates a step both fall due together in one step of 165.
+# may (n = 1000).
 _MOST_GRAMS, _MOST_PAIRS = 44, 15
 # Large matrices grow within spare rows. Not a power of two, columns would share cache sets.
 _SPARE, _ODD = 128, 8
 
+HEADING = 0
+POSITION = slice(1, 3)
+CALIBRATION = slice(3, 6)
+HEAD_SIZE = 6
+_SMALL_RAD = 1e-4
+
 
 class SymmetricMatrix:
-    """A symmetric matrix of which the lower triangle is stored, columns first.
-
-    A rank-k change costs one pass over the triangle (BLAS ``dsyrk``, ``dsyr2``), or a share of one;
-    nothing is copied, and symmetry cannot be lost because there is no second triangle.
-    """
+    """A symmetric matrix of which the lower triangle is stored, columns first."""
 
     __slots__ = ("_first", "_grams", "_lower", "_n_grams", "_n_pairs", "_second", "_size")
 
@@ -74,7 +76,7 @@ class SymmetricMatrix:
 
     def _store(self, part: Array, size: int) -> None:
         """Store a square part as the first rows and columns of ``size`` ones."""
-        room = size if size <= _PROMPT_SIZE else _room(size)
+        room = size if size <= _PROMPT_SIZE else _SPARE * (size // _SPARE + 1) + _ODD
         self._lower: Array = np.zeros((room, room), order="F")
         self._lower[: len(part), : len(part)] = part
         self._size = size
@@ -93,7 +95,7 @@ class SymmetricMatrix:
         return self._size
 
     def columns(self, at: Indices) -> Array:
-        """Return columns as they are in the full matrix, shape (m, k)."""
+        """Return columns of the full matrix, shape (m, k)."""
         m, lower = self._size, self._lower
         # Rows together: small maps keep their bits, whatever is put off for large ones.
         result: Array = np.ascontiguousarray(lower[:m, at])
@@ -104,7 +106,7 @@ class SymmetricMatrix:
         return result
 
     def block(self, at: Indices) -> Array:
-        """Return the principal submatrix of some indices, shape (k, k), full."""
+        """Return the principal submatrix of some indices, shape (k, k)."""
         part = self._lower[np.ix_(at, at)]
         result = np.where(at[:, None] < at[None, :], part.T, part)
         if self._n_grams or self._n_pairs:
@@ -228,17 +230,6 @@ class SymmetricMatrix:
         self._lower = dsyr2k(1.0, a, b, beta=1.0, c=self._lower, lower=1, overwrite_c=1)
 
 
-def _room(size: int) -> int:
-    return _SPARE * (size // _SPARE + 1) + _ODD
-
-
-HEADING = 0
-POSITION = slice(1, 3)
-CALIBRATION = slice(3, 6)
-HEAD_SIZE = 6
-_SMALL_RAD = 1e-4
-
-
 def rotation(angle_rad: float) -> Array:
     """Return the matrix that turns the plane counter-clockwise, shape (2, 2)."""
     cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
@@ -262,31 +253,7 @@ def quarter_turn(points: Array) -> Array:
 
 
 class State:
-    """Mean and covariance of the filter; changed in place by the functions of this package.
-
-    Attributes
-    ----------
-    heading_rad, position_m
-        Pose in the map frame; shape (2,).
-    calibration
-        shape (3,): s, w [1], kappa [rad/m].
-    offsets_m
-        shape (r,), what each radar measures too long.
-    landmarks_m
-        shape (n, 2), map frame.
-    landmark_ids
-        n ids in row order; an id is never used twice.
-    walls
-        shape (w, 2): phi [rad], not wrapped, and d [m], map frame.
-    wall_ids
-        w ids in row order, from the same sequence as the landmarks'.
-    radii_m, shape_sigmas_m
-        By id: radius of each landmark known to be round, whose axis is the landmark; and what is
-        added in squares to the sigmas of a feature's ranges: a radius's uncertainty, a wall's
-        roughness.
-    P
-        Covariance of the errors, size 6 + r + 2 (n + w).
-    """
+    """Mean and covariance of the filter, map frame; changed in place."""
 
     __slots__ = (
         "P",
@@ -308,16 +275,20 @@ class State:
     ) -> None:
         self.heading_rad = 0.0
         self.position_m: Array = np.zeros(2)
-        self.calibration: Array = np.zeros(3)
-        self.offsets_m: Array = np.zeros(len(offset_sigmas_m))
+        self.calibration: Array = np.zeros(3)  # s, w [1], kappa [rad/m]
+        self.offsets_m: Array = np.zeros(len(offset_sigmas_m))  # what each radar measures too long
         self.landmarks_m: Array = np.zeros((0, 2))
-        self.landmark_ids: list[int] = []
-        self.walls: Array = np.zeros((0, 2))
-        self.wall_ids: list[int] = []
+        self.landmark_ids: list[int] = []  # in row order; an id is never used twice
+        self.walls: Array = np.zeros((0, 2))  # phi [rad], not wrapped, and d [m]
+        self.wall_ids: list[int] = []  # from the same sequence as the landmarks'
+        # By id: radius of each landmark known to be round, whose axis is the landmark
         self.radii_m: dict[int, float] = {}
+        # By id: what is added in squares to the sigmas of a feature's ranges, for the uncertainty
+        # of a radius or the roughness of a wall
         self.shape_sigmas_m: dict[int, float] = {}
         self.next_id = 0
         sigmas = [0.0, 0.0, 0.0, *calibration_sigmas, *offset_sigmas_m]
+        # Covariance of the errors, size 6 + r + 2 (n + w)
         self.P = SymmetricMatrix(np.diag(np.square(sigmas)))
 
     @property
@@ -341,7 +312,6 @@ class State:
 
     @property
     def feature_radii_m(self) -> Array:
-        """Return radii in the order of their columns, (n + w,)."""
         return np.array([self.radii_m.get(id_, 0.0) for id_ in self.feature_ids])
 
     @property
@@ -389,27 +359,22 @@ class State:
         """Append a landmark and return its id; ``cross`` (m, 2), ``corner`` (2, 2)."""
         self.P.grow(cross, corner)
         if self.wall_ids:
-            self._move_last_before_walls()
+            m, n_walls = self.P.size, 2 * len(self.wall_ids)
+            order = np.arange(m)
+            order[m - n_walls - 2 :] = np.roll(order[m - n_walls - 2 :], 2)
+            self.P = SymmetricMatrix(self.P.full()[np.ix_(order, order)])
         self.landmarks_m = np.vstack([self.landmarks_m, point_m])
-        landmark_id = self.next_id
-        self.landmark_ids.append(landmark_id)
+        self.landmark_ids.append(self.next_id)
         self.next_id += 1
-        return landmark_id
+        return self.landmark_ids[-1]
 
     def augment_wall(self, wall: Array, cross: Array, corner: Array) -> int:
         """Append a wall (phi, d) and return its id; ``cross`` (m, 2), ``corner`` (2, 2)."""
         self.P.grow(cross, corner)
         self.walls = np.vstack([self.walls, wall])
-        wall_id = self.next_id
-        self.wall_ids.append(wall_id)
+        self.wall_ids.append(self.next_id)
         self.next_id += 1
-        return wall_id
-
-    def _move_last_before_walls(self) -> None:
-        m, n_walls = self.P.size, 2 * len(self.wall_ids)
-        order = np.arange(m)
-        order[m - n_walls - 2 :] = np.roll(order[m - n_walls - 2 :], 2)
-        self.P = SymmetricMatrix(self.P.full()[np.ix_(order, order)])
+        return self.wall_ids[-1]
 
     def remove(self, row: int) -> None:
         """Marginalise a landmark, or a wall; the covariance of the rest stays bit for bit."""
@@ -426,10 +391,7 @@ class State:
             del self.wall_ids[row - n]
 
     def pose_covariance(self) -> Array:
-        """Return the covariance of [x, y, heading] with additive errors, shape (3, 3).
-
-        To first order e_add,p = e_p + J p e_th.
-        """
+        """Return the covariance of [x, y, heading], shape (3, 3): e_add,p = e_p + J p e_th."""
         P = self.P.block(np.array([1, 2, 0]))
         T = np.eye(3)
         T[:2, 2] = quarter_turn(self.position_m)
@@ -458,23 +420,16 @@ class State:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Motion:
-    """One increment of the body frame before it, corrected for the calibration errors.
+    """One increment of the body frame before it, corrected for the calibration errors."""
 
-    ``step_m`` has shape (2,), d above; ``covariance`` of (d, a), shape (3, 3).
-    """
-
-    step_m: Array
+    step_m: Array  # shape (2,), d above
     turn_rad: float
-    covariance: Array
+    covariance: Array  # of (d, a), shape (3, 3)
     walk_variance: float
 
     @property
     def distance_m(self) -> float:
         return math.hypot(self.step_m[0], self.step_m[1])
-
-
-def at_rest() -> Motion:
-    return Motion(step_m=np.zeros(2), turn_rad=0.0, covariance=np.zeros((3, 3)), walk_variance=0.0)
 
 
 def calibrated_motion(

@@ -37,7 +37,7 @@ from slam.robust.initialisation import (
     clear_match,
     is_consistent,
 )
-from slam.robust.map import Law, Sightings, compare, fit_wall
+from slam.robust.map import Sightings, compare, fit_wall
 from slam.robust.parameters import BackEndParameters, RangeNoise, WallRule
 from slam.robust.state import HEADING, Array, State, rotation
 
@@ -81,13 +81,10 @@ class WallTracker:
     """Follows guesses of walls back in time; offsets as in ``Tracker``."""
 
     def __init__(
-        self,
-        parameters: BackEndParameters,
-        rule: WallRule,
-        offsets_m: Array,
-        offset_covariance: Array,
+        self, parameters: BackEndParameters, offsets_m: Array, offset_covariance: Array
     ) -> None:
-        self._noise, self._rule, self._walls = parameters.ranges, parameters.tracklets, rule
+        self._noise, self._rule = parameters.ranges, parameters.tracklets
+        self._walls = parameters.walls
         self._offsets: list[float] = offsets_m.tolist()
         self._offset_variances: list[float] = offset_covariance.diagonal().tolist()
         known = max(self._offset_variances, default=0.0) <= (0.1 * self._noise.sigma_m) ** 2
@@ -156,8 +153,8 @@ class WallTracker:
     def _with_free_offsets(self, walked: WallTracklet) -> WallTracklet:
         """Judge the members by a wall *and* the radars' common offsets, which are uncertain.
 
-        While walking, an offset's uncertainty is noise of each range, and a wall would be allowed
-        to miss every range by it. It is one number: a wall may miss them all alike.
+        For the filter, an offset's uncertainty is noise of each range. It is one number: a wall may
+        miss all ranges alike.
         """
         if walked.dof < 1:
             return walked
@@ -186,7 +183,6 @@ class WallTracker:
         return self._heading_rad_per_sqrt_m**2 * way / 3.0
 
     def _way_m(self, tracklet: WallTracklet) -> float:
-        """Return how far the echo moved along the wall."""
         phi = float(tracklet.wall[0])
         along = [math.cos(phi) * m.slot.y_m - math.sin(phi) * m.slot.x_m for m in tracklet.members]
         of_radar: dict[int, list[float]] = {}
@@ -203,16 +199,16 @@ class WallTracker:
             return False
         if not is_consistent(tracklet, 2, self._rule):
             return False
-        verdict = compare(self.sightings(members), float(tracklet.wall[0]))
-        return verdict.law(self._walls.wall_margin) is Law.WALL
+        point, wall = compare(self.sightings(members), float(tracklet.wall[0]))
+        return point - wall >= self._walls.wall_margin
 
     def is_point(self, tracklet: Tracklet) -> bool:
         """Return whether the ranges of a tracklet follow a point's law, not a wall's."""
         members = tracklet.members
         middle = np.mean([(m.slot.x_m, m.slot.y_m) for m in members], axis=0)
         x, y = tracklet.point_m - middle
-        verdict = compare(self.sightings(members), math.atan2(y, x))
-        return verdict.law(self._walls.point_margin) is Law.POINT
+        point, wall = compare(self.sightings(members), math.atan2(y, x))
+        return wall - point >= self._walls.point_margin
 
     def sightings(self, members: Sequence[Member]) -> Sightings:
         offsets = np.array([self._offsets[member.slot.radar] for member in members])
@@ -227,16 +223,12 @@ class WallTracker:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BodyWall:
-    """A wall in the newest body frame.
+    """A wall in the newest body frame."""
 
-    ``wall`` (2,): phi [rad], d [m]; ``covariance`` (2, 2); ``by_offsets`` (2, r): d(phi, d) /
-    d(range offsets); ``feet_m`` (k, 2): where its echoes came from.
-    """
-
-    wall: Array
-    covariance: Array
-    by_offsets: Array
-    feet_m: Array
+    wall: Array  # shape (2,): phi [rad], d [m]
+    covariance: Array  # shape (2, 2)
+    by_offsets: Array  # shape (2, r), d(phi, d) / d(range offsets)
+    feet_m: Array  # shape (k, 2), where its echoes came from
 
     def in_map(self, state: State) -> Array:
         """Return where its echoes came from in the map frame, shape (k, 2)."""
@@ -280,9 +272,6 @@ class WallCells:
                 spans.append((begin, end))
         return spans
 
-    def merge(self, kept: int, gone: int) -> None:
-        self._cells.setdefault(kept, set()).update(self._cells.pop(gone, set()))
-
     def forget(self, wall_id: int) -> None:
         self._cells.pop(wall_id, None)
 
@@ -313,8 +302,7 @@ def wall_rows(state: State, wall_row: int, seen: BodyWall) -> FeatureRows:
 def match_wall(state: State, seen: BodyWall, cells: WallCells, rule: WallRule) -> int | None:
     """Return the row of the wall that a wall seen is, or None where no match is clear.
 
-    As for points: the match must pass the gate, be likelier than a wall not yet in the map, and
-    beat the next best; and the two must come within reach of each other along the line.
+    The rules are those of points; and the two must come within reach of each other along the line.
     """
     feet = seen.in_map(state)
     scored = []
@@ -328,7 +316,7 @@ def match_wall(state: State, seen: BodyWall, cells: WallCells, rule: WallRule) -
 
 
 def is_unresolved(state: State, seen: BodyWall, cells: WallCells, rule: WallRule) -> bool:
-    """Return whether a wall seen is nearer to a mapped one than radars tell two walls apart."""
+    """Return whether a wall seen is too near to a mapped one for radars to separate the two."""
     feet = seen.in_map(state)
     phi_seen = float(seen.wall[0]) + state.heading_rad
     for row, wall_id in enumerate(state.wall_ids):
@@ -365,51 +353,30 @@ def initialise_wall(state: State, seen: BodyWall) -> int:
     return state.augment_wall(np.array([phi, d]), cross, (corner + corner.T) / 2)
 
 
-def foot_points(state: State, wall_row: int, antennas: Antennas) -> Array:
-    """Return where each antenna's echo of a wall comes from, map frame, shape (r, 2)."""
-    phi, d = (float(value) for value in state.walls[wall_row])
-    n = np.array([math.cos(phi), math.sin(phi)])
-    places = state.position_m + antennas.position_m @ rotation(state.heading_rad).T
-    return np.asarray(places + np.outer(d - places @ n, n))
-
-
-def hide_unknown(state: State, seen: View, feet_m: Array, cells: WallCells) -> View:
-    """Move walls out of view where no wall tracklet has shown them.
-
-    The end of a wall reflects, too, from farther on: its edge's range leaves the wall's by x^2 / 2
-    r only, within the gates of single ranges for long, and would turn wall and pose.
-
-    ``feet_m`` has shape (r, w, 2): where echoes come from.
-    """
-    n = len(state.landmark_ids)
-    off = seen.off_boresight_rad.copy()
-    for row, wall_id in enumerate(state.wall_ids):
-        for radar, place in enumerate(along_wall(state, row, feet_m[:, row]).tolist()):
-            if not cells.surrounds(wall_id, place):
-                off[radar, n + row] = math.pi
-    return replace(seen, off_boresight_rad=off)
-
-
 class WallKeeper:
-    """The walls of a state; without a rule for walls there are none.
-
-    Attributes
-    ----------
-    cells
-        Which stretches of them gave echoes.
-    """
+    """The walls of a state."""
 
     def __init__(self, state: State, parameters: BackEndParameters) -> None:
-        self._state, self._parameters = state, parameters
-        self._rule = parameters.walls or WallRule()
+        self._state, self._parameters, self._rule = state, parameters, parameters.walls
         self.cells = WallCells(self._rule.cell_m)
 
     def look(self, seen: View, antennas: Antennas) -> View:
-        """Return a view without the walls that are not known where they would reflect."""
-        state = self._state
-        feet = [foot_points(state, row, antennas) for row in range(len(state.wall_ids))]
-        by_radar = np.array(feet).reshape(-1, len(antennas.yaw_rad), 2).transpose(1, 0, 2)
-        return hide_unknown(state, seen, by_radar, self.cells)
+        """Return a view without the walls that no wall tracklet has shown where they would reflect.
+
+        The end of a wall reflects, too, from farther on: its edge's range leaves the wall's by x^2
+        / 2 r only, within the gates of single ranges for long, and would turn wall and pose.
+        """
+        state, n = self._state, len(self._state.landmark_ids)
+        off = seen.off_boresight_rad.copy()
+        places = state.position_m + antennas.position_m @ rotation(state.heading_rad).T
+        for row, wall_id in enumerate(state.wall_ids):
+            phi, d = (float(value) for value in state.walls[row])
+            normal = np.array([math.cos(phi), math.sin(phi)])
+            feet = np.asarray(places + np.outer(d - places @ normal, normal))
+            for radar, place in enumerate(along_wall(state, row, feet).tolist()):
+                if not self.cells.surrounds(wall_id, place):
+                    off[radar, n + row] = math.pi
+        return replace(seen, off_boresight_rad=off)
 
     def is_point(self, tracklet: Tracklet) -> bool:
         """Return whether the ranges of a tracklet follow a point's law rather than a wall's.
@@ -417,8 +384,6 @@ class WallKeeper:
         What goes on where a mapped wall does is not known to be a point yet: over a few frames both
         laws fit.
         """
-        if self._parameters.walls is None:
-            return True
         tracker = self._tracker()
         return tracker.is_point(tracklet) and not self._is_on_a_wall(tracklet, tracker)
 
@@ -446,11 +411,11 @@ class WallKeeper:
     def _tracker(self) -> WallTracker:
         state = self._state
         offsets = np.arange(state.offsets.start, state.offsets.stop)
-        return WallTracker(self._parameters, self._rule, state.offsets_m, state.P.block(offsets))
+        return WallTracker(self._parameters, state.offsets_m, state.P.block(offsets))
 
     def find(self, unassigned: UnassignedRanges, radars: Sequence[int]) -> list[WallTracklet]:
         """Return the walls among the unassigned ranges of one side, and use these up."""
-        if self._parameters.walls is None or len(radars) < 2:
+        if len(radars) < 2:
             return []
         frames = unassigned.slots(radars, self._rule.window)
         guesses = wall_guesses(frames[0], self._parameters.ranges)
@@ -462,7 +427,7 @@ class WallKeeper:
     def place(self, tracklet: WallTracklet) -> tuple[int, bool] | None:
         """Bring a wall into the map; return its id and whether it is new.
 
-        None: it is too near to a mapped one to be another.
+        None: it is another wall, too near to a mapped one.
         """
         state = self._state
         phi, d = tracklet.wall
@@ -476,9 +441,9 @@ class WallKeeper:
         )
         row = match_wall(state, seen, self.cells, self._rule)
         is_new = row is None
-        if row is None and is_unresolved(state, seen, self.cells, self._rule):
-            return None
         if row is None:
+            if is_unresolved(state, seen, self.cells, self._rule):
+                return None
             wall_id = initialise_wall(state, seen)
             state.shape_sigmas_m[wall_id] = self._rule.roughness_m
             row = len(state.wall_ids) - 1

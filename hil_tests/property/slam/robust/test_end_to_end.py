@@ -18,31 +18,21 @@ from numpy.typing import NDArray
 
 from hil_tests.property.slam.front_end.test_detection import N_BINS, frame, pulse
 from hil_tests.system.short_scene import write_short_scene
-from hil_tests.unit.slam.robust.range_world import LAB
-from hil_tests.unit.slam.simulation import FRAME_NS, World, at_rest, integrate, simulate
-from slam.app.run.runner import execute
+from hil_tests.unit.slam.robust.range_world import LAB, odometry_path
+from hil_tests.unit.slam.simulation import FRAME_NS, World, at_rest, simulate
+from slam.app.run.runner import execute, make_slam
 from slam.app.sweep.run import make_case, source_of
 from slam.config import WheelNoise, load_preset, override
 from slam.evaluation import align_se2, ate_rmse_m
 from slam.frames import Detection, RadarFrame
 from slam.front_end import make_detector
 from slam.geometry import paper_rig, transform
-from slam.pipelines import make_slam
 from slam.results import PoseAt, StepResult
 
 Array = NDArray[np.float64]
 
 PRESETS = ("paper", "robust")
 WHEELS = WheelNoise()
-
-
-def cut(world: World, n: int) -> World:
-    return replace(
-        world,
-        truth=world.truth[:n],
-        odometry=world.odometry[:n],
-        detections=world.detections[:n],
-    )
 
 
 def run(world: World, preset: str) -> list[StepResult]:
@@ -79,7 +69,7 @@ def exact_world(before_ns: tuple[int, ...]) -> World:
     Each radar samples some time before the pose, on the straight or within the turn to it.
     """
     straight, left = [(0.01, 0.0, 0.0)], [(0.0, 0.0, math.pi / 32)]
-    truth = integrate(np.array(straight * 100 + left * 16 + straight * 50))
+    truth = odometry_path(np.array(straight * 100 + left * 16 + straight * 50))
     detections: list[tuple[Detection, ...]] = [()]
     for k in range(1, len(truth)):
         seen: list[Detection] = []
@@ -120,7 +110,7 @@ def test_without_noise_path_and_map_are_exact(preset: str, before_ns: tuple[int,
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_clock_and_chance_take_no_part(preset: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    world = cut(simulate(LAB, paper_rig(), 5, laps=1), 260)  # with a corner
+    world = simulate(LAB, 5, laps=1).cut(260)  # with a corner
     wanted = bytes_of(run(world, preset))
     assert len(wanted[-1][3]) >= 2
 

@@ -148,7 +148,7 @@ def drive_robust(seed: int, n_steps: int) -> tuple[list[Array], list[Array], lis
     state = random_state(seed, N_LANDMARKS, float(rng.uniform(-3, 3)))
     # Each radar sees each landmark, at right angles or not, from within a metre or two.
     state.landmarks_m = state.position_m + rng.uniform(0.5, 2.0, (N_LANDMARKS, 2))
-    antennas = antennas_of(paper_rig(), (), calibrated_motion(np.zeros(3), np.zeros(3), WHEELS))
+    antennas = antennas_of(paper_rig(), (), np.zeros(3))
     radars = np.repeat(np.arange(N_RADARS), N_LANDMARKS)
     landmarks = np.tile(np.arange(N_LANDMARKS), N_RADARS)
     H, F, T = [], [], []

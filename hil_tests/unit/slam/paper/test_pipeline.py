@@ -24,8 +24,8 @@ from slam.config import (
     override,
 )
 from slam.evaluation import ate_rmse_m
-from slam.frames import Detection, RadarFrame
-from slam.geometry import Mount, Rig, paper_rig
+from slam.frames import Detection
+from slam.geometry import paper_rig
 from slam.paper.ekf import motion_noise
 from slam.paper.pipeline import UwbRadarSlam
 from slam.results import StepResult
@@ -101,46 +101,6 @@ def test_map_frame_is_the_first_odometry_pose() -> None:
     assert slam.belief.pose == pytest.approx([0.5, 0.0, math.pi / 2], abs=1e-12)
 
 
-def test_frames_give_what_their_detections_give() -> None:
-    """Feed frames with one echo per radar, and the detections the front end finds in them."""
-    rig = paper_rig()
-    config = SlamConfig(window=WindowConfig(end_of_run=EndOfRun.FLUSH))
-    by_frames, by_detections = UwbRadarSlam(config, rig), UwbRadarSlam(config, rig)
-    bin_length_m = 299_792_458 / (2 * 23.328e9)
-    labels = 0.2 + bin_length_m * np.arange(1431)
-    one: list[StepResult] = []
-    two: list[StepResult] = []
-    for k in range(25):
-        pose = np.array([0.01 * k, 0.0, 0.0])
-        frames, detections = [], []
-        for radar in (0, 1):
-            mount = rig.mounts[radar]
-            range_m = math.dist((0.1, 1.0), (pose[0] + mount.x_m, mount.y_m))
-            envelope = 0.015 * np.exp(-0.5 * ((labels - range_m) / 0.0517) ** 2)
-            echo = envelope * np.cos(4 * math.pi * 7.29e9 * (labels - range_m) / 299_792_458)
-            frame = RadarFrame(
-                radar=radar,
-                t_ns=k,
-                counter=k,
-                samples=echo.astype(np.float32),
-                range_start_m=0.2,
-                bin_length_m=bin_length_m,
-            )
-            frames.append(frame)
-            peak = round((range_m - 0.2) / bin_length_m)
-            detections.append(
-                Detection(radar=radar, t_ns=k, range_m=float(labels[peak]), amplitude=0.01)
-            )
-        one += by_frames.step(frames, at_rest(pose), k)
-        two += by_detections.step_detections(detections, at_rest(pose), k)
-    one += by_frames.flush()
-    two += by_detections.flush()
-    assert [len(r.observations) for r in one] == [len(r.observations) for r in two]
-    assert len(one[-1].belief.landmark_ids) == 1
-    # The peak of the sampled magnitude can lie one carrier ripple off the nearest bin.
-    assert one[-1].belief.landmarks == pytest.approx(two[-1].belief.landmarks, abs=0.05)
-
-
 def test_lost_frame_of_one_radar_costs_only_the_fixes_of_its_pair() -> None:
     rig = paper_rig()
     slam = UwbRadarSlam(SlamConfig(window=WindowConfig(size=1)), rig)
@@ -176,14 +136,7 @@ def bytes_of(results: list[StepResult]) -> list[bytes]:
 @pytest.mark.parametrize("sample_time", list(SampleTime))
 def test_the_rule_of_sample_times_changes_no_bit_where_it_must_not(sample_time: SampleTime) -> None:
     """Take all samples at once under "own"; under "nominal", at any time within the frame."""
-    whole = simulate(LAB, paper_rig(), 5, laps=1)
-    n = 300  # with a corner
-    world = replace(
-        whole,
-        truth=whole.truth[:n],
-        odometry=whole.odometry[:n],
-        detections=whole.detections[:n],
-    )
+    world = simulate(LAB, 5, laps=1).cut(300)  # with a corner
     paper = load_preset("paper")
     changed = override(paper, {"trilateration.sample_time": sample_time.value})
     if sample_time is SampleTime.NOMINAL:
@@ -203,13 +156,10 @@ def test_the_rule_of_sample_times_changes_no_bit_where_it_must_not(sample_time: 
 @pytest.mark.slow
 @pytest.mark.parametrize(("room", "environment"), [(LAB, "lab"), (CLASSROOM, "classroom")])
 def test_slam_beats_the_odometry_it_is_given(room: Room, environment: str) -> None:
-    """Drive four laps, both ways round, on three seeds; `uwb-slam sweep` has the statistics.
-
-    Over 20 seeds the medians of SLAM and odometry are 29 and 51 mm (lab), 79 and 352 (classroom).
-    """
+    """Drive four laps on three seeds; `uwb-slam sweep` has the statistics."""
     errors = []
     for seed in range(3):
-        world = simulate(room, paper_rig(), seed)
+        world = simulate(room, seed)
         results = run(world, load_preset("paper", environment))
         odometry_ate = ate_rmse_m(world.odometry[:, :2], world.truth[:, :2])
         errors.append((ate_rmse_m(*trajectories(results, world)), odometry_ate))
@@ -290,32 +240,6 @@ def test_proportional_noise_lies_along_the_robots_heading_in_the_map() -> None:
     wanted[2, 2] = 0.04 * 4.2e-3**2 + turned
     wanted[0, 2] = wanted[2, 0] = -0.04 * turned
     assert pytest.approx(wanted, rel=1e-9, abs=1e-18) == P
-
-
-def test_range_offset_of_each_mount_is_subtracted() -> None:
-    mounts = tuple(
-        Mount(name=m.name, x_m=m.x_m, y_m=m.y_m, yaw_rad=m.yaw_rad, range_offset_m=0.05 * k)
-        for k, m in enumerate(paper_rig().mounts)
-    )
-    slam = UwbRadarSlam(SlamConfig(window=EVERY_STATE), Rig(mounts=mounts))
-    labels = 0.2 + 0.01 * np.arange(200)
-    # Every module labels its echo 0.9 m.
-    echo = 0.02 * np.exp(-0.5 * ((labels - 0.9) / 0.05) ** 2)
-    frames = [
-        RadarFrame(
-            radar=radar,
-            t_ns=1,
-            counter=1,
-            samples=echo.astype(np.float32),
-            range_start_m=0.2,
-            bin_length_m=0.01,
-        )
-        for radar in range(4)
-    ]
-    slam.step((), at_rest(np.zeros(3)), 0)
-    (result,) = slam.step(frames, at_rest(np.array([0.01, 0.0, 0.0])), 1)
-    found = {detection.radar: detection.range_m for detection in result.detections}
-    assert found == {k: pytest.approx(0.9 - 0.05 * k, abs=1e-9) for k in range(4)}
 
 
 def test_as_printed_every_step_adds_the_same_in_world_axes() -> None:

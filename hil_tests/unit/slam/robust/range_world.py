@@ -1,12 +1,12 @@
-"""A world at the level of ranges for the robust back end.
+"""A world at the level of ranges, to judge back ends without echoes.
 
-A robot drives a square four times with turns on the spot, among point landmarks beside the path.
-Radars detect with a probability and see clutter; wheels have calibration errors per run, which
-may walk. Geometry is written out again here, so that the back end is judged by another hand.
+A robot drives a square with turns on the spot, among point landmarks beside the path. Radars detect
+with a probability and see clutter; wheels have calibration errors per run, which may walk. Geometry
+is written out again here: no product code takes part.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,8 +14,11 @@ from numpy.typing import NDArray
 
 from slam.config import WheelNoise
 from slam.geometry import Mount, paper_rig
+from slam.results import UpdateReport
 from slam.robust.association import RangeScan
+from slam.robust.back_end import RobustBackEnd
 from slam.robust.parameters import BackEndParameters, RangeNoise
+from slam.robust.state import Motion, calibrated_motion
 
 Array = NDArray[np.float64]
 
@@ -41,29 +44,6 @@ CLASSROOM = Room(
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Stress:
-    """What makes a run hard.
-
-    ``random_share`` of the ranges are replaced by uniform ones; ``dropped_share`` of the frames
-    are lost, radar by radar; ``sampled_after`` gives each radar's sample time in steps after the
-    pose; ``offset_m`` is the standard deviation of each radar's constant offset; ``dead`` radars
-    send nothing; ``silent_share`` of the run, in one piece, no radar does; ``walk`` is how far the
-    calibration errors wander over the whole run, in their own standard deviations; after a share
-    ``carried_at`` of the run the robot is carried on by ``carried_laps``, unknown to the wheels.
-    """
-
-    random_share: float = 0.0
-    dropped_share: float = 0.0
-    sampled_after: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    offset_m: float = 0.0
-    dead: tuple[int, ...] = ()
-    silent_share: float = 0.0
-    walk: float = 0.0
-    carried_at: float = 1.0
-    carried_laps: float = 0.37
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Run:
     """One run: true poses (k, 3), landmarks (n, 2), reported increments (k - 1, 3), scans."""
@@ -74,19 +54,11 @@ class Run:
     scans: list[list[RangeScan]]
 
 
-def true_path(room: Room) -> Array:
-    """Return the poses of four laps, shape (k, 3), heading not wrapped."""
-    n_side = round(room.side_m / STEP_M)
-    x = y = heading = 0.0
-    poses = [(x, y, heading)]
-    for _ in range(4 * LAPS):
-        for _ in range(n_side):
-            x, y = x + STEP_M * math.cos(heading), y + STEP_M * math.sin(heading)
-            poses.append((x, y, heading))
-        for _ in range(TURN_STEPS):
-            heading += math.pi / 2 / TURN_STEPS
-            poses.append((x, y, heading))
-    return np.array(poses)
+def true_path(room: Room, laps: int = LAPS) -> Array:
+    """Return the poses of some laps, shape (k, 3), heading not wrapped."""
+    straight = [(STEP_M, 0.0, 0.0)] * round(room.side_m / STEP_M)
+    turn = [(0.0, 0.0, math.pi / 2 / TURN_STEPS)] * TURN_STEPS
+    return odometry_path(np.array((straight + turn) * (4 * laps)))
 
 
 def place_landmarks(room: Room, rng: np.random.Generator) -> Array:
@@ -106,28 +78,27 @@ def place_landmarks(room: Room, rng: np.random.Generator) -> Array:
 
 
 def simulate(
-    room: Room, seed: int, sigma_m: float, stress: Stress | None = None, labelled: bool = False
+    room: Room,
+    seed: int,
+    sigma_m: float,
+    offset_m: float = 0.0,
+    *,
+    laps: int = LAPS,
+    labelled: bool = False,
 ) -> Run:
-    """Return one run; ``labelled`` ranges tell which landmark they are of, clutter left out."""
-    stress = stress or Stress()
+    """Return one run; ``labelled`` ranges tell which landmark they are of, clutter left out.
+
+    ``offset_m`` is the standard deviation of each radar's constant offset.
+    """
     rng = np.random.default_rng(seed)
-    poses = true_path(room)
+    poses = true_path(room, laps)
     landmarks = place_landmarks(room, rng)
-    cut = round(stress.carried_at * len(poses))
-    if cut < len(poses):
-        poses = np.delete(poses, np.s_[cut : cut + carried_steps(room, stress)], axis=0)
-    increments = reported(poses, room, rng, stress.walk, unaware=cut)
     return Run(
         poses=poses,
         landmarks=landmarks,
-        increments=increments,
-        scans=list(scans_of(poses, landmarks, rng, sigma_m, stress, labelled=labelled)),
+        increments=reported(poses, room, rng, 0.0),
+        scans=list(scans_of(poses, landmarks, rng, sigma_m, offset_m, labelled=labelled)),
     )
-
-
-def carried_steps(room: Room, stress: Stress) -> int:
-    """Return how many steps of the path a carried robot leaves out."""
-    return round(stress.carried_laps * 4 * (room.side_m / STEP_M + TURN_STEPS))
 
 
 def reported(
@@ -166,59 +137,32 @@ def scans_of(
     landmarks: Array,
     rng: np.random.Generator,
     sigma_m: float,
-    stress: Stress,
+    offset_m: float = 0.0,
     *,
-    labelled: bool,
+    radars: Collection[int] = range(4),
+    labelled: bool = False,
 ) -> Iterator[list[RangeScan]]:
-    """Yield what the radars detect at each pose but the first."""
-    mounts = paper_rig().mounts
-    n = len(poses)
-    offsets = stress.offset_m * rng.standard_normal(len(mounts))
-    silent_from = int(rng.uniform(0.1, 0.8) * n)
-    silent = range(silent_from, silent_from + int(stress.silent_share * n))
+    """Yield what some radars detect at each pose but the first."""
+    mounts, n = paper_rig().mounts, len(poses)
+    offsets = offset_m * rng.standard_normal(len(mounts))
     ranges = np.empty((len(mounts), n, len(landmarks)))
     seen = np.empty((len(mounts), n, len(landmarks)), dtype=bool)
     for radar, mount in enumerate(mounts):
-        at = sampled_poses(poses, stress.sampled_after[radar])
-        ranges[radar], off = polar(at, mount, landmarks)
+        ranges[radar], off = polar(poses, mount, landmarks)
         seen[radar] = (off <= math.radians(32.5)) & (ranges[radar] >= 0.2) & (ranges[radar] <= 1.5)
     seen &= rng.random(seen.shape) < 0.92
     ranges += sigma_m * rng.standard_normal(ranges.shape) + offsets[:, None, None]
-    random = rng.random(ranges.shape) < stress.random_share
-    ranges[random] = rng.uniform(0.2, 1.5, int(random.sum()))
     n_clutter = rng.poisson(0.15, (len(mounts), n))
-    dropped = rng.random((len(mounts), n)) < stress.dropped_share
     for k in range(1, n):
         scans = []
-        for radar in range(len(mounts)):
-            clutter = rng.uniform(0.2, 1.5, n_clutter[radar, k])
-            if radar in stress.dead or dropped[radar, k] or k in silent:
-                continue
+        for radar in radars:
             ids = np.flatnonzero(seen[radar, k])
             own = ranges[radar, k, ids].tolist()
-            labels: tuple[int, ...] | None = None
-            if labelled:
-                true = ~random[radar, k, ids]
-                own, labels = ranges[radar, k, ids[true]].tolist(), tuple(ids[true].tolist())
-            else:
-                own += clutter.tolist()
-            scans.append(
-                RangeScan(
-                    radar=radar,
-                    ranges_m=tuple(own),
-                    sampled_after=stress.sampled_after[radar],
-                    labels=labels,
-                )
-            )
+            if not labelled:
+                own += rng.uniform(0.2, 1.5, n_clutter[radar, k]).tolist()
+            labels = tuple(ids.tolist()) if labelled else None
+            scans.append(RangeScan(radar=radar, ranges_m=tuple(own), labels=labels))
         yield scans
-
-
-def sampled_poses(poses: Array, f: float) -> Array:
-    """Return the poses a fraction of a step later; on the spot and straight ahead exactly."""
-    if f == 0.0:
-        return poses
-    after = np.vstack([poses[1:], poses[-1:]]) if f > 0 else np.vstack([poses[:1], poses[:-1]])
-    return poses + abs(f) * (after - poses)
 
 
 def polar(poses: Array, mount: Mount, landmarks: Array) -> tuple[Array, Array]:
@@ -231,11 +175,8 @@ def polar(poses: Array, mount: Mount, landmarks: Array) -> tuple[Array, Array]:
     return np.hypot(dx, dy), np.abs((off + math.pi) % math.tau - math.pi)
 
 
-def parameters_for(
-    room: Room, sigma_m: float, stress: Stress | None = None, walk_per_sqrt_m: float = 0.0
-) -> BackEndParameters:
+def parameters_for(room: Room, sigma_m: float, walk_per_sqrt_m: float = 0.0) -> BackEndParameters:
     """Return the matched parameters: noise as specified, rules as they are."""
-    stress = stress or Stress()
     wheels = WheelNoise(
         heading_rad_per_sqrt_m=room.curvature_sigma,
         scale_sigma=room.scale_sigma,
@@ -243,14 +184,23 @@ def parameters_for(
         curvature_sigma_rad_per_m=room.curvature_sigma,
         walk_per_sqrt_m=walk_per_sqrt_m,
     )
-    extra = stress.random_share * 0.92 * 1.5
-    ranges = RangeNoise(
-        sigma_m=sigma_m,
-        offset_sigma_m=stress.offset_m,
-        detection_probability=0.92 * (1.0 - stress.random_share),
-        clutter_per_m=(0.15 + extra) / 1.3,
-    )
-    return BackEndParameters(wheels=wheels, ranges=ranges)
+    return BackEndParameters(wheels=wheels, ranges=RangeNoise(sigma_m=sigma_m))
+
+
+def follow(
+    back_end: RobustBackEnd, increments: Iterable[Array], scans: Iterable[list[RangeScan]]
+) -> Iterator[UpdateReport]:
+    """Give a back end steps and what the radars saw at their ends; yield its reports."""
+    for increment, of_pose in zip(increments, scans, strict=True):
+        back_end.predict(increment)
+        yield back_end.update(of_pose)
+
+
+def step_of(increment: Sequence[float] | Array, variance: float) -> tuple[Array, Motion]:
+    """Return a step of perfect wheels as reported, and the motion with a noise of its own."""
+    reported_step = np.array(increment, dtype=np.float64)
+    noise = variance * np.eye(3)
+    return reported_step, calibrated_motion(reported_step, np.zeros(3), WheelNoise(), noise)
 
 
 def odometry_path(increments: Array) -> Array:
@@ -260,6 +210,3 @@ def odometry_path(increments: Array) -> Array:
     x = np.concatenate([[0.0], np.cumsum(c * increments[:, 0] - s * increments[:, 1])])
     y = np.concatenate([[0.0], np.cumsum(s * increments[:, 0] + c * increments[:, 1])])
     return np.column_stack([x, y, heading])
-
-
-STRESSES = {"clean": Stress(), "offsets20": Stress(offset_m=0.02)}

@@ -11,6 +11,7 @@ from hil_tests.unit.slam.robust.range_world import (
     LAB,
     Array,
     Run,
+    follow,
     odometry_path,
     parameters_for,
     simulate,
@@ -28,12 +29,8 @@ SIGMA_M = 7.4e-3
 def drive(run: Run, rig: Rig) -> tuple[RobustBackEnd, Array]:
     """Run a back end over a run; return it and the causal path (k, 3)."""
     back_end = RobustBackEnd(rig, parameters_for(LAB, SIGMA_M))
-    path = [np.zeros(3)]
-    for increment, scans in zip(run.increments, run.scans, strict=True):
-        back_end.predict(increment)
-        back_end.update(scans)
-        path.append(back_end.pose)
-    return back_end, np.array(path)
+    path = [back_end.pose for _ in follow(back_end, run.increments, run.scans)]
+    return back_end, np.array([np.zeros(3), *path])
 
 
 def cut(run: Run, n_poses: int) -> Run:
@@ -69,12 +66,7 @@ def test_the_same_run_gives_the_same_bits() -> None:
 
 
 def test_a_relinearised_belief_stays_where_the_filter_was_in_a_linear_regime() -> None:
-    rig = paper_rig()
-    run = cut(simulate(LAB, 1, SIGMA_M, labelled=True), 150)
-    back_end = RobustBackEnd(rig, parameters_for(LAB, SIGMA_M))
-    for increment, scans in zip(run.increments, run.scans, strict=True):
-        back_end.predict(increment)
-        back_end.update(scans)
+    back_end, _ = drive(cut(simulate(LAB, 1, SIGMA_M, labelled=True), 150), paper_rig())
     before, sigmas = back_end.pose, np.sqrt(np.diag(back_end.pose_covariance))
     assert back_end.relinearise()
     assert (np.abs(back_end.pose - before) <= sigmas).all()

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from hil_tests.unit.slam.robust.range_world import (
     LAB,
-    Stress,
+    follow,
     parameters_for,
     reported,
     scans_of,
@@ -57,7 +57,7 @@ def driven(targets: Array, offsets_m: Array, *, moving: bool = False) -> Unassig
             )
             for radar in LEFT
         ]
-        unassigned.keep(k, antennas_of(paper_rig(), scans, step), scans, set())
+        unassigned.keep(k, antennas_of(paper_rig(), scans, np.zeros(3)), scans, set())
     return unassigned
 
 
@@ -112,11 +112,7 @@ def test_a_radar_alone_gives_birth_where_its_partner_is_dead(dead: int) -> None:
     target = np.array([[0.5, 0.8]])
     back_end = RobustBackEnd(paper_rig(), parameters_for(LAB, SIGMA_M))
     increments = reported(poses, LAB, rng, 0.0)
-    stress = Stress(dead=(dead, 2, 3))
-    scans = scans_of(poses, target, rng, SIGMA_M, stress, labelled=False)
-    for increment, seen in zip(increments, scans, strict=True):
-        back_end.predict(increment)
-        back_end.update(seen)
+    list(follow(back_end, increments, scans_of(poses, target, rng, SIGMA_M, radars=(1 - dead,))))
     (mark,) = back_end.landmarks()
     miss = mark.position_m - target[0]
     assert np.hypot(*miss) < 0.06
@@ -192,10 +188,8 @@ def test_walking_biases_are_as_uncertain_to_the_filter_as_to_the_smoother() -> N
     landmarks = np.array([[0.2, 1.0], [0.7, 0.8], [1.1, 0.9], [0.3, -0.9], [0.9, -1.1]])
     parameters = parameters_for(LAB, SIGMA_M, walk_per_sqrt_m=1.0)
     back_end = RobustBackEnd(paper_rig(), parameters)
-    scans = scans_of(poses, landmarks, rng, SIGMA_M, Stress(), labelled=True)
-    for increment, seen in zip(reported(poses, LAB, rng, 1.0), scans, strict=True):
-        back_end.predict(increment)
-        back_end.update(seen)
+    scans = scans_of(poses, landmarks, rng, SIGMA_M, labelled=True)
+    list(follow(back_end, reported(poses, LAB, rng, 1.0), scans))
     at = np.arange(6)
     mean, sigmas = back_end.state.calibration, np.sqrt(np.diag(back_end.state.P.block(at)))
     assert back_end.relinearise()
@@ -208,12 +202,15 @@ positive = st.floats(1e-4, 1e-1)
 
 
 @given(prior=positive, sigma=positive, sigmas_off=st.floats(0.0, 2.0))
-def test_near_its_prediction_a_range_counts_in_full(
+def test_near_its_prediction_or_without_a_bound_a_range_counts_in_full(
     prior: float, sigma: float, sigmas_off: float
 ) -> None:
     nu = np.array([sigmas_off * np.sqrt(prior**2 + sigma**2)]) * (1 - 1e-9)
-    weighed = huber_weighted_sigmas_m(nu, np.array([prior**2]), np.array([sigma]), 2.0)
-    np.testing.assert_array_equal(weighed, [sigma])
+    for factor, bound in ((1.0, 2.0), (1e3, np.inf)):
+        weighed = huber_weighted_sigmas_m(
+            factor * nu, np.array([prior**2]), np.array([sigma]), bound
+        )
+        np.testing.assert_array_equal(weighed, [sigma])
 
 
 @given(prior=positive, sigma=positive, sigmas_off=st.floats(2.0, 1e3))
@@ -226,11 +223,6 @@ def test_far_from_it_a_range_moves_the_state_no_further_than_at_the_bound(
     weighed = huber_weighted_sigmas_m(np.array([nu]), np.array([prior**2]), np.array([sigma]), 2.0)
     moved = nu * prior**2 / (prior**2 + float(weighed[0]) ** 2)
     assert moved == pytest.approx(2.0 * prior**2 / np.sqrt(S), rel=1e-9)
-
-
-def test_without_a_bound_every_range_counts_in_full() -> None:
-    weighed = huber_weighted_sigmas_m(np.array([5.0]), np.array([0.0]), np.array([1e-3]), np.inf)
-    np.testing.assert_array_equal(weighed, [1e-3])
 
 
 def test_a_doubt_is_added_to_what_the_front_end_tells_and_to_nothing_else() -> None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from hil_tests.unit.slam.robust.range_world import step_of
 from hil_tests.unit.slam.robust.test_walls import antennas, state_with_map
 from slam.config import WheelNoise
 from slam.evaluation import nees_pose
@@ -24,7 +25,7 @@ from slam.robust.parameters import (
 )
 from slam.robust.run_log import RunLog, start_prior
 from slam.robust.smoother import give_radius
-from slam.robust.state import State, at_rest
+from slam.robust.state import State
 
 SIGMA_M, STEP_M = 2e-3, 0.01
 WIDE = RangeNoise(min_range_m=0.0, max_range_m=10.0)
@@ -102,7 +103,7 @@ def test_a_radius_is_found_as_surely_as_it_says() -> None:
         for k in range(121):
             if k:
                 step = np.array([(1.0 + s) * STEP_M, 0.0, kappa * STEP_M])
-                log.add_motion(step, 1e-6 * np.eye(3), 0.0, np.zeros(3))
+                log.add_motion(*step_of(step, 1e-6))
             for radar, mount in enumerate(paper_rig().mounts[:2]):
                 dx, dy = 0.6 - k * STEP_M - mount.x_m, 0.85 - mount.y_m
                 if abs(math.atan2(dx, dy)) < math.radians(32.5):
@@ -160,7 +161,7 @@ def test_echoes_that_overlap_tell_no_radius() -> None:
     scan = RangeScan(radar=0, ranges_m=(0.5, 0.58, 0.9, 1.2), blurred_m=(1.25,))
     assert [scan.is_alone(i) for i in range(4)] == [False, False, True, False]
     unassigned = UnassignedRanges(3, SIGMA_M, 0.0, 0.0)
-    unassigned.keep(0, antennas_of(paper_rig(), [scan], at_rest()), [scan], {(0, 1)})
+    unassigned.keep(0, antennas_of(paper_rig(), [scan], np.zeros(3)), [scan], {(0, 1)})
     assert [left.alone for left in unassigned.newest().unused[0]] == [False, True, False]
 
 

@@ -33,7 +33,6 @@ from slam.app.sweep.statistics import summarise_groups
 from slam.geometry import paper_rig, transform
 from slam.robust.association import antennas_of, sides_of, sure_landmarks, view
 from slam.robust.parameters import ContinuationRule, RangeNoise
-from slam.robust.state import Motion
 from xethru_protocol.system import StopFlag
 
 RANGES_M = (0.6, 0.61, 0.62, 0.9, 0.91, 0.92)
@@ -139,8 +138,7 @@ def test_a_step_predicts_and_learns_from_a_landmark_on_each_side() -> None:
 
 def test_the_gate_of_a_step_has_something_to_weigh() -> None:
     state, rig = mapped_state(40), paper_rig()
-    still = Motion(step_m=np.zeros(2), turn_rad=0.0, covariance=np.zeros((3, 3)), walk_variance=0.0)
-    seen = view(state, antennas_of(rig, (), still))
+    seen = view(state, antennas_of(rig, (), np.zeros(3)))
     for side in sides_of(rig):
         sure = sure_landmarks(state, seen, side, RangeNoise(), ContinuationRule())
         assert sure is not None
