@@ -1,8 +1,8 @@
 """Settings of SLAM and the presets that hold them.
 
 Wherever the paper's text leaves a choice, or prints something an expert would do otherwise, the
-choice is an option here. The default is what is printed; the comment of each other value says what
-it corrects. Lengths in metres, angles in radians unless the name says degrees.
+choice is an option here. The default is what is printed. Lengths in metres, angles in radians
+unless the name says degrees.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ class GateRule(StrEnum):
     """What the number ``gate`` means.
 
     The paper prints "Mahalanobis distance threshold" and no formula. The default compares the
-    squared distance: so does the authors' later code, and so does the algorithm with unknown
+    squared distance, as the authors' later code does, and the algorithm with unknown
     correspondences in Probabilistic Robotics (Thrun et al., table 10.2), which the paper follows.
     """
 
@@ -271,8 +271,8 @@ class WheelNoise:
     def step_sigmas(self, steps: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return standard deviations along [m], across [m] and of the turn [rad], shape (n, 3).
 
-        ``steps`` of shape (n, 3): ux [m], uy [m], ua [rad], body frame at the start of each. Here
-        the floors are bounds; in ``step_variances`` their squares are added.
+        ``steps`` (n, 3): ux [m], uy [m], ua [rad], body frame at the start of each. Here the floors
+        are bounds; in ``step_variances`` their squares are added.
         """
         distance = np.sqrt(steps[:, 0] ** 2 + steps[:, 1] ** 2)
         root = np.sqrt(distance)
@@ -286,7 +286,7 @@ class WheelNoise:
         )
 
     def walk_variance(self, distance_m: float, turn_rad: float) -> float:
-        """Return the variance one step adds to a calibration error, in units of its own."""
+        """Return what a step adds to the variance of a calibration error, as a share of it."""
         return self.walk_per_sqrt_m**2 * (distance_m + self.walk_lever_m * abs(turn_rad))
 
 
@@ -350,10 +350,7 @@ class AssociationConfig(_Model):
 
 
 class RobustConfig(_Model):
-    """The radars as the robust back end models them; the wheels' errors come with the robot.
-
-    Limits of range are those of ``detection``; the window's rules say when a state is collected.
-    """
+    """The radars as the robust back end models them; limits of range are those of ``detection``."""
 
     # Full opening angle within which the front end finds what is there, wider than -3 dB.
     field_of_view_deg: Annotated[float, Field(gt=0, lt=180)] = 65.0
@@ -410,8 +407,8 @@ class ConfigError(ValueError):
     """A preset file or an override that cannot be used; one line with file, key and remedy."""
 
 
-# Beside this package, in the repository and in the wheel alike; a folder named "fixtures" in the
-# user's own project must not come first, as it would by that name.
+# Beside this package, in the repository and in the wheel alike: a folder named "fixtures" in the
+# user's own project must not come first.
 _SHIPPED_PRESETS = Path(__file__).parent.parent / "fixtures" / "presets"
 
 REMOVED_KEYS: Mapping[str, str | float] = {
@@ -452,8 +449,8 @@ def config_from_tables(
 
     There is one table per part of SlamConfig, and ``environment.<name>`` with the values that
     differ there. Environment "lab" is the top level itself; any other must have its table, unless
-    the file has none at all and so is the same everywhere. The tables of all environments are
-    checked, whichever is asked for. ``source`` names the tables in an error message.
+    the file has none at all. The tables of all environments are checked. ``source`` names the
+    tables in an error message.
     """
     base = {key: value for key, value in tables.items() if key != "environment"}
     overrides = _table(tables.get("environment", {}), "environment", source)
@@ -487,7 +484,8 @@ def override(config: SlamConfig, settings: Mapping[str, object]) -> SlamConfig:
             continue
         tables.setdefault(part, {})
         if not isinstance(tables[part], dict) or not field:
-            raise ConfigError(f"setting {key!r}: write it as part.key; parts: {_parts()}")
+            parts = ", ".join(SlamConfig.model_fields)
+            raise ConfigError(f"setting {key!r}: write it as part.key; parts: {parts}")
         tables[part] = {**tables[part], field: value}
     return _validated(tables, "setting", context=TEXT_ALLOWED)
 
@@ -549,10 +547,6 @@ def _validated(tables: Mapping[str, Any], source: str, context: str | None = Non
         message = first["msg"].removeprefix("Value error, ")
         given = f" (given: {first['input']!r})" if not isinstance(first["input"], dict) else ""
         raise ConfigError(f"{source}: {key}: {message}{given}") from error
-
-
-def _parts() -> str:
-    return ", ".join(SlamConfig.model_fields)
 
 
 def _siblings(key: str) -> str:

@@ -1,11 +1,10 @@
 """What the numbers mean: trajectory, landmark and consistency metrics.
 
 Every trajectory error states its alignment. ``ate_rmse_m`` is the one to quote; the ICP numbers
-of the paper are computed beside it because they answer a different question.
+of the paper answer a different question.
 
 Which landmarks are observable is part of the metric, not of the design under test, so the numbers
-of that rule are constants here: designs are compared on equal seeds only, and against the same
-landmarks.
+of that rule are constants here.
 """
 
 from __future__ import annotations
@@ -30,6 +29,18 @@ _ICP_ITERATIONS = 100
 # A share of a variance (of a unit one) that is rounding, and an error [m, rad] that is.
 _ROUNDING_VARIANCE = 1e-12
 _ROUNDING_ERROR = 1e-9
+# Half of a pulse's width at half height: what lies farther from a target is no echo of it.
+ECHO_LENGTH_M = 0.06
+# Joint field of view and range limits of one radar: theta and L of the paper, and the start of
+# the module's detection zone.
+VIEW_DEG = 65.0
+MIN_RANGE_M = 0.2
+MAX_RANGE_M = 1.5
+# As many poses as the paper wants observations of a landmark (min_opc) ...
+MIN_POSES = 9
+# ... and two poses are distinct if the paper would collect both (min_disp).
+DISTINCT_M = 5e-3
+DISTINCT_RAD = 0.1
 
 
 def associate_times(
@@ -37,8 +48,7 @@ def associate_times(
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return index pairs of stamps that belong together, each stamp used at most once.
 
-    Stamps are strictly increasing [ns], those of a pair no farther apart than the tolerance. The
-    rows have equal lengths and increase; empty where nothing is close enough.
+    Stamps are strictly increasing [ns], those of a pair no farther apart than the tolerance.
     """
     if len(estimate_ns) == 0 or len(reference_ns) == 0:
         return np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp)
@@ -88,10 +98,9 @@ def ate_rmse_m(estimate_xy: Array, reference_xy: Array) -> float:
 def icp_ate_rmse_m(estimate_xy: Array, reference_xy: Array) -> float:
     """Return the RMS distance of the ICP-aligned points to the nearest reference points [m].
 
-    This is what ICP minimises, and one reading of the paper's "RMS ATE after ICP". Time plays no
-    part, so drift along the path costs nothing. Both have shape (n, 2) [m], rows together by time,
-    *both in their start frames*: ICP begins with the two start poses on each other, as two SLAM
-    systems started together are.
+    One reading of the paper's "RMS ATE after ICP". Time plays no part, so drift along the path
+    costs nothing. Both have shape (n, 2) [m], rows together by time, *both in their start frames*:
+    ICP begins with the two start poses on each other.
     """
     _check_rows(estimate_xy, reference_xy)
     aligned = transform(icp_align_se2(estimate_xy, reference_xy), estimate_xy)
@@ -138,9 +147,8 @@ class LandmarkScore:
 def landmark_metrics(estimated_xy: Array, true_xy: Array, alignment: Array) -> LandmarkScore:
     """Return how well estimated landmarks (n, 2), map frame, match true ones (m, 2), world frame.
 
-    The true ones are those that count (``observable_landmarks``). ``alignment`` (3,) is the
-    *trajectory's* (``align_se2`` of its positions): the map is not fitted to the landmarks it is
-    judged by.
+    ``alignment`` (3,) is the *trajectory's* (``align_se2`` of its positions): the map is not fitted
+    to the landmarks it is judged by.
     """
     n, m = len(estimated_xy), len(true_xy)
     if n and m:
@@ -170,10 +178,8 @@ def landmark_metrics(estimated_xy: Array, true_xy: Array, alignment: Array) -> L
 def nees_pose(estimate: Array, covariance: Array, truth: Array) -> float:
     """Return the normalised estimation error squared of a pose (3 dof), not aligned.
 
-    ``e^T P^-1 e``, both poses in the start frame, with the pseudo-inverse where P is singular, as
-    it is after a turn on the spot from a perfect start under proportional noise: a direction
-    without variance adds nothing if the error in it is rounding, and makes the result inf if not,
-    the limit of a vanishing variance. Then fewer than 3 degrees of freedom take part.
+    ``e^T P^-1 e``, both poses in the start frame. A direction without variance adds nothing if the
+    error in it is rounding, and makes the result inf if not.
     """
     error = np.array(
         [estimate[0] - truth[0], estimate[1] - truth[1], wrap_angle(estimate[2] - truth[2])]
@@ -208,18 +214,14 @@ def _check_rows(estimate_xy: Array, reference_xy: Array) -> None:
         raise ValueError("trajectories have no common stamps")
 
 
-ECHO_LENGTH_M = 0.06
-"""Half of a pulse's width at half height: what lies farther from a target is no echo of it."""
-
-
 def true_range_nis(result: StepResult, true_pose: Array, true_xy: Array) -> tuple[float, ...]:
     """Return the NIS (1 dof) of every range of the robust pipeline that is truly of a landmark.
 
     The back end reports its predicted ranges, made before it looked at any. Ground truth decides
     the rest: a landmark of the map belongs to the true one nearest to it as seen from the robot,
     within 0.15 m; of the detections the one nearest to that target's true range is of it, if no
-    farther than half a pulse, and if no other predicted target is nearer to it. Gates play no part.
-    Ranges that the front end itself called unfit for the back end are not judged.
+    farther than half a pulse, and if no other predicted target is nearer to it. Ranges that were
+    left out as unfit are not judged.
 
     ``true_pose`` (3,) is that at ``result.t_ns``, ``true_xy`` (m, 2) all true landmarks, world
     frame.
@@ -262,13 +264,12 @@ class TrueAssociationNis:
 
     Ground truth decides the *origin* of an observation: the true landmark nearest to where the true
     pose puts it, within 0.15 m, or clutter. A landmark of the map belongs to the origin that more
-    than half of its observations so far, its first included, came from; so one that wrong
-    associations dragged from one true landmark to another changes its owner, and in between has
-    none. Of several that belong to one true landmark, the one with most observations of it counts.
+    than half of its observations so far, its first included, came from. Of several that belong to
+    one true landmark, the one with most observations of it counts.
 
     An observation is judged before it is counted and whatever the filter made of it, so a tight
-    gate cannot improve the numbers. An observation of clutter, or of a true landmark that no
-    landmark of the map belongs to at that moment, is not counted: there is no innovation.
+    gate cannot improve the numbers. One of clutter, or of a true landmark that no landmark of the
+    map belongs to at that moment, is not counted: there is no innovation.
 
     ``true_xy`` has shape (m, 2) [m], all true landmarks, world frame.
     """
@@ -282,7 +283,7 @@ class TrueAssociationNis:
         """Return the NIS (2 dof) of this state's observations of landmarks already in the map.
 
         ``true_pose`` has shape (3,), world frame, at ``result.t_ns``. Call it for every result, in
-        order: who belongs to whom is learned on the way.
+        order.
         """
         values = []
         for observation, association in zip(result.observations, result.associations, strict=True):
@@ -314,18 +315,6 @@ class TrueAssociationNis:
         return best
 
 
-# Joint field of view and range limits of one radar: theta and L of the paper, and the start of
-# the module's detection zone.
-VIEW_DEG = 65.0
-MIN_RANGE_M = 0.2
-MAX_RANGE_M = 1.5
-# As many poses as the paper wants observations of a landmark (min_opc) ...
-MIN_POSES = 9
-# ... and two poses are distinct if the paper would collect both (min_disp).
-DISTINCT_M = 5e-3
-DISTINCT_RAD = 0.1
-
-
 def observable_landmarks(rig: Rig, poses: Array, landmarks_xy: Array) -> NDArray[np.bool_]:
     """Return which landmarks both radars of a pair could see at nine or more poses, shape (m,).
 
@@ -333,22 +322,18 @@ def observable_landmarks(rig: Rig, poses: Array, landmarks_xy: Array) -> NDArray
     and 0.1 rad from the last distinct one count with it, so standing still adds nothing. ``poses``
     (n, 3) are true poses in time order, frame of the landmarks, (m, 2) [m].
     """
+    kept: list[Array] = []
+    for pose in poses:
+        if not kept or has_moved(kept[-1], pose, DISTINCT_M, DISTINCT_RAD):
+            kept.append(pose)
+    distinct = np.array(kept).reshape(-1, 3)
     observable = np.zeros(len(landmarks_xy), dtype=bool)
-    distinct = _distinct(poses)
     for pair in rig.pairs():
         seen = _in_view(rig.mounts[pair.first], distinct, landmarks_xy) & _in_view(
             rig.mounts[pair.second], distinct, landmarks_xy
         )
         observable |= seen.sum(axis=0) >= MIN_POSES
     return observable
-
-
-def _distinct(poses: Array) -> Array:
-    kept: list[Array] = []
-    for pose in poses:
-        if not kept or has_moved(kept[-1], pose, DISTINCT_M, DISTINCT_RAD):
-            kept.append(pose)
-    return np.array(kept).reshape(-1, 3)
 
 
 def _in_view(mount: Mount, poses: Array, landmarks_xy: Array) -> NDArray[np.bool_]:
@@ -359,9 +344,5 @@ def _in_view(mount: Mount, poses: Array, landmarks_xy: Array) -> NDArray[np.bool
     ranges_m = np.hypot(offsets[..., 0], offsets[..., 1])
     directions = np.arctan2(offsets[..., 1], offsets[..., 0])
     off_boresight = wrap_angles(directions - poses[:, 2, None] - mount.yaw_rad)
-    in_view: NDArray[np.bool_] = (
-        (ranges_m >= MIN_RANGE_M)
-        & (ranges_m <= MAX_RANGE_M)
-        & (np.abs(off_boresight) <= math.radians(VIEW_DEG) / 2)
-    )
-    return in_view
+    inside = (ranges_m >= MIN_RANGE_M) & (ranges_m <= MAX_RANGE_M)
+    return np.asarray(inside & (np.abs(off_boresight) <= math.radians(VIEW_DEG) / 2))

@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 
 from slam.geometry import Rig
 
+# A sampler's limit is reached when this part of its span is missing: it comes as float32.
+_LIMIT_TOLERANCE = 1e-6
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RadarFrame:
@@ -41,10 +44,6 @@ class RadarFrame:
             raise ValueError(f"bin_length_m is {self.bin_length_m}, must be positive")
 
 
-# A sampler's limit is reached when this part of its span is missing: it comes as float32.
-_LIMIT_TOLERANCE = 1e-6
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Detection:
     """One echo seen by one radar: a range without a direction."""
@@ -70,22 +69,14 @@ class Detector(Protocol):
     def detect(self, frame: RadarFrame, range_offset_m: float = 0.0) -> tuple[Detection, ...]:
         """Return the echoes of one frame inside the range limits, nearest first.
 
-        Parameters
-        ----------
-        frame
-            The raw frame.
-        range_offset_m
-            What this module measures too long (``Mount.range_offset_m``).
+        ``range_offset_m`` is what this module measures too long (``Mount.range_offset_m``).
         """
         ...
 
     def detect_many(
         self, frames: Sequence[RadarFrame], offsets_m: Sequence[float]
     ) -> list[tuple[Detection, ...]]:
-        """Return what ``detect`` returns, for each frame with its range offset.
-
-        The frames may be of several radars.
-        """
+        """Return what ``detect`` returns, for each frame, of any radar, with its range offset."""
         ...
 
 

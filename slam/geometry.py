@@ -1,8 +1,7 @@
 """Planar geometry: poses in SE(2), the mounts of the radars, and the pairs that can trilaterate.
 
 A pose is ``[x, y, heading]`` in [m, m, rad], heading counter-clockwise from x. The body frame has
-x forward, y left and its origin at the base footprint. Nothing here knows left from right: a pair
-is two mounts with one boresight, and the order of its members follows from the boresight alone.
+x forward, y left and its origin at the base footprint.
 """
 
 from __future__ import annotations
@@ -60,20 +59,14 @@ def between(origin: Array, pose: Array) -> Array:
 
 
 def has_moved(previous: Array, pose: Array, min_distance_m: float, min_turn_rad: float) -> bool:
-    """Return whether two poses of shape (3,) differ by at least a distance or a turn.
-
-    The turn is wrapped, so a heading that passes pi is no motion.
-    """
+    """Return whether two poses of shape (3,) differ by at least a distance or a turn, wrapped."""
     distance_m = math.hypot(pose[0] - previous[0], pose[1] - previous[1])
     turn_rad = abs(wrap_angle(pose[2] - previous[2]))
     return distance_m >= min_distance_m or turn_rad >= min_turn_rad
 
 
 def transform(pose: Array, points: Array) -> Array:
-    """Return points of the frame ``pose`` in the frame the pose is given in.
-
-    ``points`` has shape (2,) or (n, 2) [m]; the result has the same shape.
-    """
+    """Return points (2,) or (n, 2) [m] of the frame ``pose`` in the frame the pose is given in."""
     cosine, sine = math.cos(pose[2]), math.sin(pose[2])
     rotation = np.array([[cosine, -sine], [sine, cosine]])
     result: Array = points @ rotation.T + pose[:2]
@@ -99,9 +92,8 @@ class Mount:
 def mount_at(mount: Mount, motion: Array) -> Mount:
     """Return where a mount was when it sampled, in the body frame of another time.
 
-    ``m' = d + Rot(a) m`` and ``yaw' = yaw + a`` for a motion (d, a), [m, m, rad]: the pose of the
-    robot at the sample's time, seen from its pose at the time whose body frame is wanted
-    (``between``).
+    ``motion`` (3,) is the pose of the robot at the sample's time, seen from its pose at the time
+    whose body frame is wanted (``between``).
     """
     cosine, sine = math.cos(motion[2]), math.sin(motion[2])
     return replace(
@@ -117,8 +109,7 @@ class RadarPair:
     """Two radars that look the same way, and the triangle base between them.
 
     ``first`` and ``second`` are mount indices; in the pairs of a rig they are ordered so that the
-    boresight lies to the left of the base from first to second. On the paper's left side first is
-    the rear radar, on its right side the front one: a rotation by pi, not a mirror image.
+    boresight lies to the left of the base from first to second.
     """
 
     first: int
@@ -130,8 +121,8 @@ class RadarPair:
     along: Array
     ahead: Array
     # Angle of each boresight, of the first and of the second radar, from ``along`` towards
-    # ``ahead``, in [-pi/2, 3 pi/2); pi/2 in the paper's rig. They differ only where the two sampled
-    # at different times while the robot turned.
+    # ``ahead``, in [-pi/2, 3 pi/2). They differ only where the two sampled at different times while
+    # the robot turned.
     boresights_rad: tuple[float, float]
 
 
@@ -165,9 +156,8 @@ def paper_rig() -> Rig:
 def pair_of(first: int, second: int, mounts: tuple[Mount, Mount]) -> RadarPair | None:
     """Return the triangle base between two mounts; None where they are at the same place.
 
-    ``first`` and ``second`` are their indices; the mounts are in one body frame: on the robot, or
-    each moved to its own sample time. The view is on the side of the base that the boresights look
-    to.
+    ``first`` and ``second`` are their indices. The view is on the side of the base that the
+    boresights look to.
     """
     a, b = mounts
     baseline_m = math.hypot(b.x_m - a.x_m, b.y_m - a.y_m)

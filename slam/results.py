@@ -77,8 +77,7 @@ class Belief:
     def __post_init__(self) -> None:
         """Check the shapes and make the fields read-only views.
 
-        The arrays are not copied, since the covariance of a dense map is large: the caller must
-        not write to them any more.
+        The arrays are not copied: the caller must not write to them any more.
         """
         size = POSE_SIZE + LANDMARK_SIZE * len(self.landmark_ids)
         if self.mean.shape != (size,) or self.covariance.shape != (size, size):
@@ -102,7 +101,7 @@ class Belief:
 
     @property
     def landmarks(self) -> Array:
-        """Return the landmarks' positions, shape (n, 2) [m], map frame, in row order."""
+        """Return the landmarks' positions, shape (n, 2) [m], map frame."""
         return self.mean[POSE_SIZE:].reshape(-1, LANDMARK_SIZE)
 
     def landmark_covariance(self, row: int) -> Array:
@@ -123,7 +122,7 @@ class Association:
 
     @property
     def nis(self) -> float | None:
-        """Return the normalised innovation squared (2 dof), None for a new landmark."""
+        """Return the normalised innovation squared (2 dof); None for a new landmark."""
         if self.is_new:
             return None
         return float(self.mahalanobis_sq[self.candidate_ids.index(self.landmark_id)])
@@ -131,12 +130,12 @@ class Association:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MapLandmark:
-    """One landmark of the map: id, position (2,) [m], covariance (2, 2), frames that hit it."""
+    """One landmark of the map."""
 
     landmark_id: int
-    position_m: Array
-    covariance: Array
-    hits: int
+    position_m: Array  # shape (2,)
+    covariance: Array  # shape (2, 2)
+    hits: int  # the frames that hit it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -227,20 +226,25 @@ class StepResult:
 
 
 class Slam(Protocol):
-    """The paper's pipeline or the robust one."""
+    """The paper's pipeline or the robust one; the map frame is the body frame at the first pose."""
 
     config: SlamConfig
 
     def step(
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
-        """Take in the frames and odometry around one time; return the states now ready."""
+        """Take in the frames and odometry around one time; return the states now ready.
+
+        There is at most one frame per radar, each with the time it was taken at; a radar whose
+        frame was lost is absent. ``pose_at`` is asked for the pose at ``t_ns``, the time of the
+        state, and, unless all radars are taken to have sampled then, at the times of the frames.
+        """
         ...
 
     def step_detections(
         self, detections: Sequence[Detection], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
-        """Do what ``step`` does, from ranges that some other front end found."""
+        """Do what ``step`` does, with ranges that some other front end found."""
         ...
 
     def flush(self) -> tuple[StepResult, ...]:

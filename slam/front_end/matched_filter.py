@@ -18,8 +18,7 @@ Threshold
     rate of upcrossings, c r exp(-r**2 / 2) with c = N / (2 sqrt(pi) s) (Rice 1945, section 3.8). An
     estimated sigma_y scatters like that of K independent cells; averaged over that, exp(-t) with
     t = r**2 / 2 becomes (1 + t / K)**-K (cell-averaging CFAR; Richards 2014, chapter 6). A mean of
-    all powers has K = N / (sqrt(2 pi) s), since they correlate by rho**2; a median has the part
-    ``_MEDIAN_EFFICIENCY`` of that.
+    all powers has K = N / (sqrt(2 pi) s), a median the part ``_MEDIAN_EFFICIENCY`` of that.
 Echoes
     The local maxima of the magnitude of y above the threshold. The logarithm of the magnitude is a
     parabola around an echo: the vertex through three of its values is the position, and its scatter
@@ -32,10 +31,8 @@ Misfit
 Joint
     Where peaks overlap or one is not one pulse, and the misfit is more than the pulse's own
     uncertain shape leaves, :mod:`slam.front_end.overlapping` decides how many echoes there are and
-    where, with all other echoes of the frame subtracted.
-Cut pulses
-    Where samples within 3 s of a peak are missing - saturated, or beyond an end of the frame - the
-    echo is fitted to those that are left, likewise.
+    where, with all other echoes of the frame subtracted; likewise where samples within 3 s of a
+    peak are missing, saturated or beyond an end of the frame.
 """
 
 from __future__ import annotations
@@ -62,6 +59,7 @@ from slam.front_end.overlapping import (
 from slam.front_end.pulse import ComplexArray, PulseModel
 
 Array = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 _PROBES = np.linspace(-2.0, 2.0, 9)
 # Bins from one value of y to the next.
@@ -74,14 +72,31 @@ _ECHO_LEVEL = 3.5**2
 _FLANK_CELLS = 2
 # Below one part in so many of its cells left, a frame is taken as a whole.
 _LEAST_QUIET = 8
+# Samples this far from a peak, in envelope sigmas, belong to it: beyond, 1 % of its height.
+_REACH = 3.0
+# Peaks closer than this, in envelope sigmas, overlap: rho there is 1 %.
+OVERLAP = 4.3
+# Samples fitted on either side of a group, also beyond an end of the frame, in envelope sigmas. A
+# weak echo nearer than that to a strong one makes no peak of its own.
+_MARGIN = 5.0
+_SEARCH = 3.5
+# With fewer usable samples than this many envelope sigmas a fit says nothing.
+_LEAST_SAMPLES = 2.0
+# Behind the filter an echo is wider: beyond, 1e-7 of its height.
+_FILTERED_REACH = 8.0
+# Columns of a table of echoes.
+_POSITION, _AMPLITUDE, _PHASE, _SIGMA = range(4)
+# Most echoes that a group is taken apart into.
+_MAX_ECHOES = 4
+# A second look is worth while where this part of the pulse's own possible error is exceeded.
+_SUSPICIOUS = 0.5
+_NEIGHBOURS = np.array([[-1], [0], [1]])
+# A float32 frame says its samples to this part of the largest; noise is never less.
+_RESOLUTION = float(np.finfo(np.float32).eps)
 
 
 class PulseFilter:
-    """Correlation of frames of one length with one pulse.
-
-    ``false_alarms`` is the mean number of peaks in a frame of noise; with ``noise_is_known``, sigma
-    is known, and the threshold needs no allowance for its scatter.
-    """
+    """Correlation of frames of one length with one pulse; parameters as in `threshold_sigmas`."""
 
     def __init__(
         self,
@@ -156,8 +171,8 @@ class PulseFilter:
 def threshold_sigmas(length_sigmas: float, false_alarms: float, *, noise_is_known: bool) -> float:
     """Return the level, in sigma_y, with ``false_alarms`` local maxima of noise above it per frame.
 
-    ``length_sigmas`` is the length of the frame in envelope sigmas; ``noise_is_known`` says that
-    sigma_y is known and not estimated from the frame itself.
+    ``length_sigmas`` is the length of the frame in envelope sigmas; ``noise_is_known``: sigma_y is
+    not estimated from the frame itself.
     """
     rate = length_sigmas / (2 * math.sqrt(math.pi))
     cells = _MEDIAN_EFFICIENCY * length_sigmas / math.sqrt(math.tau)
@@ -174,24 +189,6 @@ def threshold_sigmas(length_sigmas: float, false_alarms: float, *, noise_is_know
 def _median(values: Array) -> float:
     middle = values.size // 2
     return float(np.partition(values, middle)[middle])
-
-
-BoolArray = NDArray[np.bool_]
-
-# Samples this far from a peak, in envelope sigmas, belong to it: beyond, 1 % of its height.
-_REACH = 3.0
-# Peaks closer than this, in envelope sigmas, overlap: rho there is 1 %.
-OVERLAP = 4.3
-# Samples fitted on either side of a group, also beyond an end of the frame, in envelope sigmas. A
-# weak echo nearer than that to a strong one makes no peak of its own.
-_MARGIN = 5.0
-_SEARCH = 3.5
-# With fewer usable samples than this many envelope sigmas a fit says nothing.
-_LEAST_SAMPLES = 2.0
-# Behind the filter an echo is wider: beyond, 1e-7 of its height.
-_FILTERED_REACH = 8.0
-# Columns of a table of echoes.
-_POSITION, _AMPLITUDE, _PHASE, _SIGMA = range(4)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -245,7 +242,7 @@ def saturated_pulses(position_bins: Array, filtered: Filtered) -> BoolArray:
 def refit(peaks: Peaks, again: BoolArray, filtered: Filtered, split: SplitTest) -> Peaks:
     """Return the peaks with those ``again`` (k,), and those that overlap with them, fitted anew.
 
-    Before, each is as if it were a single pulse. ``split.max_echoes`` 1 leaves each peak one echo.
+    ``split.max_echoes`` 1 leaves each peak one echo.
     """
     pulse_filter = filtered.pulse_filter
     table = np.column_stack(
@@ -307,9 +304,9 @@ def _fitted(group: Array, others: Array, filtered: Filtered, split: SplitTest) -
         search_bins=search_bins,
         split=split,
     )
-    return np.array(
-        [(f.position_bins + first, f.amplitude, f.phase_rad, f.sigma_bins) for f in fits]
-    )
+    table = np.array(fits)
+    table[:, _POSITION] += first
+    return table
 
 
 def _fitted_whole(group: Array, others: Array, filtered: Filtered, split: SplitTest) -> Array:
@@ -333,7 +330,7 @@ def _fitted_whole(group: Array, others: Array, filtered: Filtered, split: SplitT
         group[-1, _POSITION] + search - begin,
         split,
     )
-    table = np.array([(f.position_bins, f.amplitude, f.phase_rad, f.sigma_bins) for f in fits])
+    table = np.array(fits)
     table[:, _PHASE] += pulse_filter.carrier_rad * table[:, _POSITION]
     table[:, _POSITION] += begin
     return table
@@ -387,15 +384,6 @@ def _misfit(table: Array, filtered: Filtered) -> Array:
     return energy / (filtered.sigma_y**2 * pulse_filter.probe_noise)
 
 
-# Most echoes that a group is taken apart into.
-_MAX_ECHOES = 4
-# A second look is worth while where this part of the pulse's own possible error is exceeded.
-_SUSPICIOUS = 0.5
-_NEIGHBOURS = np.array([[-1], [0], [1]])
-# A float32 frame says its samples to this part of the largest; noise is never less.
-_RESOLUTION = float(np.finfo(np.float32).eps)
-
-
 class MatchedFilterDetector:
     """Echoes by correlation; under ``joint``, overlapping ones fitted together."""
 
@@ -446,8 +434,8 @@ class MatchedFilterDetector:
     def peaks(self, frame: RadarFrame, within_m: tuple[float, float]) -> Peaks:
         """Return every echo of a frame, whatever its range.
 
-        Samples that are NaN or lie at one of the frame's limits are not used. Only echoes that lie
-        ``within_m``, from the first bin on [m], or overlap with one that may, are fitted anew.
+        Only echoes that lie ``within_m``, from the first bin on [m], or overlap with one that may,
+        are fitted anew.
         """
         filtered = self._filtered(frame)
         found, unexplained = _single_pulses(filtered)

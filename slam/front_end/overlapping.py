@@ -19,8 +19,8 @@ How many echoes: one more is accepted if it raises twice the log-likelihood by m
 h is exceeded by noise alone, anywhere in the window, with probability ``false_split`` (upcrossings
 of a chi-square process with 2 degrees of freedom; Davies 1987). The other term keeps a pulse that
 differs from the model one echo, however strong: the residual of the pulse model grows with the
-signal, and the noise adds to its root. Its price: of two echoes in phase, closer than the bandwidth
-can tell from one wide pulse, or one far weaker than the other, only one is reported.
+signal. Its price: of two echoes in phase that look like one wide pulse, or one far weaker than the
+other, only one is reported.
 
 `fit_echoes` does so sample by sample, where some samples are unknown. Where all are known,
 `fit_whole_echoes` does it in closed form behind the filter (:mod:`slam.front_end.matched_filter`):
@@ -39,8 +39,7 @@ and with D_kl = d rho(u_k - u_l) / d u_k and H_kl = d2 rho(u_k - u_l) / (d u_k d
     1/2 dG/du_k = Re conj(a_k) (z'(u_k) - sum_l D_kl a_l)
     Fisher information of u = Re(conj(a_k) a_l) (H - D R^-1 D^T)_kl / sigma_y**2
 
-The matrices have at most `SplitTest.max_echoes` rows: plain Python is several times faster on them
-than arrays are.
+On matrices of at most `SplitTest.max_echoes` rows plain Python is several times faster than arrays.
 """
 
 from __future__ import annotations
@@ -60,6 +59,8 @@ from scipy.optimize import brentq
 from slam.front_end.pulse import ComplexArray
 
 Array = NDArray[np.float64]
+Matrix = list[list[float]]
+T = TypeVar("T")
 
 _MAX_STEPS = 30
 # Of the envelope's sigma.
@@ -68,6 +69,18 @@ _LARGEST_STEP = 0.5
 _HOPELESS = 1e3
 # Added to what may be zero where no sample is usable.
 TINY = 1e-200
+# Of the envelope's sigma: spacing of the start grid. The likelihood is smooth on that scale.
+_GRID_STEP = 0.2
+# Gains of twice the log-likelihood too small to go on: while echoes are counted, and at last, where
+# it is a hundredth of a standard deviation of a position.
+_COARSE, _FINE = 1.0, 1e-4
+# How many times its forecast a search may gain, at most.
+_OPTIMISM = 10.0
+# On either side of a step, how many it takes to interpolate there.
+REACH_STEPS = 4
+_WINDOW = np.arange(2 * REACH_STEPS + 1)
+# From nine values of z to the polynomial through them; z is smooth over ten steps.
+_TAYLOR = np.linalg.inv(np.vander(_WINDOW - REACH_STEPS, increasing=True)).T + 0j
 
 
 class Window(NamedTuple):
@@ -96,8 +109,8 @@ class State(NamedTuple):
 class Solver:
     """Positions of K echoes by Levenberg-Marquardt, kept in the window and apart.
 
-    ``sigma`` is that of the envelope, ``first`` and ``last`` are the limits of a position, and
-    ``separation`` is the least distance of two positions, all in bins.
+    In bins: ``sigma`` of the envelope, limits ``first`` and ``last`` of a position, and the least
+    distance of two.
     """
 
     def __init__(self, sigma: float, first: float, last: float, separation: float) -> None:
@@ -187,8 +200,7 @@ def evaluate(data: Window, positions: Array, sigma: float) -> State:
 def _on_grid(data: Window, samples: Array, envelopes: Array) -> tuple[Array, Array]:
     """Return the correlation of samples with pulses on a grid, complex, and their squared norms.
 
-    Shapes (1, n_grid), edges and gaps of the window included. Cosine and sine columns are taken as
-    orthogonal, which they are but for cut pulses.
+    Shapes (1, n_grid). Cosine and sine columns are orthogonal but for cut pulses.
     """
     matched = (samples * data.cosine) @ envelopes.T + 1j * ((samples * data.sine) @ envelopes.T)
     norm = 0.5 * data.weight @ (envelopes**2).T
@@ -250,22 +262,13 @@ def one_more(data: Window, state: State, grid: Array, sigma: float, separation: 
     return together.clip(grid[0], grid[-1])
 
 
-# Of the envelope's sigma: spacing of the start grid. The likelihood is smooth on that scale.
-_GRID_STEP = 0.2
-# Gains of twice the log-likelihood too small to go on: while echoes are counted, and at last, where
-# it is a hundredth of a standard deviation of a position.
-_COARSE, _FINE = 1.0, 1e-4
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EchoFit:
+class EchoFit(NamedTuple):
     """One echo of a window."""
 
     position_bins: float  # centre of the pulse, in bins from the window's first sample
     amplitude: float  # peak of the envelope, in the unit of the samples
     phase_rad: float  # phase of the carrier at the pulse's centre, in (-pi, pi]
-    # Standard deviation of the position: the Cramer-Rao bound at this fit, the amplitudes and
-    # phases of all echoes and the other positions unknown
+    # Standard deviation of the position: the Cramer-Rao bound at this fit, all else unknown
     sigma_bins: float
 
 
@@ -348,9 +351,8 @@ def fit_echoes(
 def split_threshold(false_split: float, search_sigmas: float) -> float:
     """Return the rise of twice the log-likelihood that noise exceeds with a given probability.
 
-    Along the position, the energy that one more echo explains is a chi-square process of 2 degrees,
-    whose correlation is that of the pulse; the probability that it exceeds h anywhere is at most
-    that of its first point plus its upcrossings, ``exp(-h/2) (1 + L sqrt(h / (4 pi)))``, with L =
+    The probability that the energy that one more echo explains exceeds h anywhere is at most that
+    of its first point plus its upcrossings, ``exp(-h/2) (1 + L sqrt(h / (4 pi)))``, with L =
     ``search_sigmas`` the interval searched, in standard deviations of the envelope.
     """
 
@@ -370,40 +372,15 @@ def _echoes(fit: State, noise_sigma: float, carrier_rad_per_bin: float) -> tuple
     b, d = fit.linear[0, :n_echoes], fit.linear[0, n_echoes:]
     # A cos(w (n - u) + phase) = b cos(w n) + d sin(w n)
     phases = np.angle((b - 1j * d) * np.exp(1j * carrier_rad_per_bin * positions))
-    return tuple(
-        EchoFit(
-            position_bins=position,
-            amplitude=amplitude,
-            phase_rad=phase,
-            sigma_bins=spread,
-        )
-        for position, amplitude, phase, spread in zip(
-            positions.tolist(),
-            np.hypot(b, d).tolist(),
-            phases.tolist(),
-            sigma_bins.tolist(),
-            strict=True,
-        )
-    )
-
-
-Matrix = list[list[float]]
-T = TypeVar("T")
-
-# How many times its forecast a search may gain, at most.
-_OPTIMISM = 10.0
-# On either side of a step, how many it takes to interpolate there.
-REACH_STEPS = 4
-_WINDOW = np.arange(2 * REACH_STEPS + 1)
-# From nine values of z to the polynomial through them; z is smooth over ten steps.
-_TAYLOR = np.linalg.inv(np.vander(_WINDOW - REACH_STEPS, increasing=True)).T + 0j
+    table = np.column_stack([positions, np.hypot(b, d), phases, sigma_bins])
+    return tuple(EchoFit(*row) for row in table.tolist())
 
 
 class Correlation:
     """z of a stretch of one frame, a polynomial around each of its steps.
 
-    ``z`` (n,), complex, is the filter's output with the carrier turned back, ``step_bins`` apart;
-    ``sigma_bins`` is s of the envelope, ``sigma_y`` the noise of z per quadrature.
+    ``z`` (n,), complex, is ``step_bins`` apart; ``sigma_bins`` is s of the envelope, ``sigma_y``
+    the noise of z per quadrature.
     """
 
     def __init__(
@@ -447,10 +424,9 @@ class _Search(NamedTuple):
 
 
 class _Fit:
-    """The echoes at given positions.
+    """The echoes at given positions u: amplitudes a, ``inverse`` R^-1, ``explained`` G.
 
-    ``positions``, ``amplitudes``: u and a; ``inverse``: R^-1; ``explained``: G; ``gradient`` and
-    ``information``: half of dG/du, and the Fisher matrix times sigma_y**2.
+    ``gradient`` and ``information``: half of dG/du, and the Fisher matrix times sigma_y**2.
     """
 
     __slots__ = ("amplitudes", "explained", "gradient", "information", "inverse", "positions")
@@ -485,7 +461,7 @@ def fit_whole_echoes(
     """Return the echoes between two positions [bins], between one and ``split.max_echoes``.
 
     ``data`` is z around them, all other echoes of the frame subtracted. Nearest first, positions
-    counted in bins from ``z[0]``, phases at the positions with the carrier turned back.
+    in bins from ``z[0]``, phases with the carrier turned back.
     """
     s = data.sigma_bins
     grid, z = data.on_steps(first, last)
@@ -607,10 +583,7 @@ def _pairs(size: int, step_bins: float, s: float, separation: float) -> tuple[Ar
 
 
 def _one_more(fit: _Fit, search: _Search, s: float, needed: float) -> list[list[float]]:
-    """Return starts with one more echo: where it explains most, or as a split of one.
-
-    None, where the residual is far from explaining what is needed.
-    """
+    """Return starts as `one_more` does; none where the residual cannot explain what is needed."""
     first, last, separation, grid, z = search
     positions = np.array(fit.positions)
     apart = grid - positions[:, np.newaxis]
@@ -658,11 +631,6 @@ def _fitted_echoes(fit: _Fit, sigma_y: float) -> tuple[EchoFit, ...]:
         variances = [row[k] for k, row in enumerate(_inverse(information))]
     spread = [sigma_y * math.sqrt(v) if v > 0.0 else math.inf for v in variances]
     return tuple(
-        EchoFit(
-            position_bins=position,
-            amplitude=abs(a),
-            phase_rad=math.atan2(a.imag, a.real),
-            sigma_bins=sigma,
-        )
+        EchoFit(position, abs(a), math.atan2(a.imag, a.real), sigma)
         for position, a, sigma in zip(fit.positions, fit.amplitudes, spread, strict=True)
     )

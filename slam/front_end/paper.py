@@ -53,9 +53,9 @@ class PaperDetector:
         return results
 
     def smooth(self, samples: NDArray[np.float32]) -> Array:
-        """Return the magnitude, background set to zero, smoothed.
+        """Return the magnitude, background set to zero, smoothed; shapes (..., n_bins).
 
-        Shapes (..., n_bins), float64; each frame on its own, to the same bits however many.
+        Each frame on its own, to the same bits however many.
         """
         magnitude = np.abs(samples, dtype=np.float64)
         mean = magnitude.mean(axis=-1, keepdims=True)
@@ -97,11 +97,10 @@ class PaperDetector:
 
 
 class SavitzkyGolay:
-    """Least-squares polynomial smoothing of equally spaced samples, as one FIR filter.
+    """``scipy.signal.savgol_filter`` with ``mode="interp"``, its coefficients computed once.
 
-    Equal to ``scipy.signal.savgol_filter`` with ``mode="interp"``: in the middle a fixed kernel, at
-    each end the polynomial fitted to the last ``length`` samples, an odd number. Both are computed
-    once instead of once per frame.
+    In the middle a fixed kernel, at each end the polynomial fitted to the last ``length`` samples,
+    an odd number.
     """
 
     def __init__(self, length: int, order: int) -> None:
@@ -126,12 +125,10 @@ class SavitzkyGolay:
         smoothed: Array = correlate1d(samples, self._kernel, axis=-1, mode="constant")
         half = self.length // 2
         # Sums of products rather than matrix products: those round by the number of frames.
-        head, tail = (
-            samples[..., np.newaxis, : self.length],
-            samples[..., np.newaxis, -self.length :],
-        )
-        smoothed[..., :half] = (self._head * head).sum(axis=-1)
-        smoothed[..., -half:] = (self._tail * tail).sum(axis=-1)
+        first = samples[..., np.newaxis, : self.length]
+        last = samples[..., np.newaxis, -self.length :]
+        smoothed[..., :half] = (self._head * first).sum(axis=-1)
+        smoothed[..., -half:] = (self._tail * last).sum(axis=-1)
         return smoothed
 
 

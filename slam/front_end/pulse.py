@@ -9,16 +9,14 @@ two-way delay 2 R / c, so everything follows from two frequencies and the length
 
 Cramer-Rao bound of the position, A and phi unknown, white noise of standard deviation sigma per
 sample (Kay 1993, Fundamentals of Statistical Signal Processing vol. 1: section 3.5, and 3.7 for
-more than one parameter). Amplitude and phase enter the pulse linearly as a complex number, so
-what counts is the part of the derivative that they do not explain: the carrier's share of dp/du
-is a turn of the phase, the envelope's share remains. With the sums over n as integrals,
+more than one parameter). What counts is the part of the derivative that amplitude and phase do not
+explain, the envelope's. With the sums over n as integrals,
 
     I(u) = A**2 / (2 sigma**2) int e'(x)**2 dx = A**2 sqrt(pi) / (4 s sigma**2),   e = |p|
     std(u) >= (2 sigma / A) sqrt(s / sqrt(pi))
 
-``position_bound_bins``. The matched filter's amplitude has the standard deviation
-sigma sqrt(2 / (s sqrt(pi))) in either quadrature, so the same bound reads sqrt(2) s over the ratio
-of amplitude to that.
+The matched filter's amplitude has the standard deviation sigma sqrt(2 / (s sqrt(pi))) in either
+quadrature, so the same bound reads sqrt(2) s over the ratio of amplitude to that.
 """
 
 from __future__ import annotations
@@ -46,9 +44,7 @@ class PulseModel:
 
     @property
     def sigma_m(self) -> float:
-        """Return the envelope's standard deviation as a range.
-
-        The spectrum exp(-(2 pi f sigma_t)**2) is 0.1 at half the bandwidth.
+        """Return the envelope's standard deviation: exp(-(2 pi f sigma_t)**2) is 0.1 at half width.
 
         >>> round(1e3 * PulseModel().sigma_m, 1)
         51.7

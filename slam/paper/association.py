@@ -74,12 +74,9 @@ def update_map(
 ) -> tuple[Belief, tuple[Association, ...]]:
     """Update known landmarks and add new ones from the observations of one pose.
 
-    As printed, one observation after the other goes to the landmark nearest to it in Mahalanobis
-    distance given all before it, or becomes a landmark if none lies within the gate. With
-    ``one_to_one`` all are assigned jointly against the belief before any of them.
-
-    Returns the belief after all observations, (range [m], bearing [rad]) each with noise Q, and
-    the result of each, in their order.
+    As printed, one observation (range [m], bearing [rad], noise Q) after the other goes to the
+    landmark nearest to it in Mahalanobis distance, or becomes a landmark if none lies within the
+    gate. With ``one_to_one`` all are assigned jointly against the belief before any of them.
     """
     planned: list[int | None] | None = None
     if config.assignment is Assignment.ONE_TO_ONE and observations:

@@ -16,6 +16,8 @@ from slam.results import Fix, Observation
 
 Array = NDArray[np.float64]
 
+NOISE = -1
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CollectedState:
@@ -27,15 +29,11 @@ class CollectedState:
     fixes: tuple[Fix, ...]  # trilaterated points, body frame of this pose
 
 
-NOISE = -1
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilteredWindow:
     """What DBSCAN makes of one window."""
 
-    # One per emitted cluster, in the order of first appearance
-    observations: tuple[Observation, ...]
+    observations: tuple[Observation, ...]  # one per emitted cluster, by first appearance
     rejected: tuple[Fix, ...]  # fixes of the window's first pose that belong to no cluster
 
 
@@ -65,13 +63,21 @@ def cluster_labels(points: Array, config: ClusteringConfig) -> NDArray[np.int64]
 def filter_window(window: Sequence[CollectedState], config: ClusteringConfig) -> FilteredWindow:
     """Return the observations of the window's first pose, confirmed by the poses after it.
 
-    All fixes are expressed, through odometry, in the frame of the first pose and clustered there. A
-    cluster that holds a fix of the first pose becomes one observation of that pose. ``window`` is
-    in time order and not empty.
+    All fixes are clustered in the body frame of the first pose, to which odometry brings them. A
+    cluster that holds a fix of that pose becomes one observation. ``window`` is in time order.
     """
     fixes = [fix for state in window for fix in state.fixes]
     state_of_fix = np.repeat(np.arange(len(window)), [len(state.fixes) for state in window])
-    points = points_in_first_frame(window)
+    origin = window[0].odometry_pose
+    parts = [
+        transform(
+            between(origin, state.odometry_pose),
+            np.array([(fix.x_m, fix.y_m) for fix in state.fixes]),
+        )
+        for state in window
+        if state.fixes
+    ]
+    points = np.concatenate(parts) if parts else np.empty((0, 2))
     labels = cluster_labels(points, config)
 
     observations = []
@@ -103,17 +109,3 @@ def filter_window(window: Sequence[CollectedState], config: ClusteringConfig) ->
         observations=tuple(observations),
         rejected=tuple(fixes[i] for i in np.flatnonzero(~confirmed[:n_current])),
     )
-
-
-def points_in_first_frame(window: Sequence[CollectedState]) -> Array:
-    """Return all fixes of a window in the body frame of its first pose, shape (n, 2) [m]."""
-    origin = window[0].odometry_pose
-    parts = [
-        transform(
-            between(origin, state.odometry_pose),
-            np.array([(fix.x_m, fix.y_m) for fix in state.fixes]),
-        )
-        for state in window
-        if state.fixes
-    ]
-    return np.concatenate(parts) if parts else np.empty((0, 2))

@@ -1,10 +1,9 @@
 """Extended Kalman filter over one pose and the landmarks: pure functions from belief to belief.
 
-Words and letters: mean x, covariance P, motion Jacobian G, motion noise R, observation Jacobian H,
-observation noise Q, innovation covariance S. (R is motion and Q observation noise, as in the
-paper.) The state is ``[x, y, heading, l0x, l0y, l1x, l1y, ...]`` in the map frame, which is the
-body frame at the start of the run. A landmark's *row* is its place in that order; its *id* stays
-with it for good.
+Letters as in the paper: mean x, covariance P, motion Jacobian G, motion noise R, observation
+Jacobian H, observation noise Q, innovation covariance S. The state is ``[x, y, heading, l0x, l0y,
+l1x, l1y, ...]`` in the map frame. A landmark's *row* is its place in that order; its *id* never
+changes.
 """
 
 from __future__ import annotations
@@ -61,9 +60,8 @@ def motion_jacobian(heading_rad: float, increment: Array) -> Array:
 def predict(belief: Belief, increment: Array, R: Array) -> Belief:
     """Move the pose by an odometry increment.
 
-    ``x_r' = x_r (+) u``, ``P_rr' = G P_rr G^T + R``, ``P_rl' = G P_rl``; landmarks stay. u has
-    shape (3,), the motion in the body frame before it, [m, m, rad]; R (3, 3) is its noise in map
-    axes.
+    ``x_r' = x_r (+) u``, ``P_rr' = G P_rr G^T + R``, ``P_rl' = G P_rl``. u has shape (3,), the
+    motion in the body frame before it, [m, m, rad]; R (3, 3) is its noise in map axes.
     """
     pose = slice(0, POSE_SIZE)
     G = motion_jacobian(float(belief.mean[2]), increment)
@@ -93,8 +91,6 @@ def observation_jacobians(pose: Array, landmarks: Array) -> tuple[Array, Array]:
 
         H_pose     = [[-dx/sqrt(q), -dy/sqrt(q),  0], [ dy/q, -dx/q, -1]]
         H_landmark = [[ dx/sqrt(q),  dy/sqrt(q)   ], [-dy/q,  dx/q    ]]
-
-    The bearing falls by exactly as much as the heading rises: the last entry is -1, not -1/q.
     """
     dx, dy = landmarks[:, 0] - pose[0], landmarks[:, 1] - pose[1]
     q = dx**2 + dy**2
@@ -124,8 +120,7 @@ def update(belief: Belief, row: int, observed: Array, Q: Array) -> Belief:
 
         x' = x + W^T L^-1 nu          P' = P - W^T W
 
-    Equal to the Joseph form ``(I - K H) P (I - K H)^T + K Q K^T`` with K = P H^T S^-1, at the cost
-    of one symmetric rank-2 downdate; W^T W is computed symmetric, so P stays so.
+    Equal to the Joseph form ``(I - K H) P (I - K H)^T + K Q K^T`` with K = P H^T S^-1.
     """
     landmark = belief.landmarks[row : row + 1]
     expected = expected_observations(belief.pose, landmark)[0]
@@ -151,7 +146,7 @@ def update(belief: Belief, row: int, observed: Array, Q: Array) -> Belief:
 def whiten(L: NDArray[np.floating], rows: Array) -> Array:
     """Return L^-1 rows for a lower triangular L of shape (2, 2) and two rows of any length.
 
-    Written out: a library call for two rows costs more than it computes, and wakes BLAS threads.
+    A library call would cost more than it computes, and wake BLAS threads.
     """
     first = rows[0] / L[0, 0]
     return np.array([first, (rows[1] - L[1, 0] * first) / L[1, 1]], dtype=np.float64)
@@ -164,8 +159,6 @@ def augment(belief: Belief, observed: Array, Q: Array) -> Belief:
     (2, 2)::
 
         P_ll = G_pose P_rr G_pose^T + G_obs Q G_obs^T          P_lx = G_pose P_rx
-
-    It is the limit of an update of a landmark with boundless prior covariance.
     """
     r, direction = float(observed[0]), float(observed[1] + belief.mean[2])
     cosine, sine = math.cos(direction), math.sin(direction)

@@ -23,10 +23,7 @@ Array = NDArray[np.float64]
 
 
 class UwbRadarSlam:
-    """UWB radar SLAM as in the paper: fixes of two radars, DBSCAN over a window, EKF SLAM.
-
-    The map frame is the body frame at the first odometry pose.
-    """
+    """UWB radar SLAM as in the paper: fixes of two radars, DBSCAN over a window, EKF SLAM."""
 
     def __init__(self, config: SlamConfig, rig: Rig, detector: Detector | None = None) -> None:
         self.config = config
@@ -44,13 +41,6 @@ class UwbRadarSlam:
     def step(
         self, frames: Sequence[RadarFrame], pose_at: PoseAt, t_ns: int
     ) -> tuple[StepResult, ...]:
-        """Take in the frames and odometry around one time; return the state now ready, if any.
-
-        There is at most one frame per radar, each with the time it was taken at; a radar whose
-        frame was lost is absent. ``pose_at`` is asked for the pose at ``t_ns``, the time of the
-        state, and, where ``trilateration.sample_time`` is "own", at the time of every frame with an
-        echo.
-        """
         detect = partial(detect_all, self._detector, frames, self.rig)
         return self._take(detect, pose_at, t_ns)
 
@@ -92,7 +82,8 @@ class UwbRadarSlam:
         """Estimate state s from the window s .. s + w - 1 (the inner part of Algorithm 1)."""
         config, state = self.config, self._window[0]
         filtered = filter_window(tuple(self._window), config.clustering)
-        observations = filtered.observations if self._is_update_due() else ()
+        is_update_due = self._n_estimated % config.window.stride == 0
+        observations = filtered.observations if is_update_due else ()
 
         u = between(self._estimated_pose, state.odometry_pose)
         R = motion_noise(u, float(self.belief.pose[2]), config.motion)
@@ -122,6 +113,3 @@ class UwbRadarSlam:
             return NO_MOTIONS
         stamps_ns = {detection.t_ns for detection in detections} - {t_ns}
         return {stamp_ns: between(pose, pose_at(stamp_ns)) for stamp_ns in stamps_ns}
-
-    def _is_update_due(self) -> bool:
-        return self._n_estimated % self.config.window.stride == 0

@@ -1,7 +1,7 @@
 """Two ranges from two radars of one side become a point in the body frame (paper eq. 1 to 4).
 
 The paper calls it trilateration; it is the intersection of two circles, of which the one in front
-of the radars is kept. Everything follows from the mounts: the same formula serves both sides.
+of the radars is kept.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ _AMPLITUDES = (1e-12, 1e12)
 
 NO_MOTIONS: Mapping[int, Array] = MappingProxyType({})
 """All radars sampled at one time, or are taken to have."""
-_STANDING: Array = np.zeros(3)
 
 
 def bilaterate(
@@ -43,11 +42,10 @@ def bilaterate(
         u = (l1 - l2) (l1 + l2) / (2 d)          v = sqrt((l1^2 + l2^2) / 2 - d^2 / 4 - u^2)
         alpha = atan2(v, u + d/2)                beta = atan2(v, d/2 - u)
 
-    alpha and beta are the paper's inner angles. Its eq. 2 gives their cosines; the angles
-    themselves, arccos of those, are compared with gamma = (pi - theta) / 2 of eq. 1. atan2 gives
-    the same angles without losing digits near 0. Seen by both means that each antenna's direction
-    to the point is less than theta / 2 off its boresight; for a boresight square to the base that
-    is exactly alpha > gamma and beta > gamma.
+    alpha and beta are the paper's inner angles, whose cosines its eq. 2 gives; atan2 loses no
+    digits near 0. Seen by both means that each antenna's direction to the point is less than
+    theta / 2 off its boresight; for a boresight square to the base that is exactly alpha > gamma
+    and beta > gamma, with gamma = (pi - theta) / 2 of eq. 1.
 
     Returns positions (n, 2) [m], body frame, NaN where the circles do not meet; and whether they
     meet inside both fields of view (n,), never for ranges that are negative, zero, not finite or
@@ -94,10 +92,8 @@ class Trilaterator:
     ) -> tuple[Fix, ...]:
         """Return the fixes of one pose, at ``t_ns`` and in its body frame, from all detections.
 
-        The radars of a pair follow from the rig; the triangle of two detections has its base
-        between the mounts at the detections' own times, and their own two boresights. ``motions``
-        has, by session time, the pose of the robot then as seen from the pose at ``t_ns``, shape
-        (3,); detections of a time without entry were made at ``t_ns``.
+        ``motions`` has, by session time, the pose of the robot then as seen from the pose at
+        ``t_ns``, shape (3,); detections of a time without entry were made at ``t_ns``.
         """
         by_radar: dict[int, list[Detection]] = {}
         for detection in detections:
@@ -151,7 +147,7 @@ class Trilaterator:
         if motions.keys().isdisjoint(stamps_ns):
             return pair
         first, second = (
-            mount_at(self.rig.mounts[radar], motions.get(stamp_ns, _STANDING))
+            mount_at(self.rig.mounts[radar], motions.get(stamp_ns, np.zeros(3)))
             for radar, stamp_ns in zip((pair.first, pair.second), stamps_ns, strict=True)
         )
         return pair_of(pair.first, pair.second, (first, second))
@@ -162,9 +158,7 @@ def one_to_one(fixes: Sequence[Fix]) -> list[Fix]:
 
     As many as possible; among those choices the one whose amplitudes fit best: least sum of
     ``|ln(a1 / a2)|``, because two radars side by side receive one target with nearly equal
-    amplitude. The order of the fixes plays no part, in ties neither: detections are numbered by
-    range first.
-    Equal detections of one radar are one.
+    amplitude. The order of the fixes plays no part, and equal detections of one radar are one.
     """
     firsts = _numbered(fix.detections[0] for fix in fixes)
     seconds = _numbered(fix.detections[1] for fix in fixes)
