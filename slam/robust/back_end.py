@@ -288,11 +288,10 @@ class RobustBackEnd:
         near = near.with_added_sigma(shape_sigmas_m)
         matches.evidence += evidence(near, seen, scans, state, self.parameters)
         inside = seen.inside(noise, -limits.view_inset_rad, -limits.view_inset_m)[radars]
-        in_all_views = inside.all(axis=0)
         known = () if sure is None else sure.landmarks
         # Too unsure for single ranges: a miss only where no echo at all is near the prediction.
         for row in np.setdiff1d(near.unanswered(scans, noise, limits.view_inset_m), known).tolist():
-            if in_all_views[row]:
+            if inside[:, row].all():
                 existence.miss(ids[row])
         if sure is None:
             return
@@ -302,7 +301,7 @@ class RobustBackEnd:
         count = Counter(continuation.row for continuation in found)
         for row in count:
             existence.hit(ids[row])
-        for row in sure.landmarks[in_all_views[sure.landmarks]].tolist():
+        for row in sure.landmarks[inside[:, sure.landmarks].all(axis=0)].tolist():
             hidden = any(scan.may_hide(float(seen.ranges_m[scan.radar, row])) for scan in scans)
             if row not in count and not hidden:
                 existence.miss(ids[row])

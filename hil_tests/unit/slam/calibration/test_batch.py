@@ -54,9 +54,7 @@ def range_term(seed: int, cauchy_scale: float | None = None) -> RangeTerm:
 def prior_term(seed: int) -> PriorTerm:
     random = np.random.default_rng(seed)
     indices = random.permutation(LAYOUT.size)[:9]
-    return PriorTerm(
-        indices=indices, means=random.normal(size=9), sigmas=random.uniform(1, 2, 9)
-    )
+    return PriorTerm(indices=indices, means=random.normal(size=9), sigmas=random.uniform(1, 2, 9))
 
 
 @pytest.mark.parametrize("make", [odometry_term, range_term, prior_term])
