@@ -77,10 +77,7 @@ def add_experiments(experiment: argparse.ArgumentParser) -> None:
 def run_experiment(arguments: argparse.Namespace, stop: StopFlag) -> None:
     """Run ``arguments.name``; write NAME.json and NAME.png into ``arguments.out``, print tables.
 
-    Raises
-    ------
-    AppError
-        The folder or a file cannot be written, or the experiment failed.
+    Raises AppError if the folder or a file cannot be written, or the experiment failed.
     """
     name, out = arguments.name, arguments.out
     with naming(out):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from emulator.scene.scene import PathSpec, RadarSpec, Scene, TargetSpec, load_scene
 from slam.app.experiments import Result, table
 from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, open_loopback
-from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label
+from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label, note
 from slam.config import DetectionConfig, FrontEnd, load_preset, override
 from slam.frames import Detection, RadarFrame
 from slam.front_end import make_detector
@@ -39,53 +39,19 @@ _WATER = LinearSegmentedColormap.from_list("water", ["#ffffff", "#9cc0ea", "#124
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Steps:
-    """Frames of every position.
+    """Frames of every position of the rod."""
 
-    Attributes
-    ----------
-    ranges_m
-        Shape (n_steps,): the rod's true range from the antenna.
-    frames
-        For each position its frames, as SLAM gets them.
-    """
-
-    ranges_m: Array
-    frames: tuple[tuple[RadarFrame, ...], ...]
+    ranges_m: Array  # (n_steps,): true ranges from the antenna
+    frames: tuple[tuple[RadarFrame, ...], ...]  # of each position
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RangeErrors:
-    """What one front end made of the frames.
+    """What one front end made of the frames."""
 
-    Attributes
-    ----------
-    detections
-        For each position and frame all detections.
-    residuals_m
-        Shape (n_steps, n_frames): the nearest detection's range minus the true one; NaN where
-        none lay within ``MATCH_M``.
-    """
-
-    detections: tuple[tuple[tuple[Detection, ...], ...], ...]
+    detections: tuple[tuple[tuple[Detection, ...], ...], ...]  # by position and frame
+    # (n_steps, n_frames): nearest detection minus truth; NaN where none lay within MATCH_M
     residuals_m: Array
-
-    @property
-    def found(self) -> float:
-        return float(np.isfinite(self.residuals_m).mean())
-
-    @property
-    def others_per_frame(self) -> float:
-        """Return how many detections per frame were not the rod's, or its second one."""
-        total = sum(len(one) for step in self.detections for one in step)
-        return total / self.residuals_m.size - self.found
-
-    @property
-    def bias_m(self) -> float:
-        return float(np.nanmean(self.residuals_m)) if self.found else math.nan
-
-    @property
-    def std_m(self) -> float:
-        return float(np.nanstd(self.residuals_m)) if self.found else math.nan
 
     @property
     def position_means_m(self) -> Array:
@@ -96,28 +62,31 @@ class RangeErrors:
         means_m: Array = np.divide(total, seen.sum(axis=1), out=means, where=seen.any(axis=1))
         return means_m
 
-    @property
-    def noise_std_m(self) -> float:
-        """Return the standard deviation about each position's own mean: noise, not bias."""
-        about = self.residuals_m - self.position_means_m[:, np.newaxis]
-        return float(np.sqrt(np.nanmean(about**2))) if self.found else math.nan
+    def numbers(self) -> dict[str, float]:
+        """Return the figures of the table; NaN where nothing was found.
 
-    @property
-    def worst_position_m(self) -> float:
-        return float(np.nanmax(np.abs(self.position_means_m))) if self.found else math.nan
-
-    def numbers(self) -> dict[str, object]:
+        ``others_per_frame`` are not the rod's, or its second ones; ``noise_std_m`` is about each
+        position's own mean: noise, not bias.
+        """
+        found = float(np.isfinite(self.residuals_m).mean())
+        total = sum(len(one) for step in self.detections for one in step)
         names = ("bias_m", "std_m", "noise_std_m", "worst_position_m")
+        values = [math.nan] * len(names)
+        if found:
+            means_m = self.position_means_m
+            about = self.residuals_m - means_m[:, np.newaxis]
+            values = [
+                float(np.nanmean(self.residuals_m)),
+                float(np.nanstd(self.residuals_m)),
+                float(np.sqrt(np.nanmean(about**2))),
+                float(np.nanmax(np.abs(means_m))),
+            ]
+        others_per_frame = total / self.residuals_m.size - found
         return {
-            "found": self.found,
-            "others_per_frame": self.others_per_frame,
-            **{name: _known(getattr(self, name)) for name in names},
-            "position_means_m": [_known(value) for value in self.position_means_m.tolist()],
+            "found": found,
+            "others_per_frame": others_per_frame,
+            **dict(zip(names, values, strict=True)),
         }
-
-
-def _known(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def rod_ranges_m() -> list[float]:
@@ -206,24 +175,10 @@ def _draw_raw(axes: Axes, frame: RadarFrame, true_m: float) -> None:
     axes.axvspan(true_m - 0.1, true_m + 0.1, color=TRUTH, alpha=0.18, linewidth=0)
     axes.plot(_ranges_m(frame), _MILLI * magnitude, color=ESTIMATE, linewidth=0.8)
     axes.axhline(_MILLI * magnitude.mean(), color=ODOMETRY, linewidth=1.0, linestyle="--")
-    axes.annotate(
-        "dashed: mean,\nless is set to 0",
-        (_SHOWN_TO_M, _MILLI * magnitude.mean()),
-        xytext=(-4, 24),
-        textcoords="offset points",
-        ha="right",
-        fontsize=8.5,
-        color=ODOMETRY,
-    )
-    axes.annotate(
-        "the rod is here",
-        (true_m, 1.0),
-        xycoords=("data", "axes fraction"),
-        xytext=(24, -14),
-        textcoords="offset points",
-        fontsize=8.5,
-        color=PALE_INK,
-    )
+    mean = (_SHOWN_TO_M, _MILLI * magnitude.mean())
+    note(axes, "dashed: mean,\nless is set to 0", mean, (-4, 24), ODOMETRY, ha="right")
+    top = ("data", "axes fraction")
+    note(axes, "the rod is here", (true_m, 1.0), (24, -14), PALE_INK, xycoords=top)
     axes.set_xlim(frame.range_start_m, _SHOWN_TO_M)
     axes.set_ylim(bottom=0)
     label(axes, "(a) one raw frame, magnitude", "range [m]", "amplitude [1e-3]")
@@ -234,32 +189,19 @@ def _draw_smoothed(axes: Axes, frame: RadarFrame, true_m: float, config: Detecti
     smoothed = detector.smooth(frame.samples)
     axes.axvline(true_m, color=TRUTH, linewidth=3.2, alpha=0.55, label="true range of the rod")
     axes.plot(_ranges_m(frame), _MILLI * smoothed, color=ESTIMATE, linewidth=1.0, label="smoothed")
-    axes.axhline(
-        _MILLI * config.min_peak_height,
-        color=ODOMETRY,
-        linewidth=1.0,
-        linestyle="--",
-        label="least peak height",
-    )
+    least = _MILLI * config.min_peak_height
+    axes.axhline(least, color=ODOMETRY, linewidth=1.0, linestyle="--", label="least peak height")
     found = detector.detect(frame)
     heights = [_MILLI * each.amplitude for each in found]
     axes.plot([each.range_m for each in found], heights, "v", color=LANDMARK, label="detection")
     for each in found:
-        axes.annotate(
-            f"{each.range_m:.3f} m, {_MILLI * (each.range_m - true_m):+.1f} mm off",
-            (each.range_m, _MILLI * each.amplitude),
-            xytext=(10, 2),
-            textcoords="offset points",
-            fontsize=8.5,
-            color=LANDMARK,
-        )
+        text = f"{each.range_m:.3f} m, {_MILLI * (each.range_m - true_m):+.1f} mm off"
+        note(axes, text, (each.range_m, _MILLI * each.amplitude), (10, 2), LANDMARK)
     axes.set_xlim(frame.range_start_m, _SHOWN_TO_M)
     axes.margins(y=0.12)
     axes.legend(loc="upper left", frameon=False, fontsize=8.5)
-    title = (
-        f"(b) mean filter, Savitzky-Golay ({config.smoothing_length_bins}, "
-        f"{config.smoothing_order}), peaks"
-    )
+    settings = f"({config.smoothing_length_bins}, {config.smoothing_order})"
+    title = f"(b) mean filter, Savitzky-Golay {settings}, peaks"
     label(axes, title, "range [m]", "amplitude [1e-3]")
 
 
@@ -288,58 +230,59 @@ def _draw_positions(axes: Axes, steps: Steps, paper: RangeErrors, config: Detect
     x, y = np.array(points).reshape(-1, 2).T
     axes.plot(x, y, "o", markersize=2.6, color=LANDMARK, label="detection")
     axes.legend(loc="upper left", frameon=False, fontsize=8.5)
-    label(
-        axes,
-        "(c) the rod moves away in 1 cm steps: one frame per row",
-        "range [m]",
-        "true range of the rod [m]",
-    )
+    title = "(c) the rod moves away in 1 cm steps: one frame per row"
+    label(axes, title, "range [m]", "true range of the rod [m]")
 
 
 def _draw_residuals(axes: Axes, steps: Steps, errors: Mapping[str, RangeErrors]) -> None:
     axes.axhline(0.0, color=TRUTH, linewidth=1.0)
     for name, error in errors.items():
-        spread = f"bias {_MILLI * error.bias_m:+.2f} mm, std {_MILLI * error.std_m:.2f} mm"
+        numbers = error.numbers()
+        bias_mm, std_mm = _MILLI * numbers["bias_m"], _MILLI * numbers["std_m"]
+        spread = f"bias {bias_mm:+.2f} mm, std {std_mm:.2f} mm"
+        colour = _COLOURS[name]
+        # on a single echo the joint fit is the matched filter: the first line is wide
+        width, alpha = (4.0, 0.4) if name == FrontEnd.MATCHED_FILTER else (1.0, 1.0)
         axes.plot(
             np.repeat(steps.ranges_m, error.residuals_m.shape[1]),
             _MILLI * error.residuals_m.ravel(),
             ".",
             markersize=2.0,
             alpha=0.25,
-            color=_COLOURS[name],
+            color=colour,
             zorder=1,
         )
         axes.plot(
             steps.ranges_m,
             _MILLI * error.position_means_m,
-            # on a single echo the joint fit is the matched filter: the first line is wide
-            linewidth=4.0 if name == FrontEnd.MATCHED_FILTER else 1.0,
-            alpha=0.4 if name == FrontEnd.MATCHED_FILTER else 1.0,
-            color=_COLOURS[name],
+            linewidth=width,
+            alpha=alpha,
+            color=colour,
             label=f"{name}: {spread}",
         )
     axes.legend(loc="upper left", frameon=False, fontsize=8.5)
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.25 * (high - low))  # room for the legend
-    label(
-        axes,
-        "(d) error: dots frames, lines their mean",
-        "true range of the rod [m]",
-        "error [mm]",
-    )
+    title = "(d) error: dots frames, lines their mean"
+    label(axes, title, "true range of the rod [m]", "error [mm]")
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
     seed, n_frames = arguments.seed, arguments.frames
     steps = measure_steps(rod_ranges_m(), seed=seed, frames_per_step=n_frames, stop=stop)
     errors = range_errors(steps, stop)
+    numbers = {name: error.numbers() for name, error in errors.items()}
     return Result(
         numbers={
             "simulated": True,
             "seed": seed,
             "frames_per_step": n_frames,
             "true_ranges_m": steps.ranges_m.tolist(),
-            "front_ends": {name: error.numbers() for name, error in errors.items()},
+            "front_ends": {
+                name: {key: _known(value) for key, value in numbers[name].items()}
+                | {"position_means_m": list(map(_known, error.position_means_m.tolist()))}
+                for name, error in errors.items()
+            },
         },
         title="From raw frame to range: the paper's figure of raw observations, repeated on an "
         f"emulated X4M300 (simulated, seed {seed})",
@@ -350,17 +293,23 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
                 f"a rod moved away in {len(steps.ranges_m)} steps of 1 cm, {n_frames} frames each, "
                 f"seed {seed}: simulated numbers",
                 {
-                    "front end": list(errors),
-                    "found": [f"{each.found:.3f}" for each in errors.values()],
-                    "others/frame": [f"{each.others_per_frame:.3f}" for each in errors.values()],
-                    "bias": [_mm(each.bias_m) for each in errors.values()],
-                    "std": [_mm(each.std_m) for each in errors.values()],
-                    "of it noise": [_mm(each.noise_std_m) for each in errors.values()],
-                    "worst position": [_mm(each.worst_position_m) for each in errors.values()],
+                    "front end": list(numbers),
+                    "found": [f"{each['found']:.3f}" for each in numbers.values()],
+                    "others/frame": [
+                        f"{each['others_per_frame']:.3f}" for each in numbers.values()
+                    ],
+                    "bias": [_mm(each["bias_m"]) for each in numbers.values()],
+                    "std": [_mm(each["std_m"]) for each in numbers.values()],
+                    "of it noise": [_mm(each["noise_std_m"]) for each in numbers.values()],
+                    "worst position": [_mm(each["worst_position_m"]) for each in numbers.values()],
                 },
             )
         ],
     )
+
+
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 def _mm(length_m: float) -> str:

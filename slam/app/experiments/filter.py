@@ -87,27 +87,13 @@ _PARAMETERS: Mapping[str, tuple[str, Callable[[Setting], float]]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Seen:
-    """What one lap saw.
-
-    Attributes
-    ----------
-    scene
-        Its name.
-    states
-        Every collected state, in time order.
-    truth
-        Shape (n_states, 3): the true pose of each, world frame.
-    origins
-        For each state what its fixes are of.
-    landmarks_m
-        Shape (m, 2), world frame.
-    """
+    """What one lap saw."""
 
     scene: str
-    states: tuple[CollectedState, ...]
-    truth: Array
-    origins: tuple[tuple[Origin, ...], ...]
-    landmarks_m: Array
+    states: tuple[CollectedState, ...]  # in time order
+    truth: Array  # (n_states, 3): true poses, world frame
+    origins: tuple[tuple[Origin, ...], ...]  # of the fixes of each state
+    landmarks_m: Array  # (m, 2), world frame
 
     def count(self, origin: Origin) -> int:
         return sum(each is origin for of_state in self.origins for each in of_state)
@@ -117,15 +103,7 @@ class Seen:
 class Outcome:
     """What one setting did; shares are None where there is nothing to divide by.
 
-    Attributes
-    ----------
-    true_kept, ghosts_kept, clutter_kept
-        Shares of the fixes that some cluster confirmed, of those whose window was complete.
-    n_observations, wrong_observations
-        What went to the filter, and the share farther than 15 cm from every landmark, on true
-        poses.
-    latency_s
-        Median time from a state to the newest one of its window.
+    Fixes are kept if some cluster confirmed them; those are judged whose window was complete.
     """
 
     setting: Setting
@@ -133,18 +111,12 @@ class Outcome:
     ghosts_kept: float | None
     clutter_kept: float | None
     n_observations: int
-    wrong_observations: float | None
-    latency_s: float
+    wrong_observations: float | None  # farther than WRONG_M from every landmark, on true poses
+    latency_s: float  # median time from a state to the newest one of its window
 
 
 def drive(scene: str, *, seed: int, stop: StopFlag) -> Seen:
-    """Drive the first lap of a scene and return every state with all its fixes.
-
-    Raises
-    ------
-    AppError
-        The scene cannot be used; one line.
-    """
+    """Drive the first lap of a scene and return every state with all its fixes."""
     loaded, config = scene_and_config(scene, "paper")
     lap = first_laps(loaded, 1)
     rig = rig_of(lap)

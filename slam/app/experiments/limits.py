@@ -27,7 +27,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -68,8 +68,6 @@ PULSE = KnownPulse(
 NARROW, FULL = (949, 1100), (0, 2047)
 """Ends of the DAC sweep: +-0.0742 as radars are used, and everything."""
 DAC_WINDOW = 0.07421875
-_BLOCK = 250
-"""Frames made at once."""
 
 AMPLITUDE = 0.015
 NOISE_SIGMA = 5e-4
@@ -122,22 +120,9 @@ def pair_covariance(
 
     with m_k the correlations of the derivative of pulse k by its position with both pulses.
 
-    Parameters
-    ----------
-    distance
-        Shape (n,), > 0: from the first echo to the second.
-    ratio
-        Amplitude of the second over the first.
-    turn_rad
-        Shape (n,): phase between the two on a common carrier.
-    snr
-        Amplitude of the first over sigma.
-    envelope_sigma
-        s.
-
-    Returns
-    -------
-    Shape (n, 2, 2), squared bins.
+    ``distance`` (n,) > 0 and ``turn_rad`` (n,) lead from the first echo to the second, the phase on
+    a common carrier; ``ratio`` is the amplitude of the second over the first, ``snr`` that of the
+    first over sigma. Returns shape (n, 2, 2), squared bins.
     """
     s = envelope_sigma
     d = np.asarray(distance, dtype=np.float64)
@@ -162,14 +147,8 @@ def pair_covariance(
 def detection_probability(snr: Array, threshold_sigmas: float, envelope_sigma: float) -> Array:
     """Return how often the matched filter's output at the echo exceeds a threshold: Marcum's Q.
 
-    Parameters
-    ----------
-    snr
-        Amplitude over sigma, any shape.
-    threshold_sigmas
-        In standard deviations of one quadrature of the filter's output.
-    envelope_sigma
-        s; the filter gains s sqrt(pi) / 2 in power.
+    ``snr`` is amplitude over sigma, of any shape; the threshold is in standard deviations of one
+    quadrature of the filter's output. The filter gains s sqrt(pi) / 2 in power.
     """
     noncentrality = np.asarray(snr) ** 2 * envelope_sigma * np.sqrt(np.pi) / 2
     probability: Array = ncx2.sf(threshold_sigmas**2, 2, noncentrality)
@@ -178,21 +157,11 @@ def detection_probability(snr: Array, threshold_sigmas: float, envelope_sigma: f
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Echoes:
-    """What is in each of n frames: k echoes each; every array has shape (n, k).
+    """What is in each of n frames, k echoes each: arrays of shape (n, k)."""
 
-    Attributes
-    ----------
-    range_m
-        True metres.
-    amplitude
-        Peak of the envelope, normalised units.
-    phase_rad
-        Phase of the carrier at the pulse's centre.
-    """
-
-    range_m: Array
-    amplitude: Array
-    phase_rad: Array
+    range_m: Array  # true metres
+    amplitude: Array  # peak of the envelope, normalised units
+    phase_rad: Array  # of the carrier at the pulse's centre
 
     @property
     def position_bins(self) -> Array:
@@ -229,25 +198,21 @@ def chip_frames(
     radar = RadarSpec(name="radar", serial="000000000001", x_m=0.0, y_m=0.0, yaw_deg=0.0)
     scene = empty_room().model_copy(update={"noise": NoiseSpec(rf_sigma=noise_sigma)})
     receiver = Receiver(scene, radar, seed)
-    frames = []
-    for start in range(0, len(echoes.range_m), _BLOCK):
-        rows = slice(start, start + _BLOCK)
-        position = echoes.position_bins[rows]
-        n, k = position.shape
-        signal = sum_of_pulses(
-            frame=np.repeat(np.arange(n), k),
-            position=position.ravel(),
-            amplitude=echoes.amplitude[rows].ravel(),
-            phase_rad=echoes.phase_rad[rows].ravel(),
-            tx_center_frequency=config.tx_center_frequency,
-            shape=(n, N_BINS),
-        )
-        counters = np.arange(start, start + n, dtype=np.int64)
-        counts = receiver.counters(signal, counters, counters * 200_000_000, capture, gain=1.0)
-        samples = counts.astype(np.float32) * np.float32(normalisation.quantum)
-        samples -= np.float32(normalisation.dac_offset)
-        frames += [_frame(int(c), row, limits) for c, row in zip(counters, samples, strict=True)]
-    return frames
+    position = echoes.position_bins
+    n, k = position.shape
+    signal = sum_of_pulses(
+        frame=np.repeat(np.arange(n), k),
+        position=position.ravel(),
+        amplitude=echoes.amplitude.ravel(),
+        phase_rad=echoes.phase_rad.ravel(),
+        tx_center_frequency=config.tx_center_frequency,
+        shape=(n, N_BINS),
+    )
+    counters = np.arange(n, dtype=np.int64)
+    counts = receiver.counters(signal, counters, counters * 200_000_000, capture, gain=1.0)
+    samples = counts.astype(np.float32) * np.float32(normalisation.quantum)
+    samples -= np.float32(normalisation.dac_offset)
+    return [_frame(counter, row, limits) for counter, row in enumerate(samples)]
 
 
 def closed_form_frames(echoes: Echoes, *, noise_sigma: float, seed: int) -> list[RadarFrame]:
@@ -287,24 +252,12 @@ Separator = Callable[[Array, KnownPulse, Array, SplitTest], list[Array]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Dictionary:
-    """Pulses of norm 1 on a grid, and what of the windows each explains.
+    """Pulses of norm 1 on a grid, and what of the windows each explains."""
 
-    Attributes
-    ----------
-    grid
-        Shape (g,), bins.
-    gram
-        Shape (g, g), float64: correlation of the pulses.
-    matched
-        Shape (b, g), complex128: correlation of the windows, over the noise.
-    root_h
-        Square root of the power from which one more echo is accepted.
-    """
-
-    grid: Array
-    gram: Array
-    matched: ComplexArray
-    root_h: float
+    grid: Array  # (g,), bins
+    gram: Array  # (g, g): correlation of the pulses
+    matched: ComplexArray  # (b, g): correlation of the windows, over the noise
+    root_h: float  # square root of the power from which one more echo is accepted
 
 
 def _dictionary(
@@ -500,7 +453,7 @@ def resolution(found: Sequence[Array], true_m: Array) -> _Row:
 
 
 def _of_each_front_end(frames: Sequence[RadarFrame], echoes: Echoes, stop: StopFlag) -> _Row:
-    """Return the fields of `Ranging` by front end, judged by the first echo of each frame."""
+    """Return what `ranging` says of each front end, by the first echo of each frame."""
     cells: _Row = {}
     for name in FRONT_ENDS:
         stop.check()
@@ -508,32 +461,33 @@ def _of_each_front_end(frames: Sequence[RadarFrame], echoes: Echoes, stop: StopF
     return cells
 
 
-def ranging_against_snr(trials: int, seed: int, stop: StopFlag) -> list[_Row]:
-    """Return one row per SNR: the bound, and each front end on both kinds of frames."""
-    rows: list[_Row] = []
+def _bound_mm(snr: float) -> float:
+    return 1e3 * BIN_LENGTH_M * PulseModel().position_bound_bins(snr, BIN_LENGTH_M)
+
+
+def ranging_against_snr(trials: int, seed: int, stop: StopFlag) -> Iterator[_Row]:
+    """Yield one row per SNR: the bound, and each front end on both kinds of frames."""
     for snr_db in SNRS_DB:
         rng = np.random.default_rng([seed, 1, snr_db])
         echoes = single_echoes(trials, AMPLITUDE, rng)
         snr = 10 ** (snr_db / 20)
         row: _Row = {
             "snr_db": snr_db,
-            "bound_mm": 1e3 * BIN_LENGTH_M * PulseModel().position_bound_bins(snr, BIN_LENGTH_M),
+            "bound_mm": _bound_mm(snr),
         }
         for source, make in (("chip", chip_frames), ("closed_form", closed_form_frames)):
             frames = make(echoes, noise_sigma=AMPLITUDE / snr, seed=seed + snr_db)
             for name, cell in _of_each_front_end(frames, echoes, stop).items():
                 row[f"{source}.{name}"] = cell
-        rows.append(row)
-    return rows
+        yield row
 
 
-def resolution_against_separation(trials: int, seed: int, stop: StopFlag) -> list[_Row]:
-    """Return one row per separation of two equal echoes: the bound, and each method.
+def resolution_against_separation(trials: int, seed: int, stop: StopFlag) -> Iterator[_Row]:
+    """Yield one row per separation of two equal echoes: the bound, and each method.
 
     The methods of `SEPARATORS` get the window of each frame that holds the two echoes, 3.5
     envelope sigmas either side; the front ends get the frame.
     """
-    rows: list[_Row] = []
     for separation_m in SEPARATIONS_M:
         rng = np.random.default_rng([seed, 2, round(1e3 * separation_m)])
         echoes = echo_pairs(trials, separation_m, rng)
@@ -569,8 +523,7 @@ def resolution_against_separation(trials: int, seed: int, stop: StopFlag) -> lis
                 for first, each in zip(first_bins, positions, strict=True)
             ]
             row[name] = resolution(found, echoes.range_m)
-        rows.append(row)
-    return rows
+        yield row
 
 
 def windows_of(frames: Sequence[RadarFrame], echoes: Echoes) -> tuple[Array, NDArray[np.intp]]:
@@ -586,8 +539,8 @@ def windows_of(frames: Sequence[RadarFrame], echoes: Echoes) -> tuple[Array, NDA
     return np.stack(windows), first
 
 
-def detection_against_snr(trials: int, seed: int, stop: StopFlag) -> list[_Row]:
-    """Return one row per SNR: the share of echoes found, and Marcum's at the same threshold.
+def detection_against_snr(trials: int, seed: int, stop: StopFlag) -> Iterator[_Row]:
+    """Yield one row per SNR: the share of echoes found, and Marcum's at the same threshold.
 
     Noise stays as it is, the echo changes: the paper's thresholds are absolute. ``told`` is the
     matched filter that is given sigma, for which Marcum's Q holds at the echo's own place; a
@@ -603,7 +556,6 @@ def detection_against_snr(trials: int, seed: int, stop: StopFlag) -> list[_Row]:
     threshold = threshold_sigmas(
         N_BINS / sigma, MatchedFilterConfig().false_alarms_per_frame, noise_is_known=True
     )
-    rows: list[_Row] = []
     for snr_db in DETECTION_SNRS_DB:
         snr = 10 ** (snr_db / 20)
         rng = np.random.default_rng([seed, 5, snr_db])
@@ -617,12 +569,11 @@ def detection_against_snr(trials: int, seed: int, stop: StopFlag) -> list[_Row]:
         for name, detector in detectors.items():
             stop.check()
             row[name] = ranging(ranges_of(detector, frames), echoes.range_m[:, 0])["found"]
-        rows.append(row)
-    return rows
+        yield row
 
 
-def false_alarms(trials: int, seed: int, stop: StopFlag) -> list[_Row]:
-    """Return one row per configured rate: peaks per frame of noise alone, the whole frame."""
+def false_alarms(trials: int, seed: int, stop: StopFlag) -> Iterator[_Row]:
+    """Yield one row per configured rate: peaks per frame of noise alone, the whole frame."""
     nothing = single_echoes(trials, 0.0, np.random.default_rng([seed, 6]))
     frames = chip_frames(nothing, noise_sigma=NOISE_SIGMA, seed=seed + 4)
 
@@ -632,27 +583,22 @@ def false_alarms(trials: int, seed: int, stop: StopFlag) -> list[_Row]:
         return sum(map(len, found)) / trials
 
     paper = per_frame("paper", {})
-    rows: list[_Row] = []
     for rate in FALSE_ALARMS:
         settings: _Row = {"matched_filter.false_alarms_per_frame": rate}
         told = settings | {"matched_filter.noise_sigma": NOISE_SIGMA}
-        rows.append(
-            {
-                "configured_per_frame": rate,
-                "trials": trials,
-                "standard_error": float(np.sqrt(rate / trials)),
-                "paper": paper,
-                "matched_filter": per_frame("matched_filter", settings),
-                "told": per_frame("matched_filter", told),
-                "joint": per_frame("joint", settings),
-            }
-        )
-    return rows
+        yield {
+            "configured_per_frame": rate,
+            "trials": trials,
+            "standard_error": float(np.sqrt(rate / trials)),
+            "paper": paper,
+            "matched_filter": per_frame("matched_filter", settings),
+            "told": per_frame("matched_filter", told),
+            "joint": per_frame("joint", settings),
+        }
 
 
-def leakage(trials: int, seed: int, stop: StopFlag) -> list[_Row]:
-    """Return one row per leakage and DAC window: each front end's view of one echo beside it."""
-    rows: list[_Row] = []
+def leakage(trials: int, seed: int, stop: StopFlag) -> Iterator[_Row]:
+    """Yield one row per leakage and DAC window: each front end's view of one echo beside it."""
     for window, dac in (("narrow", NARROW), ("full", FULL)):
         for amplitude, at_m in ((0.0, 0.05), *LEAKAGES):
             rng = np.random.default_rng([seed, 3, round(1e3 * amplitude), round(1e3 * at_m)])
@@ -669,13 +615,11 @@ def leakage(trials: int, seed: int, stop: StopFlag) -> list[_Row]:
                 "leakage_amplitude": amplitude,
                 "leakage_m": at_m,
             }
-            rows.append(row | _of_each_front_end(frames, echoes, stop))
-    return rows
+            yield row | _of_each_front_end(frames, echoes, stop)
 
 
-def saturation(trials: int, seed: int, stop: StopFlag) -> list[_Row]:
-    """Return one row per strength of an echo over the DAC window: each front end's view of it."""
-    rows: list[_Row] = []
+def saturation(trials: int, seed: int, stop: StopFlag) -> Iterator[_Row]:
+    """Yield one row per strength of an echo over the DAC window: each front end's view of it."""
     for strength in SATURATIONS:
         rng = np.random.default_rng([seed, 4, round(10 * strength)])
         echoes = single_echoes(trials, strength * DAC_WINDOW, rng)
@@ -683,12 +627,9 @@ def saturation(trials: int, seed: int, stop: StopFlag) -> list[_Row]:
         snr = strength * DAC_WINDOW / NOISE_SIGMA
         row: _Row = {
             "amplitude_over_window": strength,
-            "bound_unclipped_mm": 1e3
-            * BIN_LENGTH_M
-            * PulseModel().position_bound_bins(snr, BIN_LENGTH_M),
+            "bound_unclipped_mm": _bound_mm(snr),
         }
-        rows.append(row | _of_each_front_end(frames, echoes, stop))
-    return rows
+        yield row | _of_each_front_end(frames, echoes, stop)
 
 
 def _draw(figure: Figure, tables: Mapping[str, Sequence[_Row]]) -> None:
@@ -711,19 +652,14 @@ def _ranging(axes: Axes, rows: Sequence[_Row]) -> None:
 
 def _resolution(axes: Axes, rows: Sequence[_Row]) -> None:
     x = [row["separation_mm"] for row in rows]
-    axes.plot(
-        x, [1e2 * row["bound_resolved"] for row in rows], label="at the Cramer-Rao bound", **_BOUND
-    )
+    bound = [1e2 * row["bound_resolved"] for row in rows]
+    axes.plot(x, bound, label="at the Cramer-Rao bound", **_BOUND)
     for name in METHODS:
         _line(axes, x, [1e2 * row[name]["resolved"] for row in rows], name)
     axes.set_ylim(-4, 104)
     axes.set_xlim(x[0] - 8, x[-1] + 120)  # room for the legend
-    label(
-        axes,
-        "Two equal echoes at 29.5 dB: two found, each within 20 mm",
-        "separation [mm]",
-        "share [%]",
-    )
+    title = "Two equal echoes at 29.5 dB: two found, each within 20 mm"
+    label(axes, title, "separation [mm]", "share [%]")
     axes.legend(frameon=False, loc="center right")
 
 
@@ -739,19 +675,14 @@ def _detection(axes: Axes, rows: Sequence[_Row]) -> None:
 
 def _saturation(axes: Axes, rows: Sequence[_Row]) -> None:
     x = [row["amplitude_over_window"] for row in rows]
-    axes.plot(
-        x, [row["bound_unclipped_mm"] for row in rows], label="bound, nothing clipped", **_BOUND
-    )
+    bound = [row["bound_unclipped_mm"] for row in rows]
+    axes.plot(x, bound, label="bound, nothing clipped", **_BOUND)
     for name in FRONT_ENDS:
         _line(axes, x, [row[name]["std_mm"] for row in rows], name)
     axes.axvline(1.0, color=PALE_INK, linewidth=0.9, linestyle=":")
     axes.set_yscale("log")
-    label(
-        axes,
-        "One echo clipped: standard deviation of its range",
-        "amplitude over the DAC window",
-        "std [mm]",
-    )
+    title = "One echo clipped: standard deviation of its range"
+    label(axes, title, "amplitude over the DAC window", "std [mm]")
     axes.legend(frameon=False)
 
 
@@ -776,7 +707,7 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
     for number, (name, measure) in enumerate(cells.items(), start=1):
         sys.stderr.write(f"{number}/{len(cells)} {name}\n")
         sys.stderr.flush()
-        tables[name] = measure(trials, seed, stop)
+        tables[name] = list(measure(trials, seed, stop))
     return Result(
         numbers={
             "simulated": True,

@@ -91,22 +91,12 @@ _MRAD_TICKS = (1, 2, 5, 10, 20, 50, 100)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SlowTime:
-    """Frames of a standing radar.
+    """Frames of a standing radar."""
 
-    Attributes
-    ----------
-    iq
-        Shape (n_frames, n_bins), complex128: baseband.
-    rate_hz
-        Frames per second.
-    first_bin_m, bin_length_m
-        Where the bins lie, module metres.
-    """
-
-    iq: NDArray[np.complex128]
-    rate_hz: float
-    first_bin_m: float
-    bin_length_m: float
+    iq: NDArray[np.complex128]  # (n_frames, n_bins): baseband
+    rate_hz: float  # frames per second
+    first_bin_m: float  # module metres
+    bin_length_m: float  # module metres
 
     @property
     def amplitude(self) -> Array:
@@ -206,18 +196,10 @@ def _neighbours(values: NDArray[np.complex128]) -> float:
     return float((products / (sigma[1:] * sigma[:-1])).mean())
 
 
-def spread_of(values: Sequence[float]) -> tuple[float, float, float]:
-    low, middle, high = np.percentile(values, (10, 50, 90))
-    return float(low), float(middle), float(high)
-
-
 def read_slow_time(path: Path, radar: str | None = None) -> SlowTime:
     """Return the baseband frames of a recording; of several radars, the named one.
 
-    Raises
-    ------
-    AppError
-        There is no such recording, or it holds too few baseband frames of one shape; one line.
+    Raises AppError if there is no such recording, or it holds too few baseband frames of one shape.
     """
     try:
         records = read_recording(path, radar=radar)
@@ -271,10 +253,7 @@ def equivalent_scene(recorded: SlowTime) -> Scene:
 def emulate(scene: Scene, like: SlowTime, seed: int) -> SlowTime:
     """Return as many frames of the same bins at the same rate from an emulated module in process.
 
-    Raises
-    ------
-    AppError
-        The chip has no frame area with these bins.
+    Raises AppError if the chip has no frame area with these bins.
     """
     n_frames, n_bins = like.iq.shape
     last_bin_m = like.first_bin_m + (n_bins - 1) * like.bin_length_m
@@ -424,7 +403,10 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
         emulated.append(emulate(scene, recorded, seed))
     figures = recorded.numbers()
     quiet = recorded.quietest().numbers()
-    spread = {name: spread_of([one.numbers()[name] for one in emulated]) for name in TITLES}
+    runs = [one.numbers() for one in emulated]
+    spread = {
+        name: np.percentile([one[name] for one in runs], (10, 50, 90)).tolist() for name in TITLES
+    }
     text = _three_digits
     return Result(
         numbers={
@@ -436,8 +418,8 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
             "recorded": figures,
             "recorded_quietest": quiet,
             "emulated": {
-                name: {"p10": low, "median": middle, "p90": high}
-                for name, (low, middle, high) in spread.items()
+                name: dict(zip(("p10", "median", "p90"), values, strict=True))
+                for name, values in spread.items()
             },
         },
         title=f"A real X4 ({len(recorded.iq)} frames at {recorded.rate_hz:.1f} Hz) and the "

@@ -62,38 +62,20 @@ def light_attenuation_db(range_m: float, g_per_m3: float = SMOKE_G_PER_M3) -> fl
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ObservedRun:
-    """What one run observed, on the poses that odometry gives.
-
-    Attributes
-    ----------
-    name
-        What the run is called.
-    n_detections
-        Ranges, over all radars and states.
-    same_detections
-        Share of the states at which all ranges are equal to those in clear air, to the last bit;
-        None in another scene.
-    raw_m, filtered_m
-        Shape (n, 2) each, world frame: every fix, and what the outlier filter made of them.
-    raw_rms_m, filtered_rms_m
-        Root mean square distance to the nearest true landmark on *true* poses: of the observation
-        alone, without the drift of odometry. None where nothing was seen.
-    odometry_m, truth_m
-        Shape (n, 2) each, world frame: the path.
-    landmarks_m
-        Shape (m, 2), world frame.
-    """
+    """What one run observed, on the poses that odometry gives; places in the world frame."""
 
     name: str
-    n_detections: int
+    n_detections: int  # over all radars and states
+    # states with the ranges of clear air to the last bit; None elsewhere
     same_detections: float | None
-    raw_m: Array
-    filtered_m: Array
+    raw_m: Array  # (n, 2): every fix
+    filtered_m: Array  # (n, 2): what the outlier filter made of them
+    # distance to the nearest landmark, seen from the true pose; None without a fix
     raw_rms_m: float | None
-    filtered_rms_m: float | None
-    odometry_m: Array
-    truth_m: Array
-    landmarks_m: Array
+    filtered_rms_m: float | None  # the same of the observations
+    odometry_m: Array  # (n, 2): the path
+    truth_m: Array  # (n, 2): the path
+    landmarks_m: Array  # (m, 2)
 
 
 def drive_in_clear_air_and_smoke(seed: int, stop: StopFlag) -> list[ObservedRun]:

@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 
 from slam.app.errors import UsageError
 from slam.app.experiments import Result, table
-from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label
+from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label, note
 from slam.config import WheelNoise
 from slam.geometry import paper_rig
 from slam.robust.association import antennas_of, rows_of, sides_of, sure_landmarks, view
@@ -48,27 +48,15 @@ _FEWEST = 2
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepCost:
-    """What a step costs at one size of the map, CPU time in milliseconds.
-
-    Attributes
-    ----------
-    n_landmarks, size
-        Landmarks, and rows of the covariance.
-    step_ms, slowest_ms
-        Mean over a cycle, and the slowest of it: one that carries out what others put off.
-    at_once_ms
-        The two passes that a step would make if it put nothing off: ``dsyr2`` and ``dsyrk`` of
-        rank 4, in place, nothing else.
-    triangle_ms, triangle_gb_per_s
-        Reading and writing as many bytes as the triangle has, in order: what memory allows.
-    """
+    """What a step costs at one size of the map, CPU time."""
 
     n_landmarks: int
-    size: int
-    step_ms: float
-    slowest_ms: float
+    size: int  # rows of the covariance
+    step_ms: float  # mean over a cycle
+    slowest_ms: float  # of the cycle: the step that carries out what others put off
+    # dsyr2 and dsyrk of rank 4 in place: what a step passes if it puts nothing off
     at_once_ms: float
-    triangle_ms: float
+    triangle_ms: float  # as many bytes as the triangle has, read and written: what memory allows
     triangle_gb_per_s: float
 
 
@@ -212,25 +200,11 @@ def _draw(figure: Figure, costs: Sequence[StepCost]) -> None:
         for quoted in {low_ms, high_ms}:
             axes.axhline(quoted, color=PALE_INK, linewidth=0.9, linestyle=(0, (6, 3)))
         text = f"{low_ms:g}" if low_ms == high_ms else f"{low_ms:g} - {high_ms:g}"
-        axes.annotate(
-            f"{name}, n = {BAR_LANDMARKS}: {text} ms (quoted)",
-            (float(n.min()), low_ms),
-            xytext=(0, -4),
-            textcoords="offset points",
-            va="top",
-            fontsize=8,
-            color=PALE_INK,
-        )
+        text = f"{name}, n = {BAR_LANDMARKS}: {text} ms (quoted)"
+        note(axes, text, (float(n.min()), low_ms), (0, -4), PALE_INK, va="top", fontsize=8)
     axes.plot([BAR_LANDMARKS], [BAR_MS], marker="_", markersize=26, markeredgewidth=2.2, color=INK)
-    axes.annotate(
-        f"bar: {BAR_MS:g} ms",
-        (BAR_LANDMARKS, BAR_MS),
-        xytext=(16, 0),
-        textcoords="offset points",
-        va="center",
-        fontsize=8,
-        color=INK,
-    )
+    text = f"bar: {BAR_MS:g} ms"
+    note(axes, text, (BAR_LANDMARKS, BAR_MS), (16, 0), INK, va="center", fontsize=8)
     ticks = [10, 20, 50, 100, 200, 500, 1000, 2000]
     axes.set_xticks(ticks, [str(tick) for tick in ticks])
     axes.minorticks_off()
@@ -239,13 +213,7 @@ def _draw(figure: Figure, costs: Sequence[StepCost]) -> None:
 
 
 def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
-    """Time a step at every size.
-
-    Raises
-    ------
-    UsageError
-        A map of one landmark was asked for: each side of the robot needs its own.
-    """
+    """Time a step at every size; a map of one landmark is a UsageError."""
     if min(arguments.landmarks) < _FEWEST:
         raise UsageError(
             f"--landmarks {min(arguments.landmarks)}: a step sees one landmark on each side, "

@@ -51,11 +51,8 @@ _COLOURS = (ESTIMATE, ODOMETRY, LANDMARK, "#2b8a3e", "#7048b8")
 def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
     """Read the sweep and return the experiment of that name.
 
-    Raises
-    ------
-    AppError
-        The file cannot be read, is not a sweep's, or would be replaced by the result; or it has no
-        stressed runs, where they are what is shown.
+    Raises AppError if the file cannot be read, is not a sweep's, would be replaced by the result,
+    or has no stressed runs where they are what is shown.
     """
     path: Path = arguments.sweep
     groups = _read_groups(path, arguments.out / f"{arguments.name}.json")

@@ -61,19 +61,11 @@ _MAPS = ("true ids", "unknown ids")
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Drive:
-    """Odometry and landmarks seen.
+    """Odometry and landmarks seen."""
 
-    Attributes
-    ----------
-    increments, covariances
-        shapes (k, 3) and (k, 3, 3): dx, dy [m], turn [rad] in the body frame before the step.
-    seen
-        One entry per pose, k + 1 of them: the points seen from there, labelled with their ids.
-    """
-
-    increments: Array
-    covariances: Array
-    seen: tuple[tuple[RangeBearing, ...], ...]
+    increments: Array  # (k, 3): dx, dy [m], turn [rad] in the body frame before the step
+    covariances: Array  # (k, 3, 3)
+    seen: tuple[tuple[RangeBearing, ...], ...]  # from each of k + 1 poses, labelled with ids
 
     @property
     def n_observations(self) -> int:
@@ -94,13 +86,7 @@ class Drive:
 
 
 def shipped_file() -> Path:
-    """Return where GTSAM keeps the data.
-
-    Raises
-    ------
-    AppError
-        GTSAM is not installed, or its wheel has no such file.
-    """
+    """Return where GTSAM keeps the data; raise AppError if it is not there."""
     path = Path(load_gtsam("Victoria Park").__file__).parent / "Data" / FILE
     if not path.is_file():
         raise AppError(
@@ -111,13 +97,7 @@ def shipped_file() -> Path:
 
 
 def read_drive(path: Path) -> Drive:
-    """Read the file.
-
-    Raises
-    ------
-    AppError
-        It cannot be read, or a line is not in the format above; file and line are named.
-    """
+    """Read the file; AppError names the file, or the line that is not in the format above."""
     increments: list[list[float]] = []
     covariances: list[Array] = []
     seen: list[list[RangeBearing]] = [[]]
@@ -176,28 +156,15 @@ def range_bearing(x_m: float, y_m: float, covariance: Array, label: int | None) 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ParkRun:
-    """What came out of a drive.
+    """What came out of a drive."""
 
-    Attributes
-    ----------
-    poses
-        shape (k + 1, 3): x, y [m], heading [rad]; of the causal path, each as it was known then.
-    landmarks_m
-        shape (n, 2).
-    given
-        One entry per observation: (true id, id it was given, or None where left out).
-    calibration, calibration_sigmas
-        shape (3,): scale, turn scale and curvature errors of the wheels at the end.
-    seconds
-        Processor time.
-    """
-
-    poses: Array
-    landmarks_m: Array
-    calibration: Array
-    calibration_sigmas: Array
+    poses: Array  # (k + 1, 3): x, y [m], heading [rad]; causal, each as it was known then
+    landmarks_m: Array  # (n, 2)
+    calibration: Array  # (3,): errors of scale, turn scale and curvature of the wheels at the end
+    calibration_sigmas: Array  # (3,)
+    # true id of each observation and its own; None: left out
     given: tuple[tuple[int, int | None], ...]
-    seconds: float
+    seconds: float  # processor time
 
 
 def drive_back_end(drive: Drive, wheels: WheelNoise, stop: StopFlag, *, with_ids: bool) -> ParkRun:
@@ -238,29 +205,15 @@ def drive_back_end(drive: Drive, wheels: WheelNoise, stop: StopFlag, *, with_ids
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Reference:
-    """GTSAM's solutions with true ids.
+    """GTSAM's solutions with true ids."""
 
-    Attributes
-    ----------
-    poses
-        shape (k + 1, 3), of the batch solution.
-    causal
-        The same of ISAM2, each pose as it was known then: what a causal path can be.
-    landmarks_m, labels
-        shape (n, 2), of the batch solution, and their ids.
-    chi_square, dof
-        Sum of squared white residuals of the batch solution, and what it should be on average.
-    seconds
-        Processor time.
-    """
-
-    poses: Array
-    causal: Array
-    landmarks_m: Array
-    labels: tuple[int, ...]
-    chi_square: float
-    dof: int
-    seconds: float
+    poses: Array  # (k + 1, 3), of the batch solution
+    causal: Array  # the same of ISAM2, each pose as it was known then: what a causal path can be
+    landmarks_m: Array  # (n, 2), of the batch solution
+    labels: tuple[int, ...]  # ids of the landmarks
+    chi_square: float  # sum of squared white residuals of the batch solution
+    dof: int  # what that should be on average
+    seconds: float  # processor time
 
 
 def batch_reference(drive: Drive, stop: StopFlag) -> Reference:
@@ -327,31 +280,18 @@ def _vector(pose: Any) -> Array:  # noqa: ANN401 - GTSAM's own types
 class PathScore:
     """One path against the batch solution.
 
-    Attributes
-    ----------
-    ate_m
-        Time-associated, SE(2)-aligned.
-    rmse_m, max_m
-        Root mean square and largest distance, both paths from the same start, not aligned.
-    n_landmarks
-        Landmarks in the map.
-    right_share
-        Share of the observations taken in whose landmark is the one that its tree is mostly
-        called, and is mostly called so for its tree; None where the ids were given.
-    left_out
-        Observations that were in doubt and not taken in.
-    seconds
-        Processor time.
+    An observation is right if its landmark is the one that its tree is mostly called, and is mostly
+    called so for its tree.
     """
 
     name: str
-    ate_m: float
-    rmse_m: float
-    max_m: float
+    ate_m: float  # time-associated, SE(2)-aligned
+    rmse_m: float  # from the same start, not aligned
+    max_m: float  # largest distance, not aligned
     n_landmarks: int | None
-    right_share: float | None
-    left_out: int | None
-    seconds: float | None
+    right_share: float | None  # of the observations taken in; None where the ids were given
+    left_out: int | None  # observations that were in doubt and not taken in
+    seconds: float | None  # processor time
 
 
 def odometry_path(drive: Drive) -> Array:

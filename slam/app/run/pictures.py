@@ -92,6 +92,19 @@ def label(
     axes.tick_params(length=0)
 
 
+def note(
+    axes: Axes,
+    text: str,
+    at: tuple[float, float],
+    offset_points: tuple[float, float],
+    colour: str,
+    **more: Any,  # noqa: ANN401 - of annotate
+) -> None:
+    """Write a small text beside a point."""
+    more = {"textcoords": "offset points", "fontsize": 8.5, "color": colour} | more
+    axes.annotate(text, at, xytext=offset_points, **more)
+
+
 # Chi-square quantile for two degrees of freedom, in closed form.
 CHI2_95_TWO_DOF = -2.0 * math.log(1.0 - 0.95)
 

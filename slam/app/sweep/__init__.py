@@ -16,41 +16,21 @@ CLEAN = "clean"
 class Stress:
     """What a run suffers; random choices depend on the run's seed alone.
 
-    SLAM knows nothing of the stress; frames carry the time at which they were really taken.
-
-    Attributes
-    ----------
-    outlier_share
-        Of the detections, replaced by ranges that are uniform between the front end's limits. The
-        only stress that enters behind the front end: no reflector gives such echoes.
-    dropped_share
-        Of the frames, each lost by itself.
-    start_skews_ms
-        How late each radar samples.
-    walk_sigmas
-        By how many of their own standard deviations the wheels' scale, turn scale and curvature
-        walk at random over the run.
-    silent_share
-        Of the run, during which no radar sends anything, in one piece; it begins between 15 and
-        75 % of the run.
-    dead_radars
-        Indices of radars that never send a frame.
-    offset_sigma_m
-        Standard deviation of every radar's own constant range error.
-    carried_at, carried_skips
-        Parts of the drive: where the robot is picked up, and how much of its course it misses.
+    SLAM knows nothing of the stress; frames carry the time at which they were really taken. The
+    only stress that enters behind the front end are outliers: no reflector gives such echoes.
     """
 
     help: str
-    outlier_share: float = 0.0
-    dropped_share: float = 0.0
-    start_skews_ms: tuple[float, ...] = ()
+    outlier_share: float = 0.0  # of the detections: uniform between the front end's limits
+    dropped_share: float = 0.0  # of the frames, each lost by itself
+    start_skews_ms: tuple[float, ...] = ()  # how late each radar samples
+    # random walk of the wheels' errors over the run, in their own standard deviations
     walk_sigmas: float = 0.0
-    silent_share: float = 0.0
-    dead_radars: frozenset[int] = frozenset()
-    offset_sigma_m: float = 0.0
-    carried_at: float = 0.0
-    carried_skips: float = 0.0
+    silent_share: float = 0.0  # of the run, in one piece that begins between 15 and 75 % of it
+    dead_radars: frozenset[int] = frozenset()  # indices of radars that never send a frame
+    offset_sigma_m: float = 0.0  # of every radar's own constant range error
+    carried_at: float = 0.0  # part of the drive at which the robot is picked up
+    carried_skips: float = 0.0  # part of its course that it misses
 
 
 _SKEWS_MS = (0.0, 190.0, 100.0, 150.0)

@@ -1,7 +1,7 @@
 """The known-association bound of one run: what is possible with the true ids, on the same data.
 
 Each range goes to the true landmark that it fits: nearest in range, in front of the antenna, no
-landmark twice in a frame, and within ``gate_sigmas`` standard deviations of the true range. What
+landmark twice in a frame, and within ``GATE_SIGMAS`` standard deviations of the true range. What
 fits none is clutter to the bound. Nothing else of the truth gets in.
 
 GTSAM solves for poses, landmarks, the wheels' calibration errors (s, w, kappa) and, where they
@@ -150,16 +150,13 @@ def wheel_factor(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class KnownRange:
-    """One range of one true landmark.
-
-    ``motion`` (3,) leads from the pose to where the body was when the radar sampled, as odometry
-    has it; ``sigma_m`` is the standard deviation of ``range_m``.
-    """
+    """One range of one true landmark."""
 
     radar: int
     landmark: int
     range_m: float
-    sigma_m: float
+    sigma_m: float  # standard deviation of the range
+    # (3,): from the pose to where the body was when the radar sampled, as odometry has it
     motion: Array
 
 
@@ -322,26 +319,14 @@ def _from_many(seen: Sequence[SeenFrom], poses: Sequence[Array]) -> Array | None
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class KnownAssociation:
-    """The paths of a run with true associations, map frame, one row per step.
+    """The paths of a run with true associations, map frame, n steps."""
 
-    Attributes
-    ----------
-    filtered, filtered_covariance
-        shapes (n, 3) and (n, 3, 3): each pose as it was known at its own time, additive errors.
-    smoothed
-        shape (n, 3): all poses given everything.
-    landmark_ids, landmarks_m
-        Rows of the true landmarks that were placed, and where the smoother has them, (k, 2).
-    calibration
-        shape (3,): s, w, kappa of the smoother at the end.
-    """
-
-    filtered: Array
-    filtered_covariance: Array
-    smoothed: Array
-    landmark_ids: tuple[int, ...]
-    landmarks_m: Array
-    calibration: Array
+    filtered: Array  # (n, 3): each pose as it was known at its own time
+    filtered_covariance: Array  # (n, 3, 3), of additive errors
+    smoothed: Array  # (n, 3): all poses given everything
+    landmark_ids: tuple[int, ...]  # rows of the true landmarks that were placed
+    landmarks_m: Array  # (k, 2): where the smoother has them
+    calibration: Array  # (3,): s, w, kappa of the smoother at the end
 
 
 def solve_known(
@@ -352,26 +337,9 @@ def solve_known(
     ``rig`` and ``wheels`` are as SLAM knew them; ``offset_sigma_m`` is the standard deviation of
     each radar's unknown range offset, zero if they are calibrated.
 
-    Raises
-    ------
-    AppError
-        GTSAM is not installed.
+    Raises AppError if GTSAM is not installed.
     """
-    estimator = _Estimator(rig, wheels, offset_sigma_m)
-    filtered, covariances = [], []
-    for increment, ranges in zip(run.increments, run.ranges, strict=True):
-        pose, covariance = estimator.step(increment, ranges)
-        filtered.append(pose)
-        covariances.append(covariance)
-    smoothed, ids, landmarks, calibration = estimator.smooth()
-    return KnownAssociation(
-        filtered=np.array(filtered).reshape(-1, 3),
-        filtered_covariance=np.array(covariances).reshape(-1, 3, 3),
-        smoothed=smoothed,
-        landmark_ids=ids,
-        landmarks_m=landmarks,
-        calibration=calibration,
-    )
+    return _Estimator(rig, wheels, offset_sigma_m).solve(run)
 
 
 class _Estimator:
@@ -407,7 +375,29 @@ class _Estimator:
                 noise = gtsam.noiseModel.Isotropic.Sigma(1, offset_sigma_m)
                 self._graph.add(gtsam.PriorFactorDouble(self._B(radar), 0.0, noise))
 
-    def step(self, increment: Array, ranges: tuple[KnownRange, ...]) -> tuple[Array, Array]:
+    def solve(self, run: KnownRun) -> KnownAssociation:
+        filtered, covariances = [], []
+        for increment, ranges in zip(run.increments, run.ranges, strict=True):
+            pose, covariance = self._step(increment, ranges)
+            filtered.append(pose)
+            covariances.append(covariance)
+        optimizer = self._gtsam.LevenbergMarquardtOptimizer(
+            self._isam.getFactorsUnsafe(), self._isam.calculateEstimate()
+        )
+        values = optimizer.optimize()
+        smoothed = [values.atPose2(self._X(step)) for step in range(1, len(self._poses))]
+        ids = tuple(sorted(self._known))
+        landmarks = [values.atPoint2(self._L(id_)) for id_ in ids]
+        return KnownAssociation(
+            filtered=np.array(filtered).reshape(-1, 3),
+            filtered_covariance=np.array(covariances).reshape(-1, 3, 3),
+            smoothed=np.array([[p.x(), p.y(), p.theta()] for p in smoothed]).reshape(-1, 3),
+            landmark_ids=ids,
+            landmarks_m=np.array(landmarks).reshape(-1, 2),
+            calibration=np.asarray(values.atVector(self._C(self._n_calibrations - 1))),
+        )
+
+    def _step(self, increment: Array, ranges: tuple[KnownRange, ...]) -> tuple[Array, Array]:
         """Take in one step; return the newest pose (3,) and its covariance (3, 3)."""
         gtsam, step = self._gtsam, len(self._poses)
         self._walk(increment)
@@ -437,21 +427,6 @@ class _Estimator:
         turn[:2, :2] = rotation(float(pose[2]))
         # GTSAM's error of a pose lies in the body frame.
         return pose, turn @ self._isam.marginalCovariance(self._X(step)) @ turn.T
-
-    def smooth(self) -> tuple[Array, tuple[int, ...], Array, Array]:
-        """Return all poses but the first, landmark ids and positions, and calibration."""
-        optimizer = self._gtsam.LevenbergMarquardtOptimizer(
-            self._isam.getFactorsUnsafe(), self._isam.calculateEstimate()
-        )
-        values = optimizer.optimize()
-        poses = [values.atPose2(self._X(step)) for step in range(1, len(self._poses))]
-        ids = tuple(sorted(self._known))
-        return (
-            np.array([[p.x(), p.y(), p.theta()] for p in poses]).reshape(-1, 3),
-            ids,
-            np.array([values.atPoint2(self._L(id_)) for id_ in ids]).reshape(-1, 2),
-            np.asarray(values.atVector(self._C(self._n_calibrations - 1))),
-        )
 
     def _new_graph(self) -> None:
         self._graph = self._gtsam.NonlinearFactorGraph()
@@ -519,18 +494,11 @@ def _isam_parameters(gtsam: Any) -> Any:  # noqa: ANN401 - GTSAM's own types
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoundSummary:
-    """Errors of GTSAM with true associations: ISAM2's filtered path, and the full smoother's.
+    """Errors of GTSAM with true associations: ISAM2's filtered path, and the full smoother's."""
 
-    Attributes
-    ----------
-    filtered_ate_rmse_m, smoothed_ate_rmse_m
-        Time-associated, SE(2)-aligned, like `ate_rmse_m`.
-    nees_pose
-        (Time [s], NEES) of the filtered pose at the ten times of the run's own `nees_pose`.
-    """
-
-    filtered_ate_rmse_m: float
+    filtered_ate_rmse_m: float  # time-associated, SE(2)-aligned, like `ate_rmse_m`
     smoothed_ate_rmse_m: float
+    # at the ten times of the run's own: (time [s], NEES)
     nees_pose: tuple[tuple[float, float], ...]
 
 
@@ -539,10 +507,7 @@ def bound_of(record: RunRecord, scene: Scene, config: SlamConfig) -> BoundSummar
 
     Rig, wheels and offsets are those that SLAM knew; the truth only gives each range its landmark.
 
-    Raises
-    ------
-    AppError
-        GTSAM is not installed.
+    Raises AppError if GTSAM is not installed.
     """
     is_robust = config.back_end is BackEnd.ROBUST
     rig = rig_of(scene)

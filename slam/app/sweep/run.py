@@ -133,22 +133,14 @@ def stressed_scans(
 class OutlierDetector:
     """A front end that gives random ranges now and then, with the looks of the true detection.
 
-    Attributes
-    ----------
-    detector
-        The true front end.
-    share
-        Of the detections, replaced by ranges uniform between ``min_range_m`` and ``max_range_m``
-        with a uniform carrier phase, if they have one; amplitude and predictions stay.
-    seed
-        Of the run.
+    Ranges are uniform between the limits, the carrier phase, if there is one, on the circle.
     """
 
-    detector: Detector
-    share: float
+    detector: Detector  # the true front end
+    share: float  # of the detections, replaced
     min_range_m: float
     max_range_m: float
-    seed: int
+    seed: int  # of the run
 
     def detect(self, frame: RadarFrame, range_offset_m: float = 0.0) -> tuple[Detection, ...]:
         """Return the echoes of one frame, some replaced, nearest first."""
@@ -272,14 +264,9 @@ def make_case(
 ) -> Case:
     """Load what a run needs by its names.
 
-    Raises
-    ------
-    AppError
-        A name or a setting is not known, or a file cannot be used; one line.
+    Raises AppError if a name or a setting is not known, or a file cannot be used.
     """
     loaded, config = scene_and_config(scene, preset)
-    if stress not in STRESSES:
-        raise UsageError(f"unknown stress {stress!r}; known: {', '.join(STRESSES)}")
     named = tuple((settings or {}).items())
     try:
         config = override(config, dict(named))
@@ -359,10 +346,8 @@ def run_case(case: Case, program: str | None = None, *, stop: StopFlag = NO_STOP
 
     ``program`` is the `program_version` of the caller, if that may be another machine.
 
-    Raises
-    ------
-    AppError
-        The scene is too short for a single state, or the program here is another version.
+    Raises AppError if the scene is too short for a single state, or the program here is another
+    version.
     """
     if program not in (None, program_version()):
         raise AppError(
@@ -391,10 +376,7 @@ def finite(run: SweepRun) -> SweepRun:
 
     JSON has no infinity, and one such run must neither end a sweep nor go unseen in its means.
 
-    Raises
-    ------
-    AppError
-        Another number is not finite: SLAM has diverged.
+    Raises AppError if another number is not finite: SLAM has diverged.
     """
     capped = replace(
         run,

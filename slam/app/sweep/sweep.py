@@ -54,10 +54,7 @@ class PartFile:
     ``command`` holds what the runs depend on, by name, and must be what the file says; ``runs``
     are those done so far, in their order.
 
-    Raises
-    ------
-    AppError
-        It holds the runs of another command, or no such thing; nothing is changed then.
+    Raises AppError and changes nothing if it holds the runs of another command, or no such thing.
     """
 
     def __init__(self, path: Path, command: Mapping[str, str]) -> None:
