@@ -13,17 +13,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
+from hil_tests.bench.speed.test_protocol import FRAMES, stream_of_frames
 from xethru_protocol.driver.async_radar import AsyncX4M300
 from xethru_protocol.driver.frames import FrameGeometry
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.connection import Connection, Role
+from xethru_protocol.wire.framing import Framing
 
-FRAMES = 2000
 GEOMETRY = FrameGeometry(range_start_m=0.2, bin_length_m=0.0064, n_bins=1431, downconversion=False)
 _WRITER = """
 import os, sys
@@ -38,11 +36,7 @@ while True:
 @pytest.fixture
 def port(tmp_path: Path) -> Iterator[str]:
     """Pty into which another process writes quantised frames without end."""
-    counters = np.random.default_rng(0).integers(0, 729_600, (200, 1431))
-    samples = counters.astype(np.float32) * np.float32(2.03450526e-07) - np.float32(0.07421875)
-    module = Connection(Role.MODULE)
-    frames = (module.send(m.DataFloat(info=k, values=samples[k])) for k in range(200))
-    (tmp_path / "stream").write_bytes(b"".join(frames) * 10)
+    (tmp_path / "stream").write_bytes(stream_of_frames(Framing.NO_ESCAPE))
     master, slave = pty.openpty()
     tty.setraw(slave)
     command = [sys.executable, "-c", _WRITER, str(master), str(tmp_path / "stream")]

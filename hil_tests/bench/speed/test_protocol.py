@@ -19,15 +19,14 @@ FRAMES = 2000
 CHUNK = 65536
 
 
-def _samples() -> NDArray[np.float32]:
+def quantised_noise() -> NDArray[np.float32]:
     """Quantised noise at the vendor's working point, shape (200, 1431)."""
     counters = np.random.default_rng(0).integers(0, 729_600, (200, 1431))
     return counters.astype(np.float32) * np.float32(2.03450526e-07) - np.float32(0.07421875)
 
 
-def _stream(framing: Framing) -> bytes:
-    """Frames of 1431 samples."""
-    samples = _samples()
+def stream_of_frames(framing: Framing) -> bytes:
+    samples = quantised_noise()
     module = Connection(Role.MODULE)
     return b"".join(
         module.send(m.DataFloat(info=k, values=samples[k]), framing) for k in range(200)
@@ -37,7 +36,7 @@ def _stream(framing: Framing) -> bytes:
 @pytest.mark.parametrize("framing", Framing)
 def test_decode_1431_float_frames(benchmark: Any, framing: Framing) -> None:  # noqa: ANN401 - the plugin has no types
     """Bars: NoEscape 350 000 frames/s, Normal 57 000."""
-    stream = _stream(framing)
+    stream = stream_of_frames(framing)
     chunks = [stream[begin : begin + CHUNK] for begin in range(0, len(stream), CHUNK)]
 
     def decode() -> int:
@@ -57,7 +56,7 @@ def test_decode_1431_float_frames(benchmark: Any, framing: Framing) -> None:  # 
 def test_encode_1431_float_frames(benchmark: Any, framing: Framing) -> None:  # noqa: ANN401 - the plugin has no types
     """What an emulated module does with each frame."""
     module = Connection(Role.MODULE)
-    frames = [m.DataFloat(info=k, values=values) for k, values in enumerate(_samples())]
+    frames = [m.DataFloat(info=k, values=values) for k, values in enumerate(quantised_noise())]
 
     def encode() -> int:
         return sum(len(module.send(frame, framing)) for frame in frames)
@@ -77,7 +76,7 @@ def test_lattice_of_1431_float_frames(benchmark: Any) -> None:  # noqa: ANN401 -
         downconversion=False,
         tx_center_frequency=3,
     )
-    samples = _samples()
+    samples = quantised_noise()
     assert benchmark(lambda: sum(lattice.off_lattice(values) for values in samples)) == 0
     benchmark.extra_info["frames"] = 200
 

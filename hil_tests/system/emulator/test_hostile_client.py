@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from emulator.chip import Pace
+from hil_tests.bench import corrupted_traffic
 from hil_tests.bench.corrupted_traffic import (
     SWALLOWED_BULK,
     SWALLOWED_MERGED,
@@ -16,12 +17,9 @@ from hil_tests.bench.corrupted_traffic import (
     Outcome,
     run_command,
 )
-from hil_tests.bench.corrupted_traffic import (
-    run as run_traffic,
-)
-from hil_tests.bench.hostile_client import MOST_OBJECTS_GROWN, run
 from hil_tests.device.serving import Served, emulator
 from hil_tests.patience import seconds
+from hil_tests.system.emulator.hostile_client import run
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import PongCode, SensorMode, X4Setting
 from xethru_protocol.wire.connection import Connection, Role
@@ -33,9 +31,12 @@ from xethru_protocol.wire.framing import NeedData
 def test_a_hostile_client_disturbs_no_other_port(seed: int, pace: Pace) -> None:
     outcome = run(1.0, seed, pace)
     assert outcome.answers
-    assert (outcome.gaps, outcome.in_order) == (0, True)
-    assert outcome.frames_due - 2 <= outcome.frames <= outcome.frames_due + 1
-    assert outcome.objects_grown <= MOST_OBJECTS_GROWN
+    first, n_frames = outcome.counters[0], len(outcome.counters)
+    assert outcome.counters == list(range(first, first + n_frames))
+    # at most two frames may still be on their way
+    assert outcome.frames_due - 2 <= n_frames <= outcome.frames_due + 1
+    # what a full queue and a full flash may differ by
+    assert outcome.objects_grown <= 2000
     assert outcome.sent_bytes > 50_000
     assert outcome.faults_seen > 20
     assert min(outcome.actions.values()) > 5
@@ -152,27 +153,27 @@ def check(outcome: Outcome) -> None:
 
 @pytest.mark.parametrize("rate", [1e-5, 1e-3])
 def test_mixed_traffic(rate: float) -> None:
-    outcome = run_traffic(1_000_000, rate, 1, short=False)
+    outcome = corrupted_traffic.run(1_000_000, rate, 1, short=False)
     check(outcome)
     assert outcome.untouched > (0.4 if rate == 1e-3 else 0.9) * outcome.packets
     assert outcome.damaged_bytes > 0
 
 
 def test_short_packets_with_a_hundredth_of_all_bytes_damaged() -> None:
-    outcome = run_traffic(200_000, 1e-2, 1, short=True)
+    outcome = corrupted_traffic.run(200_000, 1e-2, 1, short=True)
     check(outcome)
     assert outcome.untouched > 0.8 * outcome.packets
     assert outcome.statistics.checksum_failures > 100
 
 
 def test_undamaged_traffic_is_found_whole() -> None:
-    outcome = run_traffic(1_000_000, 0.0, 1, short=False)
+    outcome = corrupted_traffic.run(1_000_000, 0.0, 1, short=False)
     assert outcome.found == outcome.untouched == outcome.packets == outcome.statistics.packets
     assert outcome.statistics.clean
 
 
 def test_the_command_finds_the_same() -> None:
-    outcome = run_traffic(300_000, 1e-3, 2, short=False)
+    outcome = corrupted_traffic.run(300_000, 1e-3, 2, short=False)
     command = run_command(300_000, 1e-3, 2, short=False)
     assert command.exit_code == 0
     assert command.statistics == outcome.statistics.summary()

@@ -101,8 +101,8 @@ def note(
     **more: Any,  # noqa: ANN401 - of annotate
 ) -> None:
     """Write a small text beside a point."""
-    more = {"textcoords": "offset points", "fontsize": 8.5, "color": colour} | more
-    axes.annotate(text, at, xytext=offset_points, **more)
+    options: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8.5, "color": colour}
+    axes.annotate(text, at, xytext=offset_points, **(options | more))
 
 
 # Chi-square quantile for two degrees of freedom, in closed form.

@@ -20,9 +20,8 @@ from emulator.chip import Pace
 from emulator.device import Device
 from emulator.ports.pty import PtyLink
 from emulator.ports.server import PACKETS_PER_TURN, Port, Server
-from hil_tests.bench.pair_line import PairLine
 from hil_tests.patience import seconds
-from hil_tests.unit.emulator.doubles import PortHost, ramp_device
+from hil_tests.unit.emulator.doubles import PairLine, PortHost, ramp_device
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import SensorMode, X4Setting
 from xethru_protocol.wire.framing import NeedData
@@ -40,13 +39,6 @@ LIMIT_S = seconds(60)
 PONG = m.Pong(value=0xAAEEAEEA)
 
 
-class PairLink(PairLine):
-    """A line without a terminal, which holds a few packets."""
-
-    def host_fd(self) -> int:
-        return os.dup(self.host_fileno())
-
-
 class TerminalLink(PtyLink):
     """The real thing."""
 
@@ -58,7 +50,7 @@ class TerminalLink(PtyLink):
 class Bench:
     clock: Clock
     server: Server
-    links: list[PairLink] | list[TerminalLink]
+    links: list[PairLine] | list[TerminalLink]
     devices: list[Device]
     hosts: list[PortHost] = field(default_factory=list)
 
@@ -69,7 +61,7 @@ class Bench:
 
 
 @contextlib.contextmanager
-def served(links: list[PairLink] | list[TerminalLink], pace: Pace) -> Iterator[Bench]:
+def served(links: list[PairLine] | list[TerminalLink], pace: Pace) -> Iterator[Bench]:
     devices = [ramp_device(pace) for _ in links]
     clock = Clock()
     ports = [Port(links[index], device) for index, device in enumerate(devices)]
@@ -85,13 +77,13 @@ def served(links: list[PairLink] | list[TerminalLink], pace: Pace) -> Iterator[B
 
 @pytest.fixture(params=list(Pace))
 def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
-    with served([PairLink() for _ in range(3)], request.param) as made:
+    with served([PairLine() for _ in range(3)], request.param) as made:
         yield made
 
 
 @pytest.fixture
 def asap() -> Iterator[Bench]:
-    with served([PairLink()], Pace.ASAP) as made:
+    with served([PairLine()], Pace.ASAP) as made:
         yield made
 
 
@@ -277,7 +269,7 @@ def test_a_deadline_beyond_what_the_system_waits_for_is_no_error() -> None:
         def wake_ns(self, now_ns: int) -> int | None:
             return 10**24
 
-    link = PairLink()
+    link = PairLine()
     server = Server([Port(link, Distant())], clock_ns=lambda: 0)
     server.stop()  # its wait ends at once, if it begins
     server.turn()
