@@ -134,7 +134,6 @@ class StopFlag:
         self._end = None
 
     def request(self) -> None:
-        """Request the end without a signal."""
         self.requested = True
         if self._end is not None:
             self._end()

@@ -162,7 +162,6 @@ def capacity_bytes_per_s(line: object) -> float:
 
 
 def set_rate(line: object, baudrate: int) -> None:
-    """Change a line's baud rate, if it has one."""
     change = getattr(line, "set_baudrate", None)
     if change is not None:
         change(baudrate)

@@ -85,7 +85,6 @@ def _add_port(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_raw_settings(parser: argparse.ArgumentParser) -> None:
-    """Add the settings that `raw_config` reads."""
     group = parser.add_argument_group("raw radar frames")
     group.add_argument(
         "--frame-area",

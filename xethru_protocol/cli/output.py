@@ -26,10 +26,10 @@ def profile_name(profile_id: int) -> str:
     >>> profile_name(0x014D4AB8), profile_name(5)
     ('PRESENCE_2', '0x00000005')
     """
-    for known in ProfileId:
-        if known == profile_id:
-            return known.name.removeprefix("XTS_ID_APP_")
-    return f"0x{profile_id:08X}"
+    try:
+        return ProfileId(profile_id).name.removeprefix("XTS_ID_APP_")
+    except ValueError:
+        return f"0x{profile_id:08X}"
 
 
 class CommandFailed(XeThruError):  # noqa: N818 - reads as the event it is
@@ -218,7 +218,6 @@ def module_at(port: str, baudrate: int) -> Iterator[X4M300]:
 
 
 def print_warnings(radar: X4M300) -> None:
-    """Print the driver's warnings, each once."""
     for text in radar.warnings:
         warn(f"xethru: {one_line(text)}")
     radar.warnings.clear()

@@ -140,16 +140,9 @@ def port_users(path: str) -> tuple[str, ...]:
         return ()
     return tuple(
         f"{_name(pid)!r} (pid {pid})"
-        for pid in _process_ids()
+        for pid in sorted(int(process.name) for process in Path("/proc").glob("[0-9]*"))
         if _has_open(pid, device) and not _serves(pid, device)
     )
-
-
-def _process_ids() -> list[int]:
-    try:
-        return sorted(int(name) for name in os.listdir("/proc") if name.isdecimal())
-    except OSError:  # no /proc on this system
-        return []
 
 
 def _has_open(pid: int, device: os.stat_result) -> bool:
@@ -344,17 +337,16 @@ class PortProbe:
     @cached_property
     def profile_id(self) -> int | None:
         """Loaded profile, 0 for none; None where the module refuses."""
-        try:
-            values = self.module.request(m.GetProfileId()).values
-        except DeviceError:
-            return None
-        return values[0] if values else None
+        return self._value(m.GetProfileId())
 
     @cached_property
     def tx_power(self) -> int | None:
         """Transmitter power, 0 for off; None where the module refuses."""
+        return self._value(m.X4DriverGet(setting=X4Setting.TXPOWER))
+
+    def _value(self, command: Command[m.ReplyByte | m.ReplyInt | m.ReplyFloat]) -> int | None:
         try:
-            values = self.module.request(m.X4DriverGet(setting=X4Setting.TXPOWER)).values
+            values = self.module.request(command).values
         except DeviceError:
             return None
         return int(values[0]) if values else None

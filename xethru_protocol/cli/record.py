@@ -9,7 +9,6 @@ from argparse import Namespace
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from copy import deepcopy
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -172,33 +171,6 @@ _ANSWERS = (
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Targets:
-    """Where a recording goes, and what is kept with it; None: not wanted, or not known."""
-
-    directory: Path | None  # in the vendor's format
-    wire: Path | None  # file for all bytes of both directions
-    session_id: str
-    profile_id: int | None
-    port: str
-
-    @property
-    def text(self) -> str:
-        return " and ".join(one_line(str(path)) for path in self.paths)
-
-    @property
-    def paths(self) -> tuple[Path, ...]:
-        return tuple(path for path in (self.directory, self.wire) if path is not None)
-
-    def check(self, *, replace: bool) -> None:
-        """Raise RecordingError if something is in the way and must stay."""
-        if self.directory is not None and self.directory.exists() and not self.directory.is_dir():
-            raise RecordingError(f"{self.directory} is no directory; name a new one")
-        if self.wire is not None and self.wire.is_dir():
-            raise RecordingError(f"{self.wire} is a directory; name a file in it")
-        files_to_replace(self.paths, replace=replace)
-
-
 class Recorder:
     """Writes what a driver receives to files.
 
@@ -206,14 +178,18 @@ class Recorder:
     not cost an older recording. Bytes that come before that are kept until then.
 
     An error of a file is kept in ``failure``, not raised: the caller is in the middle of
-    receiving. After ``count`` messages it is enough; None: never.
+    receiving.
     """
 
-    def __init__(self, targets: Targets, count: int | None) -> None:
+    def __init__(self, arguments: Namespace, profile_id: int | None) -> None:
         self.messages = 0  # taken
         self.failure: XeThruError | None = None  # why nothing more is written
-        self._targets = targets
-        self._count = count
+        self._directory = Path(arguments.out) if arguments.out else None
+        self._wire_path = Path(arguments.wire) if arguments.wire else None
+        paths = (self._directory, self._wire_path)
+        self.paths = tuple(path for path in paths if path is not None)
+        self._arguments = arguments
+        self._profile_id = profile_id
         self._statistics = LinkStatistics()
         self._began_ns = self._newest_ns = time.monotonic_ns()
         self._since_1970_ns = time.time_ns() - self._began_ns
@@ -238,23 +214,30 @@ class Recorder:
             for path, was_there in reversed(self._were_there.items()):
                 remove_unfinished(path, was_there=was_there)
 
-    def open(self, *, replace: bool) -> None:
+    def check(self) -> None:
+        """Raise RecordingError if something is in the way and must stay."""
+        directory, wire = self._directory, self._wire_path
+        if directory is not None and directory.exists() and not directory.is_dir():
+            raise RecordingError(f"{directory} is no directory; name a new one")
+        if wire is not None and wire.is_dir():
+            raise RecordingError(f"{wire} is a directory; name a file in it")
+        files_to_replace(self.paths, replace=self._arguments.force)
+
+    def open(self) -> None:
         """Remove older files if that is allowed, and make new ones; RecordingError if not."""
-        targets = self._targets
-        for path in files_to_replace(targets.paths, replace=replace):
+        for path in files_to_replace(self.paths, replace=self._arguments.force):
             try:
                 path.unlink()
             except OSError as error:
                 raise RecordingError(f"{path} cannot be removed: {error.strerror}") from None
-        self._were_there = {path: path.exists() for path in targets.paths}
-        if targets.directory is not None:
+        self._were_there = {path: path.exists() for path in self.paths}
+        if self._directory is not None:
+            session_id = self._arguments.session_id
             self._writer = RecordingWriter(
-                targets.directory,
-                session_id=targets.session_id,
-                profile_id=targets.profile_id,
+                self._directory, session_id=session_id, profile_id=self._profile_id
             )
-        if targets.wire is not None:
-            self._wire = WireCapture(targets.wire, {"port": targets.port})
+        if self._wire_path is not None:
+            self._wire = WireCapture(self._wire_path, {"port": self._arguments.port})
         early, self._early = self._early or [], None
         for received in early:
             self.take_bytes(*received)
@@ -288,7 +271,7 @@ class Recorder:
             self.fail(error)
 
     def take_bytes(self, direction: Literal["rx", "tx"], data: bytes, t_ns: int) -> None:
-        if self._early is not None and self._targets.wire is not None:
+        if self._early is not None and self._wire_path is not None:
             self._early.append((direction, bytes(data), t_ns))
         if self._wire is None or self.failure is not None:
             return
@@ -300,9 +283,8 @@ class Recorder:
     @property
     def is_enough(self) -> bool:
         """Whether nothing more will be taken."""
-        return self.failure is not None or (
-            self._count is not None and self.messages >= self._count
-        )
+        count = self._arguments.count
+        return self.failure is not None or (count is not None and self.messages >= count)
 
     @property
     def elapsed_s(self) -> float:
@@ -321,10 +303,9 @@ class Recorder:
         )
 
     def summary(self) -> dict[str, Any]:
-        directory, wire = self._targets.directory, self._targets.wire
         return {
-            "directory": None if directory is None else str(directory),
-            "wire": None if wire is None else str(wire),
+            "directory": None if self._directory is None else str(self._directory),
+            "wire": None if self._wire_path is None else str(self._wire_path),
             "messages": self.messages,
             "duration_s": (self._newest_ns - self._began_ns) * 1e-9,
             "link": self._statistics.summary(),
@@ -346,37 +327,30 @@ def record(arguments: Namespace) -> int:
         mode = RawFrames(config=config, fps=arguments.fps)
     elif arguments.profile == "presence":
         mode = Presence()
-    targets = Targets(
-        directory=Path(arguments.out) if arguments.out else None,
-        wire=Path(arguments.wire) if arguments.wire else None,
-        session_id=arguments.session_id,
-        profile_id=mode.profile_id,
-        port=arguments.port,
-    )
-    replace = arguments.force
-    targets.check(replace=replace)
     stop = StopFlag("previous")
-    with Recorder(targets, arguments.count) as recorder:
+    with Recorder(arguments, mode.profile_id) as recorder:
+        recorder.check()
         try:
             with module_at(arguments.port, arguments.baudrate) as radar:
                 radar.raw_listener = recorder.take_bytes
                 mode.prepare(radar)
                 print_warnings(radar)
-                recorder.open(replace=replace)
+                recorder.open()
                 with stop:
                     _record_from(radar, recorder, mode, arguments.duration, stop)
         except XeThruError as error:
             recorder.fail(error)
+    targets = " and ".join(one_line(str(path)) for path in recorder.paths)
     if arguments.json:
         print_json(recorder.summary() | {"ended_by": _end(recorder, stop)})
     elif recorder.failure is None and recorder.messages:
-        print_line(f"{targets.text}: {recorder.numbers()}")
+        print_line(f"{targets}: {recorder.numbers()}")
     elif recorder.failure is None:
         warn("xethru record: nothing came, so nothing was written")
     if recorder.failure is not None:
         text = str(recorder.failure)
         if recorder.messages:
-            text += f"; kept {counted(recorder.messages, 'message')} in {targets.text}"
+            text += f"; kept {counted(recorder.messages, 'message')} in {targets}"
         if stop.received is None:
             raise CommandFailed(text)
         warn(f"xethru record: {one_line(text)}")

@@ -154,7 +154,7 @@ MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
 MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END = 7, 9, 12, 15
 _OF_SUMMARY = (8, 10, 11, 13, 14)  # indexes and statistics, behind the data
-_LAST_CODE = 15  # private ones, from 128 on, are taken for damage
+_CODES = range(1, 16)  # private ones, from 128 on, are taken for damage
 
 _HEAD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQI")
@@ -225,7 +225,7 @@ class RecordReader:
                 yield Cut(at)
                 return
             code, length = _HEAD.unpack(head)
-            is_record = _is_code(code) and min(length, self._size) <= _MOST_BYTES
+            is_record = code in _CODES and min(length, self._size) <= _MOST_BYTES
             end = at + _HEAD.size + length
             if not is_record or end > self._size:
                 # A length that is damaged looks like a cut, but then a sound chunk follows.
@@ -290,7 +290,7 @@ class RecordReader:
         if len(head) < _HEAD.size:
             return True
         code, length = _HEAD.unpack(head)
-        return _is_code(code) and at + _HEAD.size + int(length) <= self._size
+        return code in _CODES and at + _HEAD.size + int(length) <= self._size
 
     def _is_zero_from(self, at: int) -> bool:
         """Whether nothing but zeros follows, as after a loss of power."""
@@ -324,10 +324,6 @@ class RecordReader:
         except DAMAGES:
             return False
         return True
-
-
-def _is_code(code: int) -> bool:
-    return 1 <= code <= _LAST_CODE
 
 
 def text_at(body: bytes, at: int) -> tuple[str, int]:
@@ -393,7 +389,6 @@ def _unpacked(name: str, packed: bytes, size: int) -> bytes:
 
 
 def _records_in(at: int, content: bytes) -> Iterator[Record]:
-    """Yield the whole records of a chunk that begins at a place."""
     here = 0
     while here + _HEAD.size <= len(content):
         code, length = _HEAD.unpack_from(content, here)
@@ -551,8 +546,6 @@ _UNTIMED = {"xethru-hil": "time unknown"}
 
 
 class _RecordingWriter:
-    """The channels of one radar in a file being written."""
-
     def __init__(self, writer: McapWriter) -> None:
         self._writer = writer
         self._channels: dict[tuple[str, bool], int] = {}
@@ -566,8 +559,11 @@ class _RecordingWriter:
             data = pack_array(FLOAT_ARRAY, message.values)
             self._add("frame", FLOAT_ARRAY, data, t_ns, message.info)
             return
-        if isinstance(message, ReplyInt | ReplyFloat):
-            self._note_setting(message)
+        match message:  # the module's answers about its frame area
+            case ReplyFloat(content_id=X4Setting.FRAMEAREA, values=(start_m, end_m)):
+                self._settings[X4Setting.FRAMEAREA.name] = start_m, end_m
+            case ReplyInt(content_id=X4Setting.FRAMEBINCOUNT, values=(n_bins,)):
+                self._settings[X4Setting.FRAMEBINCOUNT.name] = n_bins
         bulk = not isinstance(message, UnknownMessage) and ROWS[type(message)].bulk
         if isinstance(message, BasebandIq | BasebandAp):
             self._info(message, t_ns)
@@ -622,14 +618,6 @@ class _RecordingWriter:
             n_bins=n_bins,
             downconversion=len(frame.values) == 2 * n_bins,
         )
-
-    def _note_setting(self, answer: ReplyInt | ReplyFloat) -> None:
-        """Remember what the module answered of its frame area: the content id is the setting's."""
-        match answer:
-            case ReplyFloat(content_id=X4Setting.FRAMEAREA, values=(start_m, end_m)):
-                self._settings[X4Setting.FRAMEAREA.name] = start_m, end_m
-            case ReplyInt(content_id=X4Setting.FRAMEBINCOUNT, values=(n_bins,)):
-                self._settings[X4Setting.FRAMEBINCOUNT.name] = n_bins
 
     def _add(self, topic: str, schema: str, data: bytes, t_ns: int | None, sequence: int) -> None:
         key = topic, t_ns is not None
@@ -696,7 +684,11 @@ def read_mcap(path: Path, on_fault: FaultHandler | None, radar: str | None = Non
                 )
             continue
         try:
-            message = _message(part, entry)
+            if part == "frame":
+                values = unpack_array(FLOAT_ARRAY, entry.data)
+                message: Response = DataFloat(info=entry.sequence, values=values)
+            else:
+                message = decode_response(unpack_array(BYTE_ARRAY, entry.data).tobytes())
         except (ValueError, struct.error) as error:
             raise RecordingError(f"{path}: a message is damaged: {error}") from None
         yield message, None if "xethru-hil" in entry.channel.metadata else entry.t_ns
@@ -754,13 +746,6 @@ def mcap_facts(path: Path) -> RecordingFacts:
         if isinstance(entry, Message):
             break
     return RecordingFacts()
-
-
-def _message(part: str, message: Message) -> Response:
-    if part == "frame":
-        values = unpack_array(FLOAT_ARRAY, message.data)
-        return DataFloat(info=message.sequence, values=values)
-    return decode_response(unpack_array(BYTE_ARRAY, message.data).tobytes())
 
 
 def _radar_topic(topic: str) -> tuple[str, str]:

@@ -83,7 +83,6 @@ def _group(kind: BinaryKind) -> str:
 
 
 def _header_arrays(kind: BinaryKind) -> dict[str, str]:
-    """Return the fields of a kind's header with the names of their arrays."""
     names = _FRAME_ARRAYS if kind.name == "datafloat" else _ARRAYS
     return {part: f"{_group(kind)}_{names.get(part, part)}" for part in kind.header.names or ()}
 
@@ -123,8 +122,6 @@ class _Bulk:
 
 
 class _Others:
-    """All other messages while they are gathered."""
-
     def __init__(self) -> None:
         self.index = array("q")
         self.t_ns = array("q")
@@ -207,7 +204,6 @@ def read_npz(path: Path) -> TimedMessages:
 
 
 def npz_facts(path: Path) -> RecordingFacts:
-    """Return the facts of an archive; RecordingError if it cannot be read."""
     with _open(path, ": its description is damaged") as archive:
         return RecordingFacts.from_json(json.loads(str(archive["facts"])))
 

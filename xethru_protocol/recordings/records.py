@@ -70,6 +70,12 @@ class GrowingFile:
         with writing(path):
             self._stream = FileIO(path, "x")
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
     @property
     def closed(self) -> bool:
         return self._stream.closed

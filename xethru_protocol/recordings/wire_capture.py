@@ -25,7 +25,7 @@ import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, Self
+from typing import Any, BinaryIO, Literal
 
 from xethru_protocol.recordings.records import (
     FaultHandler,
@@ -64,7 +64,7 @@ class Chunk:
     t_ns: int | None
 
 
-class WireCapture:
+class WireCapture(GrowingFile):
     """Writes a wire capture; each chunk is handed to the operating system at once.
 
     ``note`` holds JSON-able values about the capture. RecordingError if the file exists or cannot
@@ -72,16 +72,9 @@ class WireCapture:
     """
 
     def __init__(self, path: Path | str, note: Mapping[str, Any] | None = None) -> None:
-        self.path = Path(path)
         text = json.dumps(dict(note or {})).encode()
-        self._file = GrowingFile(self.path)
-        self._file.append(_HEAD.pack(MAGIC, VERSION, len(text)) + text)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
+        super().__init__(Path(path))
+        self.append(_HEAD.pack(MAGIC, VERSION, len(text)) + text)
 
     def write(self, direction: Way, data: bytes, t_ns: int | None) -> None:
         """Append a chunk; ``t_ns`` since 1970, None if unknown.
@@ -90,14 +83,10 @@ class WireCapture:
         """
         if not data:
             return
-        if self._file.closed:
+        if self.closed:
             raise RecordingError(f"{self.path}: the capture is closed")
         stamp_ns = _NO_TIME if t_ns is None else t_ns
-        self._file.append(_CHUNK.pack(_MARKS[direction], stamp_ns, len(data)) + data)
-
-    def close(self) -> None:
-        """Close the file; calling it again does nothing."""
-        self._file.close()
+        self.append(_CHUNK.pack(_MARKS[direction], stamp_ns, len(data)) + data)
 
 
 def read_chunks(path: Path | str, on_fault: FaultHandler | None = None) -> Iterator[Chunk]:

@@ -391,7 +391,6 @@ _LONGEST_FIRST = sorted(KINDS, key=lambda kind: -len(kind.name))
 
 
 def kind_of_file(name: str) -> BinaryKind | TextKind | None:
-    """Return the kind of a data file by its name; None if there is no such kind."""
     for kind in _LONGEST_FIRST:
         if name.startswith(kind.file_prefix) and name.endswith(kind.suffix):
             return kind

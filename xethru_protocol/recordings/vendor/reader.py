@@ -288,7 +288,6 @@ def _files_by_entry(
 
 
 def vendor_facts(path: Path) -> RecordingFacts:
-    """Return the facts about a recording; almost none without a meta file."""
     (directory, _), *rest = _parts(path)
     try:
         meta = _read_meta(directory)
@@ -312,7 +311,6 @@ def vendor_facts(path: Path) -> RecordingFacts:
 
 
 def is_vendor_file(path: Path) -> bool:
-    """Whether a file's name is one that ModuleConnector gives."""
     return path.name == META_NAME or kind_of_file(path.name) is not None
 
 

@@ -6,7 +6,6 @@ up to the last record and the index up to the last entry. Only the totals in the
 file and its list of files are missing then; the reader does without them.
 """
 
-from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
@@ -126,7 +125,7 @@ class RecordingWriter:
                 )
         if parameter_file is not None:
             content = parameter_file.encode() if isinstance(parameter_file, str) else parameter_file
-            with closing(GrowingFile(self.directory / PARAMETER_FILE_NAME)) as file:
+            with GrowingFile(self.directory / PARAMETER_FILE_NAME) as file:
                 file.append(content)
 
     def __enter__(self) -> Self:

@@ -177,20 +177,16 @@ def test_a_module_that_stops_answering_half_way(capsys: Capture) -> None:
 # --- the port ---------------------------------------------------------------------------------
 
 
-def test_a_link_to_nothing(tmp_path: Path, capsys: Capture) -> None:
-    link = tmp_path / "radar"
+@pytest.mark.parametrize(
+    ("name", "quoted"), [("radar", "{}"), ("my {radar} $(id)", "'{}'")], ids=["plain", "quoted"]
+)
+def test_a_link_to_nothing(name: str, quoted: str, tmp_path: Path, capsys: Capture) -> None:
+    link = tmp_path / name
     link.symlink_to(tmp_path / "gone")
     code, finding = only_finding(capsys, str(link))
     assert (code, finding["check"]) == (1, "link leads to a port")
     assert str(tmp_path / "gone") in finding["found"]
-    assert finding["remedy"].endswith(f"rm {link}")
-
-
-def test_names_in_remedies_can_be_given_to_a_shell(tmp_path: Path, capsys: Capture) -> None:
-    link = tmp_path / "my {radar} $(id)"
-    link.symlink_to(tmp_path / "gone")
-    _, finding = only_finding(capsys, str(link))
-    assert finding["remedy"].endswith(f"rm '{link}'")
+    assert finding["remedy"].endswith(f"rm {quoted.format(link)}")
 
 
 def test_a_port_that_vanishes_while_it_is_examined(
@@ -202,15 +198,16 @@ def test_a_port_that_vanishes_while_it_is_examined(
     assert finding["found"] == "this could not be found out: No such file or directory"
 
 
-def test_no_such_port(tmp_path: Path, capsys: Capture) -> None:
-    code, finding = only_finding(capsys, str(tmp_path / "radar"))
-    assert (code, finding["check"]) == (1, "port exists")
-
-
-@pytest.mark.parametrize("path", [".", __file__, "/dev/null"])
-def test_what_is_no_serial_port(path: str, capsys: Capture) -> None:
+@pytest.mark.parametrize(
+    ("path", "check"),
+    [
+        ("/dev/none", "port exists"),
+        *((path, "is a serial port") for path in (".", __file__, "/dev/null")),
+    ],
+)
+def test_what_is_no_port(path: str, check: str, capsys: Capture) -> None:
     code, finding = only_finding(capsys, path)
-    assert (code, finding["check"]) == (1, "is a serial port")
+    assert (code, finding["check"]) == (1, check)
 
 
 @pytest.mark.parametrize(

@@ -11,11 +11,11 @@ import pytest
 
 from hil_tests.paths import FIXTURES
 from hil_tests.unit.emulator.test_playback_control import samples, write_session
+from hil_tests.unit.xethru_protocol.recordings.messages import write_capture
 from hil_tests.unit.xethru_protocol.scripted import framed
 from xethru_protocol.cli import main
-from xethru_protocol.recordings import RecordingError, WireCapture, convert, read_recording
+from xethru_protocol.recordings import RecordingError, convert, read_recording
 from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.connection import Connection, Role
 
 Capture = pytest.CaptureFixture[str]
 RECORDINGS = FIXTURES / "recordings"
@@ -87,14 +87,9 @@ def test_a_damaged_recording_is_read_as_far_as_it_goes(tmp_path: Path, capsys: C
 
 def test_answers_and_unknown_messages_in_a_wire_capture(tmp_path: Path, capsys: Capture) -> None:
     wire = tmp_path / "port.xtwire"
-    module = Connection(Role.MODULE)
-    with WireCapture(wire) as capture:
-        capture.write("tx", bytes.fromhex("7D 01 AE EA AA EE 00 7E"), 1_000_000_000)
-        for number, said in enumerate((m.Ack(), m.UnknownMessage(code=0x77, payload=b"\x77" * 50))):
-            capture.write("rx", module.send(said), 2_000_000_000 + number)
-        capture.write(
-            "rx", module.send(m.DataFloat(info=1, values=np.array([np.nan, np.inf]))), None
-        )
+    unknown = m.UnknownMessage(code=0x77, payload=b"\x77" * 50)
+    frame = m.DataFloat(info=1, values=np.array([np.nan, np.inf]))
+    write_capture(wire, [(m.Ack(), 2_000_000_000), (unknown, 2_000_000_001), (frame, None)])
     assert main(["dump", str(wire)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[-3] == "    0.000000  ACK"
@@ -137,11 +132,8 @@ def test_what_was_left_out_and_what_was_damaged_is_reported(
     tmp_path: Path, capsys: Capture
 ) -> None:
     wire = tmp_path / "port.xtwire"
-    module = Connection(Role.MODULE)
-    frame = module.send(m.DataFloat(info=1, values=np.zeros(8, np.float32)))
-    with WireCapture(wire) as capture:
-        for data in (module.send(m.Ack()), frame, frame):
-            capture.write("rx", data, 10**18)
+    frame = m.DataFloat(info=1, values=np.zeros(8, np.float32))
+    write_capture(wire, [(m.Ack(), 10**18), (frame, 10**18), (frame, 10**18)])
     wire.write_bytes(wire.read_bytes()[:-4])
     assert main(["convert", str(wire), str(tmp_path / "c"), "--json"]) == 1
     printed, errors = capsys.readouterr()

@@ -1,11 +1,13 @@
 """Small messages, and recordings read with their faults."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
-from xethru_protocol.recordings import RecordingFault, read_recording
+from xethru_protocol.recordings import RecordingFault, WireCapture, read_recording
 from xethru_protocol.wire import messages as m
+from xethru_protocol.wire.connection import Connection, Role
 
 
 def frame(counter: int, n_bins: int = 3) -> m.DataFloat:
@@ -14,6 +16,14 @@ def frame(counter: int, n_bins: int = 3) -> m.DataFloat:
 
 def presence(counter: int) -> m.PresenceSingle:
     return m.PresenceSingle(counter=counter, state=1, distance_m=1.5, direction=2, signal_quality=7)
+
+
+def write_capture(path: Path, timed: Iterable[tuple[m.Response, int | None]]) -> None:
+    """Write messages of a module as bytes of a port."""
+    module = Connection(Role.MODULE)
+    with WireCapture(path) as capture:
+        for message, t_ns in timed:
+            capture.write("rx", module.send(message), t_ns)
 
 
 def read_with_faults(
