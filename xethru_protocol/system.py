@@ -80,18 +80,11 @@ class StopFlag:
         What a second signal of the same kind gets: ``"default"``, the system's handler, which
         ends the process where it stands (SIGHUP is ignored then: a closing terminal sends two);
         ``"previous"``, the handler of before; ``"same"``, the same as the first.
-
-    Attributes
-    ----------
-    received
-        The last signal that arrived; None: none did.
-    requested
-        Whether the end was requested, by a signal or by `request`.
     """
 
     def __init__(self, second: Literal["default", "previous", "same"] = "default") -> None:
-        self.received: signal.Signals | None = None
-        self.requested = False
+        self.received: signal.Signals | None = None  # the last that arrived
+        self.requested = False  # by a signal or by `request`
         self._second = second
         self._previous: dict[signal.Signals, Any] = {}
         self._at_once = False

@@ -4,13 +4,12 @@ import argparse
 import math
 from argparse import ArgumentTypeError
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from xethru_protocol.driver.link import RawConfig
 
 
-_Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 _LONGEST_S = 1e9  # 30 years
 
 
@@ -57,7 +56,7 @@ baud_rate = _number(
 
 
 def _add_command(
-    commands: _Commands,
+    commands: "argparse._SubParsersAction[argparse.ArgumentParser]",
     name: str,
     text: str,
     run: str,

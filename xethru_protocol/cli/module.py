@@ -145,11 +145,10 @@ class _Live:
         self._began_ns = 0  # arrival of the first
 
     def show(self, frame: Frame) -> None:
-        if self._newest is None:
-            self._began_ns = time.monotonic_ns()
+        now_ns = time.monotonic_ns()
+        self._began_ns = self._began_ns or now_ns
         self._frames += 1
         self._newest = frame
-        now_ns = time.monotonic_ns()
         if now_ns - self._shown_ns >= _REFRESH_NS:
             self._shown_ns = now_ns
             self._write(frame, now_ns)

@@ -44,27 +44,15 @@ class Level(StrEnum):
 class Check(Generic[SubjectT]):
     """Enters a function into a table: it returns what is wrong, None if nothing is.
 
-    Attributes
-    ----------
-    name
-        What is in order if nothing is found.
-    looks_at
-        Where the evidence comes from.
-    remedy
-        What to do about it; ``{...}`` may name any attribute of the subject, which is quoted for
-        a shell.
-    level
-        NOTE for what is a fault only to some users.
-    ends
-        Whether no check follows this finding: later ones have nothing to look at, or would
-        disturb another program.
+    A check that ``ends`` is the last one if it finds something: later ones would have nothing to
+    look at, or would disturb another program.
     """
 
     table: "list[Check[SubjectT]]"
-    name: str
-    looks_at: str
-    remedy: str
-    level: Level = Level.FAULT
+    name: str  # what is in order if nothing is found
+    looks_at: str  # where the evidence comes from
+    remedy: str  # ``{...}`` names an attribute of the subject, which is quoted for a shell
+    level: Level = Level.FAULT  # NOTE for what is a fault only to some users
     ends: bool = False
     find: Callable[[SubjectT], str | None] = field(init=False)
 

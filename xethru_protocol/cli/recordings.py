@@ -75,21 +75,6 @@ def decode(arguments: Namespace) -> int:
     return 0
 
 
-def found_in(
-    chunks: Iterable[bytes], sender: str, statistics: LinkStatistics
-) -> Iterator[Packet | FramingFault]:
-    """Packets and faults of a stream that comes in chunks, each as soon as it is complete."""
-    direction = Direction.FROM_HOST if sender == "host" else Direction.FROM_MODULE
-    reader = PacketReader(direction, statistics)
-    for chunk in chunks:
-        reader.receive_data(chunk)
-        while isinstance(found := reader.next_packet(), Packet | FramingFault):
-            yield found
-    reader.end_data()
-    while isinstance(found := reader.next_packet(), Packet | FramingFault):
-        yield found
-
-
 def message_of(packet: Packet, sender: str) -> Message:
     """Message of a packet from ``sender``: "host", "module", or "auto" to judge by structure.
 
@@ -121,21 +106,23 @@ def _explains(message: Message, payload: bytes) -> bool:
 
 
 def _print_all(chunks: Iterable[bytes], sender: str, statistics: LinkStatistics) -> None:
-    for found in found_in(chunks, sender, statistics):
+    direction = Direction.FROM_HOST if sender == "host" else Direction.FROM_MODULE
+    reader = PacketReader(direction, statistics)
+    for chunk in chunks:
+        reader.receive_data(chunk)
+        _print_found(reader, sender)
+    reader.end_data()
+    _print_found(reader, sender)
+
+
+def _print_found(reader: PacketReader, sender: str) -> None:
+    while isinstance(found := reader.next_packet(), Packet | FramingFault):
         if isinstance(found, FramingFault):
             print_json({"fault": found.kind.value, "offset": found.offset})
             continue
         message = message_of(found, sender)
-        statistics.unknown += isinstance(message, UnknownMessage)
-        name, shown = describe(message)
-        print_json(
-            {
-                "framing": found.framing.value,
-                "payload_hex": hex_bytes(found.payload),
-                "message": name,
-                "fields": shown,
-            }
-        )
+        reader.statistics.unknown += isinstance(message, UnknownMessage)
+        print_json(_as_json(found.framing, found.payload, message))
 
 
 def _chunks(source: BinaryIO, name: str) -> Iterator[bytes]:
@@ -168,7 +155,10 @@ def dump(arguments: Namespace) -> int:
     faults: list[RecordingFault] = []
     if arguments.json:
         for message, t_ns in read_recording(file, faults.append, radar=radar):
-            print_json(_as_json(message, t_ns))
+            bulk = not isinstance(message, UnknownMessage) and ROWS[type(message)].bulk
+            framing = Framing.NO_ESCAPE if bulk else Framing.NORMAL
+            payload = encode(message, bulk=bulk)
+            print_json(_as_json(framing, payload, message) | {"t_ns": t_ns})
     else:
         summary = describe_recording(file, radar=radar)
         for line in _head(summary):
@@ -194,15 +184,13 @@ def message_line(message: Response, *, with_samples: bool) -> str:
     return " ".join([name, *parts])
 
 
-def _as_json(message: Response, t_ns: int | None) -> dict[str, Any]:
-    bulk = not isinstance(message, UnknownMessage) and ROWS[type(message)].bulk
+def _as_json(framing: Framing, payload: bytes, message: Message) -> dict[str, Any]:
     name, shown = describe(message)
     return {
-        "framing": (Framing.NO_ESCAPE if bulk else Framing.NORMAL).value,
-        "payload_hex": hex_bytes(encode(message, bulk=bulk)),
+        "framing": framing.value,
+        "payload_hex": hex_bytes(payload),
         "message": name,
         "fields": shown,
-        "t_ns": t_ns,
     }
 
 

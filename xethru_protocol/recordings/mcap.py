@@ -512,10 +512,9 @@ class McapWriter(Writer):
 
     def end_chunk(self) -> None:
         """End the chunk here, whatever its size."""
-        # A private method: mcap's writer closes a chunk by size only and offers no public way
-        # to close it by time. pyproject pins the minor version of mcap for this line; before
-        # that is raised, see that the method is still there and still writes the pending
-        # chunk. The tests of chunks cut by time and of files never finished fail if not.
+        # A private method: mcap's writer offers no public way to close a chunk by time. pyproject
+        # pins the minor version of mcap for this line; the tests of chunks cut by time and of
+        # files never finished fail if the method does not write the pending chunk any more.
         self._Writer__finalize_chunk()  # type: ignore[attr-defined]  # see above
 
     def finish(self) -> None:

@@ -130,20 +130,12 @@ class RadarFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingFacts:
-    """Facts about a recording, beside its messages.
+    """Facts about a recording, beside its messages; None where unknown.
 
-    Attributes
-    ----------
-    session_id
-        The recorder's name for the session; empty if it gave none.
-    profile_id
-        Profile that ran (Protocol reference 4.3); None where unknown.
-    parameter_file
-        Content of the module's parameter file; None if none was stored.
-    user_header
-        Bytes that the recorder put before the records of each data file.
-    stopped_ns, closed_ns
-        When the last data file and the recording were closed [ns since 1970]; None: unknown.
+    ``profile_id`` is of the profile that ran (Protocol reference 4.3), ``parameter_file`` the
+    content of the module's parameter file, ``user_header`` what the recorder put before the records
+    of each data file; ``stopped_ns`` and ``closed_ns`` are when the last data file and the
+    recording were closed [ns since 1970].
     """
 
     session_id: str = ""

@@ -3,7 +3,7 @@
 import asyncio
 import inspect
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol, Self, cast
+from typing import Any, Self, cast
 
 from hil_tests.unit.xethru_protocol.scripted import Answer, PlainModule, ScriptedTransport
 from xethru_protocol.driver.async_radar import AsyncX4M300
@@ -72,16 +72,8 @@ class Blocking:
             yield item
 
 
-class DriverOn(Protocol):
-    def __call__(
-        self,
-        answer: Answer | None = None,
-        *,
-        ports: dict[str, Callable[[int], ScriptedTransport]] | None = None,
-        name: str = "the port",
-        **options: Any,  # noqa: ANN401 - those of the drivers
-    ) -> tuple[X4M300, ScriptedTransport]:
-        """Return both; ``ports`` are those at which a reconnect may open a line."""
+DriverOn = Callable[..., tuple[X4M300, ScriptedTransport]]
+"""Returns a driver and its line: the function below."""
 
 
 def driver_factory(kind: str, runner: asyncio.Runner) -> DriverOn:
@@ -92,6 +84,7 @@ def driver_factory(kind: str, runner: asyncio.Runner) -> DriverOn:
         name: str = "the port",
         **options: Any,  # noqa: ANN401 - those of the drivers
     ) -> tuple[X4M300, ScriptedTransport]:
+        """Return both; ``ports`` are those at which a reconnect may open a line."""
         line = ScriptedTransport(answer or PlainModule(), name)
         known = ports or {}
 

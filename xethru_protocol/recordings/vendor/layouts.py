@@ -45,7 +45,7 @@ end; these are what others report of split recordings in the same format.
 """
 
 import struct
-from collections.abc import Callable, Iterable, Iterator, Sized
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta, tzinfo
 from typing import Any, ClassVar, NamedTuple
@@ -178,10 +178,6 @@ def _unescaped(text: str) -> str:
     return text.encode("latin-1").decode("unicode_escape")
 
 
-def _length_text(values: Sized) -> str:
-    return str(len(values))
-
-
 class _Column(NamedTuple):
     """A column of a text file: its title, the message's field, the field as text and back."""
 
@@ -246,7 +242,7 @@ def _text(name: str, bit: int, message: type[Response], titles: dict[str, str]) 
             case fields.Elements():
                 column = _Column(title, field_name, _escaped, _unescaped)
             case fields.Count(of=(counted, *_)):
-                column = _Column(title, counted, _length_text, int, is_count=True)
+                column = _Column(title, counted, lambda of: str(len(of)), int, is_count=True)
             case _:
                 column = _Column(title, field_name, str, int)
         columns.append(column)

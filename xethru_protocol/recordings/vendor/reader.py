@@ -289,10 +289,7 @@ def _files_by_entry(
 
 def vendor_facts(path: Path) -> RecordingFacts:
     (directory, _), *rest = _parts(path)
-    try:
-        meta = _read_meta(directory)
-    except RecordingError:
-        meta = None
+    meta = _usable_meta(directory)
     parameters = directory / PARAMETER_FILE_NAME
     with reading(parameters):
         parameter_file = parameters.read_bytes() if parameters.is_file() else None
@@ -359,7 +356,8 @@ def _split_directories(path: Path) -> list[tuple[Path, list[Path]]]:
     names = sorted(child for child in path.iterdir() if child.name.startswith(_DIRECTORY_PREFIX))
     parts = [(child, files) for child in names if child.is_dir() and (files := _data_files(child))]
     # Without a session id, two directories cannot be assigned to one radar.
-    sessions = {_session(directory) or directory for directory, _ in parts}
+    metas = ((directory, _usable_meta(directory)) for directory, _ in parts)
+    sessions = {(meta.session_id if meta else b"") or directory for directory, meta in metas}
     if len(sessions) > 1:
         raise RecordingError(
             f"{path} holds {len(parts)} recordings of {len(sessions)} sessions; name one of them"
@@ -367,13 +365,11 @@ def _split_directories(path: Path) -> list[tuple[Path, list[Path]]]:
     return parts
 
 
-def _session(directory: Path) -> bytes | None:
-    """Return the session id of a directory; None without a usable meta file."""
+def _usable_meta(directory: Path) -> Meta | None:
     try:
-        meta = _read_meta(directory)
+        return _read_meta(directory)
     except RecordingError:
         return None
-    return meta.session_id if meta else None
 
 
 def _read_meta(directory: Path) -> Meta | None:
