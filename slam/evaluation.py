@@ -131,13 +131,15 @@ def icp_align_se2(estimate_xy: Array, reference_xy: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LandmarkScore:
-    """How a map compares with the landmarks that were there to be found."""
+    """How a map compares with the landmarks that were there to be found.
 
-    # Numbers of true landmarks, of estimates, and of one-to-one matches within 0.15 m
-    true: int
+    Field names are those of summary.json.
+    """
+
+    # Numbers of true landmarks, None if unknown, and of estimates
+    true: int | None
     estimated: int
-    matched: int
-    # matched / estimated and matched / true; None where the denominator is 0
+    # One-to-one matches within 0.15 m / estimated and / true; None where the denominator is 0
     precision: float | None
     recall: float | None
     duplicates: int  # further estimates within 0.15 m of a matched true landmark
@@ -167,7 +169,6 @@ def landmark_metrics(estimated_xy: Array, true_xy: Array, alignment: Array) -> L
     return LandmarkScore(
         true=m,
         estimated=n,
-        matched=matched,
         precision=matched / n if n else None,
         recall=matched / m if m else None,
         duplicates=int(close[others][:, columns].any(axis=1).sum()),

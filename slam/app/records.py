@@ -54,8 +54,8 @@ class SessionInfo:
 
     Attributes
     ----------
-    scene, preset, seed
-        Its names; seed None on real modules.
+    seed
+        None on real modules.
     radars
         In the order of the rig.
     true_landmarks_m
@@ -68,8 +68,6 @@ class SessionInfo:
         Fields of `WheelNoise`: the wheel errors that SLAM assumes.
     outlines_m
         Lines of walls and boxes for pictures, shape (k, 2) each, world frame.
-    simulated
-        Whether radars and world are emulated.
     time_base
         Source of the frames' stamps: "counter" or "arrival".
     has_detections
@@ -165,14 +163,11 @@ class SessionObserver:
     Subclasses define the methods they need.
     """
 
-    def on_scan(self, scan: Scan) -> None:
-        """Take the frames of one tick."""
+    def on_scan(self, scan: Scan) -> None: ...
 
-    def on_snapshot(self, snapshot: Snapshot) -> None:
-        """Take a state of SLAM."""
+    def on_snapshot(self, snapshot: Snapshot) -> None: ...
 
-    def on_log(self, line: LogLine) -> None:
-        """Take a line about the link."""
+    def on_log(self, line: LogLine) -> None: ...
 
     def close(self) -> None:
         """Finish; called once, also after a failure."""

@@ -15,7 +15,8 @@ from rosbags.highlevel import AnyReader
 
 from hil_tests.system.short_scene import write_short_scene
 from slam.app.odometry.track import read_tum
-from slam.app.run.results import evaluate, summary_of
+from slam.app.run.evaluation import summarise
+from slam.app.run.results import evaluate
 from slam.app.run.runner import RunRecord, RunSource, execute
 from slam.app.session import messages as ros
 from slam.app.sweep.run import make_case, source_of
@@ -143,7 +144,7 @@ def test_ports_and_in_process_give_the_same_belief_bit_for_bit(demo: Finished) -
     positions = np.array([row.belief.pose[:2] for row in record.results])
     assert estimate.poses[:, :2].tobytes() == positions.tobytes()
     summary = json.loads((demo.out / "summary.json").read_text())
-    in_process = summary_of(source, record)
+    in_process = summarise(record, source.info, source.rig)
     assert in_process is not None
     again = json.loads(in_process.to_json())
     # covariances, landmarks and innovations all enter here

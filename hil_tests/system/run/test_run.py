@@ -114,7 +114,7 @@ def test_a_run_from_stdin_ends_when_it_is_told_to_and_replays_to_the_last_bit(
     used = [scan for scan, _ in session.scans() if scan.used]
     assert summary["frames"] == sum(len(scan.frames) for scan in used) > 0
     assert session.info.time_base == "arrival"
-    assert {row.radar for row in session.wire()} == {m.name for m in session.rig.mounts}
+    assert {row[0] for row in session.wire()} == {m.name for m in session.rig.mounts}
 
 
 @pytest.mark.parametrize(("which", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])

@@ -9,7 +9,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Literal
 
-from emulator.scene.scene import Scene
 from slam.app.errors import AppError, EmulatorError, RadarSilentError
 from slam.app.odometry.track import read_odometry_socket
 from slam.app.records import Scan, SessionInfo, SessionObserver
@@ -33,7 +32,6 @@ from slam.app.run.runner import LinkLog, RunSource, execute, make_slam
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import settings_text
 from slam.app.view.viewer import LiveView
-from slam.config import SlamConfig
 from xethru_protocol.system import StopFlag
 
 _OUTPUTS = ("session.mcap", "session.rrd", "report.html", *RESULTS)
@@ -75,10 +73,22 @@ def run_demo(
                 rig_source.listen(lambda *row: early_bytes.append(row))
             rig_source.start(RAW_CONFIG, FRAME_RATE_HZ)
             trajectory = loaded.trajectory()
+            wheels = wheels_of(loaded)
+            info = SessionInfo(
+                scene=loaded.name,
+                preset=preset,
+                seed=seed,
+                radars=rig_source.radars,
+                true_landmarks_m=true_landmarks_m(loaded),
+                versions=versions(),
+                config_json=settings_text(config),
+                wheels=asdict(wheels),
+                outlines_m=outlines_m(loaded),
+            )
             source = RunSource(
-                info=_session_info(loaded, preset, seed, config, rig_source),
+                info=info,
                 rig=rig,
-                slam=make_slam(config, rig, wheels_of(loaded)),
+                slam=make_slam(config, rig, wheels),
                 scans=_scans(rig_source, end_counter(trajectory.duration_ns), emulator, stop, kept),
                 odometry=odometry,
                 truth_at=trajectory.poses,
@@ -86,7 +96,6 @@ def run_demo(
                 link_log=link_log,
                 close=rig_source.close,
             )
-            info = source.info
             log = SessionLog(out / "session.mcap", info, odometry, truth_at=trajectory.poses)
             stack.callback(log.close)
             view = RerunView(out / "session.rrd", info)
@@ -110,22 +119,6 @@ def run_demo(
         if live is not None:
             sys.stdout.flush()
             live.keep_serving()
-
-
-def _session_info(
-    scene: Scene, preset: str, seed: int, config: SlamConfig, rig_source: RigSource
-) -> SessionInfo:
-    return SessionInfo(
-        scene=scene.name,
-        preset=preset,
-        seed=seed,
-        radars=rig_source.radars,
-        true_landmarks_m=true_landmarks_m(scene),
-        versions=versions(),
-        config_json=settings_text(config),
-        wheels=asdict(wheels_of(scene)),
-        outlines_m=outlines_m(scene),
-    )
 
 
 def _scans(

@@ -30,6 +30,7 @@ from slam.app.run.evaluation import (
     nis_dof,
     pose_nees,
     position_errors_m,
+    summarise,
     world_from_odom,
 )
 from slam.app.run.output import Progress, run_rows, summary_rows
@@ -43,7 +44,6 @@ from slam.app.run.pictures import (
     svg_of,
 )
 from slam.app.run.replay import recorded_source
-from slam.app.run.results import summary_of
 from slam.app.run.runner import LinkChange, LinkState, LinkStates, RunRecord, RunSource, execute
 from slam.app.session.reader import RecordedSession, open_session
 from slam.evaluation import LANDMARK_MATCH_M
@@ -336,7 +336,7 @@ def _report_text(session: RecordedSession, stop: StopFlag) -> str:
     if not record.results:
         raise AppError(f"{session.path}: no state was estimated, the robot did not move")
     info = session.info
-    summary = summary_of(source, record)
+    summary = summarise(record, info, source.rig)
     seed = "" if info.seed is None else f", seed {info.seed}"
     page = _Page(f"{info.scene}, preset {info.preset}{seed}")
     page.note("simulated data" if info.simulated else "measured data", kind="origin")

@@ -35,15 +35,8 @@ _OLDEST = (0, 23)
 """Of files that later versions open."""
 
 
-def require_readable(path: Path) -> None:
-    """Require that the installed Rerun opens a recording.
-
-    Raises
-    ------
-    AppError
-        It is no recording, has a version that is too new or too old, or was never closed; the
-        message names the remedy.
-    """
+def _require_readable(path: Path) -> None:
+    """Require that the installed Rerun opens a recording, else raise AppError."""
     try:
         with path.open("rb") as stream:
             head = stream.read(8)
@@ -82,19 +75,10 @@ _MENU_PIXELS = 36
 """The viewer's own bar on top, which names the machine that drew it."""
 
 
-def take_screenshot(rrd: Path, out: Path, *, at_s: float | None, stop: StopFlag) -> None:
+def _take_screenshot(rrd: Path, out: Path, at_s: float | None, stop: StopFlag) -> None:
     """Open a recording in a viewer that draws in memory, and write what it shows as PNG.
 
-    Parameters
-    ----------
-    rrd
-        The recording, with its blueprint.
-    out
-        The picture.
-    at_s
-        Where the cursor of `device_time` stands; None for the end.
-    stop
-        Checked again and again.
+    `at_s` is where the cursor of `device_time` stands; None for the end.
 
     Raises
     ------
@@ -115,6 +99,7 @@ def take_screenshot(rrd: Path, out: Path, *, at_s: float | None, stop: StopFlag)
         few = shown.quantize(_PALETTE, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
     with naming(out):
         few.save(out, format="png", optimize=True)
+    sys.stdout.write(f"{out}\n")
 
 
 def _settled(process: ViewerProcess, rrd: Path, at_s: float | None, stop: StopFlag) -> bytes:
@@ -145,7 +130,7 @@ def _wait(stop: StopFlag, give_up: float) -> None:
     time.sleep(_PERIOD_S)
 
 
-SESSION_NAME, VIEW_NAME = "session.mcap", "session.rrd"
+_SESSION_NAME, _VIEW_NAME = "session.mcap", "session.rrd"
 
 
 def run_view(
@@ -157,15 +142,7 @@ def run_view(
     screenshot: Path | None,
     at_s: float | None,
 ) -> None:
-    """Show a session; at most one of `web`, `out` and `screenshot` is given.
-
-    Raises
-    ------
-    AppError
-        The session cannot be read, or there is nothing to show it with; one line with the remedy.
-    StopRequestedError
-        A signal arrived; also the way to end serving a browser.
-    """
+    """Show a session; at most one of `web`, `out` and `screenshot` is given."""
     if at_s is not None and screenshot is None:
         raise UsageError("--at: says when a --screenshot is taken; name its file, too")
     path = session_file(session, allow_view=out is None)
@@ -175,22 +152,22 @@ def run_view(
     if path.suffix == ".rrd":
         if out is not None:
             raise UsageError(f"{path}: is an .rrd already; --out makes one of a session.mcap")
-        require_readable(path)
+        _require_readable(path)
         if screenshot is not None:
-            _take_picture(path, screenshot, at_s, stop)
+            _take_screenshot(path, screenshot, at_s, stop)
             return
         with LiveView(where, stop, path) as live:
             live.keep_serving()
         return
     recorded = open_session(path)
     if out is not None:
-        write_view(recorded, out, stop)
+        _write_view(recorded, out, stop)
         sys.stdout.write(f"{out}\n")
     elif screenshot is not None:
         with tempfile.TemporaryDirectory(prefix="uwb-slam-view-") as folder:
-            made = Path(folder) / VIEW_NAME
-            write_view(recorded, made, stop)
-            _take_picture(made, screenshot, at_s, stop)
+            made = Path(folder) / _VIEW_NAME
+            _write_view(recorded, made, stop)
+            _take_screenshot(made, screenshot, at_s, stop)
     else:
         with LiveView(where, stop, is_replay=True) as live:
             source = recorded_source(recorded, stop)
@@ -202,33 +179,22 @@ def session_file(given: Path, *, allow_view: bool = False) -> Path:
     """Return a file as it is, or the session of a run's folder.
 
     `allow_view` prefers the .rrd of a folder, which needs no replay, if it was closed.
-
-    Raises
-    ------
-    AppError
-        There is no such file.
     """
     if not given.is_dir():
         if not given.exists():
             raise AppError(f"{given}: no such file")
         return given
-    session, view = given / SESSION_NAME, given / VIEW_NAME
+    session, view = given / _SESSION_NAME, given / _VIEW_NAME
     if allow_view and view.is_file() and (is_finished(view) or not session.is_file()):
         return view
     if session.is_file():
         return session
-    names = f"{VIEW_NAME} nor {SESSION_NAME}" if allow_view else SESSION_NAME
+    names = f"{_VIEW_NAME} nor {_SESSION_NAME}" if allow_view else _SESSION_NAME
     raise AppError(f"{given}: holds no {names}; name a session.mcap")
 
 
 def refuse_overwriting(recorded: Path, out: Path | None) -> None:
-    """Require that a result does not replace its own session or another recording.
-
-    Raises
-    ------
-    UsageError
-        It would.
-    """
+    """Raise UsageError if a result would replace its own session or another recording."""
     if out is None or not out.is_file():
         return
     if out.samefile(recorded):
@@ -239,14 +205,8 @@ def refuse_overwriting(recorded: Path, out: Path | None) -> None:
         raise UsageError(f"{out}: is a recording, which cannot be repeated; write to another file")
 
 
-def write_view(session: RecordedSession, path: Path, stop: StopFlag) -> None:
-    """Replay a session into an .rrd file.
-
-    Raises
-    ------
-    AppError
-        It cannot be replayed, or the file not be written.
-    """
+def _write_view(session: RecordedSession, path: Path, stop: StopFlag) -> None:
+    """Replay a session into an .rrd file."""
     from slam.app.view.panels import RerunView  # half a second, loaded only if needed
 
     source = recorded_source(session, stop)  # before an existing file is replaced
@@ -262,8 +222,3 @@ def _replay(session: RecordedSession, source: RunSource, view: SessionObserver) 
             f"uwb-slam: {session.path} was cut at byte {session.cut_at_byte}; "
             "the view shows what is left of it\n"
         )
-
-
-def _take_picture(rrd: Path, out: Path, at_s: float | None, stop: StopFlag) -> None:
-    take_screenshot(rrd, out, at_s=at_s, stop=stop)
-    sys.stdout.write(f"{out}\n")

@@ -37,11 +37,11 @@ def _write_wire(session: RecordedSession, out: Path, radar: str | None, stop: St
     sizes = {"rx": 0, "tx": 0}
     try:
         with WireCapture(out, {"radar": chosen, "clock": "monotonic"}) as capture:
-            for row in session.wire():
+            for name, way, data, host_ns in session.wire():
                 stop.check()
-                if row.radar == chosen:
-                    capture.write(row.way, row.data, row.host_ns)
-                    sizes[row.way] += len(row.data)
+                if name == chosen:
+                    capture.write(way, data, host_ns)
+                    sizes[way] += len(data)
     except RecordingError as error:
         raise AppError(str(error)) from None
     if not any(sizes.values()):

@@ -117,8 +117,6 @@ class _Stream:
 
 @dataclass(slots=True, kw_only=True)
 class _Contents:
-    """All of a bag but its frames."""
-
     streams: dict[str, _Stream] = field(default_factory=dict)
     infos: dict[str, str] = field(default_factory=dict)
     odometry: list[TumSample] = field(default_factory=list)
@@ -221,7 +219,9 @@ def _contents(bag: Path, truth_topic: str, stop: StopFlag) -> _Contents:
                 contents.session = reader.deserialize(raw, connection.msgtype).data
             elif topic in (ODOMETRY_TOPIC, truth_topic):
                 poses = contents.odometry if topic == ODOMETRY_TOPIC else contents.truth
-                sample = _sample(reader.deserialize(raw, connection.msgtype), t_ns)
+                sample = ros.pose_sample(reader.deserialize(raw, connection.msgtype))
+                if abs(sample.t_ns - t_ns) >= _SAME_CLOCK_NS:
+                    sample = replace(sample, t_ns=t_ns)
                 if poses and sample.t_ns <= poses[-1].t_ns:
                     contents.left_out += 1
                 else:
@@ -268,22 +268,6 @@ def _open(bag: Path) -> Iterator[Any]:
             f"{bag}: no bag of ROS 1 or 2, or a damaged one: {reason}; `rosbag reindex` or "
             "`ros2 bag reindex` mend some"
         ) from None
-
-
-def _sample(message: ros.Message, t_ns: int) -> TumSample:
-    """Read a pose, however deep the message holds it, at its stamp or else when it was recorded."""
-    pose = message.pose
-    while not hasattr(pose, "position"):
-        pose = pose.pose
-    stamp_ns = message.header.stamp.sec * NS_PER_S + message.header.stamp.nanosec
-    same = abs(stamp_ns - t_ns) < _SAME_CLOCK_NS
-    return TumSample(
-        t_ns=stamp_ns if same else t_ns,
-        x_m=pose.position.x,
-        y_m=pose.position.y,
-        qz=pose.orientation.z,
-        qw=pose.orientation.w,
-    )
 
 
 def _radar_info(
@@ -397,7 +381,7 @@ def _scan(number: int, held: dict[int, RadarFrame]) -> Scan:
 
 
 class _Bag:
-    """A bag being written: of ROS 1 if the path ends in .bag, else of ROS 2."""
+    """A bag of ROS 1 if the path ends in .bag, else of ROS 2."""
 
     def __init__(self, path: Path) -> None:
         self._is_ros1 = path.suffix == ".bag"

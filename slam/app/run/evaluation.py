@@ -6,7 +6,7 @@ import json
 import math
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from slam.app.odometry.track import NS_PER_S
-from slam.app.records import Snapshot
+from slam.app.records import SessionInfo, Snapshot
 from slam.app.run.runner import RunRecord
 from slam.evaluation import (
+    LandmarkScore,
     TrueAssociationNis,
     align_se2,
     ate_rmse_m,
@@ -36,20 +37,6 @@ def ratio(error_m: float, odometry_error_m: float) -> float:
     (0.25, inf)
     """
     return error_m / odometry_error_m if odometry_error_m else math.inf
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LandmarkSummary:
-    """Landmarks against the truth, matched within 0.15 m after the trajectory's alignment."""
-
-    true: int | None
-    """None if unknown; so are precision, recall and rmse_m then."""
-    estimated: int
-    precision: float | None
-    recall: float | None
-    duplicates: int
-    rmse_m: float | None
-    """These three are None if there is nothing to divide by."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +61,7 @@ class Summary:
     ate_icp_rmse_m: float
     odometry_ate_rmse_m: float
     final_error_m: float
-    landmarks: LandmarkSummary
+    landmarks: LandmarkScore
     nees_pose: tuple[tuple[float, float], ...]
     nis_mean: float | None
     """None where nothing was associated."""
@@ -164,28 +151,14 @@ Nis = tuple[float, int]
 """Summed NIS of one state's true associations, and its degrees of freedom."""
 
 
-def summarise(
-    record: RunRecord,
-    *,
-    scene: str,
-    preset: str,
-    seed: int | None,
-    rig: Rig,
-    true_landmarks_m: NDArray[np.float64],
-) -> Summary | None:
-    """Compute summary.json's numbers; None where the run was too short for any state.
+def summarise(record: RunRecord, info: SessionInfo, rig: Rig) -> Summary | None:
+    """Compute summary.json's numbers; None if no state was estimated or the truth is unknown.
 
-    Parameters
-    ----------
-    record
-        The run; its truth is known.
-    rig
-        The mounts that SLAM uses; decides which true landmarks count.
-    true_landmarks_m
-        Shape (n, 2), world frame.
+    `rig` holds the mounts that SLAM uses; it decides which true landmarks count.
     """
-    if not record.results:
+    if not record.has_truth:
         return None
+    true_landmarks_m = info.true_landmarks_m
     truth_xy = record.truth[:, :2]
     truth_in_map = np.array([between(record.world_from_map, pose) for pose in record.truth])
     estimate = np.array([result.belief.pose for result in record.results])
@@ -193,12 +166,14 @@ def summarise(
     last = record.results[-1]
     alignment = align_se2(estimate[:, :2], truth_xy)
     counting = observable_landmarks(rig, record.truth, true_landmarks_m)
-    score = landmark_metrics(last.belief.landmarks, true_landmarks_m[counting], alignment)
     nis = _true_nis(record, true_landmarks_m)
+    landmarks = landmark_metrics(last.belief.landmarks, true_landmarks_m[counting], alignment)
+    if not info.simulated and not len(true_landmarks_m):
+        landmarks = replace(landmarks, true=None, precision=None, recall=None)
     return Summary(
-        scene=scene,
-        preset=preset,
-        seed=seed,
+        scene=info.scene,
+        preset=info.preset,
+        seed=info.seed,
         frames=record.n_frames,
         duration_s=record.duration_ns / NS_PER_S,
         realtime_factor=record.duration_ns / NS_PER_S / record.wall_s,
@@ -206,14 +181,7 @@ def summarise(
         ate_icp_rmse_m=icp_ate_rmse_m(estimate[:, :2], truth_in_map[:, :2]),
         odometry_ate_rmse_m=ate_rmse_m(odometry[:, :2], truth_xy),
         final_error_m=float(np.linalg.norm(estimate[-1, :2] - truth_in_map[-1, :2])),
-        landmarks=LandmarkSummary(
-            true=score.true,
-            estimated=score.estimated,
-            precision=score.precision,
-            recall=score.recall,
-            duplicates=score.duplicates,
-            rmse_m=score.rmse_m,
-        ),
+        landmarks=landmarks,
         nees_pose=_nees(record, truth_in_map),
         nis_mean=sum(value for value, _ in nis) / dof if (dof := sum(n for _, n in nis)) else None,
         nis_times=_nis_times(record, nis),
@@ -221,7 +189,7 @@ def summarise(
 
 
 def _nees(record: RunRecord, truth_in_map: NDArray[np.float64]) -> tuple[tuple[float, float], ...]:
-    """Return (its time [s], its NEES) of the last state at or before each of the ten times."""
+    """Return (time [s], NEES) of the last state at or before each of the ten times."""
     values = []
     for row in _rows_at(record, range(len(record.results))):
         result = record.results[row]

@@ -15,8 +15,9 @@ import numpy as np
 from slam.app.errors import naming
 from slam.app.odometry.track import NS_PER_S
 from slam.app.records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
-from slam.app.run.evaluation import LandmarkSummary, Summary, ratio
+from slam.app.run.evaluation import Summary, ratio
 from slam.app.run.runner import RunRecord, RunSource
+from slam.evaluation import LandmarkScore
 from slam.geometry import transform
 
 _LIVE_PERIOD_S = 0.2
@@ -196,7 +197,7 @@ def summary_rows(
     ]
 
 
-def _landmark_row(landmarks: LandmarkSummary) -> Row:
+def _landmark_row(landmarks: LandmarkScore) -> Row:
     if landmarks.true is None:
         return ("landmarks", str(landmarks.estimated), "the true ones are unknown")
     return (

@@ -7,7 +7,7 @@ import math
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from slam.app.errors import AppError, naming
 from slam.app.odometry.track import NS_PER_S, Trajectory, read_tum, write_tum
 from slam.app.records import SessionInfo
-from slam.app.run.evaluation import LandmarkSummary, Summary, summarise
+from slam.app.run.evaluation import Summary, summarise
 from slam.app.run.output import Row, print_result
 from slam.app.run.runner import RunRecord, RunSource
-from slam.evaluation import associate_times, ate_rmse_m
+from slam.evaluation import LandmarkScore, associate_times, ate_rmse_m
 from xethru_protocol.system import PathInUseError, StopFlag, StopRequestedError, locked
 
 RESULTS = ("map.png", "summary.json", "estimate.tum", "truth.tum", "odometry.tum")
@@ -33,32 +33,13 @@ def finish(
     If a file cannot be written, the table is printed nevertheless.
     """
     stop.check()
-    summary = summary_of(source, record)
+    summary = summarise(record, source.info, source.rig)
     try:
         _write(out, source.info, record, summary, stop)
     except AppError:
         print_result(source, record, summary, also)
         raise
     print_result(source, record, summary, also)
-
-
-def summary_of(source: RunSource, record: RunRecord) -> Summary | None:
-    """Return the numbers of a run; None if no state was estimated or the truth is unknown."""
-    info = source.info
-    if not record.has_truth:
-        return None
-    summary = summarise(
-        record,
-        scene=info.scene,
-        preset=info.preset,
-        seed=info.seed,
-        rig=source.rig,
-        true_landmarks_m=info.true_landmarks_m,
-    )
-    if summary is not None and not info.simulated and not len(info.true_landmarks_m):
-        unknown = replace(summary.landmarks, true=None, precision=None, recall=None)
-        summary = replace(summary, landmarks=unknown)
-    return summary
 
 
 def _write(
@@ -106,8 +87,7 @@ def _summary_without_truth(info: SessionInfo, record: RunRecord) -> str:
         "frames": record.n_frames,
         "duration_s": duration_s,
         "realtime_factor": duration_s / record.wall_s,
-        "landmarks": {row.name: None for row in fields(LandmarkSummary)}
-        | {"estimated": n_landmarks},
+        "landmarks": {row.name: None for row in fields(LandmarkScore)} | {"estimated": n_landmarks},
     }
     return json.dumps(unknown | known, indent=2, allow_nan=False)
 

@@ -164,8 +164,11 @@ def odometry(sample: TumSample) -> Message:
     )
 
 
-def odometry_sample(message: Message) -> TumSample:
-    pose = message.pose.pose
+def pose_sample(message: Message) -> TumSample:
+    """Return the pose of a message, however deep the message holds it, at its header's stamp."""
+    pose = message.pose
+    while not hasattr(pose, "position"):
+        pose = pose.pose
     stamp = message.header.stamp
     return TumSample(
         t_ns=stamp.sec * NS_PER_S + stamp.nanosec,

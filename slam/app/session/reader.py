@@ -220,7 +220,7 @@ def _state(message: Message) -> Snapshot:
 
 
 def _odometry(message: Message) -> TumSample:
-    return ros.odometry_sample(ros.deserialise(message.data, ros.ODOMETRY))
+    return ros.pose_sample(ros.deserialise(message.data, ros.ODOMETRY))
 
 
 def _log_line(message: Message) -> LogLine:
@@ -237,20 +237,6 @@ _READERS: Mapping[str, Callable[[Message], SessionRecord]] = {
     "/odom": _odometry,
     "/log": _log_line,
 }
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WireBytes:
-    """Bytes as a radar's port gave (rx) or took (tx) them.
-
-    ``t_ns`` is the session time of the newest scan then, ``host_ns`` the driver's own clock.
-    """
-
-    radar: str
-    way: Literal["rx", "tx"]
-    data: bytes
-    t_ns: int
-    host_ns: int
 
 
 class RecordedSession:
@@ -344,8 +330,12 @@ class RecordedSession:
                 held = []
         return of_scan
 
-    def wire(self) -> Iterator[WireBytes]:
-        """Yield the raw bytes of all ports in the order of the file; nothing if none are in it."""
+    def wire(self) -> Iterator[tuple[str, Literal["rx", "tx"], bytes, int]]:
+        """Yield the raw bytes of all ports in the order of the file.
+
+        Each with the radar's name, the way, and the time by the driver's clock [ns]; nothing if
+        none were recorded.
+        """
         ways: dict[str, tuple[str, Literal["rx", "tx"]]] = {}
         for radar in self.info.radars:
             ways[f"/radar/{radar.name}/rx"] = (radar.name, "rx")
@@ -354,13 +344,7 @@ class RecordedSession:
             if isinstance(entry, Message) and (found := ways.get(entry.topic)):
                 with self._naming(entry):
                     data = unpack_array(BYTE_ARRAY, entry.data).tobytes()
-                yield WireBytes(
-                    radar=found[0],
-                    way=found[1],
-                    data=data,
-                    t_ns=entry.t_ns,
-                    host_ns=entry.publish_ns,
-                )
+                yield *found, data, entry.publish_ns
 
     def odometry(self) -> OdometryTrack:
         samples = [record for record in self.records() if isinstance(record, TumSample)]

@@ -36,8 +36,7 @@ from slam.app.rig.emulated import (
     versions,
     wheels_of,
 )
-from slam.app.run.evaluation import Summary
-from slam.app.run.results import summary_of
+from slam.app.run.evaluation import Summary, summarise
 from slam.app.run.runner import RunRecord, RunSource, execute, make_slam
 from slam.app.sweep import CLEAN, STRESSES, Stress
 from slam.app.sweep.bound import BoundSummary, bound_of
@@ -356,7 +355,7 @@ def run_case(case: Case, program: str | None = None, *, stop: StopFlag = NO_STOP
         )
     source = source_of(case, stop)
     record = execute(source)
-    summary = summary_of(source, record)
+    summary = summarise(record, source.info, source.rig)
     if summary is None:
         raise AppError(f"{case.scene.name}: too short for SLAM, no state was estimated")
     false, confident = false_landmarks(record, case.scene)

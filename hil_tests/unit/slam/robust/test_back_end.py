@@ -51,7 +51,8 @@ def test_a_lap_of_the_lab_gives_a_clean_map() -> None:
     counted = run.landmarks[observable_landmarks(rig, run.poses, run.landmarks)]
     score = landmark_metrics(landmarks, counted, alignment)
     assert score.duplicates == 0
-    assert score.matched >= score.true - 1
+    assert score.recall is not None
+    assert score.recall >= 1 - 1.001 / len(counted)  # one may be missing
     for point in transform(alignment, landmarks):
         assert np.hypot(*(run.landmarks - point).T).min() <= 0.15
     odometry = odometry_path(run.increments)

@@ -9,18 +9,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hil_tests.unit.slam.app.sessions import session_info
 from slam.app.cli import main
 from slam.app.odometry.track import Trajectory, write_tum
-from slam.app.run.evaluation import NEES_AT, LandmarkSummary, Summary, summarise
+from slam.app.run.evaluation import NEES_AT, Summary, summarise
 from slam.app.run.output import summary_rows, table_text
 from slam.app.run.results import evaluate
 from slam.app.run.runner import RunRecord
+from slam.evaluation import LandmarkScore
 from slam.geometry import Mount, Rig
 from slam.results import Association, Belief, Observation, StepResult
 
 N = 201
 PERIOD_NS = 200_000_000
 LANDMARKS = np.array([[1.0, 1.0], [2.0, 1.1], [50.0, 50.0]])
+INFO = dataclasses.replace(session_info(), true_landmarks_m=LANDMARKS)
 RIG = Rig(
     mounts=(
         Mount(name="rear", x_m=-0.1, y_m=0.2, yaw_rad=np.pi / 2),
@@ -59,14 +62,7 @@ def run(offset_m: float, drift: float, variance: float) -> Summary:
         duration_ns=(N - 1) * PERIOD_NS,
         wall_s=0.5,
     )
-    summary = summarise(
-        record,
-        scene="made_up",
-        preset="paper",
-        seed=0,
-        rig=RIG,
-        true_landmarks_m=LANDMARKS,
-    )
+    summary = summarise(record, INFO, RIG)
     assert summary is not None
     return summary
 
@@ -163,14 +159,8 @@ def turned() -> Summary:
         duration_ns=(N - 1) * PERIOD_NS + PERIOD_NS // 10,
         wall_s=0.5,
     )
-    summary = summarise(
-        record,
-        scene="turned",
-        preset="paper",
-        seed=0,
-        rig=RIG,
-        true_landmarks_m=np.array([(w.real, w.imag) for w in map(in_world, (first, second))]),
-    )
+    true_m = np.array([(w.real, w.imag) for w in map(in_world, (first, second))])
+    summary = summarise(record, dataclasses.replace(INFO, true_landmarks_m=true_m), RIG)
     assert summary is not None
     return summary
 
@@ -205,15 +195,7 @@ def test_a_run_without_a_state_has_no_summary() -> None:
         duration_ns=0,
         wall_s=1.0,
     )
-    nothing = summarise(
-        record,
-        scene="s",
-        preset="paper",
-        seed=0,
-        rig=RIG,
-        true_landmarks_m=LANDMARKS,
-    )
-    assert nothing is None
+    assert summarise(record, INFO, RIG) is None
 
 
 N_POSES = 200
@@ -292,7 +274,7 @@ SUMMARY = Summary(
     ate_icp_rmse_m=0.0089,
     odometry_ate_rmse_m=0.0564,
     final_error_m=0.02,
-    landmarks=LandmarkSummary(
+    landmarks=LandmarkScore(
         true=14, estimated=15, precision=14 / 15, recall=1.0, duplicates=1, rmse_m=0.012
     ),
     nees_pose=((69.12, 2.5), (691.2, 3.25)),
@@ -346,7 +328,7 @@ def test_the_table_gives_the_ratio() -> None:
 
 
 def test_a_map_without_a_match_has_dashes() -> None:
-    nothing = LandmarkSummary(
+    nothing = LandmarkScore(
         true=14, estimated=0, precision=None, recall=0.0, duplicates=0, rmse_m=None
     )
     rows = summary_rows(

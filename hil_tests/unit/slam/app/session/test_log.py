@@ -58,7 +58,7 @@ def test_counters_stamps_and_samples_come_back_identical(finished: Path) -> None
 
 
 def test_odometry_comes_back_as_the_same_floats(finished: Path) -> None:
-    samples = tuple(ros.odometry_sample(row[2]) for row in messages(finished, "/odom"))
+    samples = tuple(ros.pose_sample(row[2]) for row in messages(finished, "/odom"))
     assert samples == odometry(20).samples
 
 

@@ -1,8 +1,8 @@
 """Made-up results of a sweep, for tests of what becomes of them."""
 
-from slam.app.run.evaluation import LandmarkSummary
 from slam.app.sweep.bound import BoundSummary
 from slam.app.sweep.run import Case, SweepRun
+from slam.evaluation import LandmarkScore
 
 
 def run_of(case: Case) -> SweepRun:
@@ -20,7 +20,7 @@ def run_of(case: Case) -> SweepRun:
         ate_icp_rmse_m=0.005,
         odometry_ate_rmse_m=0.04,
         final_error_m=0.02,
-        landmarks=LandmarkSummary(
+        landmarks=LandmarkScore(
             true=4, estimated=4, precision=None, recall=1.0, duplicates=case.seed % 2, rmse_m=0.01
         ),
         nees_pose=((1.0, 2.0), (9.9, 1.0)),

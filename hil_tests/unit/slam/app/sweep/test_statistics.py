@@ -10,7 +10,6 @@ import pytest
 
 from emulator.scene.scene import ObjectSpec, Scene, TargetSpec, WallSpec, empty_room
 from hil_tests.unit.slam.app.sweep.sweep_runs import run_of
-from slam.app.run.evaluation import LandmarkSummary
 from slam.app.run.runner import RunRecord
 from slam.app.sweep.bound import BoundSummary
 from slam.app.sweep.run import SweepRun, distance_m, false_landmarks, make_case
@@ -22,13 +21,14 @@ from slam.app.sweep.statistics import (
     summarise_groups,
     times_clean,
 )
+from slam.evaluation import LandmarkScore
 from slam.results import Belief, StepResult
 
 RUN = dataclasses.replace(
     run_of(make_case("lab", "paper", 0)),
     scene="a",
     ate_rmse_m=0.01,
-    landmarks=LandmarkSummary(
+    landmarks=LandmarkScore(
         true=4, estimated=4, precision=1.0, recall=1.0, duplicates=0, rmse_m=0.01
     ),
     nis_mean=0.5,
