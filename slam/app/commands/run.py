@@ -21,7 +21,7 @@ from slam.app.rig.emulated import RAW_CONFIG, versions
 from slam.app.rig.files import are_emulated, load_rig, open_rig
 from slam.app.rig.sources import RigSource, sampler_limits
 from slam.app.run.live_source import Inbox, LiveLog, LiveSource, drift_text, reading
-from slam.app.run.output import Progress, Row
+from slam.app.run.output import Progress, Row, note
 from slam.app.run.results import RESULTS, finish, prepare_folder
 from slam.app.run.runner import RunRecord, RunSource, execute, make_slam
 from slam.app.session.log import SessionLog
@@ -81,7 +81,7 @@ def run_rig(
             rig,
             None if ports is None else tuple(ports),
             lambda radar, record: inbox.put(("link", radar, record)),
-            _note,
+            note,
         )
         rig_source = held.enter_context(RigSource(links))
         if wire:
@@ -182,7 +182,7 @@ def _report_end(live: LiveSource, log: LiveLog, out: Path) -> None:
         raise AppError(f"{ended}{kept}")
     if log.failure:
         raise AppError(log.failure)
-    _note(f"{ended}{kept}")
+    note(f"{ended}{kept}")
 
 
 def _rows(record: RunRecord, live: LiveSource, odometry: LiveOdometry) -> list[Row]:
@@ -210,8 +210,3 @@ def _rows(record: RunRecord, live: LiveSource, odometry: LiveOdometry) -> list[R
 def _lag_text(live: LiveSource) -> str:
     lag_s = live.ticks.lag_ns / NS_PER_S
     return f"  {lag_s:.1f} s behind" if lag_s >= 1.0 else ""
-
-
-def _note(text: str) -> None:
-    sys.stderr.write(f"uwb-slam: {text}\n")
-    sys.stderr.flush()

@@ -18,7 +18,7 @@ from PIL import Image
 
 from slam.app.errors import AppError, UsageError, naming
 from slam.app.records import SessionObserver
-from slam.app.run.output import Progress
+from slam.app.run.output import Progress, note
 from slam.app.run.replay import recorded_source
 from slam.app.run.runner import RunSource, execute
 from slam.app.session.reader import RecordedSession, open_session
@@ -218,7 +218,7 @@ def _write_view(session: RecordedSession, path: Path, stop: StopFlag) -> None:
 def _replay(session: RecordedSession, source: RunSource, view: SessionObserver) -> None:
     execute(source, [Progress(source.info, None, source.lost_frames), view])
     if session.cut_at_byte is not None:
-        sys.stderr.write(
-            f"uwb-slam: {session.path} was cut at byte {session.cut_at_byte}; "
-            "the view shows what is left of it\n"
+        note(
+            f"{session.path} was cut at byte {session.cut_at_byte}; "
+            "the view shows what is left of it"
         )

@@ -110,6 +110,12 @@ class Progress(SessionObserver):
         self._stream.flush()
 
 
+def note(text: str) -> None:
+    """Print a line about the program itself."""
+    sys.stderr.write(f"uwb-slam: {text}\n")
+    sys.stderr.flush()
+
+
 def write_json(path: Path, numbers: Mapping[str, object]) -> None:
     """Write numbers without NaN; raise AppError if the file cannot be written."""
     text = json.dumps(numbers, indent=2, allow_nan=False)

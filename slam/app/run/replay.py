@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -21,7 +20,7 @@ from pydantic import ValidationError
 from slam.app.errors import AppError, OdometryError
 from slam.app.odometry.track import OdometryTrack, TumSample
 from slam.app.records import LogLine, Scan, SessionObserver, Snapshot
-from slam.app.run.output import Progress
+from slam.app.run.output import Progress, note
 from slam.app.run.results import RESULTS, finish, prepare_folder, saying_what_is_left
 from slam.app.run.runner import LinkLog, RunSource, execute, make_slam
 from slam.app.session.messages import state_row
@@ -59,8 +58,8 @@ def run_replay(stop: StopFlag, *, session: Path, out: Path) -> None:
         prepare_folder(out, RESULTS, held)
         record = execute(source, [comparison, Progress(source.info, None, source.lost_frames)])
         if recorded.cut_at_byte is not None:
-            _note(f"{session} was cut at byte {recorded.cut_at_byte}; this is what is left of it")
-        _note(comparison.verdict())
+            note(f"{session} was cut at byte {recorded.cut_at_byte}; this is what is left of it")
+        note(comparison.verdict())
         with saying_what_is_left(f"; {out} is not complete"):
             finish(out, source, record, stop)
 
@@ -212,8 +211,3 @@ class Comparison(SessionObserver):
 
 def _digest(snapshot: Snapshot) -> bytes:
     return hashlib.blake2b(state_row(snapshot).tobytes(), digest_size=16).digest()
-
-
-def _note(text: str) -> None:
-    sys.stderr.write(f"uwb-slam: {text}\n")
-    sys.stderr.flush()

@@ -58,18 +58,11 @@ def bscan_picture(
 ) -> NDArray[np.uint8]:
     """Draw echoes as grey levels: constant part removed, envelope, decibels.
 
-    Parameters
-    ----------
-    frames
-        Shape (n_frames, n_bins), raw RF, slow time downwards.
-    range_start_m, bin_length_m
-        True metres of the first bin and between two bins.
-
-    Returns
-    -------
-    Shape (n_frames, n_shown - 2), up to 3 m of range; 0 is -62 dB of full scale or less, 255 is
-    -30 dB or more. The quadrature of the pulse comes from the central difference of the samples,
-    which for a carrier of w radians per sample is its Hilbert partner times 2 sin w.
+    `frames` is raw RF, shape (n_frames, n_bins), slow time downwards, with true metres of the first
+    bin and between two bins. The result has shape (n_frames, n_shown - 2), up to 3 m of range; 0 is
+    -62 dB of full scale or less, 255 is -30 dB or more. The quadrature of the pulse comes from the
+    central difference of the samples, which for a carrier of w radians per sample is its Hilbert
+    partner times 2 sin w.
     """
     n_wanted = int((_SHOWN_RANGE_M - range_start_m) / bin_length_m)
     n_shown = min(frames.shape[1], max(n_wanted, 3))
@@ -109,8 +102,9 @@ class FrameLayer:
         host = scan.host_ns or (None,) * len(scan.frames)
         for frame, host_ns in zip(scan.frames, host, strict=True):
             block = self._blocks[frame.radar]
-            block.add(frame, host_ns)
-            if len(block.stamps) == BLOCK_FRAMES:
+            block.stamps.add(frame.t_ns, frame.counter, host_ns)
+            block.frames.append(frame)
+            if len(block.frames) == BLOCK_FRAMES:
                 self._send_frames(block)
 
     def send(self) -> None:
@@ -121,7 +115,7 @@ class FrameLayer:
     def send_older(self, t_ns: int) -> None:
         """Send the frames of radars of which one from `t_ns` or before still waits."""
         for block in self._blocks:
-            if len(block.stamps) and block.stamps.t_ns[0] <= t_ns:
+            if block.frames and block.stamps.t_ns[0] <= t_ns:
                 self._send_frames(block)
 
     def send_detections(self, snapshots: Sequence[Snapshot], stamps: Stamps) -> None:
@@ -149,46 +143,40 @@ class FrameLayer:
             self._recording.rows(entity, stamps.at(known), _charts(heights, labels_m, widths))
 
     def _send_frames(self, block: _FrameBlock) -> None:
-        if not len(block.stamps):
+        if not block.frames:
             return
-        frames = np.stack(block.samples)
-        if block.axis != (axis := (block.range_start_m, block.bin_length_m, frames.shape[1])):
+        samples = np.stack([frame.samples for frame in block.frames])
+        n_frames, n_bins = samples.shape
+        newest = block.frames[-1]
+        if block.axis != (axis := (newest.range_start_m, newest.bin_length_m, n_bins)):
             block.axis = axis
-            labels_m = (axis[0] + axis[1] * np.arange(axis[2])).astype(np.float32)
-            style = _chart_style(abscissa=labels_m, bar_m=block.bin_length_m)
-            self._recording.static(f"radar/{part(block.name)}/frame", style)
-        self._recording.rows(f"radar/{part(block.name)}/frame", block.stamps, [_bar_charts(frames)])
-        block.shown.extend(block.samples)
+            labels_m = (axis[0] + axis[1] * np.arange(n_bins)).astype(np.float32)
+            style = _chart_style(abscissa=labels_m, bar_m=newest.bin_length_m)
+            self._recording.static(f"{block.entity}/frame", style)
+        charts = _tensors("BarChart:values", samples.ravel(), np.full(n_frames, n_bins))
+        self._recording.rows(f"{block.entity}/frame", block.stamps, [charts])
+        block.shown.extend(frame.samples for frame in block.frames)
         # Stamped with its first frame, so that the cursor is inside the picture it shows; where
         # blocks come early, because someone watches, the picture is of the newest frames.
-        shown = frames if len(frames) == BLOCK_FRAMES else np.stack(block.shown)
-        picture = bscan_picture(shown, block.range_start_m, block.bin_length_m)
+        shown = samples if n_frames == BLOCK_FRAMES else np.stack(block.shown)
+        picture = bscan_picture(shown, newest.range_start_m, newest.bin_length_m)
         self._recording.row(
-            f"radar/{part(block.name)}/bscan",
+            f"{block.entity}/bscan",
             block.stamps,
             rr.Tensor(picture, dim_names=("frame", "range_bin"), value_range=(0.0, 255.0)),
         )
-        block.clear()
+        block.stamps, block.frames = Stamps(), []
 
 
 class _FrameBlock:
     """Frames of one radar that wait to be sent together."""
 
     def __init__(self, name: str) -> None:
-        self.name = name
-        self.range_start_m = self.bin_length_m = 0.0
+        self.entity = f"radar/{part(name)}"
         self.axis: tuple[float, float, int] | None = None
         self.shown: deque[NDArray[np.float32]] = deque(maxlen=BLOCK_FRAMES)
-        self.clear()
-
-    def add(self, frame: RadarFrame, host_ns: int | None) -> None:
-        self.stamps.add(frame.t_ns, frame.counter, host_ns)
-        self.samples.append(frame.samples)
-        self.range_start_m, self.bin_length_m = frame.range_start_m, frame.bin_length_m
-
-    def clear(self) -> None:
-        self.stamps = Stamps.none()
-        self.samples: list[NDArray[np.float32]] = []
+        self.stamps = Stamps()
+        self.frames: list[RadarFrame] = []
 
 
 def _chart_style(
@@ -202,11 +190,6 @@ def _chart_style(
     chart = rr.BarChart(_ONE_VALUE, color=color, abscissa=abscissa, widths=widths)
     batches = chart.as_component_batches()
     return [b for b in batches if b.component_descriptor().component != "BarChart:values"]
-
-
-def _bar_charts(frames: NDArray[np.float32]) -> rr.ComponentColumn:
-    """Make one bar chart per row of shape (n_frames, n_bins), as one column."""
-    return _tensors("BarChart:values", frames.ravel(), np.full(len(frames), frames.shape[1]))
 
 
 def _charts(
@@ -267,37 +250,27 @@ def _tensors(
 
 _PAPERS_FIELD_OF_VIEW_DEG = 65.0
 _PAPERS_REACH_M = 1.5
+_ARC_POINTS = 17
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Beams:
-    """Beam width and reach of radars.
-
-    Attributes
-    ----------
-    field_of_view_rad
-        Opening angle.
-    reach_m
-        Longest range of the front end.
-    n_points
-        Points of an arc.
-    """
+    """Opening angle of radars, and the longest range of the front end."""
 
     field_of_view_rad: float
     reach_m: float
-    n_points: int = 17
 
     def arcs(self, radar: RadarInfo, ranges_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return where echoes of these ranges (n,) may come from: (n, n_points, 2), body frame."""
+        """Return where echoes of these ranges (n,) may come from: shape (n, 17, 2), body frame."""
         half = self.field_of_view_rad / 2
-        angles_rad = radar.yaw_rad + np.linspace(-half, half, self.n_points)
+        angles_rad = radar.yaw_rad + np.linspace(-half, half, _ARC_POINTS)
         ray = np.stack([np.cos(angles_rad), np.sin(angles_rad)], axis=-1)
         antenna = np.array([radar.x_m, radar.y_m])
         arcs: NDArray[np.float64] = antenna + ranges_m[:, None, None] * ray
         return arcs
 
     def wedge(self, radar: RadarInfo) -> NDArray[np.float64]:
-        """Return the closed outline of the beam, shape (n_points + 2, 2), body frame."""
+        """Return the closed outline of the beam, shape (19, 2), body frame."""
         antenna = np.array([[radar.x_m, radar.y_m]])
         (rim,) = self.arcs(radar, np.array([self.reach_m]))
         return np.concatenate([antenna, rim, antenna])
@@ -504,7 +477,7 @@ class MapLayer:
         self._recording.rows(entity, stamps, [arcs.partition(lengths(ranges_m))])
 
     def _send_landmarks(self, snapshot: Snapshot, host_ns: int | None) -> None:
-        stamps = Stamps.none()
+        stamps = Stamps()
         stamps.add(snapshot.t_ns, snapshot.counter, host_ns)
         points = transform(snapshot.world_from_map, snapshot.landmarks_m)
         covariances = rotate_covariances(
@@ -523,7 +496,7 @@ class MapLayer:
         self._recording.row("map/landmarks/ellipses", stamps, ellipses)
 
     def _send_paths(self, snapshot: Snapshot, host_ns: int | None) -> None:
-        stamps = Stamps.none()
+        stamps = Stamps()
         stamps.add(snapshot.t_ns, snapshot.counter, host_ns)
         for name, colour, radius_m, order in _PATHS:
             points = self._paths[name]

@@ -13,7 +13,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,15 +84,15 @@ def is_world_known(info: SessionInfo) -> bool:
     return len(info.true_landmarks_m) > 0 or len(info.outlines_m) > 0
 
 
-def about(info: SessionInfo, *, block: int, states: int) -> str:
-    """Return the text about a run: frames in a B-scan, states with points on the map."""
+def about(info: SessionInfo) -> str:
+    """Return the text about a run."""
     settings = json.loads(info.config_json or "{}")
     return _ABOUT.format(
         n_radars=len(info.radars),
-        block=block,
+        block=BLOCK_FRAMES,
         data="**All data here are simulated.**" if info.simulated else "All data are measured.",
         truth=_TRUTH if is_world_known(info) else "",
-        points="" if settings.get("back_end") == "robust" else _POINTS.format(states=states),
+        points="" if settings.get("back_end") == "robust" else _POINTS.format(states=TRAIL_STATES),
     )
 
 
@@ -131,28 +130,25 @@ def _map_view(info: SessionInfo) -> rrb.Spatial2DView:
 
 def _echoes(names: Sequence[str]) -> rrb.Tabs:
     mapping = rrb.TensorScalarMapping(colormap="viridis")
-    bscans = [
-        rrb.TensorView(
-            name=f"B-scan {name}",
-            origin=f"/radar/{part(name)}/bscan",
-            view_fit="fill",
-            scalar_mapping=mapping,
+    return rrb.Tabs(
+        *(
+            rrb.Vertical(
+                rrb.TensorView(
+                    name=f"B-scan {name}",
+                    origin=f"/radar/{part(name)}/bscan",
+                    view_fit="fill",
+                    scalar_mapping=mapping,
+                ),
+                rrb.BarChartView(
+                    name=f"Frame {name}",
+                    origin=f"/radar/{part(name)}",
+                    contents=["$origin/frame", "$origin/detections"],
+                ),
+                name=name,
+            )
+            for name in names
         )
-        for name in names
-    ]
-    frames = [
-        rrb.BarChartView(
-            name=f"Frame {name}",
-            origin=f"/radar/{part(name)}",
-            contents=["$origin/frame", "$origin/detections"],
-        )
-        for name in names
-    ]
-    both = [
-        rrb.Vertical(bscan, frame, name=name)
-        for name, bscan, frame in zip(names, bscans, frames, strict=True)
-    ]
-    return rrb.Tabs(*both)
+    )
 
 
 def _numbers(info: SessionInfo) -> rrb.Tabs:
@@ -211,7 +207,7 @@ _STATE_COLOURS = {
 class LinkLayer:
     """Collects lines and changes of state, and sends them in blocks.
 
-    Lines come at any time, also from the threads that read the ports; all else is of one thread.
+    Lines come at any time, also from the threads that read the ports.
     """
 
     def __init__(self, recording: Recording, radars: Sequence[RadarInfo]) -> None:
@@ -220,7 +216,7 @@ class LinkLayer:
         self._lines: deque[LogLine] = deque()
         self._changes: list[tuple[LinkChange, int, int | None]] = []
         self._losses: dict[str, tuple[Stamps, list[int]]] = {
-            radar.name: (Stamps.none(), []) for radar in radars
+            radar.name: (Stamps(), []) for radar in radars
         }
         self._counter = self._t_ns = 0
         self._host_ns: int | None = None
@@ -261,7 +257,7 @@ class LinkLayer:
         self._follow_log()
         changes, self._changes = self._changes, []
         for radar in self._states.radars:
-            stamps = Stamps.none()
+            stamps = Stamps()
             states = []
             for change, counter, host_ns in changes:
                 if change.radar == radar.name:
@@ -271,7 +267,7 @@ class LinkLayer:
                 columns = rr.StateChange.columns(state=states)
                 self._recording.rows(f"link/state/{part(radar.name)}", stamps, columns)
             losses, values = self._losses[radar.name]
-            self._losses[radar.name] = Stamps.none(), []
+            self._losses[radar.name] = Stamps(), []
             if values:
                 scalars = rr.Scalars.columns(scalars=np.array(values, dtype=np.float64))
                 self._recording.rows(f"link/lost/{part(radar.name)}", losses, scalars)
@@ -315,7 +311,7 @@ class LinkLayer:
             self._recording.rows(f"link/faults/{part(name)}", self._stamps_of(faults), scalars)
 
     def _stamps_of(self, lines: Sequence[LogLine]) -> Stamps:
-        stamps = Stamps.none()
+        stamps = Stamps()
         for line in lines:
             stamps.add(line.t_ns, self._counter, self._host_ns)
         return stamps
@@ -352,10 +348,7 @@ def style_numbers(recording: Recording) -> None:
 def send_numbers(
     recording: Recording, rows: Sequence[Snapshot], stamps: Stamps, odom: NDArray[np.float64]
 ) -> None:
-    """Send the curves of some states; a value that is not finite is left out.
-
-    `odom` is `world_from_odom` of the first state.
-    """
+    """Send the curves of some states, finite values only; `odom` is the first `world_from_odom`."""
     errors_m = [position_errors_m(row, odom) for row in rows]
     nis_bands = [_band(nis_dof(row)) for row in rows]
     nees = [pose_nees(row) / POSE_DOF for row in rows]
@@ -393,14 +386,10 @@ _BLOCK_STATES = 128
 
 
 class RerunView(SessionObserver):
-    """Draws a session, into a file in large blocks, or live as it happens.
+    """Draws a session, into an .rrd file in large blocks, or in a viewer as it happens.
 
     Parameters
     ----------
-    target
-        An .rrd file, or the address of a viewer that listens.
-    info
-        Describes the run.
     flush_s
         Live: longest time that a row waits before it is sent; None for full blocks only.
     clock_s
@@ -426,23 +415,20 @@ class RerunView(SessionObserver):
         self._clock_s, self._flush_s = clock_s, flush_s
         self._time_of_day_ns = time_of_day_ns
         self._flushed_s = clock_s()
+        self._began = False
         self._waiting: list[Snapshot] = []
-        self._stamps = Stamps.none()
+        self._stamps = Stamps()
         self._odom: NDArray[np.float64] | None = None
         self._host_ns: int | None = None
-        self._began = False
-        seed = "" if info.seed is None else f"-{info.seed}"
+        seed, of_seed = ("", "") if info.seed is None else (f"-{info.seed}", f", seed {info.seed}")
         self._recording = Recording(
             target,
             blueprint(info),
             recording_id=f"{info.scene}-{info.preset}{seed}",
+            name=f"{info.scene}, preset {info.preset}{of_seed}",
+            start_ns=info.started_unix_ns or 0,
         )
-        of_seed = "" if info.seed is None else f", seed {info.seed}"
-        name = f"{info.scene}, preset {info.preset}{of_seed}"
-        self._recording.name(name, info.started_unix_ns or 0)
-        text = rr.TextDocument(
-            about(info, block=BLOCK_FRAMES, states=TRAIL_STATES), media_type=rr.MediaType.MARKDOWN
-        )
+        text = rr.TextDocument(about(info), media_type=rr.MediaType.MARKDOWN)
         self._recording.static("about", text)
         settings = json.dumps([asdict(radar) for radar in info.radars], indent=1)
         self._recording.static("radars", rr.TextDocument(settings))
@@ -464,7 +450,6 @@ class RerunView(SessionObserver):
             self._send(scan.t_ns - round(self._flush_s * NS_PER_S))
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
-        """Take a state of SLAM: poses and scalars in blocks, the map once per second."""
         if self._odom is None:
             self._odom = world_from_odom(snapshot)
         self._map.on_snapshot(snapshot, self._host_ns, self._odom)
@@ -475,8 +460,6 @@ class RerunView(SessionObserver):
             self._link.send()
 
     def on_log(self, line: LogLine) -> None:
-        if self._recording.is_finished:
-            raise ValueError("the view is closed already")
         self._link.on_log(line)
 
     def close(self) -> None:
@@ -489,12 +472,7 @@ class RerunView(SessionObserver):
         self._link.finish()
         self._recording.finish()
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         """Close; an error of the run itself takes precedence over one of its view."""
         try:
             self.close()
@@ -512,7 +490,7 @@ class RerunView(SessionObserver):
 
     def _send_states(self) -> None:
         rows, self._waiting = self._waiting, []
-        stamps, self._stamps = self._stamps, Stamps.none()
+        stamps, self._stamps = self._stamps, Stamps()
         if rows and self._odom is not None:
             self._map.send(rows, stamps)
             send_numbers(self._recording, rows, stamps, self._odom)

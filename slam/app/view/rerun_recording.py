@@ -10,7 +10,7 @@ import os
 import warnings
 from collections import defaultdict
 from collections.abc import Iterable, Sequence, Sized
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Thread
 
@@ -67,22 +67,14 @@ _VIEWER_CLOSE_LIMIT_S = 5.0
 
 @dataclass(slots=True, kw_only=True)
 class Stamps:
-    """When rows happened, on every timeline.
+    """When rows happened: session times, frame counters, and nanoseconds since 1970.
 
-    Attributes
-    ----------
-    t_ns, counters, host_ns
-        Session times, frame counters, and nanoseconds since 1970, equally long. `host_ns` is left
-        out of the recording as soon as one of its rows has none.
+    `host_ns` is left out of the recording as soon as one of its rows has none.
     """
 
-    t_ns: list[int]
-    counters: list[int]
-    host_ns: list[int | None]
-
-    @classmethod
-    def none(cls) -> Stamps:
-        return cls(t_ns=[], counters=[], host_ns=[])
+    t_ns: list[int] = field(default_factory=list)
+    counters: list[int] = field(default_factory=list)
+    host_ns: list[int | None] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.t_ns)
@@ -93,13 +85,13 @@ class Stamps:
         self.host_ns.append(host_ns)
 
     def at(self, rows: Iterable[int]) -> Stamps:
-        picked = Stamps.none()
+        picked = Stamps()
         for row in rows:
             picked.add(self.t_ns[row], self.counters[row], self.host_ns[row])
         return picked
 
     def columns(self, epoch_ns: int) -> list[rr.TimeColumn]:
-        """Return the rows as Rerun's time columns, device time counted from an epoch."""
+        """Return Rerun's time columns, device time counted from an epoch."""
         since_ns = np.maximum(np.array(self.t_ns, dtype=np.int64) - epoch_ns, 0)
         columns = [
             rr.TimeColumn(DEVICE_TIME, duration=since_ns.astype("timedelta64[ns]")),
@@ -122,6 +114,8 @@ class Recording:
         How a viewer lays it out, unless its user chose otherwise.
     recording_id
         The same for the same run: a file written twice is the same.
+    name, start_ns
+        What viewers call it, and when it began, since 1970.
 
     Attributes
     ----------
@@ -137,7 +131,15 @@ class Recording:
         The file cannot be begun; from `finish`: it does not hold every row that was sent.
     """
 
-    def __init__(self, target: Path | str, blueprint: rrb.Blueprint, *, recording_id: str) -> None:
+    def __init__(
+        self,
+        target: Path | str,
+        blueprint: rrb.Blueprint,
+        *,
+        recording_id: str,
+        name: str,
+        start_ns: int,
+    ) -> None:
         rr.set_strict_mode(True)
         self._target = target
         self.epoch_ns = 0
@@ -156,15 +158,12 @@ class Recording:
                 raise AppError(f"{target}: cannot be written: {reason}") from None
         else:
             self._stream.connect_grpc(target, default_blueprint=blueprint)
+        self._stream.send_recording_name(name)
+        self._stream.send_recording_start_time_nanos(start_ns)
 
     @property
     def is_finished(self) -> bool:
         return self._stream is None
-
-    def name(self, name: str, start_ns: int = 0) -> None:
-        """Send the recording's name and when it began."""
-        self._open().send_recording_name(name)
-        self._open().send_recording_start_time_nanos(start_ns)
 
     def static(
         self, entity: str, what: rr.AsComponents | Sequence[rr.DescribedComponentBatch]
@@ -173,11 +172,9 @@ class Recording:
         self._open().log(entity, what, static=True)
         self.sent[f"/{entity}{_STATIC}"] += 1
 
-    def rows(
-        self, entity: str, stamps: Stamps, columns: Iterable[rr.ComponentColumn] | None
-    ) -> None:
+    def rows(self, entity: str, stamps: Stamps, columns: Iterable[rr.ComponentColumn]) -> None:
         """Send a row for each stamp, all at once."""
-        if columns is not None and len(stamps):
+        if len(stamps):
             self._open().send_columns(entity, stamps.columns(self.epoch_ns), columns)
             self.sent[f"/{entity}"] += len(stamps)
 
@@ -217,13 +214,7 @@ class Recording:
 
 
 def _check_rows(path: Path, sent: dict[str, int]) -> None:
-    """Require that a finished file holds the rows that were sent.
-
-    Raises
-    ------
-    AppError
-        Rows are missing; names the file and the first entity.
-    """
+    """Require that a finished file holds the rows that were sent; AppError if it does not."""
     try:
         found = count_rows(path)
     except RuntimeError:  # Rerun's own errors about a damaged file

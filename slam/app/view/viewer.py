@@ -25,6 +25,7 @@ from urllib.parse import quote, urlsplit
 from slam.app.errors import AppError
 from slam.app.records import LogLine, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.rig.emulated import signal_at_parents_death
+from slam.app.run.output import note
 from slam.app.view import SERVE_WEB, SPAWN
 from xethru_protocol.system import StopFlag
 
@@ -50,15 +51,7 @@ class ViewerKind(Enum):
 
 
 class ViewerProcess:
-    """Runs a viewer while it is entered; a window may be left open.
-
-    Parameters
-    ----------
-    kind
-        Where it draws.
-    files
-        Recordings to open at once; none if rows will be sent.
-    """
+    """Runs a viewer while it is entered, with files opened at once; a window may be left open."""
 
     def __init__(self, kind: ViewerKind, *files: Path) -> None:
         self._kind, self._files = kind, files
@@ -106,12 +99,7 @@ class ViewerProcess:
         )
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         """End the process, unless it is a window, which the user closes."""
         process = self._process
         if process is None:
@@ -127,13 +115,7 @@ class ViewerProcess:
         process.wait()
 
     def wait_until_ready(self, stop: StopFlag) -> None:
-        """Wait until the viewer takes recordings.
-
-        Raises
-        ------
-        AppError
-            It ended, or did not listen in time.
-        """
+        """Wait until the viewer takes recordings; AppError if it ends or does not in time."""
         give_up = time.monotonic() + _START_LIMIT_S
         ports = [self._port] + ([self._web_port] if self._kind is ViewerKind.WEB else [])
         for port in ports:
@@ -160,13 +142,7 @@ class ViewerProcess:
 
 
 def require_listening(url: str) -> None:
-    """Require that a viewer listens at a `rerun+http://` address.
-
-    Raises
-    ------
-    AppError
-        None does; the message names the remedy.
-    """
+    """Require that a viewer listens at a `rerun+http://` address; AppError if none does."""
     try:
         parts = urlsplit(url)
         host, port = parts.hostname or "", parts.port or _DEFAULT_PORT
@@ -184,11 +160,11 @@ def require_listening(url: str) -> None:
 def executable() -> Path:
     """Return the viewer that came with the SDK, and so has the same version."""
     found = importlib.util.find_spec("rerun_cli")
-    folder = Path(found.origin).parent if found is not None and found.origin else None
-    names = ("Rerun.app/Contents/MacOS/Rerun", "rerun")
-    for name in names:
-        if folder is not None and (folder / name).is_file():
-            return folder / name
+    if found is not None and found.origin:
+        for name in ("Rerun.app/Contents/MacOS/Rerun", "rerun"):
+            path = Path(found.origin).parent / name
+            if path.is_file():
+                return path
     raise AppError("the Rerun viewer is not installed; `pip install rerun-sdk` brings it")
 
 
@@ -237,8 +213,6 @@ class LiveView:
     where
         `spawn`: a window; `serve-web`: a page for a browser; else the `rerun+http://` address of a
         running viewer.
-    stop
-        Checked again and again while waiting.
     files
         Recordings that a viewer started here opens at once.
     is_replay
@@ -269,7 +243,7 @@ class LiveView:
             self._url, self._has_ended = viewer.url, lambda: viewer.has_ended
             if kind is ViewerKind.WEB:
                 self._web_url = viewer.web_url
-                _print_line(f"watch at {self._web_url}")
+                note(f"watch at {self._web_url}")
         else:
             require_listening(self._url)
         return self
@@ -282,9 +256,8 @@ class LiveView:
     ) -> None:
         """End a viewer that serves a browser; a window stays open if a run was shown in it."""
         if self._has_shown:
-            self._stack.close()
-        else:
-            self._stack.__exit__(kind, error, trace)
+            kind = error = trace = None
+        self._stack.__exit__(kind, error, trace)
 
     def observer(self, info: SessionInfo) -> SessionObserver:
         """Return an observer that shows a run."""
@@ -303,7 +276,7 @@ class LiveView:
         """Serve a page for the browser until a signal comes; a window needs nothing."""
         if not self._web_url:
             return
-        _print_line(f"the view stays at {self._web_url} until Ctrl-C")
+        note(f"the view stays at {self._web_url} until Ctrl-C")
         while not self._has_ended():
             self._stop.check()
             time.sleep(_VIEW_POLL_S)
@@ -319,7 +292,7 @@ class _WhileWatched(SessionObserver):
     def on_scan(self, scan: Scan) -> None:
         if self._is_watched and self._has_ended():
             self._is_watched = False
-            _print_line("the viewer was closed; the run goes on without it")
+            note("the viewer was closed; the run goes on without it")
         if self._is_watched:
             self._view.on_scan(scan)
 
@@ -332,10 +305,4 @@ class _WhileWatched(SessionObserver):
             self._view.on_log(line)
 
     def close(self) -> None:
-        """Send the last rows; a viewer that is gone takes none."""
         self._view.close()
-
-
-def _print_line(text: str) -> None:
-    sys.stderr.write(f"uwb-slam: {text}\n")
-    sys.stderr.flush()
