@@ -48,13 +48,7 @@ class PortLock:
 
     The target is a port or another name of a radar, such as an address. Links are resolved, so
     ``/dev/serial/by-id/...`` and ``/dev/ttyACM0`` are the same radar. The lock file remains.
-
-    Raises
-    ------
-    PortBusyError
-        If another session has the lock.
-    OSError
-        If the lock file cannot be opened, or is a link.
+    Raises `PortBusyError` if another session has the lock.
     """
 
     def __init__(self, target: str) -> None:
@@ -107,9 +101,9 @@ def _open(path: Path) -> int:
 
 
 def matched(path: Path, drivers: Mapping[str, X4M300]) -> Mapping[str, X4M300]:
-    """Return the drivers under the names of a rig file; the test fails if they are not its modules.
+    """Return the drivers, named as the specs, under the names of a rig file.
 
-    The rig file is that of `uwb-slam calibrate --rig`; ``drivers`` has the names of the specs.
+    The test fails if they are not its modules.
     """
     from slam.app.errors import AppError
     from slam.app.rig.files import load_rig
@@ -144,29 +138,21 @@ class RadarUnderTest:
 
     Attributes
     ----------
-    place
-        How it is reached.
     identity
         Order code, serial number and firmware; empty before it was first opened.
     broken
         Why later tests do not try it again; None: it works.
-    tap
-        What passed over its line in the running test.
-    drivers
-        Those that the running test opened.
+    tap, drivers
+        What passed over its line in the running test, and the drivers that this test opened.
     """
 
     def __init__(self, spec: RadarSpec) -> None:
-        place = target_of(spec)
-        lock = place.lock_target
-        self._lock = None if lock is None else PortLock(lock)
-        try:
-            place.explore()
-        except BaseException:
-            if self._lock is not None:
-                self._lock.release()
-            raise
-        self.place: RadarTarget = place
+        self.place: RadarTarget = target_of(spec)
+        with contextlib.ExitStack() as held:
+            if self.place.lock_target is not None:
+                held.callback(PortLock(self.place.lock_target).release)
+            self.place.explore()
+            self._lock = held.pop_all()
         self.identity = ""
         self.broken: str | None = None
         self.tap = WireTap()
@@ -180,12 +166,7 @@ class RadarUnderTest:
     def begin_test(self) -> None:
         """Bring the radar to a known state: stopped, no profile loaded, nothing on the line.
 
-        Raises
-        ------
-        BrokenRadarError
-            If it failed to answer in an earlier test.
-        PortUnavailable, Disconnected, ResponseTimeout
-            If it does not answer.
+        Raises `BrokenRadarError` if it failed to answer in an earlier test.
         """
         if self.broken is not None:
             raise BrokenRadarError(self.broken)
@@ -220,8 +201,7 @@ class RadarUnderTest:
 
     def close(self) -> None:
         self.place.close()
-        if self._lock is not None:
-            self._lock.release()
+        self._lock.close()
 
     def _settle(self) -> None:
         deadline_ns = self.place.clock_ns() + _RESTART_LIMIT_NS
@@ -293,15 +273,7 @@ class Bench:
         self._failed: dict[str, str] = {}
 
     def radar(self, name: str) -> RadarUnderTest:
-        """Return a radar, opened on first use.
-
-        Raises
-        ------
-        TargetError, PortBusyError, PortUnavailable
-            If it cannot be opened.
-        BrokenRadarError
-            If it could not be opened earlier.
-        """
+        """Return a radar, opened on first use; `BrokenRadarError` if it could not be earlier."""
         if name in self._failed:
             raise BrokenRadarError(self._failed[name])
         if name not in self._radars:

@@ -26,7 +26,7 @@ import numpy as np
 
 from hil_tests.plugin.bench import RadarUnderTest
 from hil_tests.plugin.gate import Measurement
-from hil_tests.plugin.radar_targets import WireBytes, WireTap
+from hil_tests.plugin.radar_targets import Way, WireBytes, WireTap
 from xethru_protocol.recordings.mcap import BYTE_ARRAY, SCHEMAS, pack_array
 from xethru_protocol.wire.codec import describe, encode
 from xethru_protocol.wire.connection import Connection, Role
@@ -91,18 +91,18 @@ def _log(radars: Sequence[RadarUnderTest], failure: str) -> str:
             lines.append(
                 f"{time_s:12.6f} s  {passed.way}  {shown}" + (f" ... +{more}" if more > 0 else "")
             )
-            who = "the module" if passed.way == "tx" else "the driver"
-            lines.extend(f"{'':20}{_event_text(event, who)}" for event in events)
+            lines.extend(f"{'':20}{_event_text(event, passed.way)}" for event in events)
             if passed.way == "tx" and not any(isinstance(event, Command) for event in events):
-                lines.append(f"{'':20}!! no command that {who} can read ends here")
+                lines.append(f"{'':20}!! no command that the module can read ends here")
         for driver in radar.drivers:
             lines.extend(f"    driver's warning: {text}" for text in driver.warnings)
             lines.append(f"    link statistics: {json.dumps(driver.statistics.summary())}")
     return "\n".join([*lines, "", "=== failure", failure, ""])
 
 
-def _event_text(event: Message | FramingFault, who: str) -> str:
+def _event_text(event: Message | FramingFault, way: Way) -> str:
     if isinstance(event, FramingFault):
+        who = "the module" if way == "tx" else "the driver"
         return f"!! {who} cannot read this: {event.kind.value}, byte {event.offset} of the line"
     if isinstance(event, DataFloat):
         return f"frame {event.info}: {event.values.size} values, content {event.content_id}"
@@ -233,8 +233,11 @@ def _log_wire(recording: rr.RecordingStream, name: str, tap: WireTap) -> None:
         for event in events:
             if isinstance(event, DataFloat):
                 frames.append(event)
-            else:
-                _log_event(recording, f"log/{name}/{passed.way}", event)
+                continue
+            is_fault = isinstance(event, FramingFault)
+            level = rr.TextLogLevel.ERROR if is_fault else rr.TextLogLevel.INFO
+            text = _event_text(event, passed.way)[:500]
+            recording.log(f"log/{name}/{passed.way}", rr.TextLog(text, level=level))
     if not frames:
         return
     shown = [frame.values for frame in frames if frame.values.size == frames[-1].values.size]
@@ -242,14 +245,3 @@ def _log_wire(recording: rr.RecordingStream, name: str, tap: WireTap) -> None:
     recording.log(
         f"radar/{name}/bscan", rr.Tensor(block, dim_names=("frame", "value")), static=True
     )
-
-
-def _log_event(recording: rr.RecordingStream, path: str, event: Message | FramingFault) -> None:
-    import rerun as rr
-
-    if isinstance(event, FramingFault):
-        text, level = f"{event.kind.value} at byte {event.offset}", rr.TextLogLevel.ERROR
-    else:
-        message, fields = describe(event)
-        text, level = f"{message} {json.dumps(fields)}"[:500], rr.TextLogLevel.INFO
-    recording.log(path, rr.TextLog(text, level=level))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,20 +89,14 @@ def add_options(parser: pytest.Parser) -> None:
 
 
 def choose(config: pytest.Config) -> Choices:
-    """Read and check the options.
-
-    Raises
-    ------
-    pytest.UsageError
-        If they make no sense; one line with the remedy.
-    """
+    """Read and check the options; `pytest.UsageError` if they make no sense."""
     rig = config.getoption("rig") or os.environ.get(RIG_ENVIRONMENT) or config.getini(RIG_INI)
     worker: dict[str, list[str]] = getattr(config, "workerinput", {})
     try:
         chosen = (
             worker.get(WORKER_KEY)  # found by the first process
             or config.getoption("radar")
-            or _split(os.environ.get(ENVIRONMENT, ""))
+            or os.environ.get(ENVIRONMENT, "").split()
             or config.getini(INI)
             or (_modules_of(Path(rig)) if rig else [])
         )
@@ -155,10 +148,6 @@ def _check_report(report: Path) -> None:
         raise pytest.UsageError(f"--hil-json {report}: {wrong} is there already; name a new file")
 
 
-def _split(text: str) -> list[str]:
-    return re.split(r"\s+", text.strip()) if text.strip() else []
-
-
 def _found(specs: tuple[RadarSpec, ...]) -> tuple[RadarSpec, ...]:
     """Replace `auto` by the ports where modules answer."""
     if not any(spec.kind is Kind.AUTO for spec in specs):
@@ -182,7 +171,7 @@ def _check_workers(config: pytest.Config, specs: tuple[RadarSpec, ...]) -> None:
     """Reject `--dist each` if all workers would test the same real radar."""
     if not config.pluginmanager.hasplugin("xdist"):
         return
-    shared = next((spec for spec in specs if spec.shared), None)
+    shared = next((spec for spec in specs if not spec.emulated), None)
     if shared is not None and config.getoption("dist", "no") == "each":
         raise SpecError(
             f"--radar {shared.text}: with --dist each all workers want this radar at once; "

@@ -13,7 +13,6 @@ import pytest
 
 from hil_tests.plugin.choices import CHOICES, WORKER_KEY, add_options, choose
 from hil_tests.plugin.gate import FINDINGS, Findings
-from hil_tests.plugin.specs import RadarSpec
 
 pytest_plugins = ["hil_tests.plugin.fixtures"]
 
@@ -60,14 +59,12 @@ class Summary:
         terminal.line(f"{'radar':{width}}  passed  failed  skipped  what it is")
         for name, counts in self._counts.items():
             numbers = "  ".join(f"{counts[outcome]:{len(outcome)}}" for outcome in _OUTCOMES)
-            terminal.line(f"{name:{width}}  {numbers}  {self._what(name)}")
+            together = name.count("+") + 1
+            unknown = "could not be opened" if together == 1 else f"{together} radars together"
+            what = self._identities.get(name, unknown)
+            terminal.line(f"{name:{width}}  {numbers}  {what}")
         for reason, count in sorted(self._reasons.items()):
             terminal.line(f"{count:4} x {reason}")
-
-    def _what(self, name: str) -> str:
-        together = name.count("+") + 1
-        unknown = "could not be opened" if together == 1 else f"{together} radars together"
-        return self._identities.get(name, unknown)
 
     def write_json(self, path: Path) -> None:
         """Write every test with its radars, outcome and measurements."""
@@ -125,17 +122,12 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         names = [spec.name for spec in specs]
         metafunc.parametrize("radar_name", names, indirect=True, scope="session", ids=names)
     if "rig_name" in metafunc.fixturenames:
-        rigs = _rigs(specs)
+        # what belongs together: all real radars, and the scene of each emulated one
+        real = tuple(spec.name for spec in specs if not spec.emulated)
+        rigs = [*([real] if real else []), *((spec.name,) for spec in specs if spec.emulated)]
         metafunc.parametrize(
             "rig_name", rigs, indirect=True, scope="session", ids=["+".join(rig) for rig in rigs]
         )
-
-
-def _rigs(specs: tuple[RadarSpec, ...]) -> list[tuple[str, ...]]:
-    """Return the radars that belong together: all real ones, and the scene of each emulated one."""
-    real = tuple(spec.name for spec in specs if spec.shared)
-    rigs = [(spec.name,) for spec in specs if spec.emulated]
-    return [*([real] if real else []), *rigs]
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -145,7 +137,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object | Non
     The mark ``xdist_group`` would need ``--dist loadgroup``, and xdist 3.8 loses groups under
     pytest 9.2.
     """
-    shared = [spec.name for spec in config.stash[CHOICES].specs if spec.shared]
+    shared = [spec.name for spec in config.stash[CHOICES].specs if not spec.emulated]
     if not shared:
         return None
     from xdist.scheduler import LoadScopeScheduling  # which need not be installed

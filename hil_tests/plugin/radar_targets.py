@@ -134,7 +134,6 @@ class WireTap:
             self.forgotten_bytes += size
 
     def around(self, transport: Transport) -> TappedTransport:
-        """Return a line that passes everything on and notes it."""
         return TappedTransport(transport, self)
 
 
@@ -142,8 +141,7 @@ class TappedTransport:
     """A line that notes what passes; every other attribute is the line's own."""
 
     def __init__(self, line: Transport, tap: WireTap) -> None:
-        self._line = line
-        self._tap = tap
+        self._line, self._tap = line, tap
 
     @property
     def name(self) -> str:
@@ -189,8 +187,13 @@ class TargetError(Exception):
 class RadarTarget(ABC):
     """How one radar under test is reached, and its capabilities.
 
-    ``bytes_per_s`` is the capacity of the line: infinite but on a UART.
+    ``bytes_per_s`` is the capacity of the line, infinite but on a UART; ``scene_text`` the scene
+    file of an emulated radar; ``lock_target`` the name to lock against other sessions (None: no
+    other process can reach the radar).
     """
+
+    scene_text: str | None = None
+    lock_target: str | None = None
 
     def __init__(self, spec: RadarSpec, capabilities: frozenset[str], description: str) -> None:
         self.spec = spec
@@ -204,16 +207,6 @@ class RadarTarget(ABC):
     def virtual(self) -> bool:
         """Whether time passes only while a driver waits for the module."""
         return "virtual_time" in self.capabilities
-
-    @property
-    def lock_target(self) -> str | None:
-        """Name to lock against other sessions; None: no other process can reach the radar."""
-        return None
-
-    @property
-    def scene_text(self) -> str | None:
-        """The scene file of an emulated radar; None without one."""
-        return None
 
     def explore(self) -> None:  # noqa: B027 - most targets know it without asking
         """Complete the capabilities; called once, after locking."""
@@ -257,13 +250,9 @@ class InProcessTarget(RadarTarget):
             frozenset(CAPABILITIES) - {"uart"},
             f"emulated in this process, virtual time, {spec.target or 'an empty room'}",
         )
-        self._scene = _scene(spec)
+        self._scene, self.scene_text = _scene(spec), _scene_text(spec)
         self._index = _index_of(spec, [radar.name for radar in self._scene.radars])
         self.begin_test()
-
-    @property
-    def scene_text(self) -> str | None:
-        return _scene_text(self.spec)
 
     def begin_test(self) -> None:
         """Make a new module, so that no test sees what an earlier one left."""
@@ -319,15 +308,12 @@ class ProcessTarget(RadarTarget):
         try:
             self._served: Served = self._cleanup.enter_context(emulator(*arguments))
             self._index = _index_of(spec, self._served.names)
+            self.scene_text = None if played else _scene_text(spec)
         except AssertionError as error:
             raise TargetError(f"--radar {spec.text}: the emulator did not start: {error}") from None
         except TargetError:
             self._cleanup.close()
             raise
-
-    @property
-    def scene_text(self) -> str | None:
-        return None if self.spec.kind is Kind.REPLAY else _scene_text(self.spec)
 
     def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
         if self.spec.line == "tcp":
@@ -350,11 +336,7 @@ class PortTarget(RadarTarget):
     def __init__(self, spec: RadarSpec) -> None:
         path = _port_of(spec.target) if spec.kind is Kind.SERIAL_NUMBER else spec.target
         super().__init__(spec, frozenset({"settings", "profiles", "files"}), f"module at {path}")
-        self._path = path
-
-    @property
-    def lock_target(self) -> str | None:
-        return os.path.realpath(self._path)
+        self._path, self.lock_target = path, os.path.realpath(path)
 
     def explore(self) -> None:
         """Find out whether the port is a UART."""
@@ -378,10 +360,7 @@ class TcpTarget(RadarTarget):
         super().__init__(
             spec, frozenset({"settings", "profiles", "files"}), f"module at tcp://{spec.target}"
         )
-
-    @property
-    def lock_target(self) -> str | None:
-        return self.spec.target
+        self.lock_target = spec.target
 
     def open_line(self, path: str | None = None, baudrate: int = _BAUD) -> Transport:
         del path, baudrate
@@ -389,13 +368,7 @@ class TcpTarget(RadarTarget):
 
 
 def target_of(spec: RadarSpec) -> RadarTarget:
-    """Return the target that a spec names.
-
-    Raises
-    ------
-    TargetError, PortUnavailable
-        If there is no such radar; one line with the remedy.
-    """
+    """Return the target of a spec; `TargetError` or `PortUnavailable` if there is none."""
     match spec.kind:
         case Kind.EMULATED if spec.line == "memory":
             return InProcessTarget(spec)
@@ -418,9 +391,9 @@ def ports_that_answer() -> tuple[tuple[str, str], ...]:
     for port in find_ports():
         if port_users(port.path):
             continue
-        with contextlib.suppress(PortUnavailable), X4M300.open(port.path) as radar:
-            serial = _serial_number(radar)
-            if serial is not None:
+        with contextlib.suppress(XeThruError), X4M300.open(port.path) as radar:
+            radar.ping(0.5)
+            if (serial := radar.info().serial_number) is not None:
                 found.append((port.path, serial))
     return tuple(found)
 
@@ -435,14 +408,6 @@ def _port_of(serial: str) -> str:
             return path
     there = ", ".join(f"{number} at {path}" for path, number in found) or "none"
     raise TargetError(f"no module with serial number {serial} answers; those that do: {there}")
-
-
-def _serial_number(radar: X4M300) -> str | None:
-    try:
-        radar.ping(0.5)
-        return radar.info().serial_number
-    except XeThruError:
-        return None
 
 
 def _index_of(spec: RadarSpec, names: Sequence[str]) -> int:

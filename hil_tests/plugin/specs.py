@@ -72,13 +72,8 @@ class RadarSpec:
 
     @property
     def emulated(self) -> bool:
-        """Whether this program starts the radar itself."""
+        """Whether this program starts the radar itself; else other processes may want it, too."""
         return self.kind in {Kind.EMULATED, Kind.REPLAY}
-
-    @property
-    def shared(self) -> bool:
-        """Whether other processes may want the same radar."""
-        return not self.emulated
 
     @property
     def line(self) -> str:

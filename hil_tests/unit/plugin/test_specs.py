@@ -54,9 +54,10 @@ def test_radars_that_would_share_a_name_get_numbers() -> None:
     assert names == ["radar", "radar-2", "radar-3"]
 
 
-def test_what_this_program_makes_itself_is_not_shared() -> None:
-    assert not one("emu:?line=tcp").shared
-    assert all(one(text).shared for text in ("/dev/ttyACM0", "tcp://h:1", "serial=202611210001"))
+def test_what_this_program_starts_itself_is_emulated() -> None:
+    assert one("emu:?line=tcp").emulated
+    others = ("/dev/ttyACM0", "tcp://h:1", "serial=202611210001")
+    assert not any(one(text).emulated for text in others)
 
 
 @pytest.mark.parametrize(
