@@ -44,6 +44,18 @@ def test_defaults_after_init(radar: X4M300) -> None:
     assert settings[X4Setting.FRAMEBINCOUNT] == 1467
 
 
+def test_the_working_point_reads_back(radar: X4M300) -> None:
+    radar.configure_raw()
+    settings = radar.x4_settings()
+    assert settings[X4Setting.DACMIN] == 949
+    assert settings[X4Setting.DACMAX] == 1100
+    assert settings[X4Setting.ITERATIONS] == 16
+    assert settings[X4Setting.PULSESPERSTEP] == 300
+    assert settings[X4Setting.DACSTEP] == 0
+    assert settings[X4Setting.PRFDIV] == 16
+    assert settings[X4Setting.FRAMEAREA] == pytest.approx((0.199290, 9.400679), abs=1e-6)
+
+
 @pytest.mark.parametrize(
     ("setting", "values"),
     [
