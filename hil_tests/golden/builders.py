@@ -4,6 +4,7 @@ The tables here are written by hand from the vectors' own vocabulary; nothing in
 by the codec under test.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -90,17 +91,20 @@ def _matrix(kind: type[Any]) -> Callable[[Fields], m.Message]:
     return build
 
 
-def _lists(**keys: str) -> Callable[[Fields], Any]:
-    """Take a message's lists from a vector, which leaves empty ones out."""
-    return lambda fields: {name: tuple(fields.get(key, ())) for name, key in keys.items()}
+def _listed(kind: type[Any], **renamed: str) -> Callable[[Fields], m.Message]:
+    """Build a message with lists, whose counts it derives; a vector leaves empty lists out."""
+
+    def build(vector: Fields) -> m.Message:
+        counts = {"interval_count", "detection_count", "count", "frame_length"}
+        rest = {key: vector[key] for key in vector.keys() - counts}
+        lists = {key: tuple(value) for key, value in rest.items() if isinstance(value, list)}
+        given = {renamed.get(key, key) for key in rest}
+        absent = {field.name: () for field in dataclasses.fields(kind) if field.name not in given}
+        return _plain(kind, **renamed)(rest | lists | absent)
+
+    return build
 
 
-_MOVING = _lists(movement_slow="movement_slow", movement_fast="movement_fast")
-_DETECTED = _lists(
-    detection_distance_m="detection_distance",
-    detection_rcs="detection_rcs",
-    detection_velocity="detection_velocity",
-)
 _HIL_TYPES = {"none": 0x00, "byte": 0x10, "int": 0x11, "float": 0x12, "string": 0x13, "user": 0x50}
 
 
@@ -204,9 +208,7 @@ BUILDERS: dict[str, Callable[[Fields], m.Message]] = {
     "DIR CLEAR_CRASH_DUMP": _plain(m.ClearCrashDump),
     "DIR GET_CRASH_DUMP": _plain(m.GetCrashDump),
     "DIR PREPARE_INJECT_FRAME": _plain(m.PrepareInjectFrame, num_frames="frames", num_bins="bins"),
-    "DIR INJECT_FRAME": lambda fields: m.InjectFrame(
-        counter=fields["frame_counter"], values=tuple(fields["samples"])
-    ),
+    "DIR INJECT_FRAME": _listed(m.InjectFrame, frame_counter="counter", samples="values"),
     "DIR SYSTEM_GET_VERSION (legacy)": _plain(m.LegacyGetVersion),
     "DIR RADLIB_GETVARINT (legacy)": _plain(m.LegacyGetVarInt, id="variable"),
     "DIR (legacy)": lambda fields: m.LegacyDirCommand(
@@ -239,11 +241,8 @@ BUILDERS: dict[str, Callable[[Fields], m.Message]] = {
     "NOISEMAP_FLOAT": _matrix(m.NoiseMapFloat),
     "NOISEMAP_BYTE": _matrix(m.NoiseMapByte),
     "PRESENCE_SINGLE": _plain(m.PresenceSingle, presence_state="state", distance="distance_m"),
-    "PRESENCE_MOVINGLIST": lambda fields: m.PresenceMovingList(
-        counter=fields["counter"],
-        state=fields["presence_state"],
-        **_MOVING(fields),
-        **_DETECTED(fields),
+    "PRESENCE_MOVINGLIST": _listed(
+        m.PresenceMovingList, presence_state="state", detection_distance="detection_distance_m"
     ),
     "RESP_STATUS": _plain(m.RespStatus, distance="distance_m"),
     "SLEEP_STATUS": _plain(m.SleepStatus, distance="distance_m"),
@@ -255,18 +254,16 @@ BUILDERS: dict[str, Callable[[Fields], m.Message]] = {
         normalized_movement_end="normalized_movement_end_m",
     ),
     "SLEEPSTAGE": _plain(m.SleepStage),
-    "RESPIRATION_MOVINGLIST": lambda fields: m.RespirationMovingList(
-        counter=fields["counter"], **_MOVING(fields)
+    "RESPIRATION_MOVINGLIST": _listed(m.RespirationMovingList),
+    "RESPIRATION_DETECTIONLIST": _listed(
+        m.RespirationDetectionList, detection_distance="detection_distance_m"
     ),
-    "RESPIRATION_DETECTIONLIST": lambda fields: m.RespirationDetectionList(
-        counter=fields["counter"], **_DETECTED(fields)
-    ),
-    "RESPIRATION_NORMALIZEDMOVEMENTLIST": lambda fields: m.RespirationNormalizedMovementList(
-        counter=fields["counter"],
-        start_m=fields["start"],
-        bin_length_m=fields["bin_length"],
-        movement_slow=tuple(fields["slow"]),
-        movement_fast=tuple(fields["fast"]),
+    "RESPIRATION_NORMALIZEDMOVEMENTLIST": _listed(
+        m.RespirationNormalizedMovementList,
+        start="start_m",
+        bin_length="bin_length_m",
+        slow="movement_slow",
+        fast="movement_fast",
     ),
     "PROFILE_PARAMETERFILE": _plain(m.ParameterFile, filename="name"),
     "RESP_STATUS_EXT": _opaque(m.RespStatusExt),

@@ -1058,6 +1058,7 @@ class BootloaderStartApp(Command[Response]):
 
 X4Value = int | float | tuple[float, float] | tuple[int, int]
 _X4 = CommandCode.XTS_SPC_X4DRIVER
+_I2C = id32(I2C_REGISTER)
 _SETTING = fields.Member(X4Setting, "id")
 REGISTERS = frozenset({X4Setting.SPIREGISTER, X4Setting.PIFREGISTER, X4Setting.XIFREGISTER})
 # Struct codes and names of what SET carries, as the firmware parses it (4.9).
@@ -1145,13 +1146,7 @@ class X4DriverRead(Command[ReplyByte]):
     length: Annotated[int, fields.U32]
 
 
-@command(
-    _X4,
-    X4DriverCode.WRITE_I2C,
-    *id32(I2C_REGISTER),
-    name="X4DRIVER_WRITE_I2C",
-    errors=X4Error,
-)
+@command(_X4, X4DriverCode.WRITE_I2C, *_I2C, name="X4DRIVER_WRITE_I2C", errors=X4Error)
 class X4DriverWriteI2c(Command[Ack]):
     """Write bytes to the I2C device at ``address``; newer sensor firmware. 16."""
 
@@ -1159,13 +1154,7 @@ class X4DriverWriteI2c(Command[Ack]):
     values: Annotated[bytes, fields.RestBytes(shown=list)]
 
 
-@command(
-    _X4,
-    X4DriverCode.READ_I2C,
-    *id32(I2C_REGISTER),
-    name="X4DRIVER_READ_I2C",
-    errors=X4Error,
-)
+@command(_X4, X4DriverCode.READ_I2C, *_I2C, name="X4DRIVER_READ_I2C", errors=X4Error)
 class X4DriverReadI2c(Command[ReplyByte]):
     """Read ``length`` bytes from the I2C device; newer sensor firmware. 16."""
 

@@ -23,6 +23,7 @@ from hil_tests.property.device_model import (
     ModuleModel,
     Verdict,
 )
+from hil_tests.property.wire_streams import oracle
 from hil_tests.unit.emulator.doubles import BareHost, ramp_device
 from hil_tests.unit.xethru_protocol.scripted import READY, ScriptedTransport
 from xethru_protocol.driver.radar import X4M300
@@ -32,7 +33,7 @@ from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.errors import DeviceError, ResponseTimeout
 from xethru_protocol.wire.framing import NEED_DATA, Direction, FramingFault, Packet, PacketReader
 
-_SECOND = 1_000_000_000
+SECOND = 1_000_000_000
 _WORK_NS = 20_000_000
 TAG = 1000  # above all codes that have a meaning
 
@@ -71,7 +72,7 @@ def stalls(draw: st.DrawFn) -> list[tuple[int, int]]:
     begins = draw(st.lists(st.integers(0, 60), max_size=5, unique=True).map(sorted))
     lengths = draw(st.lists(st.floats(0.5, 12.0), min_size=5, max_size=5))
     return [
-        (begin * _SECOND, begin * _SECOND + round(length * _SECOND))
+        (begin * SECOND, begin * SECOND + round(length * SECOND))
         for begin, length in zip(begins, lengths, strict=False)
     ]
 
@@ -89,7 +90,7 @@ def test_no_command_gets_the_answer_of_another(
     radar = X4M300(module.line, clock=module.line.clock)
     for number, action in enumerate(actions, start=TAG):
         if action == "wait":
-            module.line.now_ns += _SECOND // 2
+            module.line.now_ns += SECOND // 2
             continue
         command = m.X4DriverSet(setting=X4Setting.PULSESPERSTEP, value=number)
         code = number
@@ -102,32 +103,6 @@ def test_no_command_gets_the_answer_of_another(
         assert code == number
 
 
-@settings(deadline=None, max_examples=100)
-@given(st.lists(st.integers(1, 4000), min_size=1, max_size=40))
-def test_replies_and_frames_survive_any_chunking(sizes: list[int]) -> None:
-    line = ScriptedTransport(lambda command: [])
-    radar = X4M300(line, clock=line.clock)
-    heard: list[m.Response] = []
-    radar.listener = lambda message, t_ns: heard.append(message)
-    said: list[m.Message] = [
-        m.DataFloat(info=1, values=np.arange(300, dtype=np.float32)),
-        m.System(code=0x11),
-        m.DataFloat(info=2, values=np.zeros(0, np.float32)),
-        READY,
-    ]
-    stream = b"".join(line._bytes(message) for message in said)
-    position = 0
-    while position < len(stream):
-        size = sizes[position % len(sizes)]
-        line.say(stream[position : position + size])
-        position += size
-    while line.pending:
-        radar._pump(0.0)
-    assert heard == said
-    assert radar.fault_count == 0
-
-
-SECOND = 1_000_000_000
 REPLIES = (m.Ack, m.Error, m.Pong, m.ReplyByte, m.ReplyInt, m.ReplyFloat, m.System)
 FEATURES = (*VOLATILE, 0x723BFA1E, 0x723BFA1F)
 
@@ -322,7 +297,7 @@ class Line:
 
     def send(self, message: Any) -> None:  # noqa: ANN401 - any message
         wire = self._sender.send(message)
-        payload = wire[9:] if wire.startswith(b"\x7c" * 4) else _unescaped(wire)
+        ((_, payload),) = oracle(wire)
         packet = Sent(message=message, payload=payload)
         self._flight += [(packet, byte) for byte in wire]
 
@@ -415,17 +390,6 @@ class Line:
         judged = statistics.bytes - self._receiver.buffered
         assert statistics.junk_bytes + 4 * statistics.packets <= judged
         assert statistics.packets or statistics.junk_bytes == judged
-
-
-def _unescaped(wire: bytes) -> bytes:
-    content, escaped = bytearray(), False
-    for byte in wire[1:-1]:
-        if byte != 0x7F or escaped:
-            content.append(byte)
-            escaped = False
-        else:
-            escaped = True
-    return bytes(content[:-1])
 
 
 LINES = st.sampled_from(["to host", "to module"])
