@@ -10,8 +10,6 @@ from hil_tests.property.wire_streams import STREAMS, oracle, packets, read_all
 from xethru_protocol.wire import framing
 from xethru_protocol.wire.framing import FramingFault, Packet, encode_no_escape, encode_normal
 
-ESCAPES = st.lists(st.sampled_from([0x10, 0x7D, 0x7E, 0x7F]), max_size=60).map(bytes)
-
 
 def marking_windows(size: int) -> AbstractContextManager[object]:
     """Let the receiver mark terminators in windows of ``size`` bytes, also in short streams."""
@@ -34,19 +32,60 @@ def test_any_chunking_gives_the_same_events(stream: bytes, data: st.DataObject |
 
 
 @settings(max_examples=600)
-@given(STREAMS | ESCAPES)
+@given(STREAMS)
 def test_packets_are_those_of_the_rescan_rule(stream: bytes) -> None:
     assert packets_in(read_all(stream)) == oracle(stream)
 
 
 @settings(max_examples=400)
-@given(STREAMS | ESCAPES, st.integers(2, 70), st.lists(st.integers(0, 300), max_size=3))
+@given(STREAMS, st.integers(2, 70), st.lists(st.integers(0, 300), max_size=3))
 def test_marking_terminators_in_windows_changes_nothing(
     stream: bytes, size: int, cuts: list[int]
 ) -> None:
     expected = read_all(stream, ended=True)
     with marking_windows(size):
         assert read_all(stream, [cut for cut in cuts if cut < len(stream)], ended=True) == expected
+
+
+@settings(max_examples=300)
+@given(
+    st.lists(st.sampled_from([0x10, 0x7D, 0x7E, 0x7F]), max_size=60).map(bytes),
+    st.integers(2, 20),
+    st.integers(1, 60),
+)
+def test_terminators_are_those_that_a_reader_of_single_bytes_stops_at(
+    stream: bytes, size: int, chunk: int
+) -> None:
+    finder = framing.TerminatorFinder()
+    with marking_windows(size):
+        start = stream.find(b"\x7d")
+        for limit in range(chunk, len(stream) + chunk, chunk):
+            while 0 <= start < min(limit, len(stream)):
+                end = finder.after(stream[:limit], 0, start, 1000)
+                assert end == _stops_at(stream[:limit], start)
+                if end < 0:
+                    break
+                between = stream[start + 1 : end]
+                literal = bytes(byte for byte, is_literal in _literals(between) if is_literal)
+                assert finder.content(stream[:limit], 0, start) == literal
+                start = stream.find(b"\x7d", start + 1)
+
+
+def _literals(between: bytes) -> list[tuple[int, bool]]:
+    marked, escaped = [], False
+    for byte in between:
+        escaped = byte == 0x7F and not escaped
+        marked.append((byte, not escaped))
+    return marked
+
+
+def _stops_at(stream: bytes, start: int) -> int:
+    at = start + 1
+    while at < len(stream):
+        if stream[at] in (0x7D, 0x7E):
+            return at
+        at += 2 if stream[at] == 0x7F else 1
+    return -1
 
 
 @given(
