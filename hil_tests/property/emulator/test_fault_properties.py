@@ -22,7 +22,7 @@ from emulator.faults.kind import (
     frame_packet,
 )
 from emulator.faults.kinds import KINDS
-from emulator.faults.plan import FaultPlan, Injected, fault_spec
+from emulator.faults.plan import FaultPlan, FaultSpec, Injected, fault_spec
 from emulator.module.memory import Identity
 from emulator.scene.philox import Rng
 from emulator.scene.scene import empty_room
@@ -91,16 +91,18 @@ def transcript(device: InnerDevice, chunk: int = 7) -> list[tuple[int, bytes]]:
     return sent
 
 
-def test_without_a_plan_every_byte_is_the_same() -> None:
-    assert transcript(FaultyDevice(module(), "radar_1", FaultPlan())) == transcript(module())
-
-
 @pytest.mark.parametrize(
-    "kind", [name for name, kind in KINDS.items() if kind.target is Target.COMMAND]
+    "faults",
+    [
+        (),
+        (fault_spec("silent", radar=["other"]),),
+        *((fault_spec(k, at_s=3600.0),) for k in KINDS if KINDS[k].target is Target.COMMAND),
+    ],
 )
-def test_a_fault_that_never_fires_changes_no_byte(kind: str) -> None:
-    plan = FaultPlan(fault=(fault_spec(kind, at_s=3600.0),))
-    assert transcript(FaultyDevice(module(), "radar_1", plan)) == transcript(module())
+def test_faults_that_never_fire_change_no_byte(faults: tuple[FaultSpec, ...]) -> None:
+    device = FaultyDevice(module(), "radar_1", FaultPlan(fault=faults))
+    assert transcript(device) == transcript(module())
+    assert not device.injected
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -121,13 +123,6 @@ def test_another_seed_or_radar_gives_other_bytes() -> None:
 
     assert bytes_of(1, "a") != bytes_of(2, "a")
     assert bytes_of(1, "a") != bytes_of(1, "b")
-
-
-def test_a_plan_for_another_radar_changes_nothing() -> None:
-    plan = FaultPlan(fault=(fault_spec("silent", radar=["other"]),))
-    device = FaultyDevice(module(), "radar_1", plan)
-    assert transcript(device) == transcript(module())
-    assert not device.injected
 
 
 def effect_of(kind: Kind, packet: bytes, seed: int) -> Any:  # noqa: ANN401 - of either sort

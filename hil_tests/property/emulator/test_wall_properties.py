@@ -9,21 +9,11 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from emulator.echo.echo import ScenePaths
 from emulator.echo.reflections import Scatterers
 from emulator.echo.walls import faces_of, passing, spread
 from emulator.scene.motion import PersonSpec
-from emulator.scene.scene import (
-    MIRROR_AMPLITUDE_1M,
-    LeakageSpec,
-    ObjectSpec,
-    RadarSpec,
-    Scene,
-    TargetSpec,
-    WallSpec,
-)
-
-WAVELENGTH_M = 299_792_458 / 7.29e9
+from emulator.scene.scene import MIRROR_AMPLITUDE_1M, ObjectSpec, TargetSpec, WallSpec
+from hil_tests.unit.emulator.rooms import WAVELENGTH_M, heard, radar_at
 
 Point = tuple[float, float]
 
@@ -74,23 +64,8 @@ def field(
     people: tuple[PersonSpec, ...],
 ) -> complex:
     """Return the sum of all paths at the carrier: it is continuous where a foot meets an edge."""
-    radar = RadarSpec(
-        name="only", serial="000000000001", x_m=mount[0], y_m=mount[1], yaw_deg=mount[2]
-    )
-    scene = Scene(
-        name="room",
-        environment="lab",
-        description="",
-        radars=(radar,),
-        walls=walls,
-        objects=boxes,
-        targets=targets,
-        people=people,
-        leakage=LeakageSpec(amplitude=0.0),
-    )
-    paths = ScenePaths(scene, radar).reflections(np.array([700_000_000]), WAVELENGTH_M)
-    phase_rad = paths.phase_rad - 4 * np.pi / WAVELENGTH_M * paths.range_m
-    return complex((paths.amplitude * np.exp(1j * phase_rad)).sum())
+    parts = {"walls": walls, "objects": boxes, "targets": targets, "people": people}
+    return heard(radar_at(*mount), t_ns=700_000_000, **parts).field()
 
 
 def clear_of(walls: tuple[WallSpec, ...], boxes: tuple[ObjectSpec, ...], *at: Point) -> bool:

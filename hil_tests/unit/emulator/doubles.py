@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.chip import Pace
-from emulator.chip.chip import CaptureSettings
+from emulator.chip.chip import CaptureSettings, Chip
 from emulator.device import Device, radar_device
 from emulator.module.memory import Identity
+from emulator.module.settings import DeviceOptions
 from emulator.ports.server import Server
 from hil_tests.patience import seconds
 from xethru_protocol.wire import messages as m
@@ -65,6 +66,14 @@ class FormulaSource:
         return np.tile(row, (len(frame_counters), 1))
 
 
+def working_point(chip: Chip) -> None:
+    chip.set(X4Setting.DACMIN, 949)
+    chip.set(X4Setting.DACMAX, 1100)
+    chip.set(X4Setting.ITERATIONS, 16)
+    chip.set(X4Setting.PULSESPERSTEP, 300)
+    chip.set(X4Setting.FRAMEAREA, (0.2, 9.4))
+
+
 class BareHost:
     """Speaks to a device directly; collects everything the device says."""
 
@@ -108,8 +117,16 @@ class BareHost:
         return [message for message in heard if isinstance(message, m.DataFloat)]
 
 
-def ramp_device(pace: Pace = Pace.ASAP, source: RampSource | None = None) -> Device:
-    return radar_device(IDENTITY, source or RampSource(), pace)
+def ramp_device(
+    pace: Pace = Pace.ASAP,
+    source: RampSource | None = None,
+    options: DeviceOptions | None = None,
+) -> Device:
+    return radar_device(IDENTITY, source or RampSource(), pace, options=options)
+
+
+def host_of(options: DeviceOptions) -> BareHost:
+    return BareHost(ramp_device(options=options))
 
 
 class PortHost:

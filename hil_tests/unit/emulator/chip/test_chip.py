@@ -6,20 +6,14 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from emulator.chip.chip import CaptureSettings, Chip, Refusal
-from hil_tests.unit.emulator.doubles import FormulaSource, RampSource
+from emulator.chip.chip import CaptureSettings, Chip, Refusal, Timeline
+from hil_tests.unit.emulator.doubles import FormulaSource, RampSource, working_point
 from xethru_protocol.wire.codes import X4Setting
 from xethru_protocol.wire.messages import X4Value
-
-
-def working_point(chip: Chip) -> None:
-    chip.set(X4Setting.DACMIN, 949)
-    chip.set(X4Setting.DACMAX, 1100)
-    chip.set(X4Setting.ITERATIONS, 16)
-    chip.set(X4Setting.PULSESPERSTEP, 300)
-    chip.set(X4Setting.FRAMEAREA, (0.2, 9.4))
 
 
 class OneEchoSource(RampSource):
@@ -155,19 +149,6 @@ def test_a_setting_takes_effect_with_the_next_frame() -> None:
     assert lengths == [1431] * 6 + [716] * 3
 
 
-def test_blocks_grow_but_never_change_a_value() -> None:
-    source = RampSource()
-    chip = Chip(source)
-    working_point(chip)
-    values = [chip.next_frame().values for _ in range(70)]
-    assert max(source.blocks) > 1
-    for counter, row in enumerate(values):
-        alone = Chip(RampSource())
-        working_point(alone)
-        alone.timeline.next_counter = counter
-        np.testing.assert_array_equal(alone.next_frame().values, row)
-
-
 def test_counter_wraps_at_32_bits() -> None:
     chip = Chip(RampSource())
     chip.timeline.next_counter = 2**32 - 1
@@ -212,19 +193,6 @@ def test_settings_without_a_sweep_give_finite_frames(
     chip.set(X4Setting.DOWNCONVERSION, downconversion)
     chip.set(setting, value)
     assert np.isfinite(chip.next_frame().values).all()
-
-
-def test_coupled_registers_are_the_settings() -> None:
-    """Protocol reference 4.9: PIF 53 iterations, 48/49 dac max, 2E/2F pulses, 101, 117, 15."""
-    chip = Chip(RampSource())
-    working_point(chip)
-    pif = X4Setting.PIFREGISTER
-    read = {address: chip.read_register(pif, address) for address in (0x35, 0x2E, 0x2F, 0x30, 0x31)}
-    assert read == {0x35: 16, 0x2E: 300 >> 8, 0x2F: 300 & 255, 0x30: 1100 >> 3, 0x31: 1100 & 7}
-    chip.set(pif, (0x35, 24))
-    assert chip.get(X4Setting.ITERATIONS) == 24
-    chip.set(pif, (0x0F, 1))
-    assert chip.get(X4Setting.FRAMEBINCOUNT) == 181
 
 
 # Protocol reference 4.9, table of X4 registers: address, byte written, and what it sets.
@@ -319,3 +287,33 @@ def test_of_modules_in_step_few_make_a_block_at_a_time() -> None:
     assert made[0] == 8
     assert made[24:] == [1] * 40
     assert [source.blocks[-1] for source in sources] == [8] * 8
+
+
+def test_the_same_rate_after_a_pause_continues_the_segment() -> None:
+    timeline = Timeline()
+    timeline.set_rate(10.0)
+    timeline.next_counter = 7
+    timeline.set_rate(10.0)
+    assert timeline.scene_time_ns(7) == 700_000_000
+    assert timeline.scene_time_ns(0) == 0
+
+
+@given(
+    rate_hz=st.floats(1.0, 65535.0),
+    start=st.integers(0, 2**33),
+    ahead_ns=st.integers(-(10**9), 10**11),
+)
+def test_skipping_finds_the_first_counter_not_before(
+    rate_hz: float, start: int, ahead_ns: int
+) -> None:
+    timeline = Timeline()
+    timeline.set_rate(rate_hz)
+    timeline.next_counter = start
+    target_ns = timeline.scene_time_ns(start) + ahead_ns
+    timeline.skip_before(target_ns)
+    assert timeline.next_counter >= start
+    if timeline.next_counter > start:
+        assert timeline.scene_time_ns(timeline.next_counter) >= target_ns
+        assert timeline.scene_time_ns(timeline.next_counter - 1) < target_ns
+    else:
+        assert timeline.scene_time_ns(start) >= target_ns

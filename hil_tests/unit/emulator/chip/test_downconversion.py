@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from emulator.chip.chip import Chip
 from emulator.chip.downconversion import CHANNELS, downconvert
-from hil_tests.unit.emulator.doubles import FormulaSource
+from hil_tests.unit.emulator.doubles import FormulaSource, working_point
 from xethru_protocol.wire.codes import X4Setting
 
 Samples = NDArray[np.float64]
@@ -27,17 +27,11 @@ def test_taps_are_those_the_reference_describes(
     assert sum(tap != 0 for tap in taps) == non_zero
 
 
-def baseband_of(
-    setting: int, formula: FormulaSource, area: tuple[float, float] = (0.2, 9.4)
-) -> tuple[NDArray[np.complex128], Chip]:
+def baseband_of(setting: int, formula: FormulaSource) -> tuple[NDArray[np.complex128], Chip]:
     chip = Chip(formula)
-    chip.set(X4Setting.DACMIN, 949)
-    chip.set(X4Setting.DACMAX, 1100)
-    chip.set(X4Setting.ITERATIONS, 16)
-    chip.set(X4Setting.PULSESPERSTEP, 300)
+    working_point(chip)
     chip.set(X4Setting.TXCENTERFREQUENCY, setting)
     chip.set(X4Setting.DOWNCONVERSION, 1)
-    chip.set(X4Setting.FRAMEAREA, area)
     values = chip.next_frame().values.astype(np.float64)
     n_bins = len(values) // 2
     return values[:n_bins] + 1j * values[n_bins:], chip
@@ -90,14 +84,6 @@ def test_a_target_appears_at_its_labelled_range(line: int, setting: int) -> None
     peak = int(np.argmax(np.abs(iq)))
     label_m = chip.area.start_m + peak * chip.area.bin_length_m
     assert label_m == pytest.approx(0.18 + 8 * line * 1.5e8 / 23.328e9, abs=1e-4)
-
-
-def test_no_dc_and_exact_integers() -> None:
-    level = np.full((1, 8 * 9 + 32), 2**24 - 1, dtype=np.int64)
-    i_raw, q_raw = downconvert(level, CHANNELS[3], 0)
-    assert i_raw.shape == (1, 10)
-    assert not i_raw.any()
-    assert not q_raw.any()
 
 
 def test_filter_agrees_with_a_plain_sum() -> None:

@@ -17,6 +17,12 @@ from xethru_protocol.wire.codes import NoiseMapControl, PresenceState
 SECOND = 1_000_000_000
 
 
+def transport_of_the_corridor() -> LoopbackTransport:
+    scene = load_scene("visitor")
+    identity = Identity(serial=scene.radars[0].serial)
+    return LoopbackTransport(radar_device(identity, echo_source(scene, 0, 0), Pace.REALTIME))
+
+
 def expected_state(time_s: float) -> PresenceState | None:
     """Return the state at a time, None in the seconds when it changes."""
     if time_s < 119:
@@ -28,11 +34,7 @@ def expected_state(time_s: float) -> PresenceState | None:
 
 def test_a_stock_module_sees_the_visitor_of_the_corridor() -> None:
     """It powers up with its profile running; the visitor comes after 130 s, at 5.5 m."""
-    scene = load_scene("visitor")
-    device = radar_device(
-        Identity(serial=scene.radars[0].serial), echo_source(scene, 0, 0), Pace.REALTIME
-    )
-    transport = LoopbackTransport(device)
+    transport = transport_of_the_corridor()
     with X4M300(transport, clock=transport.clock_ns) as radar:
         seen = []
         for message in radar.presence.messages(140):
@@ -52,11 +54,7 @@ def test_a_stock_module_sees_the_visitor_of_the_corridor() -> None:
 
 def test_settings_of_a_host_reach_the_profile() -> None:
     """A zone that ends before the visitor's path, then one that holds it."""
-    scene = load_scene("visitor")
-    device = radar_device(
-        Identity(serial=scene.radars[0].serial), echo_source(scene, 0, 0), Pace.REALTIME
-    )
-    transport = LoopbackTransport(device)
+    transport = transport_of_the_corridor()
     with X4M300(transport, clock=transport.clock_ns) as radar:
         states = {}
         for zone in ((0.5, 1.2), (0.5, 6.0)):

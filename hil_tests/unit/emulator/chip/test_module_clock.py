@@ -1,4 +1,7 @@
-"""A module's clock: when it samples, how short its bins are, and how loud its receiver is."""
+"""A module's clock: when it samples, how short its bins are, when its frames come.
+
+And how loud its receiver is.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +11,32 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
-from emulator.chip.chip import ModuleClock
-from emulator.echo.echo import SceneEcho
+from emulator.chip import Pace
+from emulator.chip.chip import CaptureSettings, EchoSource, ModuleClock
+from emulator.device import radar_device
+from emulator.echo.echo import SceneEcho, echo_source
+from emulator.loopback import LoopbackTransport
 from emulator.scene.scene import LeakageSpec, NoiseSpec, PathSpec, RadarSpec, Scene
+from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource
 from hil_tests.unit.emulator.rooms import PAPER, radar_at, room, target
+from xethru_protocol.driver.frames import Frame
+from xethru_protocol.driver.link import RawConfig
+from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.wire.codes import X4Setting
+from xethru_protocol.wire.x4 import frame_time_ns, real_frame_rate
 
 DAY_NS = 86_400_000_000_000
+PPM = 50.0
 CAPTURE = replace(PAPER, first_sample_m=0.0, n_samples=1400, dac_min=0, dac_max=2047)
+
+
+def true_ns(nominal_ns: int, ppm: float = PPM, skew_ns: int = 0) -> Fraction:
+    """Return when a clock that is ppm fast shows a time: earlier than a perfect one."""
+    return Fraction(nominal_ns) / (1 + Fraction(ppm) / 10**6) + skew_ns
 
 
 @given(
@@ -30,7 +49,7 @@ def test_a_frame_is_taken_when_the_modules_clock_says_so(
 ) -> None:
     """Against exact fractions; and the clock shows the same time when it is read back."""
     clock = ModuleClock(skew_ns=skew_ns, ppm=ppm)
-    exact = Fraction(nominal_ns) / (1 + Fraction(ppm) / 1_000_000) + skew_ns
+    exact = true_ns(nominal_ns, ppm, skew_ns)
     assert abs(clock.scene_time_ns(nominal_ns) - exact) <= Fraction(51, 100)
     assert abs(clock.nominal_ns(clock.scene_time_ns(nominal_ns)) - nominal_ns) <= 1
     many = clock.scene_times_ns(np.array([nominal_ns, 0]))
@@ -54,11 +73,11 @@ def test_a_fast_module_samples_earlier_with_shorter_bins() -> None:
     carrier that is as much shorter: to the bin, an echo from there.
     """
     perfect, fast = radar_at(0, 0, 0), radar_at(0, 0, 0, clock_ppm=100.0)
-    nominal_ns, true_ns = np.array([900_090_000_000]), np.array([900_000_000_000])
+    nominal_ns, earlier_ns = np.array([900_090_000_000]), np.array([900_000_000_000])
     got = SceneEcho(driving(fast, 52.0), fast, 0).echo(CAPTURE, nominal_ns)[0]
     ahead_m = 52.0 - 0.05 * 900
     stretched = driving(perfect, 52.0 + ahead_m * 1e-4)
-    same = SceneEcho(stretched, perfect, 0).echo(CAPTURE, true_ns)[0]
+    same = SceneEcho(stretched, perfect, 0).echo(CAPTURE, earlier_ns)[0]
     np.testing.assert_allclose(got * 1.0001**-2, same, atol=1e-9)
     assert np.abs(got).max() > 0.05
     late = SceneEcho(stretched, perfect, 0).echo(CAPTURE, nominal_ns)[0]
@@ -68,14 +87,8 @@ def test_a_fast_module_samples_earlier_with_shorter_bins() -> None:
 @pytest.mark.parametrize("gain_db", [-6.0, 3.0])
 def test_gain_scales_what_arrives_and_not_the_noise(gain_db: float) -> None:
     now = np.array([0])
-    scene = Scene(
-        name="room",
-        environment="lab",
-        description="",
-        radars=(radar_at(0, 0, 0),),
-        targets=(target(1.0, 0.0),),
-        leakage=LeakageSpec(amplitude=0.01),
-        noise=NoiseSpec(rf_sigma=1e-3),
+    scene = room(radar_at(0, 0, 0), targets=(target(1.0, 0.0),)).model_copy(
+        update={"leakage": LeakageSpec(amplitude=0.01), "noise": NoiseSpec(rf_sigma=1e-3)}
     )
     plain, loud = radar_at(0, 0, 0), radar_at(0, 0, 0, gain_db=gain_db)
     factor = 10 ** (gain_db / 20)
@@ -95,3 +108,90 @@ def test_the_phase_of_a_frame_turns_all_of_its_echoes() -> None:
     two = source.echo(CAPTURE, np.array([0, 0]), np.array([0.3, 0.3 + math.pi]))
     np.testing.assert_allclose(two[0], -two[1], atol=1e-15)
     assert not np.array_equal(two[0], source.echo(CAPTURE, np.array([0]))[0])
+
+
+@settings(max_examples=40)
+@given(st.floats(-1000, 1000), st.integers(0, 10**10), st.integers(0, 10**13), st.integers(2, 300))
+def test_in_real_time_a_stream_begins_with_the_first_frame_still_ahead(
+    ppm: float, skew_ns: int, start_ns: int, fps: int
+) -> None:
+    clock = ModuleClock(skew_ns=skew_ns, ppm=ppm)
+    device = radar_device(IDENTITY, RampSource(), Pace.REALTIME, clock=clock)
+    host = BareHost(device)
+    host.enter_manual()
+    host.now_ns = start_ns
+    host.set(X4Setting.FPS, float(fps))
+    due_ns = device.wake_ns(host.now_ns)
+    assert due_ns is not None
+    host.now_ns = due_ns
+    device.advance(host.now_ns)
+    counter = host.frames(1)[0].info
+
+    def frame_ns(counter: int) -> Fraction:
+        return true_ns(frame_time_ns(counter, real_frame_rate(float(fps))), ppm, skew_ns)
+
+    assert abs(due_ns - frame_ns(counter)) <= 1
+    assert due_ns >= start_ns
+    assert counter == 0 or frame_ns(counter - 1) < start_ns + 1
+
+
+class AtTrueTimes:
+    """A perfect module's source, asked at the times when a fast module takes its frames."""
+
+    def __init__(self, source: EchoSource) -> None:
+        self._source = source
+
+    def rf_counters(
+        self,
+        capture: CaptureSettings,
+        frame_counters: NDArray[np.int64],
+        scene_times_ns: NDArray[np.int64],
+    ) -> NDArray[np.int64]:
+        times_ns = np.array([round(true_ns(t_ns)) for t_ns in scene_times_ns.tolist()])
+        return self._source.rf_counters(capture, frame_counters, times_ns)
+
+
+def approaching(ppm: float) -> Scene:
+    """Return a robot that drives 1 m/s towards a rod for 100 s, and hears nothing else."""
+    path = PathSpec(waypoints_m=((0.0, 0.0), (100.0, 0.0)), laps=("forward",), speed_mps=1.0)
+    rod = target(101.5, 0.0, "rod", name="rod", amplitude_1m=0.015)
+    return room(radar_at(0, 0, 0, clock_ppm=ppm), path=path, targets=(rod,))
+
+
+def frames_of(source: EchoSource, pace: Pace, ppm: float) -> list[Frame]:
+    """Return 100 frames, about one a second, heard by the driver in virtual time."""
+    device = radar_device(IDENTITY, source, pace, clock=ModuleClock(ppm=ppm))
+    line = LoopbackTransport(device)
+    with X4M300(line, clock=line.clock_ns) as driver:
+        driver.configure_raw(RawConfig())
+        driver.start(1.0)
+        return list(driver.frames(100, timeout_s=5.0))
+
+
+def test_a_fast_modules_frames_are_a_perfect_ones_at_an_earlier_time() -> None:
+    """After 97 s at 50 ppm the robot is 4.8 mm less far: a quarter of a carrier period."""
+    fast = frames_of(echo_source(approaching(PPM), 0, 0), Pace.ASAP, PPM)
+    perfect = echo_source(approaching(0.0), 0, 0)
+    right = frames_of(AtTrueTimes(perfect), Pace.ASAP, 0.0)
+    late = frames_of(perfect, Pace.ASAP, 0.0)
+    for counter in (96, 97, 98):  # 5.3 to 3.3 m from the rod
+        echo = fast[counter].samples
+        loudness = np.abs(echo).max()
+        assert loudness > 1e-3
+        # What is left is the length of its bins, 50 ppm of the range.
+        assert np.abs(echo - right[counter].samples).max() < 0.1 * loudness
+        assert np.abs(echo - late[counter].samples).max() > 0.8 * loudness
+
+
+def test_a_fast_module_sends_the_same_frames_under_both_paces_and_in_real_time_early() -> None:
+    source = echo_source(approaching(PPM), 0, 0)
+    asap, realtime = (frames_of(source, pace, PPM) for pace in Pace)
+    by_counter = {frame.counter: frame for frame in asap}
+    assert list(by_counter) == list(range(100))
+    rate_hz = real_frame_rate(1.0)
+    for frame in realtime:
+        if frame.counter in by_counter:
+            assert frame.samples.tobytes() == by_counter[frame.counter].samples.tobytes()
+        nominal_ns = frame_time_ns(frame.counter, rate_hz)
+        assert abs(frame.arrival_ns - true_ns(nominal_ns)) <= 1
+        assert frame.counter < 90 or nominal_ns - frame.arrival_ns > 4_000_000

@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from emulator.chip import Pace
-from emulator.device import radar_device
 from emulator.module.settings import DeviceOptions
-from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource
+from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, host_of
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import FramePostprocessing, X4Setting
 
 SECOND = 1_000_000_000
 BOOTED = [m.System(code=0x10), m.System(code=0x11)]
 READY, SAFE = m.Pong(value=0xAAEEAEEA), m.Pong(value=0xFFEEFEEF)
-
-
-def host_of(options: DeviceOptions | None = None) -> BareHost:
-    return BareHost(radar_device(IDENTITY, RampSource(), Pace.ASAP, options=options))
 
 
 @pytest.fixture

@@ -159,13 +159,15 @@ def test_it_flows_without_steps() -> None:
     assert moves.max() < 0.01
 
 
-def test_strength_and_gain_are_factors_and_zero_leaves_the_signal_alone() -> None:
+def test_strength_and_gain_are_factors_and_the_number_of_pulses_is_none() -> None:
     times_ns = np.array([0, 123_456_789], dtype=np.int64)
     np.testing.assert_allclose(
         clutter(times_ns, sigma=0.25, gain=0.5), 0.125 * clutter(times_ns), rtol=1e-12
     )
     assert not clutter(times_ns, sigma=0.0).any()
     assert not clutter(times_ns, gain=0.0).any()
+    few = replace(CAPTURE, iterations=8, pulses_per_step=100)
+    np.testing.assert_array_equal(clutter(times_ns, few), clutter(times_ns))
 
 
 def test_baseband_hears_the_share_of_it_that_its_filter_passes() -> None:

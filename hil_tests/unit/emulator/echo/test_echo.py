@@ -21,21 +21,19 @@ from emulator.echo.reflections import (
 )
 from emulator.scene.scene import (
     LeakageSpec,
-    NoiseSpec,
     PathSpec,
     RadarSpec,
-    Scene,
     TargetSpec,
     empty_room,
     load_scene,
 )
-from hil_tests.unit.emulator.rooms import PAPER
+from hil_tests.unit.emulator.rooms import PAPER, radar_at, room
 
 BIN_M = 1.5e8 / 23.328e9
 C_MPS = 299_792_458.0
 NOW = np.array([0])
 CAPTURE = replace(PAPER, first_sample_m=0.18 + 3 * BIN_M)
-FORWARD = RadarSpec(name="only", serial="000000000007", x_m=0.0, y_m=0.0, yaw_deg=0.0)
+FORWARD = radar_at(0, 0, 0)
 
 
 def target(x_m: float, y_m: float = 0.0, **changes: object) -> TargetSpec:
@@ -46,18 +44,7 @@ def target(x_m: float, y_m: float = 0.0, **changes: object) -> TargetSpec:
 def quiet(
     *targets: TargetSpec, radar: RadarSpec = FORWARD, path: PathSpec | None = None
 ) -> SceneEcho:
-    """Return a noise-free, leakage-free echo of one radar."""
-    scene = Scene(
-        name="test",
-        environment="lab",
-        description="",
-        radars=(radar,),
-        targets=targets,
-        path=path or PathSpec(),
-        noise=NoiseSpec(rf_sigma=0.0),
-        leakage=LeakageSpec(amplitude=0.0),
-    )
-    return SceneEcho(scene, radar, seed=0)
+    return SceneEcho(room(radar, targets=targets, path=path or PathSpec()), radar, seed=0)
 
 
 def envelope(frame: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -236,7 +223,9 @@ def test_silence_is_half_the_counter() -> None:
     assert set(counts.ravel().tolist()) == {16 * 300 * 152 // 2}
 
 
-@pytest.mark.parametrize(("iterations", "pulses"), [(16, 300), (16, 10), (64, 87)])
+@pytest.mark.parametrize(
+    ("iterations", "pulses"), [(16, 300), (16, 10), (64, 87), (4, 1200), (32, 26)]
+)
 def test_noise_is_white_and_falls_with_the_root_of_the_pulses(iterations: int, pulses: int) -> None:
     capture = replace(
         CAPTURE, iterations=iterations, pulses_per_step=pulses, dac_min=0, dac_max=2047

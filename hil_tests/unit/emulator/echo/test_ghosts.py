@@ -104,19 +104,6 @@ def test_two_walls_also_mix() -> None:
     assert got.at((by_floor + by_ceiling) / 2).sum() == pytest.approx(expected, rel=3e-3)
 
 
-def test_the_way_there_is_the_way_back() -> None:
-    """Swap radar and target, each looking along the line between: the paths are the same."""
-    for one, other in ((HERE, THERE), (THERE, HERE)):
-        straight = math.dist(one, other)
-        towards = math.degrees(math.atan2(other[1] - one[1], other[0] - one[0]))
-        radar = radar_at(*one, towards)
-        got = heard(radar, walls=(FLOOR,), targets=(target(*other),))
-        ghosts = got.range_m[got.range_m > straight + 1e-9]
-        bent = math.hypot(2.0, 2.5)
-        assert min(abs(ghosts - bent)) == pytest.approx(0, abs=1e-12)
-        assert min(abs(ghosts - (bent + straight) / 2)) == pytest.approx(0, abs=1e-12)
-
-
 def test_a_ghost_needs_its_mirror_where_it_touches() -> None:
     """The touching point is at x = 1.2; a wall that ends before it, or a gap, has no ghost."""
     range_m = (math.hypot(2, 0.5) + math.hypot(2, 2.5)) / 2

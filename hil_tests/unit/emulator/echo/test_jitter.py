@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from emulator.chip.chip import CaptureSettings
 from emulator.chip.downconversion import CHANNELS, TAP_COUNT, downconvert
 from emulator.echo.echo import echo_source
 from emulator.echo.receiver import CarrierJitter
-from emulator.scene.scene import JitterSpec, LeakageSpec, NoiseSpec, RadarSpec, Scene, TargetSpec
+from emulator.scene.scene import JitterSpec, LeakageSpec
+from hil_tests.unit.emulator.rooms import PAPER, radar_at, room, target
 
 SERIAL = 202305070101
 BOTH = JitterSpec(white_rad=0.0056, slow_rad=0.032, slow_correlation_s=4.0)
@@ -67,30 +69,12 @@ def test_seeds_and_radars_are_independent(spec: JitterSpec) -> None:
 
 
 def test_all_echoes_of_a_frame_and_the_leakage_turn_by_the_same_phase() -> None:
-    scene = Scene(
-        name="two_points",
-        environment="lab",
-        description="",
-        radars=(RadarSpec(name="radar", serial=str(SERIAL), x_m=0.0, y_m=0.0, yaw_deg=0.0),),
-        targets=tuple(
-            TargetSpec(name=f"point_{x_m:.0f}", kind="point", x_m=x_m, y_m=0.0, amplitude_1m=0.05)
-            for x_m in (1.0, 2.0)
-        ),
-        leakage=LeakageSpec(amplitude=0.05, range_m=0.5),
-        noise=NoiseSpec(rf_sigma=0.0),
-        jitter=JitterSpec(white_rad=0.1, slow_rad=0.2),
-    )
-    capture = CaptureSettings(
-        first_sample_m=0.18,
-        n_samples=8 * 44 + TAP_COUNT,
-        iterations=255,
-        pulses_per_step=300,
-        dac_min=0,
-        dac_max=2047,
-        dac_step=0,
-        tx_power=2,
-        tx_center_frequency=3,
-    )
+    points = tuple(target(x_m, 0.0, name=f"point_{x_m:.0f}", amplitude_1m=0.05) for x_m in (1, 2))
+    jitter = JitterSpec(white_rad=0.1, slow_rad=0.2)
+    scene = room(radar_at(0, 0, 0, serial=str(SERIAL)), targets=points, jitter=jitter)
+    scene = scene.model_copy(update={"leakage": LeakageSpec(amplitude=0.05, range_m=0.5)})
+    capture = replace(PAPER, first_sample_m=0.18, n_samples=8 * 44 + TAP_COUNT)
+    capture = replace(capture, iterations=255, dac_min=0, dac_max=2047)
     times = counters(40) * 900_000_000
     raw = echo_source(scene, 0, 3).rf_counters(capture, counters(40), times)
     i_lines, q_lines = downconvert(raw, CHANNELS[3], 0)

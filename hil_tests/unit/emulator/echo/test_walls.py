@@ -52,12 +52,6 @@ def test_a_wall_is_heard_at_the_distance_to_its_line(
     assert math.cos(got.phase_rad[first]) == pytest.approx(-1)
 
 
-@pytest.mark.parametrize("range_m", [0.5, 1.0, 2.0, 4.0, 8.0])
-def test_a_wall_falls_with_its_range_alone(range_m: float) -> None:
-    got = heard(UP, walls=(wall((-FAR, range_m), (FAR, range_m), reflection=1.0),))
-    assert abs(got.field()) == pytest.approx(0.06 * math.sqrt(math.pi) / range_m, rel=1e-3)
-
-
 def test_a_perfect_mirror_is_as_strong_as_pi_r_squared_of_cross_section() -> None:
     """Radar equation: sigma / R**4 of a point against 1 / (2 R)**2 of an image, sigma = pi R**2."""
     points = heard(UP, targets=(target(0, 3.0, amplitude_1m=0.06 * math.sqrt(math.pi * 9)),))

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from emulator.chip import Pace
 from emulator.chip.chip import Refusal
-from emulator.device import radar_device
 from emulator.module.memory import FileSystem
 from emulator.module.settings import DeviceOptions
-from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource
+from hil_tests.unit.emulator.doubles import BareHost, host_of
 from xethru_protocol.wire import messages as m
 
 SECOND = 1_000_000_000
@@ -82,7 +80,7 @@ def test_twenty_files_exist(host: BareHost) -> None:
     [(DeviceOptions(storage_bytes=0x18000), 0x18000), (DeviceOptions(), 0x48000)],
 )
 def test_all_files_together_fill_the_storage(options: DeviceOptions, storage: int) -> None:
-    host = BareHost(radar_device(IDENTITY, RampSource(), Pace.ASAP, options=options))
+    host = host_of(options)
     assert host.ask(m.CreateFile(**KEY, length=storage - 10)) == m.Ack()
     assert host.ask(m.CreateFile(**MISSING, length=11)) == m.Error(code=9)
     assert host.ask(m.CreateFile(**MISSING, length=10)) == m.Ack()

@@ -8,19 +8,13 @@ import sys
 
 import pytest
 
-from emulator.chip import Pace
-from emulator.device import radar_device
 from emulator.module.modes import permission_table, state_diagram
 from emulator.module.settings import DeviceOptions
-from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource
+from hil_tests.unit.emulator.doubles import BareHost, host_of
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import X4Setting
 
 RUN, IDLE, MANUAL, STOP = 0x01, 0x11, 0x12, 0x13
-
-
-def host_of(options: DeviceOptions) -> BareHost:
-    return BareHost(radar_device(IDENTITY, RampSource(), Pace.ASAP, options=options))
 
 
 def mode_of(host: BareHost) -> int:
@@ -120,9 +114,8 @@ def test_x4_settings_between_two_stays_in_manual(kept: str, iterations: int) -> 
     assert reply == m.ReplyInt(content_id=0x12, values=(iterations,))
 
 
-def test_a_command_larger_than_a_pool_block_is_dropped() -> None:
+def test_a_command_larger_than_a_pool_block_is_dropped(host: BareHost) -> None:
     """1.1: 7000 bytes of payload; no reply."""
-    host = host_of(DeviceOptions())
     assert host.ask(m.SetMode(mode=STOP)) == m.Ack()
     key = {"file_type": 0x80000000, "identifier": 1}
     assert host.ask(m.CreateFile(**key, length=8000)) == m.Ack()
@@ -134,10 +127,9 @@ def test_a_command_larger_than_a_pool_block_is_dropped() -> None:
     assert host.ask(m.Ping()) == m.Pong(value=0xAAEEAEEA)
 
 
-def test_noise_maps_are_stored_periodically_while_the_profile_runs() -> None:
+def test_noise_maps_are_stored_periodically_while_the_profile_runs(host: BareHost) -> None:
     """16."""
     minute = 60_000_000_000
-    host = host_of(DeviceOptions())
     host.command(
         m.SetMode(mode=STOP),
         m.LoadApp(profile_id=0x014D4AB8),

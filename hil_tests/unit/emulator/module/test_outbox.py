@@ -125,15 +125,6 @@ def test_unread_replies_leave_no_room_for_more() -> None:
     assert outbox.takes_replies
 
 
-def test_clearing_forgets_everything() -> None:
-    firmware, lossless = filled(3), LosslessOutbox()
-    lossless.put(REPLY, m.Pong(value=1), 0)
-    for outbox in (firmware, lossless):
-        outbox.clear()
-        assert len(outbox) == 0
-        assert outbox.take(0) is None
-
-
 def test_lossless_fetches_only_when_nothing_waits() -> None:
     outbox, ticker = LosslessOutbox(), Ticker(period_ns=SECOND)
     for _ in range(5):

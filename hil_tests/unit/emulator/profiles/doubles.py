@@ -1,48 +1,25 @@
-"""A module that only runs its profile, rooms with one person, and messages by virtual time."""
+"""A module with its profile alone, rooms with one person, and messages by virtual time."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any
 
 from emulator.chip import Pace
-from emulator.chip.chip import ModuleClock
+from emulator.chip.chip import Chip, ModuleClock
 from emulator.echo.echo import SceneEcho
-from emulator.module.memory import FileSystem
-from emulator.module.modes import ModeMachine
 from emulator.module.module import Module
-from emulator.module.settings import DeviceOptions, ProfileSettings
+from emulator.module.settings import ProfileSettings
 from emulator.profiles.run import ProfileStream
 from emulator.scene.motion import PersonSpec
 from emulator.scene.scene import LeakageSpec, NoiseSpec, Scene, empty_room
+from hil_tests.unit.emulator.doubles import IDENTITY, RampSource
 from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.codes import SensorMode
 
 SECOND = 1_000_000_000
 DEFAULT_MAP = 6  # protocol reference 4.6: default map, no extra initialisation
 FRAME_HZ = 17.049379  # protocol reference 9.6: what 17 frames/s really are
-
-
-@dataclass
-class FakeModes:
-    mode: SensorMode = SensorMode.XTID_SM_RUN
-
-
-@dataclass
-class FakeModule:
-    profile: ProfileSettings
-    fake_modes: FakeModes = field(default_factory=FakeModes)
-    options: DeviceOptions = field(default_factory=DeviceOptions)
-    files: FileSystem = field(default_factory=lambda: FileSystem(0x48000))
-    saves: int = 0
-
-    def save(self) -> None:
-        self.saves += 1
-
-    @property
-    def modes(self) -> ModeMachine:
-        return cast(ModeMachine, self.fake_modes)
+BIN_M = 8 * 1.5e8 / 23.328e9
 
 
 def room(*people: PersonSpec, quiet: bool = False) -> Scene:
@@ -72,14 +49,14 @@ def profile(
     pace: Pace = Pace.REALTIME,
     zero_ns: int = 0,
     **settings: Any,  # noqa: ANN401 - whatever ProfileSettings takes
-) -> tuple[ProfileStream, FakeModule]:
-    module = FakeModule(ProfileSettings(**({"noise_map_control": DEFAULT_MAP} | settings)))
+) -> tuple[ProfileStream, Module]:
+    module = Module(IDENTITY, Chip(RampSource()))
+    module.profile = ProfileSettings(**({"noise_map_control": DEFAULT_MAP} | settings))
     if outputs is not None:
         module.profile.outputs = outputs
     source = SceneEcho(scene, scene.radars[0], seed=1)
-    clock = ModuleClock()
     stream = ProfileStream(
-        cast(Module, module), source, pace=pace, clock=clock, scene_time_zero_ns=zero_ns
+        module, source, pace=pace, clock=ModuleClock(), scene_time_zero_ns=zero_ns
     )
     return stream, module
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import jv
 
 from hil_tests.unit.emulator.profiles.doubles import (
+    BIN_M,
     FRAME_HZ,
     SECOND,
     heard_until,
@@ -24,7 +25,6 @@ from xethru_protocol.wire.codes import OutputFeature
 
 C_MPS = 299_792_458.0
 WAVELENGTH_M = C_MPS / 7.29e9
-BIN_M = 8 * 1.5e8 / 23.328e9
 SLOW, FAST = 1, 2  # bits of the control; instances 0 and 1
 
 

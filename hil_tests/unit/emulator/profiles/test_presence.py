@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from hil_tests.unit.emulator.profiles.doubles import (
+    BIN_M,
     FRAME_HZ,
     SECOND,
     heard_until,
@@ -20,7 +21,6 @@ from hil_tests.unit.emulator.profiles.doubles import (
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import OutputFeature, PresenceDirection, PresenceState
 
-BIN_M = 8 * 1.5e8 / 23.328e9
 MODULE_PER_METRE = 3.0e8 / 299_792_458.0
 
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from emulator.chip import Pace
-from emulator.chip.chip import Chip, ModuleClock
+from emulator.chip.chip import ModuleClock
 from emulator.device import ChipStream, CombinedStream
-from emulator.module.module import Module
+from emulator.module.modes import State
 from emulator.module.settings import ProfileSettings
-from hil_tests.unit.emulator.doubles import IDENTITY, RampSource
 from hil_tests.unit.emulator.profiles.doubles import (
+    BIN_M,
     FRAME_HZ,
     SECOND,
     heard_until,
@@ -27,7 +27,6 @@ from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import OutputFeature, PresenceState, SensorMode, X4Setting
 from xethru_protocol.wire.connection import Connection, Role
 
-BIN_M = 8 * 1.5e8 / 23.328e9
 IQ, AP = OutputFeature.BASEBAND_IQ, OutputFeature.BASEBAND_AMPLITUDE_PHASE
 WALKER = walking(4.0, 1.0, speed_mps=0.7)
 
@@ -96,10 +95,10 @@ def test_idle_pauses_and_run_fills_the_matrices_anew() -> None:
     """Protocol reference 8.3; the second is an assumption."""
     stream, module = profile(room())
     assert presence_until(stream, 30)[-1][1].state == PresenceState.NO_PRESENCE
-    module.fake_modes.mode = SensorMode.XTID_SM_IDLE
+    module.modes.state = State.IDLE
     stream.command_done(m.SetMode(mode=SensorMode.XTID_SM_IDLE), 30 * SECOND)
     assert stream.next_due_ns() is None
-    module.fake_modes.mode = SensorMode.XTID_SM_RUN
+    module.modes.state = State.RUN
     stream.command_done(m.SetMode(mode=SensorMode.XTID_SM_RUN), 100 * SECOND)
     heard = presence_until(stream, 125)
     assert heard[0][0] == pytest.approx(101, abs=0.1)
@@ -121,12 +120,12 @@ def test_an_output_that_is_switched_off_leaves_nothing_waiting() -> None:
 
 def test_stop_ends_it_and_a_restart_begins_when_the_module_is_ready() -> None:
     stream, module = profile(room())
-    module.fake_modes.mode = SensorMode.XTID_SM_STOP
+    module.modes.state = State.STOPPED
     stream.command_done(m.SetMode(mode=SensorMode.XTID_SM_STOP), 5 * SECOND)
     assert stream.next_due_ns() is None
     stream.restarted(8 * SECOND)
     assert stream.next_due_ns() is None
-    module.fake_modes.mode = SensorMode.XTID_SM_RUN
+    module.modes.state = State.RUN
     stream.restarted(12 * SECOND)
     first_s, first = presence_until(stream, 14)[0]
     assert first.state == PresenceState.INITIALIZING
@@ -168,11 +167,13 @@ def test_hours_of_silence_cost_little_and_end_in_the_right_state(control: int) -
     assert {message.state for _, message in heard} == {PresenceState.PRESENCE}
 
 
-def test_a_created_map_is_stored_and_used_again() -> None:
+def test_a_created_map_is_stored_and_used_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """Protocol reference 4.6, control 3; deleting its files deletes it."""
     stream, module = profile(room(), noise_map_control=3)
+    saved: list[int] = []
+    monkeypatch.setattr(module, "save", lambda: saved.append(len(module.files.names())))
     presence_until(stream, 125)
-    assert (len(module.files.names()), module.saves) == (2, 1)
+    assert saved == [2]
     stream.restarted(200 * SECOND)
     states = [one.state for time_s, one in presence_until(stream, 225) if time_s > 220.5]
     assert set(states) == {PresenceState.NO_PRESENCE}
@@ -223,14 +224,12 @@ def test_a_source_without_noise_divides_by_nothing() -> None:
 
 @pytest.mark.parametrize("mode", [SensorMode.XTID_SM_RUN, SensorMode.XTID_SM_MANUAL])
 def test_the_line_carries_frames_in_manual_and_the_profile_in_run(mode: SensorMode) -> None:
-    module = Module(IDENTITY, Chip(RampSource()))
-    profile_stream, host = profile(room())
+    profile_stream, module = profile(room())
     combined = CombinedStream(
         ChipStream(module, pace=Pace.REALTIME, clock=ModuleClock()), profile_stream
     )
     assert combined.next_due_ns() == pytest.approx(16 / FRAME_HZ * SECOND, rel=1e-6)
     module.modes.set_mode(mode)
-    host.fake_modes.mode = mode
     module.chip.set(X4Setting.FPS, 10.0)
     combined.command_done(m.SetMode(mode=mode), 5 * SECOND)
     expected = m.DataFloat if mode is SensorMode.XTID_SM_MANUAL else m.PresenceSingle

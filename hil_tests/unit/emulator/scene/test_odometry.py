@@ -16,15 +16,6 @@ from emulator.scene.wheels import drift, odometry_times_ns, scene_odometry, tum_
 from slam.evaluation import ate_rmse_m
 
 
-def umeyama_ate_m(estimate_xy: NDArray[np.float64], truth_xy: NDArray[np.float64]) -> float:
-    """Return the time-associated ATE after the best rotation and translation (Umeyama, 2-D)."""
-    e = estimate_xy - estimate_xy.mean(axis=0)
-    r = truth_xy - truth_xy.mean(axis=0)
-    u, _, vt = np.linalg.svd(r.T @ e)
-    rotation = u @ np.diag([1.0, np.linalg.det(u @ vt)]) @ vt
-    return float(np.sqrt(((e @ rotation.T - r) ** 2).sum(axis=1).mean()))
-
-
 def straight(length_m: float, steps: int) -> NDArray[np.float64]:
     poses = np.zeros((steps + 1, 3))
     poses[:, 0] = np.linspace(0, length_m, steps + 1)
@@ -42,9 +33,7 @@ def test_ate_over_seeds_0_to_99_is_that_of_the_robot_class(
     trajectory = loaded.trajectory()
     truth = trajectory.poses(odometry_times_ns(trajectory.duration_ns, loaded.odometry.rate_hz))
     runs = [drift(truth, loaded.odometry, seed=seed)[:, :2] for seed in range(100)]
-    ates = [umeyama_ate_m(run, truth[:, :2]) for run in runs]
-    # The metric that summary.json prints is the same number.
-    np.testing.assert_allclose([ate_rmse_m(run, truth[:, :2]) for run in runs], ates, atol=1e-9)
+    ates = [ate_rmse_m(run, truth[:, :2]) for run in runs]
     assert np.median(ates) == pytest.approx(median_m, abs=margin_m)
 
 
@@ -71,38 +60,6 @@ def test_perfect_wheels_report_the_truth() -> None:
     np.testing.assert_allclose(reported, truth, atol=1e-12)
 
 
-def test_a_scale_alone_scales_the_path() -> None:
-    truth = drive([(0, 0), (2, 0), (2, 2)], speed_mps=0.1, turn_rate_rad_per_s=1.0).poses(
-        np.arange(0, 45_000_000_000, 200_000_000)
-    )
-    reported = drift(truth, OdometrySpec(scale_sigma=0.02), seed=3)
-    scale = reported[-1, 0] / truth[-1, 0]
-    assert scale != 1
-    np.testing.assert_allclose(reported[:, :2], scale * truth[:, :2], atol=1e-12)
-    np.testing.assert_allclose(reported[:, 2], truth[:, 2], atol=1e-12)
-
-
-def test_a_turn_scale_alone_scales_the_turns() -> None:
-    truth = np.zeros((101, 3))
-    truth[:, 2] = np.linspace(0, -7.0, 101)
-    reported = drift(truth, OdometrySpec(turn_scale_sigma=0.02), seed=3)
-    ratio = reported[-1, 2] / -7.0
-    np.testing.assert_allclose(reported[:, 2], ratio * truth[:, 2], atol=1e-12)
-    assert not reported[:, :2].any()
-
-
-def test_a_curvature_alone_bends_a_straight_path_into_a_circle() -> None:
-    reported = drift(straight(10.0, 1000), OdometrySpec(curvature_sigma_rad_per_m=0.05), seed=3)
-    curvature = reported[-1, 2] / 10.0
-    length_m = np.linspace(0, 10, 1001)
-    circle = (
-        np.stack([np.sin(curvature * length_m), 1 - np.cos(curvature * length_m)], axis=1)
-        / curvature
-    )
-    # A chord of 1 cm starts tangentially: half a step's angle off the circle.
-    np.testing.assert_allclose(reported[:, :2], circle, atol=abs(curvature) * 0.01 / 2 * 10 * 1.01)
-
-
 def test_increments_invert_to_the_true_ones_with_the_runs_constants() -> None:
     """The filter's prediction model, given s, w and kappa, undoes the drift exactly."""
     model = OdometrySpec(scale_sigma=0.03, turn_scale_sigma=0.04, curvature_sigma_rad_per_m=0.02)
@@ -114,6 +71,7 @@ def test_increments_invert_to_the_true_ones_with_the_runs_constants() -> None:
     turn = np.array([[0, 0, 0], [0, 0, 1.0]])
     w = drift(turn, OdometrySpec(turn_scale_sigma=0.04), seed=8)[-1, 2] - 1
     kappa = drift(straight(1.0, 1), OdometrySpec(curvature_sigma_rad_per_m=0.02), seed=8)[-1, 2]
+    assert 0 not in (s, w, kappa)
 
     pose = np.zeros(3)
     for previous, current in pairwise(reported):
@@ -166,17 +124,12 @@ def test_white_noise_of_a_turn_is_a_hundredth_of_each_step() -> None:
     assert noise.std() == pytest.approx(0.01 * math.radians(5.625), rel=4 / math.sqrt(8000))
 
 
-def test_same_seed_same_run_and_another_seed_another_run() -> None:
-    scene = load_scene("smoke")
-    assert scene_odometry(scene, 7) == scene_odometry(scene, 7)
-    assert scene_odometry(scene, 7) != scene_odometry(scene, 8)
-
-
 def test_lines_are_tum_and_reproduce_every_float() -> None:
     scene = load_scene("lab")
     times = odometry_times_ns(scene.trajectory().duration_ns, 5.0)
     poses = drift(scene.trajectory().poses(times), scene.odometry, seed=4)
     lines = scene_odometry(scene, 4)
+    assert lines != scene_odometry(scene, 5)
     assert len(lines) == 3457
     assert lines[0] == "0.000000000 0.0 0.0 0 0 0 0.0 1.0"
     for t_ns, (x, y, heading), line in zip(times, poses, lines, strict=True):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,10 +11,11 @@ from pydantic import ValidationError
 
 from emulator.echo.reflections import direct_reflections, person_scatterer, viewpoint
 from emulator.scene.motion import PersonSpec, chest_displacement_m, positions_m
-from emulator.scene.scene import RadarSpec, SceneError, load_scene
+from emulator.scene.scene import load_scene
+from hil_tests.unit.emulator.rooms import radar_at
 
 SECOND = 1_000_000_000
-FORWARD = RadarSpec(name="only", serial="000000000007", x_m=0.0, y_m=0.0, yaw_deg=0.0)
+FORWARD = radar_at(0, 0, 0)
 L_SHAPE = ((0.0, 0.0), (3.0, 0.0), (3.0, 4.0))
 
 
@@ -38,17 +38,13 @@ def times(*seconds: float) -> np.ndarray[Any, np.dtype[np.int64]]:
 def test_walks(walk: str, at_s: list[float], expected: list[tuple[float, float]]) -> None:
     """7 m at 1 m/s; the way round closes with 5 m."""
     assert positions_m(person(walk=walk), times(*at_s)) == pytest.approx(np.array(expected))
+    stands = person(waypoints_m=((1.0, 2.0),), walk=walk)
+    assert positions_m(stands, times(0, 50)).tolist() == [[1.0, 2.0]] * 2
 
 
 def test_a_walk_begins_when_the_person_enters() -> None:
     late = positions_m(person(enters_s=10.0, speed_mps=0.5), times(5, 10, 14))
     assert late == pytest.approx(np.array([(0, 0), (0, 0), (2, 0)]))
-
-
-def test_somebody_with_one_waypoint_stands() -> None:
-    for walk in ("once", "to_and_fro", "round"):
-        stands = person(waypoints_m=((1.0, 2.0),), walk=walk)
-        assert positions_m(stands, times(0, 50)).tolist() == [[1.0, 2.0]] * 2
 
 
 def test_the_chest_moves_as_a_sine() -> None:
@@ -72,41 +68,20 @@ def test_the_echo_of_a_person() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    "changes",
     [
-        ({"leaves_s": 3.0, "enters_s": 3.0}, "leaves_s: must be later than enters_s"),
-        ({"waypoints_m": ()}, "at least 1"),
-        ({"walk": "run"}, "'once', 'to_and_fro' or 'round'"),
-        ({"speed_mps": 0.0}, "greater than or equal to 0.001"),
-        ({"speed_mps": math.inf}, "must be a finite number"),
-        ({"rcs_m2": 0.0}, "greater than 0"),
-        ({"heart": 70}, "Extra inputs"),
+        {"leaves_s": 3.0, "enters_s": 3.0},
+        {"waypoints_m": ()},
+        {"walk": "run"},
+        {"speed_mps": 0.0},
+        {"speed_mps": math.inf},
+        {"rcs_m2": 0.0},
+        {"heart": 70},
     ],
 )
-def test_a_bad_person_is_refused(changes: dict[str, Any], words: str) -> None:
-    with pytest.raises(ValidationError, match=words):
+def test_a_bad_person_is_refused(changes: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError, match="1 validation error"):
         person(**changes)
-
-
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ("pulse = 70", "people[0].pulse: unknown key; allowed are name, waypoints_m, speed_mps"),
-        ("leaves_s = 2.0\nenters_s = 2.0", "people[0]: leaves_s: must be later than enters_s"),
-        ('[[people]]\nname = "a"\nwaypoints_m = [[1.0, 0.0]]', "people.name: each must be unique"),
-    ],
-)
-def test_a_bad_file_is_one_clear_line(tmp_path: Path, line: str, words: str) -> None:
-    file = tmp_path / "room.toml"
-    file.write_text(
-        'name = "room"\nenvironment = "lab"\ndescription = "x"\n'
-        '[[radars]]\nname = "r"\nserial = "000000000001"\nx_m = 0.0\ny_m = 0.0\nyaw_deg = 0.0\n'
-        '[[people]]\nname = "a"\nwaypoints_m = [[1.0, 0.0]]\n' + line
-    )
-    with pytest.raises(SceneError) as caught:
-        load_scene(file)
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_the_visitor_is_somebody_who_comes_when_the_noise_map_is_made() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from emulator.scene.tables import shipped_names
 RADAR = '[[radars]]\nname = "left"\nserial = "000000000001"\nx_m = 0.0\ny_m = 0.2\nyaw_deg = 90.0\n'
 HEAD = 'name = "mine"\nenvironment = "lab"\ndescription = "a scene"\n'
 GOOD = HEAD + RADAR
+PERSON = '[[people]]\nname = "a"\nwaypoints_m = [[1.0, 0.0]]\n'
 FAR = '[path]\nwaypoints_m = [[0, 0], [1000, 0]]\nlaps = ["forward"]\n'
 OUT_OF_BOUNDS = [
     ("path", "speed_mps", "0", "0.001"),
@@ -51,15 +53,11 @@ def test_every_shipped_scene_loads_under_its_own_name(
 
 @pytest.mark.parametrize("as_text", [str, Path])
 def test_a_file_loads_by_its_path(tmp_path: Path, as_text: type[str] | type[Path]) -> None:
-    scene = load_scene(as_text(write(tmp_path, GOOD)))
+    scene = load_scene(as_text(write(tmp_path, GOOD.replace("90.0", "90"))))
     assert scene.name == "mine"
     assert scene.radars[0].yaw_deg == 90.0
     assert (scene.radars[0].range_offset_m, scene.radars[0].start_skew_ms) == (0.0, 0.0)
     assert scene.trajectory().duration_ns == 0
-
-
-def test_whole_numbers_are_numbers(tmp_path: Path) -> None:
-    assert load_scene(write(tmp_path, GOOD.replace("90.0", "90"))).radars[0].yaw_deg == 90.0
 
 
 def test_a_scene_is_frozen() -> None:
@@ -112,6 +110,9 @@ def test_a_scene_is_frozen() -> None:
         ("radars = 3\n" + HEAD, "radars"),
         ("", "missing"),
         (GOOD + '[walls]\nname = "w"\n', "walls: must be a list"),
+        (GOOD + PERSON + "pulse = 70", "people[0].pulse: unknown key; allowed are name, way"),
+        (GOOD + PERSON + "leaves_s = 2.0\nenters_s = 2.0", "people[0]: leaves_s: must be later"),
+        (GOOD + PERSON + PERSON, "people.name: each must be unique"),
     ],
 )
 def test_a_bad_scene_is_one_line_that_names_the_place(
@@ -137,10 +138,8 @@ def test_a_value_out_of_bounds_is_refused_with_its_limit(
 
 def test_one_bad_value_is_one_problem(tmp_path: Path) -> None:
     """That the only radar is refused is no second problem of the list of radars."""
-    path = write(tmp_path, GOOD.replace("000000000001", "1"))
-    with pytest.raises(SceneError) as caught:
-        load_scene(path)
-    assert str(caught.value).endswith("got '1'")
+    with pytest.raises(SceneError, match=r"got '1'$"):
+        load_scene(write(tmp_path, GOOD.replace("000000000001", "1")))
 
 
 def test_an_unknown_name_lists_the_known_ones() -> None:
@@ -149,21 +148,26 @@ def test_an_unknown_name_lists_the_known_ones() -> None:
         load_scene("labb")
 
 
-@pytest.mark.parametrize("make", ["missing.toml", "folder.toml"])
-def test_an_unreadable_file_is_one_clear_line(tmp_path: Path, make: str) -> None:
-    path = tmp_path / make
-    if make == "folder.toml":
-        path.mkdir()
-    with pytest.raises(SceneError, match=f"{make}: cannot read the scene file: ") as caught:
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda path: None, "cannot read the scene file: "),
+        (Path.mkdir, "cannot read the scene file: "),
+        (
+            lambda path: path.write_bytes(GOOD.encode() + b"\xff"),
+            f"not UTF-8 text at byte {len(GOOD)}",
+        ),
+    ],
+    ids=["missing", "folder", "not text"],
+)
+def test_an_unreadable_file_is_one_clear_line(
+    tmp_path: Path, make: Callable[[Path], object], message: str
+) -> None:
+    path = tmp_path / "mine.toml"
+    make(path)
+    with pytest.raises(SceneError, match=f"mine.toml: {message}") as caught:
         load_scene(path)
     assert "\n" not in str(caught.value)
-
-
-def test_a_file_that_is_not_text_is_one_clear_line(tmp_path: Path) -> None:
-    path = tmp_path / "mine.toml"
-    path.write_bytes(GOOD.encode() + b"\xff")
-    with pytest.raises(SceneError, match=f"not UTF-8 text at byte {len(GOOD)}"):
-        load_scene(path)
 
 
 @pytest.mark.parametrize("count", [1, 4, 9])
