@@ -48,6 +48,7 @@ from slam.app.rig.emulated import (
 from slam.app.run.runner import make_slam, run_slam
 from slam.app.session.log import SessionLog
 from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.system import StopFlag
 
 ROOT = REPOSITORY
 PRODUCT = ("xethru_protocol", "emulator", "slam")
@@ -143,7 +144,7 @@ def scans_to_belief_and_log() -> list[str]:
     slam = make_slam(config, rig_of(scene), wheels_of(scene))
     with tempfile.TemporaryDirectory() as folder, open_loopback(scene, SEED) as source:
         source.start(RAW_CONFIG, FRAME_RATE_HZ)
-        scans = source.scans(end_counter(scene.trajectory().duration_ns), lambda: None)
+        scans = source.scans(end_counter(scene.trajectory().duration_ns), StopFlag())
         earlier, counted = list(islice(scans, MAPPED_SCANS)), list(islice(scans, 3))
         info = SessionInfo(
             scene=scene.name,

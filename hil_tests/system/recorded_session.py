@@ -26,6 +26,7 @@ from slam.app.rig.emulated import (
 from slam.app.run.runner import RunRecord, make_slam, run_slam
 from slam.app.session.log import SessionLog
 from slam.app.session.messages import settings_text
+from xethru_protocol.system import StopFlag
 
 STARTED_UNIX_NS = 1_790_000_000_000_000_000
 LOST_RADAR, LOST_COUNTER = 1, 40
@@ -68,7 +69,7 @@ def record_session(path: Path, preset: str, seed: int = 5, *, has_truth: bool = 
         )
         truth = trajectory.poses if has_truth else _unknown
         log = SessionLog(path, info, odometry, truth_at=truth if has_truth else None)
-        scans = source.scans(end_counter(trajectory.duration_ns), lambda: None)
+        scans = source.scans(end_counter(trajectory.duration_ns), StopFlag())
         slam = make_slam(config, rig_of(scene), wheels_of(scene))
         record = run_slam(_damaged(scans, log, info), odometry, slam, truth, [log])
         log.close()

@@ -27,6 +27,7 @@ from slam.app.session.log import SessionLog
 from slam.app.sweep.run import make_case, source_of
 from slam.app.view.panels import RerunView
 from slam.paper.pipeline import UwbRadarSlam
+from xethru_protocol.system import StopFlag
 
 N_SCANS = 512
 Result = TypeVar("Result")
@@ -51,7 +52,7 @@ def test_whole_pipeline_without_synthesis(benchmark: BenchmarkFixture, tmp_path:
     trajectory = scene.trajectory()
     with open_loopback(scene, 0) as source:
         source.start(RAW_CONFIG, FRAME_RATE_HZ)
-        scans = list(source.scans(end_counter(trajectory.duration_ns), lambda: None))
+        scans = list(source.scans(end_counter(trajectory.duration_ns), StopFlag()))
     poses = trajectory.poses
     # perfect odometry: only its length matters here
     track = OdometryTrack(

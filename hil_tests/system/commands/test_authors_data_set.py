@@ -13,6 +13,7 @@ from slam.app.cli import main
 from slam.app.odometry.track import OdometryTrack
 from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, open_loopback, scene_and_config
 from slam.app.run.results import evaluate
+from xethru_protocol.system import StopFlag
 
 pytestmark = pytest.mark.slow
 
@@ -32,7 +33,7 @@ def test_whoever_downloads_it_can_run_it(
     bag = AuthorsBag(tmp_path / name)
     with open_loopback(scene, SEED) as source:
         source.start(RAW_CONFIG, FRAME_RATE_HZ)
-        for scan in source.scans(N_SCANS, lambda: None):
+        for scan in source.scans(N_SCANS, StopFlag()):
             for frame in scan.frames:
                 radar = AUTHORS_NAMES[source.radars[frame.radar].name]
                 # a few milliseconds for the line and the recorder

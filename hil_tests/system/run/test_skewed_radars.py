@@ -96,7 +96,7 @@ def results_of(
     track = OdometryTrack.from_lines(map(tum_line, times.tolist(), trajectory.poses(times)))
     with open_loopback(scene, 0) as source:
         source.start(RAW_CONFIG, FRAME_RATE_HZ)
-        scans: Iterable[Scan] = source.scans(end_counter(trajectory.duration_ns), lambda: None)
+        scans: Iterable[Scan] = source.scans(end_counter(trajectory.duration_ns), StopFlag())
         scans = without_some(scans) if lose else scans
         return run_slam(scans, track, UwbRadarSlam(config, rig_of(scene)), trajectory.poses).results
 
@@ -165,10 +165,10 @@ def test_through_ports_stamps_and_samples_are_those_in_process(tmp_path: Path) -
         ]
         with open_ports(emulator.devices, rig_of(scene), lambda name, record: None) as source:
             source.start(RAW_CONFIG, FRAME_RATE_HZ)
-            through_ports = content(source.scans(n_ticks, lambda: None))
+            through_ports = content(source.scans(n_ticks, StopFlag()))
     with open_loopback(scene, 0) as source:
         source.start(RAW_CONFIG, FRAME_RATE_HZ)
-        assert through_ports == content(source.scans(n_ticks, lambda: None))
+        assert through_ports == content(source.scans(n_ticks, StopFlag()))
     stamps_ns: NDArray[np.int64] = np.array([row[2] - row[0] for row in through_ports])
     assert set(stamps_ns.tolist()) == {round(skew_ms * 1e6) for skew_ms in RECIPE_MS}
 

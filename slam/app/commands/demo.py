@@ -125,7 +125,7 @@ def _scans(
     rig_source: RigSource, end: int, emulator: EmulatorProcess, stop: StopFlag, kept: str
 ) -> Iterator[Scan]:
     try:
-        yield from rig_source.scans(end, stop.check)
+        yield from rig_source.scans(end, stop)
     except RadarSilentError as silent:
         cause = emulator.ended() or str(silent)
         emulator.end()  # before the drivers close, which then wait for no answers

@@ -107,7 +107,7 @@ def measure_steps(
         noise_seed = seed * len(ranges_m) + number
         with open_loopback(_rod_at(lab, range_m), noise_seed) as source:
             source.start(RAW_CONFIG, FRAME_RATE_HZ)
-            scans = source.scans(frames_per_step, stop.check)
+            scans = source.scans(frames_per_step, stop)
             frames.append(tuple(scan.frames[0] for scan in scans))
     return Steps(ranges_m=np.array(ranges_m), frames=tuple(frames))
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Literal, Self, cast
@@ -23,6 +24,7 @@ from slam.geometry import Mount
 from xethru_protocol.driver.frames import Frame
 from xethru_protocol.driver.link import ProtocolRecord, RawConfig
 from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.system import StopFlag
 from xethru_protocol.wire.errors import Disconnected, ResponseTimeout, XeThruError
 from xethru_protocol.wire.x4 import MODULE_SPEED_MPS, Normalisation, frame_time_ns
 
@@ -50,6 +52,14 @@ class RadarLink:
     driver: X4M300
     start_skew_ns: int = 0
     gain_db: float = 0.0
+
+    @contextmanager
+    def naming(self) -> Iterator[None]:
+        """Turn an error of the driver into an AppError that names the radar."""
+        try:
+            yield
+        except XeThruError as error:
+            raise AppError(f"radar {self.mount.name} at {self.port}: {error}") from error
 
 
 def sampler_limits(config: RawConfig) -> tuple[float, float]:
@@ -161,50 +171,32 @@ class RigSource:
         AppError
             A module does not answer or refuses a setting; names the radar.
         """
-        infos = []
+        geometries, radars = [], []
         for link in self._links:
-            try:
-                geometry = link.driver.configure_raw(config)
-            except XeThruError as error:
-                raise AppError(f"radar {link.mount.name} at {link.port}: {error}") from error
-            infos.append((link, geometry))
-        radars = []
-        for link, geometry in infos:
-            try:
+            with link.naming():
+                geometries.append(link.driver.configure_raw(config))
+        for link, geometry in zip(self._links, geometries, strict=True):
+            with link.naming():
                 rate_hz = link.driver.start(fps)
-            except XeThruError as error:
-                raise AppError(f"radar {link.mount.name} at {link.port}: {error}") from error
             radars.append(
                 RadarInfo(
-                    name=link.mount.name,
+                    **asdict(link.mount),
                     serial=link.serial,
                     port=link.port,
-                    x_m=link.mount.x_m,
-                    y_m=link.mount.y_m,
-                    yaw_rad=link.mount.yaw_rad,
-                    range_offset_m=link.mount.range_offset_m,
                     range_start_m=geometry.range_start_m,
                     bin_length_m=geometry.bin_length_m,
                     n_bins=geometry.n_bins,
                     rate_hz=rate_hz,
                     settings=asdict(config),
                     start_skew_ns=link.start_skew_ns,
-                    phase_offset_rad=link.mount.phase_offset_rad,
                     gain_db=link.gain_db,
                 )
             )
         self.radars = tuple(radars)
         self._limits = sampler_limits(config)
 
-    def scans(self, end_counter: int, check: Callable[[], None]) -> Iterator[Scan]:
+    def scans(self, end_counter: int, stop: StopFlag) -> Iterator[Scan]:
         """Yield the frames of ticks below `end_counter`, one scan per tick; see `Scan`.
-
-        Parameters
-        ----------
-        end_counter
-            First tick that is not wanted any more.
-        check
-            Called once per scan and while waiting; may raise to stop.
 
         Raises
         ------
@@ -216,10 +208,10 @@ class RigSource:
         expected = list(late)
         heads: list[Frame | None] = [None] * len(self._links)
         while True:
-            check()
+            stop.check()
             for radar, head in enumerate(heads):
                 if head is None:
-                    frame = self._next_frame(radar, expected[radar] - late[radar], check)
+                    frame = self._next_frame(radar, expected[radar] - late[radar], stop)
                     tick = frame.counter + late[radar]
                     self.lost_frames += max(min(tick, end_counter) - expected[radar], 0)
                     expected[radar] = tick + 1
@@ -244,14 +236,14 @@ class RigSource:
             t_ns = frame_time_ns(tick, self.radars[frames[0].radar].rate_hz)
             yield Scan(counter=tick, t_ns=t_ns, frames=tuple(frames))
 
-    def _next_frame(self, radar: int, expected: int, check: Callable[[], None]) -> Frame:
+    def _next_frame(self, radar: int, expected: int, stop: StopFlag) -> Frame:
         link = self._links[radar]
         give_up = time.monotonic() + SILENCE_S
         while True:
             try:
                 return link.driver.read_frame(timeout_s=_POLL_S)
             except ResponseTimeout:
-                check()
+                stop.check()
                 if time.monotonic() > give_up:
                     raise RadarSilentError(
                         f"radar {link.mount.name} at {link.port}: no frame for {SILENCE_S:g} s "

@@ -305,7 +305,7 @@ def loopback_source(
     duration_ns = trajectory.duration_ns
     radars = open_loopback(scene, seed if noise_seed is None else noise_seed)
     radars.start(RAW_CONFIG, FRAME_RATE_HZ)
-    scans = radars.scans(end_counter(duration_ns), stop.check)
+    scans = radars.scans(end_counter(duration_ns), stop)
     return RunSource(
         info=SessionInfo(
             scene=scene.name,

@@ -52,12 +52,6 @@ def test_stamps_that_jump_back_are_refused_and_said_once() -> None:
     np.testing.assert_array_equal(odometry.pose_at(5_100_000_000), [0.0, 0.0, 0.0])
 
 
-def test_a_stamp_that_comes_twice_is_refused() -> None:
-    odometry, said = fed(line(5.0), line(5.0, 1.0))
-    assert said[1] == "stamp 5.000 s came twice; such lines are passed over"
-    assert odometry.pose_at(5 * NS_PER_S)[0] == 0.0
-
-
 def test_rubbish_is_refused_twice_said_and_never_fatal() -> None:
     odometry, said = fed(line(1.0), *["rubbish"] * 8, line(1.1))
     assert said[1].startswith("expected 8 numbers")
@@ -122,18 +116,22 @@ def test_a_clock_that_is_known_needs_no_arrivals() -> None:
     assert odometry.session_ns(7 * NS_PER_S) == 2 * NS_PER_S
 
 
-@pytest.mark.parametrize("stamp_s", [-0.001, -3e9, 2.0**31, 9e9])
-def test_stamps_that_no_session_can_hold_are_refused(stamp_s: float) -> None:
-    odometry, said = fed(line(5.0), line(stamp_s), line(5.1))
-    assert "s, the range of a session; such lines are passed over" in said[1]
-    assert odometry.last_ns == 5_100_000_000
-
-
-@pytest.mark.parametrize("x_m", [1e9, -1e308])
-def test_positions_that_overflow_the_filter_are_refused(x_m: float) -> None:
-    odometry, said = fed(line(5.0), line(5.1, x_m))
-    assert said[1].endswith("m is nowhere on Earth; such lines are passed over")
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        (line(5.0, 1.0), "stamp 5.000 s came twice"),
+        *((line(stamp_s), "the range of a session") for stamp_s in (-0.001, -3e9, 2.0**31, 9e9)),
+        *((line(5.1, x_m), "is nowhere on Earth") for x_m in (1e9, -1e308)),
+    ],
+)
+def test_poses_that_neither_a_session_nor_the_filter_takes_are_refused(
+    bad: str, words: str
+) -> None:
+    odometry, said = fed(line(5.0), bad, line(5.2))
+    assert words in said[1]
     assert odometry.n_refused == 1
+    assert odometry.last_ns == 5_200_000_000
+    assert odometry.pose_at(5 * NS_PER_S)[0] == 0.0
 
 
 def test_a_source_that_ends_without_a_pose_says_what_was_wrong_with_its_lines() -> None:
@@ -186,21 +184,18 @@ def threads() -> Iterator[Callable[[Callable[[], object]], None]]:
         assert not thread.is_alive()
 
 
-def test_a_file(tmp_path: Path) -> None:
-    (path := tmp_path / "drive.tum").write_bytes(TEXT)
-    source = parse_source(str(path))
-    assert source.kind is SourceKind.FILE
-    assert not source.is_live
-    assert lines_of(source) == LINES
-
-
-def test_a_fifo_waits_for_its_writer_and_ends_with_it(
-    tmp_path: Path, threads: Callable[[Callable[[], object]], None]
+@pytest.mark.parametrize("kind", [SourceKind.FILE, SourceKind.FIFO])
+def test_a_file_or_a_fifo_is_read_to_its_end(
+    tmp_path: Path, threads: Callable[[Callable[[], object]], None], kind: SourceKind
 ) -> None:
-    os.mkfifo(path := tmp_path / "fifo")
+    path = tmp_path / "drive.tum"
+    if kind is SourceKind.FIFO:
+        os.mkfifo(path)
+        threads(lambda: path.write_bytes(TEXT))  # which waits for its reader
+    else:
+        path.write_bytes(TEXT)
     source = parse_source(str(path))
-    assert source.kind is SourceKind.FIFO
-    threads(lambda: path.write_bytes(TEXT))
+    assert (source.kind, source.is_live) == (kind, kind is SourceKind.FIFO)
     assert lines_of(source) == LINES
 
 

@@ -114,7 +114,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Scan]
             log.on_wire(*row)
         source.listen(log.on_wire)
         scans = []
-        for scan in source.scans(N_SCANS, lambda: None):
+        for scan in source.scans(N_SCANS, StopFlag()):
             log.on_scan(scan)
             scans.append(scan)
     log.close()

@@ -43,15 +43,7 @@ def test_a_rig_comes_back_with_the_same_floats(tmp_path: Path) -> None:
                 phase_offset_deg=100 / 3,
                 gain_db=-1.5,
             ),
-        )
-    )
-    write_rig(tmp_path / "rig.toml", rig)
-    assert load_rig(tmp_path / "rig.toml") == rig
-
-
-def test_wheels_come_back_and_tell_slam_how_they_err(tmp_path: Path) -> None:
-    rig = RigFile(
-        radars=(RigRadar(name="a", serial="000000000001", x_m=0, y_m=0, yaw_deg=0),),
+        ),
         wheels=RigWheels(scale_sigma=0.02, curvature_sigma_rad_per_m=0.001),
     )
     write_rig(tmp_path / "rig.toml", rig)
@@ -173,13 +165,6 @@ def test_a_missing_module_is_named_and_the_others_are_let_go(bench: Bench) -> No
     assert not bench.is_open("a")
 
 
-def test_a_module_in_place_of_another_is_named(bench: Bench) -> None:
-    bench.serials = {"a": LEFT, "b": OTHER}
-    with pytest.raises(AppError, match=r"radar right .* instead there is 000000000009 at b: if a"):
-        bench.find("a", "b")
-    assert not bench.is_open("b")
-
-
 def test_a_foreign_module_is_refused_where_it_was_named_and_passed_over_elsewhere(
     bench: Bench,
 ) -> None:
@@ -194,19 +179,23 @@ def test_a_foreign_module_is_refused_where_it_was_named_and_passed_over_elsewher
         link.driver.close()
 
 
-def test_two_modules_of_one_serial_number_are_refused(bench: Bench) -> None:
-    bench.serials = {"a": LEFT, "b": LEFT, "c": RIGHT}
-    with pytest.raises(AppError, match="two modules have the serial number 000000000001, at a and"):
-        bench.find("a", "b", "c")
-
-
-def test_a_port_that_is_none_is_refused_where_it_was_named(bench: Bench) -> None:
-    bench.serials = {"a": LEFT}
-    with pytest.raises(AppError, match="nowhere: there is no port nowhere"):
-        bench.find("a", "nowhere")
-    assert not bench.is_open("a")
-
-
-def test_a_machine_without_modules_says_so(bench: Bench) -> None:
-    with pytest.raises(AppError, match="no modules and no running emulators on this machine"):
-        bench.find()
+@pytest.mark.parametrize(
+    ("serials", "ports", "words"),
+    [
+        (
+            {"a": LEFT, "b": OTHER},
+            "a b",
+            r"radar right .* there is 000000000009 at b: if a",
+        ),
+        ({"a": LEFT, "b": LEFT, "c": RIGHT}, "a b c", f"the serial number {LEFT}, at a and b"),
+        ({"a": LEFT}, "a nowhere", "nowhere: there is no port nowhere"),
+        ({}, "", "no modules and no running emulators on this machine"),
+    ],
+)
+def test_what_does_not_match_is_named_and_let_go(
+    bench: Bench, serials: dict[str, str], ports: str, words: str
+) -> None:
+    bench.serials = serials
+    with pytest.raises(AppError, match=words):
+        bench.find(*ports.split())
+    assert not any(map(bench.is_open, bench.lines))

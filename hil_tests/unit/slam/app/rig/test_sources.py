@@ -1,6 +1,7 @@
 """Scans from drivers: true metres, time by the counter, gaps, silence, and the real driver."""
 
 import dataclasses
+import signal
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -21,6 +22,7 @@ from slam.geometry import Mount
 from xethru_protocol.driver.frames import Frame, FrameGeometry
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
+from xethru_protocol.system import StopFlag, StopRequestedError
 from xethru_protocol.wire.errors import DeviceError, Disconnected, ResponseTimeout
 
 MS = 1_000_000
@@ -76,7 +78,7 @@ def rig_source(*drivers: Canned, skews_ns: Sequence[int] = ()) -> RigSource:
 def counters_of(source: RigSource, end: int) -> list[tuple[int, list[int]]]:
     source.start(RAW_CONFIG, 5)
     return [
-        (scan.counter, [f.radar for f in scan.frames]) for scan in source.scans(end, lambda: None)
+        (scan.counter, [f.radar for f in scan.frames]) for scan in source.scans(end, StopFlag())
     ]
 
 
@@ -115,7 +117,7 @@ def times_of(source: RigSource, end: int) -> list[tuple[int, int, list[tuple[int
             scan.t_ns // MS,
             [(one.radar, one.counter, one.t_ns // MS) for one in scan.frames],
         )
-        for scan in source.scans(end, lambda: None)
+        for scan in source.scans(end, StopFlag())
     ]
 
 
@@ -184,16 +186,12 @@ def test_a_refused_setting_is_named() -> None:
 
 
 def test_stopping_is_asked_for_while_waiting() -> None:
-    class StoppedError(Exception):
-        pass
-
-    def check() -> None:
-        raise StoppedError
-
+    stop = StopFlag()
+    stop.received = signal.SIGTERM
     source = rig_source(Canned([]))
     source.start(RAW_CONFIG, 5)
-    with pytest.raises(StoppedError):
-        next(source.scans(1, check))
+    with pytest.raises(StopRequestedError):
+        next(source.scans(1, stop))
 
 
 def test_drivers_are_closed_once() -> None:
@@ -227,7 +225,7 @@ def test_limits_are_what_the_sampler_gives_at_its_ends(
     config = dataclasses.replace(RAW_CONFIG, **settings)
     with open_loopback(loud_scene(short_scene), 0) as source:
         source.start(config, 1)
-        (scan,) = source.scans(1, lambda: None)
+        (scan,) = source.scans(1, StopFlag())
     for one in scan.frames:
         assert one.limits is not None
         assert one.limits == (one.samples.min(), one.samples.max())  # the same floats
@@ -240,7 +238,7 @@ def test_the_counter_knows_a_radars_skew_but_not_its_clocks_rate(short_scene: Sc
     skewed = standing.model_copy(update={"radars": (standing.radars[0], late)})
     with open_loopback(skewed, 0) as source:
         source.start(RAW_CONFIG, 5)
-        scans = list(source.scans(3, lambda: None))
+        scans = list(source.scans(3, StopFlag()))
     assert source.radars[1].start_skew_ns == 190 * MS
     assert [[f.t_ns - scan.t_ns for f in scan.frames] for scan in scans] == [[0, 190 * MS]] * 3
 
@@ -253,7 +251,7 @@ def short_scene(tmp_path: Path) -> Scene:
 def test_the_real_driver_in_process_gives_1431_bins_at_the_chips_rate(short_scene: Scene) -> None:
     with open_loopback(short_scene, 0) as source:
         source.start(RAW_CONFIG, 5)
-        scans = list(source.scans(3, lambda: None))
+        scans = list(source.scans(3, StopFlag()))
     assert [info.name for info in source.radars] == [m.name for m in rig_of(short_scene).mounts]
     for info in source.radars:
         assert info.n_bins == 1431

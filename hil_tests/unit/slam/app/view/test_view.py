@@ -1,6 +1,6 @@
 """Views in Rerun: pictures, tables and recordings of sessions."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from rerun.chunk import RrdReader
 
 from hil_tests.unit.slam.app.sessions import feed, scan, session_info, snapshot
 from slam.app.errors import AppError
-from slam.app.records import LogLine
+from slam.app.records import LogLine, Scan, SessionInfo, Snapshot
 from slam.app.view.layers import bscan_picture
 from slam.app.view.panels import RerunView
 from slam.app.view.rerun_recording import count_rows
@@ -26,9 +26,8 @@ N_SCANS = 150  # more than a block, and not a multiple of it
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("view") / "session.rrd"
-    view = RerunView(path, session_info())
-    feed(view, N_SCANS)
-    view.close()
+    with RerunView(path, session_info()) as view:
+        feed(view, N_SCANS)
     return path
 
 
@@ -42,6 +41,37 @@ def rows(path: Path, entity: str, component: str) -> Iterator[tuple[int | None, 
         if component in batch.schema.names:
             for index, value in enumerate(batch[component].to_pylist()):
                 yield (None if frames is None else frames[index]), value
+
+
+def stamps(path: Path, entity: str, timeline: str) -> list[int]:
+    """Return an entity's stamps [ns] on a timeline; of `host_time` since 1970."""
+    return [
+        stamp.value
+        for chunk in RrdReader(path).stream()
+        if str(chunk.entity_path) == entity
+        for batch in [chunk.to_record_batch()]
+        if timeline in batch.schema.names
+        for stamp in batch[timeline]
+    ]
+
+
+def drawn(
+    path: Path,
+    *events: Scan | Snapshot | LogLine,
+    info: SessionInfo | None = None,
+    time_of_day_ns: Callable[[], int] | None = None,
+) -> Path:
+    """Write a view of these events and return its path."""
+    with RerunView(path / "s.rrd", info or session_info(), time_of_day_ns=time_of_day_ns) as view:
+        for event in events:
+            match event:
+                case Scan():
+                    view.on_scan(event)
+                case Snapshot():
+                    view.on_snapshot(event)
+                case LogLine():
+                    view.on_log(event)
+    return path / "s.rrd"
 
 
 def test_every_frame_is_a_bar_chart_with_its_counter_and_samples(finished: Path) -> None:
@@ -116,10 +146,8 @@ def test_a_fault_is_a_marker_and_a_state_of_its_lane(finished: Path) -> None:
 @pytest.mark.parametrize("is_known", [True, False])
 def test_the_guide_speaks_of_truth_only_where_there_is_one(tmp_path: Path, is_known: bool) -> None:
     info = session_info()
-    path = tmp_path / "s.rrd"
     known = info if is_known else replace(info, true_landmarks_m=np.empty((0, 2)))
-    RerunView(path, known).close()
-    (_, (text,)) = next(rows(path, "/about", "TextDocument:text"))
+    (_, (text,)) = next(rows(drawn(tmp_path, info=known), "/about", "TextDocument:text"))
     assert ("*true* path" in text) is is_known
     assert "2 short-range radars" in text
 
@@ -179,91 +207,51 @@ def test_a_followed_view_waits_for_the_next_block_of_a_fast_radar(tmp_path: Path
     assert [frame for frame, _ in pictures] == [0, 128, 256]  # full blocks, though 0.5 s passed
 
 
-def arrivals(path: Path, entity: str) -> list[int]:
-    """Return an entity's stamps on `host_time`, nanoseconds since 1970."""
-    return [
-        stamp.value
-        for chunk in RrdReader(path).stream()
-        if str(chunk.entity_path) == entity
-        for batch in [chunk.to_record_batch()]
-        if "host_time" in batch.schema.names
-        for stamp in batch["host_time"]
-    ]
+DAY_NS = 1_790_000_000_000_000_000
 
 
 def test_host_time_is_a_timeline_where_arrival_is_known(tmp_path: Path) -> None:
-    view = RerunView(tmp_path / "s.rrd", session_info())
-    day_ns = 1_790_000_000_000_000_000
-    for counter in range(3):
-        view.on_scan(replace(scan(counter), host_ns=(day_ns + counter, day_ns + 10 + counter)))
-    view.close()
-    stamps = arrivals(tmp_path / "s.rrd", "/radar/radar1/frame")
-    assert stamps == [day_ns + 10, day_ns + 11, day_ns + 12]
+    came = [replace(scan(k), host_ns=(DAY_NS + k, DAY_NS + 10 + k)) for k in range(3)]
+    path = drawn(tmp_path, *came)
+    expected = [DAY_NS + 10, DAY_NS + 11, DAY_NS + 12]
+    assert stamps(path, "/radar/radar1/frame", "host_time") == expected
 
 
 def test_a_live_view_notes_arrival_itself(tmp_path: Path) -> None:
-    day_ns = iter(range(1_790_000_000_000_000_000, 2_000_000_000_000_000_000))
-    view = RerunView(tmp_path / "s.rrd", session_info(), time_of_day_ns=lambda: next(day_ns))
-    for counter in range(2):
-        view.on_scan(scan(counter))
-    view.close()
+    now_ns = iter(range(DAY_NS, DAY_NS + 10))
+    path = drawn(tmp_path, scan(0), scan(1), time_of_day_ns=lambda: next(now_ns))
     for name in ("radar0", "radar1"):  # one arrival per scan
-        assert arrivals(tmp_path / "s.rrd", f"/radar/{name}/frame") == [
-            1_790_000_000_000_000_000,
-            1_790_000_000_000_000_001,
-        ]
+        assert stamps(path, f"/radar/{name}/frame", "host_time") == [DAY_NS, DAY_NS + 1]
 
 
-@pytest.mark.parametrize("day_ns", [1_790_000_000_000_000_000, 37_310_000_000_000])
+@pytest.mark.parametrize("day_ns", [DAY_NS, 37_310_000_000_000])
 def test_time_is_counted_from_the_first_scan(tmp_path: Path, day_ns: int) -> None:
-    view = RerunView(tmp_path / "s.rrd", session_info())
-    view.on_log(LogLine(t_ns=0, radar="radar0", warning=False, text="tx Ping"))  # before any scan
-    for counter in range(3):
-        view.on_scan(replace(scan(counter), t_ns=day_ns + counter))
-        view.on_snapshot(replace(snapshot(counter), t_ns=day_ns + counter))
-    view.close()
-    for entity, expected in (("/error/slam", [0, 1, 2]), ("/link/log/radar0", [0])):
-        stamps = [
-            stamp.value
-            for chunk in RrdReader(tmp_path / "s.rrd").stream()
-            if str(chunk.entity_path) == entity
-            for batch in [chunk.to_record_batch()]
-            if "device_time" in batch.schema.names
-            for stamp in batch["device_time"]
-        ]
-        assert stamps == expected
+    early = LogLine(t_ns=0, radar="radar0", warning=False, text="tx Ping")
+    events = [replace(one, t_ns=day_ns + k) for k in range(3) for one in (scan(k), snapshot(k))]
+    path = drawn(tmp_path, early, *events)
+    assert stamps(path, "/error/slam", "device_time") == [0, 1, 2]
+    assert stamps(path, "/link/log/radar0", "device_time") == [0]
 
 
 def test_without_truth_there_is_no_error_to_show(tmp_path: Path) -> None:
-    view = RerunView(tmp_path / "s.rrd", session_info())
-    for counter in range(3):
-        view.on_scan(scan(counter))
-        view.on_snapshot(replace(snapshot(counter), truth=np.full(3, np.nan)))
-    view.close()
-    counted = count_rows(tmp_path / "s.rrd")
+    unknown = [replace(snapshot(k), truth=np.full(3, np.nan)) for k in range(3)]
+    counted = count_rows(drawn(tmp_path, scan(0), *unknown))
     assert {"/error/slam", "/consistency/nees/value", "/map/truth/path"}.isdisjoint(counted)
     assert counted["/map/estimate/path"] == 2  # first state, and last
 
 
 def test_odometry_that_began_with_slam_is_shown_as_it_is(tmp_path: Path) -> None:
-    path = tmp_path / "s.rrd"
-    view = RerunView(path, session_info())
     state = snapshot(0)
-    view.on_snapshot(replace(state, odometry=state.estimate + np.array([0.03, 0.0, 0.01])))
-    view.close()
+    begun = replace(state, odometry=state.estimate + np.array([0.03, 0.0, 0.01]))
+    path = drawn(tmp_path, begun)
     (_, (error_m,)) = next(rows(path, "/error/odometry", "Scalars:scalars"))
     assert error_m == pytest.approx(np.hypot(0.03, 0.01))  # the estimate itself is 0.01 m off
 
 
 def test_odometry_that_began_elsewhere_begins_where_slam_does(tmp_path: Path) -> None:
-    path = tmp_path / "s.rrd"
-    view = RerunView(path, session_info())
     elsewhere = np.array([40.0, -7.0, 2.0])
-    for counter in range(3):
-        state = snapshot(counter)
-        driven = np.array([0.1 * counter, 0.0, 0.0])
-        view.on_snapshot(replace(state, odometry=compose(elsewhere, driven)))
-    view.close()
+    driven = [compose(elsewhere, np.array([0.1 * k, 0.0, 0.0])) for k in range(3)]
+    path = drawn(tmp_path, *(replace(snapshot(k), odometry=driven[k]) for k in range(3)))
     (strip,) = [s for _, s in rows(path, "/map/odometry/path", "LineStrips2D:strips")][-1]
     start = snapshot(0).estimate
     expected = transform(start, np.array([[0.0, 0.0], [0.2, 0.0]])) * [1, -1]
@@ -272,17 +260,17 @@ def test_odometry_that_began_elsewhere_begins_where_slam_does(tmp_path: Path) ->
 
 def test_names_may_hold_any_character(tmp_path: Path) -> None:
     # closing compares the rows of every entity by its name
-    path = tmp_path / "s.rrd"
     name = "left/rear 1.ä"
     info = session_info()
     radars = (replace(info.radars[0], name=name), info.radars[1])
-    view = RerunView(path, replace(info, radars=radars))
-    view.on_log(LogLine(t_ns=0, radar=name, warning=True, text="fault CRC"))
-    view.on_log(LogLine(t_ns=0, radar="tcp://127.0.0.1:3000", warning=False, text="tx Ping"))
-    for counter in range(3):
-        view.on_scan(scan(counter))
-        view.on_snapshot(replace(snapshot(counter), step=step(robust=True)))
-    view.close()
+    path = drawn(
+        tmp_path,
+        LogLine(t_ns=0, radar=name, warning=True, text="fault CRC"),
+        LogLine(t_ns=0, radar="tcp://127.0.0.1:3000", warning=False, text="tx Ping"),
+        *map(scan, range(3)),
+        *(replace(snapshot(k), step=step(robust=True)) for k in range(3)),
+        info=replace(info, radars=radars),
+    )
     counted = count_rows(path)
     assert counted["/radar/left\\/rear\\ 1.ä/frame"] == 3
     assert counted["/link/faults/left\\/rear\\ 1.ä"] == 1
@@ -323,11 +311,7 @@ def step(*, robust: bool) -> StepResult:
 
 @pytest.mark.parametrize("robust", [True, False])
 def test_echoes_are_arcs_of_the_body_and_bars_of_the_frame(tmp_path: Path, robust: bool) -> None:
-    path = tmp_path / "s.rrd"
-    view = RerunView(path, session_info())
-    view.on_scan(scan(0))
-    view.on_snapshot(replace(snapshot(0), step=step(robust=robust)))
-    view.close()
+    path = drawn(tmp_path, scan(0), replace(snapshot(0), step=step(robust=robust)))
     antenna = np.array([0.1, -0.2])  # of radar0, on the screen
     for name, range_m in (("arcs_used", 1.0), ("arcs_unused", 0.5)):
         found = rows(path, f"/map/robot/radar0/{name}", "LineStrips2D:strips")
@@ -342,11 +326,8 @@ def test_echoes_are_arcs_of_the_body_and_bars_of_the_frame(tmp_path: Path, robus
 
 
 def test_fixes_and_clusters_lie_where_the_robot_saw_them(tmp_path: Path) -> None:
-    path = tmp_path / "s.rrd"
-    view = RerunView(path, session_info())
-    for counter in range(50):
-        view.on_snapshot(replace(snapshot(counter), step=step(robust=False)))
-    view.close()
+    states = (replace(snapshot(k), step=step(robust=False)) for k in range(50))
+    path = drawn(tmp_path, *states)
     for name, places in (
         ("fixes/found", [(0.3, 0.9), (0.1, 0.4)]),
         ("fixes/rejected", [(0.1, 0.4)]),
