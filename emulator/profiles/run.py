@@ -38,7 +38,6 @@ from numpy.typing import NDArray
 from emulator.chip import Pace
 from emulator.chip.chip import EchoSource, ModuleClock, Refusal
 from emulator.module.module import NOISE_MAPS, MessageStream, Module
-from emulator.module.settings import ProfileSettings
 from emulator.profiles.doppler import (
     FRAME_RATE_HZ,
     FRAMES_PER_TICK,
@@ -195,28 +194,25 @@ def matrix_reports(
 class ProfileRun:
     """A profile from RUN to STOP, or from one pause to the next.
 
-    ``settings`` is asked for what to send, ``zero_ns`` is the device time of scene time 0, and
-    ``sampling_hz`` what baseband messages claim.
+    ``zero_ns`` is the device time of scene time 0.
     """
 
     def __init__(
         self,
+        module: Module,
         sweep: ProfileSweep,
-        processing: PresenceProcessing,
-        settings: Callable[[], ProfileSettings],
+        noise_map: NoiseMap,
         *,
         first_counter: int,
         zero_ns: int,
         clock: ModuleClock,
-        sampling_hz: float,
     ) -> None:
-        self.sweep = sweep
-        self.processing = processing
-        self._settings = settings
+        self.processing = PresenceProcessing(sweep, noise_map)
+        self._module = module
+        self._sweep = sweep
         self._first_counter = first_counter
         self._zero_ns = zero_ns
         self._clock = clock
-        self._sampling_hz = sampling_hz
         self._taken = 0  # frames so far
         self._ready: deque[Response] = deque()
         self._spread: dict[tuple[int, Matrix], deque[Response]] = {}
@@ -245,11 +241,11 @@ class ProfileRun:
             self._ready.clear()
 
     def _due_ns(self, index: int) -> int:
-        nominal_ns = self.sweep.timeline.scene_time_ns(self._first_counter + index)
+        nominal_ns = self._sweep.timeline.scene_time_ns(self._first_counter + index)
         return self._zero_ns + self._clock.scene_time_ns(nominal_ns)
 
     def _on(self, feature: int) -> int:
-        return self._settings().outputs.get(feature, 0)
+        return self._module.profile.outputs.get(feature, 0)
 
     def _next_index(self) -> int | None:
         """Return the frame that brings the next message."""
@@ -276,22 +272,20 @@ class ProfileRun:
         return [matrix for matrix in MATRICES if wanted[matrix.instance]]
 
     def _frame(self) -> None:
-        index = self._taken
-        counter = self._first_counter + index
-        iq = self.sweep.frame(counter)
+        counter = self._first_counter + self._taken
+        iq = self._sweep.frame(counter)
         self.processing.add(iq)
         self._taken += 1
+        sampling_hz = self._module.options.baseband_sampling_hz
         for feature in filter(self._on, _BASEBAND):
-            message = baseband(
-                feature, self.sweep, iq, counter=counter, sampling_hz=self._sampling_hz
-            )
+            message = baseband(feature, self._sweep, iq, counter=counter, sampling_hz=sampling_hz)
             self._ready.append(message)
         if self._taken % FRAMES_PER_TICK == 0:
             self._tick(counter)
         self._release()
 
     def _tick(self, counter: int) -> None:
-        sensitivity = self._settings().sensitivity
+        sensitivity = self._module.profile.sensitivity
         presence = self.processing.tick(sensitivity)
         if self._on(OutputFeature.PRESENCE_SINGLE):
             self._ready.append(presence_single(counter, presence, sensitivity))
@@ -305,7 +299,7 @@ class ProfileRun:
                         matrix_reports(
                             feature,
                             matrix,
-                            self.sweep,
+                            self._sweep,
                             power.copy(),
                             counter=counter,
                             matrix_counter=self._taken // matrix.period,
@@ -323,7 +317,7 @@ class ProfileRun:
         for (feature, matrix), waiting in self._spread.items():
             if matrix not in self._instances(feature):
                 waiting.clear()
-            share = -(-self.sweep.n_bins // matrix.period)
+            share = -(-self._sweep.n_bins // matrix.period)
             for _ in range(min(share, len(waiting))):
                 self._ready.append(waiting.popleft())
 
@@ -372,23 +366,23 @@ class ProfileStream(MessageStream):
         self.restarted(scene_time_zero_ns)
 
     @property
-    def running(self) -> ProfileRun | None:
+    def _running(self) -> ProfileRun | None:
         """The run whose messages go to the host."""
         return None if self._paused else self._run
 
     def next_due_ns(self) -> int | None:
-        run = self.running
+        run = self._running
         return None if run is None else run.next_due_ns()
 
     def take(self) -> Response:
-        run = self.running
+        run = self._running
         assert run is not None
         message = run.take()
         self._keep_created_map()
         return message
 
     def skip_due_before(self, time_ns: int) -> None:
-        run = self.running
+        run = self._running
         if run is None or self._pace is Pace.ASAP:
             return
         run.skip_before(time_ns)
@@ -442,13 +436,12 @@ class ProfileStream(MessageStream):
             zero_ns = self._zero_ns
             first_counter = sweep.first_counter_from(clock.nominal_ns(now_ns - zero_ns))
         self._run = ProfileRun(
+            self._module,
             sweep,
-            PresenceProcessing(sweep, noise_map or self._first_map(sweep)),
-            lambda: self._module.profile,
+            noise_map or self._first_map(sweep),
             first_counter=first_counter,
             zero_ns=zero_ns,
             clock=clock,
-            sampling_hz=self._module.options.baseband_sampling_hz,
         )
         self._creating = not self._run.processing.noise_map.complete
         self._paused = False

@@ -41,6 +41,8 @@ LARGEST_UNITS = 2 * int(_TABLE[-1])
 _WORDS_PER_FRAME = 2 * MAX_SAMPLES * _TABLE_BITS // 64
 _BLOCKS_PER_FRAME = _WORDS_PER_FRAME // 4
 
+_UNIFORMS_PER_NORMAL = 12  # their sum has variance 1
+
 
 class Purpose(IntEnum):
     """What a module's random streams are for."""
@@ -136,9 +138,6 @@ def _philox(seed: int, stream: int, counter: int = 0) -> np.random.Philox:
 def _half_words(words: NDArray[np.uint64]) -> NDArray[np.uint16]:
     """Split 64 bit words into 16 bit ones, lowest first on any machine."""
     return words.astype("<u8", copy=False).view("<u2")
-
-
-_UNIFORMS_PER_NORMAL = 12  # their sum has variance 1
 
 
 class Rng:
