@@ -15,40 +15,19 @@ import pytest
 
 from hil_tests.device.serving import emulator
 from hil_tests.patience import seconds, wait_until
-from xethru_protocol.cli import main
+from hil_tests.unit.xethru_protocol.recordings.messages import dumped, xethru
 
 pytestmark = pytest.mark.slow
 
+Capture = pytest.CaptureFixture[str]
 XETHRU = [sys.executable, "-m", "xethru_protocol.cli"]
 FRAMES = 30
 SERVED = ("serve", "smoke", "--pace", "asap")
 
 
-@pytest.fixture
-def environment(tmp_path: Path) -> dict[str, str]:
-    return {"XDG_RUNTIME_DIR": str(tmp_path)}
-
-
-class Xethru:
-    """Runs commands in this process; each must succeed and warn of nothing."""
-
-    def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
-        self._capsys = capsys
-
-    def __call__(self, *arguments: str | Path) -> str:
-        """Return what a command printed."""
-        assert main([str(argument) for argument in arguments]) == 0
-        printed, errors = self._capsys.readouterr()
-        assert errors == ""
-        return printed
-
-    def dumped(self, recording: Path) -> list[dict[str, Any]]:
-        return [json.loads(line) for line in self("dump", recording, "--json").splitlines()]
-
-
-@pytest.fixture
-def xethru(capsys: pytest.CaptureFixture[str]) -> Xethru:
-    return Xethru(capsys)
+@pytest.fixture(autouse=True)
+def own_run_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
 
 
 def payloads(messages: Sequence[dict[str, Any]]) -> list[str]:
@@ -56,40 +35,47 @@ def payloads(messages: Sequence[dict[str, Any]]) -> list[str]:
 
 
 @pytest.mark.parametrize("kind", [[], ["--baseband"]], ids=["rf", "baseband"])
-def test_identical_messages(
-    kind: list[str], xethru: Xethru, tmp_path: Path, environment: dict[str, str]
-) -> None:
+def test_identical_messages(kind: list[str], tmp_path: Path, capsys: Capture) -> None:
     first, listened, again = (tmp_path / name for name in ("first", "listened", "again"))
     count = ("--count", str(FRAMES))
-    with emulator(*SERVED, environment=environment) as served:
-        xethru("record", "--port", served.paths[0], "--out", first, *count, *kind)
-    messages = xethru.dumped(first)
+    with emulator(*SERVED) as served:
+        xethru(capsys, "record", "--port", served.paths[0], "--out", first, *count, *kind)
+    messages = dumped(capsys, first)
     assert len(messages) == FRAMES
     assert [message["fields"]["info"] for message in messages] == list(range(FRAMES))
     assert len(set(payloads(messages))) == FRAMES
 
-    with emulator("play", first, "--rate", "0", environment=environment) as played:
+    with emulator("play", first, "--rate", "0") as played:
         port = played.paths[0]
-        xethru("record", "--port", port, "--out", listened, *count, "--profile", "none")
-        xethru("record", "--port", port, "--out", again, *count, *kind)
-        lines = xethru("stream", "--port", port, *count, *kind, "--samples").splitlines()
+        xethru(capsys, "record", "--port", port, "--out", listened, *count, "--profile", "none")
+        xethru(capsys, "record", "--port", port, "--out", again, *count, *kind)
+        lines = xethru(capsys, "stream", "--port", port, *count, *kind, "--samples").splitlines()
     for copy in (listened, again):
-        assert payloads(xethru.dumped(copy)) == payloads(messages)
+        assert payloads(dumped(capsys, copy)) == payloads(messages)
     for frame, message in zip(map(json.loads, lines), messages, strict=True):
         assert frame["counter"] == message["fields"]["info"]
         samples = frame["i"] + frame["q"] if kind else frame["samples"]
         assert samples == message["fields"]["data"]
 
 
-def test_wire_capture_holds_the_same_messages(
-    xethru: Xethru, tmp_path: Path, environment: dict[str, str]
-) -> None:
+def test_wire_capture_holds_the_same_messages(tmp_path: Path, capsys: Capture) -> None:
     vendor, wire = tmp_path / "vendor", tmp_path / "port.xtwire"
-    with emulator(*SERVED, environment=environment) as served:
+    with emulator(*SERVED) as served:
         port = served.paths[0]
-        xethru("record", "--port", port, "--out", vendor, "--wire", wire, "--count", str(FRAMES))
-    messages = xethru.dumped(vendor)
-    heard = [message for message in xethru.dumped(wire) if message["message"] == "DATA FLOAT"]
+        xethru(
+            capsys,
+            "record",
+            "--port",
+            port,
+            "--out",
+            vendor,
+            "--wire",
+            wire,
+            "--count",
+            str(FRAMES),
+        )
+    messages = dumped(capsys, vendor)
+    heard = [message for message in dumped(capsys, wire) if message["message"] == "DATA FLOAT"]
     assert payloads(heard)[:FRAMES] == payloads(messages)
     assert all(
         abs(one["t_ns"] - other["t_ns"]) < 10**9
@@ -97,11 +83,9 @@ def test_wire_capture_holds_the_same_messages(
     )
 
 
-def test_unplugging_keeps_what_came(
-    xethru: Xethru, tmp_path: Path, environment: dict[str, str]
-) -> None:
+def test_unplugging_keeps_what_came(tmp_path: Path, capsys: Capture) -> None:
     out = tmp_path / "recording"
-    with emulator(*SERVED, environment=environment) as served:
+    with emulator(*SERVED) as served:
         command = [*XETHRU, "record", "--port", served.paths[0], "--out", str(out)]
         with subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -114,7 +98,7 @@ def test_unplugging_keeps_what_came(
     assert line.startswith(f"xethru record: {served.paths[0]} was disconnected")
     kept = re.search(rf"; kept (\d+) messages in {out}$", line)
     assert kept
-    counters = [message["fields"]["info"] for message in xethru.dumped(out)]
+    counters = [message["fields"]["info"] for message in dumped(capsys, out)]
     assert counters == list(range(int(kept[1])))
 
 

@@ -97,23 +97,14 @@ def driver_factory(kind: str, runner: asyncio.Runner) -> DriverOn:
         async def let_time_pass(seconds: float) -> None:
             pass_time(seconds)
 
+        shared = {"clock": line.clock, "candidates": lambda: list(known), **options}
         if kind == "sync":
-            radar = X4M300(
-                line,
-                clock=line.clock,
-                open_port=open_line,
-                candidates=lambda: list(known),
-                sleep=pass_time,
-                **options,
-            )
-            return radar, line
+            return X4M300(line, open_port=open_line, sleep=pass_time, **shared), line
         awaited = AsyncX4M300(
             AsyncScripted(line),
-            clock=line.clock,
             open_port=lambda path, baudrate: AsyncScripted(open_line(path, baudrate)),
-            candidates=lambda: list(known),
             sleep=let_time_pass,
-            **options,
+            **shared,
         )
         return cast(X4M300, Blocking(awaited, runner)), line
 

@@ -47,32 +47,23 @@ def test_stream_with_samples(module: PtyModule, capsys: pytest.CaptureFixture[st
 
 
 @pytest.mark.parametrize(
-    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["SIGINT", "SIGTERM"]
+    ("number", "code"),
+    [(signal.SIGINT, 130), (signal.SIGTERM, 143), (None, 0)],
+    ids=["SIGINT", "SIGTERM", "its reader leaves"],
 )
-def test_stream_ends_cleanly_by_a_signal(
-    module: PtyModule, number: signal.Signals, code: int
-) -> None:
+def test_stream_ends_cleanly(module: PtyModule, number: signal.Signals | None, code: int) -> None:
     command = [*XETHRU, "stream", "--port", module.path]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stderr is not None
         assert json.loads(process.stdout.readline())["counter"] == 0
-        process.send_signal(number)
-        process.stdout.read()
+        if number is None:
+            process.stdout.close()
+        else:
+            process.send_signal(number)
+            process.stdout.read()
         assert process.stderr.read() == b""
         assert process.wait() == code
-    assert stopped(module)
-
-
-def test_stream_ends_cleanly_when_its_reader_leaves(module: PtyModule) -> None:
-    command = [*XETHRU, "stream", "--port", module.path]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
-        process.stdout.readline()
-        process.stdout.close()
-        assert process.stderr.read() == b""
-        assert process.wait() == 0
     assert stopped(module)
 
 

@@ -6,7 +6,7 @@ import subprocess
 import sys
 import termios
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -92,13 +92,11 @@ def only_bootloader(command: m.Message) -> Sequence[Said]:
     return [bytes.fromhex("7D 00 7F 7D 7E")] if is_known else []
 
 
-SILENT_MODULES = [
+MODULES = [
     ("not in the bootloader", lambda: PtyModule(only_bootloader), "fault", "bootloader"),
     ("speaks XeThru", lambda: PtyModule(silent, unasked=UNCHECKED), "fault", "no XeThru packets"),
     ("listens", lambda: PtyModule(silent, unasked=FRAME), "fault", "does not answer"),
     ("answers", lambda: PtyModule(silent), "fault", "nothing answers"),
-]
-ANSWERING_MODULES = [
     ("stays connected", lambda: PtyModule(gone), "fault", "went away"),
     ("no echo", lambda: PtyModule(silent, echoes=True), "fault", "sends back"),
     ("is a module", lambda: PtyModule(stock(pong=0x12345678)), "fault", "0x12345678"),
@@ -117,32 +115,28 @@ ANSWERING_MODULES = [
     ("radar runs", lambda: PtyModule(stock(mode=IDLE)), "note", "mode IDLE"),
     ("transmitter on", lambda: PtyModule(stock(mode=MANUAL, tx_power=0)), "fault", "off"),
 ]
-
-
-Make = Callable[[], PtyModule]
+SILENT = {"not in the bootloader", "speaks XeThru", "listens", "answers"}
 
 
 @pytest.mark.parametrize(
-    ("check", "make", "level", "word"), ANSWERING_MODULES, ids=[row[0] for row in ANSWERING_MODULES]
+    ("check", "make", "level", "word"), MODULES, ids=[row[0] for row in MODULES]
 )
 def test_what_is_wrong_with_a_module(
-    check: str, make: Make, level: str, word: str, capsys: Capture
+    check: str,
+    make: Callable[[], PtyModule],
+    level: str,
+    word: str,
+    *,
+    capsys: Capture,
+    request: pytest.FixtureRequest,
 ) -> None:
+    if check in SILENT:
+        request.getfixturevalue("hurried")
     with make() as module:
         code, finding = only_finding(capsys, module.path)
     assert (finding["check"], finding["level"]) == (check, level)
     assert code == (1 if level == "fault" else 0)
     assert word in finding["found"]
-
-
-@pytest.mark.usefixtures("hurried")
-@pytest.mark.parametrize(
-    ("check", "make", "level", "word"), SILENT_MODULES, ids=[row[0] for row in SILENT_MODULES]
-)
-def test_what_is_wrong_with_a_module_that_does_not_answer(
-    check: str, make: Make, level: str, word: str, capsys: Capture
-) -> None:
-    test_what_is_wrong_with_a_module(check, make, level, word, capsys)
 
 
 @pytest.mark.parametrize("version", ["1.6.8", "1.6.10", "1.10.0", "2.0.0", "new"])
@@ -260,12 +254,11 @@ def test_a_port_that_another_program_has_open_is_left_alone(
 
 @needs_proc
 def test_two_programs_that_split_the_stream(capsys: Capture) -> None:
-    with ExitStack() as stack:
-        module = stack.enter_context(PtyModule(stock()))
-        pids = [stack.enter_context(reader(module.path)) for _ in range(2)]
+    with PtyModule(stock()) as module, reader(module.path) as pid, reader(module.path) as other:
         code, finding = only_finding(capsys, module.path)
     assert (code, finding["check"]) == (1, "no two readers")
-    assert all(f"pid {pid}" in finding["found"] for pid in pids)
+    assert f"pid {pid}" in finding["found"]
+    assert f"pid {other}" in finding["found"]
     assert module.received == []
 
 
@@ -367,5 +360,4 @@ def test_every_row_about_a_port_has_a_test() -> None:
         "can be opened",
         "usual baud rate",
     }
-    modules = {row[0] for row in SILENT_MODULES + ANSWERING_MODULES}
-    assert modules | elsewhere == {row.name for row in PORT_CHECKS}
+    assert {row[0] for row in MODULES} | elsewhere == {row.name for row in PORT_CHECKS}

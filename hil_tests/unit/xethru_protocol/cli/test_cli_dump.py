@@ -4,14 +4,13 @@ import json
 import os
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from hil_tests.paths import FIXTURES
 from hil_tests.unit.emulator.test_playback_control import samples, write_session
-from hil_tests.unit.xethru_protocol.recordings.messages import write_capture
+from hil_tests.unit.xethru_protocol.recordings.messages import dumped, write_capture
 from hil_tests.unit.xethru_protocol.scripted import framed
 from xethru_protocol.cli import main
 from xethru_protocol.recordings import RecordingError, convert, read_recording
@@ -21,13 +20,6 @@ Capture = pytest.CaptureFixture[str]
 RECORDINGS = FIXTURES / "recordings"
 IQ = RECORDINGS / "iq"
 IQ_FILE = "xethru_baseband_iq_20261121_003557.dat"
-
-
-def dumped(capsys: Capture, path: Path) -> list[dict[str, Any]]:
-    assert main(["dump", str(path), "--json"]) == 0
-    printed, errors = capsys.readouterr()
-    assert errors == ""
-    return [json.loads(line) for line in printed.splitlines()]
 
 
 def test_arrays_are_cut_unless_asked_for(capsys: Capture) -> None:
@@ -212,17 +204,9 @@ def snapshot(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-NAMES = ("left", "middle", "right")
-
-
-@pytest.fixture
-def session(tmp_path: Path) -> Path:
-    path = tmp_path / "session.mcap"
-    write_session(path, {name: 10**9 for name in NAMES}, n_frames=3)
-    return path
-
-
-def test_one_radar_of_a_session_is_dumped_and_converted(session: Path, capsys: Capture) -> None:
+def test_one_radar_of_a_session_is_dumped_and_converted(tmp_path: Path, capsys: Capture) -> None:
+    session = tmp_path / "session.mcap"
+    write_session(session, {name: 10**9 for name in ("left", "middle", "right")}, n_frames=3)
     expected = [samples(1, counter).tolist() for counter in range(3)]
     assert main(["dump", str(session), "--radar", "middle", "--json"]) == 0
     told = [json.loads(line)["fields"] for line in capsys.readouterr().out.splitlines()]

@@ -43,6 +43,7 @@ def shell(command: str) -> subprocess.CompletedProcess[str]:
         ),
         (">/dev/full 2>/dev/full", 1, "", ""),
         ("| head -1", 0, ACK, ""),
+        ("-", 0, 2 * ACK, ""),  # a dash is standard input
     ],
 )
 def test_output_that_takes_nothing(redirection: str, code: int, out: str, err: str) -> None:
@@ -72,11 +73,6 @@ def test_input_that_is_closed() -> None:
         *(1, ""),
         "xethru decode: standard input is closed; there is nothing to decode\n",
     )
-
-
-def test_a_dash_is_standard_input() -> None:
-    result = shell(f"{DECODE} -")
-    assert (result.returncode, result.stdout, result.stderr) == (0, 2 * ACK, "")
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")

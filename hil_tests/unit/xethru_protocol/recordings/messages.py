@@ -1,10 +1,14 @@
 """Small messages, and recordings read with their faults."""
 
+import json
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 
+from xethru_protocol.cli import main
 from xethru_protocol.recordings import RecordingFault, WireCapture, read_recording
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.connection import Connection, Role
@@ -24,6 +28,18 @@ def write_capture(path: Path, timed: Iterable[tuple[m.Response, int | None]]) ->
     with WireCapture(path) as capture:
         for message, t_ns in timed:
             capture.write("rx", module.send(message), t_ns)
+
+
+def xethru(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+    """Return what a command prints, which must succeed and warn of nothing."""
+    assert main([str(argument) for argument in arguments]) == 0
+    printed, errors = capsys.readouterr()
+    assert errors == ""
+    return printed
+
+
+def dumped(capsys: pytest.CaptureFixture[str], path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in xethru(capsys, "dump", path, "--json").splitlines()]
 
 
 def read_with_faults(

@@ -148,20 +148,6 @@ def test_vendor_recordings_survive_every_way_around(name: str, tmp_path: Path) -
     assert recording_format(previous) == "mcap"
 
 
-@pytest.mark.parametrize("target", ["a.mcap", "b.npz", "c.xtwire"])
-def test_nanoseconds_and_answers_survive_where_there_is_room(
-    capture: Path, tmp_path: Path, target: str
-) -> None:
-    expected = list(read_recording(capture))
-    convert(capture, tmp_path / target)
-    assert list(read_recording(tmp_path / target)) == expected
-    assert describe_recording(tmp_path / target).messages == {
-        "PONG": 1,
-        "DATA FLOAT": 1,
-        "BASEBAND_IQ": 1,
-    }
-
-
 def test_what_the_vendors_format_has_no_room_for_is_counted(capture: Path, tmp_path: Path) -> None:
     done = convert(capture, tmp_path / "vendor")
     assert (done.messages, done.skipped) == (2, {"PONG": 1})
