@@ -7,12 +7,7 @@ Results go to stdout, everything else to stderr. Exit 0 done, 1 failed, 2 wrong 
 from collections.abc import Sequence
 from importlib import import_module
 
-from xethru_protocol.system import (
-    StopFlag,
-    StopRequestedError,
-    flush_streams,
-    open_closed_streams,
-)
+from xethru_protocol.system import StopFlag, StopRequestedError, flush_streams, open_closed_streams
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -135,8 +135,6 @@ def _as_json(frame: Frame, with_samples: bool) -> dict[str, Any]:
 
 
 class _Live:
-    """One line that is rewritten."""
-
     def __init__(self, radar: X4M300) -> None:
         self._radar = radar
         self._shown_ns = 0

@@ -225,7 +225,7 @@ class Contact:
 
 
 class PortProbe:
-    """Facts about one port."""
+    """Facts about one port: above `refusal`, which opens it, those that leave it closed."""
 
     def __init__(self, path: str) -> None:
         self.path = path
@@ -234,8 +234,6 @@ class PortProbe:
     def close(self) -> None:
         if self._transport is not None:
             self._transport.close()
-
-    # --- without opening it ---------------------------------------------------------------------
 
     @property
     def target(self) -> str:
@@ -272,8 +270,6 @@ class PortProbe:
     @cached_property
     def users(self) -> tuple[str, ...]:
         return port_users(self.path)
-
-    # --- having opened it -----------------------------------------------------------------------
 
     @cached_property
     def refusal(self) -> str | None:

@@ -358,11 +358,7 @@ def record(arguments: Namespace) -> int:
 
 
 def _record_from(
-    radar: X4M300,
-    recorder: Recorder,
-    mode: Listen,
-    duration_s: float | None,
-    stop: StopFlag,
+    radar: X4M300, recorder: Recorder, mode: Listen, duration_s: float | None, stop: StopFlag
 ) -> None:
     progress = Progress("xethru record")
     recorder.listen_to(radar)

@@ -38,6 +38,7 @@ import numpy.typing as npt
 from numpy.lib.format import read_array_header_1_0, read_magic, write_array, write_array_header_1_0
 
 from xethru_protocol.recordings.records import (
+    NO_TIME_NS,
     RecordingError,
     RecordingFacts,
     Timed,
@@ -51,8 +52,6 @@ from xethru_protocol.wire.table import Response
 
 FORMAT = "xethru-hil recording 1"
 SUFFIX = ".npz"
-NO_TIME = np.iinfo(np.int64).min
-"""Stands for an unknown time."""
 
 _Archive = Any  # what numpy.load gives
 _AT_ONCE = 1 << 20  # bytes copied together
@@ -167,7 +166,7 @@ def write_npz(path: Path, messages: Iterable[Timed], facts: RecordingFacts) -> N
                 group = bulk[kind.data_type]
             group.add(message)
             group.index.append(index)
-            group.t_ns.append(NO_TIME if t_ns is None else t_ns)
+            group.t_ns.append(NO_TIME_NS if t_ns is None else t_ns)
         cleanup.callback(partial.unlink, missing_ok=True)
         with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
             _add(archive, "format", np.array(FORMAT))
@@ -200,7 +199,7 @@ def read_npz(path: Path) -> TimedMessages:
             if f"{_group(kind)}_index" in archive
         ]
         for _, t_ns, payload in heapq.merge(*found, key=itemgetter(0)):
-            yield decode_response(payload), None if t_ns == NO_TIME else t_ns
+            yield decode_response(payload), None if t_ns == NO_TIME_NS else t_ns
 
 
 def npz_facts(path: Path) -> RecordingFacts:

@@ -106,6 +106,7 @@ class GrowingFile:
 
 
 MS_NS = 1_000_000
+NO_TIME_NS = -(2**63)  # stands for an unknown time
 LATEST_MS = 2**63 // MS_NS - 2**32
 """Latest time at which a recording may begin [ms since 1970]: each of its times [ns], at most
 2**32 ms later, fits 64 bits."""

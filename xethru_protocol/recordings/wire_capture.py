@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
 from xethru_protocol.recordings.records import (
+    NO_TIME_NS,
     FaultHandler,
     GrowingFile,
     RecordingError,
@@ -51,7 +52,6 @@ _HEAD = struct.Struct("<8sII")
 _CHUNK = struct.Struct("<BqI")
 _MARKS: dict[Way, int] = {"rx": ord("<"), "tx": ord(">")}
 _WAYS: dict[int, Way] = {mark: way for way, mark in _MARKS.items()}
-_NO_TIME = -(2**63)
 _LARGEST_PIECE = 1 << 20  # bytes: what a reader holds does not depend on what a chunk claims
 
 
@@ -85,7 +85,7 @@ class WireCapture(GrowingFile):
             return
         if self.closed:
             raise RecordingError(f"{self.path}: the capture is closed")
-        stamp_ns = _NO_TIME if t_ns is None else t_ns
+        stamp_ns = NO_TIME_NS if t_ns is None else t_ns
         self.append(_CHUNK.pack(_MARKS[direction], stamp_ns, len(data)) + data)
 
 
@@ -114,7 +114,7 @@ def read_chunks(path: Path | str, on_fault: FaultHandler | None = None) -> Itera
             if way is None:
                 report_at(begin, f"no chunk begins with byte {mark:02X}")
                 return
-            t_ns = None if stamp_ns == _NO_TIME else stamp_ns
+            t_ns = None if stamp_ns == NO_TIME_NS else stamp_ns
             there = min(length, size - stream.tell())
             left = there
             while left and (data := stream.read(min(left, _LARGEST_PIECE))):

@@ -142,11 +142,11 @@ class _DataFile:
     def disagree(self, offset: int, reason: str) -> None:
         """Report that the index and the file differ; the file's times are unknown from here on."""
         self.times_hold = False
-        fault = RecordingFault(file=self.path.name, offset=offset, reason=reason, minor=True)
-        report(fault, self._on_fault)
+        self.report(reason, offset, minor=True)
 
-    def report(self, reason: str) -> None:
-        fault = RecordingFault(file=self.path.name, offset=self.position, reason=reason)
+    def report(self, reason: str, offset: int | None = None, *, minor: bool = False) -> None:
+        at = self.position if offset is None else offset
+        fault = RecordingFault(file=self.path.name, offset=at, reason=reason, minor=minor)
         report(fault, self._on_fault)
 
 

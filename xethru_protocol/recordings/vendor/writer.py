@@ -62,7 +62,7 @@ class _DataFile(GrowingFile):
 
 
 class RecordingWriter:
-    """Writes one recording directory.
+    """Writes one recording directory; RecordingError if it cannot be made or holds a recording.
 
     Parameters
     ----------
@@ -80,11 +80,6 @@ class RecordingWriter:
         When to begin a new data file; None: never.
     timezone
         Of the stamps in file names and text files; None: this machine's.
-
-    Raises
-    ------
-    RecordingError
-        If the directory cannot be made or holds a recording.
 
     Examples
     --------

@@ -1,6 +1,5 @@
 """``xethru decode`` on the golden vectors and on bad input."""
 
-import io
 import json
 import subprocess
 import sys
@@ -111,16 +110,6 @@ def test_lines_are_streams_of_their_own(capsys: pytest.CaptureFixture[str], tmp_
         "packet cut off by the end of the data",
         "PING",
     ]
-
-
-def test_bytes_from_standard_input(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stdin = io.TextIOWrapper(io.BytesIO(b"\x00" + ACK + ACK))
-    monkeypatch.setattr(sys, "stdin", stdin)
-    assert main(["decode"]) == 0
-    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [line.get("message") for line in lines] == [None, "ACK", "ACK"]
 
 
 def test_not_a_number_is_still_json(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
