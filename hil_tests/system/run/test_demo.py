@@ -47,7 +47,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     return Finished(scene=scene, out=out, process=process)
 
 
-def test_stdout_is_one_table_of_simulated_numbers(demo: Finished) -> None:
+def test_stdout_is_one_table_of_simulated_numbers_and_stderr_is_progress(demo: Finished) -> None:
     lines = demo.process.stdout.splitlines()
     assert lines[0] == f"short, preset robust, seed {SEED}: simulated numbers"
     assert [line.split("  ")[0] for line in lines[2:-1]] == [
@@ -59,12 +59,9 @@ def test_stdout_is_one_table_of_simulated_numbers(demo: Finished) -> None:
         "speed",
     ]
     assert "0 lost" in lines[-2]
-
-
-def test_progress_is_on_stderr_and_nothing_else(demo: Finished) -> None:
-    lines = demo.process.stderr.splitlines()
-    assert lines
-    assert all(line.startswith("scene time") for line in lines)
+    progress = demo.process.stderr.splitlines()
+    assert progress
+    assert all(line.startswith("scene time") for line in progress)
 
 
 def test_exactly_the_promised_files(demo: Finished) -> None:

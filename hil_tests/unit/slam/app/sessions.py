@@ -1,11 +1,14 @@
 """A made-up session for the tests of logs and viewers: known frames, poses and landmarks."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
+import pytest
 from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader
 
+from slam.app.cli import main
 from slam.app.odometry.track import OdometryTrack, format_tum_line
 from slam.app.records import LogLine, RadarInfo, Scan, SessionInfo, SessionObserver, Snapshot
 from slam.app.session.log import SessionLog
@@ -101,6 +104,27 @@ def write_session(
     feed(log, n_scans)
     log.close()
     return path
+
+
+def write_scans(
+    path: Path,
+    scans: Iterable[Scan],
+    track: OdometryTrack | None = None,
+    info: SessionInfo | None = None,
+) -> Path:
+    """Write a session of nothing but scans, and the odometry that they need."""
+    log = SessionLog(path, info or session_info(), track)
+    for one in scans:
+        log.on_scan(one)
+    log.close()
+    return path
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    """Run a command of `uwb-slam`; return its exit code, stdout and stderr."""
+    code = main([str(argument) for argument in arguments])
+    said = capsys.readouterr()
+    return code, said.out, said.err
 
 
 def surviving_counters(path: Path, topic: str) -> list[int]:

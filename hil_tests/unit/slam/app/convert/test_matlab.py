@@ -12,13 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.io import loadmat, savemat
 
-from hil_tests.unit.slam.app.sessions import scan, session_info
+from hil_tests.unit.slam.app.sessions import run, scan, session_info, write_scans
 from slam.app.cli import main
 from slam.app.convert.matlab import MAT_RIG, MatDrive, read_mat, write_mat
 from slam.app.errors import AppError
 from slam.app.odometry.track import OdometryTrack, format_tum_line
 from slam.app.records import SessionInfo
-from slam.app.session.log import SessionLog
 from slam.app.session.messages import settings_text
 from slam.app.session.reader import open_session
 from slam.config import SlamConfig, load_preset
@@ -26,12 +25,6 @@ from slam.frames import Detection
 from slam.paper.trilateration import Trilaterator
 
 N_STATES = 6
-
-
-def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    code = main(["convert", *map(str, arguments)])
-    said = capsys.readouterr()
-    return code, said.out, said.err
 
 
 def authors_table() -> dict[str, Any]:
@@ -70,7 +63,7 @@ def test_a_session_gets_the_ranges_that_the_fixes_are_made_of(
     authors_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "s.mcap"
-    code, said, err = run(capsys, authors_file, out, "--rate", 10)
+    code, said, err = run(capsys, "convert", authors_file, out, "--rate", 10)
     assert (code, err) == (0, "")
     assert "6 states with 3 fixes, made of 6 ranges" in said
     assert "no stamps, 10 states/s are assumed" in said
@@ -101,7 +94,7 @@ def test_a_session_gets_the_ranges_that_the_fixes_are_made_of(
 def test_it_is_replayed(
     authors_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run(capsys, authors_file, tmp_path / "s.mcap")
+    run(capsys, "convert", authors_file, tmp_path / "s.mcap")
     assert main(["replay", str(tmp_path / "s.mcap"), "--out", str(tmp_path / "out")]) == 0
     assert "Traceback" not in capsys.readouterr().err
 
@@ -177,13 +170,11 @@ def test_a_session_as_such_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[
         format_tum_line(scan(k).t_ns, np.array([x_m, 0.0, turn]))
         for k, (x_m, turn) in enumerate(steps)
     ]
-    session = tmp_path / "s.mcap"
-    log = SessionLog(session, four_radars(), OdometryTrack.from_lines(lines))
-    for counter in range(6):
-        one = scan(counter, 4)
-        log.on_scan(replace(one, frames=one.frames[1:]) if counter == 4 else one)
-    log.close()
-    code, said, err = run(capsys, session, tmp_path / "a.mat", "--preset", "paper")
+    scans = [scan(counter, 4) for counter in range(6)]
+    scans[4] = replace(scans[4], frames=scans[4].frames[1:])
+    track = OdometryTrack.from_lines(lines)
+    session = write_scans(tmp_path / "s.mcap", scans, track, four_radars())
+    code, said, err = run(capsys, "convert", session, tmp_path / "a.mat", "--preset", "paper")
     assert (code, err) == (0, "")
     assert said == f"{tmp_path / 'a.mat'}: 4 states with 0 fixes\n"
     drive = read_mat(tmp_path / "a.mat")
@@ -213,10 +204,8 @@ def test_a_removed_setting_of_a_session_is_read_at_its_default_only(
     stored["robust"]["calibrated_offset_sigma_m"] = sigma_m
     info = replace(four_radars(), config_json=json.dumps(stored), wheels={"scale_sigma": 0.1})
     track = OdometryTrack.from_lines([format_tum_line(scan(0).t_ns, np.zeros(3))])
-    log = SessionLog(tmp_path / "s.mcap", info, track)
-    log.on_scan(scan(0, 4))
-    log.close()
-    ended, _, err = run(capsys, tmp_path / "s.mcap", tmp_path / "a.mat")
+    write_scans(tmp_path / "s.mcap", [scan(0, 4)], track, info)
+    ended, _, err = run(capsys, "convert", tmp_path / "s.mcap", tmp_path / "a.mat")
     assert ended == code
     assert err.count("\n") == code
 
@@ -230,12 +219,10 @@ def test_a_file_that_was_begun_is_removed(
 
     monkeypatch.setattr("slam.app.convert.matlab.savemat", full)
     lines = [format_tum_line(scan(k).t_ns, np.zeros(3)) for k in range(2)]
-    log = SessionLog(tmp_path / "s.mcap", four_radars(), OdometryTrack.from_lines(lines))
-    for counter in range(2):
-        log.on_scan(scan(counter, 4))
-    log.close()
+    track = OdometryTrack.from_lines(lines)
+    write_scans(tmp_path / "s.mcap", [scan(0, 4), scan(1, 4)], track, four_radars())
     out = tmp_path / "a.mat"
-    code, _, err = run(capsys, tmp_path / "s.mcap", out, "--preset", "paper")
+    code, _, err = run(capsys, "convert", tmp_path / "s.mcap", out, "--preset", "paper")
     assert code == 1
     assert "No space left on device" in err
     assert not out.exists()
@@ -248,6 +235,6 @@ def test_a_cut_file_is_one_line(
     content = authors_file.read_bytes()
     for share in (0.0, 0.1, 0.5, 0.9):
         path.write_bytes(content[: round(share * len(content))])
-        code, said, err = run(capsys, path, out)
+        code, said, err = run(capsys, "convert", path, out)
         assert (code, said, err.count("\n")) == (1, "", 1)
         assert not out.exists()

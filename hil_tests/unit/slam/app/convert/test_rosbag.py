@@ -19,22 +19,22 @@ from hil_tests.unit.slam.app.convert.authors_bag import (
     jittered_ns,
     samples,
 )
-from hil_tests.unit.slam.app.sessions import FRAME_NS, feed, scan, session_info, snapshot
-from slam.app.cli import main
+from hil_tests.unit.slam.app.sessions import (
+    FRAME_NS,
+    feed,
+    run,
+    scan,
+    session_info,
+    snapshot,
+    write_scans,
+)
 from slam.app.convert.rosbag import AUTHORS_RIG, convert_bag, write_bag
 from slam.app.odometry.track import OdometryTrack, format_tum_line
-from slam.app.records import Scan
 from slam.app.session.log import SessionLog
 from slam.app.session.reader import RecordedSession, open_session
 from xethru_protocol.system import StopFlag, StopRequestedError
 
 KINDS = ("bag.bag", "bag")
-
-
-def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    code = main(["convert", *map(str, arguments)])
-    said = capsys.readouterr()
-    return code, said.out, said.err
 
 
 def facts(session: RecordedSession) -> list[tuple[object, ...]]:
@@ -69,10 +69,10 @@ def test_a_session_comes_back_from_a_bag(
     kind: str, recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bag, again = tmp_path / kind, tmp_path / "again.mcap"
-    code, out, err = run(capsys, recorded, bag)
+    code, out, err = run(capsys, "convert", recorded, bag)
     assert (code, err) == (0, "")
     assert f"{2 * N_SCANS} frames" in out
-    assert run(capsys, bag, again)[::2] == (0, "")
+    assert run(capsys, "convert", bag, again)[::2] == (0, "")
     first, second = open_session(recorded), open_session(again)
     assert facts(second) == facts(first)
     assert second.odometry().samples == first.odometry().samples
@@ -91,7 +91,7 @@ def test_a_session_comes_back_from_a_bag(
 def test_the_bag_has_the_topics_and_types_of_the_data_set(
     kind: str, recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run(capsys, recorded, tmp_path / kind)
+    run(capsys, "convert", recorded, tmp_path / kind)
     with AnyReader([tmp_path / kind]) as reader:
         types = {c.topic: (c.msgtype, c.msgcount) for c in reader.connections}
         connection = next(c for c in reader.connections if c.topic == "/UWBradar2/readings")
@@ -111,7 +111,7 @@ def test_the_authors_layout_becomes_a_session(
     kind: str, topics: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bag = authors_bag(tmp_path / kind, topics=topics)
-    code, out, err = run(capsys, bag, tmp_path / "s.mcap")
+    code, out, err = run(capsys, "convert", bag, tmp_path / "s.mcap")
     assert (code, err) == (0, "")
     assert f"{4 * N_SCANS} frames of 4 radars in {N_SCANS} scans" in out
     session = open_session(tmp_path / "s.mcap")
@@ -143,7 +143,7 @@ def test_the_authors_layout_becomes_a_session(
 
 def problem(capsys: pytest.CaptureFixture[str], bag: Path, *options: object, code: int = 1) -> str:
     out = bag.parent / "s.mcap"
-    found, said, err = run(capsys, bag, out, *options)
+    found, said, err = run(capsys, "convert", bag, out, *options)
     assert (found, said) == (code, "")
     assert len(err.splitlines()) == 1
     assert not out.exists()
@@ -152,7 +152,7 @@ def problem(capsys: pytest.CaptureFixture[str], bag: Path, *options: object, cod
 
 def test_another_frame_area(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     short = authors_bag(tmp_path / "short.bag", n_bins=500)
-    assert run(capsys, short, tmp_path / "s.mcap", "--frame-area", 0.2, 3.41)[0] == 0
+    assert run(capsys, "convert", short, tmp_path / "s.mcap", "--frame-area", 0.2, 3.41)[0] == 0
     (radar, *_) = open_session(tmp_path / "s.mcap").info.radars
     assert (radar.n_bins, round(radar.range_start_m, 2)) == (500, 0.2)
     for area_m in ((9.4, 0.2), ("nan", 9.4)):
@@ -165,7 +165,7 @@ def test_what_is_odd_is_said_and_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bag = authors_bag(tmp_path / "odd.bag", jump_back=True, truth=False)
-    code, _, err = run(capsys, bag, tmp_path / "s.mcap")
+    code, _, err = run(capsys, "convert", bag, tmp_path / "s.mcap")
     assert code == 0
     assert err.splitlines() == [
         f"uwb-slam: {bag}: poses that went back in time and are left out: 1",
@@ -179,12 +179,9 @@ def test_scans_that_odometry_does_not_reach_are_not_used(
 ) -> None:
     poses = [format_tum_line(k * FRAME_NS + 5, np.zeros(3)) for k in range(1, 5)]
     short = tmp_path / "short.mcap"
-    log = SessionLog(short, session_info(), OdometryTrack.from_lines(poses))
-    for counter in range(8):
-        log.on_scan(scan(counter))
-    log.close()
-    run(capsys, short, tmp_path / "bag")
-    code, _, err = run(capsys, tmp_path / "bag", tmp_path / "again.mcap")
+    write_scans(short, map(scan, range(8)), OdometryTrack.from_lines(poses))
+    run(capsys, "convert", short, tmp_path / "bag")
+    code, _, err = run(capsys, "convert", tmp_path / "bag", tmp_path / "again.mcap")
     assert code == 0
     assert "5 scans lie outside the odometry" in err
     used = [one.used for one, _ in open_session(tmp_path / "again.mcap").scans()]
@@ -254,7 +251,7 @@ def test_a_disk_that_fills_up_is_one_line_and_leaves_nothing(
 
     monkeypatch.setattr("slam.app.convert.rosbag._fill", full)
     for out in (tmp_path / kind for kind in KINDS):
-        code, said, err = run(capsys, recorded, out)
+        code, said, err = run(capsys, "convert", recorded, out)
         assert (code, said) == (1, "")
         (line,) = err.splitlines()
         assert line.startswith(f"uwb-slam: {out}: cannot be written: ")
@@ -266,14 +263,11 @@ def test_frames_of_one_period_are_one_scan_even_if_one_is_lost(
 ) -> None:
     path = tmp_path / "s.mcap"
     poses = [format_tum_line(k * FRAME_NS, np.zeros(3)) for k in range(12)]
-    log = SessionLog(path, session_info(), OdometryTrack.from_lines(poses))
-    for counter in range(8):
-        one = scan(counter)
-        frames = one.frames[1:] if counter == 3 else one.frames
-        log.on_scan(Scan(counter=counter, t_ns=one.t_ns, frames=frames))
-    log.close()
-    run(capsys, path, tmp_path / "bag")
-    run(capsys, tmp_path / "bag", tmp_path / "again.mcap")
+    scans = [scan(counter) for counter in range(8)]
+    scans[3] = replace(scans[3], frames=scans[3].frames[1:])
+    write_scans(path, scans, OdometryTrack.from_lines(poses))
+    run(capsys, "convert", path, tmp_path / "bag")
+    run(capsys, "convert", tmp_path / "bag", tmp_path / "again.mcap")
     taken = [one for one, _ in open_session(tmp_path / "again.mcap").scans()]
     assert [[f.radar for f in one.frames] for one in taken] == [
         [1] if counter == 3 else [0, 1] for counter in range(8)

@@ -172,6 +172,12 @@ def odometry_until(end_s: float) -> LiveOdometry:
     return odometry
 
 
+def begun(n_radars: int, odometry: LiveOdometry | None = None) -> TickAssembler:
+    assembler = TickAssembler(n_radars, PERIOD_NS, odometry or odometry_until(12.0))
+    assembler.begin(START_NS)
+    return assembler
+
+
 def scans_until(assembler: TickAssembler, now_ns: int) -> list[Scan]:
     scans = []
     while (scan := assembler.next_scan(now_ns)) is not None:
@@ -203,8 +209,7 @@ def streams(draw: st.DrawFn) -> list[list[int]]:
 def test_every_frame_is_in_one_scan_and_scans_are_in_order(
     stamps: list[list[int]], latency_ns: int
 ) -> None:
-    assembler = TickAssembler(len(stamps), PERIOD_NS, odometry_until(12.0))
-    assembler.begin(START_NS)
+    assembler = begun(len(stamps))
     arrivals = sorted(
         (t_ns + latency_ns, radar, t_ns) for radar, row in enumerate(stamps) for t_ns in row
     )
@@ -228,8 +233,7 @@ def test_every_frame_is_in_one_scan_and_scans_are_in_order(
 
 
 def test_a_tick_waits_for_a_radar_as_long_as_it_may_come_and_no_longer() -> None:
-    assembler = TickAssembler(2, PERIOD_NS, odometry_until(12.0))
-    assembler.begin(START_NS)
+    assembler = begun(2)
     take_frame(assembler, 0, START_NS + 1)
     end_ns = START_NS + PERIOD_NS
     assert assembler.next_scan(end_ns + GRACE_NS - 1) is None
@@ -239,8 +243,7 @@ def test_a_tick_waits_for_a_radar_as_long_as_it_may_come_and_no_longer() -> None
 
 
 def test_a_lost_radar_is_not_waited_for_until_it_is_back() -> None:
-    assembler = TickAssembler(2, PERIOD_NS, odometry_until(12.0))
-    assembler.begin(START_NS)
+    assembler = begun(2)
     assembler.alive.discard(1)
     for tick in range(3):
         take_frame(assembler, 0, START_NS + tick * PERIOD_NS + 1)
@@ -251,8 +254,7 @@ def test_a_lost_radar_is_not_waited_for_until_it_is_back() -> None:
 
 
 def test_of_too_many_frames_the_oldest_are_recorded_and_not_used() -> None:
-    assembler = TickAssembler(1, PERIOD_NS, odometry_until(12.0))
-    assembler.begin(START_NS)
+    assembler = begun(1)
     for number in range(12):  # twice as many as ticks
         take_frame(assembler, 0, START_NS + number * PERIOD_NS // 2, counter=number)
     scans = scans_until(assembler, START_NS + 6 * PERIOD_NS)
@@ -266,8 +268,7 @@ def test_of_too_many_frames_the_oldest_are_recorded_and_not_used() -> None:
 
 def test_slam_that_is_too_late_uses_nothing_until_it_has_caught_up() -> None:
     """Late from more than 10 s on; in time again from 1 s on."""
-    assembler = TickAssembler(1, PERIOD_NS, odometry_until(20.0))
-    assembler.begin(START_NS)
+    assembler = begun(1, odometry_until(20.0))
     rows = []
     for tick, lag_s in enumerate((10.0, 10.1, 5.0, 1.1, 1.0, 10.0)):
         take_frame(assembler, 0, START_NS + tick * PERIOD_NS)
@@ -293,8 +294,7 @@ def test_slam_that_is_too_late_uses_nothing_until_it_has_caught_up() -> None:
 def test_a_frame_is_too_late_for_a_tick_by_a_period_or_a_quarter_where_a_newer_one_is_there(
     ages_ns: tuple[int, ...], left_out: int
 ) -> None:
-    assembler = TickAssembler(1, PERIOD_NS, odometry_until(12.0))
-    assembler.begin(START_NS)
+    assembler = begun(1)
     begin_ns = START_NS + 2 * PERIOD_NS
     assert assembler.next_scan(begin_ns + GRACE_NS) is None  # two empty ticks are over
     for age_ns in ages_ns:
@@ -305,8 +305,7 @@ def test_a_frame_is_too_late_for_a_tick_by_a_period_or_a_quarter_where_a_newer_o
 
 
 def test_a_burst_after_a_stall_is_recorded_and_the_run_is_not_held_up() -> None:
-    assembler = TickAssembler(2, PERIOD_NS, odometry_until(12.0))
-    assembler.begin(START_NS)
+    assembler = begun(2)
     scans: list[Scan] = []
     for tick in range(20):
         now_ns = START_NS + (tick + 1) * PERIOD_NS
@@ -326,8 +325,7 @@ def test_a_burst_after_a_stall_is_recorded_and_the_run_is_not_held_up() -> None:
 
 def test_where_odometry_is_missing_frames_come_without_being_used() -> None:
     odometry = odometry_until(4.0)
-    assembler = TickAssembler(1, PERIOD_NS, odometry)
-    assembler.begin(START_NS)
+    assembler = begun(1, odometry)
     for number in range(15):
         take_frame(assembler, 0, START_NS + number * PERIOD_NS + 1)
     scans = scans_until(assembler, START_NS + 3 * NS_PER_S)
@@ -339,8 +337,7 @@ def test_where_odometry_is_missing_frames_come_without_being_used() -> None:
 def test_it_ends_where_odometry_ended() -> None:
     odometry = odometry_until(4.0)
     odometry.end("")
-    assembler = TickAssembler(1, PERIOD_NS, odometry)
-    assembler.begin(START_NS)
+    assembler = begun(1, odometry)
     for number in range(15):
         take_frame(assembler, 0, START_NS + number * PERIOD_NS + 1)
     assert len(scans_until(assembler, START_NS + 3 * NS_PER_S)) == 6  # the last one unused
@@ -350,8 +347,7 @@ def test_it_ends_where_odometry_ended() -> None:
 def test_a_clock_set_from_1970_costs_no_time() -> None:
     """Five billion ticks without a frame are passed over at once, and the next frame is found."""
     odometry = odometry_until(4.0)
-    assembler = TickAssembler(1, PERIOD_NS, odometry)
-    assembler.begin(START_NS)
+    assembler = begun(1, odometry)
     today_ns = 1_700_000_000 * NS_PER_S
     odometry.take(f"{today_ns // NS_PER_S} 0 0 0 0 0 0 1", 0)
     assert scans_until(assembler, today_ns) == []

@@ -19,7 +19,6 @@ from emulator.module.memory import Identity
 from emulator.ports.sockets import stamp_ns
 from emulator.scene.scene import Scene
 from emulator.scene.wheels import scene_odometry
-from slam.app.odometry.track import TumSample
 from slam.app.records import RadarInfo
 from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG, rig_of
 from slam.app.rig.sources import RadarLink, RigSource
@@ -67,10 +66,6 @@ class Words(LiveLog):
     def __init__(self) -> None:
         super().__init__()
         self.said: list[tuple[str, str]] = []
-        self.samples: list[TumSample] = []
-
-    def on_odometry(self, sample: TumSample) -> None:
-        self.samples.append(sample)
 
     def log(self, subject: str, text: str, *, warning: bool) -> None:
         self.said.append((subject, text))

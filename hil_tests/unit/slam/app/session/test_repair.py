@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.unit.slam.app.sessions import write_session
-from slam.app.cli import main
+from hil_tests.unit.slam.app.sessions import run, write_session
 from slam.app.session.reader import open_session
 from slam.app.session.repair import repair
 from xethru_protocol.system import StopFlag, StopRequestedError, locked
@@ -20,23 +19,17 @@ def cut(tmp_path: Path) -> Path:
     return path
 
 
-def run(capsys: pytest.CaptureFixture[str], *arguments: Path | str) -> tuple[int, str, str]:
-    code = main(["repair", *map(str, arguments)])
-    said = capsys.readouterr()
-    return code, said.out, said.err
-
-
 def test_it_says_what_is_kept_and_where_the_old_file_is(
     cut: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     size = cut.stat().st_size
-    code, out, err = run(capsys, cut)
+    code, out, err = run(capsys, "repair", cut)
     assert (code, err) == (0, "")
     n_scans = sum(1 for _ in open_session(cut).scans())
     assert f"{(n_scans - 1) * 0.199261498:.1f} s" in out
     assert f"{cut}.unrepaired" in out
     assert Path(f"{cut}.unrepaired").stat().st_size == size
-    assert run(capsys, cut)[0] == 0
+    assert run(capsys, "repair", cut)[0] == 0
 
 
 def test_it_never_overwrites_what_it_did_not_write(
@@ -45,8 +38,8 @@ def test_it_never_overwrites_what_it_did_not_write(
     before = cut.read_bytes()
     kept = Path(f"{cut}.unrepaired")
     kept.write_text("precious")
-    assert run(capsys, cut)[:2] == (1, "")
-    assert run(capsys, cut, "--out", kept)[0] == 1
+    assert run(capsys, "repair", cut)[:2] == (1, "")
+    assert run(capsys, "repair", cut, "--out", kept)[0] == 1
     assert (cut.read_bytes(), kept.read_text()) == (before, "precious")
     assert sorted(tmp_path.iterdir()) == [cut, kept]
 
@@ -56,7 +49,7 @@ def test_a_folder_in_which_a_run_is_recording_is_left_alone(
 ) -> None:
     before = cut.read_bytes()
     with locked(tmp_path):
-        code, out, err = run(capsys, cut)
+        code, out, err = run(capsys, "repair", cut)
     assert (code, out, err.count("\n")) == (1, "", 1)
     assert cut.read_bytes() == before
 
@@ -97,10 +90,10 @@ def test_a_file_that_cannot_take_its_place_leaves_everything_as_it_was(
     monkeypatch.setattr(Path, "replace", fail)
     if not has_second_names:
         monkeypatch.setattr(Path, "hardlink_to", no_names)
-    code, _, err = run(capsys, cut)
+    code, _, err = run(capsys, "repair", cut)
     assert (code, err.count("\n")) == (1, 1)
     assert f"{cut} is as it was" in err
     assert (list(tmp_path.iterdir()), cut.read_bytes()) == ([cut], before)
     monkeypatch.setattr(Path, "replace", replace)
-    assert run(capsys, cut)[0] == 0
+    assert run(capsys, "repair", cut)[0] == 0
     assert Path(f"{cut}.unrepaired").read_bytes() == before
