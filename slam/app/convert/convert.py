@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +10,7 @@ from slam.app.convert.matlab import convert_mat, write_detections
 from slam.app.convert.rosbag import AUTHORS_RIG, convert_bag, write_bag
 from slam.app.errors import AppError, UsageError
 from slam.app.rig.files import load_rig
+from slam.app.run.output import note
 from slam.app.run.replay import recorded_config
 from slam.app.session.reader import RecordedSession, open_session
 from slam.config import ConfigError, SlamConfig, load_preset
@@ -104,7 +104,7 @@ def run_convert(
                     truth_topic=truth_topic,
                 )
     for line in warnings:
-        print(f"uwb-slam: {source}: {line}", file=sys.stderr)  # noqa: T201 - a warning
+        note(f"{source}: {line}")
     print(result)  # noqa: T201 - the result
 
 

@@ -299,20 +299,15 @@ def _radar_info(
             f"{bag}: frames of {stream.n_bins} bins, but a frame area of {area_m[0]:g} to "
             f"{area_m[1]:g} m has {area.n_bins}; say another --frame-area"
         )
+    steps_ns = np.diff(stream.stamps_ns)
+    period_ns = float(np.median(steps_ns)) if len(steps_ns) else 0.0
     return imported_radar(
         mount,
         range_start_m=area.start_m,
         bin_length_m=(area.end_m - area.start_m) / area.n_bins,
         n_bins=area.n_bins,
-        rate_hz=_rate_hz(stream),
+        rate_hz=NS_PER_S / period_ns if period_ns > 0 else 1.0,
     )
-
-
-def _rate_hz(stream: _Stream) -> float:
-    """Return frames per second by the median of what lies between two; 1 for a single frame."""
-    steps_ns = np.diff(stream.stamps_ns)
-    period_ns = float(np.median(steps_ns)) if len(steps_ns) else 0.0
-    return NS_PER_S / period_ns if period_ns > 0 else 1.0
 
 
 def _session_info(

@@ -489,8 +489,8 @@ class LiveSource:
         if self._duration_s is not None and elapsed_s >= self._duration_s:
             self.ended = f"the {self._duration_s:g} s asked for are over"
             return None
-        self._note_lag()
-        self._note_unused(scan)
+        self._warn_of_lag()
+        self._warn_of_unused(scan)
         return scan
 
     def _drain(self, wait_s: float) -> None:
@@ -541,7 +541,7 @@ class LiveSource:
         made = replace(made, t_ns=self._odometry.session_ns(taken_ns))
         self.ticks.take(made, frame.arrival_ns + self._unix_ns)
 
-    def _note_lag(self) -> None:
+    def _warn_of_lag(self) -> None:
         lag_s = self.ticks.lag_ns / NS_PER_S
         self.worst_lag_s = max(self.worst_lag_s, lag_s)
         if lag_s > self._lag_warned_s:
@@ -553,7 +553,7 @@ class LiveSource:
                 warning=True,
             )
 
-    def _note_unused(self, scan: Scan) -> None:
+    def _warn_of_unused(self, scan: Scan) -> None:
         """Warn if SLAM has got no scan for long: a clock may have been set."""
         if scan.used:
             self._unused_since_ns = None

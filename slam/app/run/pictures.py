@@ -180,27 +180,19 @@ def draw_map(figure: Figure, info: SessionInfo, record: RunRecord, summary: Summ
             f"{info.scene}, preset {info.preset}{' (simulated)' if info.simulated else ''}: "
             f"{length_m:.1f} m driven, no truth to compare with"
         )
-        note = "map frame: the origin is the robot's first pose"
+        remark = "map frame: the origin is the robot's first pose"
     else:
         title = (
             f"{summary.scene}, preset {summary.preset}, seed {summary.seed} (simulated): "
             f"ATE {1e3 * summary.ate_rmse_m:.1f} mm, "
             f"{summary.ate_ratio:.2f} of odometry's {1e3 * summary.odometry_ate_rmse_m:.1f} mm"
         )
-        note = (
+        remark = (
             "drawn from the start pose, while the ATE is after SE(2) alignment; "
             f"last state {1e3 * summary.final_error_m:.0f} mm off"
         )
     label(axes, title, "x [m]", "y [m]", fontsize=11, pad=24)
-    axes.annotate(
-        note,
-        xy=(0.0, 1.0),
-        xytext=(0.0, 8.0),
-        xycoords="axes fraction",
-        textcoords="offset points",
-        fontsize=8.5,
-        color=PALE_INK,
-    )
+    note(axes, remark, (0.0, 1.0), (0.0, 8.0), PALE_INK, xycoords="axes fraction")
     # beside the axes, below a title that may be longer than they are wide
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, handlelength=1.6)
 

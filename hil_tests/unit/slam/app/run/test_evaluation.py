@@ -4,6 +4,7 @@ import cmath
 import dataclasses
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,19 @@ RIG = Rig(
 )
 
 
+def record_of(
+    results: Sequence[StepResult], truth: np.ndarray, world_from_map: np.ndarray, more_ns: int = 0
+) -> RunRecord:
+    return RunRecord(
+        results=tuple(results),
+        truth=truth,
+        world_from_map=world_from_map,
+        n_frames=2 * N,
+        duration_ns=(N - 1) * PERIOD_NS + more_ns,
+        wall_s=0.5,
+    )
+
+
 def run(offset_m: float, drift: float, variance: float) -> Summary:
     """Drive 3 m along x; the estimate is off by a constant and a share of the way in y."""
     truth = np.zeros((N, 3))
@@ -54,14 +68,7 @@ def run(offset_m: float, drift: float, variance: float) -> Summary:
                 detections=(),
             )
         )
-    record = RunRecord(
-        results=tuple(results),
-        truth=truth,
-        world_from_map=np.zeros(3),
-        n_frames=2 * N,
-        duration_ns=(N - 1) * PERIOD_NS,
-        wall_s=0.5,
-    )
+    record = record_of(results, truth, np.zeros(3))
     summary = summarise(record, INFO, RIG)
     assert summary is not None
     return summary
@@ -151,14 +158,7 @@ def turned() -> Summary:
                 associations=tuple(association for _, association in observed),
             )
         )
-    record = RunRecord(
-        results=tuple(results),
-        truth=truth,
-        world_from_map=PLACE,
-        n_frames=2 * N,
-        duration_ns=(N - 1) * PERIOD_NS + PERIOD_NS // 10,
-        wall_s=0.5,
-    )
+    record = record_of(results, truth, PLACE, PERIOD_NS // 10)
     true_m = np.array([(w.real, w.imag) for w in map(in_world, (first, second))])
     summary = summarise(record, dataclasses.replace(INFO, true_landmarks_m=true_m), RIG)
     assert summary is not None
@@ -187,14 +187,7 @@ def test_nis_is_of_true_associations_before_the_gate_per_degree_of_freedom(
 
 
 def test_a_run_without_a_state_has_no_summary() -> None:
-    record = RunRecord(
-        results=(),
-        truth=np.zeros((0, 3)),
-        world_from_map=np.zeros(3),
-        n_frames=4,
-        duration_ns=0,
-        wall_s=1.0,
-    )
+    record = record_of([], np.zeros((0, 3)), np.zeros(3))
     assert summarise(record, INFO, RIG) is None
 
 

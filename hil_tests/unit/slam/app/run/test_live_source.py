@@ -521,15 +521,21 @@ def test_odometry_that_falls_silent_ends_the_run_with_all_its_states(drive: Driv
     assert record.results[-1].t_ns > silent_ns - NS_PER_S
 
 
-def test_a_rig_without_odometry_does_not_begin(drive: Drive) -> None:
-    source, _, _ = source_of(drive, lambda row: row.event[0] == "frame")
-    with pytest.raises(AppError, match="odometry from the test: no line for 10 s"):
-        source.settle()
+@pytest.mark.parametrize(
+    ("silent", "error"),
+    [
+        ("odometry", "odometry from the test: no line for 10 s"),
+        ("frame", "radar rear_left: no frame in 15 s"),
+    ],
+)
+def test_a_source_that_never_sends_is_named(drive: Drive, silent: str, error: str) -> None:
+    def keep(row: Timed) -> bool:
+        if silent == "odometry":
+            return row.event[0] == "frame"
+        return row.event[:2] != ("frame", 1)
 
-
-def test_a_radar_that_never_streams_is_named(drive: Drive) -> None:
-    source, _, _ = source_of(drive, lambda row: row.event[:2] != ("frame", 1))
-    with pytest.raises(AppError, match="radar rear_left: no frame in 15 s"):
+    source, _, _ = source_of(drive, keep)
+    with pytest.raises(AppError, match=error):
         source.settle()
 
 
