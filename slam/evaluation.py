@@ -18,7 +18,16 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
-from slam.geometry import Mount, Rig, compose, has_moved, transform, wrap_angle, wrap_angles
+from slam.geometry import (
+    Mount,
+    Rig,
+    align_se2,
+    compose,
+    has_moved,
+    transform,
+    wrap_angle,
+    wrap_angles,
+)
 from slam.results import Association, StepResult
 
 Array = NDArray[np.float64]
@@ -66,21 +75,6 @@ def associate_times(
     return estimate_rows, nearest[estimate_rows]
 
 
-def align_se2(estimate_xy: Array, reference_xy: Array) -> Array:
-    """Return the rigid motion (3,) that brings an estimate closest to a reference, row by row.
-
-    Least squares over rotation and translation, no scale (Umeyama 1991 in the plane), shapes (n, 2)
-    [m]: ``transform(pose, estimate_xy)`` is the aligned estimate.
-    """
-    _check_rows(estimate_xy, reference_xy)
-    centre_e, centre_r = estimate_xy.mean(axis=0), reference_xy.mean(axis=0)
-    e, r = estimate_xy - centre_e, reference_xy - centre_r
-    cross = float(np.sum(e[:, 0] * r[:, 1] - e[:, 1] * r[:, 0]))
-    heading = math.atan2(cross, float(np.sum(e * r)))
-    rotation_only = np.array([0.0, 0.0, heading])
-    return np.append(centre_r - transform(rotation_only, centre_e), heading)
-
-
 def rmse_m(estimate_xy: Array, reference_xy: Array) -> float:
     """Return the root mean square distance of rows that belong together, not aligned."""
     _check_rows(estimate_xy, reference_xy)
@@ -92,6 +86,7 @@ def ate_rmse_m(estimate_xy: Array, reference_xy: Array) -> float:
 
     Both have shape (n, 2) [m]; rows belong together by time.
     """
+    _check_rows(estimate_xy, reference_xy)
     return rmse_m(transform(align_se2(estimate_xy, reference_xy), estimate_xy), reference_xy)
 
 

@@ -73,6 +73,19 @@ def transform(pose: Array, points: Array) -> Array:
     return result
 
 
+def align_se2(points: Array, targets: Array) -> Array:
+    """Return the rigid motion (3,) that brings points closest to targets, row by row.
+
+    Least squares over rotation and translation, no scale (Umeyama 1991 in the plane), shapes (n, 2)
+    [m]: ``transform(motion, points)`` are the aligned points.
+    """
+    centre_p, centre_t = points.mean(axis=0), targets.mean(axis=0)
+    p, t = points - centre_p, targets - centre_t
+    cross = float(np.sum(p[:, 0] * t[:, 1] - p[:, 1] * t[:, 0]))
+    heading = math.atan2(cross, float(np.sum(p * t)))
+    return np.append(centre_t - transform(np.array([0.0, 0.0, heading]), centre_p), heading)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mount:
     """Where one radar sits on the robot and how its range zero is off."""

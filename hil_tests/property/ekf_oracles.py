@@ -74,7 +74,7 @@ def place(pose: Complex, observed: Complex) -> Complex:
 
 
 def complex_step(function: Callable[[Complex], Complex], at: Array) -> Array:
-    """Return the Jacobian of an analytic function, exact to rounding."""
+    """Return the Jacobian of an analytic function, ``Im f(x + i h) / h``, exact to rounding."""
     columns = []
     for k in range(len(at)):
         point = at.astype(np.complex128)

@@ -1,10 +1,6 @@
-"""What the robust filter must agree with: its error model written again in complex numbers.
-
-A derivative by complex step, ``Im f(x + i h) / h`` with h = 1e-30, has no rounding to speak of.
-"""
+"""What the robust filter must agree with: its error model written again in complex numbers."""
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 from hypothesis import strategies as st
@@ -15,18 +11,7 @@ from slam.robust.state import State, SymmetricMatrix
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-STEP = 1e-30
 N_RADARS = 4
-
-
-def derivative(function: Callable[[Complex], Complex], at: Array) -> Array:
-    """Return d function / d x at x, shape (outputs, inputs)."""
-    columns = []
-    for i in range(len(at)):
-        x = at.astype(np.complex128)
-        x[i] += 1j * STEP
-        columns.append(function(x).imag / STEP)
-    return np.column_stack(columns)
 
 
 def turn(angle: complex) -> Complex:

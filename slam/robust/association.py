@@ -140,13 +140,6 @@ class View:
             & (self.ranges_m <= noise.max_range_m + widen_m)
         )
 
-    def without(self, rows: Sequence[int]) -> View:
-        if not rows:
-            return self
-        ranges = self.ranges_m.copy()
-        ranges[:, rows] = math.inf
-        return replace(self, ranges_m=ranges)
-
 
 def view(state: State, antennas: Antennas) -> View:
     R = rotation(state.heading_rad)

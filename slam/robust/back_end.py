@@ -384,7 +384,7 @@ class RobustBackEnd:
                     self._use(placed[0], wall.members)
                     (new if placed[1] else again).append(placed[0])
             offsets = np.arange(state.offsets.start, state.offsets.stop)
-            tracker = Tracker(noise, rule, state.offsets_m, state.P.block(offsets))
+            tracker = Tracker(self.parameters, state.offsets_m, state.P.block(offsets))
             n_radars = min(len(radars), 2)
             is_point = self._walls.is_point if n_radars > 1 else None
             for tracklet in find_tracklets(

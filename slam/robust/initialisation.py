@@ -23,8 +23,8 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TypeVar
+from dataclasses import dataclass, replace
+from itertools import combinations, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,11 +32,17 @@ from scipy.optimize import linear_sum_assignment
 
 from slam.geometry import compose, wrap_angle
 from slam.robust.association import LONGEST_M, Antennas, RangeScan, fix_of_pair
-from slam.robust.parameters import MapRule, RangeNoise, TrackletRule, chi_square_limit
+from slam.robust.parameters import (
+    BackEndParameters,
+    MapRule,
+    RangeNoise,
+    TrackletRule,
+    chi_square_limit,
+)
 from slam.robust.state import POSITION, Array, Indices, Motion, State, rotation
 
 _SEED_MARGIN_RAD = 0.05
-_MEMBER_MARGIN_RAD = 0.1
+MEMBER_MARGIN_RAD = 0.1
 _SINGLE_BEARINGS_RAD = (0.0, -0.25, 0.25, -0.5, 0.5)
 _SINGLE_SPREAD_RAD = 0.2
 _SINGLE_RANGE_SIGMA_M = 0.05
@@ -275,8 +281,7 @@ def clear_match(
 def update_with_point(state: State, row: int, point: BodyPoint) -> float:
     """Correct the state with a point that is the landmark in ``row``; return the NIS."""
     rows = point_rows(state, row, point)
-    nis, _ = state.update(rows.at, rows.H, rows.residual, point.covariance)
-    return nis
+    return state.update(rows.at, rows.H, rows.residual, point.covariance)
 
 
 def initialise_landmark(state: State, point: BodyPoint) -> int:
@@ -301,17 +306,18 @@ class Member:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Guess:
-    """Where a point may be, in the newest body frame: mean (2,) and covariance (2, 2)."""
+    """Where a target may be, in the newest body frame: mean (2,) and covariance (2, 2)."""
 
-    point_m: Array
+    target: Array
     covariance: Array
     label: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Followed:
+class Tracklet:
     """A target at rest in the newest body frame, and the ranges that it explains."""
 
+    target: Array  # shape (2,): a point [m], or phi [rad] and d [m] of a wall
     covariance: Array  # shape (2, 2), for the range offsets of the state
     by_offsets: Array  # shape (2, r), d(target) / d(offsets)
     members: tuple[Member, ...]  # newest first
@@ -319,53 +325,43 @@ class Followed:
     chi_square: float
     dof: int
     share: float  # part of the frames with the target in view that hold a member
+    label: int | None
 
     @property
     def score(self) -> float:
         """Return 4 dof - chi-square, by which tracklets compete for ranges."""
         return 4.0 * self.dof - self.chi_square
 
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Tracklet(Followed):
-    """A point at rest."""
-
-    point_m: Array  # shape (2,)
-    label: int | None
+    @property
+    def antennas_m(self) -> Array:
+        """Return where the antennas of the members were, shape (k, 2)."""
+        return np.array([(member.slot.x_m, member.slot.y_m) for member in self.members])
 
     def body_point(self) -> BodyPoint:
-        antennas = [(member.slot.x_m, member.slot.y_m) for member in self.members]
-        away = self.point_m - np.mean(antennas, axis=0)
+        away = self.target - np.mean(self.antennas_m, axis=0)
         return BodyPoint(
-            point_m=self.point_m,
+            point_m=self.target,
             covariance=self.covariance,
             by_offsets=self.by_offsets,
             outward=away / max(math.hypot(away[0], away[1]), 1e-6),
         )
 
 
-F = TypeVar("F", bound=Followed)
-G = TypeVar("G")
-
-
 def pair_guesses(newest: Sequence[Slot], noise: RangeNoise, rule: TrackletRule) -> list[Guess]:
     """Return the fixes of all pairs of unused ranges inside both fields of view."""
     guesses = []
-    for place, first in enumerate(newest):
-        for second in newest[place + 1 :]:
-            ahead = np.array([math.cos(first.yaw_rad), math.sin(first.yaw_rad)])
-            here, there = np.array([first.x_m, first.y_m]), np.array([second.x_m, second.y_m])
-            for a in first.unused:
-                for b in second.unused:
-                    if a.label != b.label:
-                        continue
-                    point = fix_of_pair(here, there, a.range_m, b.range_m, ahead)
-                    if point is None or not (
-                        _in_view(point, first, noise) and _in_view(point, second, noise)
-                    ):
-                        continue
-                    spread = rule.prior_sigma_m**2 * np.eye(2)
-                    guesses.append(Guess(point_m=point, covariance=spread, label=a.label))
+    spread = rule.prior_sigma_m**2 * np.eye(2)
+    for first, second in combinations(newest, 2):
+        ahead = np.array([math.cos(first.yaw_rad), math.sin(first.yaw_rad)])
+        here, there = np.array([first.x_m, first.y_m]), np.array([second.x_m, second.y_m])
+        for a, b in product(first.unused, second.unused):
+            if a.label != b.label:
+                continue
+            point = fix_of_pair(here, there, a.range_m, b.range_m, ahead)
+            if point is None:
+                continue
+            if _in_view(point, first, noise) and _in_view(point, second, noise):
+                guesses.append(Guess(target=point, covariance=spread, label=a.label))
     return guesses
 
 
@@ -380,7 +376,7 @@ def single_guesses(newest: Sequence[Slot]) -> list[Guess]:
                 along = _SINGLE_RANGE_SIGMA_M**2
                 guesses.append(
                     Guess(
-                        point_m=np.array([slot.x_m, slot.y_m]) + measured.range_m * u,
+                        target=np.array([slot.x_m, slot.y_m]) + measured.range_m * u,
                         covariance=across * np.eye(2) + (along - across) * np.outer(u, u),
                         label=measured.label,
                     )
@@ -401,24 +397,33 @@ class Tracker:
     """
 
     def __init__(
-        self, noise: RangeNoise, rule: TrackletRule, offsets_m: Array, offset_covariance: Array
+        self, parameters: BackEndParameters, offsets_m: Array, offset_covariance: Array
     ) -> None:
-        self._noise, self._rule = noise, rule
+        self._noise, self._rule = parameters.ranges, parameters.tracklets
         self._offsets: list[float] = offsets_m.tolist()
         self._offset_covariance = offset_covariance
         self._offset_variances: list[float] = offset_covariance.diagonal().tolist()
-        self._offsets_known = max(self._offset_variances, default=0.0) <= (0.1 * noise.sigma_m) ** 2
+        least = (0.1 * self._noise.sigma_m) ** 2
+        self._offsets_known = max(self._offset_variances, default=0.0) <= least
 
     def follow(self, guess: Guess, frames: Sequence[Sequence[Slot]]) -> Tracklet:
         """Return the ranges that follow a guess; found twice, again from the first result."""
         first = self._walk(guess, frames)
-        again = Guess(point_m=first.point_m, covariance=guess.covariance, label=guess.label)
-        second = self._walk(again, frames)
+        second = self._walk(replace(guess, target=first.target), frames)
         return second if self._offsets_known else self._with_free_offsets(second)
 
+    def _sight(self, x: float, y: float, slot: Slot) -> tuple[float, float, float, float]:
+        """Return a target's range, its angle off boresight, and d(range) / d(target)."""
+        dx, dy = x - slot.x_m, y - slot.y_m
+        distance = math.sqrt(dx * dx + dy * dy)
+        if distance == 0.0:
+            return 0.0, math.inf, 0.0, 0.0
+        off = abs(math.remainder(math.atan2(dy, dx) - slot.yaw_rad, math.tau))
+        return distance, off, dx / distance, dy / distance
+
     def _walk(self, guess: Guess, frames: Sequence[Sequence[Slot]]) -> Tracklet:
-        """Filter the position backwards; plain floats, the loop is short and runs often."""
-        x, y = float(guess.point_m[0]), float(guess.point_m[1])
+        """Filter the target backwards; plain floats, the loop is short and runs often."""
+        x, y = float(guess.target[0]), float(guess.target[1])
         cxx, cxy, cyy = (float(guess.covariance[i]) for i in ((0, 0), (0, 1), (1, 1)))
         noise, rule = self._noise, self._rule
         half_view = noise.field_of_view_rad / 2
@@ -431,12 +436,10 @@ class Tracker:
         for slots in frames:
             sees = hits = False
             for slot in slots:
-                dx, dy = x - slot.x_m, y - slot.y_m
-                distance = math.sqrt(dx * dx + dy * dy)
-                off = abs(math.remainder(math.atan2(dy, dx) - slot.yaw_rad, math.tau))
+                distance, off, ux, uy = self._sight(x, y, slot)
                 if off <= half_view and noise.min_range_m <= distance <= noise.max_range_m:
                     sees = True
-                if off > half_view + _MEMBER_MARGIN_RAD or not slot.unused or distance == 0.0:
+                if off > half_view + MEMBER_MARGIN_RAD or not slot.unused:
                     continue
                 radar = slot.radar
                 expected = distance + self._offsets[radar]
@@ -447,7 +450,6 @@ class Tracker:
                         nearest, nu = measured, miss
                 if nearest is None:
                     continue
-                ux, uy = dx / distance, dy / distance
                 px, py = cxx * ux + cxy * uy, cxy * ux + cyy * uy
                 variance = nearest.sigma_m**2 + slot.drift
                 s = ux * px + uy * py + variance + self._offset_variances[radar]
@@ -466,7 +468,7 @@ class Tracker:
             in_view += sees or hits
             hit += hits
         return Tracklet(
-            point_m=np.array([x, y]),
+            target=np.array([x, y]),
             covariance=np.array([[cxx, cxy], [cxy, cyy]]),
             by_offsets=np.array([dx_do, dy_do]),
             members=tuple(members),
@@ -487,14 +489,14 @@ class Tracker:
             return walked
         radars = sorted({member.slot.radar for member in walked.members})
         place = np.array([radars.index(member.slot.radar) for member in walked.members])
-        antennas = np.array([[m.slot.x_m, m.slot.y_m] for m in walked.members])
+        antennas = walked.antennas_m
         z = np.array([m.measured.range_m - self._offsets[m.slot.radar] for m in walked.members])
         variance = np.array([m.measured.sigma_m**2 + m.slot.drift for m in walked.members])
         offset_part = np.zeros((len(z), len(radars)))
         offset_part[np.arange(len(z)), place] = 1.0
         prior = self._offset_covariance[np.ix_(radars, radars)]
         prior = np.asarray(np.linalg.inv(prior + 1e-12 * np.eye(len(radars))))
-        point, offsets = walked.point_m.copy(), np.zeros(len(radars))
+        point, offsets = walked.target.copy(), np.zeros(len(radars))
         for _ in range(4):
             away = point - antennas
             distance = np.hypot(away[:, 0], away[:, 1])
@@ -510,15 +512,12 @@ class Tracker:
         covariance = np.linalg.inv((u.T / variance) @ u + np.eye(2) / self._rule.prior_sigma_m**2)
         by_offsets = np.zeros((2, len(self._offsets)))
         by_offsets[:, radars] = -covariance @ (u.T / variance) @ offset_part
-        return Tracklet(
-            point_m=point - by_offsets[:, radars] @ offsets,
+        return replace(
+            walked,
+            target=point - by_offsets[:, radars] @ offsets,
             covariance=covariance,
             by_offsets=by_offsets,
-            members=walked.members,
             chi_square=float(residual @ (residual / variance) + offsets @ prior @ offsets),
-            dof=walked.dof,
-            share=walked.share,
-            label=walked.label,
         )
 
 
@@ -537,23 +536,26 @@ def is_believable(tracklet: Tracklet, n_radars: int, rule: TrackletRule) -> bool
     return True
 
 
-def is_consistent(followed: Followed, n_radars: int, rule: TrackletRule) -> bool:
+def is_consistent(tracklet: Tracklet, n_radars: int, rule: TrackletRule) -> bool:
     """Return whether enough radars and frames hold it, with residuals as small as their noise."""
-    hits = Counter(member.slot.radar for member in followed.members)
+    hits = Counter(member.slot.radar for member in tracklet.members)
     if len(hits) < n_radars or min(hits.values()) < rule.min_hits_per_radar:
         return False
-    limit = chi_square_limit(followed.dof, rule.excess_sigmas)
-    return followed.share >= rule.min_share and followed.chi_square <= limit
+    limit = chi_square_limit(tracklet.dof, rule.excess_sigmas)
+    return tracklet.share >= rule.min_share and tracklet.chi_square <= limit
 
 
 def best_first(
-    guesses: Sequence[G], follow: Callable[[G], F], accepts: Callable[[F], bool]
-) -> list[F]:
-    """Return what is accepted, best first; its ranges are taken out of the frames."""
-    found: list[F] = []
+    tracker: Tracker,
+    guesses: Sequence[Guess],
+    frames: Sequence[Sequence[Slot]],
+    accepts: Callable[[Tracklet], bool],
+) -> list[Tracklet]:
+    """Return the accepted tracklets, best first; their ranges are taken out of the frames."""
+    found: list[Tracklet] = []
     waiting = list(guesses)
     while waiting:
-        followed = [(follow(guess), guess) for guess in waiting]
+        followed = [(tracker.follow(guess, frames), guess) for guess in waiting]
         accepted = [pair for pair in followed if accepts(pair[0])]
         if not accepted:
             break
@@ -575,10 +577,7 @@ def find_tracklets(
     *,
     is_point: Callable[[Tracklet], bool] | None = None,
 ) -> list[Tracklet]:
-    """Return the accepted tracklets, best first; their ranges are taken out of the frames.
-
-    ``is_point`` may reject a tracklet that passes all other tests.
-    """
+    """Return the tracklets of points, as `best_first` does; ``is_point`` is the last test."""
     available: dict[int, int] = {}
     for slots in frames:
         for slot in slots:
@@ -591,7 +590,7 @@ def find_tracklets(
             return False
         return is_point is None or tracklet.label is not None or is_point(tracklet)
 
-    return best_first(guesses, lambda guess: tracker.follow(guess, frames), accepts)
+    return best_first(tracker, guesses, frames, accepts)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

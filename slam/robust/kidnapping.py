@@ -29,12 +29,12 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtri
 
-from slam.geometry import between, compose, transform
+from slam.geometry import align_se2, between, compose, transform
 from slam.robust.association import RangeScan, SureLandmarks, View
 from slam.robust.map import Existence, apply_merge, find_merge
 from slam.robust.parameters import BackEndParameters, MapRule, RelocationRule, SurpriseRule
@@ -291,7 +291,7 @@ def _aligned(state: State, pairs: tuple[tuple[int, int], ...]) -> tuple[Array, A
     points, targets = state.landmarks_m[here], state.landmarks_m[there]
     P = _additive_block(state, np.concatenate([here, there]))
     k = 2 * len(pairs)
-    motion = _first_alignment(points, targets)
+    motion = align_se2(points, targets)
     for _ in range(5):
         turned = np.kron(np.eye(len(pairs)), rotation(float(motion[2])))
         H = np.hstack([turned, -np.eye(k)])
@@ -317,14 +317,6 @@ def _additive_block(state: State, rows: Indices) -> Array:
     P = state.P.block(at)
     T = np.hstack([quarter_turn(state.landmarks_m[rows]).reshape(-1, 1), np.eye(2 * len(rows))])
     return np.asarray(T @ P @ T.T)
-
-
-def _first_alignment(points: Array, targets: Array) -> Array:
-    """Return the motion of unweighted least squares (Umeyama without scale), (3,)."""
-    p, t = points - points.mean(axis=0), targets - targets.mean(axis=0)
-    turn = math.atan2(float(np.sum(p[:, 0] * t[:, 1] - p[:, 1] * t[:, 0])), float(np.sum(p * t)))
-    shift = targets.mean(axis=0) - rotation(turn) @ points.mean(axis=0)
-    return np.array([shift[0], shift[1], turn])
 
 
 def apply_join(state: State, join: Join, submap: Collection[int], sigma_m: float) -> None:
@@ -372,8 +364,13 @@ class Localisation:
         return np.diag([sigma_m**2, sigma_m**2, math.pi**2 / 3.0])
 
     def without_old_map(self, seen: View, state: State) -> View:
-        ids = enumerate(state.feature_ids)
-        return seen.without([row for row, id_ in ids if id_ in self.old_map])
+        """Return a view in which the landmarks of the old map are out of reach."""
+        rows = [row for row, id_ in enumerate(state.feature_ids) if id_ in self.old_map]
+        if not rows:
+            return seen
+        ranges = seen.ranges_m.copy()
+        ranges[:, rows] = math.inf
+        return replace(seen, ranges_m=ranges)
 
     def look(self, evidence: Sequence[Evidence], state: State, log: RunLog) -> None:
         """Judge one frame; to be called before anything is learned from it."""

@@ -336,13 +336,13 @@ class State:
         self.landmarks_m = self.landmarks_m @ turn.T + shifts[:n] @ V.T
         self.walls = self.walls + shifts[n:] + [angle, 0.0]
 
-    def update(self, at: Indices, H: Array, residual: Array, R: Array) -> tuple[float, Array]:
+    def update(self, at: Indices, H: Array, residual: Array, R: Array) -> float:
         """Correct mean and covariance with k measurements, ``residual = z - h``.
 
         With S = H P H^T + R = L L^T and W = P H^T L^-T: ``error = W L^-1 residual``, ``P -= W
         W^T``, one pass over the triangle. H has shape (k, c), entries for the columns ``at`` (c,)
         of the error; R (k, k) or its diagonal (k,). Returns the normalised innovation squared (k
-        dof) and S.
+        dof).
         """
         PHt = self.P.columns(at) @ H.T
         S = H @ PHt[at]
@@ -353,7 +353,7 @@ class State:
         whitened = L_inverse @ residual
         self.P.subtract_gram(W)
         self.correct(W @ whitened)
-        return float(whitened @ whitened), S
+        return float(whitened @ whitened)
 
     def augment(self, point_m: Array, cross: Array, corner: Array) -> int:
         """Append a landmark and return its id; ``cross`` (m, 2), ``corner`` (2, 2)."""

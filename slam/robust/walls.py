@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations, product
 
 import numpy as np
 
@@ -27,10 +28,12 @@ from slam.geometry import wrap_angle
 from slam.results import MapWall
 from slam.robust.association import Antennas, View
 from slam.robust.initialisation import (
+    MEMBER_MARGIN_RAD,
     FeatureRows,
-    Followed,
+    Guess,
     Member,
     Slot,
+    Tracker,
     Tracklet,
     UnassignedRanges,
     best_first,
@@ -38,119 +41,57 @@ from slam.robust.initialisation import (
     is_consistent,
 )
 from slam.robust.map import Sightings, compare, fit_wall
-from slam.robust.parameters import BackEndParameters, RangeNoise, WallRule
+from slam.robust.parameters import BackEndParameters, RangeNoise, TrackletRule, WallRule
 from slam.robust.state import HEADING, Array, State, rotation
 
 _PRIOR_RAD = 0.3
-_MARGIN_RAD = 0.1
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class WallTracklet(Followed):
-    """A wall; ``wall`` (2,) and its covariance are of phi [rad] and d [m]."""
-
-    wall: Array
-
-
-def wall_guesses(newest: Sequence[Slot], noise: RangeNoise) -> list[Array]:
+def wall_guesses(newest: Sequence[Slot], noise: RangeNoise, rule: TrackletRule) -> list[Guess]:
     """Return the lines (phi, d) that touch both circles of every pair of unused ranges."""
     guesses = []
-    for place, first in enumerate(newest):
-        for second in newest[place + 1 :]:
-            base_x, base_y = second.x_m - first.x_m, second.y_m - first.y_m
-            base = math.hypot(base_x, base_y)
-            for a in first.unused:
-                for b in second.unused:
-                    cosine = (a.range_m - b.range_m) / base if base else 2.0
-                    if abs(cosine) > 1.0 or a.label is not None or b.label is not None:
-                        continue
-                    along, off = math.atan2(base_y, base_x), math.acos(cosine)
-                    phi = min(
-                        (along + off, along - off),
-                        key=lambda angle: abs(math.remainder(angle - first.yaw_rad, math.tau)),
-                    )
-                    away = abs(math.remainder(phi - first.yaw_rad, math.tau))
-                    if away > noise.field_of_view_rad / 2 + _MARGIN_RAD:
-                        continue
-                    d = a.range_m + math.cos(phi) * first.x_m + math.sin(phi) * first.y_m
-                    guesses.append(np.array([phi, d]))
+    spread = np.diag([_PRIOR_RAD**2, rule.prior_sigma_m**2])
+    for first, second in combinations(newest, 2):
+        base_x, base_y = second.x_m - first.x_m, second.y_m - first.y_m
+        base = math.hypot(base_x, base_y)
+        for a, b in product(first.unused, second.unused):
+            cosine = (a.range_m - b.range_m) / base if base else 2.0
+            if abs(cosine) > 1.0 or a.label is not None or b.label is not None:
+                continue
+            along, off = math.atan2(base_y, base_x), math.acos(cosine)
+            phi = min(
+                (along + off, along - off),
+                key=lambda angle: abs(math.remainder(angle - first.yaw_rad, math.tau)),
+            )
+            away = abs(math.remainder(phi - first.yaw_rad, math.tau))
+            if away <= noise.field_of_view_rad / 2 + MEMBER_MARGIN_RAD:
+                d = a.range_m + math.cos(phi) * first.x_m + math.sin(phi) * first.y_m
+                guesses.append(Guess(target=np.array([phi, d]), covariance=spread))
     return guesses
 
 
-class WallTracker:
-    """Follows guesses of walls back in time; offsets as in ``Tracker``."""
+class WallTracker(Tracker):
+    """Follows guesses of walls, phi and d, back in time."""
 
     def __init__(
         self, parameters: BackEndParameters, offsets_m: Array, offset_covariance: Array
     ) -> None:
-        self._noise, self._rule = parameters.ranges, parameters.tracklets
+        super().__init__(parameters, offsets_m, offset_covariance)
         self._walls = parameters.walls
-        self._offsets: list[float] = offsets_m.tolist()
-        self._offset_variances: list[float] = offset_covariance.diagonal().tolist()
-        known = max(self._offset_variances, default=0.0) <= (0.1 * self._noise.sigma_m) ** 2
-        self._offset_covariance = None if known else offset_covariance
         self._heading_rad_per_sqrt_m = parameters.wheels.heading_rad_per_sqrt_m
 
-    def follow(self, guess: Array, frames: Sequence[Sequence[Slot]]) -> WallTracklet:
-        """Return the ranges that follow a guess; twice, as ``Tracker.follow`` does."""
-        first = self._walk(float(guess[0]), float(guess[1]), frames)
-        second = self._walk(float(first.wall[0]), float(first.wall[1]), frames)
-        return second if self._offset_covariance is None else self._with_free_offsets(second)
+    def _sight(self, x: float, y: float, slot: Slot) -> tuple[float, float, float, float]:
+        cosine, sine = math.cos(x), math.sin(x)
+        distance = y - cosine * slot.x_m - sine * slot.y_m
+        off = abs(math.remainder(x - slot.yaw_rad, math.tau))
+        return distance, off, sine * slot.x_m - cosine * slot.y_m, 1.0
 
-    def _walk(self, phi: float, d: float, frames: Sequence[Sequence[Slot]]) -> WallTracklet:
-        """Filter the line backwards; plain floats, the loop is short and runs often."""
-        noise, rule = self._noise, self._rule
-        half_view, gate_sq = noise.field_of_view_rad / 2, rule.gate_sigmas**2
-        cpp, cpd, cdd = _PRIOR_RAD**2, 0.0, rule.prior_sigma_m**2
-        n_radars = len(self._offsets)
-        dp_do, dd_do = [0.0] * n_radars, [0.0] * n_radars
-        members: list[Member] = []
-        chi_square = 0.0
-        in_view, hit = 0, 0
-        for slots in frames:
-            sees = hits = False
-            cosine, sine = math.cos(phi), math.sin(phi)
-            for slot in slots:
-                distance = d - cosine * slot.x_m - sine * slot.y_m
-                off = abs(math.remainder(phi - slot.yaw_rad, math.tau))
-                if off <= half_view and noise.min_range_m <= distance <= noise.max_range_m:
-                    sees = True
-                if off > half_view + _MARGIN_RAD or not slot.unused:
-                    continue
-                radar = slot.radar
-                expected = distance + self._offsets[radar]
-                nearest = min(slot.unused, key=lambda left: abs(left.range_m - expected))
-                nu = nearest.range_m - expected
-                h = sine * slot.x_m - cosine * slot.y_m
-                pp, pd = cpp * h + cpd, cpd * h + cdd
-                variance = nearest.sigma_m**2 + slot.drift
-                s = h * pp + pd + variance + self._offset_variances[radar]
-                if nearest.label is not None or nu * nu > gate_sq * s:
-                    continue
-                kp, kd = pp / s, pd / s
-                phi, d = phi + kp * nu, d + kd * nu
-                cosine, sine = math.cos(phi), math.sin(phi)
-                cpp, cpd, cdd = cpp - kp * pp, cpd - kp * pd, cdd - kd * pd
-                for other in range(n_radars):
-                    change = h * dp_do[other] + dd_do[other] + (other == radar)
-                    dp_do[other] -= kp * change
-                    dd_do[other] -= kd * change
-                chi_square += nu * nu / s
-                members.append(Member(slot, nearest))
-                hits = True
-            in_view += sees or hits
-            hit += hits
-        return WallTracklet(
-            wall=np.array([phi, d]),
-            covariance=np.array([[cpp + self._turned(members), cpd], [cpd, cdd]]),
-            by_offsets=np.array([dp_do, dd_do]),
-            members=tuple(members),
-            chi_square=chi_square,
-            dof=len(members) - 2,
-            share=hit / max(in_view, 1),
-        )
+    def _walk(self, guess: Guess, frames: Sequence[Sequence[Slot]]) -> Tracklet:
+        walked = super()._walk(guess, frames)
+        walked.covariance[0, 0] += self._turned(walked.members)
+        return walked
 
-    def _with_free_offsets(self, walked: WallTracklet) -> WallTracklet:
+    def _with_free_offsets(self, walked: Tracklet) -> Tracklet:
         """Judge the members by a wall *and* the radars' common offsets, which are uncertain.
 
         For the filter, an offset's uncertainty is noise of each range. It is one number: a wall may
@@ -158,8 +99,8 @@ class WallTracker:
         """
         if walked.dof < 1:
             return walked
-        sightings, rule = self.sightings(walked.members), self._rule
-        fit = fit_wall(sightings, walked.wall)
+        sightings, rule = self.sightings(walked), self._rule
+        fit = fit_wall(sightings, walked.target)
         information = (fit.by_law.T / sightings.variances) @ fit.by_law
         prior = np.diag([_PRIOR_RAD**-2, rule.prior_sigma_m**-2])
         covariance: Array = np.asarray(np.linalg.inv(information + prior), dtype=np.float64)
@@ -168,7 +109,7 @@ class WallTracker:
         covariance[0, 0] += self._turned(walked.members)
         return replace(
             walked,
-            wall=fit.unknown - by_offsets[:, fit.radars] @ fit.offsets_m,
+            target=fit.unknown - by_offsets[:, fit.radars] @ fit.offsets_m,
             covariance=covariance,
             by_offsets=by_offsets,
             chi_square=fit.chi_square,
@@ -182,42 +123,41 @@ class WallTracker:
         way = math.hypot(last.x_m - first.x_m, last.y_m - first.y_m)
         return self._heading_rad_per_sqrt_m**2 * way / 3.0
 
-    def _way_m(self, tracklet: WallTracklet) -> float:
-        phi = float(tracklet.wall[0])
-        along = [math.cos(phi) * m.slot.y_m - math.sin(phi) * m.slot.x_m for m in tracklet.members]
+    def _way_m(self, tracklet: Tracklet) -> float:
+        """Return how far the echo moved along the wall, the most that a radar has seen."""
+        phi = float(tracklet.target[0])
         of_radar: dict[int, list[float]] = {}
-        for member, place in zip(tracklet.members, along, strict=True):
-            of_radar.setdefault(member.slot.radar, []).append(place)
+        for slot in (member.slot for member in tracklet.members):
+            along = math.cos(phi) * slot.y_m - math.sin(phi) * slot.x_m
+            of_radar.setdefault(slot.radar, []).append(along)
         return max(max(places) - min(places) for places in of_radar.values())
 
-    def is_wall(self, tracklet: WallTracklet) -> bool:
+    def is_wall(self, tracklet: Tracklet) -> bool:
         """Return whether a tracklet is evidence of a wall and not of a point."""
-        members = tracklet.members
-        if len({member.slot.back for member in members}) < self._walls.min_frames:
+        if len({member.slot.back for member in tracklet.members}) < self._walls.min_frames:
             return False
         if self._way_m(tracklet) < self._walls.min_way_m:
             return False
         if not is_consistent(tracklet, 2, self._rule):
             return False
-        point, wall = compare(self.sightings(members), float(tracklet.wall[0]))
+        point, wall = compare(self.sightings(tracklet), float(tracklet.target[0]))
         return point - wall >= self._walls.wall_margin
 
     def is_point(self, tracklet: Tracklet) -> bool:
-        """Return whether the ranges of a tracklet follow a point's law, not a wall's."""
-        members = tracklet.members
-        middle = np.mean([(m.slot.x_m, m.slot.y_m) for m in members], axis=0)
-        x, y = tracklet.point_m - middle
-        point, wall = compare(self.sightings(members), math.atan2(y, x))
+        """Return whether the ranges of a point follow its law, not a wall's."""
+        x, y = tracklet.target - np.mean(tracklet.antennas_m, axis=0)
+        point, wall = compare(self.sightings(tracklet), math.atan2(y, x))
         return wall - point >= self._walls.point_margin
 
-    def sightings(self, members: Sequence[Member]) -> Sightings:
+    def sightings(self, tracklet: Tracklet) -> Sightings:
+        members = tracklet.members
         offsets = np.array([self._offsets[member.slot.radar] for member in members])
         return Sightings(
-            antennas_m=np.array([(m.slot.x_m, m.slot.y_m) for m in members]),
+            antennas_m=tracklet.antennas_m,
             ranges_m=np.array([m.measured.range_m for m in members]) - offsets,
             variances=np.array([m.measured.sigma_m**2 + m.slot.drift for m in members]),
             radars=np.array([m.slot.radar for m in members]),
-            offset_covariance=self._offset_covariance,
+            offset_covariance=None if self._offsets_known else self._offset_covariance,
         )
 
 
@@ -334,8 +274,7 @@ def is_unresolved(state: State, seen: BodyWall, cells: WallCells, rule: WallRule
 def update_with_wall(state: State, wall_row: int, seen: BodyWall) -> float:
     """Correct the state with a measurement of a mapped wall; return the NIS (2 dof)."""
     rows = wall_rows(state, wall_row, seen)
-    nis, _ = state.update(rows.at, rows.H, rows.residual, seen.covariance)
-    return nis
+    return state.update(rows.at, rows.H, rows.residual, seen.covariance)
 
 
 def initialise_wall(state: State, seen: BodyWall) -> int:
@@ -392,7 +331,7 @@ class WallKeeper:
         state, rule = self._state, self._rule
         if not state.wall_ids:
             return False
-        sightings = tracker.sightings(tracklet.members)
+        sightings = tracker.sightings(tracklet)
         for row, wall_id in enumerate(state.wall_ids):
             phi, d = (float(value) for value in state.walls[row])
             n = np.array([np.cos(phi - state.heading_rad), np.sin(phi - state.heading_rad)])
@@ -413,28 +352,28 @@ class WallKeeper:
         offsets = np.arange(state.offsets.start, state.offsets.stop)
         return WallTracker(self._parameters, state.offsets_m, state.P.block(offsets))
 
-    def find(self, unassigned: UnassignedRanges, radars: Sequence[int]) -> list[WallTracklet]:
+    def find(self, unassigned: UnassignedRanges, radars: Sequence[int]) -> list[Tracklet]:
         """Return the walls among the unassigned ranges of one side, and use these up."""
         if len(radars) < 2:
             return []
         frames = unassigned.slots(radars, self._rule.window)
-        guesses = wall_guesses(frames[0], self._parameters.ranges)
+        guesses = wall_guesses(frames[0], self._parameters.ranges, self._parameters.tracklets)
         if not guesses:
             return []
         tracker = self._tracker()
-        return best_first(guesses, lambda guess: tracker.follow(guess, frames), tracker.is_wall)
+        return best_first(tracker, guesses, frames, tracker.is_wall)
 
-    def place(self, tracklet: WallTracklet) -> tuple[int, bool] | None:
+    def place(self, tracklet: Tracklet) -> tuple[int, bool] | None:
         """Bring a wall into the map; return its id and whether it is new.
 
         None: it is another wall, too near to a mapped one.
         """
         state = self._state
-        phi, d = tracklet.wall
+        phi, d = tracklet.target
         n = np.array([np.cos(phi), np.sin(phi)])
-        antennas = np.array([(m.slot.x_m, m.slot.y_m) for m in tracklet.members])
+        antennas = tracklet.antennas_m
         seen = BodyWall(
-            wall=tracklet.wall,
+            wall=tracklet.target,
             covariance=tracklet.covariance,
             by_offsets=tracklet.by_offsets,
             feet_m=antennas + np.outer(d - antennas @ n, n),

@@ -19,7 +19,6 @@ from slam.app.run.runner import RunRecord
 from slam.evaluation import (
     LandmarkScore,
     TrueAssociationNis,
-    align_se2,
     ate_rmse_m,
     icp_ate_rmse_m,
     landmark_metrics,
@@ -27,7 +26,7 @@ from slam.evaluation import (
     observable_landmarks,
     true_range_nis,
 )
-from slam.geometry import Rig, between, compose, transform
+from slam.geometry import Rig, align_se2, between, compose, transform
 
 
 def ratio(error_m: float, odometry_error_m: float) -> float:

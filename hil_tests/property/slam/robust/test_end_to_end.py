@@ -23,10 +23,10 @@ from hil_tests.unit.slam.simulation import FRAME_NS, World, at_rest, simulate
 from slam.app.run.runner import execute, make_slam
 from slam.app.sweep.run import make_case, source_of
 from slam.config import WheelNoise, load_preset, override
-from slam.evaluation import align_se2, ate_rmse_m
+from slam.evaluation import ate_rmse_m
 from slam.frames import Detection, RadarFrame
 from slam.front_end import make_detector
-from slam.geometry import paper_rig, transform
+from slam.geometry import align_se2, paper_rig, transform
 from slam.results import PoseAt, StepResult
 
 Array = NDArray[np.float64]

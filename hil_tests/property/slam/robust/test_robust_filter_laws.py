@@ -53,7 +53,7 @@ def dense(rows: Rows, size: int) -> Array:
 def see(state: State, radar: int, landmark: int, range_m: float, sigma_m: float = SIGMA_M) -> float:
     rows = rows_for(state, [radar], [landmark])
     residual = np.array([range_m]) - rows.predicted_m
-    return state.update(rows.at, rows.H, residual, np.array([sigma_m**2]))[0]
+    return state.update(rows.at, rows.H, residual, np.array([sigma_m**2]))
 
 
 def foreseen(state: State, radar: int, landmark: int) -> float:
@@ -86,7 +86,7 @@ def test_update_is_joseph_s_and_the_information_form(seed: int) -> None:
     rest = np.eye(len(P)) - K @ H
     wanted = deepcopy(state)
     wanted.correct(K @ residual)
-    nis, _ = state.update(rows.at, rows.H, residual, variances)
+    nis = state.update(rows.at, rows.H, residual, variances)
     after = state.P.full()
     assert relative_error(after, rest @ P @ rest.T + K @ R @ K.T) <= 1e-9
     assert (

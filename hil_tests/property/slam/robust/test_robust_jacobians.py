@@ -8,12 +8,12 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from hil_tests.property.ekf_oracles import complex_step
 from hil_tests.property.robust_oracles import (
     N_RADARS,
     Array,
     Complex,
     body_point,
-    derivative,
     increments,
     minus,
     moved,
@@ -62,8 +62,10 @@ def test_prediction_is_the_derivative_of_the_motion(
     nothing: Complex = np.zeros(3, dtype=np.complex128)
     ahead = moved(mean, increment, nothing)
     size = len(mean)
-    F = derivative(lambda e: minus(moved(plus(mean, e), increment, nothing), ahead), np.zeros(size))
-    G = derivative(lambda n: minus(moved(mean, increment, n), ahead), np.zeros(3))
+    F = complex_step(
+        lambda e: minus(moved(plus(mean, e), increment, nothing), ahead), np.zeros(size)
+    )
+    G = complex_step(lambda n: minus(moved(mean, increment, n), ahead), np.zeros(3))
     wanted = F @ before.P.full() @ F.T + G @ root @ root.T @ G.T
     assert np.abs(state.P.full() - wanted).max() <= 1e-10 * max(1.0, np.abs(wanted).max())
     assert np.abs(values(state)[1:] - ahead.real[1:]).max() <= 1e-12
@@ -89,7 +91,7 @@ def test_range_rows_are_derivatives_by_the_invariant_error(
         def predicted(e: Complex, k: int = landmark, r: int = radar, m: Array = antenna) -> Complex:
             return np.array([range_to(plus(mean, e), k, r, m)])
 
-        wanted = derivative(predicted, np.zeros(len(mean)))[0]
+        wanted = complex_step(predicted, np.zeros(len(mean)))[0]
         full = np.zeros(len(mean))
         full[rows.at] = rows.H[i]
         assert np.abs(full - wanted).max() <= 1e-10
@@ -111,7 +113,7 @@ def test_point_rows_are_derivatives(seed: int, heading: float) -> None:
     )
     rows = point_rows(state, 1, point)
     mean = values(state).astype(np.complex128)
-    wanted = derivative(lambda e: body_point(plus(mean, e), 1), np.zeros(len(mean)))
+    wanted = complex_step(lambda e: body_point(plus(mean, e), 1), np.zeros(len(mean)))
     full = np.zeros((2, len(mean)))
     full[:, rows.at] = rows.H
     full[:, state.offsets] += point.by_offsets
@@ -133,7 +135,7 @@ def test_range_and_bearing_rows_are_derivatives(seed: int, heading: float) -> No
         angle = np.arctan(b[1] / b[0])
         return np.array([np.sqrt(b @ b), angle])
 
-    wanted = derivative(measured, np.zeros(len(mean)))
+    wanted = complex_step(measured, np.zeros(len(mean)))
     full = np.zeros((2, len(mean)))
     full[:, rows.at] = rows.H
     assert np.abs(full - wanted).max() <= 1e-10 * max(1.0, np.abs(wanted).max())
@@ -162,7 +164,7 @@ def test_a_new_landmark_is_correlated_as_its_formula_says(seed: int, heading: fl
         return np.concatenate([e, np.linalg.solve(np.eye(2) + 0 * turn(e[0]), away)])
 
     # V(e_th) is the identity to first order, and the error it acts on is zero here.
-    G = derivative(error, np.zeros(len(mean) + 2))
+    G = complex_step(error, np.zeros(len(mean) + 2))
     inputs = np.zeros((len(mean) + 2, len(mean) + 2))
     inputs[: len(mean), : len(mean)] = before.P.full()
     inputs[len(mean) :, len(mean) :] = C
@@ -241,7 +243,7 @@ def test_derivatives_of_the_smoother_are_those_of_its_residuals(seed: int) -> No
             return result
 
         x = np.concatenate([estimate.poses[k], estimate.poses[k + 1], estimate.calibration[0]])
-        wanted = derivative(step, x)
+        wanted = complex_step(step, x)
         found = np.hstack([steps.by_before[k], steps.by_after[k], steps.by_calibration[k]])
         assert np.abs(found - wanted).max() <= 1e-10 * np.abs(wanted).max()
 
@@ -259,7 +261,7 @@ def test_derivatives_of_the_smoother_are_those_of_its_residuals(seed: int) -> No
                 [estimate.offsets_m[problem.range_radars[i]]],
             ]
         )
-        wanted = derivative(white_range, x)[0]
+        wanted = complex_step(white_range, x)[0]
         found = np.concatenate([rows.by_pose[i], rows.by_landmark[i], [rows.by_offset[i]]])
         assert np.abs(found - wanted).max() <= 1e-10 * np.abs(wanted).max()
         assert rows.residual[i] == pytest.approx(white_range(x.astype(complex))[0].real, abs=1e-9)
@@ -278,6 +280,6 @@ def test_derivatives_of_the_smoother_are_those_of_its_residuals(seed: int) -> No
                 estimate.landmarks_m[problem.point_landmarks[i]],
             ]
         )
-        wanted = derivative(white_point, x)
+        wanted = complex_step(white_point, x)
         found = np.hstack([rows.by_pose[4 + 2 * i :][:2], rows.by_landmark[4 + 2 * i :][:2]])
         assert np.abs(found - wanted).max() <= 1e-9 * np.abs(wanted).max()

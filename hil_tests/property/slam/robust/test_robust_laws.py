@@ -37,8 +37,7 @@ def measure(
     state: State, radars: Indices, landmarks: Indices, residual: Array, sigma: float
 ) -> float:
     rows = rows_of(state, view(state, ANTENNAS), radars, landmarks)
-    nis, _ = state.update(rows.at, rows.H, residual, np.full(len(residual), sigma**2))
-    return nis
+    return state.update(rows.at, rows.H, residual, np.full(len(residual), sigma**2))
 
 
 def test_covariance_stays_symmetric_and_positive_over_ten_thousand_operations() -> None:

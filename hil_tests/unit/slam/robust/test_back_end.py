@@ -16,8 +16,8 @@ from hil_tests.unit.slam.robust.range_world import (
     parameters_for,
     simulate,
 )
-from slam.evaluation import align_se2, ate_rmse_m, landmark_metrics, observable_landmarks
-from slam.geometry import Mount, Rig, paper_rig, transform
+from slam.evaluation import ate_rmse_m, landmark_metrics, observable_landmarks
+from slam.geometry import Mount, Rig, align_se2, paper_rig, transform
 from slam.robust.association import RangeScan, sides_of
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import RangeBearing

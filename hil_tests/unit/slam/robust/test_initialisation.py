@@ -27,12 +27,12 @@ from slam.robust.initialisation import (
     pair_guesses,
 )
 from slam.robust.map import Existence, find_merge
-from slam.robust.parameters import MapRule, RangeNoise, TrackletRule
+from slam.robust.parameters import BackEndParameters, MapRule, RangeNoise, TrackletRule
 from slam.robust.state import Array, State, SymmetricMatrix, calibrated_motion
 
 SIGMA_M = 5e-3
-NOISE = RangeNoise(sigma_m=SIGMA_M)
-RULE = TrackletRule()
+NOISE, RULE = RangeNoise(sigma_m=SIGMA_M), TrackletRule()
+PARAMETERS = BackEndParameters(ranges=NOISE, tracklets=RULE)
 LEFT = (0, 1)
 
 
@@ -63,7 +63,7 @@ def driven(targets: Array, offsets_m: Array, *, moving: bool = False) -> Unassig
 
 def tracklets(unassigned: UnassignedRanges, offset_sigma_m: float = 0.0) -> list[Tracklet]:
     frames = unassigned.slots(LEFT, 15)
-    tracker = Tracker(NOISE, RULE, np.zeros(4), offset_sigma_m**2 * np.eye(4))
+    tracker = Tracker(PARAMETERS, np.zeros(4), offset_sigma_m**2 * np.eye(4))
     return find_tracklets(tracker, pair_guesses(frames[0], NOISE, RULE), frames, 2, RULE)
 
 
@@ -71,7 +71,7 @@ def test_a_tracklet_is_a_point_at_rest_and_uses_its_ranges_up() -> None:
     target = np.array([[0.15, 0.9]])
     unassigned = driven(target, np.zeros(4))
     (found,) = tracklets(unassigned)
-    miss = found.point_m - (target[0] - [0.28, 0.0])
+    miss = found.target - (target[0] - [0.28, 0.0])
     assert miss @ np.linalg.solve(found.covariance, miss) < 13.8
     assert len(found.members) == 30
     assert all(not slot.unused for slots in unassigned.slots(LEFT, 15) for slot in slots)
@@ -89,10 +89,10 @@ def test_of_two_points_four_fixes_and_two_tracklets() -> None:
     unassigned = driven(targets, np.zeros(4))
     frames = unassigned.slots(LEFT, 15)
     assert len(pair_guesses(frames[0], NOISE, RULE)) > 2
-    found = sorted(tracklets(unassigned), key=lambda tracklet: float(tracklet.point_m[1]))
+    found = sorted(tracklets(unassigned), key=lambda tracklet: float(tracklet.target[1]))
     assert len(found) == 2
     for tracklet, target in zip(found, targets, strict=True):
-        assert tracklet.point_m == pytest.approx(target - [0.28, 0.0], abs=0.03)
+        assert tracklet.target == pytest.approx(target - [0.28, 0.0], abs=0.03)
 
 
 def test_offsets_that_are_told_to_be_doubtful_cost_no_tracklet() -> None:
@@ -101,8 +101,8 @@ def test_offsets_that_are_told_to_be_doubtful_cost_no_tracklet() -> None:
     assert tracklets(driven(target, offsets)) == []
     (found,) = tracklets(driven(target, offsets), 0.02)
     true = target[0] - [0.28, 0.0]
-    corrected = found.point_m + found.by_offsets @ offsets
-    assert np.hypot(*(corrected - true)) < 0.5 * np.hypot(*(found.point_m - true))
+    corrected = found.target + found.by_offsets @ offsets
+    assert np.hypot(*(corrected - true)) < 0.5 * np.hypot(*(found.target - true))
 
 
 @pytest.mark.parametrize("dead", [0, 1])

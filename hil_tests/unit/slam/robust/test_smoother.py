@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from hil_tests.property.robust_oracles import derivative
+from hil_tests.property.ekf_oracles import complex_step
 from hil_tests.unit.slam.robust.range_world import LAB, parameters_for, simulate, step_of
 from hil_tests.unit.slam.robust.test_roundness import RODS, SIGMA_M, drive
 from slam.config import WheelNoise
@@ -204,7 +204,7 @@ def test_the_smoother_is_least_squares_and_its_complement_the_marginal(walk: flo
 
     oracle = least_squares(real, packed(start), xtol=1e-15, ftol=1e-15, gtol=1e-12, x_scale="jac")
     assert np.abs(packed(solution.estimate) - oracle.x).max() <= 1e-6
-    J = derivative(residuals, oracle.x)
+    J = complex_step(residuals, oracle.x)
     keep = newest(N_STEPS + 1, n_cal, len(oracle.x))
     wanted = np.linalg.inv(J.T @ J)[np.ix_(keep, keep)]
     marginal = np.linalg.inv(solution.information)
@@ -220,7 +220,7 @@ def test_the_prior_is_the_dense_schur_complement_of_the_poses_gone(walk: float) 
         start, poses=start.poses[: N_GONE + 1], calibration=start.calibration[:n_cal]
     )
     x = packed(beginning)
-    J = derivative(lambda y: white_residuals(problem, N_GONE, N_GONE, n_cal, y), x)
+    J = complex_step(lambda y: white_residuals(problem, N_GONE, N_GONE, n_cal, y), x)
     r = white_residuals(problem, N_GONE, N_GONE, n_cal, x.astype(np.complex128)).real
     H, g = J.T @ J, J.T @ r
     keep = newest(N_GONE + 1, n_cal, len(x))
@@ -230,7 +230,7 @@ def test_the_prior_is_the_dense_schur_complement_of_the_poses_gone(walk: float) 
     pull = g[keep] - gain @ g[gone]
     values = x[keep]
     assert np.array_equal(prior.mean, values)
-    K = derivative(lambda y: invariant_errors(values, y), values)
+    K = complex_step(lambda y: invariant_errors(values, y), values)
     assert np.abs(K.T @ prior.information @ K - wanted).max() <= 1e-8 * np.abs(wanted).max()
     assert np.abs(K.T @ prior.gradient - pull).max() <= 1e-8 * np.abs(pull).max()
 
@@ -342,11 +342,11 @@ def test_a_prior_pulls_as_its_cost_falls() -> None:
         e = invariant_errors(prior.mean, x)
         return np.atleast_1d(e @ (prior.information @ e + 2.0 * prior.gradient))
 
-    slope = derivative(cost, values)[0]
+    slope = complex_step(cost, values)[0]
     here = prior_cost(prior, values, N_RADARS)
     assert here == pytest.approx(float(cost(values.astype(np.complex128))[0].real), rel=1e-9)
     assert np.abs(2.0 * gradient - slope).max() <= 1e-9 * np.abs(slope).max()
-    K = derivative(lambda y: invariant_errors(prior.mean, y), values)
+    K = complex_step(lambda y: invariant_errors(prior.mean, y), values)
     wanted = K.T @ prior.information @ K
     assert np.abs(information - wanted).max() <= 1e-9 * np.abs(wanted).max()
 

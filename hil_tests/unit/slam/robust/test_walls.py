@@ -20,7 +20,7 @@ from slam.evaluation import nees_pose
 from slam.geometry import paper_rig
 from slam.robust.association import Antennas, RangeScan, antennas_of, rows_of, view
 from slam.robust.back_end import RobustBackEnd
-from slam.robust.initialisation import Slot, UnassignedRange
+from slam.robust.initialisation import Slot, Tracklet, UnassignedRange
 from slam.robust.map import Sightings, compare
 from slam.robust.parameters import BackEndParameters, RangeNoise, WallRule
 from slam.robust.run_log import Estimate, RunLog, start_prior
@@ -30,11 +30,11 @@ from slam.robust.walls import (
     BodyWall,
     WallCells,
     WallTracker,
-    WallTracklet,
     initialise_wall,
     is_unresolved,
     match_wall,
     update_with_wall,
+    wall_guesses,
 )
 
 OFFSETS = (0.01, 0.01, 0.01, 0.01)
@@ -344,7 +344,7 @@ def test_the_edge_of_a_wall_turns_neither_wall_nor_robot(seed: int) -> None:
     assert wall.spans_m[:, :, 0].max() < WALL_END_M + 0.2
 
 
-def tracklet_of(shape: Array, offset_sigma_m: float) -> tuple[WallTracker, WallTracklet]:
+def tracklet_of(shape: Array, offset_sigma_m: float) -> tuple[WallTracker, Tracklet]:
     """Return what a wall tracker makes of ranges that miss a wall by a shape, front and rear."""
     parameters = BackEndParameters(ranges=RangeNoise(sigma_m=SIGMA_M, offset_sigma_m=0.02))
     frames = []
@@ -359,7 +359,9 @@ def tracklet_of(shape: Array, offset_sigma_m: float) -> tuple[WallTracker, WallT
             )
         frames.append(slots)
     tracker = WallTracker(parameters, np.zeros(2), offset_sigma_m**2 * np.ones((2, 2)))
-    return tracker, tracker.follow(np.array([math.pi / 2, WALL_Y_M + OFFSET_M]), frames)
+    (first, *_) = wall_guesses(frames[0], parameters.ranges, parameters.tracklets)
+    guess = replace(first, target=np.array([math.pi / 2, WALL_Y_M + OFFSET_M]))
+    return tracker, tracker.follow(guess, frames)
 
 
 def test_an_unknown_offset_is_one_number_and_no_noise_of_each_range() -> None:
@@ -367,7 +369,7 @@ def test_an_unknown_offset_is_one_number_and_no_noise_of_each_range() -> None:
     rng = np.random.default_rng(1)
     tracker, wall = tracklet_of(SIGMA_M * rng.standard_normal(40), OFFSET_M)
     assert tracker.is_wall(wall)
-    assert wall.wall == pytest.approx([math.pi / 2, WALL_Y_M + OFFSET_M], abs=2e-3)
+    assert wall.target == pytest.approx([math.pi / 2, WALL_Y_M + OFFSET_M], abs=2e-3)
     # d is right for the offsets of the state, zero; as they are corrected, so is d.
     assert wall.by_offsets[1].sum() == pytest.approx(-1.0, abs=1e-3)
     assert wall.covariance[1, 1] < SIGMA_M**2
