@@ -54,8 +54,7 @@ def _costs(residuals: Array, scale: float | None) -> Array:
     """Return c^2 / 2 ln(1 + r^2 / c^2), Cauchy's cost for the scale c; r^2 / 2 without one."""
     if scale is None:
         return residuals**2 / 2
-    result: Array = scale**2 / 2 * np.log1p((residuals / scale) ** 2)
-    return result
+    return np.asarray(scale**2 / 2 * np.log1p((residuals / scale) ** 2))
 
 
 def _weights(residuals: Array, scale: float | None) -> Array:
@@ -206,6 +205,13 @@ class PriorTerm:
         return csr_array((1 / self.sigmas, (rows, self.indices)), shape=(len(rows), len(state)))
 
 
+def steps_of(poses: Array) -> Array:
+    """Return each step in the body frame at its start, shape (n - 1, 3): [m], [m], [rad]."""
+    step_x, step_y, turn = np.diff(poses, axis=0).T
+    cosine, sine = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
+    return np.column_stack([cosine * step_x + sine * step_y, cosine * step_y - sine * step_x, turn])
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OdometryTerm:
     """The reported steps of the wheels from one pose to the next.
@@ -222,7 +228,7 @@ class OdometryTerm:
     cauchy_scale: float | None = None
 
     def residuals(self, state: Array) -> Array:
-        dx, dy, turn, *_ = self._motion(state)
+        dx, dy, turn = steps_of(state[self.layout.poses].reshape(-1, 3)).T
         scale, turn_scale, curvature = state[self.layout.wheels]
         distance = np.sqrt(self.steps[:, 0] ** 2 + self.steps[:, 1] ** 2)
         expected = np.column_stack(
@@ -235,7 +241,9 @@ class OdometryTerm:
         return ((expected - self.steps) / self.sigmas).ravel()
 
     def jacobian(self, state: Array) -> csr_array[np.float64]:
-        dx, dy, turn, cosine, sine = self._motion(state)
+        poses = state[self.layout.poses].reshape(-1, 3)
+        dx, dy, turn = steps_of(poses).T
+        cosine, sine = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
         scale, turn_scale, curvature = state[self.layout.wheels]
         distance = np.sqrt(self.steps[:, 0] ** 2 + self.steps[:, 1] ** 2)
         n = len(dx)
@@ -266,14 +274,6 @@ class OdometryTerm:
         columns = np.concatenate([column for _, column, _ in parts])
         values = np.concatenate([value / self.sigmas[:, row] for row, _, value in parts])
         return csr_array((values, (rows, columns)), shape=(3 * n, len(state)))
-
-    def _motion(self, state: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """Return the true steps in the body frame at their start, and that frame's axes."""
-        poses = state[self.layout.poses].reshape(-1, 3)
-        step_x, step_y, turn = np.diff(poses, axis=0).T
-        cosine, sine = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
-        dx, dy = cosine * step_x + sine * step_y, cosine * step_y - sine * step_x
-        return dx, dy, turn, cosine, sine
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

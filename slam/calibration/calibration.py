@@ -27,6 +27,7 @@ from slam.calibration.batch import (
     Stop,
     Term,
     minimise,
+    steps_of,
 )
 from slam.calibration.tracks import (
     UNASSIGNED,
@@ -152,13 +153,6 @@ def make_drive(
     )
 
 
-def steps_of(poses: Array) -> Array:
-    """Return each step in the body frame at its start, shape (n - 1, 3): [m], [m], [rad]."""
-    step_x, step_y, turn = np.diff(poses, axis=0).T
-    cosine, sine = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
-    return np.column_stack([cosine * step_x + sine * step_y, cosine * step_y - sine * step_x, turn])
-
-
 def calibrate(
     drive: Drive, priors: CalibrationPriors | None = None, known_m: Array | None = None
 ) -> Calibration:
@@ -266,11 +260,10 @@ class _Estimator:
         ranges, sights = self._drive.ranges, self._sights(model)
         strength = strengths(ranges, sights, model.landmarks, landmark)
         offsets_m = model.radars[ranges.radar, 0]
-        assignment = assign(
+        landmark, self._bend_m = assign(
             ranges, sights, offsets_m, model.landmarks, gate_m=gates_m, strengths=strength
         )
-        self._bend_m = assignment.bend_m
-        return assignment.landmark
+        return landmark
 
     def _without_poor(self, model: _Model, landmark: Indices) -> tuple[_Model, Indices]:
         """Drop landmarks that too few ranges see; known ones stay, as first."""

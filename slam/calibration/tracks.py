@@ -270,14 +270,6 @@ def _seen_together(first: Track, second: Track, ranges: RangeSet) -> bool:
     return len(shared) >= _SHARED_FRAMES
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Assignment:
-    """Which landmark each range belongs to, and the effect of its neighbours."""
-
-    landmark: Indices  # shape (n,), or UNASSIGNED
-    bend_m: Array  # shape (n,), standard deviation that echoes of other landmarks add
-
-
 def assign(
     ranges: RangeSet,
     sights: Array,
@@ -286,18 +278,19 @@ def assign(
     *,
     gate_m: Array,
     strengths: Array,
-) -> Assignment:
-    """Give each range the one landmark whose predicted range it meets.
+) -> tuple[Indices, Array]:
+    """Return the one landmark whose predicted range each range meets, or UNASSIGNED, shape (n,).
 
     A range is left alone where two landmarks would meet it, and where another echo overlaps so much
     that it bends the peak by more than 4 mm. A landmark takes one range per frame. ``sights`` (n,
     3): antenna x, y [m] and boresight [rad] at each range, map frame; ``offset_m`` and ``gate_m``
-    (n,): the radar's offset and the largest difference; ``strengths`` (k,) of the landmarks, see
-    there.
+    (n,): the radar's offset and the largest difference; ``strengths`` (k,) of the landmarks.
+
+    Also returned, (n,) [m]: the standard deviation that echoes of other landmarks add.
     """
     unassigned = np.full(len(ranges), UNASSIGNED, dtype=np.intp)
     if not len(landmarks_m) or not len(ranges):
-        return Assignment(landmark=unassigned, bend_m=np.zeros(len(ranges)))
+        return unassigned, np.zeros(len(ranges))
     distance, cosine = _seen(sights, landmarks_m)
     visible = cosine > _HALF_VIEW_COS
     error = np.abs(distance + offset_m[:, np.newaxis] - ranges.range_m[:, np.newaxis])
@@ -311,9 +304,8 @@ def assign(
     keys = np.column_stack([ranges.t_ns[rows], ranges.radar[rows], best[rows]])
     first = np.ones(len(rows), dtype=np.bool_)
     first[1:] = np.any(keys[1:] != keys[:-1], axis=1)
-    landmark = unassigned
-    landmark[rows[first]] = best[rows[first]]
-    return Assignment(landmark=landmark, bend_m=bend_m)
+    unassigned[rows[first]] = best[rows[first]]
+    return unassigned, bend_m
 
 
 def echo_law(distance_m: Array, cosine: Array) -> Array:
@@ -374,8 +366,7 @@ def well_seen(ranges: RangeSet, landmark: Indices, n_landmarks: int) -> NDArray[
     n_seeing = (counts >= _LEAST_PER_RADAR).sum(axis=1)
     usual = float(np.median(total[total > 0])) if used.any() else 0.0
     enough = max(_LEAST_ASSOCIATED_RANGES, _LEAST_SHARE * usual)
-    result: NDArray[np.bool_] = (n_seeing >= min(2, n_radars)) & (total >= enough)
-    return result
+    return np.asarray((n_seeing >= min(2, n_radars)) & (total >= enough))
 
 
 def covisible(ranges: RangeSet, landmark: Indices, first: int, second: int) -> int:

@@ -96,27 +96,13 @@ def share_error(share: float) -> float:
     return math.sqrt(share * (1 - share) / TRIALS)
 
 
+@pytest.mark.parametrize("wide", [0.9, 1.0, 1.1])
 @pytest.mark.parametrize("front_end", ["matched_filter", "joint"])
-def test_one_echo_is_ranged_at_the_cramer_rao_bound(front_end: str) -> None:
-    """Bound with amplitude and phase unknown: 2 sigma / A sqrt(s / sqrt(pi)), in bins."""
-    rng = np.random.default_rng(1)
-    true_m = places(rng)
-    found = by_trial(detect(frames_of(true_m, AMPLITUDE, rng), front_end))
-    assert all(len(each) > 0 for each in found)
-    errors = np.array(
-        [each[np.abs(each - r).argmin()] - r for each, r in zip(found, true_m.flat, strict=True)]
-    )
-    bound_m = 2 * NOISE_SIGMA / AMPLITUDE * math.sqrt(S / math.sqrt(math.pi)) * BIN_M
-    # 2000 trials tell a standard deviation to 1.6 %, and none is less than the bound
-    assert 0.95 * bound_m <= errors.std(ddof=1) <= 1.1 * bound_m
-    assert abs(errors.mean()) < 1e-4
-    assert np.mean([len(each) == 1 for each in found]) >= 0.99
+def test_one_echo_is_ranged_at_the_cramer_rao_bound(front_end: str, wide: float) -> None:
+    """Bound with amplitude and phase unknown, 2 sigma / A sqrt(s / sqrt(pi)), in bins.
 
-
-@pytest.mark.parametrize("wide", [0.9, 1.1])
-@pytest.mark.parametrize("front_end", ["matched_filter", "joint"])
-def test_a_pulse_that_is_not_quite_ours_costs_little(front_end: str, wide: float) -> None:
-    """Ten percent too narrow or wide: still one echo, without bias, near its own bound."""
+    A pulse ten percent too narrow or wide is still one echo, without bias, near its own bound.
+    """
     rng = np.random.default_rng(6)
     true_m = places(rng)
     found = by_trial(detect(frames_of(true_m, AMPLITUDE, rng, wide=wide), front_end))
@@ -125,6 +111,7 @@ def test_a_pulse_that_is_not_quite_ours_costs_little(front_end: str, wide: float
         [each[np.abs(each - r).argmin()] - r for each, r in zip(found, true_m.flat, strict=True)]
     )
     bound_m = 2 * NOISE_SIGMA / AMPLITUDE * math.sqrt(wide * S / math.sqrt(math.pi)) * BIN_M
+    # 2000 trials tell a standard deviation to 1.6 %, and none is less than the bound
     assert 0.95 * bound_m <= errors.std(ddof=1) <= 1.1 * bound_m
     assert abs(errors.mean()) < 1e-4
 

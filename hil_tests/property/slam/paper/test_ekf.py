@@ -211,13 +211,6 @@ def test_jacobians_of_a_landmark_straight_behind() -> None:
             assert np.abs(H_landmark[0] - by_landmark).max() <= 1e-10
 
 
-@given(st.one_of(angles, st.sampled_from([-math.pi, math.pi - 1e-9, math.pi])), increments)
-def test_motion_jacobian_is_the_complex_step_derivative(heading: float, u: Array) -> None:
-    pose = np.array([1.0, -2.0, heading])
-    wanted = complex_step(lambda p: move(p, u.astype(np.complex128)), pose)
-    assert np.abs(ekf_slam.motion_jacobian(heading, u) - wanted).max() <= 1e-10
-
-
 @given(st.floats(-20, 20), st.floats(-20, 20), st.sampled_from([-2, -1, 0, 1, 2]))
 @example(math.pi, 0.0, 0)
 @example(0.0, math.pi, 0)
