@@ -1,8 +1,8 @@
 """What ``xethru decode`` finds when some of all bytes are damaged.
 
 ``python -m hil_tests.bench.corrupted_traffic --megabytes 100 --rate 1e-3`` makes mixed traffic of
-a module, replaces that share of all bytes by other values, decodes what is left through the
-command's own code path and prints how many of the packets that no damage touched were found.
+a module, replaces that share of all bytes by other values, decodes what is left by the
+command's own reader and prints how many of the packets that no damage touched were found.
 Each that was not is explained by what stands in its place; ``unexplained`` must be 0.
 ``--short`` sends answers of a few bytes only; ``--cli`` also runs the command itself and prints
 its memory. Everything follows from ``--seed``.
@@ -16,20 +16,22 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
 
-from xethru_protocol.cli.recordings import found_in, message_of
+from xethru_protocol.cli.recordings import message_of
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import SystemCode
 from xethru_protocol.wire.connection import Connection, Role
 from xethru_protocol.wire.framing import (
+    Direction,
     Framing,
     FramingFault,
     LinkStatistics,
     Packet,
+    PacketReader,
     encode_normal,
 )
 
@@ -164,9 +166,7 @@ def run(size: int, rate: float, seed: int, *, short: bool) -> Outcome:
     line = Corruption(size, rate, seed, short=short)
     outcome = line.outcome
     swallowing: list[tuple[int, Packet]] = []
-    for found in found_in(line.chunks(), "module", outcome.statistics):
-        if isinstance(found, FramingFault):
-            continue
+    for found in packets_in(line.chunks(), outcome.statistics):
         message = message_of(found, "module")
         outcome.statistics.unknown += isinstance(message, m.UnknownMessage)
         sent = line.untouched.get(found.offset)
@@ -182,6 +182,21 @@ def run(size: int, rate: float, seed: int, *, short: bool) -> Outcome:
         before = swallowing[index][1] if index >= 0 and swallowing else None
         outcome.missed[_why(before, offset, line.merged)] += 1
     return outcome
+
+
+def packets_in(chunks: Iterator[bytes], statistics: LinkStatistics) -> Iterator[Packet]:
+    reader = PacketReader(Direction.FROM_MODULE, statistics)
+    for chunk in chunks:
+        reader.receive_data(chunk)
+        yield from _complete(reader)
+    reader.end_data()
+    yield from _complete(reader)
+
+
+def _complete(reader: PacketReader) -> Iterator[Packet]:
+    while isinstance(found := reader.next_packet(), Packet | FramingFault):
+        if isinstance(found, Packet):
+            yield found
 
 
 def _carries(sent: bytes, found: Packet) -> bool:
@@ -264,7 +279,8 @@ def main() -> None:
     arguments = parser.parse_args()
     size = int(arguments.megabytes * 1e6)
     outcome = run(size, arguments.rate, arguments.seed, short=arguments.short)
-    shown = asdict(outcome) | {"statistics": outcome.statistics.summary()}
+    shown: dict[str, object] = {each.name: getattr(outcome, each.name) for each in fields(outcome)}
+    shown["statistics"] = outcome.statistics.summary()
     if arguments.cli:
         command = run_command(size, arguments.rate, arguments.seed, short=arguments.short)
         shown["command"] = asdict(command)

@@ -21,7 +21,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from itertools import islice
 from pathlib import Path
-from types import CodeType, FrameType, TracebackType
+from types import CodeType, FrameType
 from typing import Self
 
 from emulator.chip import Pace
@@ -30,25 +30,14 @@ from emulator.echo.echo import echo_source
 from emulator.loopback import LoopbackTransport
 from emulator.module.memory import Identity
 from emulator.scene.scene import load_scene
-from emulator.scene.wheels import scene_odometry
 from hil_tests.paths import REPOSITORY
 from slam.app.cli import main as uwb_slam
 from slam.app.odometry.track import OdometryTrack
-from slam.app.records import SessionInfo
-from slam.app.rig.emulated import (
-    FRAME_RATE_HZ,
-    RAW_CONFIG,
-    end_counter,
-    open_loopback,
-    rig_of,
-    scene_and_config,
-    true_landmarks_m,
-    wheels_of,
-)
-from slam.app.run.runner import make_slam, run_slam
+from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG
+from slam.app.run.runner import run_slam
 from slam.app.session.log import SessionLog
+from slam.app.sweep.run import make_case, source_of
 from xethru_protocol.driver.radar import X4M300
-from xethru_protocol.system import StopFlag
 
 ROOT = REPOSITORY
 PRODUCT = ("xethru_protocol", "emulator", "slam")
@@ -88,12 +77,7 @@ class Trace:
         sys.setprofile(self._on_event)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         sys.setprofile(None)
         threading.setprofile(None)
 
@@ -138,27 +122,18 @@ def echo_to_frame() -> list[str]:
 
 def scans_to_belief_and_log() -> list[str]:
     """Step preset ``robust`` with three scans of four frames, and log scans and states."""
-    scene, config = scene_and_config(SCENE, "robust")
-    truth_at = scene.trajectory().poses
-    odometry = OdometryTrack.from_lines(scene_odometry(scene, SEED))
-    slam = make_slam(config, rig_of(scene), wheels_of(scene))
-    with tempfile.TemporaryDirectory() as folder, open_loopback(scene, SEED) as source:
-        source.start(RAW_CONFIG, FRAME_RATE_HZ)
-        scans = source.scans(end_counter(scene.trajectory().duration_ns), StopFlag())
-        earlier, counted = list(islice(scans, MAPPED_SCANS)), list(islice(scans, 3))
-        info = SessionInfo(
-            scene=scene.name,
-            preset="robust",
-            seed=SEED,
-            radars=source.radars,
-            true_landmarks_m=true_landmarks_m(scene),
-            versions={},
-        )
-        log = SessionLog(Path(folder) / "session.mcap", info, odometry, truth_at=truth_at)
+    source = source_of(make_case(SCENE, "robust", SEED))
+    scans = iter(source.scans)
+    earlier, counted = list(islice(scans, MAPPED_SCANS)), list(islice(scans, 3))
+    assert isinstance(source.odometry, OdometryTrack)
+    inputs = source.odometry, source.slam, source.truth_at
+    with tempfile.TemporaryDirectory() as folder, contextlib.closing(source):
+        session = Path(folder) / "session.mcap"
+        log = SessionLog(session, source.info, source.odometry, truth_at=source.truth_at)
         with contextlib.closing(log):
-            run_slam(earlier, odometry, slam, truth_at, [log])
+            run_slam(earlier, *inputs, [log])
             with Trace() as trace:
-                record = run_slam(counted, odometry, slam, truth_at, [log])
+                record = run_slam(counted, *inputs, [log])
     if len(record.results) != len(counted):
         raise RuntimeError(f"{len(counted)} scans led to {len(record.results)} states")
     return trace.files()

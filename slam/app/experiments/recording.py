@@ -43,7 +43,7 @@ from emulator.module.memory import Identity
 from emulator.scene.scene import ClutterSpec, JitterSpec, NoiseSpec, RadarSpec, Scene, TargetSpec
 from slam.app.errors import AppError
 from slam.app.experiments import Result, table
-from slam.app.run.pictures import ESTIMATE, INK, ODOMETRY, TRUTH, label
+from slam.app.run.pictures import ESTIMATE, INK, ODOMETRY, TRUTH, label, note
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings import RecordingError, read_recording
@@ -331,16 +331,11 @@ def _draw_amplitudes(axes: Axes, recorded: SlowTime, emulated: Sequence[SlowTime
     _draw_band(axes, range_m, [one.amplitude for one in emulated])
     sigma = np.median([one.sigma for one in emulated], axis=0)
     axes.semilogy(range_m, sigma, color=_EMULATED, linewidth=1.0, linestyle="--")
-    axes.annotate(
+    text = (
         "solid: mean amplitude, dashed: std per component\n"
-        "in the scene there is the strongest\nreflector only: no room, nobody moves",
-        (0.97, 0.97),
-        xycoords="axes fraction",
-        ha="right",
-        va="top",
-        fontsize=8.5,
-        color=INK,
+        "in the scene there is the strongest\nreflector only: no room, nobody moves"
     )
+    note(axes, text, (0.97, 0.97), (0, 0), INK, xycoords="axes fraction", ha="right", va="top")
     label(axes, "(a) bins (grey: the ten farthest)", "range [module m]", "amplitude")
 
 

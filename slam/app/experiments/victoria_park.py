@@ -356,33 +356,25 @@ def _draw(
         run = runs[name]
         axes = figure.add_subplot(grid[0, column])
         _map(axes, odometry, reference, run)
-        label(
-            axes,
-            f"{name}: {len(run.landmarks_m)} landmarks for {len(reference.labels)} trees, "
-            f"ATE {ate[f'robust, {name}']:.2f} m",
-            "x [m]",
-            "y [m]",
-        )
+        landmarks = f"{len(run.landmarks_m)} landmarks for {len(reference.labels)} trees"
+        label(axes, f"{name}: {landmarks}, ATE {ate[f'robust, {name}']:.2f} m", "x [m]", "y [m]")
         if column == 0:
             axes.legend(loc="lower left", fontsize=8, frameon=False)
     axes = figure.add_subplot(grid[1, :])
     gone_m = np.concatenate(
         [[0.0], np.cumsum(np.hypot(*np.diff(reference.poses[:, :2], axis=0).T))]
     )
-    paths = {"ISAM2, true ids": reference.causal} | {
-        f"robust, {name}": runs[name].poses for name in _MAPS
-    }
-    for (name, poses), colour in zip(paths.items(), (_ISAM, ESTIMATE, LANDMARK), strict=True):
+    for name, poses, colour in (
+        ("ISAM2, true ids", reference.causal, _ISAM),
+        ("robust, true ids", runs["true ids"].poses, ESTIMATE),
+        ("robust, unknown ids", runs["unknown ids"].poses, LANDMARK),
+    ):
         away = np.hypot(*(poses - reference.poses)[:, :2].T)
         axes.semilogy(gone_m, np.maximum(away, 1e-3), color=colour, linewidth=0.9, label=name)
     axes.set_ylim(1e-2, None)
     axes.legend(loc="lower right", fontsize=8, frameon=False, ncols=3)
-    label(
-        axes,
-        "distance to the batch solution, not aligned (batch also knows what came later)",
-        "distance driven [m]",
-        "distance [m]",
-    )
+    title = "distance to the batch solution, not aligned (batch also knows what came later)"
+    label(axes, title, "distance driven [m]", "distance [m]")
 
 
 def _map(axes: Axes, odometry: Array, reference: Reference, run: ParkRun) -> None:

@@ -376,11 +376,10 @@ class _Estimator:
                 self._graph.add(gtsam.PriorFactorDouble(self._B(radar), 0.0, noise))
 
     def solve(self, run: KnownRun) -> KnownAssociation:
-        filtered, covariances = [], []
-        for increment, ranges in zip(run.increments, run.ranges, strict=True):
-            pose, covariance = self._step(increment, ranges)
-            filtered.append(pose)
-            covariances.append(covariance)
+        covariances = [
+            self._step(increment, ranges)
+            for increment, ranges in zip(run.increments, run.ranges, strict=True)
+        ]
         optimizer = self._gtsam.LevenbergMarquardtOptimizer(
             self._isam.getFactorsUnsafe(), self._isam.calculateEstimate()
         )
@@ -389,7 +388,7 @@ class _Estimator:
         ids = tuple(sorted(self._known))
         landmarks = [values.atPoint2(self._L(id_)) for id_ in ids]
         return KnownAssociation(
-            filtered=np.array(filtered).reshape(-1, 3),
+            filtered=np.array(self._poses[1:]).reshape(-1, 3),
             filtered_covariance=np.array(covariances).reshape(-1, 3, 3),
             smoothed=np.array([[p.x(), p.y(), p.theta()] for p in smoothed]).reshape(-1, 3),
             landmark_ids=ids,
@@ -397,8 +396,8 @@ class _Estimator:
             calibration=np.asarray(values.atVector(self._C(self._n_calibrations - 1))),
         )
 
-    def _step(self, increment: Array, ranges: tuple[KnownRange, ...]) -> tuple[Array, Array]:
-        """Take in one step; return the newest pose (3,) and its covariance (3, 3)."""
+    def _step(self, increment: Array, ranges: tuple[KnownRange, ...]) -> Array:
+        """Take in one step; return the covariance of the newest pose, shape (3, 3)."""
         gtsam, step = self._gtsam, len(self._poses)
         self._walk(increment)
         calibration_key = self._C(self._n_calibrations - 1)
@@ -426,7 +425,8 @@ class _Estimator:
         turn = np.eye(3)
         turn[:2, :2] = rotation(float(pose[2]))
         # GTSAM's error of a pose lies in the body frame.
-        return pose, turn @ self._isam.marginalCovariance(self._X(step)) @ turn.T
+        covariance: Array = turn @ self._isam.marginalCovariance(self._X(step)) @ turn.T
+        return covariance
 
     def _new_graph(self) -> None:
         self._graph = self._gtsam.NonlinearFactorGraph()

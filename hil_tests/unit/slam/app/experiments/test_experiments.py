@@ -12,7 +12,8 @@ import pytest
 from numpy.typing import NDArray
 
 from emulator.scene.scene import load_scene
-from hil_tests.paths import FIXTURES, REPOSITORY
+from hil_tests.paths import REPOSITORY
+from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.sweep.sweep_runs import run_of
 from slam.app.cli import main
 from slam.app.experiments.figure7 import measure_steps, range_errors
@@ -78,14 +79,8 @@ def test_a_scene_in_smoke_echoes_weaker_by_just_that_much() -> None:
 
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory: pytest.TempPathFactory) -> Seen:
-    """Half a metre of the lab, so that it is driven in a moment."""
-    lines = (FIXTURES / "scenes" / "lab.toml").read_text().split("\n")
-    for key, value in (("waypoints_m", "[[0.0, 0.0], [0.5, 0.0]]"), ("laps", '["forward"]')):
-        (row,) = (n for n, line in enumerate(lines) if line.startswith(key))
-        lines[row] = f"{key} = {value}"
-    path = tmp_path_factory.mktemp("scene") / "short.toml"
-    path.write_text("\n".join(lines))
-    return drive(str(path), seed=0, stop=StopFlag())
+    scene = write_short_scene(tmp_path_factory.mktemp("scene"))
+    return drive(str(scene), seed=0, stop=StopFlag())
 
 
 def test_a_true_fix_lies_where_a_landmark_is(seen: Seen) -> None:
