@@ -1,6 +1,5 @@
 """A recording made on real hardware goes through an emulated module's port, byte for byte."""
 
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from emulator.loopback import LoopbackTransport
 from emulator.playback import PlayOptions, played_radars
 from hil_tests.device.serving import Served, emulator, open_radar
-from hil_tests.paths import REPOSITORY
+from hil_tests.paths import real_recording
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings import read_recording
 from xethru_protocol.wire.codes import PongCode
@@ -20,17 +19,9 @@ from xethru_protocol.wire.messages import BasebandIq
 pytestmark = pytest.mark.slow
 
 
-def shared_data() -> Path:
-    named = os.environ.get("XETHRU_SHARED_DATA")
-    return Path(named) if named else REPOSITORY.parent / "shared" / "data"
-
-
 @pytest.fixture(scope="module")
 def recording() -> Path:
-    path = shared_data() / "x4_baseband_iq_2017"
-    if not path.is_dir():
-        pytest.skip(f"no recording {path}: set XETHRU_SHARED_DATA to the folder that holds it")
-    return path
+    return real_recording()
 
 
 @pytest.fixture(scope="module")

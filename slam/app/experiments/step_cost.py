@@ -11,7 +11,7 @@ import argparse
 import math
 import platform
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -139,14 +139,12 @@ def study(sizes: Sequence[int], repetitions: int, stop: StopFlag) -> list[StepCo
     return costs
 
 
-def slope_of(costs: Sequence[StepCost]) -> float | None:
+def slope_of(step_ms: Mapping[int, float]) -> float | None:
     """Return d ln(step) / d ln(n) from 200 landmarks on, by least squares; None for one size."""
-    large = [cost for cost in costs if cost.n_landmarks >= SLOPE_FROM]
+    large = [n for n in step_ms if n >= SLOPE_FROM]
     if len(large) < 2:
         return None
-    n = np.log([cost.n_landmarks for cost in large])
-    ms = np.log([cost.step_ms for cost in large])
-    return float(np.polyfit(n, ms, 1)[0])
+    return float(np.polyfit(np.log(large), np.log([step_ms[n] for n in large]), 1)[0])
 
 
 def _passes_ms(size: int, repetitions: int) -> float:
@@ -177,7 +175,7 @@ def _cpu_ms(work: Callable[[], object]) -> float:
 
 def _draw(figure: Figure, costs: Sequence[StepCost]) -> None:
     n = np.array([cost.n_landmarks for cost in costs])
-    slope = slope_of(costs)
+    slope = slope_of({cost.n_landmarks: cost.step_ms for cost in costs})
     fitted = "" if slope is None else f", slope {slope:.2f} from n = {SLOPE_FROM} on"
     axes = figure.subplots()
     axes.set_xscale("log")
@@ -233,7 +231,7 @@ def run(arguments: argparse.Namespace, stop: StopFlag) -> Result:
             "numpy": np.__version__,
             "scipy": scipy.__version__,
             "bar": {"landmarks": BAR_LANDMARKS, "step_ms": BAR_MS, "slope": 2.0},
-            "slope": slope_of(costs),
+            "slope": slope_of({cost.n_landmarks: cost.step_ms for cost in costs}),
             "slope_from_landmarks": SLOPE_FROM,
             "steps": [asdict(cost) for cost in costs],
             "quoted": [

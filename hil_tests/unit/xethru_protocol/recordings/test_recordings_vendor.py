@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import struct
 from datetime import UTC
 from pathlib import Path
@@ -11,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil_tests.paths import FIXTURES, REPOSITORY
+from hil_tests.paths import FIXTURES, SHARED_DATA
 from hil_tests.unit.xethru_protocol.recordings.messages import frame, presence
 from xethru_protocol.recordings import (
     RecordingError,
@@ -24,9 +23,8 @@ from xethru_protocol.recordings import (
 from xethru_protocol.wire import messages as m
 
 RECORDINGS = FIXTURES / "recordings"
-SHARED = Path(os.environ.get("XETHRU_SHARED_DATA", REPOSITORY.parent / "shared" / "data"))
-REAL = SHARED / "x4_baseband_iq_2017"
-MANIFEST = SHARED / "recordings" / "manifest.json"
+REAL = SHARED_DATA / "x4_baseband_iq_2017"
+MANIFEST = SHARED_DATA / "recordings" / "manifest.json"
 META = "xethru_recording_meta.dat"
 MS = 1_000_000
 

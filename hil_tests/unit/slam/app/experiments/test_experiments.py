@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from emulator.scene.scene import load_scene
-from hil_tests.paths import REPOSITORY
+from hil_tests.paths import real_recording
 from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.sweep.sweep_runs import run_of
 from slam.app.cli import main
@@ -26,7 +25,7 @@ from slam.app.experiments.recording import (
     read_slow_time,
 )
 from slam.app.experiments.smoke import in_smoke, light_attenuation_db, smoke_attenuation_db
-from slam.app.experiments.step_cost import StepCost, mapped_state, slope_of, stepper
+from slam.app.experiments.step_cost import mapped_state, slope_of, stepper
 from slam.app.run.pictures import picture
 from slam.app.sweep.run import SweepRun, make_case
 from slam.app.sweep.statistics import summarise_groups
@@ -141,20 +140,9 @@ def test_the_gate_of_a_step_has_something_to_weigh() -> None:
 
 
 def test_the_slope_is_that_of_a_power_law() -> None:
-    costs = [
-        StepCost(
-            n_landmarks=n,
-            size=10 + 2 * n,
-            step_ms=3e-6 * n**1.7 if n >= 200 else 5.0,
-            slowest_ms=1.0,
-            at_once_ms=1.0,
-            triangle_ms=1.0,
-            triangle_gb_per_s=1.0,
-        )
-        for n in (10, 200, 600, 2000)
-    ]
-    assert slope_of(costs) == pytest.approx(1.7)
-    assert slope_of(costs[:2]) is None
+    ms_of = {n: 3e-6 * n**1.7 if n >= 200 else 5.0 for n in (10, 200, 600, 2000)}
+    assert slope_of(ms_of) == pytest.approx(1.7)
+    assert slope_of({n: ms_of[n] for n in (10, 200)}) is None
 
 
 def test_the_experiment_tells_measured_from_quoted(
@@ -174,15 +162,6 @@ def test_the_experiment_tells_measured_from_quoted(
 
 SIGMA = 3e-5
 SEEDS = range(6)
-
-
-def shared_recording() -> Path:
-    named = os.environ.get("XETHRU_SHARED_DATA")
-    shared = Path(named) if named else REPOSITORY.parent / "shared" / "data"
-    path = shared / "x4_baseband_iq_2017"
-    if not path.is_dir():
-        pytest.skip(f"no recording {path}: set XETHRU_SHARED_DATA to the folder that holds it")
-    return path
 
 
 def frames_of(iq: NDArray[Any]) -> SlowTime:
@@ -242,7 +221,7 @@ def test_the_quietest_stretch_is_found(white: SlowTime) -> None:
 
 def test_emulated_frames_have_the_statistics_of_the_recording() -> None:
     """Spreads over seeds are those of 30 s of slow processes; what is fast is held tightly."""
-    recorded = read_slow_time(shared_recording())
+    recorded = read_slow_time(real_recording())
     assert recorded.rate_hz == pytest.approx(17.05, abs=0.01)
     scene = equivalent_scene(recorded)
     runs = [emulate(scene, recorded, seed).numbers() for seed in SEEDS]
@@ -269,7 +248,7 @@ def test_emulated_frames_have_the_statistics_of_the_recording() -> None:
 
 def test_white_noise_of_neighbouring_bins_is_as_alike_as_in_the_real_filter() -> None:
     """In the quietest stretch the fast part is the receiver's: it went through the real taps."""
-    recorded = read_slow_time(shared_recording())
+    recorded = read_slow_time(real_recording())
     real = recorded.quietest().numbers()["far_neighbours_fast"]
     emulated = emulate(equivalent_scene(recorded), recorded, 0).numbers()["far_neighbours_fast"]
     assert emulated == pytest.approx(real, abs=0.06)
@@ -278,8 +257,7 @@ def test_white_noise_of_neighbouring_bins_is_as_alike_as_in_the_real_filter() ->
 def test_the_experiment_leaves_picture_numbers_and_table(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    recording = shared_recording()
-    options = ["--recording", str(recording), "--runs", "2", "--out", str(tmp_path)]
+    options = ["--recording", str(real_recording()), "--runs", "2", "--out", str(tmp_path)]
     assert main(["experiment", "recording", *options]) == 0
     numbers = json.loads((tmp_path / "recording.json").read_text())
     assert numbers["frames"] == 514
