@@ -154,7 +154,7 @@ def _control(arguments: argparse.Namespace) -> int:
         request["radar"] = arguments.radar
     path = _socket_of(arguments.socket)
     try:
-        answer = _ask(path, request)
+        answer = ask(path, request)
     except OSError as error:
         reason = error.strerror or str(error) or type(error).__name__
         return _failed(f"{path}: no emulator answers: {reason}")
@@ -247,7 +247,8 @@ def _socket_of(path: Path) -> Path:
     return path
 
 
-def _ask(path: Path, request: dict[str, Any]) -> bytes:
+def ask(path: Path, request: dict[str, Any]) -> bytes:
+    """Send a request to the control socket of a running emulator; return its answer, JSON."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
         connection.settimeout(TIMEOUT_S)
         connection.connect(str(path))

@@ -50,15 +50,13 @@ def radar_name(request: pytest.FixtureRequest) -> str:
 @pytest.fixture
 def radar_place(
     request: pytest.FixtureRequest, radar_name: str, hil_bench: Bench
-) -> Iterator[RadarUnderTest]:
+) -> RadarUnderTest:
     """Return the radar in a known state: stopped, no profile, nothing on the line.
 
     ``radar_place.open()`` returns drivers; ``radar_place.place.unplug(seconds)`` unplugs a radar
     that has the capability ``unplug``.
     """
-    found = gate(request, hil_bench, (radar_name,))
-    yield found[0]
-    found[0].end_test()
+    return gate(request, hil_bench, (radar_name,))[0]
 
 
 @pytest.fixture
@@ -83,23 +81,19 @@ def rig_name(request: pytest.FixtureRequest) -> tuple[str, ...]:
 @pytest.fixture
 def radar_pair(
     request: pytest.FixtureRequest, rig_name: tuple[str, ...], hil_bench: Bench
-) -> Iterator[tuple[X4M300, X4M300]]:
+) -> tuple[X4M300, X4M300]:
     """Drivers of two radars, both in their known state."""
     names = hil_bench.rig(rig_name)
     if len(names) < 2:
         lacking(request, names, f"{'+'.join(names)}: needs two radars; give --radar twice")
-    found = gate(request, hil_bench, names[:2])
-    try:
-        yield found[0].open(), found[1].open()
-    finally:
-        for place in found:
-            place.end_test()
+    one, other = gate(request, hil_bench, names[:2])
+    return one.open(), other.open()
 
 
 @pytest.fixture
 def radar_rig(
     request: pytest.FixtureRequest, rig_name: tuple[str, ...], hil_bench: Bench
-) -> Iterator[Mapping[str, X4M300]]:
+) -> Mapping[str, X4M300]:
     """Drivers of all radars by name: of the real ones together, or of an emulated scene.
 
     With ``--rig`` by the names of its file; each module is found by its serial number there.
@@ -108,12 +102,8 @@ def radar_rig(
 
     found = gate(request, hil_bench, hil_bench.rig(rig_name))
     rig = request.config.stash[CHOICES].rig
-    try:
-        drivers = {place.spec.name: place.open() for place in found}
-        yield drivers if rig is None else matched(rig, drivers)
-    finally:
-        for place in found:
-            place.end_test()
+    drivers = {place.spec.name: place.open() for place in found}
+    return drivers if rig is None else matched(rig, drivers)
 
 
 @pytest.fixture

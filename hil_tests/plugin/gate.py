@@ -158,7 +158,7 @@ def gate(
                 lacking(request, names, str(problem))
             if problem is not None:
                 pytest.fail(f"{name}: {problem}", pytrace=False)
-        begun.pop_all()  # the fixture ends them, after the test
+        request.addfinalizer(begun.pop_all().close)
     return tuple(found)
 
 

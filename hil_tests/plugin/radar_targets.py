@@ -29,8 +29,8 @@ from xethru_protocol.wire.errors import Disconnected, PortUnavailable, XeThruErr
 if TYPE_CHECKING:
     from emulator.scene.scene import Scene
 
-_CONNECT_S = 5.0
-_WRITE_S = 5.0
+_TIMEOUT_S = 5.0
+"""To connect, and to write."""
 _CHUNK_BYTES = 65536
 
 
@@ -41,14 +41,13 @@ class TcpTransport:
         self.name = address if address.startswith("tcp://") else f"tcp://{address}"
         host, _, port = self.name.removeprefix("tcp://").rpartition(":")
         try:
-            self._socket = socket.create_connection((host.strip("[]"), int(port)), _CONNECT_S)
+            self._socket = socket.create_connection((host.strip("[]"), int(port)), _TIMEOUT_S)
         except (OSError, UnicodeError) as error:  # UnicodeError: not a host name
             reason = getattr(error, "strerror", None) or error
             raise PortUnavailable(
                 f"{self.name} cannot be reached: {reason}; does the adapter, or "
                 "'xethru-emulator serve --tcp', run there?"
             ) from None
-        self._socket.setblocking(False)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def read(self, timeout_s: float) -> bytes:
@@ -64,20 +63,13 @@ class TcpTransport:
         return data
 
     def write(self, data: bytes) -> None:
-        rest = memoryview(data)
-        deadline_s = time.monotonic() + _WRITE_S
-        while rest:
-            left_s = deadline_s - time.monotonic()
-            if left_s <= 0:
-                raise Disconnected(f"{self.name} takes no data any more; is the module hanging?")
-            try:
-                _, ready, _ = select.select([], [self._socket], [], left_s)
-                if ready:
-                    rest = rest[self._socket.send(rest) :]
-            except BlockingIOError:
-                continue
-            except (OSError, ValueError) as error:
-                raise Disconnected(self._lost()) from error
+        try:
+            self._socket.sendall(data)
+        except TimeoutError:
+            text = f"{self.name} takes no data any more; is the module hanging?"
+            raise Disconnected(text) from None
+        except OSError as error:
+            raise Disconnected(self._lost()) from error
 
     def close(self) -> None:
         self._socket.close()
@@ -174,7 +166,6 @@ CAPABILITIES: Mapping[str, str] = {
 }
 """What a test may require of a radar, and why one may lack it; ``?has=`` adds others."""
 
-_CONTROL_S = 5.0
 _BAUD = 115200
 _UART_BYTES_PER_S = _BAUD / 10
 _EMPTY_ROOM_RADARS = 4
@@ -321,9 +312,14 @@ class ProcessTarget(RadarTarget):
         return SerialTransport(path or self._served.paths[self._index], baudrate)
 
     def unplug(self, seconds: float) -> None:
+        from emulator.cli import ask
+
         assert self._served.control is not None
         name = self._served.names[self._index]
-        _ask(self._served.control, {"verb": "unplug", "radar": name, "seconds": seconds})
+        request = {"verb": "unplug", "radar": name, "seconds": seconds}
+        answer = json.loads(ask(Path(self._served.control), request))
+        if not answer["ok"]:
+            raise TargetError(str(answer["error"]))
 
     def close(self) -> None:
         self._served.end()
@@ -448,15 +444,3 @@ def _scene_text(spec: RadarSpec) -> str | None:
     if path.suffix != ".toml":
         path = FIXTURES / "scenes" / f"{spec.target}.toml"
     return path.read_text("utf-8")
-
-
-def _ask(control: str, request: Mapping[str, object]) -> None:
-    """Send a request to a running emulator; `TargetError` if it refuses."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
-        connection.settimeout(_CONTROL_S)
-        connection.connect(control)
-        connection.sendall(json.dumps(request).encode() + b"\n")
-        with connection.makefile() as answers:
-            answer = json.loads(answers.readline())
-    if not answer["ok"]:
-        raise TargetError(str(answer["error"]))

@@ -118,10 +118,7 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
 def read_tum(path: Path) -> Trajectory:
     """Read a TUM file; empty lines and lines that begin with `#` are skipped.
 
-    Raises
-    ------
-    TumError
-        The file cannot be read, holds no pose, goes back in time, or has a malformed line.
+    Raises TumError if it cannot be read, holds no pose, goes back in time, or has a bad line.
     """
     try:
         text = read_bounded(path, _MAX_BYTES).decode()
@@ -229,12 +226,8 @@ class OdometryTrack:
         Position and heading are linear between two samples. That is exact on straight legs and for
         turns on the spot. On an arc the position half way between samples is
         chord / 2 * tan(turn / 4) off, 0.12 mm for 1 cm and 5.6 degrees; an arc instead would help
-        only there, and fits no wheel that stops or starts between samples either.
-
-        Raises
-        ------
-        OdometryError
-            The time is more than half a second outside the samples.
+        only there, and fits no wheel that stops or starts between samples either. Raises
+        OdometryError if the time is more than half a second outside the samples.
         """
         stamps_ns = self._stamps_ns
         first, last = stamps_ns[0], stamps_ns[-1]
@@ -281,10 +274,7 @@ def _unwrapping(before_rad: float, after_rad: float) -> float:
 def read_odometry_socket(path: str, timeout_s: float = 10.0) -> OdometryTrack:
     """Read every line that an emulator under `--pace asap` serves on its unix socket.
 
-    Raises
-    ------
-    OdometryError
-        There is no listener, the sender stops before the end, or a line is malformed.
+    Raises OdometryError if there is no listener, the sender stops before the end, or a line is bad.
     """
     received = bytearray()
     try:

@@ -14,7 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -76,9 +76,7 @@ class EmulatorProcess:
     """Runs `xethru-emulator serve` in its own process group while it is entered.
 
     The group keeps Ctrl-C for us: we stop reading first and end the emulator afterwards. It removes
-    its links when it ends; if it was killed, we remove them.
-
-    `scene` is its name or its file.
+    its links when it ends; if it was killed, we remove them. `scene` is its name or its file.
     """
 
     def __init__(self, scene: str, seed: int) -> None:
@@ -129,10 +127,7 @@ class EmulatorProcess:
     def wait_until_ready(self, stop: StopFlag) -> None:
         """Read the ready line, which names ports and odometry socket.
 
-        Raises
-        ------
-        EmulatorError
-            The process ended, or said nothing in time.
+        Raises EmulatorError if the process ended, or said nothing in time.
         """
         output = self._process.stdout
         assert output is not None
@@ -149,14 +144,9 @@ class EmulatorProcess:
                 line += part
         try:
             ready = json.loads(line)
+            keys = [field.name for field in fields(EmulatedDevice)]
             self.devices = tuple(
-                EmulatedDevice(
-                    name=row["name"],
-                    path=row["path"],
-                    serial=row["serial"],
-                    start_skew_ns=row["start_skew_ns"],
-                )
-                for row in ready["devices"]
+                EmulatedDevice(**{key: row[key] for key in keys}) for row in ready["devices"]
             )
             self.odometry_socket = ready["odometry"]
             self._control_socket = ready["control"]
@@ -252,10 +242,7 @@ def open_ports(
 ) -> RigSource:
     """Open emulated modules through their serial ports, as hardware would be.
 
-    Raises
-    ------
-    AppError
-        A port is missing, in use, or what answers there is no such radar.
+    Raises AppError if a port is missing or in use, or what answers there is no such radar.
     """
     links: list[RadarLink] = []
     by_name = {device.name: device for device in devices}

@@ -103,13 +103,7 @@ class RigFile(Table):
 
 
 def load_rig(path: Path) -> RigFile:
-    """Read a rig file.
-
-    Raises
-    ------
-    AppError
-        One line with file, key and what is allowed.
-    """
+    """Read a rig file; AppError with file, key and what is allowed."""
     rig = load_table(RigFile, path, folder="rigs", what="rig", error=AppError, unknown=AppError)
     for key in ("name", "serial"):
         values = [getattr(radar, key) for radar in rig.radars]
@@ -120,13 +114,7 @@ def load_rig(path: Path) -> RigFile:
 
 
 def write_rig(path: Path, rig: RigFile) -> None:
-    """Write a rig file that `load_rig` reads back with the same floats.
-
-    Raises
-    ------
-    AppError
-        The file cannot be written.
-    """
+    """Write a rig file that `load_rig` reads back with the same floats."""
     tables = []
     for radar in rig.radars:
         # a JSON string of these names is a TOML string
@@ -174,7 +162,7 @@ def open_rig(
     observer: RecordObserver,
     note: Callable[[str], None],
 ) -> tuple[RadarLink, ...]:
-    """Open the modules of a rig.
+    """Open the modules of a rig; the links are in its order.
 
     Parameters
     ----------
@@ -185,15 +173,10 @@ def open_rig(
     note
         Gets a line about where each radar was found, and about each port that is skipped.
 
-    Returns
-    -------
-    Links in the order of the rig.
-
     Raises
     ------
     AppError
-        A module is missing, not in the rig, or found twice, or a named port has no module; one
-        line that names it.
+        A module is missing, not in the rig, or found twice, or a named port has no module.
     """
     with ExitStack() as unless_it_works:
         candidates = known_ports() if ports is None else ports

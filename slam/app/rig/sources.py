@@ -93,18 +93,9 @@ def radar_frame(
     """Turn a driver's frame into one for SLAM: true metres, time by the counter.
 
     The counter is the only clock here: what the module's own clock is off by (tens of ppm, tens
-    of milliseconds after a quarter of an hour) does not show in it.
-
-    Parameters
-    ----------
-    radar
-        Its index in the rig.
-    rate_hz
-        The chip's real frame rate, as read back.
-    start_skew_ns
-        Session time of its counter 0.
-    limits
-        Of the sampler, see `RadarFrame`.
+    of milliseconds after a quarter of an hour) does not show in it. `radar` is its index in the
+    rig, `rate_hz` the chip's real frame rate, as read back, `start_skew_ns` the session time of
+    counter 0, `limits` those of the sampler, see `RadarFrame`.
     """
     return RadarFrame(
         radar=radar,
@@ -132,12 +123,8 @@ def whole_periods(start_skew_ns: int, rate_hz: float) -> int:
 class RigSource:
     """All radars of a robot as one stream of scans, in the order of time.
 
-    Attributes
-    ----------
-    radars
-        What the modules answered, after `start`.
-    lost_frames
-        Frames missing between the counters that arrived, over all radars.
+    `radars` is what the modules answered, after `start`; `lost_frames` counts the frames missing
+    between the counters that arrived, over all radars.
     """
 
     def __init__(self, links: Sequence[RadarLink]) -> None:
@@ -164,13 +151,7 @@ class RigSource:
             link.driver.raw_listener = partial(listener, link.mount.name)
 
     def start(self, config: RawConfig, fps: int) -> None:
-        """Configure raw RF on every radar and start all streams.
-
-        Raises
-        ------
-        AppError
-            A module does not answer or refuses a setting; names the radar.
-        """
+        """Configure raw RF on every radar and start all streams; AppError names the radar."""
         geometries, radars = [], []
         for link in self._links:
             with link.naming():
@@ -198,10 +179,7 @@ class RigSource:
     def scans(self, end_counter: int, stop: StopFlag) -> Iterator[Scan]:
         """Yield the frames of ticks below `end_counter`, one scan per tick; see `Scan`.
 
-        Raises
-        ------
-        RadarSilentError
-            A radar sent no frame for 5 s, or its port is gone.
+        Raises RadarSilentError if a radar sends no frame for 5 s, or its port is gone.
         """
         # By tick, from here on: a radar's counter and the periods that it started late.
         late = [whole_periods(info.start_skew_ns, info.rate_hz) for info in self.radars]

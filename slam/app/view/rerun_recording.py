@@ -104,12 +104,10 @@ class Stamps:
 
 
 class Recording:
-    """Sends rows to one target and knows how many.
+    """Sends rows to an .rrd file or to a viewer that listens, and knows how many.
 
     Parameters
     ----------
-    target
-        An .rrd file, or the `rerun+http://` address of a viewer that listens.
     blueprint
         How a viewer lays it out, unless its user chose otherwise.
     recording_id
@@ -122,8 +120,6 @@ class Recording:
     epoch_ns
         Session time that `device_time` is counted from: the first scan's. What was before it is
         shown at it.
-    sent
-        Rows sent, of every entity.
 
     Raises
     ------

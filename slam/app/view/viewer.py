@@ -73,13 +73,7 @@ class ViewerProcess:
         return self._process is None or self._process.poll() is not None
 
     def __enter__(self) -> Self:
-        """Start the process.
-
-        Raises
-        ------
-        AppError
-            There is no viewer, no display for its window, or no way to draw.
-        """
+        """Start the process; AppError if there is no viewer or no display for its window."""
         if self._kind is ViewerKind.WINDOW and sys.platform == "linux":
             _require_display()
         command = [str(executable()), "--bind", _HERE, "--port", str(self._port)]
@@ -227,13 +221,7 @@ class LiveView:
         self._has_ended: Callable[[], bool] = lambda: False
 
     def __enter__(self) -> Self:
-        """Start the viewer, unless it runs already.
-
-        Raises
-        ------
-        AppError
-            It cannot be started, or nothing listens at the address given.
-        """
+        """Start the viewer; AppError if it cannot be started, or nothing listens at the address."""
         if self._where in {SPAWN, SERVE_WEB}:
             kind = ViewerKind.WEB if self._where == SERVE_WEB else ViewerKind.WINDOW
             with ExitStack() as starting:
