@@ -90,7 +90,10 @@ def test_unplugging_keeps_what_came(tmp_path: Path, capsys: Capture) -> None:
         with subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         ) as process:
-            wait_for_records(out, process)
+            files = "xethru_datafloat_*"
+            wait_until(
+                lambda: any(path.stat().st_size > 50_000 for path in out.glob(files)), process
+            )
             served.process.kill()
             printed, errors = process.communicate(timeout=seconds(10))
     assert (process.returncode, printed) == (1, "")
@@ -100,9 +103,3 @@ def test_unplugging_keeps_what_came(tmp_path: Path, capsys: Capture) -> None:
     assert kept
     counters = [message["fields"]["info"] for message in dumped(capsys, out)]
     assert counters == list(range(int(kept[1])))
-
-
-def wait_for_records(out: Path, process: subprocess.Popen[str]) -> None:
-    """Wait until some frames are on disk."""
-    files = "xethru_datafloat_*"
-    wait_until(lambda: any(path.stat().st_size > 50_000 for path in out.glob(files)), process)
