@@ -14,6 +14,7 @@ from emulator.loopback import LoopbackTransport
 from emulator.playback import PlayOptions, played_radars
 from hil_tests.paths import FIXTURES
 from hil_tests.unit.emulator.doubles import BareHost
+from hil_tests.unit.xethru_protocol.scripted import framed
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings import (
@@ -73,10 +74,7 @@ def test_presence_comes_byte_for_byte_in_normal_framing() -> None:
     payload = bytes.fromhex(
         "50 1E FA 3B 72  A4 00 00 00  02 00 00 00  00 00 AE 41  02  0A 00 00 00"
     )
-    checksum = 0x7D
-    for byte in payload:
-        checksum ^= byte
-    expected = b"\x7d" + payload + bytes((checksum, 0x7E))
+    expected = framed(payload)
     played = wire_bytes(device_of(RECORDINGS / "single"))
     assert played.startswith(expected)
     assert len(played) == 40 * len(expected)
@@ -148,14 +146,10 @@ def raw_capture(tmp_path: Path) -> Path:
     """Commands, their answers (FRAMEAREA 0.5 ... 0.75 among them), and two frames of 39 bins."""
     path = tmp_path / "raw.xtwire"
     area = struct.pack("<IIIff", X4Setting.FRAMEAREA, 0, 2, 0.5, 0.75)
-    payload = b"\x11\x12" + area + b"\4"
-    checksum = 0x7D
-    for byte in payload:
-        checksum ^= byte
     with WireCapture(path) as capture:
         capture.write("tx", bytes.fromhex("7D 01 AE EA AA EE 90 7E"), 0)
         capture.write("rx", bytes.fromhex("7D 10 6D 7E"), 1)
-        capture.write("rx", b"\x7d" + payload + bytes((checksum, 0x7E)), 2)
+        capture.write("rx", framed(b"\x11\x12" + area + b"\4"), 2)
         for counter in range(2):
             body = b"\xa0\x12" + struct.pack("<III", 0, counter, 39) + bytes(4 * 39)
             capture.write("rx", b"\x7c" * 4 + struct.pack("<I", len(body)) + b"\0" + body, 3)
