@@ -29,23 +29,13 @@ Table = tuple[str, Sequence[str], Sequence[Sequence[str]]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Result:
-    """What an experiment found.
+    """What an experiment found."""
 
-    Attributes
-    ----------
-    numbers
-        For NAME.json.
-    title, size_in, draw
-        NAME.png: its title, its width and height [inch], and what draws into the figure.
-    tables
-        For stdout.
-    """
-
-    numbers: Mapping[str, object]
-    title: str
-    size_in: tuple[float, float]
+    numbers: Mapping[str, object]  # for NAME.json
+    title: str  # of NAME.png
+    size_in: tuple[float, float]  # its width and height
     draw: Callable[[Figure], None]
-    tables: Sequence[Table]
+    tables: Sequence[Table]  # for stdout
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -69,7 +69,7 @@ class RangeErrors:
         position's own mean: noise, not bias.
         """
         found = float(np.isfinite(self.residuals_m).mean())
-        total = sum(len(one) for step in self.detections for one in step)
+        n_detections = sum(len(one) for step in self.detections for one in step)
         names = ("bias_m", "std_m", "noise_std_m", "worst_position_m")
         values = [math.nan] * len(names)
         if found:
@@ -81,12 +81,10 @@ class RangeErrors:
                 float(np.sqrt(np.nanmean(about**2))),
                 float(np.nanmax(np.abs(means_m))),
             ]
-        others_per_frame = total / self.residuals_m.size - found
-        return {
-            "found": found,
-            "others_per_frame": others_per_frame,
-            **dict(zip(names, values, strict=True)),
-        }
+        others_per_frame = n_detections / self.residuals_m.size - found
+        return {"found": found, "others_per_frame": others_per_frame} | dict(
+            zip(names, values, strict=True)
+        )
 
 
 def rod_ranges_m() -> list[float]:
@@ -115,18 +113,7 @@ def measure_steps(
 def _rod_at(lab: Scene, range_m: float) -> Scene:
     radar = RadarSpec(name="radar", serial="202305070901", x_m=0.0, y_m=0.0, yaw_deg=0.0)
     rod = TargetSpec(name="rod", kind="rod", x_m=range_m, y_m=0.0, amplitude_1m=ROD_AMPLITUDE_1M)
-    return Scene(
-        name="range_steps",
-        environment=lab.environment,
-        description="One radar and one rod.",
-        path=PathSpec(),
-        noise=lab.noise,
-        leakage=lab.leakage,
-        clutter=lab.clutter,
-        jitter=lab.jitter,
-        radars=(radar,),
-        targets=(rod,),
-    )
+    return lab.model_copy(update={"path": PathSpec(), "radars": (radar,), "targets": (rod,)})
 
 
 def range_errors(steps: Steps, stop: StopFlag) -> dict[str, RangeErrors]:

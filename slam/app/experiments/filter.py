@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -62,15 +62,12 @@ class Setting:
 
 
 TABLE_I = Setting(window_size=15, min_opc=9, search_rad_m=0.2)
-WINDOWS = (9, 12, 15, 20, 30)
-COUNTS = (3, 6, 9, 12, 15)
-RADII_M = (0.025, 0.05, 0.1, 0.2, 0.4)
 SETTINGS = tuple(
     dict.fromkeys(
         [
-            *(Setting(window_size=w, min_opc=9, search_rad_m=0.2) for w in WINDOWS),
-            *(Setting(window_size=15, min_opc=c, search_rad_m=0.2) for c in COUNTS),
-            *(Setting(window_size=15, min_opc=9, search_rad_m=r) for r in RADII_M),
+            *(replace(TABLE_I, window_size=size) for size in (9, 12, 15, 20, 30)),
+            *(replace(TABLE_I, min_opc=count) for count in (3, 6, 9, 12, 15)),
+            *(replace(TABLE_I, search_rad_m=radius) for radius in (0.025, 0.05, 0.1, 0.2, 0.4)),
         ]
     )
 )

@@ -335,9 +335,7 @@ def solve_known(
     """Return the paths of labelled data.
 
     ``rig`` and ``wheels`` are as SLAM knew them; ``offset_sigma_m`` is the standard deviation of
-    each radar's unknown range offset, zero if they are calibrated.
-
-    Raises AppError if GTSAM is not installed.
+    each radar's unknown range offset, zero if they are calibrated. Raises AppError without GTSAM.
     """
     return _Estimator(rig, wheels, offset_sigma_m).solve(run)
 
@@ -506,8 +504,7 @@ def bound_of(record: RunRecord, scene: Scene, config: SlamConfig) -> BoundSummar
     """Return the bound of a run that has a state.
 
     Rig, wheels and offsets are those that SLAM knew; the truth only gives each range its landmark.
-
-    Raises AppError if GTSAM is not installed.
+    Raises AppError without GTSAM.
     """
     is_robust = config.back_end is BackEnd.ROBUST
     rig = rig_of(scene)

@@ -124,13 +124,9 @@ def run_sweep(
     to try. ``jobs`` is the number of processes, None for one per core; ``dask`` the address of a
     scheduler that runs them instead.
 
-    Raises
-    ------
-    AppError
-        A wrong name, a file that cannot be written or is not this sweep's, before the first run; a
-        scene too short; a worker process or a cluster that died.
-    StopRequestedError
-        A signal arrived; OUT.part stays if it holds a run.
+    Raises AppError before the first run for a wrong name, or a file that cannot be written or is
+    not this sweep's; later for a scene too short, or a worker process or a cluster that died.
+    Raises StopRequestedError after a signal; OUT.part stays if it holds a run.
     """
     presets = presets or ["robust"]
     # a wrong name ends the command before any run

@@ -130,14 +130,8 @@ def dask_results(
     ``function``, importable by name on every worker, is called with the members of each of the
     tasks, of which there is at least one. Leaving the block cancels what is not done.
 
-    Raises
-    ------
-    UsageError
-        The address is invalid, or Dask is not installed.
-    AppError
-        No scheduler answers there, or there is no worker.
-    ClusterLostError
-        See there; while results are awaited.
+    Raises UsageError if the address is invalid or Dask is not installed, AppError if no scheduler
+    or no worker answers there; `ClusterLostError` while results are awaited.
     """
     client = _connect(address)
     futures: list[Any] = []
