@@ -338,8 +338,10 @@ class Conversation:
                 self._rebooted_since = True
         else:
             self._take_data(message, arrival_ns)
-        if self._observer is not None and not _is_bulk(message):
-            self.report("rx", summary(message))
+        if self._observer is not None:
+            row = ROWS.get(type(message))
+            if row is None or not row.bulk:
+                self.report("rx", summary(message))
 
     def new_line(self, name: str) -> None:
         """Begin anew on a line that was just opened: no answer is due and no packet half-read."""
@@ -392,11 +394,6 @@ class Conversation:
     def report(self, direction: Literal["tx", "rx", "fault", "warning"], text: str) -> None:
         if self._observer is not None:
             self._observer(ProtocolRecord(t_ns=self._clock(), direction=direction, summary=text))
-
-
-def _is_bulk(message: Response) -> bool:
-    row = ROWS.get(type(message))
-    return row is not None and row.bulk
 
 
 def summary(message: m.Message) -> str:

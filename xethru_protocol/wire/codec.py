@@ -6,7 +6,7 @@ them (Protocol reference 3).
 """
 
 import struct
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -25,8 +25,6 @@ from xethru_protocol.wire.table import (
     Row,
     UnknownMessage,
 )
-
-BuiltT = TypeVar("BuiltT", bound=Message)
 
 
 def encode(message: Message, *, bulk: bool | None = None) -> bytes:
@@ -70,8 +68,7 @@ def decode_command(payload: bytes) -> Command[Response]:
     >>> decode_command(bytes.fromhex("50 10 10 00 00 00 00 00 A0 41"))
     X4DriverSet(setting=<X4Setting.FPS: 16>, value_width=None, value=20.0)
     """
-    cls = message_type(COMMANDS, payload)
-    return _unknown(payload) if cls is None else cast(Command[Response], _build(cls, payload))
+    return cast(Command[Response], _build(COMMANDS, payload))
 
 
 def decode_response(payload: bytes) -> Response:
@@ -80,8 +77,7 @@ def decode_response(payload: bytes) -> Response:
     >>> decode_response(bytes.fromhex("20 01 00 00 00"))
     Error(code=1)
     """
-    cls = message_type(RESPONSES, payload)
-    return _unknown(payload) if cls is None else cast(Response, _build(cls, payload))
+    return cast(Response, _build(RESPONSES, payload))
 
 
 _FRAME_HEADER = struct.Struct("<III")  # content id, info, count: from payload byte 2
@@ -129,23 +125,23 @@ def describe(message: Message) -> tuple[str, dict[str, Any]]:
     return row.name, shown
 
 
-def _build(cls: type[BuiltT], payload: bytes) -> BuiltT | UnknownMessage:
-    row = ROWS[cls]
-    position = len(row.prefix)
-    fields: dict[str, Any] = {}
-    try:
-        for name, kind in row.kinds:
-            fields[name], position = kind.unpack(payload, position, fields)
-    except (struct.error, ValueError, KeyError):
-        return _unknown(payload)
-    for name in row.wire_only:
-        del fields[name]
-    return cls(**fields)
+def _build(prefixes: Prefixes, payload: bytes) -> Message:
+    cls = message_type(prefixes, payload)
+    if cls is not None:
+        row = ROWS[cls]
+        position = len(row.prefix)
+        fields: dict[str, Any] = {}
+        try:
+            for name, kind in row.kinds:
+                fields[name], position = kind.unpack(payload, position, fields)
+        except (struct.error, ValueError, KeyError):
+            pass
+        else:
+            for name in row.wire_only:
+                del fields[name]
+            return cls(**fields)
+    return UnknownMessage(code=payload[0] if payload else -1, payload=payload)
 
 
 def _fields(message: Message, row: Row) -> dict[str, Any]:
     return {name: getattr(message, name) for name in row.fields}
-
-
-def _unknown(payload: bytes) -> UnknownMessage:
-    return UnknownMessage(code=payload[0] if payload else -1, payload=payload)

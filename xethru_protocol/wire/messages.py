@@ -738,20 +738,15 @@ class LoadNoiseMap(Command[Ack]):
     """Load the stored noise map; without effect in released firmware. 4.4."""
 
 
+_DELETE = AppCommandCode.XTS_SPCA_DELETE_NOISEMAP
+_DELETE_AS_PRINTED = AppCommandCode.XTS_SPCA_GET_PARAMETER_FILE
+
+
 @command(_APP, name="APP_DELETE_NOISEMAP")
 class DeleteNoiseMap(Command[Ack]):
     """Delete the stored noise map; ``sub_code`` 15h is the document's form of it. 4.4, 11."""
 
-    sub_code: Annotated[
-        int,
-        fields.Spelling(
-            (
-                AppCommandCode.XTS_SPCA_DELETE_NOISEMAP,
-                AppCommandCode.XTS_SPCA_GET_PARAMETER_FILE,
-            ),
-            usual=AppCommandCode.XTS_SPCA_DELETE_NOISEMAP,
-        ),
-    ] = AppCommandCode.XTS_SPCA_DELETE_NOISEMAP
+    sub_code: Annotated[int, fields.Spelling((_DELETE, _DELETE_AS_PRINTED), _DELETE)] = _DELETE
 
 
 @command(_APP, AppCommandCode.XTS_SPCA_POLL, name="APP_POLL")

@@ -58,8 +58,6 @@ class FrameArea:
     rx_wait: int
     requested_start_m: float
     requested_end_m: float
-    offset_m: float
-    downconversion: bool
 
 
 def frame_area(
@@ -119,8 +117,6 @@ def frame_area(
         rx_wait=(1 + delay_steps) % 256,
         requested_start_m=start,
         requested_end_m=end,
-        offset_m=offset,
-        downconversion=downconversion,
     )
 
 
