@@ -51,10 +51,6 @@ def filled(count: int, kind: MessageKind = FRAME) -> FirmwareOutbox:
     return outbox
 
 
-def test_a_reading_host_gets_everything_in_order() -> None:
-    assert numbers(filled(50), 0) == list(range(50))
-
-
 def test_a_full_queue_loses_the_new_frame_but_never_a_reply() -> None:
     outbox = filled(50)
     outbox.put(FRAME, m.Pong(value=50), SECOND // 2)

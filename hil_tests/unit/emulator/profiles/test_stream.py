@@ -25,7 +25,6 @@ from hil_tests.unit.emulator.profiles.doubles import (
 )
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import OutputFeature, PresenceState, SensorMode, X4Setting
-from xethru_protocol.wire.connection import Connection, Role
 
 IQ, AP = OutputFeature.BASEBAND_IQ, OutputFeature.BASEBAND_AMPLITUDE_PHASE
 WALKER = walking(4.0, 1.0, speed_mps=0.7)
@@ -47,14 +46,6 @@ def test_baseband_covers_the_zone_and_a_bin_more_at_either_end() -> None:
     assert message.carrier_frequency_hz == pytest.approx(7.29e9)
     strongest = int(np.argmax(np.hypot(message.i, message.q)[20:])) + 20
     assert message.range_offset_m + strongest * BIN_M == pytest.approx(2.0, abs=BIN_M)
-
-
-def test_the_length_on_the_line_is_the_documented_one() -> None:
-    """Protocol reference 7.1: 29 + 8 N in the header of the NoEscape packet."""
-    stream, _ = profile(room(), outputs={IQ: 1})
-    packet = Connection(Role.MODULE).send(stream.take())
-    assert packet[:4] == bytes.fromhex("7C7C7C7C")
-    assert int.from_bytes(packet[4:8], "little") == 29 + 8 * 179
 
 
 def test_amplitude_and_phase_are_those_of_the_same_frame() -> None:
