@@ -1,4 +1,4 @@
-"""Locks, taps, measurements and frame rates."""
+"""Locks, taps, measurements, frame rates, and a test that cannot run on a radar."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from pathlib import Path
 import pytest
 
 from hil_tests.plugin import radar_targets
-from hil_tests.plugin.bench import PortBusyError, PortLock
+from hil_tests.plugin.bench import Bench, PortBusyError, PortLock
 from hil_tests.plugin.fixtures import carried_rate_hz
-from hil_tests.plugin.gate import Measure
-from hil_tests.plugin.radar_targets import TcpTransport, WireTap
+from hil_tests.plugin.gate import Measure, findings_of, gate
+from hil_tests.plugin.radar_targets import TappedTransport, TcpTransport, WireTap
+from hil_tests.plugin.specs import parse_specs
 from xethru_protocol.wire.errors import PortUnavailable
 
 
@@ -95,3 +96,23 @@ def test_rates_that_lines_carry(bytes_per_s: float, rate_hz: float) -> None:
 def test_what_is_no_name_of_a_host_cannot_be_reached(host: str) -> None:
     with pytest.raises(PortUnavailable, match="cannot be reached"):
         TcpTransport(f"tcp://{host}:5")
+
+
+@pytest.mark.requires("profiles")
+def test_a_line_is_closed_where_the_firmware_turns_out_to_lack_something(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed = []
+    close = TappedTransport.close
+
+    def noted(line: TappedTransport) -> None:
+        closed.append(line)
+        close(line)
+
+    monkeypatch.setattr(TappedTransport, "close", noted)
+    bench = Bench(parse_specs(["emu:?firmware=xep"]))
+    with pytest.raises((pytest.skip.Exception, pytest.fail.Exception), match="needs profiles"):
+        gate(request, bench, tuple(bench.specs))
+    assert len(closed) == 1
+    findings = findings_of(request.node)
+    findings.names, findings.radars, findings.reason = (), (), None  # not a test of that radar

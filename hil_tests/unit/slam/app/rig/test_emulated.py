@@ -3,6 +3,7 @@
 import os
 import stat
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,6 @@ from hil_tests.system.short_scene import write_short_scene
 from hil_tests.unit.slam.app.sessions import session_info
 from slam.app.cli import main
 from slam.app.errors import EmulatorError
-from slam.app.records import Scan, SessionInfo
 from slam.app.rig import emulated as emulator_process
 from slam.app.rig.emulated import (
     FRAME_RATE_HZ,
@@ -88,43 +88,24 @@ def test_the_arguments_are_those_of_the_emulators_command_line(
     assert said.read_text() == "-P -m emulator.cli serve scene.toml --pace asap --seed 42\n"
 
 
-N_SCANS = 4
-
-
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Scan]]:
-    """Record a short drive in this process, raw bytes and all."""
-    folder = tmp_path_factory.mktemp("wire")
-    scene, _ = scene_and_config(str(write_short_scene(folder)), "paper")
-    path = folder / "session.mcap"
+def test_the_bytes_of_every_port_hold_its_frames(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A short drive in this process, raw bytes and all."""
+    scene, _ = scene_and_config(str(write_short_scene(tmp_path)), "paper")
+    path = tmp_path / "session.mcap"
     with open_loopback(scene, 3) as source:
         early = []
         source.listen(lambda *row: early.append(row))
         source.start(RAW_CONFIG, FRAME_RATE_HZ)
-        info = SessionInfo(
-            scene="short",
-            preset="paper",
-            seed=3,
-            radars=source.radars,
-            true_landmarks_m=session_info().true_landmarks_m,
-            versions={},
-        )
-        log = SessionLog(path, info)
+        log = SessionLog(path, replace(session_info(), radars=source.radars))
         for row in early:
             log.on_wire(*row)
         source.listen(log.on_wire)
-        scans = []
-        for scan in source.scans(N_SCANS, StopFlag()):
+        scans = list(source.scans(4, StopFlag()))
+        for scan in scans:
             log.on_scan(scan)
-            scans.append(scan)
     log.close()
-    return path, scans
-
-
-def test_the_bytes_of_every_port_hold_its_frames(
-    recorded: tuple[Path, list[Scan]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path, scans = recorded
     for index, radar in enumerate(open_session(path).info.radars):
         out = tmp_path / f"{radar.name}.xtwire"
         assert main(["convert", str(path), str(out), "--radar", radar.name]) == 0

@@ -75,39 +75,6 @@ def rig_source(*drivers: Canned, skews_ns: Sequence[int] = ()) -> RigSource:
     )
 
 
-def counters_of(source: RigSource, end: int) -> list[tuple[int, list[int]]]:
-    source.start(RAW_CONFIG, 5)
-    return [
-        (scan.counter, [f.radar for f in scan.frames]) for scan in source.scans(end, StopFlag())
-    ]
-
-
-def test_module_metres_become_true_metres() -> None:
-    made = radar_frame(2, frame(10), rate_hz=5.0)
-    # light travels 299 792 458 m/s, the module reckons with 300 000 000
-    assert made.range_start_m == pytest.approx(0.299792458, rel=1e-15)
-    assert made.bin_length_m == pytest.approx(0.0064 * 0.99930819333, rel=1e-10)
-    assert (made.radar, made.counter, made.t_ns) == (2, 10, 2_000_000_000)
-
-
-def test_frames_of_one_counter_make_one_scan() -> None:
-    source = rig_source(Canned(range(5)), Canned(range(5)))
-    assert counters_of(source, 4) == [(k, [0, 1]) for k in range(4)]
-    assert source.lost_frames == 0
-
-
-def test_a_lost_frame_is_counted_and_its_scan_lacks_the_radar() -> None:
-    source = rig_source(Canned([0, 1, 4, 5]), Canned([0, 1, 2, 3, 4, 5]))
-    assert counters_of(source, 5) == [(0, [0, 1]), (1, [0, 1]), (2, [1]), (3, [1]), (4, [0, 1])]
-    assert source.lost_frames == 2
-
-
-def test_a_counter_that_every_radar_lost_gives_no_scan() -> None:
-    source = rig_source(Canned([1, 2, 9]), Canned([1, 2, 9]))
-    assert counters_of(source, 5) == [(1, [0, 1]), (2, [0, 1])]
-    assert source.lost_frames == 2 * 3
-
-
 def times_of(source: RigSource, end: int) -> list[tuple[int, int, list[tuple[int, int, int]]]]:
     """Return tick and time [ms] of each scan, with radar, counter and time [ms] of its frames."""
     source.start(RAW_CONFIG, 5)
@@ -119,6 +86,39 @@ def times_of(source: RigSource, end: int) -> list[tuple[int, int, list[tuple[int
         )
         for scan in source.scans(end, StopFlag())
     ]
+
+
+def radars_of(source: RigSource, end: int) -> list[tuple[int, list[int]]]:
+    return [(tick, [radar for radar, *_ in rows]) for tick, _, rows in times_of(source, end)]
+
+
+def test_module_metres_become_true_metres() -> None:
+    made = radar_frame(2, frame(10), rate_hz=5.0)
+    # light travels 299 792 458 m/s, the module reckons with 300 000 000
+    assert made.range_start_m == pytest.approx(0.299792458, rel=1e-15)
+    assert made.bin_length_m == pytest.approx(0.0064 * 0.99930819333, rel=1e-10)
+    assert (made.radar, made.counter, made.t_ns) == (2, 10, 2_000_000_000)
+
+
+@pytest.mark.parametrize(
+    ("counters", "end", "scans", "lost"),
+    [
+        ((range(5), range(5)), 4, [(k, [0, 1]) for k in range(4)], 0),
+        (
+            ([0, 1, 4, 5], [0, 1, 2, 3, 4, 5]),
+            5,
+            [(0, [0, 1]), (1, [0, 1]), (2, [1]), (3, [1]), (4, [0, 1])],
+            2,
+        ),
+        (([1, 2, 9], [1, 2, 9]), 5, [(1, [0, 1]), (2, [0, 1])], 6),
+    ],
+)
+def test_frames_of_one_counter_are_a_scan_and_lost_ones_are_counted(
+    counters: Sequence[Sequence[int]], end: int, scans: object, lost: int
+) -> None:
+    source = rig_source(*map(Canned, counters))
+    assert radars_of(source, end) == scans
+    assert source.lost_frames == lost
 
 
 def test_frames_are_stamped_with_their_own_radars_time() -> None:
@@ -167,22 +167,20 @@ def test_every_frame_lies_in_the_period_of_its_scan(start_skew_ns: int, rate_hz:
     assert -1 < late_ns < period + 1  # times are rounded to nanoseconds
 
 
-def test_silence_names_radar_port_and_last_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("end", "error", "words"),
+    [
+        (ResponseTimeout, RadarSilentError, "radar1 at port1: no frame for 0 s after frame 2"),
+        (Disconnected, RadarSilentError, "radar1 at port1: the port is gone after frame 2"),
+        (DeviceError, AppError, "radar1 at port1: the module refused X4DRIVER_SET FRAME"),
+    ],
+)
+def test_a_radar_that_fails_is_named(
+    monkeypatch: pytest.MonkeyPatch, end: type[Exception], error: type[AppError], words: str
+) -> None:
     monkeypatch.setattr(sources, "SILENCE_S", 0.0)
-    source = rig_source(Canned(range(9)), Canned(range(3)))
-    with pytest.raises(RadarSilentError, match="radar1 at port1: no frame for 0 s after frame 2"):
-        counters_of(source, 9)
-
-
-def test_an_unplugged_radar_is_named() -> None:
-    source = rig_source(Canned(range(2), Disconnected))
-    with pytest.raises(RadarSilentError, match="radar0 at port0: the port is gone after frame 1"):
-        counters_of(source, 9)
-
-
-def test_a_refused_setting_is_named() -> None:
-    with pytest.raises(AppError, match="radar0 at port0: the module refused X4DRIVER_SET FRAME"):
-        counters_of(rig_source(Canned([], DeviceError)), 1)
+    with pytest.raises(error, match=words):
+        radars_of(rig_source(Canned(range(9)), Canned(range(3), end)), 9)
 
 
 def test_stopping_is_asked_for_while_waiting() -> None:
@@ -202,12 +200,6 @@ def test_drivers_are_closed_once() -> None:
     assert driver.closed == 1
 
 
-def loud_scene(short_scene: Scene) -> Scene:
-    """Let leakage drive the sampler over both ends of its range."""
-    leakage = short_scene.leakage.model_copy(update={"amplitude": 9.0, "range_m": 0.7})
-    return short_scene.model_copy(update={"leakage": leakage})
-
-
 @pytest.mark.parametrize(
     ("settings", "limit"),
     [
@@ -223,7 +215,9 @@ def test_limits_are_what_the_sampler_gives_at_its_ends(
     short_scene: Scene, settings: dict[str, Any], limit: float
 ) -> None:
     config = dataclasses.replace(RAW_CONFIG, **settings)
-    with open_loopback(loud_scene(short_scene), 0) as source:
+    # leakage that drives the sampler over both ends of its range
+    leakage = short_scene.leakage.model_copy(update={"amplitude": 9.0, "range_m": 0.7})
+    with open_loopback(short_scene.model_copy(update={"leakage": leakage}), 0) as source:
         source.start(config, 1)
         (scan,) = source.scans(1, StopFlag())
     for one in scan.frames:

@@ -182,29 +182,28 @@ def test_one_missing_row_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         view.close()
 
 
-def test_a_followed_view_sends_what_waited_too_long(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("count", "period_s", "expected"),
+    [
+        # sent at 0.5 s with six frames, and at the end with all ten, each from its own first frame
+        (10, 0.1, [(0, 6), (6, 10)]),
+        # full blocks of a fast radar, though 0.5 s passed
+        (300, 0.0025, [(0, 128), (128, 128), (256, 128)]),
+    ],
+)
+def test_a_followed_view_sends_what_waited_too_long(
+    tmp_path: Path, count: int, period_s: float, expected: list[tuple[int, int]]
+) -> None:
     now_s = 0.0
     view = RerunView(tmp_path / "s.rrd", session_info(), flush_s=0.5, clock_s=lambda: now_s)
-    for counter in range(10):
-        now_s = 0.1 * counter
-        view.on_scan(scan(counter))
-    view.close()
-    pictures = list(rows(tmp_path / "s.rrd", "/radar/radar0/bscan", "Tensor:data"))
-    # sent at 0.5 s with six frames, and at the end with all ten, each from its own first frame
-    assert [(frame, picture[0]["shape"][0]) for frame, picture in pictures] == [(0, 6), (6, 10)]
-
-
-def test_a_followed_view_waits_for_the_next_block_of_a_fast_radar(tmp_path: Path) -> None:
-    now_s = 0.0
-    view = RerunView(tmp_path / "s.rrd", session_info(), flush_s=0.5, clock_s=lambda: now_s)
-    for counter in range(300):
-        now_s = 0.0025 * counter
-        one = scan(counter)
-        frames = tuple(replace(f, t_ns=round(1e9 * now_s)) for f in one.frames)
-        view.on_scan(replace(one, t_ns=round(1e9 * now_s), frames=frames))
+    for counter in range(count):
+        now_s = period_s * counter
+        one, t_ns = scan(counter), round(1e9 * now_s)
+        frames = tuple(replace(frame, t_ns=t_ns) for frame in one.frames)
+        view.on_scan(replace(one, t_ns=t_ns, frames=frames))
     view.close()
     pictures = rows(tmp_path / "s.rrd", "/radar/radar0/bscan", "Tensor:data")
-    assert [frame for frame, _ in pictures] == [0, 128, 256]  # full blocks, though 0.5 s passed
+    assert [(frame, picture[0]["shape"][0]) for frame, picture in pictures] == expected
 
 
 DAY_NS = 1_790_000_000_000_000_000
@@ -353,11 +352,8 @@ def test_the_envelope_of_a_tone_is_flat_and_in_decibels() -> None:
     picture = bscan_picture(moving_tone(0.02), 0.2, BIN_M)
     # half of 0.02 is left after the mean is removed: -40 dB, so 22 of 32 dB of 255 levels
     np.testing.assert_allclose(picture, 255 * 22 / 32, atol=2)
-
-
-@pytest.mark.parametrize(("amplitude", "level"), [(1.0, 255), (0.0, 0)])
-def test_levels_are_clipped(amplitude: float, level: int) -> None:
-    assert set(bscan_picture(moving_tone(amplitude), 0.2, BIN_M).ravel()) == {level}
+    for amplitude, level in ((1.0, 255), (0.0, 0)):  # clipped
+        assert set(bscan_picture(moving_tone(amplitude), 0.2, BIN_M).ravel()) == {level}
 
 
 def test_it_shows_three_metres_at_most() -> None:
