@@ -21,7 +21,7 @@ from slam.app.session.log import SessionLog
 from slam.app.session.reader import open_session, read_entries
 from slam.app.session.repair import KEPT_SUFFIX, repair
 from slam.frames import RadarFrame
-from xethru_protocol.recordings.mcap import CHUNK, FLOAT_ARRAY
+from xethru_protocol.recordings.mcap import CHUNK, FLOAT_ARRAY, Cut
 from xethru_protocol.recordings.mcap import Message as StoredMessage
 from xethru_protocol.system import StopFlag
 
@@ -80,7 +80,7 @@ def messages(path: Path) -> list[Message]:
     """Return what our reader finds before the file ends; an AppError where it finds damage."""
     return [
         (entry.topic, entry.sequence, entry.t_ns, entry.publish_ns, entry.data)
-        for entry in read_entries(path, lambda _: None)
+        for entry in read_entries(path)
         if isinstance(entry, StoredMessage)
     ]
 
@@ -196,11 +196,10 @@ def test_a_tail_of_zeros_is_a_cut(whole: Content, tmp_path: Path) -> None:
     places = list(top_level_places(whole))
     at = places[len(places) // 2]
     path.write_bytes(whole[:at] + bytes(5000))
-    cut: list[int] = []
-    n_entries = sum(1 for _ in read_entries(path, cut.append))
-    assert cut == [at]
+    *entries, cut = read_entries(path)
+    assert cut == Cut(at)
     path.write_bytes(whole[:at])
-    assert n_entries == sum(1 for _ in read_entries(path, cut.append)) > 50
+    assert len(entries) == sum(not isinstance(entry, Cut) for entry in read_entries(path)) > 50
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))

@@ -49,7 +49,6 @@ _FRONT_END = override(
         "detection.max_range_m": 2.5,
     },
 )
-_FRAMES_AT_ONCE = 64
 _YAW_LIMIT_DEG = 2.0
 _GAIN_LIMIT_DB = 1.0
 
@@ -94,28 +93,18 @@ def run_calibrate(
 
 def _drive_of(session: RecordedSession, stop: StopFlag) -> Drive:
     """Read a session once and detect its echoes."""
-    frames: list[RadarFrame] = []
     samples: list[TumSample] = []
     detections: list[Detection] = []
     detector = make_detector(_FRONT_END)
-
-    def detect() -> None:
-        for found in detector.detect_many(frames, [0.0] * len(frames)):
-            detections.extend(each for each in found if not each.saturated)
-        frames.clear()
-        stop.check()
-
-    n_frames = 0
+    has_frame = False
     for record in session.records():
         if isinstance(record, RadarFrame):
-            n_frames += 1
-            frames.append(record)
-            if len(frames) == _FRAMES_AT_ONCE:
-                detect()
+            stop.check()
+            has_frame = True
+            detections += [each for each in detector.detect(record) if not each.saturated]
         elif isinstance(record, TumSample):
             samples.append(record)
-    detect()
-    if not n_frames:
+    if not has_frame:
         raise AppError(f"{session.path}: holds no radar frame; record a longer drive")
     if len(samples) < 2:
         raise AppError(f"{session.path}: holds no odometry to speak of; record a longer drive")

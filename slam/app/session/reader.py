@@ -115,19 +115,11 @@ def open_mcap(path: Path, size: int | None = None) -> Iterator[tuple[BinaryIO, i
         yield stream, whole if size is None else min(size, whole)
 
 
-def read_entries(
-    path: Path, on_cut: Callable[[int], None], size: int | None = None
-) -> Iterator[Metadata | Message]:
+def read_entries(path: Path, size: int | None = None) -> Iterator[Metadata | Message | Cut]:
     """Yield metadata and messages in the order of the file, holding one chunk in memory.
 
-    Parameters
-    ----------
-    path
-        The file.
-    on_cut
-        Called with the position in bytes where the file ends too early, before the end.
-    size
-        How many bytes of the file to read, so that one that grows reads the same again; None: all.
+    The last entry is a `Cut` if the file ends too early. `size` is how many bytes to read, so that
+    a file that grows reads the same again; None: all.
 
     Raises
     ------
@@ -137,9 +129,6 @@ def read_entries(
     with open_mcap(path, size) as (stream, n_bytes):
         try:
             for found in entries_of(stream, n_bytes):
-                if isinstance(found, Cut):
-                    on_cut(found.at)
-                    return
                 if isinstance(found, Damage):
                     raise AppError(
                         f"{path}: damaged at byte {found.at}: {found.reason}; "
@@ -147,6 +136,8 @@ def read_entries(
                     )
                 if not isinstance(found, Channel):
                     yield found
+                if isinstance(found, Cut):
+                    return
         except OSError as error:
             raise _unreadable(path, error) from None
 
@@ -314,9 +305,7 @@ class RecordedSession:
         }
         of_scan: dict[int, tuple[Detection, ...]] = {}
         held: list[Detection] = []
-        for entry in read_entries(self.path, self._on_cut, self._size):
-            if not isinstance(entry, Message):
-                continue
+        for entry in self._messages():
             if entry.topic in index_of:
                 with self._naming(entry):
                     ranges_m = unpack_array(DOUBLE_ARRAY, entry.data).tolist()
@@ -340,8 +329,8 @@ class RecordedSession:
         for radar in self.info.radars:
             ways[f"/radar/{radar.name}/rx"] = (radar.name, "rx")
             ways[f"/radar/{radar.name}/tx"] = (radar.name, "tx")
-        for entry in read_entries(self.path, self._on_cut, self._size):
-            if isinstance(entry, Message) and (found := ways.get(entry.topic)):
+        for entry in self._messages():
+            if found := ways.get(entry.topic):
                 with self._naming(entry):
                     data = unpack_array(BYTE_ARRAY, entry.data).tobytes()
                 yield *found, data, entry.publish_ns
@@ -359,9 +348,7 @@ class RecordedSession:
             f"/radar/{radar.name}/frame": (index, radar, _limits_of(radar))
             for index, radar in enumerate(self.info.radars)
         }
-        for entry in read_entries(self.path, self._on_cut, self._size):
-            if not isinstance(entry, Message):
-                continue
+        for entry in self._messages():
             record: SessionRecord | None = None
             with self._naming(entry):
                 if entry.topic in radar_of:
@@ -370,6 +357,13 @@ class RecordedSession:
                     record = _READERS[entry.topic](entry)
             if record is not None:
                 yield entry, record
+
+    def _messages(self) -> Iterator[Message]:
+        for entry in read_entries(self.path, self._size):
+            if isinstance(entry, Message):
+                yield entry
+            elif isinstance(entry, Cut):
+                self.cut_at_byte = entry.at
 
     @contextmanager
     def _naming(self, entry: Message) -> Iterator[None]:
@@ -380,9 +374,6 @@ class RecordedSession:
                 f"{self.path}: a message of {entry.topic} at "
                 f"{entry.t_ns / 1e9:.3f} s cannot be read: {error}"
             ) from None
-
-    def _on_cut(self, at_byte: int) -> None:
-        self.cut_at_byte = at_byte
 
 
 def open_session(path: Path) -> RecordedSession:
@@ -395,13 +386,15 @@ def open_session(path: Path) -> RecordedSession:
     """
     head: dict[str, str] | None = None
     radars: list[RadarInfo] = []
-    cut: list[int] = []
+    cut: Cut | None = None
     try:
         size = path.stat().st_size
     except OSError:
         size = None  # reading it reports what is wrong
-    for entry in read_entries(path, cut.append, size):
-        if isinstance(entry, Metadata):
+    for entry in read_entries(path, size):
+        if isinstance(entry, Cut):
+            cut = entry
+        elif isinstance(entry, Metadata):
             if entry.name == METADATA_NAME:
                 head = entry.values
                 check_format(path, head)
@@ -410,8 +403,8 @@ def open_session(path: Path) -> RecordedSession:
         else:
             break  # the infos come before everything else
     if head is None:
-        if cut:
-            raise AppError(f"{path}: ends at byte {cut[0]}, before it says what run it is of")
+        if cut is not None:
+            raise AppError(f"{path}: ends at byte {cut.at}, before it says what run it is of")
         raise AppError(
             f"{path}: an MCAP file, but no session of `uwb-slam`: its metadata {METADATA_NAME!r} "
             "is missing; of a bag in the layout of the paper's data set `uwb-slam convert` makes a "

@@ -115,8 +115,11 @@ def repair(path: Path, out: Path | None, stop: StopFlag) -> Repair:
         survey = _survey(path, stop)
         kept = path.with_name(path.name + KEPT_SUFFIX)
         if survey.was_whole and out is None:
+            n_found = survey.n_messages
             _read_back(path, survey)
-            return survey
+            if survey.n_messages == n_found:
+                return survey
+            survey.has_index = False  # damage made a chunk look like another record
         if not survey.channels:
             raise AppError(f"{path}: nothing in it can be kept, no channel is named before its end")
         if out is None and kept.exists():
@@ -199,6 +202,8 @@ def _note(survey: Repair, path: Path, record: mcap.Record) -> None:
         topic, at = mcap.text_at(body, 4)
         encoding, at = mcap.text_at(body, at)
         survey.channels[number] = (schema, topic, encoding, mcap.table_at(body, at)[0])
+    elif record.code == mcap.MESSAGE:
+        survey.n_messages += 1
     elif record.code == mcap.FOOTER:
         survey.has_index = _is_index_right(path, record)
 
