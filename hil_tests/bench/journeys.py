@@ -25,11 +25,7 @@ from types import CodeType, FrameType
 from typing import Self
 
 from emulator.chip import Pace
-from emulator.device import radar_device
-from emulator.echo.echo import echo_source
-from emulator.loopback import LoopbackTransport
-from emulator.module.memory import Identity
-from emulator.scene.scene import load_scene
+from hil_tests.bench.virtual_time import lab_radar
 from hil_tests.paths import REPOSITORY
 from slam.app.cli import main as uwb_slam
 from slam.app.odometry.track import OdometryTrack
@@ -37,7 +33,6 @@ from slam.app.rig.emulated import FRAME_RATE_HZ, RAW_CONFIG
 from slam.app.run.runner import run_slam
 from slam.app.session.log import SessionLog
 from slam.app.sweep.run import make_case, source_of
-from xethru_protocol.driver.radar import X4M300
 
 ROOT = REPOSITORY
 PRODUCT = ("xethru_protocol", "emulator", "slam")
@@ -104,14 +99,16 @@ class Trace:
 
 def ping() -> list[str]:
     """Send one ping and read its answer, over the loopback: both ends count, not their set-up."""
-    with _loopback_driver() as driver, Trace() as trace:
+    driver, _ = lab_radar(Pace.ASAP)
+    with driver, Trace() as trace:
         driver.ping()
     return trace.files()
 
 
 def echo_to_frame() -> list[str]:
     """Read frames of a radar that streams already: echo, chip, module, wire and driver count."""
-    with _loopback_driver() as driver:
+    driver, _ = lab_radar(Pace.ASAP)
+    with driver:
         driver.configure_raw(RAW_CONFIG)
         driver.start(FRAME_RATE_HZ)
         with Trace() as trace:
@@ -172,16 +169,6 @@ JOURNEYS: dict[str, Callable[[], list[str]]] = {
     "3 scans to belief and log": scans_to_belief_and_log,
     "set-up and 40 scans of the demo without --rerun": demo,
 }
-
-
-def _loopback_driver() -> X4M300:
-    """Return a driver of the scene's first radar, emulated in this process."""
-    scene = load_scene(SCENE)
-    radar = scene.radars[0]
-    source = echo_source(scene, 0, SEED)
-    device = radar_device(Identity(serial=radar.serial), source, Pace.ASAP, clock=radar.clock)
-    line = LoopbackTransport(device)
-    return X4M300(line, clock=line.clock_ns)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -1,4 +1,4 @@
-"""Device time without waiting: a driver and a module in real time on a virtual clock."""
+"""Device time without waiting: a driver and a module in this process, on a virtual clock."""
 
 from __future__ import annotations
 
@@ -15,18 +15,22 @@ NS_PER_S = 1_000_000_000
 FPS = 17.0
 
 
+def lab_radar(pace: Pace) -> tuple[X4M300, LoopbackTransport]:
+    """Return a driver of the lab's first radar, and its line."""
+    scene = load_scene("lab")
+    identity = Identity(serial=scene.radars[0].serial)
+    line = LoopbackTransport(radar_device(identity, echo_source(scene, 0, 0), pace))
+    return X4M300(line, clock=line.clock_ns), line
+
+
 def counters_of(duration_s: float, config: RawConfig) -> list[int]:
     """Return the counters of the frames that a radar of the lab sends in a time of its own clock.
 
     The module has the firmware's queue and absolute deadlines, so that a frame that came late by
     a second, or met a full queue, would be missing.
     """
-    scene = load_scene("lab")
-    device = radar_device(
-        Identity(serial=scene.radars[0].serial), echo_source(scene, 0, 0), Pace.REALTIME
-    )
-    line = LoopbackTransport(device)
-    with X4M300(line, clock=line.clock_ns) as driver:
+    driver, line = lab_radar(Pace.REALTIME)
+    with driver:
         driver.configure_raw(config)
         driver.start(FPS)
         end_ns = line.clock_ns() + round(duration_s * NS_PER_S)

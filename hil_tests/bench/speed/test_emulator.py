@@ -16,12 +16,9 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from emulator.chip import Pace
 from emulator.chip.chip import Chip
-from emulator.device import radar_device
 from emulator.echo.echo import echo_source
-from emulator.loopback import LoopbackTransport
-from emulator.module.memory import Identity
 from emulator.scene.scene import load_scene
-from hil_tests.bench.virtual_time import counters_of
+from hil_tests.bench.virtual_time import counters_of, lab_radar
 from hil_tests.device.serving import Served, emulator
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
@@ -140,12 +137,7 @@ def test_synthesis_of_frames(benchmark: BenchmarkFixture, block: int, downconver
 def test_frames_through_driver_and_device_in_process(
     benchmark: BenchmarkFixture, downconversion: bool
 ) -> None:
-    scene = load_scene("lab")
-    device = radar_device(
-        Identity(serial=scene.radars[0].serial), echo_source(scene, 0, 0), Pace.ASAP
-    )
-    transport = LoopbackTransport(device)
-    driver = X4M300(transport, clock=transport.clock_ns)
+    driver, _ = lab_radar(Pace.ASAP)
     driver.configure_raw(RawConfig(downconversion=downconversion))
     driver.start(5.0)
     benchmark(lambda: sum(1 for _ in driver.frames(320)))

@@ -1,7 +1,7 @@
 """What is counted of a sweep's runs: groups, bands, false landmarks."""
 
-import dataclasses
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
 
@@ -24,7 +24,7 @@ from slam.app.sweep.statistics import (
 from slam.evaluation import LandmarkScore
 from slam.results import Belief, StepResult
 
-RUN = dataclasses.replace(
+RUN = replace(
     run_of(make_case("lab", "paper", 0)),
     scene="a",
     ate_rmse_m=0.01,
@@ -40,13 +40,13 @@ RUN = dataclasses.replace(
 
 
 def other(seed: int, ate_m: float, nees: float, nis: float | None, recall: float) -> SweepRun:
-    return dataclasses.replace(
+    return replace(
         RUN,
         seed=seed,
         ate_rmse_m=ate_m,
         nees_pose=((1.2, nees), (9.6, 4.0)),
         nis_mean=nis,
-        landmarks=dataclasses.replace(RUN.landmarks, precision=None, recall=recall, rmse_m=None),
+        landmarks=replace(RUN.landmarks, precision=None, recall=recall, rmse_m=None),
     )
 
 
@@ -69,9 +69,9 @@ def test_a_group_counts_averages_and_takes_medians() -> None:
 def test_scenes_and_presets_are_groups_of_their_own_in_order() -> None:
     runs = [
         RUN,
-        dataclasses.replace(RUN, scene="b", nis_mean=None),
-        dataclasses.replace(RUN, preset="robust"),
-        dataclasses.replace(RUN, seed=1),
+        replace(RUN, scene="b", nis_mean=None),
+        replace(RUN, preset="robust"),
+        replace(RUN, seed=1),
     ]
     groups = summarise_groups(runs)
     names = [(group["scene"], group["preset"], group["runs"]) for group in groups]
@@ -80,11 +80,11 @@ def test_scenes_and_presets_are_groups_of_their_own_in_order() -> None:
 
 
 def stressed(stress: str, seed: int, ate_m: float) -> SweepRun:
-    return dataclasses.replace(RUN, stress=stress, seed=seed, ate_rmse_m=ate_m)
+    return replace(RUN, stress=stress, seed=seed, ate_rmse_m=ate_m)
 
 
 def test_settings_and_stresses_are_groups_named_by_them() -> None:
-    runs = [RUN, dataclasses.replace(RUN, settings={"a.b": "1"}), stressed("skew", 0, 0.02)]
+    runs = [RUN, replace(RUN, settings={"a.b": "1"}), stressed("skew", 0, 0.02)]
     lines = [group_line(group) for group in summarise_groups(runs)]
     assert [line.partition(", 1 seeds")[0] for line in lines] == [
         "a, preset paper",
@@ -94,10 +94,10 @@ def test_settings_and_stresses_are_groups_named_by_them() -> None:
 
 
 def test_a_group_says_how_good_its_maps_are() -> None:
-    twice = dataclasses.replace(RUN.landmarks, duplicates=2)
+    twice = replace(RUN.landmarks, duplicates=2)
     runs = [
-        dataclasses.replace(RUN, seed=1, landmarks=twice),
-        *(dataclasses.replace(RUN, seed=seed, false=seed, confident_false=1) for seed in (2, 3, 4)),
+        replace(RUN, seed=1, landmarks=twice),
+        *(replace(RUN, seed=seed, false=seed, confident_false=1) for seed in (2, 3, 4)),
     ]
     (group,) = summarise_groups(runs)
     assert group["without_duplicates"] == 0.75
@@ -107,9 +107,9 @@ def test_a_group_says_how_good_its_maps_are() -> None:
 def test_nis_is_averaged_over_seeds_by_degrees_of_freedom() -> None:
     """Bands by hand: chi-square with 10 dof has 3.247 and 20.483 at 2.5 and 97.5 %."""
     runs = [
-        dataclasses.replace(RUN, nis_times=((1.0, 2.0, 2), (2.0, 0.0, 0))),
-        dataclasses.replace(RUN, seed=1, nis_times=((3.0, 10.0, 8), (2.0, 0.0, 0))),
-        dataclasses.replace(RUN, seed=2, nis_times=()),
+        replace(RUN, nis_times=((1.0, 2.0, 2), (2.0, 0.0, 0))),
+        replace(RUN, seed=1, nis_times=((3.0, 10.0, 8), (2.0, 0.0, 0))),
+        replace(RUN, seed=2, nis_times=()),
     ]
     (group,) = summarise_groups(runs)
     first, second = group["nis_times"]
@@ -122,7 +122,7 @@ def test_the_bound_has_the_same_statistics() -> None:
         BoundSummary(filtered_ate_rmse_m=f, smoothed_ate_rmse_m=s, nees_pose=((1.0, n),))
         for f, s, n in ((0.01, 0.004, 2.0), (0.02, 0.006, 4.0), (0.03, 0.005, 6.0))
     ]
-    runs = [dataclasses.replace(RUN, seed=i, bound=bound) for i, bound in enumerate(bounds)]
+    runs = [replace(RUN, seed=i, bound=bound) for i, bound in enumerate(bounds)]
     (group,) = summarise_groups(runs)
     assert group["bound"]["filtered_ate_rmse_m"] == {
         "median": 0.02,
@@ -138,9 +138,9 @@ def test_a_stress_table_compares_with_its_own_clean_group() -> None:
     runs = [
         RUN,
         stressed("skew", 0, 0.015),
-        dataclasses.replace(RUN, preset="robust", ate_rmse_m=0.001),
-        dataclasses.replace(stressed("skew", 0, 0.004), preset="robust"),
-        dataclasses.replace(RUN, scene="b"),
+        replace(RUN, preset="robust", ate_rmse_m=0.001),
+        replace(stressed("skew", 0, 0.004), preset="robust"),
+        replace(RUN, scene="b"),
     ]
     groups = summarise_groups(runs)
     tables = stress_tables(groups)
