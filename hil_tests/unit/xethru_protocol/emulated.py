@@ -15,17 +15,7 @@ STORAGE = 0x18000
 
 
 class EmulatedModule:
-    """A stopped module that notes its commands.
-
-    Attributes
-    ----------
-    received
-        Commands, in order.
-    fail_at
-        Offset at which reading or writing a file fails with code 12.
-    run_errors
-        Codes with which it refuses the next RUN commands.
-    """
+    """A stopped module that notes its commands."""
 
     def __init__(self, *, stopped: bool = True) -> None:
         options = DeviceOptions(storage_bytes=STORAGE)
@@ -33,8 +23,8 @@ class EmulatedModule:
         if stopped:
             answer(self.module, m.SetMode(mode=SensorMode.XTID_SM_STOP))
         self.received: list[m.Message] = []
-        self.fail_at: int | None = None
-        self.run_errors: list[int] = []
+        self.fail_at: int | None = None  # offset at which a file fails with code 12
+        self.run_errors: list[int] = []  # with which it refuses the next RUN commands
 
     @property
     def files(self) -> dict[FileKey, bytes]:

@@ -9,16 +9,10 @@ from xethru_protocol.wire.errors import PortUnavailable
 
 
 class Machine:
-    """Which module is behind which port, and from when on.
-
-    Attributes
-    ----------
-    lines
-        Every line that was opened, in order.
-    """
+    """Which module is behind which port, and from when on."""
 
     def __init__(self, *paths: str) -> None:
-        self.lines: list[ScriptedTransport] = []
+        self.lines: list[ScriptedTransport] = []  # every one that was opened, in order
         self._paths = paths
         self._behind: dict[str, tuple[Answer, int]] = {}
         self._first: ScriptedTransport | None = None

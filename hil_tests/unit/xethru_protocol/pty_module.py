@@ -71,18 +71,9 @@ def silent(command: m.Message) -> Sequence[Said]:
 class PtyModule:
     """A module behind a pseudo-terminal; it streams frames 0, 1, 2 ... while FPS is positive.
 
-    Parameters
-    ----------
-    answer
-        What it answers to each command; b"" unplugs it. By default, what `PlainModule` does.
-    baudrate
-        The only rate at which it hears (a ``termios.B...``); None: every one.
-    unasked
-        Sent again and again.
-    echoes
-        Whether it sends back what it gets, and nothing else.
-    link
-        Another name of the port, until the module is unplugged.
+    ``answer`` is what it answers to each command, by default as `PlainModule`; b"" unplugs it. It
+    hears only at ``baudrate`` (a ``termios.B...``), sends ``unasked`` again and again, or ``echoes``
+    what it gets. ``link`` is another name of the port until the module is unplugged.
     """
 
     def __init__(

@@ -154,12 +154,6 @@ def test_several_kinds_keep_their_order_in_time(tmp_path: Path) -> None:
     assert list(read_recording(tmp_path / "two")) == written
 
 
-def test_messages_without_a_place_in_the_format_are_refused_quietly(tmp_path: Path) -> None:
-    with RecordingWriter(tmp_path / "none") as writer:
-        assert not writer.write(m.Ack(), 0)
-        assert not writer.write(m.System(code=0x11), 0)
-
-
 @pytest.mark.parametrize(
     ("split", "files"),
     [
