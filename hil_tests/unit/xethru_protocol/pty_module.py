@@ -72,8 +72,8 @@ class PtyModule:
     """A module behind a pseudo-terminal; it streams frames 0, 1, 2 ... while FPS is positive.
 
     ``answer`` is what it answers to each command, by default as `PlainModule`; b"" unplugs it. It
-    hears only at ``baudrate`` (a ``termios.B...``), sends ``unasked`` again and again, or ``echoes``
-    what it gets. ``link`` is another name of the port until the module is unplugged.
+    hears only at ``baudrate`` (a ``termios.B...``), sends ``unasked`` again and again, and
+    ``echoes`` what it gets. ``link`` is another name of the port until the module is unplugged.
     """
 
     def __init__(
