@@ -174,7 +174,7 @@ class AsyncX4M300(RadarState):
         """Carry out a procedure that only receives, beside one that sends; also repeated."""
         link = self._link
         if link.reconnect_s > 0 and not link.identified:
-            await self._run(reconnect.identify_quietly(link))
+            await self._run(reconnect.identify(link))
         for _ in range(reconnect.RECONNECTS_PER_CALL):
             reconnects = link.reconnects
             try:

@@ -46,6 +46,8 @@ def identify(link: Link) -> Steps[None]:
         serial = (yield from link.info_text(InfoItem.XTID_SSIC_SERIALNUMBER)) or None
     except ResponseTimeout:
         serial = None
+    except Disconnected:
+        return  # the next command will see it
     link.identified, link.serial_number = True, serial
     if serial is None:
         link.warn(
@@ -101,7 +103,7 @@ def reconnect(link: Link, timeout_s: float = RESTART_S) -> Steps[str]:
 def resilient(link: Link, procedure: Callable[[], Steps[T]]) -> Steps[T]:
     """Run a procedure; if the line breaks and reconnecting is on, reconnect and repeat it."""
     if link.reconnect_s > 0:
-        yield from identify_quietly(link)
+        yield from identify(link)
     for _ in range(RECONNECTS_PER_CALL):
         reconnects = link.reconnects
         try:
@@ -109,14 +111,6 @@ def resilient(link: Link, procedure: Callable[[], Steps[T]]) -> Steps[T]:
         except Disconnected as error:
             yield from recover(link, reconnects, error)
     return (yield from procedure())
-
-
-def identify_quietly(link: Link) -> Steps[None]:
-    """Read the serial number, unless the line is gone already."""
-    try:
-        yield from identify(link)
-    except Disconnected:
-        return  # the next command will see it
 
 
 def recover(link: Link, reconnects: int, error: Disconnected) -> Steps[None]:

@@ -68,14 +68,6 @@ def test_wrong_length_field_is_not_waited_for(length: int) -> None:
     assert faults(found)[0] == (FaultKind.HEADER, 0)
 
 
-def test_candidate_inside_a_failed_normal_packet_wins_and_inside_a_good_one_is_data() -> None:
-    inner = frame(bins=2)
-    good = encode_normal(b"\xb0" + inner)
-    assert payloads(read(good)) == [b"\xb0" + inner]
-    bad = b"\x7d\xb0" + inner + b"\x00\x7e"
-    assert payloads(read(bad)) == [inner[9:]]
-
-
 @pytest.mark.parametrize(
     ("stream", "expected"),
     [

@@ -2,15 +2,10 @@
 
 import pytest
 
-from xethru_protocol.wire.codec import decode_response
 from xethru_protocol.wire.framing import (
     Direction,
-    Packet,
-    PacketReader,
-    encode_no_escape,
     plausible,
 )
-from xethru_protocol.wire.messages import ReplyFloat
 
 FROM_HOST, FROM_MODULE = Direction.FROM_HOST, Direction.FROM_MODULE
 BYTE, INT, FLOAT, STRING, USER, NONE = 0x10, 0x11, 0x12, 0x13, 0x50, 0x00
@@ -93,14 +88,3 @@ def test_direction_tells_what_a_first_byte_means() -> None:
     assert plausible(5, ping, FROM_MODULE)  # it may be a PONG
     assert plausible(1, reset, FROM_HOST)
     assert not plausible(1, reset, FROM_MODULE)
-
-
-@pytest.mark.parametrize("trailer", [b"", b"\x04"], ids=["without trailer", "with trailer"])
-def test_replies_are_read_in_no_escape_framing(trailer: bytes) -> None:
-    """1.3: a host accepts both framings for the same message."""
-    payload = elements(0x11, FLOAT, 1) + b"\x00\x00\x80\x3f" + trailer
-    reader = PacketReader(FROM_MODULE)
-    reader.receive_data(encode_no_escape(payload))
-    packet = reader.next_packet()
-    assert isinstance(packet, Packet)
-    assert decode_response(packet.payload) == ReplyFloat(values=(1.0,))
