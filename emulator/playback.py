@@ -5,7 +5,7 @@ or SETMODE RUN), else after half a second without a command, so that a host that
 had time to flush its side. It ends when the last host has closed the port. Meanwhile the module
 answers every command like any other; FPS, mode and geometry settings are acknowledged and change
 nothing about what is played. Nothing is dropped: a host that reads slowly makes the recording
-wait. A host that only asks something and leaves within half a second gets none of it.
+wait.
 
 A host takes only frames of the size that the module reports for its frame area, so while a
 recording plays the module reports the frame area of the recording.
@@ -151,7 +151,6 @@ class KindSteps:
 
     @property
     def newest(self) -> frozenset[str] | None:
-        """The kinds in force now; None for all."""
         return self._steps[-1][1]
 
     def change(self, kinds: frozenset[str] | None, position_ns: int) -> None:
@@ -172,19 +171,9 @@ class KindSteps:
         for begin_ns, later in self._steps[1:]:
             if begin_ns <= position_ns:
                 kinds = later
-        return kinds is None or kind_of(message) in kinds
-
-
-def kind_of(message: Response) -> str:
-    """Return the kind of a message, as filters name it.
-
-    Examples
-    --------
-    >>> from xethru_protocol.wire.messages import PresenceSingle
-    >>> kind_of(PresenceSingle(counter=0, state=0, distance_m=0, direction=0, signal_quality=0))
-    'presence-single'
-    """
-    return _UNKNOWN if isinstance(message, UnknownMessage) else _slug(ROWS[type(message)].name)
+        unknown = isinstance(message, UnknownMessage)
+        kind = _UNKNOWN if unknown else _slug(ROWS[type(message)].name)
+        return kinds is None or kind in kinds
 
 
 def kinds(names: Iterable[str]) -> frozenset[str]:
@@ -258,17 +247,14 @@ class PlayStream(MessageStream):
     """The messages of a recording, due one after the other while a host has the port open.
 
     Where the system does not report who opens the port, a host's first command counts as opening.
-
-    What is being played can be controlled meanwhile. No control brings a message twice or out of
-    order, or loses one, but for what a seek leaves out and a filter passes over; a message that
-    the line has begun to take is sent whole. Pause, rate, loop and filter outlast the host.
+    No control brings a message twice or out of order, or loses one, but for what a seek leaves out
+    and a filter passes over. Pause, rate, loop and filter outlast the host.
 
     Parameters
     ----------
     timed
-        What to play, as from `schedule`; gone through anew for every host and round, one message
-        ahead, so that it need not lie in memory. A seek and a new filter go through it from the
-        beginning, too, up to where it stands.
+        What to play, as from `schedule`; gone through anew for every host, round, seek and
+        filter, one message ahead, so that it need not lie in memory.
     loop_gap_ns
         Time of the recording between the last message and the first when playing in a loop; None
         to play once.
@@ -413,8 +399,7 @@ class PlayStream(MessageStream):
     def set_filter(self, kinds: frozenset[str] | None, now_ns: int) -> None:
         """Play other kinds, as from `kinds`, None for all, from the position of now on.
 
-        The kinds in force when the recording's clock passes a message decide about it, even where
-        a slow host has made it wait since. Where a loop had nothing to play, it begins again.
+        Where a loop had nothing to play, it begins again.
         """
         over = self._next is None
         self._kinds.change(kinds, self._clock.position_ns(now_ns))
@@ -506,24 +491,6 @@ class PlayedChip(Chip):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PlayOptions:
-    """How a recording is played; all of it can be changed while it plays.
-
-    Attributes
-    ----------
-    rate
-        Multiple of real time; 0 for as fast as the port takes it.
-    from_ns
-        Where every host and round begins, ns since the first message of the recording.
-    """
-
-    rate: float = 1.0
-    loop: bool = False
-    from_ns: int = 0
-    kinds: frozenset[str] | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class PlayedRadar:
     """One radar of a recording, played by a module of its own.
 
@@ -544,8 +511,11 @@ class PlayedRadar:
 
 def played_radars(
     recording: Path,
-    options: PlayOptions,
     *,
+    rate: float = 1.0,
+    loop: bool = False,
+    from_ns: int = 0,
+    kinds: frozenset[str] | None = None,
     on_fault: Callable[[RecordingFault], None],
     warn: Callable[[str], None] = lambda line: None,
 ) -> tuple[PlayedRadar, ...]:
@@ -559,6 +529,12 @@ def played_radars(
     ----------
     recording
         Anything that `read_recording` takes, and sessions of several radars.
+    rate
+        Multiple of real time; 0 for as fast as the port takes it.
+    from_ns
+        Where every host and round begins, ns since the first message of the recording.
+    kinds
+        What to play, as from `kinds`; None for all.
     on_fault
         Called with what could not be read; the rest plays.
     warn
@@ -574,7 +550,7 @@ def played_radars(
         surveys.append(_Survey(recording, facts, on_fault))
         on_fault = _reported_already
     zero_ns = min((s.first_ns for s in surveys if s.first_ns is not None), default=0)
-    _check(recording, surveys, zero_ns, options)
+    _check(recording, surveys, zero_ns, rate=rate, loop=loop, from_ns=from_ns)
     end_ns = max(survey.offset_ns(zero_ns) + survey.lasts_ns for survey in surveys)
     playing = [survey for survey in surveys if survey.plays]
     names = _port_names([survey.facts.name for survey in playing])
@@ -585,11 +561,11 @@ def played_radars(
             _Program(recording, survey.facts.name, offset_ns, warn),
             # rounds of all radars are equally long, so that a loop keeps them in step
             loop_gap_ns=end_ns - offset_ns - survey.lasts_ns + NOMINAL_PERIOD_NS,
-            rate=options.rate,
-            from_ns=options.from_ns,
-            kinds=options.kinds,
+            rate=rate,
+            from_ns=from_ns,
+            kinds=kinds,
         )
-        stream.set_loop(options.loop, 0)
+        stream.set_loop(loop, 0)
         serial = survey.facts.serial or ""
         serial = serial if _SERIAL.fullmatch(serial) else _NO_SERIAL
         module = Module(Identity(serial=serial), _chip(recording, survey, warn))
@@ -634,18 +610,26 @@ class _Survey:
                 yield message, stamp_ns
 
 
-def _check(recording: Path, surveys: Iterable[_Survey], zero_ns: int, options: PlayOptions) -> None:
+def _check(
+    recording: Path,
+    surveys: Iterable[_Survey],
+    zero_ns: int,
+    *,
+    rate: float,
+    loop: bool,
+    from_ns: int,
+) -> None:
     if not any(survey.messages for survey in surveys):
         raise RecordingError(f"{recording}: the recording holds no messages")
     if not any(survey.plays for survey in surveys):
         raise RecordingError(f"{recording}: the recording holds answers only, nothing to play")
     last_ns = max(s.offset_ns(zero_ns) + s.lasts_ns for s in surveys if s.plays)
-    if options.from_ns > last_ns:
+    if from_ns > last_ns:
         raise RecordingError(f"{recording} is over after {last_ns / NS_PER_S:.3f} s")
-    longest_ns = max(last_ns, NOMINAL_PERIOD_NS if options.loop else 0)
-    if options.rate and longest_ns > _LONGEST_S * NS_PER_S * options.rate:
+    longest_ns = max(last_ns, NOMINAL_PERIOD_NS if loop else 0)
+    if rate and longest_ns > _LONGEST_S * NS_PER_S * rate:
         raise RecordingError(
-            f"{recording}: at rate {options.rate:g} it would play for more than "
+            f"{recording}: at rate {rate:g} it would play for more than "
             f"{_LONGEST_S // 86400} days; rate 0 plays as fast as the port takes it"
         )
 

@@ -19,7 +19,7 @@ from emulator.faults.faulty_device import FaultyDevice, InnerDevice
 from emulator.faults.plan import FaultPlan, FaultPlanError, Injected, load_plan
 from emulator.module.memory import Identity, Memory
 from emulator.module.settings import DeviceOptions
-from emulator.playback import PlayOptions, PlayStream, played_radars
+from emulator.playback import PlayStream, played_radars
 from emulator.ports.control import Control, ControlSocket
 from emulator.ports.folders import (
     Announcement,
@@ -203,17 +203,14 @@ def play(options: Namespace, stop: StopFlag, warn: Warn) -> None:
     CannotServeError
         When the recording cannot be read or a port cannot be had.
     """
-    played = PlayOptions(
-        rate=options.rate,
-        loop=options.loop,
-        from_ns=round(options.from_s * 1e9),
-        kinds=None if options.only is None else frozenset(options.only),
-    )
     with contextlib.ExitStack() as cleanup:
         try:
             radars = played_radars(
                 options.recording,
-                played,
+                rate=options.rate,
+                loop=options.loop,
+                from_ns=round(options.from_s * 1e9),
+                kinds=None if options.only is None else frozenset(options.only),
                 on_fault=lambda fault: warn(f"{fault.file}: {fault.reason}; the rest is played"),
                 warn=warn,
             )

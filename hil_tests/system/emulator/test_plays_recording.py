@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from emulator.loopback import LoopbackTransport
-from emulator.playback import PlayOptions, played_radars
+from emulator.playback import played_radars
 from hil_tests.device.serving import Served, emulator, open_radar
 from hil_tests.paths import real_recording
 from xethru_protocol.driver.radar import X4M300
@@ -126,7 +126,7 @@ def test_real_time_is_kept(recording: Path, recorded: list[BasebandIq]) -> None:
     """At ten times the recorded speed, 30 s take 3 s, by the clock of the module's own line."""
     (radar,) = played_radars(
         recording,
-        PlayOptions(rate=10),
+        rate=10,
         on_fault=lambda fault: pytest.fail(fault.reason),
     )
     line = LoopbackTransport(radar.device)

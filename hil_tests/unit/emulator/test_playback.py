@@ -11,7 +11,7 @@ import pytest
 
 from emulator.device import Device
 from emulator.loopback import LoopbackTransport
-from emulator.playback import PlayOptions, played_radars
+from emulator.playback import played_radars
 from hil_tests.paths import FIXTURES
 from hil_tests.unit.emulator.doubles import BareHost
 from hil_tests.unit.xethru_protocol.scripted import framed
@@ -34,7 +34,7 @@ SECOND = 1_000_000_000
 def device_of(recording: Path, rate: float = 0, warnings: list[str] | None = None) -> Device:
     (radar,) = played_radars(
         recording,
-        PlayOptions(rate=rate),
+        rate=rate,
         on_fault=lambda fault: pytest.fail(fault.reason),
         warn=lambda line: None if warnings is None else warnings.append(line),
     )
@@ -57,7 +57,7 @@ def test_a_recording_of_nothing_is_refused(tmp_path: Path) -> None:
     recording = copy_of_the_vendors_recording(tmp_path)
     next(recording.glob("*baseband_iq*.dat")).write_bytes(b"")
     with pytest.raises(RecordingError):
-        played_radars(recording, PlayOptions(rate=0), on_fault=lambda fault: None)
+        played_radars(recording, rate=0, on_fault=lambda fault: None)
 
 
 def test_radar_frames_come_byte_for_byte_without_escapes() -> None:

@@ -15,7 +15,6 @@ from emulator.playback import (
     NOMINAL_PERIOD_NS,
     QUIET_NS,
     PlayedRadar,
-    PlayOptions,
     PlayStream,
     kinds,
     played_radars,
@@ -225,16 +224,22 @@ def samples(radar: int, counter: int) -> np.ndarray:
 
 
 def session(
-    tmp_path: Path, options: PlayOptions, starts_ns: dict[str, int] | None = None
+    tmp_path: Path,
+    starts_ns: dict[str, int] | None = None,
+    *,
+    rate: float = 1.0,
+    loop: bool = False,
 ) -> dict[str, PlayedRadar]:
     path = tmp_path / "session.mcap"
     write_session(path, starts_ns or {"left": 10 * SECOND, "right": 10 * SECOND + SECOND // 4})
-    played = played_radars(path, options, on_fault=lambda fault: pytest.fail(fault.reason))
+    played = played_radars(
+        path, rate=rate, loop=loop, on_fault=lambda fault: pytest.fail(fault.reason)
+    )
     return {radar.name: radar for radar in played}
 
 
 def test_every_radar_of_a_session_plays_its_own_bytes(tmp_path: Path) -> None:
-    radars = session(tmp_path, PlayOptions(rate=0))
+    radars = session(tmp_path, rate=0)
     assert list(radars) == ["left", "right"]
     for number, radar in enumerate(radars.values()):
         module = Connection(Role.MODULE)
@@ -247,7 +252,7 @@ def test_every_radar_of_a_session_plays_its_own_bytes(tmp_path: Path) -> None:
 
 
 def test_every_radar_of_a_session_says_who_it_is_and_where_its_bins_lie(tmp_path: Path) -> None:
-    for number, radar in enumerate(session(tmp_path, PlayOptions()).values()):
+    for number, radar in enumerate(session(tmp_path).values()):
         line = LoopbackTransport(radar.device)
         with X4M300(line, clock=line.clock_ns) as driver:
             geometry = driver.configure_raw(RawConfig())
@@ -259,7 +264,7 @@ def test_every_radar_of_a_session_says_who_it_is_and_where_its_bins_lie(tmp_path
 
 
 def test_radars_of_a_session_keep_their_time_in_every_round(tmp_path: Path) -> None:
-    radars = session(tmp_path, PlayOptions(loop=True))
+    radars = session(tmp_path, loop=True)
     for offset_ns, radar in zip((0, SECOND // 4), radars.values(), strict=True):
         radar.stream.port_opened(-QUIET_NS)
         dues = []
@@ -277,7 +282,7 @@ def test_radars_of_a_session_keep_their_time_in_every_round(tmp_path: Path) -> N
 
 
 def test_a_seek_means_the_same_time_in_all_radars(tmp_path: Path) -> None:
-    for radar in session(tmp_path, PlayOptions()).values():
+    for radar in session(tmp_path).values():
         host = BareHost(radar.device)
         radar.device.port_opened(-QUIET_NS)
         radar.stream.seek(2 * SECOND, 0)
@@ -288,12 +293,12 @@ def test_a_seek_means_the_same_time_in_all_radars(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["..", ".hidden", "a\0b", "x" * 100])
 def test_a_name_that_would_be_a_strange_file_is_not_used(name: str, tmp_path: Path) -> None:
-    radars = session(tmp_path, PlayOptions(), {"left": 0, name: 0})
+    radars = session(tmp_path, {"left": 0, name: 0})
     assert list(radars) == ["radar0", "radar1"]
 
 
 def test_one_radar_of_a_session_is_read_by_its_name(tmp_path: Path) -> None:
-    session(tmp_path, PlayOptions())
+    session(tmp_path)
     path = tmp_path / "session.mcap"
     assert [facts.name for facts in recording_radars(path)] == ["left", "right"]
     read = list(read_recording(path, radar="right"))
@@ -322,6 +327,6 @@ def test_a_start_behind_the_end_is_refused() -> None:
     with pytest.raises(RecordingError, match=r"is over after \d+\.\d\d\d s"):
         played_radars(
             FIXTURES / "recordings" / "iq",
-            PlayOptions(from_ns=10**15),
+            from_ns=10**15,
             on_fault=lambda fault: None,
         )
