@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,8 +28,7 @@ class Served:
     serials: tuple[str, ...]
     odometry: str | None
     scene_time_zero_ns: int
-    control: str | None = None
-    tcp_ports: tuple[int | None, ...] = ()
+    tcp_ports: tuple[int | None, ...]
 
     def end(self, number: signal.Signals = signal.SIGTERM) -> int:
         """Send a signal; return the exit code."""
@@ -44,15 +42,12 @@ def open_radar(path: str, reconnect_s: float = 0.0) -> X4M300:
 
 
 @contextmanager
-def emulator(
-    *arguments: str | Path, environment: Mapping[str, str] | None = None
-) -> Iterator[Served]:
+def emulator(*arguments: str | Path) -> Iterator[Served]:
     """Run ``xethru-emulator`` until the block ends; stderr goes to the test's."""
     process = subprocess.Popen(
         [sys.executable, "-m", "emulator.cli", *map(str, arguments)],
         stdout=subprocess.PIPE,
         text=True,
-        env={**os.environ, **(environment or {})},
         # a test session that is killed leaves no emulator behind
         preexec_fn=signal_at_parents_death(signal.SIGTERM),
     )
@@ -70,7 +65,6 @@ def emulator(
             serials=tuple(device["serial"] for device in devices),
             odometry=ready["odometry"],
             scene_time_zero_ns=ready["scene_time_zero_ns"],
-            control=ready["control"],
             tcp_ports=tuple(device["tcp"] for device in devices),
         )
     finally:

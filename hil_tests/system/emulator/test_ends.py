@@ -23,9 +23,11 @@ from xethru_protocol.wire.messages import ReplyString, SystemGetInfo
 pytestmark = pytest.mark.slow
 
 
-def environment(tmp_path: Path) -> dict[str, str]:
+@pytest.fixture(autouse=True)
+def announcements(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Keep this test's announcements to itself."""
-    return {"XDG_RUNTIME_DIR": str(tmp_path)}
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    return tmp_path / "xethru"
 
 
 def lines_of(path: str, most: int) -> list[str]:
@@ -40,21 +42,19 @@ def lines_of(path: str, most: int) -> list[str]:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_it_with_0_and_nothing_is_left(
-    number: signal.Signals, tmp_path: Path
+    number: signal.Signals, tmp_path: Path, announcements: Path
 ) -> None:
     links = tmp_path / "links"
-    with emulator(
-        "serve", "smoke", "--link-dir", links, environment=environment(tmp_path)
-    ) as served:
+    with emulator("serve", "smoke", "--link-dir", links) as served:
         assert served.odometry is not None
         assert sorted(path.name for path in links.iterdir()) == sorted(
             [*served.names, "control.sock", "odometry.sock"]
         )
-        (announced,) = (tmp_path / "xethru").glob("*.json")
+        (announced,) = announcements.glob("*.json")
         assert json.loads(announced.read_text())["pid"] == served.process.pid
         assert served.end(number) == 0
     assert not links.exists()
-    assert list((tmp_path / "xethru").iterdir()) == []
+    assert list(announcements.iterdir()) == []
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="asks /proc who catches signals")
@@ -68,7 +68,6 @@ def test_a_signal_during_the_start_ends_it_with_0(
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env={**os.environ, **environment(tmp_path)},
     ) as process:
         # before that it is the interpreter that starts, and no program can answer
         wait_until(lambda: catches(process.pid, signal.SIGHUP), process)
@@ -79,9 +78,9 @@ def test_a_signal_during_the_start_ends_it_with_0(
     assert not (tmp_path / "l").exists()
 
 
-def test_a_signal_while_streaming_ends_it_too(tmp_path: Path) -> None:
+def test_a_signal_while_streaming_ends_it_too() -> None:
     with (
-        emulator("serve", "smoke", "--pace", "asap", environment=environment(tmp_path)) as served,
+        emulator("serve", "smoke", "--pace", "asap") as served,
         open_radar(served.paths[0]) as driver,
     ):
         driver.configure_raw()
@@ -91,17 +90,17 @@ def test_a_signal_while_streaming_ends_it_too(tmp_path: Path) -> None:
         assert not Path(served.paths[0]).parent.exists()
 
 
-def test_a_killed_emulator_is_succeeded_by_the_next(tmp_path: Path) -> None:
+def test_a_killed_emulator_is_succeeded_by_the_next(tmp_path: Path, announcements: Path) -> None:
     links = tmp_path / "links"
     arguments = ("serve", "smoke", "--link-dir", links)
-    with emulator(*arguments, environment=environment(tmp_path)) as first:
+    with emulator(*arguments) as first:
         first.end(signal.SIGKILL)
     assert len(list(links.iterdir())) == 6, "a killed process cleans nothing up"
-    with emulator(*arguments, environment=environment(tmp_path)) as second:
+    with emulator(*arguments) as second:
         for path in second.paths:
             with open_radar(path) as driver:
                 assert driver.ping() is PongCode.XTS_SPRP_READY
-        assert len(list((tmp_path / "xethru").glob("*.json"))) == 1
+        assert len(list(announcements.glob("*.json"))) == 1
         assert second.odometry is not None
         assert lines_of(second.odometry, 1)
         assert second.end() == 0
@@ -117,7 +116,6 @@ def test_a_reader_of_stdout_that_left_ends_it_with_1(tmp_path: Path) -> None:
         stderr=subprocess.PIPE,
         text=True,
         check=False,
-        env={**os.environ, **environment(tmp_path)},
     )
     os.close(write_end)
     assert result.returncode == 1
@@ -127,9 +125,7 @@ def test_a_reader_of_stdout_that_left_ends_it_with_1(tmp_path: Path) -> None:
 
 def test_a_closed_stdout_does_not_matter(tmp_path: Path) -> None:
     command = f"exec {sys.executable} -m emulator.cli serve --bare --link-dir {tmp_path}/l >&-"
-    with subprocess.Popen(
-        ["sh", "-c", command], env={**os.environ, **environment(tmp_path)}
-    ) as process:
+    with subprocess.Popen(["sh", "-c", command]) as process:
         port = tmp_path / "l" / "radar_1"
         wait_until(port.is_symlink, process)
         with open_radar(str(port)) as driver:
@@ -140,7 +136,7 @@ def test_a_closed_stdout_does_not_matter(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("pace", ["asap", "realtime"])
-def test_a_host_killed_while_streaming_is_followed_by_another(pace: str, tmp_path: Path) -> None:
+def test_a_host_killed_while_streaming_is_followed_by_another(pace: str) -> None:
     host = (
         "import sys\n"
         "from xethru_protocol.driver.radar import X4M300\n"
@@ -151,7 +147,7 @@ def test_a_host_killed_while_streaming_is_followed_by_another(pace: str, tmp_pat
         "print('streaming', flush=True)\n"
         "while True: radar.read_frame()\n"
     )
-    with emulator("serve", "smoke", "--pace", pace, environment=environment(tmp_path)) as served:
+    with emulator("serve", "smoke", "--pace", pace) as served:
         with subprocess.Popen(
             [sys.executable, "-c", host, served.paths[0]], stdout=subprocess.PIPE, text=True
         ) as first:
@@ -167,8 +163,8 @@ def test_a_host_killed_while_streaming_is_followed_by_another(pace: str, tmp_pat
         assert served.end() == 0
 
 
-def test_bare_serves_stock_modules_without_odometry(tmp_path: Path) -> None:
-    with emulator("serve", "--bare", "--count", "3", environment=environment(tmp_path)) as served:
+def test_bare_serves_stock_modules_without_odometry() -> None:
+    with emulator("serve", "--bare", "--count", "3") as served:
         assert served.odometry is None
         assert len(set(served.serials)) == 3
         for path, serial in zip(served.paths, served.serials, strict=True):
@@ -177,12 +173,12 @@ def test_bare_serves_stock_modules_without_odometry(tmp_path: Path) -> None:
                 assert (info.serial_number, info.mode) == (serial, "RUN")
 
 
-def test_odometry_comes_whole_under_asap_and_in_time_under_realtime(tmp_path: Path) -> None:
-    with emulator("serve", "smoke", "--pace", "asap", environment=environment(tmp_path)) as served:
+def test_odometry_comes_whole_under_asap_and_in_time_under_realtime() -> None:
+    with emulator("serve", "smoke", "--pace", "asap") as served:
         assert served.odometry is not None
         whole = lines_of(served.odometry, 10**9)
     assert len(whole) > 1000
-    with emulator("serve", "smoke", environment=environment(tmp_path)) as served:
+    with emulator("serve", "smoke") as served:
         assert served.odometry is not None
         with socket.socket(socket.AF_UNIX) as client:
             client.connect(served.odometry)
@@ -199,19 +195,17 @@ def test_odometry_comes_whole_under_asap_and_in_time_under_realtime(tmp_path: Pa
 
 def test_a_long_link_directory_still_gets_a_socket(tmp_path: Path) -> None:
     links = tmp_path / ("long" * 20)
-    with emulator(
-        "serve", "smoke", "--pace", "asap", "--link-dir", links, environment=environment(tmp_path)
-    ) as served:
+    with emulator("serve", "smoke", "--pace", "asap", "--link-dir", links) as served:
         assert served.odometry is not None
         assert lines_of(served.odometry, 1)
         assert served.end() == 0
     assert not Path(served.odometry).parent.exists()
 
 
-def test_tcp_ports_are_told_and_reach_the_same_modules(tmp_path: Path) -> None:
+def test_tcp_ports_are_told_and_reach_the_same_modules(announcements: Path) -> None:
     arguments = ("serve", "--bare", "--count", "2", "--tcp", "0")
-    with emulator(*arguments, environment=environment(tmp_path)) as served:
-        (word,) = (tmp_path / "xethru").glob("*.json")
+    with emulator(*arguments) as served:
+        (word,) = announcements.glob("*.json")
         for told in json.loads(word.read_text())["devices"]:
             with socket.create_connection(
                 ("127.0.0.1", told["tcp"]), timeout=seconds(10)

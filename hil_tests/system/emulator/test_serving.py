@@ -1,13 +1,18 @@
-"""Serving: modules that come back, keep their state, hang on a UART or behind a proxy."""
+"""Modules that come back, keep their state, hang on a UART or behind a proxy; faults, control."""
 
+from __future__ import annotations
+
+import json
 import signal
-from collections.abc import Iterator
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from hil_tests.bench.virtual_time import counters_of
-from hil_tests.device.serving import Served, emulator, open_radar
+from hil_tests.device.serving import emulator, open_radar
+from hil_tests.paths import FIXTURES
 from hil_tests.patience import seconds
 from xethru_protocol.driver.files import FileName
 from xethru_protocol.driver.link import RawConfig
@@ -16,13 +21,32 @@ from xethru_protocol.recordings.wire_capture import read_chunks
 from xethru_protocol.wire.codes import PongCode
 from xethru_protocol.wire.errors import ResponseTimeout
 
+pytestmark = pytest.mark.slow
+
+SHORT = RawConfig(frame_area_m=(0.4, 1.0))
+MEDIUM = RawConfig(frame_area_m=(0.4, 5.0))
+FILE = FileName(file_type=0x80000001, identifier=7)
+CTL = (sys.executable, "-m", "emulator.cli", "ctl")
+TIMER_HZ_AT_17 = 17.049379
+"""What the chip's timer makes of FPS 17, measured. Protocol reference 9.6."""
+
+
+@pytest.fixture
+def scenario(tmp_path: Path) -> str:
+    """Return a scenario that takes 3 frames out of the stream, twice."""
+    path = tmp_path / "gaps.toml"
+    path.write_text(
+        '[[fault]]\nkind = "missing_frames"\nevery = 10\ncount = 2\nparameters = { frames = 3 }\n'
+    )
+    return str(path)
+
 
 def test_driver_goes_on_when_its_emulator_comes_back(tmp_path: Path) -> None:
     links = tmp_path / "links"
     serve = ("serve", "--bare", "--link-dir", links)
     with emulator(*serve) as first:
         radar = open_radar(first.paths[0], reconnect_s=15.0)
-        geometry = radar.configure_raw(RawConfig(frame_area_m=(0.4, 5.0)))
+        geometry = radar.configure_raw(MEDIUM)
         radar.start(17.0)
         radar.read_frame()
         first.end(signal.SIGKILL)  # no goodbye, and links that lead nowhere
@@ -35,9 +59,6 @@ def test_driver_goes_on_when_its_emulator_comes_back(tmp_path: Path) -> None:
         assert frame.samples.shape == (716,)  # Protocol reference 9.4
         assert radar.frames_lost == 0
         assert radar.statistics.off_lattice_samples == 0
-
-
-FILE = FileName(file_type=0x80000001, identifier=7)
 
 
 def test_a_file_survives_the_emulator(tmp_path: Path) -> None:
@@ -62,32 +83,24 @@ def test_without_a_state_dir_nothing_is_kept() -> None:
             radar.files.write(FILE.file_type, FILE.identifier, b"x")
 
 
-pytestmark = pytest.mark.slow
-
-
-@pytest.fixture
-def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
+def test_the_speed_must_fit_and_can_be_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    with emulator("serve", "--bare", "--link", "uart") as made:
-        yield made
-
-
-def test_the_speed_must_fit_and_can_be_changed(served: Served) -> None:
-    with X4M300.open(served.paths[0], baudrate=57600) as deaf, pytest.raises(ResponseTimeout):
-        deaf.ping()
-    with X4M300.open(served.paths[0]) as radar:
-        assert radar.ping() is PongCode.XTS_SPRP_READY
-        radar.set_baud_rate(921600)
-        radar.configure_raw(RawConfig(frame_area_m=(0.4, 5.0)))
-        radar.start(17.0)
-        counters = [frame.counter for frame in radar.frames(8)]
-        assert counters == list(range(counters[0], counters[0] + 8)), "716 bins fit"
-        # back at 115200, from where the driver takes it again
-        radar.reset(wait=True, timeout_s=seconds(15))
-        assert radar.ping() is PongCode.XTS_SPRP_READY
-
-
-SHORT = RawConfig(frame_area_m=(0.4, 1.0))
+    with emulator("serve", "--bare", "--link", "uart") as served:
+        path = served.paths[0]
+        with X4M300.open(path, baudrate=57600) as deaf, pytest.raises(ResponseTimeout):
+            deaf.ping()
+        with X4M300.open(path) as radar:
+            assert radar.ping() is PongCode.XTS_SPRP_READY
+            radar.set_baud_rate(921600)
+            radar.configure_raw(MEDIUM)
+            radar.start(17.0)
+            counters = [frame.counter for frame in radar.frames(8)]
+            assert counters == list(range(counters[0], counters[0] + 8)), "716 bins fit"
+            # back at 115200, from where the driver takes it again
+            radar.reset(wait=True, timeout_s=seconds(15))
+            assert radar.ping() is PongCode.XTS_SPRP_READY
 
 
 def test_no_byte_changes_without_a_fault_and_the_capture_holds_them_all(tmp_path: Path) -> None:
@@ -115,14 +128,10 @@ def test_no_byte_changes_without_a_fault_and_the_capture_holds_them_all(tmp_path
     assert passed["rx"] in captured["rx"]  # what came before we listened is there, too
 
 
-def test_faults_hit_the_line_of_the_module(tmp_path: Path) -> None:
-    scenario = tmp_path / "gaps.toml"
-    scenario.write_text(
-        '[[fault]]\nkind = "missing_frames"\nevery = 10\ncount = 2\nparameters = { frames = 3 }\n'
-    )
+def test_faults_hit_the_line_of_the_module(scenario: str) -> None:
     with (
         emulator("serve", "--bare") as module,
-        emulator("proxy", "--port", module.paths[0], "--faults", str(scenario)) as proxy,
+        emulator("proxy", "--port", module.paths[0], "--faults", scenario) as proxy,
         open_radar(proxy.paths[0]) as radar,
     ):
         radar.configure_raw(SHORT)
@@ -132,13 +141,53 @@ def test_faults_hit_the_line_of_the_module(tmp_path: Path) -> None:
         assert radar.fault_count == 0
 
 
-TIMER_HZ_AT_17 = 17.049379
-"""What the chip's timer makes of FPS 17, measured. Protocol reference 9.6."""
-
-
 @pytest.mark.parametrize("downconversion", [False, True], ids=["rf", "baseband"])
 def test_three_minutes_lack_no_frame(downconversion: bool) -> None:
     counters = counters_of(180.0, RawConfig(downconversion=downconversion))
     assert len(counters) == pytest.approx(180.0 * TIMER_HZ_AT_17, abs=1.5)
     assert counters == list(range(counters[0], counters[0] + len(counters)))
     assert counters[0] <= 1
+
+
+def ctl(*words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*CTL, *words], capture_output=True, text=True, check=False)
+
+
+def test_what_the_driver_counts_is_what_the_truth_log_says(tmp_path: Path, scenario: str) -> None:
+    truth = tmp_path / "truth.jsonl"
+    arguments = ("serve", "--bare", "--faults", scenario, "--truth", truth)
+    with emulator(*arguments) as served, open_radar(served.paths[0]) as radar:
+        radar.configure_raw(SHORT)
+        radar.start(50.0)
+        list(radar.frames(30))
+        written = [json.loads(line) for line in truth.read_text().splitlines()]
+        assert [record["kind"] for record in written] == ["missing_frames"] * 2
+        assert radar.frames_lost == sum(record["parameters"]["frames"] for record in written)
+
+        with subprocess.Popen(
+            [*CTL, served.paths[0], "fault", "add", "counter_jump", "frames=5"],
+            stderr=subprocess.PIPE,
+            text=True,
+        ) as adding:
+            while adding.poll() is None:  # a port that nobody reads overflows
+                next(radar.frames(1))
+            assert adding.stderr is not None
+            assert adding.returncode == 0, adding.stderr.read()
+        list(radar.frames(50))
+        assert radar.frames_lost == 6 + 5
+        state = json.loads(ctl(served.paths[0], "state").stdout)
+        (told,) = state["radars"].values()
+        assert told["injected"] == {"missing_frames": 2, "counter_jump": 1}
+        refused = ctl(served.paths[0], "fault", "add", "crc")
+        assert (refused.returncode, refused.stdout) == (1, "")
+        assert "no kind of fault is called 'crc'" in refused.stderr
+
+
+def test_a_playback_is_paused_and_goes_on() -> None:
+    recording = FIXTURES / "recordings" / "float"
+    with emulator("play", str(recording)) as served:
+        for words, paused in ((("pause",), True), (("resume",), False)):
+            done = ctl(served.paths[0], *words)
+            assert done.returncode == 0, done.stderr
+            (told,) = json.loads(ctl(served.paths[0], "state").stdout)["radars"].values()
+            assert told["playback"]["paused"] is paused

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
@@ -23,6 +24,24 @@ def test_the_link_directory_of_a_running_emulator_is_refused(
         assert main(["serve", "--bare", "--link-dir", str(tmp_path)]) == 1
     assert capsys.readouterr().err.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_scenario_for_another_radar_is_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scenario = tmp_path / "wrong.toml"
+    scenario.write_text('[[fault]]\nkind = "stall"\nradar = ["nose"]\n')
+    assert main(["serve", "--bare", "--faults", str(scenario)]) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "no radar is called 'nose'; there are radar_1" in error
+
+
+def test_the_list_of_faults_is_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["faults", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)
+    assert len(listed) >= 40
+    assert {"kind", "layer", "parameters", "counted", "hidden", "example"} <= set(listed[0])
 
 
 def test_a_closed_stderr_leaves_the_exit_code() -> None:

@@ -1,4 +1,6 @@
-"""What a module that plays a recording sends, and what it says of itself meanwhile."""
+"""What a module that plays a recording sends, when, and what it says of itself meanwhile."""
+
+from __future__ import annotations
 
 import shutil
 import struct
@@ -9,11 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from emulator.chip.chip import Chip
 from emulator.device import Device
 from emulator.loopback import LoopbackTransport
-from emulator.playback import played_radars
+from emulator.module.module import LosslessOutbox, Module
+from emulator.playback import PlayStream, played_radars, schedule
 from hil_tests.paths import FIXTURES
-from hil_tests.unit.emulator.doubles import BareHost
+from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource
 from hil_tests.unit.xethru_protocol.scripted import framed
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
@@ -25,10 +29,11 @@ from xethru_protocol.recordings import (
     read_recording,
 )
 from xethru_protocol.wire import messages as m
-from xethru_protocol.wire.codes import X4Setting
+from xethru_protocol.wire.codes import SensorMode, X4Setting
 
 RECORDINGS = FIXTURES / "recordings"
 SECOND = 1_000_000_000
+RECORDS = [m.Pong(value=value) for value in range(5)]
 
 
 def device_of(recording: Path, rate: float = 0, warnings: list[str] | None = None) -> Device:
@@ -218,3 +223,98 @@ def test_any_high_rate_plays() -> None:
     assert wire_bytes(device_of(RECORDINGS / "iq", rate=1e300)) == wire_bytes(
         device_of(RECORDINGS / "iq")
     )
+
+
+def player(rate: float = 1.0, gap_ns: int | None = None) -> BareHost:
+    stamps = [10 * SECOND + index * SECOND for index in range(5)]
+    timed = tuple(schedule(zip(RECORDS, stamps, strict=True)))
+    stream = PlayStream(timed, loop_gap_ns=gap_ns, rate=rate)
+    module = Module(IDENTITY, Chip(RampSource()))
+    return BareHost(Device(module, stream, LosslessOutbox()))
+
+
+def heard_at(host: BareHost, now_ns: int) -> list[m.Message]:
+    host.now_ns = now_ns
+    host.device.advance(now_ns)
+    return host.hear()
+
+
+def test_a_listening_host_hears_everything_half_a_second_after_opening() -> None:
+    host = player()
+    assert heard_at(host, SECOND) == []
+    host.device.port_opened(SECOND)
+    assert heard_at(host, SECOND * 3 // 2 - 1) == []
+    assert host.device.wake_ns(host.now_ns) == SECOND * 3 // 2
+    heard = [heard_at(host, SECOND * 3 // 2 + index * SECOND) for index in range(5)]
+    assert heard == [[record] for record in RECORDS]
+    assert host.device.wake_ns(host.now_ns) is None
+
+
+@pytest.mark.parametrize(
+    "start",
+    [
+        m.X4DriverSet(setting=X4Setting.FPS, value=17.0),
+        m.SetMode(mode=SensorMode.XTID_SM_RUN),
+    ],
+)
+def test_a_host_that_starts_the_radar_hears_it_at_once(start: m.Command[m.Response]) -> None:
+    host = player()
+    host.device.port_opened(0)
+    host.send(start)
+    assert host.hear() == [m.Ack(), RECORDS[0]]
+
+
+def test_commands_postpone_and_never_stop_it() -> None:
+    host = player()
+    host.device.port_opened(0)
+    host.now_ns = SECOND * 4 // 10
+    host.ask(m.Ping())
+    assert heard_at(host, SECOND * 8 // 10) == []
+    assert heard_at(host, SECOND * 9 // 10) == [RECORDS[0]]
+    assert host.ask(m.X4DriverSet(setting=X4Setting.FPS, value=0.0)) == m.Ack()
+    assert heard_at(host, SECOND * 19 // 10) == [RECORDS[1]]
+
+
+def test_every_host_hears_it_from_the_beginning_at_rate_0_at_once() -> None:
+    host = player(rate=0)
+    for opening_ns in (0, 5 * SECOND):
+        host.device.port_opened(opening_ns)
+        assert heard_at(host, opening_ns + SECOND // 2) == RECORDS
+        host.device.port_closed(opening_ns + SECOND)
+        assert heard_at(host, opening_ns + 2 * SECOND) == []
+
+
+def test_a_quick_visitor_does_not_start_it() -> None:
+    host = player()
+    host.device.port_opened(0)
+    host.ask(m.GetMode())
+    host.device.port_closed(SECOND // 10)
+    assert heard_at(host, 10 * SECOND) == []
+
+
+def test_a_slow_reader_makes_it_wait() -> None:
+    host = player()
+    host.device.port_opened(0)
+    host.now_ns = 100 * SECOND
+    assert host.hear(2) == RECORDS[:2]
+    assert host.ask(m.Ping()) == m.Pong(value=0xAAEEAEEA), "no queue of records to wait behind"
+    assert host.hear() == RECORDS[2:]
+
+
+def test_a_loop_goes_on() -> None:
+    host = player(gap_ns=SECOND)
+    host.device.port_opened(0)
+    assert heard_at(host, SECOND // 2 + 4 * SECOND) == RECORDS
+    assert heard_at(host, SECOND // 2 + 5 * SECOND - 1) == []
+    assert heard_at(host, SECOND // 2 + 9 * SECOND) == RECORDS
+
+
+def test_records_without_time_come_at_the_nominal_rate() -> None:
+    times = [item.time_ns for item in schedule([(record, None) for record in RECORDS])]
+    assert times == pytest.approx([index * SECOND / 17 for index in range(5)], abs=2)
+
+
+def test_time_that_runs_backwards_is_not_waited_for() -> None:
+    stamps = [5, 9, 3, 4, None]
+    times = [item.time_ns for item in schedule(zip(RECORDS, stamps, strict=True))]
+    assert times == [0, 4, 4, 5, 5 + SECOND // 17]

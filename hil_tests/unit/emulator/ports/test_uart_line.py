@@ -3,13 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
-import select
-import termios
-import time
-from collections.abc import Iterator
-from contextlib import closing
-from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -19,9 +12,7 @@ from emulator.chip import Pace
 from emulator.device import Device
 from emulator.module.settings import received_bytes
 from emulator.ports.lines import Line, UartLine, UsbLine
-from emulator.ports.pty import PtyLink
 from emulator.ports.server import Port
-from hil_tests.patience import seconds
 from hil_tests.unit.emulator.doubles import ramp_device
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import SensorMode, X4Setting
@@ -239,47 +230,6 @@ def test_usb_transfers_are_delayed_and_short() -> None:
     line = UsbLine(0)
     line.from_module(bytes(1300), 0)
     assert [len(line.to_host.take(0)) for _ in range(4)] == [512, 512, 276, 0]
-
-
-@pytest.fixture
-def link(tmp_path: Path) -> Iterator[PtyLink]:
-    flushes: list[str] = []
-    with closing(PtyLink(tmp_path / "radar", flushed=lambda: flushes.append("flushed"))) as made:
-        made.flushes = flushes  # type: ignore[attr-defined] # for the test
-        yield made
-
-
-def read_all(link: PtyLink) -> bytes:
-    deadline = time.monotonic() + seconds(5)
-    while time.monotonic() < deadline:
-        select.select([link], [], [], 0.05)
-        if data := link.read():
-            return data
-    return b""
-
-
-def test_the_speed_of_the_hosts_terminal_is_known(link: PtyLink) -> None:
-    host = os.open(link.path, os.O_RDWR | os.O_NOCTTY)
-    for constant, baud in ((termios.B9600, 9600), (termios.B921600, 921600)):
-        attributes = termios.tcgetattr(host)
-        attributes[4] = attributes[5] = constant
-        termios.tcsetattr(host, termios.TCSANOW, attributes)
-        assert link.host_baud() == baud
-    os.close(host)
-
-
-def test_bytes_pass_whole_and_a_flush_of_output_is_reported(link: PtyLink) -> None:
-    host = os.open(link.path, os.O_RDWR | os.O_NOCTTY)
-    os.write(host, bytes(range(256)))
-    data = b""
-    while len(data) < 256:
-        data += read_all(link)
-    assert data == bytes(range(256))
-    termios.tcflush(host, termios.TCOFLUSH)
-    select.select([link], [], [], seconds(5))
-    link.read()
-    assert link.flushes == ["flushed"]  # type: ignore[attr-defined] # for the test
-    os.close(host)
 
 
 def test_a_flush_loses_what_was_not_sent_yet() -> None:

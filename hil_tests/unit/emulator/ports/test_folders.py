@@ -1,9 +1,13 @@
-"""What a module keeps over resets and restarts of the emulator, and a broken state directory."""
+"""Folders of an emulator: its sockets, its announcement, what a module keeps over restarts."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import subprocess
+import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,10 +15,89 @@ import pytest
 
 from emulator.chip import Pace
 from emulator.device import radar_device
-from emulator.ports.folders import DirectoryMemory
+from emulator.ports import folders
+from emulator.ports.folders import Announcement, DirectoryMemory, fresh_port_folder
+from emulator.ports.pty import LinkError
 from hil_tests.unit.emulator.doubles import IDENTITY, BareHost, RampSource
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import FORMAT_KEY, OutputFeature, SensorMode
+
+LONG = "long" * 30
+
+
+def test_a_short_folder_holds_its_socket(tmp_path: Path) -> None:
+    short = Path("/run/links")
+    with contextlib.ExitStack() as cleanup:
+        assert folders.socket_path(short, cleanup, "odometry.sock") == short / "odometry.sock"
+
+
+def test_where_links_and_tmpdir_are_long_the_socket_is_short_and_goes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / LONG).mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / LONG))
+    with contextlib.ExitStack() as cleanup:
+        path = folders.socket_path(tmp_path / LONG, cleanup, "odometry.sock")
+        assert len(os.fsencode(path)) <= 100
+        assert path.parent.stat().st_mode & 0o077 == 0, "nobody else's business"
+        assert list((tmp_path / LONG).iterdir()) == []
+    assert not path.parent.exists()
+
+
+def test_nowhere_short_enough_is_one_clear_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(folders, "LONGEST_SOCKET_PATH", 10)
+    with (
+        contextlib.ExitStack() as cleanup,
+        pytest.raises(LinkError, match=r"too long for the odometry socket.*shorter --link-dir"),
+    ):
+        folders.socket_path(tmp_path, cleanup, "odometry.sock")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    return tmp_path / "xethru"
+
+
+def dead_pid() -> int:
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    return process.pid
+
+
+def test_an_announcement_is_the_ready_line_with_a_pid_until_closed(folder: Path) -> None:
+    announcement = Announcement({"ready": True, "devices": []})
+    (entry,) = folder.iterdir()
+    assert entry.name == f"{os.getpid()}.json"
+    assert json.loads(entry.read_text()) == {"pid": os.getpid(), "ready": True, "devices": []}
+    assert folder.stat().st_mode & 0o077 == 0, "nobody else's business"
+    announcement.close()
+    announcement.close()
+    assert list(folder.iterdir()) == []
+
+
+def test_what_dead_emulators_left_is_removed_and_nothing_else(folder: Path) -> None:
+    pid = dead_pid()
+    mine = fresh_port_folder()
+    (folder / f"{pid}.json").write_text("{}")
+    (folder / f"{pid}.new").write_text("killed while it wr")
+    (folder / f"ports-{pid}-abc").mkdir()
+    (folder / f"ports-{pid}-abc" / "radar_1").symlink_to("/dev/pts/99999")
+    (folder / "notes.json").write_text("{}")
+    announcement = Announcement({})
+    assert sorted(path.name for path in folder.iterdir()) == sorted(
+        [f"{os.getpid()}.json", "notes.json", mine.name]
+    )
+    announcement.close()
+
+
+def test_without_a_usable_folder_nothing_is_announced(folder: Path) -> None:
+    folder.write_text("a file is in the way")
+    Announcement({}).close()
+    assert folder.read_text() == "a file is in the way"
+
 
 PRESENCE_2 = 0x014D4AB8
 STOP = m.SetMode(mode=SensorMode.XTID_SM_STOP)
