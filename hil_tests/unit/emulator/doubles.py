@@ -111,6 +111,16 @@ class BareHost:
         stop, manual = SensorMode.XTID_SM_STOP, SensorMode.XTID_SM_MANUAL
         self.command(m.SetMode(mode=stop), m.SetMode(mode=manual), m.X4DriverInit())
 
+    def stream(self, fps: float = 17.0) -> None:
+        self.enter_manual()
+        self.set(X4Setting.FPS, fps)
+
+    def at(self, now_ns: int) -> list[m.Message]:
+        """Let time pass until then, and return what the device says."""
+        self.now_ns = now_ns
+        self.device.advance(now_ns)
+        return self.hear()
+
     def frames(self, count: int) -> list[m.DataFloat]:
         heard = self.hear(count)
         assert all(isinstance(message, m.DataFloat) for message in heard)

@@ -75,25 +75,21 @@ def test_a_serial_number_has_12_digits(serial: str) -> None:
 
 def test_getters_answer_in_the_documented_types(host: BareHost) -> None:
     """Protocol reference 4.9, last column."""
-    byte_settings = {"DOWNCONVERSION", "DACSTEP", "TXCENTERFREQUENCY", "TXPOWER", "PRFDIV"}
-    float_settings = {"FPS": 1, "FRAMEAREA": 2, "FRAMEAREAOFFSET": 1}
-    int_settings = {"PULSESPERSTEP", "ITERATIONS", "DACMIN", "DACMAX", "FRAMEBINCOUNT"}
+    names = {
+        m.ReplyByte: {"DOWNCONVERSION", "DACSTEP", "TXCENTERFREQUENCY", "TXPOWER", "PRFDIV"},
+        m.ReplyFloat: {"FPS", "FRAMEAREA", "FRAMEAREAOFFSET"},
+        m.ReplyInt: {"PULSESPERSTEP", "ITERATIONS", "DACMIN", "DACMAX", "FRAMEBINCOUNT"},
+    }
     for setting in X4Setting:
         address = 4 if setting.name.endswith("REGISTER") else None
         reply = host.ask(m.X4DriverGet(setting=setting, address=address))
         if setting.name == "ENABLE":
             assert reply == m.Error(code=1)
-        elif setting.name in byte_settings or address is not None:
-            assert isinstance(reply, m.ReplyByte)
-            assert (reply.content_id, reply.info, len(reply.values)) == (setting, 0, 1)
-        elif setting.name in float_settings:
-            assert isinstance(reply, m.ReplyFloat)
-            assert len(reply.values) == float_settings[setting.name]
-            assert (reply.content_id, reply.info) == (setting, 0)
-        else:
-            assert setting.name in int_settings
-            assert isinstance(reply, m.ReplyInt)
-            assert (reply.content_id, reply.info, len(reply.values)) == (setting, 0, 1)
+            continue
+        assert isinstance(reply, m.ReplyByte | m.ReplyFloat | m.ReplyInt)
+        assert setting.name in names[type(reply)] or (address and isinstance(reply, m.ReplyByte))
+        assert (reply.content_id, reply.info) == (setting, 0)
+        assert len(reply.values) == (2 if setting.name == "FRAMEAREA" else 1)
 
 
 def test_one_byte_pulses_and_dac_step_are_understood(host: BareHost) -> None:
@@ -140,8 +136,7 @@ def test_frames_flow_in_manual_mode_only(host: BareHost) -> None:
 
 
 def test_a_reply_waits_behind_no_frame_and_no_frame_follows_a_stop(host: BareHost) -> None:
-    host.enter_manual()
-    host.set(X4Setting.FPS, 17.0)
+    host.stream()
     assert len(host.frames(10)) == 10
     assert host.ask(m.Ping()) == m.Pong(value=0xAAEEAEEA)
     host.send(m.X4DriverSet(setting=X4Setting.FPS, value=0.0))
@@ -149,8 +144,7 @@ def test_a_reply_waits_behind_no_frame_and_no_frame_follows_a_stop(host: BareHos
 
 
 def test_a_pause_continues_the_counter_and_init_resets_it(host: BareHost) -> None:
-    host.enter_manual()
-    host.set(X4Setting.FPS, 17.0)
+    host.stream()
     host.frames(5)
     host.set(X4Setting.FPS, 0.0)
     host.set(X4Setting.FPS, 17.0)
@@ -164,8 +158,7 @@ def test_a_pause_continues_the_counter_and_init_resets_it(host: BareHost) -> Non
 def test_scene_time_continues_in_segments_over_a_rate_change() -> None:
     source = RampSource()
     host = BareHost(ramp_device(source=source))
-    host.enter_manual()
-    host.set(X4Setting.FPS, 100.0)
+    host.stream(100.0)
     host.frames(50)
     host.set(X4Setting.FPS, 40.0)
     host.frames(2)
@@ -176,8 +169,7 @@ def test_scene_time_continues_in_segments_over_a_rate_change() -> None:
 
 def test_reset_acks_goes_deaf_and_comes_back_stopped(host: BareHost) -> None:
     """Protocol reference 8.1 and 8.2: it was stopped, so it stays stopped."""
-    host.enter_manual()
-    host.set(X4Setting.FPS, 17.0)
+    host.stream()
     assert host.ask(m.ModReset()) == m.Ack()
     assert host.ask(m.Ping()) == m.Pong(value=0xAAEEAEEA), "half a second is left"
     host.now_ns = SECOND // 2
@@ -185,9 +177,7 @@ def test_reset_acks_goes_deaf_and_comes_back_stopped(host: BareHost) -> None:
     host.send(m.Ping())
     assert host.hear() == []
     assert host.device.wake_ns(host.now_ns) == SECOND // 2 + 2 * SECOND
-    host.now_ns = SECOND // 2 + 2 * SECOND
-    host.device.advance(host.now_ns)
-    assert host.hear() == [m.System(code=0x10), m.System(code=0x11)]
+    assert host.at(SECOND // 2 + 2 * SECOND) == [m.System(code=0x10), m.System(code=0x11)]
     assert mode_of(host) == 0x13
     count = host.ask(m.X4DriverGet(setting=X4Setting.FRAMEBINCOUNT))
     assert isinstance(count, m.ReplyInt)
@@ -196,9 +186,7 @@ def test_reset_acks_goes_deaf_and_comes_back_stopped(host: BareHost) -> None:
 
 def test_reset_of_a_running_module_restores_its_profile(host: BareHost) -> None:
     host.ask(m.ModReset())
-    host.now_ns = 3 * SECOND  # before the profile's first message
-    host.device.advance(host.now_ns)
-    assert len(host.hear()) == 2
+    assert len(host.at(3 * SECOND)) == 2  # before the profile's first message
     assert mode_of(host) == 0x01
     assert host.ask(m.GetProfileId()) == m.ReplyInt(values=(PRESENCE_2,))
 
@@ -221,8 +209,7 @@ def test_a_host_that_never_reads_is_held_back(pace: Pace) -> None:
 
 def test_frames_that_wait_hold_no_command_back() -> None:
     host = BareHost(ramp_device(Pace.REALTIME))
-    host.enter_manual()
-    host.set(X4Setting.FPS, 100.0)
+    host.stream(100.0)
     for _ in range(90):
         host.now_ns += SECOND // 100
         host.device.advance(host.now_ns)
@@ -234,9 +221,8 @@ def test_frames_that_wait_hold_no_command_back() -> None:
 def test_what_waits_is_lost_by_a_reset(host: BareHost) -> None:
     host.send(m.ModReset())
     host.send(m.Ping())
-    host.now_ns = 3 * SECOND  # before the profile's first message
-    host.device.advance(host.now_ns)
-    assert host.hear() == [m.System(code=0x10), m.System(code=0x11)]
+    # before the profile's first message
+    assert host.at(3 * SECOND) == [m.System(code=0x10), m.System(code=0x11)]
 
 
 def test_a_second_reset_does_not_postpone_the_first(host: BareHost) -> None:
@@ -256,8 +242,7 @@ def test_realtime_frames_are_due_at_absolute_deadlines() -> None:
         clock=ModuleClock(skew_ns=skew_ns),
     )
     host = BareHost(device, now_ns=zero_ns)
-    host.enter_manual()
-    host.set(X4Setting.FPS, 50.0)
+    host.stream(50.0)
     arrivals = {}
     for _ in range(100):
         due_ns = device.wake_ns(host.now_ns)
@@ -287,14 +272,12 @@ def test_a_late_start_in_realtime_skips_what_is_past() -> None:
 def test_realtime_frames_equal_asap_frames() -> None:
     asap, realtime = BareHost(ramp_device()), BareHost(ramp_device(Pace.REALTIME))
     for host in (asap, realtime):
-        host.enter_manual()
-        host.set(X4Setting.FPS, 200.0)
+        host.stream(200.0)
     wanted = {frame.info: frame for frame in asap.frames(400)}
     got = []
     for step in range(1, 60):  # an uneven loop
-        realtime.now_ns += step * 1_000_000
-        realtime.device.advance(realtime.now_ns)
-        got += realtime.frames(50)
+        heard = realtime.at(realtime.now_ns + step * 1_000_000)
+        got += [message for message in heard if isinstance(message, m.DataFloat)]
     assert len(got) > 200
     assert all(frame == wanted[frame.info] for frame in got if frame.info in wanted)
 
@@ -302,8 +285,7 @@ def test_realtime_frames_equal_asap_frames() -> None:
 def test_realtime_overflow_shows_as_counter_gaps_and_commands_still_work() -> None:
     device = ramp_device(Pace.REALTIME)
     host = BareHost(device)
-    host.enter_manual()
-    host.set(X4Setting.FPS, 100.0)
+    host.stream(100.0)
     for _ in range(500):  # five seconds nobody reads
         host.now_ns += SECOND // 100
         device.advance(host.now_ns)

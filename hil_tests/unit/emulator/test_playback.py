@@ -102,11 +102,7 @@ def test_messages_of_several_kinds_come_in_the_order_of_time(tmp_path: Path) -> 
             writer.write(message, number * SECOND)
     host = BareHost(device_of(tmp_path / "r", rate=1.0))
     host.device.port_opened(0)
-    heard = []
-    for number in range(4):
-        host.now_ns = SECOND // 2 + number * SECOND
-        host.device.advance(host.now_ns)
-        heard.append(host.hear())
+    heard = [host.at(SECOND // 2 + number * SECOND) for number in range(4)]
     assert heard == [[message] for message in written]
 
 
@@ -172,9 +168,7 @@ def test_recorded_answers_are_not_played_but_their_area_is_read_back(raw_capture
     assert host.ask(m.X4DriverGet(setting=X4Setting.FRAMEBINCOUNT)) == m.ReplyInt(
         content_id=X4Setting.FRAMEBINCOUNT, values=(39,)
     )
-    host.now_ns = SECOND
-    host.device.advance(SECOND)
-    assert [type(message) for message in host.hear()] == [m.DataFloat, m.DataFloat]
+    assert [type(message) for message in host.at(SECOND)] == [m.DataFloat, m.DataFloat]
 
 
 def test_a_recording_of_answers_only_is_refused(tmp_path: Path) -> None:
@@ -233,19 +227,13 @@ def player(rate: float = 1.0, gap_ns: int | None = None) -> BareHost:
     return BareHost(Device(module, stream, LosslessOutbox()))
 
 
-def heard_at(host: BareHost, now_ns: int) -> list[m.Message]:
-    host.now_ns = now_ns
-    host.device.advance(now_ns)
-    return host.hear()
-
-
 def test_a_listening_host_hears_everything_half_a_second_after_opening() -> None:
     host = player()
-    assert heard_at(host, SECOND) == []
+    assert host.at(SECOND) == []
     host.device.port_opened(SECOND)
-    assert heard_at(host, SECOND * 3 // 2 - 1) == []
+    assert host.at(SECOND * 3 // 2 - 1) == []
     assert host.device.wake_ns(host.now_ns) == SECOND * 3 // 2
-    heard = [heard_at(host, SECOND * 3 // 2 + index * SECOND) for index in range(5)]
+    heard = [host.at(SECOND * 3 // 2 + index * SECOND) for index in range(5)]
     assert heard == [[record] for record in RECORDS]
     assert host.device.wake_ns(host.now_ns) is None
 
@@ -269,19 +257,19 @@ def test_commands_postpone_and_never_stop_it() -> None:
     host.device.port_opened(0)
     host.now_ns = SECOND * 4 // 10
     host.ask(m.Ping())
-    assert heard_at(host, SECOND * 8 // 10) == []
-    assert heard_at(host, SECOND * 9 // 10) == [RECORDS[0]]
+    assert host.at(SECOND * 8 // 10) == []
+    assert host.at(SECOND * 9 // 10) == [RECORDS[0]]
     assert host.ask(m.X4DriverSet(setting=X4Setting.FPS, value=0.0)) == m.Ack()
-    assert heard_at(host, SECOND * 19 // 10) == [RECORDS[1]]
+    assert host.at(SECOND * 19 // 10) == [RECORDS[1]]
 
 
 def test_every_host_hears_it_from_the_beginning_at_rate_0_at_once() -> None:
     host = player(rate=0)
     for opening_ns in (0, 5 * SECOND):
         host.device.port_opened(opening_ns)
-        assert heard_at(host, opening_ns + SECOND // 2) == RECORDS
+        assert host.at(opening_ns + SECOND // 2) == RECORDS
         host.device.port_closed(opening_ns + SECOND)
-        assert heard_at(host, opening_ns + 2 * SECOND) == []
+        assert host.at(opening_ns + 2 * SECOND) == []
 
 
 def test_a_quick_visitor_does_not_start_it() -> None:
@@ -289,7 +277,7 @@ def test_a_quick_visitor_does_not_start_it() -> None:
     host.device.port_opened(0)
     host.ask(m.GetMode())
     host.device.port_closed(SECOND // 10)
-    assert heard_at(host, 10 * SECOND) == []
+    assert host.at(10 * SECOND) == []
 
 
 def test_a_slow_reader_makes_it_wait() -> None:
@@ -304,9 +292,9 @@ def test_a_slow_reader_makes_it_wait() -> None:
 def test_a_loop_goes_on() -> None:
     host = player(gap_ns=SECOND)
     host.device.port_opened(0)
-    assert heard_at(host, SECOND // 2 + 4 * SECOND) == RECORDS
-    assert heard_at(host, SECOND // 2 + 5 * SECOND - 1) == []
-    assert heard_at(host, SECOND // 2 + 9 * SECOND) == RECORDS
+    assert host.at(SECOND // 2 + 4 * SECOND) == RECORDS
+    assert host.at(SECOND // 2 + 5 * SECOND - 1) == []
+    assert host.at(SECOND // 2 + 9 * SECOND) == RECORDS
 
 
 def test_records_without_time_come_at_the_nominal_rate() -> None:

@@ -26,17 +26,20 @@ class Loop:
         self.selector = selectors.DefaultSelector()
         feed.register(self.selector)
 
-    def turn(self, now_ns: int) -> None:
-        for key, events in self.selector.select(0.01):
-            key.data(events, now_ns)
-        self.feed.advance(now_ns)
+    def turn(self, now_ns: int, times: int = 1) -> None:
+        for _ in range(times):
+            for key, events in self.selector.select(0.01):
+                key.data(events, now_ns)
+            self.feed.advance(now_ns)
 
+    def is_idle(self) -> bool:
+        return self.selector.select(0) == []
 
-def connect(feed: OdometryFeed) -> socket.socket:
-    client = socket.socket(socket.AF_UNIX)
-    client.connect(str(feed.path))
-    client.setblocking(False)
-    return client
+    def connect(self) -> socket.socket:
+        client = socket.socket(socket.AF_UNIX)
+        client.connect(str(self.feed.path))
+        client.setblocking(False)
+        return client
 
 
 def received(client: socket.socket) -> bytes:
@@ -52,22 +55,34 @@ def folder(tmp_path: Path) -> Iterator[Path]:
     assert list(tmp_path.iterdir()) == [], "the socket is gone"
 
 
-def test_asap_gives_everything_at_once_and_closes(folder: Path) -> None:
+@pytest.fixture
+def asap(folder: Path) -> Iterator[Loop]:
     feed = OdometryFeed(folder / "o", LINES, Pace.ASAP)
-    loop = Loop(feed)
+    yield Loop(feed)
+    feed.close()
+
+
+@pytest.fixture
+def loop(folder: Path) -> Iterator[Loop]:
+    """Return a feed in real time, from time 0 on."""
+    feed = OdometryFeed(folder / "o", LINES, Pace.REALTIME)
+    yield Loop(feed)
+    feed.close()
+
+
+def test_asap_gives_everything_at_once_and_closes(asap: Loop) -> None:
     for _ in range(2):  # every client gets all lines from the first one
-        with connect(feed) as client:
-            loop.turn(0)
+        with asap.connect() as client:
+            asap.turn(0)
             assert received(client) == "".join(f"{line}\n" for line in LINES).encode()
             assert received(client) == b""
-    feed.close()
 
 
 def test_realtime_gives_each_line_when_due(folder: Path) -> None:
     zero_ns = 40 * SECOND
     feed = OdometryFeed(folder / "o", LINES, Pace.REALTIME, scene_time_zero_ns=zero_ns)
     loop = Loop(feed)
-    with connect(feed) as client:
+    with loop.connect() as client:
         loop.turn(zero_ns)
         assert received(client) == b"(nothing)"
         assert feed.wake_ns(zero_ns) == zero_ns + SECOND // 2
@@ -86,12 +101,11 @@ def test_a_client_that_hangs_up_or_never_reads_disturbs_no_other(folder: Path) -
     many = tuple(f"{index}.000000000 {'0' * 100} 0 0 0 0 0 1" for index in range(20_000))
     feed = OdometryFeed(folder / "o", many, Pace.ASAP)
     loop = Loop(feed)
-    rude, stuck = connect(feed), connect(feed)
+    rude, stuck = loop.connect(), loop.connect()
     loop.turn(0)
     rude.close()
-    for _ in range(5):
-        loop.turn(0)
-    with connect(feed) as client:
+    loop.turn(0, times=5)
+    with loop.connect() as client:
         data = b""
         while chunk := received(client):
             data += b"" if chunk == b"(nothing)" else chunk
@@ -102,48 +116,37 @@ def test_a_client_that_hangs_up_or_never_reads_disturbs_no_other(folder: Path) -
     feed.close()
 
 
-def test_a_client_that_only_stops_speaking_still_listens(folder: Path) -> None:
-    feed = OdometryFeed(folder / "o", LINES, Pace.REALTIME)
-    loop = Loop(feed)
-    with connect(feed) as client:
+def test_a_client_that_only_stops_speaking_still_listens(loop: Loop) -> None:
+    with loop.connect() as client:
         loop.turn(0)
         client.shutdown(socket.SHUT_WR)
-        for _ in range(3):
-            loop.turn(0)
-        assert loop.selector.select(0) == [], "nothing keeps the loop busy"
+        loop.turn(0, times=3)
+        assert loop.is_idle(), "nothing keeps the loop busy"
         loop.turn(60 * SECOND)
         assert received(client).count(b"\n") == len(LINES)
         assert received(client) == b""
-    feed.close()
 
 
-def test_a_client_that_is_gone_is_dropped_with_the_next_line(folder: Path) -> None:
-    feed = OdometryFeed(folder / "o", LINES, Pace.REALTIME)
-    loop = Loop(feed)
-    connect(feed).close()
-    for _ in range(3):
-        loop.turn(0)
+def test_a_client_that_is_gone_is_dropped_with_the_next_line(loop: Loop) -> None:
+    loop.connect().close()
+    loop.turn(0, times=3)
     loop.turn(SECOND)
-    assert feed.wake_ns(SECOND) is None
-    feed.close()
+    assert loop.feed.wake_ns(SECOND) is None
 
 
-def test_one_client_too_many_is_sent_away(folder: Path) -> None:
-    feed = OdometryFeed(folder / "o", LINES, Pace.REALTIME)
-    loop = Loop(feed)
+def test_one_client_too_many_is_sent_away(loop: Loop) -> None:
     clients = []
     for _ in range(MOST_ODOMETRY_CLIENTS + 1):
-        clients.append(connect(feed))
+        clients.append(loop.connect())
         loop.turn(0)
     assert received(clients[-1]) == b""
     assert {received(client) for client in clients[:-1]} == {b"(nothing)"}
     for client in clients:
         client.close()
     loop.turn(SECOND)
-    with connect(feed) as later:
+    with loop.connect() as later:
         loop.turn(SECOND)
         assert received(later).count(b"\n") == 1
-    feed.close()
 
 
 class OutOfDescriptors:
@@ -174,15 +177,15 @@ def test_without_descriptors_the_loop_rests(
     monkeypatch.setattr(feed, "_listener", listener)
     loop = Loop(feed)
     listener.exhausted = False
-    with connect(feed) as early:
+    with loop.connect() as early:
         loop.turn(0)
         listener.exhausted = True
-        with connect(feed) as late:
+        with loop.connect() as late:
             loop.turn(0)
-            assert loop.selector.select(0) == [], "nothing keeps the loop busy"
+            assert loop.is_idle(), "nothing keeps the loop busy"
             assert feed.wake_ns(0) is not None
             loop.turn(1)
-            assert loop.selector.select(0) == []
+            assert loop.is_idle()
             listener.exhausted = False
             if after == "a client left":
                 early.close()
@@ -190,8 +193,7 @@ def test_without_descriptors_the_loop_rests(
                 loop.turn(2)
             else:
                 now_ns = SECOND
-            for _ in range(3):
-                loop.turn(now_ns)
+            loop.turn(now_ns, times=3)
             assert received(late) == f"{LINES[0]}\n".encode()
     feed.close()
 
@@ -201,7 +203,7 @@ def test_a_socket_somebody_replaced_is_not_removed(folder: Path) -> None:
     second = OdometryFeed(folder / "o", LINES, Pace.ASAP)
     first.close()
     loop = Loop(second)
-    with connect(second) as client:
+    with loop.connect() as client:
         loop.turn(0)
         assert received(client).count(b"\n") == len(LINES)
     second.close()

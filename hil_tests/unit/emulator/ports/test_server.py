@@ -224,21 +224,29 @@ def test_stop_ends_a_waiting_loop(asap: Bench) -> None:
     assert not loop.is_alive()
 
 
+class Idle:
+    """A device that says nothing and waits for nothing."""
+
+    wants_data = True
+
+    def receive_data(self, data: bytes, now_ns: int) -> None: ...
+
+    def advance(self, now_ns: int) -> None: ...
+
+    def next_packet(self, now_ns: int) -> bytes | None:
+        return None
+
+    def wake_ns(self, now_ns: int) -> int | None:
+        return None
+
+
 def test_a_turn_sends_a_bounded_share() -> None:
-    class Endless:
-        wants_data = True
+    class Endless(Idle):
         sent = 0
-
-        def receive_data(self, data: bytes, now_ns: int) -> None: ...
-
-        def advance(self, now_ns: int) -> None: ...
 
         def next_packet(self, now_ns: int) -> bytes | None:
             self.sent += 1
             return b"x"
-
-        def wake_ns(self, now_ns: int) -> int | None:
-            return None
 
     class Bottomless:
         def fileno(self) -> int:
@@ -256,16 +264,7 @@ def test_a_turn_sends_a_bounded_share() -> None:
 
 
 def test_a_deadline_beyond_what_the_system_waits_for_is_no_error() -> None:
-    class Distant:
-        wants_data = True
-
-        def receive_data(self, data: bytes, now_ns: int) -> None: ...
-
-        def advance(self, now_ns: int) -> None: ...
-
-        def next_packet(self, now_ns: int) -> bytes | None:
-            return None
-
+    class Distant(Idle):
         def wake_ns(self, now_ns: int) -> int | None:
             return 10**24
 

@@ -90,7 +90,6 @@ class Bench:
 
     def __init__(self, device: Device, line: Line) -> None:
         self.device = device
-        self.line = line
         self.now_ns = 0
         self.end = Descriptor()
         self.port = Port(self.end, device, line)
@@ -136,13 +135,16 @@ class Bench:
             assert m.Ack() in self.ask(command)
 
 
-def uart_bench(host_baud: int, pace: Pace = Pace.REALTIME) -> Bench:
-    device = ramp_device(pace)
-    return Bench(device, UartLine(lambda: device.module.uart_baudrate, lambda: host_baud))
+class UartBench(Bench):
+    def __init__(self, host_baud: int, pace: Pace = Pace.REALTIME) -> None:
+        device = ramp_device(pace)
+        self.host_baud = host_baud
+        self.line = UartLine(lambda: device.module.uart_baudrate, lambda: self.host_baud)
+        super().__init__(device, self.line)
 
 
 def test_a_byte_takes_ten_bits_in_either_direction() -> None:
-    bench = uart_bench(115200)
+    bench = UartBench(115200)
     ping = bench.host.send(m.Ping())
     assert len(ping) == 8
     bench.say(ping)
@@ -155,31 +157,27 @@ def test_a_byte_takes_ten_bits_in_either_direction() -> None:
 
 
 def test_a_host_at_another_rate_is_not_understood_and_understands_nothing() -> None:
-    bench = uart_bench(57600)
+    bench = UartBench(57600)
     assert bench.ask(m.Ping()) == []
     assert not bench.end.heard
-    assert uart_bench(115200).ask(m.Ping()) == [m.Pong(value=0xAAEEAEEA)]
+    assert UartBench(115200).ask(m.Ping()) == [m.Pong(value=0xAAEEAEEA)]
 
 
 def test_setbaudrate_is_acknowledged_at_the_old_rate_and_counts_half_a_second_later() -> None:
-    bench = uart_bench(115200)
-    line = bench.line
-    assert isinstance(line, UartLine)
+    bench = UartBench(115200)
     assert bench.ask(m.SetBaudRate(baudrate=921600)) == [m.Ack()]
     assert bench.ask(m.Ping()) == [m.Pong(value=0xAAEEAEEA)], "not yet"
     bench.run(bench.now_ns + SECOND // 2)
     assert bench.ask(m.Ping()) == []
-    line.host_baud = lambda: 921600
+    bench.host_baud = 921600
     assert bench.ask(m.Ping()) == [m.Pong(value=0xAAEEAEEA)]
 
 
 def test_921600_baud_cannot_carry_17_frames_of_1431_bins() -> None:
-    bench = uart_bench(115200)
-    line = bench.line
-    assert isinstance(line, UartLine)
+    bench = UartBench(115200)
     assert bench.ask(m.SetBaudRate(baudrate=921600)) == [m.Ack()]
     bench.run(bench.now_ns + SECOND // 2)
-    line.host_baud = lambda: 921600
+    bench.host_baud = 921600
     bench.stream(17.0)
     begin_ns = bench.now_ns
     seconds = 120
@@ -197,7 +195,7 @@ def test_921600_baud_cannot_carry_17_frames_of_1431_bins() -> None:
 
 
 def test_nothing_is_lost_when_the_clock_waits_for_the_line() -> None:
-    bench = uart_bench(115200, Pace.ASAP)
+    bench = UartBench(115200, Pace.ASAP)
     bench.stream(17.0)
     bench.run(bench.now_ns + 10 * SECOND)
     counters = [message.info for message in bench.heard() if isinstance(message, m.DataFloat)]
@@ -206,7 +204,7 @@ def test_nothing_is_lost_when_the_clock_waits_for_the_line() -> None:
 
 
 def test_a_uart_sends_on_without_a_reader() -> None:
-    bench = uart_bench(115200)
+    bench = UartBench(115200)
     bench.stream(17.0)
     bench.run(bench.now_ns + 5 * SECOND)
     bench.end.room = 0  # the host has gone, or reads no more
@@ -233,12 +231,10 @@ def test_usb_transfers_are_delayed_and_short() -> None:
 
 
 def test_a_flush_loses_what_was_not_sent_yet() -> None:
-    bench = uart_bench(600)
-    line = bench.line
-    assert isinstance(line, UartLine)
-    line.host_baud = lambda: 115200
+    bench = UartBench(600)
+    bench.host_baud = 115200
     bench.say(bench.host.send(m.Ping()) * 100)
-    line.flush_output()
+    bench.line.flush_output()
     bench.run(SECOND // 2)
     assert bench.heard() == []
     assert bench.ask(m.Ping()) == [m.Pong(value=0xAAEEAEEA)]
