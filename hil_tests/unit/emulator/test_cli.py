@@ -8,7 +8,9 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 import pytest
 
@@ -50,32 +52,39 @@ def test_a_closed_stderr_leaves_the_exit_code() -> None:
     assert (run.returncode, run.stdout) == (2, b"")
 
 
-@pytest.mark.parametrize("arguments", ["faults", "faults --json"])
-def test_a_reader_of_the_list_that_left_is_no_failure(arguments: str) -> None:
+def run(arguments: str, stdout: int | IO[bytes]) -> tuple[int, str]:
+    """Return exit code and stderr of a process of its own."""
+    command = [sys.executable, "-m", "emulator.cli", *arguments.split()]
+    done = subprocess.run(command, stdout=stdout, stderr=subprocess.PIPE, text=True, check=False)
+    return done.returncode, done.stderr
+
+
+@pytest.fixture
+def broken_pipe() -> Iterator[int]:
     read_end, write_end = os.pipe()
     os.close(read_end)
-    run = subprocess.run(
-        [sys.executable, "-m", "emulator.cli", *arguments.split()],
-        stdout=write_end,
-        stderr=subprocess.PIPE,
-        check=False,
-    )
+    yield write_end
     os.close(write_end)
-    assert (run.returncode, run.stderr) == (0, b"")
+
+
+@pytest.mark.parametrize("arguments", ["faults", "faults --json"])
+def test_a_reader_of_the_list_that_left_is_no_failure(arguments: str, broken_pipe: int) -> None:
+    assert run(arguments, broken_pipe) == (0, "")
+
+
+def test_a_reader_of_the_ready_line_that_left_ends_serving(
+    tmp_path: Path, broken_pipe: int
+) -> None:
+    said = "xethru-emulator: stdout: cannot write the ready line: Broken pipe\n"
+    assert run(f"serve --bare --link-dir {tmp_path}/l", broken_pipe) == (1, said)
+    assert not (tmp_path / "l").exists()
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_full_disk_is_one_line() -> None:
-    with Path("/dev/full").open("wb") as full:
-        run = subprocess.run(
-            [sys.executable, "-m", "emulator.cli", "faults"],
-            stdout=full,
-            stderr=subprocess.PIPE,
-            text=True,
-            check=False,
-        )
     said = "xethru-emulator: stdout: cannot write: No space left on device\n"
-    assert (run.returncode, run.stderr) == (1, said)
+    with Path("/dev/full").open("wb") as full:
+        assert run("faults", full) == (1, said)
 
 
 def test_ctrl_c_ends_a_request_without_answer(tmp_path: Path) -> None:

@@ -391,22 +391,22 @@ def test_what_a_module_tells_of_itself_can_be_wrong(faulty_line: FaultyLine) -> 
     assert sorted(faulty_line.device.injected.values()) == [1, 1, 1]
 
 
-def test_a_lost_mode_shows_when_it_is_asked_for(faulty_line: FaultyLine) -> None:
+@pytest.mark.parametrize(
+    ("kind", "asked", "shown"),
+    [
+        ("mode_lost", m.GetMode(), bytes((SensorMode.XTID_SM_STOP,))),
+        ("stream_stopped", m.X4DriverGet(setting=X4Setting.FPS), (0.0,)),
+    ],
+)
+def test_a_stream_that_ended_by_itself_shows_when_it_is_asked_for(
+    kind: str, asked: m.GetMode | m.X4DriverGet, shown: object, faulty_line: FaultyLine
+) -> None:
     radar = faulty_line.streaming(FPS)
-    with fault(faulty_line.device, "mode_lost"), pytest.raises(ResponseTimeout):
+    with fault(faulty_line.device, kind), pytest.raises(ResponseTimeout):
         list(radar.frames(20))
-    assert radar.request(m.GetMode()).values == bytes((SensorMode.XTID_SM_STOP,))
+    assert radar.request(asked).values == shown
     assert radar.stray_count == 0
-    assert faulty_line.device.injected["mode_lost"] == 1
-
-
-def test_a_stopped_stream_shows_when_its_rate_is_asked_for(faulty_line: FaultyLine) -> None:
-    radar = faulty_line.streaming(FPS)
-    with fault(faulty_line.device, "stream_stopped"), pytest.raises(ResponseTimeout):
-        list(radar.frames(20))
-    (rate,) = radar.request(m.X4DriverGet(setting=X4Setting.FPS)).values
-    assert rate == 0.0
-    assert radar.stray_count == 0
+    assert faulty_line.device.injected[kind] == 1
 
 
 def test_a_silent_radar_loses_its_messages(faulty_line: FaultyLine) -> None:

@@ -79,9 +79,12 @@ def old_samples(frames: list[Frame], true: list[Frame], line: FaultyLine) -> Non
     assert stale == hit(line)
 
 
-def ten_percent_slower(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
-    ratio = np.diff(arrivals_s(frames)) / np.diff(arrivals_s(true[:75]))
-    np.testing.assert_allclose(ratio, 1.1, atol=1e-6)
+def slower(ratio: float) -> Witness:
+    def witness(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
+        steps = np.diff(arrivals_s(frames)) / np.diff(arrivals_s(true[:75]))
+        np.testing.assert_allclose(steps, ratio, atol=1e-6)
+
+    return witness
 
 
 def gap_then_burst(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
@@ -94,11 +97,6 @@ def gap_then_burst(frames: list[Frame], true: list[Frame], line: FaultyLine) -> 
 
 def twenty_ms_late(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
     np.testing.assert_allclose(arrivals_s(frames) - arrivals_s(true[:75]), 0.02, atol=1e-6)
-
-
-def one_percent_slow(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
-    ratio = np.diff(arrivals_s(frames)) / np.diff(arrivals_s(true[:75]))
-    np.testing.assert_allclose(ratio, 1.01, atol=1e-6)
 
 
 def wandering(frames: list[Frame], true: list[Frame], line: FaultyLine) -> None:
@@ -176,10 +174,10 @@ WITNESSES: dict[str, Witness] = {
     "saturation": clipped,
     "dead_bins": dead,
     "dc_step": lifted,
-    "slow_rate": ten_percent_slower,
+    "slow_rate": slower(1.1),
     "stall": gap_then_burst,
     "start_offset": twenty_ms_late,
-    "clock_drift": one_percent_slow,
+    "clock_drift": slower(1.01),
     "jitter": wandering,
     "usb_latency": at_polls,
     "range_offset_drift": wandered,
