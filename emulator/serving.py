@@ -17,7 +17,7 @@ from emulator.device import radar_device
 from emulator.echo.echo import echo_source
 from emulator.faults.faulty_device import FaultyDevice, InnerDevice
 from emulator.faults.plan import FaultPlan, FaultPlanError, Injected, load_plan
-from emulator.module.memory import Identity, Memory
+from emulator.module.memory import Identity
 from emulator.module.settings import DeviceOptions
 from emulator.playback import PlayStream, played_radars
 from emulator.ports.control import Control, ControlSocket
@@ -145,9 +145,11 @@ def serve(options: Namespace, stop: StopFlag, warn: Warn) -> None:
         When scene, fault scenario or ports cannot be had.
     """
     links = _link_options(options, warn)
-    memory = _memory(options.state_dir, warn)
+    state_dir: Path | None = options.state_dir
     with contextlib.ExitStack() as cleanup:
         try:
+            if state_dir is not None:
+                make_state_directory(state_dir)
             scene = empty_room(options.count) if options.bare else load_scene(options.scene)
             folder = cleanup.enter_context(link_folder(options.link_dir))
             zero_ns = time.monotonic_ns()
@@ -163,7 +165,9 @@ def serve(options: Namespace, stop: StopFlag, warn: Warn) -> None:
                     scene_time_zero_ns=zero_ns,
                     clock=radar.clock,
                     options=device_options,
-                    memory=None if memory is None else memory(radar.serial),
+                    memory=None
+                    if state_dir is None
+                    else DirectoryMemory(state_dir, radar.serial, warn),
                 )
                 faulty = session.wrap(device, radar.name)
                 devices.append(
@@ -301,18 +305,6 @@ def _link_options(options: Namespace, warn: Warn) -> LinkOptions:
         tcp_base=options.tcp,
         tcp_host=options.tcp_host,
     )
-
-
-def _memory(state_dir: Path | None, warn: Warn) -> Callable[[str], Memory] | None:
-    if state_dir is None:
-        return None
-    try:
-        make_state_directory(state_dir)
-    except OSError as error:
-        raise CannotServeError(
-            f"{state_dir}: cannot keep state there: {error.strerror}; choose another --state-dir"
-        ) from error
-    return lambda serial: DirectoryMemory(state_dir, serial, warn)
 
 
 def _run(

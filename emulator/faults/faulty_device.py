@@ -339,7 +339,7 @@ class FaultyDevice:
     Parameters
     ----------
     inner
-        Can only be asked to reset itself if it is not emulated here but behind a proxy.
+        Only asked to reset itself if it is not emulated here, but behind a proxy.
     name
         Of the radar, as scenarios and the truth log call it.
     note
@@ -585,7 +585,6 @@ class FaultyDevice:
                 firings=armed.injected + fires,
                 packets_since=0 if fires else armed.packets_since + 1,
                 first_counter=self._watch.counter if fires else armed.first_counter,
-                packet_class=cast("PacketClass", opportunity.packet_class),
                 command=opportunity.command,
                 previous_frame=self._watch.previous_frame,
                 lattice=self._watch.lattice,
@@ -671,19 +670,7 @@ def _spoiled(armed: Armed, pieces: Sequence[Piece], context: Context) -> Sequenc
 
 @contextmanager
 def fault(device: FaultyDevice, kind: str, **keys: Any) -> Iterator[Armed]:  # noqa: ANN401 - validated
-    """Arm a fault within a block; it is cleared at its end.
-
-    Parameters
-    ----------
-    keys
-        Those of a scenario file (``count``, ``every``, ``command`` ...); all others
-        are parameters of the kind.
-
-    Raises
-    ------
-    FaultPlanError
-        Naming the key and what is allowed.
-    """
+    """Arm a fault within a block; it is cleared at its end. Keys and errors as of `fault_spec`."""
     number = device.add(fault_spec(kind, **keys))
     armed = device.armed[-1]
     try:

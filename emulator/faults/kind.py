@@ -198,7 +198,6 @@ class Context:
     firings: int = 1
     packets_since: int = 0
     first_counter: int | None = None
-    packet_class: PacketClass = PacketClass.DATA
     command: Command[Response] | None = None
     previous_frame: bytes | None = None
     lattice: Lattice | None = None
@@ -301,30 +300,37 @@ ENTERED: list[Kind] = []
 """All kinds; `emulator.faults.kinds` puts them in order."""
 
 
-def kind(
-    layer: Layer,
-    target: Target,
-    counted: str,
-    parameters: type[Parameters] = Parameters,
-    *,
-    lasting: bool = False,
-    hidden: str = "",
-) -> Callable[[EffectT], EffectT]:
-    """Enter an effect into the catalogue; its name and first docstring line describe the kind."""
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """Enters effects of one layer that wait for the same into the catalogue, as a decorator.
 
-    def enter(effect: EffectT) -> EffectT:
-        row = Kind(
-            name=effect.__name__,
-            layer=layer,
-            target=target,
-            summary=(effect.__doc__ or "").partition("\n")[0],
-            counted=counted,
-            effect=effect,
-            parameters=parameters,
-            lasting=lasting,
-            hidden=hidden,
-        )
-        ENTERED.append(row)
-        return effect
+    An effect's name and the first line of its docstring describe the kind.
+    """
 
-    return enter
+    layer: Layer
+    target: Target
+
+    def __call__(
+        self,
+        counted: str,
+        parameters: type[Parameters] = Parameters,
+        *,
+        lasting: bool = False,
+        hidden: str = "",
+    ) -> Callable[[EffectT], EffectT]:
+        def enter(effect: EffectT) -> EffectT:
+            row = Kind(
+                name=effect.__name__,
+                layer=self.layer,
+                target=self.target,
+                summary=(effect.__doc__ or "").partition("\n")[0],
+                counted=counted,
+                effect=effect,
+                parameters=parameters,
+                lasting=lasting,
+                hidden=hidden,
+            )
+            ENTERED.append(row)
+            return effect
+
+        return enter

@@ -196,16 +196,15 @@ class _State(_Document):
 
 
 def make_state_directory(directory: Path) -> None:
-    """Make a directory of states, if it is missing.
-
-    Raises
-    ------
-    OSError
-        When nothing could be kept there: better before the start than at the first save.
-    """
-    directory.mkdir(parents=True, exist_ok=True)
-    if not os.access(directory, os.R_OK | os.W_OK | os.X_OK):
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    """Make a directory of states; `LinkError` now if nothing could be kept there."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        if not os.access(directory, os.R_OK | os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    except OSError as error:
+        raise LinkError(
+            f"{directory}: cannot keep state there: {error.strerror}; choose another --state-dir"
+        ) from error
 
 
 class DirectoryMemory:

@@ -28,6 +28,7 @@ class Served:
     serials: tuple[str, ...]
     odometry: str | None
     scene_time_zero_ns: int
+    control: str | None
     tcp_ports: tuple[int | None, ...]
 
     def end(self, number: signal.Signals = signal.SIGTERM) -> int:
@@ -65,6 +66,7 @@ def emulator(*arguments: str | Path) -> Iterator[Served]:
             serials=tuple(device["serial"] for device in devices),
             odometry=ready["odometry"],
             scene_time_zero_ns=ready["scene_time_zero_ns"],
+            control=ready["control"],
             tcp_ports=tuple(device["tcp"] for device in devices),
         )
     finally:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from emulator.faults.kind import Context, Layer, Parameters, Piece, Pieces, Target, kind
+from emulator.faults.kind import Context, Entry, Layer, Parameters, Piece, Pieces, Target
 from emulator.module.settings import received_bytes
 from emulator.scene.philox import Rng
 from xethru_protocol.wire.framing import ESCAPE, START
+
+of_packet = Entry(Layer.BYTE, Target.PACKET)
 
 _FLOW_CONTROL = b"\x11\x13"
 _CALM = bytes(code for code in range(256) if code not in b"\x7c\x7d\x7e\x7f")
@@ -60,21 +62,21 @@ _DAMAGE = "one damaged place, of the kind that the byte's role makes it"
 _SAME_BYTES = "The bytes are the same; a receiver that depended on how they are cut would be wrong."
 
 
-@kind(Layer.BYTE, Target.PACKET, _DAMAGE, _Several)
+@of_packet(_DAMAGE, _Several)
 def drop_bytes(data: bytes, wanted: _Several, rng: Rng, context: Context) -> Pieces:
     """Bytes of a packet are lost."""
     at = wanted.place(data, rng)
     return [Piece(data[:at] + data[at + wanted.bytes :])]
 
 
-@kind(Layer.BYTE, Target.PACKET, _DAMAGE, _Several)
+@of_packet(_DAMAGE, _Several)
 def duplicate_bytes(data: bytes, wanted: _Several, rng: Rng, context: Context) -> Pieces:
     """Bytes of a packet come twice."""
     end = wanted.place(data, rng) + 1
     return [Piece(data[:end] + data[max(end - wanted.bytes, 0) : end] + data[end:])]
 
 
-@kind(Layer.BYTE, Target.PACKET, f"{_DAMAGE}; in a frame's samples off_lattice_samples", _Flip)
+@of_packet(f"{_DAMAGE}; in a frame's samples off_lattice_samples", _Flip)
 def flip_bits(data: bytes, wanted: _Flip, rng: Rng, context: Context) -> Pieces:
     """Bits of a packet are inverted."""
     flipped = bytearray(data)
@@ -88,21 +90,21 @@ def flip_bits(data: bytes, wanted: _Flip, rng: Rng, context: Context) -> Pieces:
     return [Piece(bytes(flipped))]
 
 
-@kind(Layer.BYTE, Target.PACKET, _DAMAGE, _Several)
+@of_packet(_DAMAGE, _Several)
 def insert_bytes(data: bytes, wanted: _Several, rng: Rng, context: Context) -> Pieces:
     """Random bytes appear inside a packet."""
     at = wanted.place(data, rng)
     return [Piece(data[:at] + rng.data(wanted.bytes) + data[at:])]
 
 
-@kind(Layer.BYTE, Target.PACKET, "1 fault 'bytes between packets' and junk_bytes = bytes", _Several)
+@of_packet("1 fault 'bytes between packets' and junk_bytes = bytes", _Several)
 def noise_between(data: bytes, wanted: _Several, rng: Rng, context: Context) -> Pieces:
     """Random bytes without a start appear before a packet."""
     noise = bytes(_CALM[rng.below(len(_CALM))] for _ in range(wanted.bytes))
     return [Piece(noise + data)]
 
 
-@kind(Layer.BYTE, Target.PACKET, f"{_DAMAGE}; in a frame's samples off_lattice_samples", _Burst)
+@of_packet(f"{_DAMAGE}; in a frame's samples off_lattice_samples", _Burst)
 def burst_errors(data: bytes, wanted: _Burst, rng: Rng, context: Context) -> Pieces:
     """Bursts of bit errors after Gilbert and Elliott."""
     bad = False
@@ -114,7 +116,7 @@ def burst_errors(data: bytes, wanted: _Burst, rng: Rng, context: Context) -> Pie
     return None if damaged == data else [Piece(bytes(damaged))]
 
 
-@kind(Layer.BYTE, Target.PACKET, "1 fault; 2 where the byte behind it was 7D, which is a start now")
+@of_packet("1 fault; 2 where the byte behind it was 7D, which is a start now")
 def escape_lost(data: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """An escape byte of a Normal packet is lost."""
     if data[:1] != bytes((START,)):
@@ -131,35 +133,33 @@ def escape_lost(data: bytes, wanted: Parameters, rng: Rng, context: Context) -> 
     return [Piece(data[:at] + data[at + 1 :])]
 
 
-@kind(Layer.BYTE, Target.PACKET, _DAMAGE)
+@of_packet(_DAMAGE)
 def flow_control_swallowed(data: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A line with XON/XOFF swallows bytes 11 and 13."""
     left = data.translate(None, _FLOW_CONTROL)
     return None if left == data else [Piece(left)]
 
 
-@kind(Layer.BYTE, Target.PACKET, _DAMAGE)
+@of_packet(_DAMAGE)
 def seven_bits(data: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A line of seven bits clears the highest bit of every byte."""
     left = bytes(byte & 0x7F for byte in data)
     return None if left == data else [Piece(left)]
 
 
-@kind(Layer.BYTE, Target.PACKET, "nothing", _Split, hidden=_SAME_BYTES)
+@of_packet("nothing", _Split, hidden=_SAME_BYTES)
 def split_writes(data: bytes, wanted: _Split, rng: Rng, context: Context) -> Pieces:
     """A packet comes in several writes."""
     return _cut(data, wanted.bytes, wanted.gap_us)
 
 
-@kind(Layer.BYTE, Target.PACKET, "nothing", _Gap, hidden=_SAME_BYTES)
+@of_packet("nothing", _Gap, hidden=_SAME_BYTES)
 def one_byte_writes(data: bytes, wanted: _Gap, rng: Rng, context: Context) -> Pieces:
     """A packet comes byte by byte."""
     return _cut(data, 1, wanted.gap_us)
 
 
-@kind(
-    Layer.BYTE, Target.PACKET, "the packet is missing; what is received of it counts as junk", _Baud
-)
+@of_packet("the packet is missing; what is received of it counts as junk", _Baud)
 def wrong_baud(data: bytes, wanted: _Baud, rng: Rng, context: Context) -> Pieces:
     """Sender and host disagree on the UART's rate; computed from the bits on the line."""
     if wanted.sent == wanted.heard:

@@ -10,6 +10,7 @@ from pydantic import Field
 
 from emulator.faults.kind import (
     Context,
+    Entry,
     Handling,
     Layer,
     Parameters,
@@ -17,7 +18,6 @@ from emulator.faults.kind import (
     Pieces,
     Target,
     command_bytes,
-    kind,
     normal_payload,
     response_bytes,
 )
@@ -25,6 +25,10 @@ from emulator.scene.philox import Rng
 from xethru_protocol.wire.codes import PongCode, ResponseCode, SystemCode
 from xethru_protocol.wire.framing import END, ESCAPE, START, encode_normal
 from xethru_protocol.wire.messages import Ack, Error, Ping, Pong, System, X4DriverSet
+
+of_command = Entry(Layer.TRANSACTION, Target.COMMAND)
+of_reply = Entry(Layer.TRANSACTION, Target.REPLY)
+of_packet = Entry(Layer.TRANSACTION, Target.PACKET)
 
 _NS_PER_MS = 1_000_000
 _LONGEST_WAIT = 20.0  # multiples of the delay that a heavy tail reaches at most
@@ -55,7 +59,7 @@ def _cut(value: float, step: float) -> float:
     return round(value / step) * step
 
 
-@kind(Layer.TRANSACTION, Target.COMMAND, "1 DeviceError of the code", _Code)
+@of_command("1 DeviceError of the code", _Code)
 def nack(packet: bytes, wanted: _Code, rng: Rng, context: Context) -> Handling | None:
     """The module refuses a command with a code, and does not carry it out."""
     if isinstance(context.command, Ping):
@@ -63,17 +67,14 @@ def nack(packet: bytes, wanted: _Code, rng: Rng, context: Context) -> Handling |
     return Handling(to_host=(Piece(response_bytes(Error(code=wanted.code))),))
 
 
-@kind(Layer.TRANSACTION, Target.REPLY, "1 ResponseTimeout")
+@of_reply("1 ResponseTimeout")
 def no_reply(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """The module carries a command out, and its answer is lost."""
     return []
 
 
-@kind(
-    Layer.TRANSACTION,
-    Target.REPLY,
-    "beyond the time limit 1 ResponseTimeout and, when it comes, 1 stray; else nothing",
-    _Slow,
+@of_reply(
+    "beyond the time limit 1 ResponseTimeout and, when it comes, 1 stray; else nothing", _Slow
 )
 def slow_reply(packet: bytes, wanted: _Slow, rng: Rng, context: Context) -> Pieces:
     """An answer is late; frames pass it."""
@@ -85,25 +86,25 @@ def slow_reply(packet: bytes, wanted: _Slow, rng: Rng, context: Context) -> Piec
     return [Piece(packet, delay_ns=round(wanted.delay_ms * factor * _NS_PER_MS), aside=True)]
 
 
-@kind(Layer.TRANSACTION, Target.REPLY, "1 stray")
+@of_reply("1 stray")
 def duplicate_ack(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """An answer comes twice."""
     return [Piece(packet), Piece(packet)]
 
 
-@kind(Layer.TRANSACTION, Target.REPLY, "1 stray")
+@of_reply("1 stray")
 def stale_ack(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """The ACK of an earlier command comes before the answer."""
     return [Piece(response_bytes(Ack())), Piece(packet)]
 
 
-@kind(Layer.TRANSACTION, Target.REPLY, "1 ResponseTimeout and 1 stray")
+@of_reply("1 ResponseTimeout and 1 stray")
 def late_reply(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """An answer comes behind the next one."""
     return [Piece(packet, behind=1)]
 
 
-@kind(Layer.TRANSACTION, Target.REPLY, "1 ResponseTimeout and 1 stray")
+@of_reply("1 ResponseTimeout and 1 stray")
 def wrong_reply(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A REPLY carries the content id of another question."""
     payload = normal_payload(packet)
@@ -113,13 +114,13 @@ def wrong_reply(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -
     return [Piece(encode_normal(payload[:2] + struct.pack("<I", content_id) + payload[6:]))]
 
 
-@kind(Layer.TRANSACTION, Target.PACKET, "BOOTING: 1 reboot", _SystemCode)
+@of_packet("BOOTING: 1 reboot", _SystemCode)
 def system_message(packet: bytes, wanted: _SystemCode, rng: Rng, context: Context) -> Pieces:
     """A SYSTEM message comes in mid-session."""
     return [Piece(response_bytes(System(code=wanted.code)) + packet)]
 
 
-@kind(Layer.TRANSACTION, Target.REPLY, "1 PONG 'not ready'")
+@of_reply("1 PONG 'not ready'")
 def not_ready(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """The module answers PING with 'not ready'."""
     if not isinstance(context.command, Ping):
@@ -127,11 +128,7 @@ def not_ready(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> 
     return [Piece(response_bytes(Pong(value=PongCode.XTS_SPRP_NOTREADY)))]
 
 
-@kind(
-    Layer.TRANSACTION,
-    Target.COMMAND,
-    "1 RemoteProtocolError where the setting is read back and differs",
-)
+@of_command("1 RemoteProtocolError where the setting is read back and differs")
 def ack_then_ignore(
     packet: bytes, wanted: Parameters, rng: Rng, context: Context
 ) -> Handling | None:
@@ -141,12 +138,7 @@ def ack_then_ignore(
     return Handling(to_host=(Piece(response_bytes(Ack())),))
 
 
-@kind(
-    Layer.TRANSACTION,
-    Target.COMMAND,
-    "1 RemoteProtocolError or warning where it is read back",
-    _Step,
-)
+@of_command("1 RemoteProtocolError or warning where it is read back", _Step)
 def ack_quantised(packet: bytes, wanted: _Step, rng: Rng, context: Context) -> Handling | None:
     """The module acknowledges an X4 setting and sets it to a step of its own."""
     command = context.command
@@ -164,13 +156,13 @@ def ack_quantised(packet: bytes, wanted: _Step, rng: Rng, context: Context) -> H
     return None if data == packet else Handling(to_module=data, command=cut)
 
 
-@kind(Layer.TRANSACTION, Target.COMMAND, "1 ResponseTimeout")
+@of_command("1 ResponseTimeout")
 def command_lost(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Handling:
     """A command does not reach the module."""
     return Handling()
 
 
-@kind(Layer.TRANSACTION, Target.COMMAND, "1 ResponseTimeout; the module does not answer")
+@of_command("1 ResponseTimeout; the module does not answer")
 def command_damaged(
     packet: bytes, wanted: Parameters, rng: Rng, context: Context
 ) -> Handling | None:

@@ -10,6 +10,7 @@ from pydantic import Field
 from emulator.faults.kind import (
     Action,
     Context,
+    Entry,
     Layer,
     Parameters,
     Piece,
@@ -19,7 +20,6 @@ from emulator.faults.kind import (
     Target,
     Unplug,
     changed_frame,
-    kind,
     response_bytes,
 )
 from emulator.scene.philox import Rng
@@ -34,6 +34,11 @@ from xethru_protocol.wire.messages import (
     SystemGetInfo,
     X4DriverSet,
 )
+
+of_moment = Entry(Layer.DEVICE, Target.MOMENT)
+of_reply = Entry(Layer.DEVICE, Target.REPLY)
+of_frame = Entry(Layer.DEVICE, Target.FRAME)
+of_time = Entry(Layer.TIME, Target.PACKET)
 
 _NS_PER_US, _NS_PER_MS, _NS_PER_S = 1_000, 1_000_000, 1_000_000_000
 
@@ -102,25 +107,25 @@ def _info_reply(item: InfoItem, text: str, context: Context) -> Pieces:
     return [Piece(response_bytes(ReplyString(content_id=content_id, info=item, text=text)))]
 
 
-@kind(Layer.DEVICE, Target.MOMENT, "1 reconnect", _Away)
+@of_moment("1 reconnect", _Away)
 def unplug(wanted: _Away, rng: Rng) -> Sequence[Action]:
     """The port vanishes and comes back; the module restarts by that."""
     return [Unplug(round(wanted.away_s * _NS_PER_S))]
 
 
-@kind(Layer.DEVICE, Target.MOMENT, "1 reconnect", _MidFrame)
+@of_moment("1 reconnect", _MidFrame)
 def disconnect_mid_frame(wanted: _MidFrame, rng: Rng) -> Sequence[Action]:
     """The port vanishes in the middle of a frame and comes back."""
     return [Unplug(round(wanted.away_s * _NS_PER_S), part_of_frame=wanted.part)]
 
 
-@kind(Layer.DEVICE, Target.MOMENT, "1 reboot, and ResponseTimeout where frames were waited for")
+@of_moment("1 reboot, and ResponseTimeout where frames were waited for")
 def watchdog_reboot(wanted: Parameters, rng: Rng) -> Sequence[Action]:
     """The module restarts by itself and counts it towards safe mode; its port stays."""
     return [Restart()]
 
 
-@kind(Layer.DEVICE, Target.MOMENT, "restarts reboots", _Loop)
+@of_moment("restarts reboots", _Loop)
 def brown_out(wanted: _Loop, rng: Rng) -> Sequence[Action]:
     """The module restarts several times in a row; ten faults in a row start safe mode."""
     period_ns = round(wanted.period_s * _NS_PER_S)
@@ -129,7 +134,7 @@ def brown_out(wanted: _Loop, rng: Rng) -> Sequence[Action]:
     ]
 
 
-@kind(Layer.DEVICE, Target.REPLY, "1 warning where raw radar mode is set up", lasting=True)
+@of_reply("1 warning where raw radar mode is set up", lasting=True)
 def safe_mode(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """The module answers PING as one in safe mode from now on."""
     if not isinstance(context.command, Ping):
@@ -137,7 +142,7 @@ def safe_mode(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> 
     return [Piece(response_bytes(Pong(value=PongCode.XTS_SPRP_SAFEMODE)))]
 
 
-@kind(Layer.DEVICE, Target.REPLY, "another profile id", _Profile, lasting=True)
+@of_reply("another profile id", _Profile, lasting=True)
 def wrong_profile(packet: bytes, wanted: _Profile, rng: Rng, context: Context) -> Pieces:
     """The module reports another profile than the one that is loaded, from now on."""
     if not isinstance(context.command, GetProfileId):
@@ -145,35 +150,31 @@ def wrong_profile(packet: bytes, wanted: _Profile, rng: Rng, context: Context) -
     return [Piece(response_bytes(ReplyInt(values=(wanted.profile,))))]
 
 
-@kind(Layer.DEVICE, Target.REPLY, "another version", _Version, lasting=True)
+@of_reply("another version", _Version, lasting=True)
 def wrong_version(packet: bytes, wanted: _Version, rng: Rng, context: Context) -> Pieces:
     """The module reports another firmware version, from now on."""
     return _info_reply(InfoItem.XTID_SSIC_VERSION, wanted.version, context)
 
 
-@kind(Layer.DEVICE, Target.REPLY, "another serial number", _Serial, lasting=True)
+@of_reply("another serial number", _Serial, lasting=True)
 def duplicate_serial(packet: bytes, wanted: _Serial, rng: Rng, context: Context) -> Pieces:
     """The module reports another module's serial number, from now on."""
     return _info_reply(InfoItem.XTID_SSIC_SERIALNUMBER, wanted.serial, context)
 
 
-@kind(
-    Layer.DEVICE, Target.MOMENT, "ResponseTimeout where frames were waited for; the mode reads STOP"
-)
+@of_moment("ResponseTimeout where frames were waited for; the mode reads STOP")
 def mode_lost(wanted: Parameters, rng: Rng) -> Sequence[Action]:
     """The module falls back to STOP by itself."""
     return [SendToModule(SetMode(mode=SensorMode.XTID_SM_STOP))]
 
 
-@kind(Layer.DEVICE, Target.MOMENT, "ResponseTimeout where frames were waited for; the rate reads 0")
+@of_moment("ResponseTimeout where frames were waited for; the rate reads 0")
 def stream_stopped(wanted: Parameters, rng: Rng) -> Sequence[Action]:
     """The module sets its frame rate to 0 by itself, as the transmitter guard does."""
     return [SendToModule(X4DriverSet(setting=X4Setting.FPS, value=0.0))]
 
 
-@kind(
-    Layer.DEVICE,
-    Target.FRAME,
+@of_frame(
     "nothing",
     _Drift,
     lasting=True,
@@ -190,36 +191,34 @@ def range_offset_drift(packet: bytes, wanted: _Drift, rng: Rng, context: Context
     )
 
 
-@kind(Layer.TIME, Target.PACKET, _ARRIVAL, _Offset, lasting=True, hidden=_TIMING)
+@of_time(_ARRIVAL, _Offset, lasting=True, hidden=_TIMING)
 def start_offset(packet: bytes, wanted: _Offset, rng: Rng, context: Context) -> Pieces:
     """Everything comes later by the same time."""
     return [Piece(packet, delay_ns=round(wanted.offset_ms * _NS_PER_MS))]
 
 
-@kind(Layer.TIME, Target.PACKET, _ARRIVAL, _Ppm, lasting=True, hidden=_TIMING)
+@of_time(_ARRIVAL, _Ppm, lasting=True, hidden=_TIMING)
 def clock_drift(packet: bytes, wanted: _Ppm, rng: Rng, context: Context) -> Pieces:
     """The module's clock is slow."""
     delay_ns = round((context.now_ns - context.since_ns) * wanted.ppm * 1e-6)
     return [Piece(packet, delay_ns=delay_ns)]
 
 
-@kind(Layer.TIME, Target.PACKET, _ARRIVAL, _Walk, lasting=True, hidden=_TIMING)
+@of_time(_ARRIVAL, _Walk, lasting=True, hidden=_TIMING)
 def jitter(packet: bytes, wanted: _Walk, rng: Rng, context: Context) -> Pieces:
     """Delays wander at random."""
     # reflected at 0: nothing can be early
     return [Piece(packet, delay_ns=round(abs(rng.walk(wanted.sigma_us)) * _NS_PER_US))]
 
 
-@kind(Layer.TIME, Target.PACKET, _ARRIVAL, _Poll, lasting=True, hidden=_TIMING)
+@of_time(_ARRIVAL, _Poll, lasting=True, hidden=_TIMING)
 def usb_latency(packet: bytes, wanted: _Poll, rng: Rng, context: Context) -> Pieces:
     """The host polls now and then: packets come in batches, at multiples of a period."""
     period_ns = round(wanted.period_ms * _NS_PER_MS)
     return [Piece(packet, delay_ns=(context.since_ns - context.now_ns) % period_ns)]
 
 
-@kind(
-    Layer.TIME,
-    Target.PACKET,
+@of_time(
     "ResponseTimeout where something was waited for; afterwards the frames lost meanwhile",
     _Silence,
     lasting=True,

@@ -10,15 +10,14 @@ from pydantic import Field
 
 from emulator.faults.kind import (
     Context,
+    Entry,
     Layer,
-    PacketClass,
     Parameters,
     Piece,
     Pieces,
     Samples,
     Target,
     changed_frame,
-    kind,
     normal_payload,
     response_bytes,
 )
@@ -34,6 +33,10 @@ from xethru_protocol.wire.framing import (
     xor,
 )
 from xethru_protocol.wire.messages import Ack, DataString
+
+of_reply = Entry(Layer.FRAME, Target.REPLY)
+of_packet = Entry(Layer.FRAME, Target.PACKET)
+of_frame = Entry(Layer.FRAME, Target.FRAME)
 
 _SPECIAL = (START, END, ESCAPE)
 _UNKNOWN_CODE = 0xB7
@@ -88,7 +91,7 @@ def _replaced(
     return changed_frame(packet, change)
 
 
-@kind(Layer.FRAME, Target.REPLY, f"1 fault 'wrong checksum'; {_LOST_REPLY}")
+@of_reply(f"1 fault 'wrong checksum'; {_LOST_REPLY}")
 def bad_checksum(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """The checksum of a Normal packet is wrong."""
     payload = _whole_normal(packet)
@@ -101,97 +104,87 @@ def bad_checksum(packet: bytes, wanted: Parameters, rng: Rng, context: Context) 
     return [Piece(body[:end] + bytes((wrong[rng.below(len(wrong))], END)))]
 
 
-@kind(Layer.FRAME, Target.PACKET, "1 unknown")
+@of_packet("1 unknown")
 def escaped_checksum(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """An intact packet of an unknown code, whose checksum needs an escape, comes before."""
     checksum_is_end = encode_normal(bytes((_UNKNOWN_CODE, END ^ START ^ _UNKNOWN_CODE)))
     return [Piece(checksum_is_end + packet)]
 
 
-@kind(Layer.FRAME, Target.REPLY, f"1 fault at the next packet; {_LOST_REPLY}")
+@of_reply(f"1 fault at the next packet; {_LOST_REPLY}")
 def missing_end(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """The end byte of a Normal packet is missing."""
     return _changed(packet, packet[:-1])
 
 
-@kind(Layer.FRAME, Target.REPLY, f"1 fault 'bytes between packets'; {_LOST_REPLY}")
+@of_reply(f"1 fault 'bytes between packets'; {_LOST_REPLY}")
 def missing_start(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """The start byte of a Normal packet is missing."""
     return _changed(packet, packet[1:])
 
 
-@kind(Layer.FRAME, Target.REPLY, "1 junk byte, no fault: nothing was lost")
+@of_reply("1 junk byte, no fault: nothing was lost")
 def double_start(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A Normal packet has two start bytes."""
     return _changed(packet, packet[:1] + packet)
 
 
-@kind(Layer.FRAME, Target.REPLY, "1 fault 'bytes between packets', 1 junk byte")
+@of_reply("1 fault 'bytes between packets', 1 junk byte")
 def double_end(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A Normal packet has two end bytes."""
     return _changed(packet, packet + packet[-1:])
 
 
-@kind(Layer.FRAME, Target.REPLY, f"1 fault; {_LOST_REPLY}")
+@of_reply(f"1 fault; {_LOST_REPLY}")
 def early_end(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """An unescaped end byte stands inside a Normal packet."""
     return _changed(packet, packet[:2] + bytes((END,)) + packet[2:])
 
 
-@kind(Layer.FRAME, Target.REPLY, f"1 fault at the next packet; {_LOST_REPLY}", _Cut)
+@of_reply(f"1 fault at the next packet; {_LOST_REPLY}", _Cut)
 def truncated_reply(packet: bytes, wanted: _Cut, rng: Rng, context: Context) -> Pieces:
     """Only the first bytes of a reply are sent."""
     return None if wanted.keep >= len(packet) else [Piece(packet[: wanted.keep])]
 
 
-@kind(Layer.FRAME, Target.PACKET, "1 fault 'packet longer than any receiver accepts'")
+@of_packet("1 fault 'packet longer than any receiver accepts'")
 def oversized(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A Normal packet that is longer than any receiver accepts comes before."""
     longest = bytes((START, *bytes(2 * MAX_NORMAL_BYTES + 8), END))
     return [Piece(longest + packet)]
 
 
-@kind(Layer.FRAME, Target.PACKET, "1 fault 'packet without payload'")
+@of_packet("1 fault 'packet without payload'")
 def empty_packet(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A packet without payload comes before."""
     return [Piece(bytes((START, END)) + packet)]
 
 
-@kind(Layer.FRAME, Target.PACKET, "1 unknown")
+@of_packet("1 unknown")
 def unknown_response(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """An intact packet of an unknown code comes before."""
     return [Piece(encode_normal(bytes((_UNKNOWN_CODE, 1, 2, 3))) + packet)]
 
 
-@kind(Layer.FRAME, Target.PACKET, "1 unknown")
+@of_packet("1 unknown")
 def unknown_content(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """An intact profile message with an unknown content id comes before."""
     return [Piece(encode_normal(_UNKNOWN_CONTENT) + packet)]
 
 
-@kind(
-    Layer.FRAME,
-    Target.REPLY,
-    "nothing",
-    hidden="Data may precede any reply; a driver that stumbles over it is wrong.",
-)
+@of_reply("nothing", hidden="Data may precede any reply; a driver that stumbles over it is wrong.")
 def stray_data(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A data message stands between a command and its answer."""
     return [Piece(response_bytes(DataString(text="between command and answer")) + packet)]
 
 
-@kind(Layer.FRAME, Target.PACKET, "1 fault 'implausible NoEscape header'")
+@of_packet("1 fault 'implausible NoEscape header'")
 def false_bulk_start(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A NoEscape start with length 0 comes before."""
     return [Piece(NO_ESCAPE_START + bytes(4) + b"\x00" + packet)]
 
 
-@kind(
-    Layer.FRAME,
-    Target.REPLY,
-    "nothing",
-    hidden="The 8-bit XOR is the same; of random damage it passes 1 in 256.",
-)
+@of_reply("nothing", hidden="The 8-bit XOR is the same; of random damage it passes 1 in 256.")
 def cancelling_flips(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """The same bit of two bytes of a reply is inverted."""
     payload = _whole_normal(packet)
@@ -206,36 +199,31 @@ def cancelling_flips(packet: bytes, wanted: Parameters, rng: Rng, context: Conte
     return [Piece(encode_normal(bytes(changed)))]
 
 
-@kind(
-    Layer.FRAME,
-    Target.FRAME,
-    "1 frame lost, 1 fault; the next frame's first bytes are taken for samples",
-    _Cut,
-)
+@of_frame("1 frame lost, 1 fault; the next frame's first bytes are taken for samples", _Cut)
 def truncated_frame(packet: bytes, wanted: _Cut, rng: Rng, context: Context) -> Pieces:
     """Only the first bytes of a radar frame are sent."""
     return None if wanted.keep >= len(packet) else [Piece(packet[: wanted.keep])]
 
 
-@kind(Layer.FRAME, Target.FRAME, "off_lattice_samples = samples", _Samples)
+@of_frame("off_lattice_samples = samples", _Samples)
 def nan_samples(packet: bytes, wanted: _Samples, rng: Rng, context: Context) -> Pieces:
     """Samples of a frame are no numbers."""
     return _replaced(packet, wanted, rng, lambda samples: np.full_like(samples, np.nan))
 
 
-@kind(Layer.FRAME, Target.FRAME, "off_lattice_samples = samples", _Samples)
+@of_frame("off_lattice_samples = samples", _Samples)
 def infinite_samples(packet: bytes, wanted: _Samples, rng: Rng, context: Context) -> Pieces:
     """Samples of a frame are infinite."""
     return _replaced(packet, wanted, rng, lambda samples: np.full_like(samples, np.inf))
 
 
-@kind(Layer.FRAME, Target.FRAME, "off_lattice_samples = samples", _Samples)
+@of_frame("off_lattice_samples = samples", _Samples)
 def denormal_samples(packet: bytes, wanted: _Samples, rng: Rng, context: Context) -> Pieces:
     """Samples of a frame are denormal numbers."""
     return _replaced(packet, wanted, rng, lambda samples: np.full_like(samples, 1e-40))
 
 
-@kind(Layer.FRAME, Target.FRAME, "off_lattice_samples = samples", _Samples)
+@of_frame("off_lattice_samples = samples", _Samples)
 def off_lattice_samples(packet: bytes, wanted: _Samples, rng: Rng, context: Context) -> Pieces:
     """Samples lie between two values that the chip can give."""
     lattice = context.lattice
@@ -251,9 +239,7 @@ def off_lattice_samples(packet: bytes, wanted: _Samples, rng: Rng, context: Cont
     return _replaced(packet, wanted, rng, between)
 
 
-@kind(
-    Layer.FRAME,
-    Target.FRAME,
+@of_frame(
     "nothing",
     _Samples,
     hidden="NoEscape packets carry no checksum, and the new values are as good as the old.",
@@ -275,7 +261,7 @@ def in_range_samples(packet: bytes, wanted: _Samples, rng: Rng, context: Context
     )
 
 
-@kind(Layer.FRAME, Target.FRAME, "1 frame discarded, 1 frame lost", _Bins)
+@of_frame("1 frame discarded, 1 frame lost", _Bins)
 def wrong_bin_count(packet: bytes, wanted: _Bins, rng: Rng, context: Context) -> Pieces:
     """A frame has another number of bins than the settings make."""
 
@@ -286,7 +272,7 @@ def wrong_bin_count(packet: bytes, wanted: _Bins, rng: Rng, context: Context) ->
     return changed_frame(packet, resized)
 
 
-@kind(Layer.FRAME, Target.FRAME, "1 fault 'implausible NoEscape header', 1 frame lost", _Length)
+@of_frame("1 fault 'implausible NoEscape header', 1 frame lost", _Length)
 def wrong_length(packet: bytes, wanted: _Length, rng: Rng, context: Context) -> Pieces:
     """The length of a NoEscape packet contradicts its content."""
     if not packet.startswith(NO_ESCAPE_START) or wanted.more == 0:
@@ -297,23 +283,14 @@ def wrong_length(packet: bytes, wanted: _Length, rng: Rng, context: Context) -> 
     return [Piece(NO_ESCAPE_START + length.to_bytes(4, "little") + packet[8:])]
 
 
-@kind(
-    Layer.FRAME, Target.FRAME, "1 fault, 4 junk bytes; the frame's later samples are shifted by one"
-)
+@of_frame("1 fault, 4 junk bytes; the frame's later samples are shifted by one")
 def packet_inside_frame(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """An ACK stands inside a frame."""
-    if context.packet_class is not PacketClass.FRAME:
-        return None
     middle = len(packet) // 2
     return [Piece(packet[:middle] + response_bytes(Ack()) + packet[middle:])]
 
 
-@kind(
-    Layer.FRAME,
-    Target.FRAME,
-    "nothing",
-    hidden="A host must accept both framings for every message.",
-)
+@of_frame("nothing", hidden="A host must accept both framings for every message.")
 def normal_framed(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A frame comes in Normal framing."""
     payload = packet[NO_ESCAPE_HEADER_BYTES:]

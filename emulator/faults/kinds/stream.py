@@ -10,6 +10,7 @@ from pydantic import Field
 
 from emulator.faults.kind import (
     Context,
+    Entry,
     Layer,
     Parameters,
     Piece,
@@ -20,9 +21,12 @@ from emulator.faults.kind import (
     frame_counter,
     frame_packet,
     frame_samples,
-    kind,
 )
 from emulator.scene.philox import Rng
+
+of_frame = Entry(Layer.STREAM, Target.FRAME)
+of_packet = Entry(Layer.STREAM, Target.PACKET)
+of_environment = Entry(Layer.ENVIRONMENT, Target.FRAME)
 
 _WRAP = 1 << 32
 _NS_PER_S = 1_000_000_000
@@ -102,26 +106,19 @@ def _distorted(packet: bytes, context: Context, distort: Callable[[Samples], Sam
     return changed_frame(packet, lambda samples: lattice.nearest(distort(samples)))
 
 
-@kind(Layer.STREAM, Target.FRAME, "frames_lost += frames", _Frames, lasting=True)
+@of_frame("frames_lost += frames", _Frames, lasting=True)
 def counter_jump(packet: bytes, wanted: _Frames, rng: Rng, context: Context) -> Pieces:
     """The frame counter jumps ahead, and goes on from there."""
     return _renumbered(packet, lambda counter: counter + wanted.frames * context.firings)
 
 
-@kind(
-    Layer.STREAM,
-    Target.FRAME,
-    "nothing; the counters of the frames show it",
-    _Frames,
-    lasting=True,
-    hidden=_BACK,
-)
+@of_frame("nothing; the counters of the frames show it", _Frames, lasting=True, hidden=_BACK)
 def counter_back(packet: bytes, wanted: _Frames, rng: Rng, context: Context) -> Pieces:
     """The frame counter jumps back, and goes on from there."""
     return _renumbered(packet, lambda counter: counter - wanted.frames * context.firings)
 
 
-@kind(Layer.STREAM, Target.FRAME, "nothing; a wrap is no loss", _Frames, lasting=True, hidden=_BACK)
+@of_frame("nothing; a wrap is no loss", _Frames, lasting=True, hidden=_BACK)
 def counter_wrap(packet: bytes, wanted: _Frames, rng: Rng, context: Context) -> Pieces:
     """The frame counter goes on shortly before 2**32, and wraps after some frames."""
     return _renumbered(
@@ -129,22 +126,13 @@ def counter_wrap(packet: bytes, wanted: _Frames, rng: Rng, context: Context) -> 
     )
 
 
-@kind(
-    Layer.STREAM,
-    Target.FRAME,
-    "nothing; the counters of the frames show it",
-    _Frames,
-    lasting=True,
-    hidden=_BACK,
-)
+@of_frame("nothing; the counters of the frames show it", _Frames, lasting=True, hidden=_BACK)
 def counter_reset(packet: bytes, wanted: _Frames, rng: Rng, context: Context) -> Pieces:
     """The frame counter begins again at 0."""
     return _renumbered(packet, lambda counter: _since_first(counter, context))
 
 
-@kind(
-    Layer.STREAM,
-    Target.FRAME,
+@of_frame(
     "nothing; two frames with one counter show it",
     _Copies,
     hidden="The counter does not move, so no frame is missing.",
@@ -154,35 +142,26 @@ def duplicate_frame(packet: bytes, wanted: _Copies, rng: Rng, context: Context) 
     return [Piece(packet)] * (1 + wanted.copies)
 
 
-@kind(Layer.STREAM, Target.FRAME, "frames_lost += frames", _Frames, lasting=True)
+@of_frame("frames_lost += frames", _Frames, lasting=True)
 def missing_frames(packet: bytes, wanted: _Frames, rng: Rng, context: Context) -> Pieces:
     """Frames are missing."""
     return [] if context.packets_since < wanted.frames else [Piece(packet)]
 
 
-@kind(Layer.STREAM, Target.FRAME, "frames_lost += 2: the counter jumps ahead by one twice")
+@of_frame("frames_lost += 2: the counter jumps ahead by one twice")
 def reordered_frames(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A frame comes behind the next one."""
     return [Piece(packet, behind=1)]
 
 
-@kind(
-    Layer.STREAM,
-    Target.FRAME,
-    "nothing; the arrival times show it",
-    _Slower,
-    lasting=True,
-    hidden=_TIMING,
-)
+@of_frame("nothing; the arrival times show it", _Slower, lasting=True, hidden=_TIMING)
 def slow_rate(packet: bytes, wanted: _Slower, rng: Rng, context: Context) -> Pieces:
     """Frames come at a lower rate than was asked for."""
     delay_ns = round((context.now_ns - context.since_ns) * wanted.percent / 100)
     return [Piece(packet, delay_ns=delay_ns)]
 
 
-@kind(
-    Layer.STREAM,
-    Target.PACKET,
+@of_packet(
     "nothing; the arrival times show it, and ResponseTimeout if someone waits for less",
     _Seconds,
     lasting=True,
@@ -194,7 +173,7 @@ def stall(packet: bytes, wanted: _Seconds, rng: Rng, context: Context) -> Pieces
     return [Piece(packet, delay_ns=max(end_ns - context.now_ns, 0))]
 
 
-@kind(Layer.STREAM, Target.FRAME, "nothing", _Level, hidden=_CONTENT)
+@of_frame("nothing", _Level, hidden=_CONTENT)
 def saturation(packet: bytes, wanted: _Level, rng: Rng, context: Context) -> Pieces:
     """The amplitudes of a frame are clipped."""
 
@@ -205,7 +184,7 @@ def saturation(packet: bytes, wanted: _Level, rng: Rng, context: Context) -> Pie
     return _distorted(packet, context, clipped)
 
 
-@kind(Layer.STREAM, Target.FRAME, "nothing", _DeadBins, hidden=_CONTENT)
+@of_frame("nothing", _DeadBins, hidden=_CONTENT)
 def dead_bins(packet: bytes, wanted: _DeadBins, rng: Rng, context: Context) -> Pieces:
     """Bins of a frame are stuck at one value."""
 
@@ -220,13 +199,13 @@ def dead_bins(packet: bytes, wanted: _DeadBins, rng: Rng, context: Context) -> P
     return changed_frame(packet, stuck)
 
 
-@kind(Layer.STREAM, Target.FRAME, "nothing", _Amplitude, lasting=True, hidden=_CONTENT)
+@of_frame("nothing", _Amplitude, lasting=True, hidden=_CONTENT)
 def dc_step(packet: bytes, wanted: _Amplitude, rng: Rng, context: Context) -> Pieces:
     """All samples are moved by the same amount from now on."""
     return _distorted(packet, context, lambda samples: samples + np.float32(wanted.amplitude))
 
 
-@kind(Layer.STREAM, Target.FRAME, "nothing", hidden=_CONTENT)
+@of_frame("nothing", hidden=_CONTENT)
 def stale_frame(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -> Pieces:
     """A frame carries the samples of the one before."""
     before = context.previous_frame
@@ -235,7 +214,7 @@ def stale_frame(packet: bytes, wanted: Parameters, rng: Rng, context: Context) -
     return changed_frame(packet, lambda samples: frame_samples(before))
 
 
-@kind(Layer.ENVIRONMENT, Target.FRAME, "nothing", _Clutter, lasting=True, hidden=_CONTENT)
+@of_environment("nothing", _Clutter, lasting=True, hidden=_CONTENT)
 def strong_clutter(packet: bytes, wanted: _Clutter, rng: Rng, context: Context) -> Pieces:
     """A strong reflector stands in one place."""
 
@@ -248,7 +227,7 @@ def strong_clutter(packet: bytes, wanted: _Clutter, rng: Rng, context: Context) 
     return _distorted(packet, context, with_clutter)
 
 
-@kind(Layer.ENVIRONMENT, Target.FRAME, "nothing", _Pulses, lasting=True, hidden=_CONTENT)
+@of_environment("nothing", _Pulses, lasting=True, hidden=_CONTENT)
 def interference(packet: bytes, wanted: _Pulses, rng: Rng, context: Context) -> Pieces:
     """Every frame has pulses at random bins."""
 
@@ -261,7 +240,7 @@ def interference(packet: bytes, wanted: _Pulses, rng: Rng, context: Context) -> 
     return _distorted(packet, context, with_pulses)
 
 
-@kind(Layer.ENVIRONMENT, Target.FRAME, "nothing", _Fading, lasting=True, hidden=_CONTENT)
+@of_environment("nothing", _Fading, lasting=True, hidden=_CONTENT)
 def fading(packet: bytes, wanted: _Fading, rng: Rng, context: Context) -> Pieces:
     """All echoes fade and come back."""
     phase = (context.now_ns - context.since_ns) / _NS_PER_S / wanted.period_s

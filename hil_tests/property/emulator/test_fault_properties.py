@@ -130,7 +130,6 @@ def effect_of(kind: Kind, packet: bytes, seed: int) -> Any:  # noqa: ANN401 - of
         now_ns=10**9,
         since_ns=10**9 - 10**6,
         first_counter=5,
-        packet_class=classify(packet),
         command=m.X4DriverGet(setting=X4Setting.PULSESPERSTEP),
         previous_frame=packet if classify(packet) is PacketClass.FRAME else None,
         lattice=LATTICE,
