@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -118,11 +119,13 @@ def _is_session(path: Path) -> bool:
 
 @contextmanager
 def _removing(out: Path) -> Iterator[None]:
-    """Remove a file that was begun where the block fails; a bag's folder goes with its writer."""
+    """Remove the file or folder that was begun where the block fails."""
     try:
         yield
     except BaseException:
-        if not out.is_dir():
+        if out.is_dir():
+            shutil.rmtree(out, ignore_errors=True)
+        else:
             out.unlink(missing_ok=True)
         raise
 

@@ -18,7 +18,6 @@ from __future__ import annotations
 import json
 import math
 import re
-import shutil
 import sqlite3
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -410,27 +409,14 @@ class _Bag:
 def write_bag(session: RecordedSession, out: Path, stop: StopFlag) -> str:
     """Write frames, odometry and truth of a session; return a line about it.
 
-    `*.bag` is for ROS 1, any other name a new folder for ROS 2; bag times are session times. A stop
-    or an error leaves nothing behind.
-
-    Raises
-    ------
-    AppError
-        It cannot be written, or the session is damaged.
+    `*.bag` is for ROS 1, any other name a new folder for ROS 2; bag times are session times.
     """
     try:
         with closing(_Bag(out)) as bag:
             counts = _fill(bag, session, stop)
-    except BaseException as error:
-        if out.is_dir():
-            shutil.rmtree(out, ignore_errors=True)
-        else:
-            out.unlink(missing_ok=True)
-        # SQLite has an error of its own for a full disk.
-        if isinstance(error, OSError | sqlite3.Error):
-            reason = getattr(error, "strerror", None) or error
-            raise AppError(f"{out}: cannot be written: {reason}") from None
-        raise
+    except (OSError, sqlite3.Error) as error:  # SQLite has its own for a full disk
+        reason = getattr(error, "strerror", None) or error
+        raise AppError(f"{out}: cannot be written: {reason}") from None
     frames, poses, truths = counts
     kind = "ROS 1" if out.suffix == ".bag" else "ROS 2"
     return f"{out}: {kind}, {frames} frames, {poses} poses of the wheels, {truths} true poses"

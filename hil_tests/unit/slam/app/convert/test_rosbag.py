@@ -28,7 +28,7 @@ from hil_tests.unit.slam.app.sessions import (
     snapshot,
     write_scans,
 )
-from slam.app.convert.rosbag import AUTHORS_RIG, convert_bag, write_bag
+from slam.app.convert.convert import run_convert
 from slam.app.odometry.track import OdometryTrack, format_tum_line
 from slam.app.session.log import SessionLog
 from slam.app.session.reader import RecordedSession, open_session
@@ -218,20 +218,20 @@ def test_a_signal_stops_a_conversion_and_leaves_nothing(recorded: Path, tmp_path
 
     stop = StopFlag()
     stop.received = signal.SIGINT
-    with pytest.raises(StopRequestedError):
-        convert_bag(
-            bag,
-            tmp_path / "s.mcap",
-            stop,
-            preset="robust",
-            rig=AUTHORS_RIG,
-            area_m=None,
-            truth_topic="/slam_out_pose",
-        )
-    with pytest.raises(StopRequestedError):
-        write_bag(open_session(recorded), tmp_path / "out", stop)
-    assert not (tmp_path / "out").exists()
-    assert not (tmp_path / "s.mcap").exists()
+    for source, out in ((bag, tmp_path / "s.mcap"), (recorded, tmp_path / "out")):
+        with pytest.raises(StopRequestedError):
+            run_convert(
+                stop,
+                source=source,
+                out=out,
+                rig=None,
+                area_m=None,
+                truth_topic="/slam_out_pose",
+                rate_hz=5,
+                preset=None,
+                radar=None,
+            )
+        assert not out.exists()
 
 
 @pytest.mark.parametrize(
