@@ -79,6 +79,24 @@ def snapshot(counter: int) -> Snapshot:
     )
 
 
+class Listener(SessionObserver):
+    """Keeps everything that a run produces."""
+
+    def __init__(self) -> None:
+        self.scans: list[Scan] = []
+        self.snapshots: list[Snapshot] = []
+        self.lines: list[LogLine] = []
+
+    def on_scan(self, scan: Scan) -> None:
+        self.scans.append(scan)
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        self.snapshots.append(snapshot)
+
+    def on_log(self, line: LogLine) -> None:
+        self.lines.append(line)
+
+
 def feed(observer: SessionObserver, n_scans: int) -> None:
     """Give an observer a whole session of two radars, without closing it."""
     observer.on_log(LogLine(t_ns=0, radar="radar0", warning=False, text="Ping -> Pong"))

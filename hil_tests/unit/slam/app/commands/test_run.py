@@ -9,25 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil_tests.unit.slam.app.sessions import scan, session_info
+from hil_tests.unit.slam.app.sessions import Listener, scan, session_info
 from slam.app.cli import CSV_TO_TUM, main
 from slam.app.commands.run import parse_clock
 from slam.app.errors import UsageError
 from slam.app.odometry.live import parse_source
 from slam.app.odometry.track import TumSample, parse_tum_line
-from slam.app.records import LogLine, SessionObserver
 from slam.app.run.live_source import LiveLog
 from slam.app.session import messages as ros
 from slam.app.session.log import CannotWriteError, SessionLog
 from slam.app.session.reader import open_session
-
-
-class Heard(SessionObserver):
-    def __init__(self) -> None:
-        self.lines: list[LogLine] = []
-
-    def on_log(self, line: LogLine) -> None:
-        self.lines.append(line)
 
 
 def pose(number: int) -> TumSample:
@@ -55,7 +46,7 @@ def test_a_disk_that_fills_up_is_said_once_and_the_run_goes_on(
     refused: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also where it is full as soon as what was kept for the log is written."""
-    listener, heard = LiveLog(), Heard()
+    listener, heard = LiveLog(), Listener()
     listener.on_odometry(pose(1))
     listener.on_odometry(pose(2))
     log = SessionLog(tmp_path / "session.mcap", session_info())

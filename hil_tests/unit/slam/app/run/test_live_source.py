@@ -4,7 +4,7 @@ import os
 import queue
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,10 +24,11 @@ from hil_tests.unit.slam.app.run.virtual_rig import (
     odometry_events,
     radar_events,
 )
+from hil_tests.unit.slam.app.sessions import Listener
 from slam.app.errors import AppError
 from slam.app.odometry.arrival import ClockLine
 from slam.app.odometry.live import LiveOdometry, parse_source
-from slam.app.records import RadarInfo, Scan, SessionObserver
+from slam.app.records import RadarInfo, Scan
 from slam.app.rig.emulated import RAW_CONFIG, rig_of, wheels_of
 from slam.app.rig.sources import RadarLink, sampler_limits
 from slam.app.run import live_source as run_readers
@@ -373,14 +374,6 @@ class Drive:
     events: list[Timed]
 
 
-@dataclass
-class Heard(SessionObserver):
-    scans: list[Scan] = field(default_factory=list)
-
-    def on_scan(self, scan: Scan) -> None:
-        self.scans.append(scan)
-
-
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
     scene = load_scene(write_short_scene(tmp_path_factory.mktemp("scene")))
@@ -415,7 +408,7 @@ def source_on(
     return source, odometry, words
 
 
-def run(drive: Drive, source: LiveSource, odometry: LiveOdometry, heard: Heard) -> RunRecord:
+def run(drive: Drive, source: LiveSource, odometry: LiveOdometry, heard: Listener) -> RunRecord:
     scene = drive.scene
     slam = make_slam(load_preset("robust"), rig_of(scene), wheels_of(scene))
     return run_slam(source.scans(), odometry, slam, scene.trajectory().poses, [heard])
@@ -425,7 +418,7 @@ def test_through_drift_and_jitter_the_map_is_as_good_as_with_perfect_clocks(driv
     """Measured: ATE 0.77 mm (0.79 without jitter) where wheels have 3.0; stamps to 1.7 ms."""
     source, odometry, words = source_of(drive)
     source.settle()
-    heard = Heard()
+    heard = Listener()
     record = run(drive, source, odometry, heard)
     assert source.ended == "odometry ended"
     assert words.said[0] == ("odometry", "ended")
@@ -468,7 +461,7 @@ def test_a_dead_radar_is_told_and_the_others_go_on(drive: Drive) -> None:
         ),
     )
     source.settle()
-    heard = Heard()
+    heard = Listener()
     run(drive, source, odometry, heard)
     assert words.about("front_right").startswith(
         "no frame for 3 s; the run goes on with 3 of 4 radars | is back, at elsewhere | clock "
@@ -490,7 +483,7 @@ def test_odometry_that_stops_for_a_while_costs_only_that_while(drive: Drive) -> 
 
     source, odometry, words = source_of(drive, keep)
     source.settle()
-    heard = Heard()
+    heard = Listener()
     record = run(drive, source, odometry, heard)
     assert "s of it are missing; no scan of them is used" in words.about("odometry")
     last_ns = odometry.last_ns - NS_PER_S  # at the end of the events it stops again
@@ -513,7 +506,7 @@ def test_odometry_that_falls_silent_ends_the_run_with_all_its_states(drive: Driv
         ),
     )
     source.settle()
-    record = run(drive, source, odometry, Heard())
+    record = run(drive, source, odometry, Listener())
     assert isinstance(source.ended, AppError)
     assert str(source.ended) == (
         "odometry from the test: no more line for 10 s; is its sender running?"

@@ -9,9 +9,9 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from hil_tests.unit.slam.app.sessions import FRAME_NS, scan, session_info, snapshot
+from hil_tests.unit.slam.app.sessions import FRAME_NS, Listener, scan, session_info, snapshot
 from slam.app.odometry.track import OdometryTrack, TumSample
-from slam.app.records import LogLine, Scan, SessionObserver, Snapshot
+from slam.app.records import LogLine
 from slam.app.run.output import Progress
 from slam.app.run.runner import LinkStates, run_slam, unknown_truth
 from slam.frames import RadarFrame
@@ -50,18 +50,6 @@ class LateSlam:
         return np.array([[[0.0, 1.0], [2.0, 1.0]]])
 
 
-class Listener(SessionObserver):
-    def __init__(self) -> None:
-        self.scans: list[int] = []
-        self.snapshots: list[Snapshot] = []
-
-    def on_scan(self, scan: Scan) -> None:
-        self.scans.append(scan.counter)
-
-    def on_snapshot(self, snapshot: Snapshot) -> None:
-        self.snapshots.append(snapshot)
-
-
 def truth_at(stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
     counters = stamps_ns / FRAME_NS
     return np.column_stack([counters, 100 - counters, 0.1 * counters])
@@ -80,7 +68,7 @@ def test_every_state_comes_with_its_own_counter_truth_and_place() -> None:
         truth_at,
         [listener],
     )
-    assert tuple(listener.scans) == COUNTERS
+    assert tuple(scan.counter for scan in listener.scans) == COUNTERS
     assert tuple(snapshot.counter for snapshot in listener.snapshots) == COUNTERS
     assert len(record.results) == len(COUNTERS)
     np.testing.assert_allclose(record.world_from_map, [5.0, 95.0, 0.5])
@@ -102,7 +90,7 @@ def test_an_unused_scan_is_told_and_not_stepped() -> None:
     scans = [replace(scan(counter), used=counter not in (5, 8)) for counter in COUNTERS]
     slam = cast(UwbRadarSlam, LateSlam())
     record = run_slam(scans, OdometryTrack(ends), slam, unknown_truth, [listener])
-    assert tuple(listener.scans) == COUNTERS
+    assert tuple(scan.counter for scan in listener.scans) == COUNTERS
     assert [snapshot.counter for snapshot in listener.snapshots] == [6, 11, 12]
     assert record.n_frames == 2 * 3
     np.testing.assert_array_equal(record.world_from_map, np.zeros(3))
