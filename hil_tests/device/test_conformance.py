@@ -28,19 +28,19 @@ def emulator() -> RadarUnderTest:
 def test_every_answer_is_the_emulators(
     request: pytest.FixtureRequest, radar_place: RadarUnderTest, measure: Measure
 ) -> None:
-    choices = request.config.stash[CHOICES]
-    if not choices.diff:
+    if not request.config.getoption("hil_diff"):
         leave_out(request, f"{radar_place.spec.name}: asked and compared only with --hil-diff")
     questions = Cassette.read(EMULATED).exchanges
     answers = ask_all(radar_place.take_line(), radar_place.place.clock_ns, questions)
-    if choices.cassette is not None:
+    cassette = request.config.stash[CHOICES].cassette
+    if cassette is not None:
         recorded = {
             "identity": radar_place.identity,
             "reached": radar_place.place.description,
             "real_module": "hardware" in radar_place.place.capabilities,  # as the user says
             "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         }
-        Cassette(recorded=recorded, exchanges=answers).write(choices.cassette)
+        Cassette(recorded=recorded, exchanges=answers).write(cassette)
     emulated = emulator()
     expected = ask_all(emulated.take_line(), emulated.place.clock_ns, questions)
     found = differences(answers, expected)

@@ -6,7 +6,6 @@ import os
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import pytest
 
@@ -20,7 +19,7 @@ RIG_ENVIRONMENT, RIG_INI = "XETHRU_RIG", "xethru_rig"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Choices:
-    """Options of the session; `add_options` documents them.
+    """Radars and paths of the session; the other options are read where they are used.
 
     ``chosen`` is false if the radars are the default, one `emu`.
     """
@@ -28,13 +27,7 @@ class Choices:
     specs: tuple[RadarSpec, ...]
     chosen: bool
     rig: Path | None
-    strict: bool
-    slow: bool
-    flash: bool
-    factory: bool
-    diff: bool
     cassette: Path | None
-    keep: Literal["failed", "all", "none"]
     artifacts: Path
     json: Path | None
 
@@ -115,13 +108,7 @@ def choose(config: pytest.Config) -> Choices:
         specs=specs,
         chosen=bool(chosen),
         rig=Path(rig) if rig else None,
-        strict=config.getoption("hil_strict"),
-        slow=config.getoption("hil_slow"),
-        flash=config.getoption("allow_flash"),
-        factory=config.getoption("allow_factory_reset"),
-        diff=config.getoption("hil_diff"),
         cassette=Path(cassette) if cassette else None,
-        keep=config.getoption("hil_keep"),
         artifacts=Path(config.invocation_params.dir, config.getoption("hil_artifacts")),
         json=Path(config.invocation_params.dir, report) if report else None,
     )

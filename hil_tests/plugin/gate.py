@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import pytest
 
-from hil_tests.plugin.choices import CHOICES
-
 if TYPE_CHECKING:
     from hil_tests.plugin.bench import Bench, RadarUnderTest
 
@@ -166,7 +164,7 @@ def lacking(request: pytest.FixtureRequest, names: Sequence[str], reason: str) -
     """Skip a test because something is missing; under ``--hil-strict`` fail it."""
     findings = findings_of(request.node)
     findings.names, findings.reason = names, reason
-    if request.config.stash[CHOICES].strict:
+    if request.config.getoption("hil_strict"):
         pytest.fail(f"--hil-strict: {reason}", pytrace=False)
     pytest.skip(reason)
 
@@ -199,16 +197,16 @@ def _check_capabilities(request: pytest.FixtureRequest, radar: RadarUnderTest) -
 
 def _check_permissions(request: pytest.FixtureRequest, radar: RadarUnderTest) -> None:
     item: pytest.Item = request.node
-    choices = request.config.stash[CHOICES]
+    option = request.config.getoption
     name = radar.spec.name
     if not radar.spec.emulated:
-        if item.get_closest_marker("writes_flash") and not choices.flash:
+        if item.get_closest_marker("writes_flash") and not option("allow_flash"):
             leave_out(request, f"{name}: writes the module's flash; --allow-flash lets it")
-        if item.get_closest_marker("writes_factory_settings") and not choices.factory:
+        if item.get_closest_marker("writes_factory_settings") and not option("allow_factory_reset"):
             leave_out(
                 request, f"{name}: resets the module's settings; --allow-factory-reset lets it"
             )
     slow = item.get_closest_marker("slow_hw")
-    if slow is not None and not radar.place.virtual and not choices.slow:
+    if slow is not None and not radar.place.virtual and not option("hil_slow"):
         seconds = slow.kwargs.get("seconds", "many")
         leave_out(request, f"{name}: takes {seconds} s in real time; --hil-slow runs it")

@@ -111,7 +111,7 @@ def pytest_report_header(config: pytest.Config) -> str | None:
     choices = config.stash[CHOICES]
     if not choices.chosen:
         return None
-    strict = ", strict" if choices.strict else ""
+    strict = ", strict" if config.getoption("hil_strict") else ""
     return f"radars: {', '.join(spec.text for spec in choices.specs)}{strict}"
 
 
@@ -173,7 +173,7 @@ def pytest_runtest_makereport(
         return report
     if report.failed:
         findings.failures.append(f"{call.when}: {report.longreprtext}")
-    keep = item.config.stash[CHOICES].keep
+    keep = item.config.getoption("hil_keep")
     if findings.radars and findings.reason is None and keep != "none":
         # after the call, while the drivers are open; after a teardown that fails, once more
         last = report.when == "call" or (report.failed and report.when in {"setup", "teardown"})

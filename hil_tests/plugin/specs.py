@@ -21,7 +21,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 from typing import Literal
@@ -106,23 +106,17 @@ def parse_specs(texts: Iterable[str]) -> tuple[RadarSpec, ...]:
     """
     specs: list[RadarSpec] = []
     for text in texts:
-        spec = _parse(text)
+        body, _, query = text.strip().partition("?")
+        kind, target = _kind(body)
+        options = _query(text, query, _OPTIONS[kind])
+        _check(text, kind, options)
         taken = {other.name for other in specs}
-        name, number = spec.name, 2
+        name = plain = _name(kind, target, options)
+        number = 2
         while name in taken:
-            name, number = f"{spec.name}-{number}", number + 1
-        specs.append(replace(spec, name=name))
+            name, number = f"{plain}-{number}", number + 1
+        specs.append(RadarSpec(text=text, kind=kind, target=target, options=options, name=name))
     return tuple(specs)
-
-
-def _parse(text: str) -> RadarSpec:
-    body, _, query = text.strip().partition("?")
-    kind, target = _kind(body)
-    options = _query(text, query, _OPTIONS[kind])
-    _check(text, kind, options)
-    return RadarSpec(
-        text=text, kind=kind, target=target, options=options, name=_name(kind, target, options)
-    )
 
 
 def _kind(body: str) -> tuple[Kind, str]:

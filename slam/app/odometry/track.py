@@ -137,14 +137,10 @@ def read_tum(path: Path) -> Trajectory:
             raise TumError(f"{path}, line {number}: its time is not after the line before")
     if not samples:
         raise TumError(f"{path}: holds no pose")
-    return trajectory_of(samples)
-
-
-def trajectory_of(samples: Iterable[TumSample]) -> Trajectory:
-    rows = [(s.t_ns, s.x_m, s.y_m, s.heading_rad) for s in samples]
+    rows = [(sample.x_m, sample.y_m, sample.heading_rad) for sample in samples]
     return Trajectory(
-        stamps_ns=np.array([row[0] for row in rows], dtype=np.int64),
-        poses=np.array([row[1:] for row in rows], dtype=np.float64).reshape(-1, 3),
+        stamps_ns=np.array([sample.t_ns for sample in samples], dtype=np.int64),
+        poses=np.array(rows, dtype=np.float64),
     )
 
 

@@ -106,7 +106,25 @@ def blueprint(info: SessionInfo) -> rrb.Blueprint:
         rrb.Horizontal(
             rrb.Vertical(_map_view(info), _numbers(info), row_shares=[5, 2]),
             _echoes(names),
-            rrb.Vertical(_texts(), _links(), row_shares=[5, 2]),
+            rrb.Vertical(
+                rrb.Tabs(
+                    rrb.TextDocumentView(name="What you see", origin="/about"),
+                    rrb.TextLogView(name="Log", origin="/link/log"),
+                    rrb.TextDocumentView(name="Radars", origin="/radars"),
+                ),
+                rrb.Tabs(
+                    rrb.StateTimelineView(
+                        name="Links", origin="/link/state", time_view=_whole_run()
+                    ),
+                    rrb.TimeSeriesView(
+                        name="Lost frames, faults",
+                        origin="/link",
+                        contents=["$origin/lost/**", "$origin/faults/**"],
+                        axis_x=_whole_run(),
+                    ),
+                ),
+                row_shares=[5, 2],
+            ),
             column_shares=[4, 3, 3],
         ),
         rrb.BlueprintPanel(state="collapsed"),
@@ -172,26 +190,6 @@ def _whole_run() -> rrb.TimeAxis:
         start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite()
     )
     return rrb.TimeAxis(view_range=everything)
-
-
-def _texts() -> rrb.Tabs:
-    return rrb.Tabs(
-        rrb.TextDocumentView(name="What you see", origin="/about"),
-        rrb.TextLogView(name="Log", origin="/link/log"),
-        rrb.TextDocumentView(name="Radars", origin="/radars"),
-    )
-
-
-def _links() -> rrb.Tabs:
-    return rrb.Tabs(
-        rrb.StateTimelineView(name="Links", origin="/link/state", time_view=_whole_run()),
-        rrb.TimeSeriesView(
-            name="Lost frames, faults",
-            origin="/link",
-            contents=["$origin/lost/**", "$origin/faults/**"],
-            axis_x=_whole_run(),
-        ),
-    )
 
 
 _STATE_COLOURS = {

@@ -201,26 +201,24 @@ class Recording:
             if is_file:
                 raise AppError(f"{self._target}: cannot be finished; is the disk full?")
         elif isinstance(self._target, Path):
-            _check_rows(self._target, self.sent)
+            self._check_rows(self._target)
+
+    def _check_rows(self, path: Path) -> None:
+        try:
+            found = count_rows(path)
+        except RuntimeError:  # Rerun's own errors about a damaged file
+            raise AppError(f"{path}: is incomplete; is the disk full?") from None
+        for entity, count in self.sent.items():
+            if found.get(entity, 0) != count:
+                raise AppError(
+                    f"{path}: holds {found.get(entity, 0)} of {count} rows of {entity}; "
+                    "the view is incomplete, the session log is not affected"
+                )
 
     def _open(self) -> rr.RecordingStream:
         if self._stream is None:
             raise ValueError("the view is closed already")
         return self._stream
-
-
-def _check_rows(path: Path, sent: dict[str, int]) -> None:
-    """Require that a finished file holds the rows that were sent; AppError if it does not."""
-    try:
-        found = count_rows(path)
-    except RuntimeError:  # Rerun's own errors about a damaged file
-        raise AppError(f"{path}: is incomplete; is the disk full?") from None
-    for entity, count in sent.items():
-        if found.get(entity, 0) != count:
-            raise AppError(
-                f"{path}: holds {found.get(entity, 0)} of {count} rows of {entity}; "
-                "the view is incomplete, the session log is not affected"
-            )
 
 
 def count_rows(path: Path) -> dict[str, int]:
