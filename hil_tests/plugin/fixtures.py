@@ -20,11 +20,7 @@ _SHARE = 0.8  # of a UART; the rest is for answers
 
 
 def carried_rate_hz(wanted_hz: float, bytes_per_s: float) -> float:
-    """Return the wanted frame rate, or less if a UART carries fewer frames of 1431 bins.
-
-    >>> carried_rate_hz(17.0, math.inf), carried_rate_hz(17.0, 11520.0)
-    (17.0, 1.0)
-    """
+    """Return the wanted frame rate, or less if a UART carries fewer frames of 1431 bins."""
     if math.isinf(bytes_per_s):
         return wanted_hz
     return min(wanted_hz, float(max(math.floor(bytes_per_s * _SHARE / RF_FRAME_BYTES), 1)))

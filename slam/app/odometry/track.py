@@ -48,11 +48,7 @@ class TumSample:
 
     @property
     def heading_rad(self) -> float:
-        """Rotation about the vertical, in (-2 pi, 2 pi]: the twist part of the quaternion.
-
-        >>> TumSample(t_ns=0, x_m=0.0, y_m=0.0, qz=1.0, qw=0.0).heading_rad == math.pi
-        True
-        """
+        """Rotation about the vertical, in (-2 pi, 2 pi]: the twist part of the quaternion."""
         return 2.0 * math.atan2(self.qz, self.qw)
 
 
@@ -254,9 +250,6 @@ def _unwrapping(before_rad: float, after_rad: float) -> float:
     """Return what to add to a heading so that it follows on the one before the short way round.
 
     One step of `numpy.unwrap`, to the last bit.
-
-    >>> _unwrapping(3.0, -3.0) == math.tau, _unwrapping(0.5, 0.25)
-    (True, 0.0)
     """
     turn_rad = after_rad - before_rad
     if abs(turn_rad) < math.pi:

@@ -155,6 +155,7 @@ def test_stamp_has_every_nanosecond_of_the_text() -> None:
     ("qz", "qw", "heading_rad"),
     [
         (0.0, 1.0, 0.0),
+        (1.0, 0.0, math.pi),
         (math.sqrt(0.5), math.sqrt(0.5), math.pi / 2),
         (-0.5, math.sqrt(0.75), -math.pi / 3),
         (0.5, -math.sqrt(0.75), 5 * math.pi / 3),  # q and -q are the same turn
