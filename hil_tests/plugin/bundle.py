@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hil_tests.plugin.bench import RadarUnderTest
-from hil_tests.plugin.gate import Measurement
+from hil_tests.plugin.gate import Findings, Measurement
 from hil_tests.plugin.radar_targets import Way, WireBytes, WireTap
 from xethru_protocol.recordings.mcap import BYTE_ARRAY, SCHEMAS, pack_array
 from xethru_protocol.wire.codec import describe, encode
@@ -35,7 +35,6 @@ from xethru_protocol.wire.messages import BasebandIq, Command, DataFloat, Messag
 
 if TYPE_CHECKING:
     import rerun as rr
-    import rerun.blueprint as rrb
 
 _SHOWN_BYTES = 64
 _LONGEST_NAME = 150
@@ -51,18 +50,13 @@ def folder_name(nodeid: str) -> str:
     return re.sub(r"[^0-9A-Za-z._]+", "-", nodeid).strip("-")[-_LONGEST_NAME:]
 
 
-def write_bundle(
-    folder: Path,
-    radars: Sequence[RadarUnderTest],
-    *,
-    about: Mapping[str, Any],
-    failure: str,
-    measurements: Sequence[Measurement],
-) -> None:
+def write_bundle(folder: Path, findings: Findings, about: Mapping[str, Any]) -> None:
     """Write the folder of one test, replacing the files of an earlier run."""
     folder.mkdir(parents=True, exist_ok=True)
     for old in ("log.txt", "wire.mcap", "about.json", "scene.toml", "session.rrd"):
         (folder / old).unlink(missing_ok=True)
+    radars, measurements = findings.radars, findings.measurements
+    failure = "\n\n".join(findings.failures) or "none"
     taps = {radar.spec.name: radar.tap for radar in radars}
     (folder / "log.txt").write_text(_log(radars, failure), "utf-8")
     (folder / "about.json").write_text(
@@ -188,31 +182,14 @@ def _write_wire(path: Path, taps: Mapping[str, WireTap]) -> None:
 def _write_rrd(
     path: Path, taps: Mapping[str, WireTap], measurements: Sequence[Measurement], failure: str
 ) -> None:
-    """Write the view for Rerun; times are those of the driver's clock.
-
-    Imports Rerun here, which takes half a second.
-    """
-    import rerun as rr
-
-    recording = rr.RecordingStream("xethru_hil_test")
-    recording.set_log_time_enabled(False)
-    recording.save(path, default_blueprint=_blueprint(list(taps)))
-    with recording:  # what is logged behind the block would be lost
-        for name, tap in taps.items():
-            _log_wire(recording, name, tap)
-        for measurement in measurements:
-            recording.log(f"measurements/{measurement.name}", rr.Scalars([measurement.value]))
-            recording.log("log/measurements", rr.TextLog(f"{measurement.name}: {measurement.text}"))
-        recording.log("log/failure", rr.TextLog(failure, level=rr.TextLogLevel.ERROR))
-
-
-def _blueprint(names: Sequence[str]) -> rrb.Blueprint:
+    """Write the view for Rerun; times are those of the driver's clock."""
+    import rerun as rr  # half a second
     import rerun.blueprint as rrb
 
     scans = [
-        rrb.TensorView(name=name, origin=f"/radar/{name}/bscan", view_fit="fill") for name in names
+        rrb.TensorView(name=name, origin=f"/radar/{name}/bscan", view_fit="fill") for name in taps
     ]
-    return rrb.Blueprint(
+    blueprint = rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(*scans) if scans else rrb.TextLogView(origin="/log"),
             rrb.TextLogView(name="messages", origin="/log"),
@@ -222,6 +199,16 @@ def _blueprint(names: Sequence[str]) -> rrb.Blueprint:
         rrb.TimePanel(state="expanded", timeline="time"),
         auto_views=False,
     )
+    recording = rr.RecordingStream("xethru_hil_test")
+    recording.set_log_time_enabled(False)
+    recording.save(path, default_blueprint=blueprint)
+    with recording:  # what is logged behind the block would be lost
+        for name, tap in taps.items():
+            _log_wire(recording, name, tap)
+        for measurement in measurements:
+            recording.log(f"measurements/{measurement.name}", rr.Scalars([measurement.value]))
+            recording.log("log/measurements", rr.TextLog(f"{measurement.name}: {measurement.text}"))
+        recording.log("log/failure", rr.TextLog(failure, level=rr.TextLogLevel.ERROR))
 
 
 def _log_wire(recording: rr.RecordingStream, name: str, tap: WireTap) -> None:

@@ -196,13 +196,7 @@ def _keep(item: pytest.Item, findings: Findings, report: pytest.TestReport) -> N
         ),
     }
     try:
-        write_bundle(
-            folder,
-            findings.radars,
-            about=about,
-            failure="\n\n".join(findings.failures) or "none",
-            measurements=findings.measurements,
-        )
+        write_bundle(folder, findings, about)
     except Exception as error:  # the failure of the test is reported in any case
         report.sections.append(("radar artefacts", f"{folder}: incomplete: {error!r}"))
         return
