@@ -494,13 +494,8 @@ class PlayedChip(Chip):
 class PlayedRadar:
     """One radar of a recording, played by a module of its own.
 
-    Attributes
-    ----------
-    name
-        What its port is called: its name in the recording where there are several radars and all
-        names are plain ones, else ``player`` or ``radar0``, ``radar1`` and so on.
-    serial
-        Serial number it answers with: the recorded one where that is known.
+    Its port is called as in the recording where there are several radars and all names are plain
+    ones, else ``player`` or ``radar0``, ``radar1`` and so on.
     """
 
     name: str

@@ -168,12 +168,6 @@ class Armed:
             return False
         return spec.probability >= 1 or self.rng.chance(spec.probability)
 
-    def next_ns(self, time_ns: int) -> int | None:
-        """Return when time alone makes it due, on the scenario's clock; None if never."""
-        if self.target is not Target.MOMENT or self.over(time_ns):
-            return None
-        return round(self.spec.at_s * NS_PER_S)
-
 
 def _is_command(command: Command[Response] | None, wanted: str | int) -> bool:
     if command is None:
@@ -258,6 +252,8 @@ class Watch:
         Of the last radar frame; None before the first.
     previous_frame
         The radar frame before the last one, as bytes.
+    unjudged
+        Bytes from the host that may become a command.
     """
 
     def __init__(self) -> None:
@@ -268,7 +264,7 @@ class Watch:
         self._lattice: Lattice | None = None
         self._pending: deque[tuple[Command[Response], bool]] = deque(maxlen=_MOST_PENDING)
         self._reader = PacketReader(Direction.FROM_HOST)
-        self._unjudged = bytearray()
+        self.unjudged = bytearray()
 
     @property
     def lattice(self) -> Lattice | None:
@@ -282,23 +278,18 @@ class Watch:
                 self._settings.clear()  # until others are set
         return self._lattice
 
-    @property
-    def incomplete_command(self) -> bytes:
-        """Bytes from the host that are not judged yet."""
-        return bytes(self._unjudged)
-
     def host_pieces(self, data: bytes) -> list[tuple[bytes, Command[Response] | None]]:
         """Cut bytes of the host into commands and others; an incomplete command waits for more.
 
         With each piece comes the command that it is, None for damaged ones.
         """
-        self._unjudged += data
+        self.unjudged += data
         self._reader.receive_data(data)
         pieces = []
         while not isinstance(found := self._reader.next_packet(), NeedData):
-            end = len(self._unjudged) - self._reader.buffered
-            piece = bytes(self._unjudged[:end])
-            del self._unjudged[:end]
+            end = len(self.unjudged) - self._reader.buffered
+            piece = bytes(self.unjudged[:end])
+            del self.unjudged[:end]
             command = decode_command(found.payload) if isinstance(found, Packet) else None
             if piece or command is not None:
                 pieces.append((piece, command))
@@ -458,7 +449,7 @@ class FaultyDevice:
                 self._watch.command_sent(command)
             if holds:
                 self.inner.receive_data(fresh, now_ns)
-        rest = self._watch.incomplete_command
+        rest = bytes(self._watch.unjudged)
         if not holds:
             self.inner.receive_data(data, now_ns)
             begun = len(rest)
@@ -529,13 +520,17 @@ class FaultyDevice:
         return None
 
     def wake_ns(self, now_ns: int) -> int | None:
-        moments = [armed.next_ns(now_ns - self._zero_ns) for armed in self.armed]
+        moments = [
+            self._zero_ns + round(armed.spec.at_s * NS_PER_S)
+            for armed in self.armed
+            if armed.target is Target.MOMENT and not armed.over(now_ns - self._zero_ns)
+        ]
         candidates = [
             self.inner.wake_ns(now_ns),
             self._again_ns,
             self._back_ns,
             self._queue.wake_ns(),
-            *(self._zero_ns + moment_ns for moment_ns in moments if moment_ns is not None),
+            *moments,
             *(due_ns for due_ns, _ in self._actions),
         ]
         return min((due_ns for due_ns in candidates if due_ns is not None), default=None)
@@ -554,7 +549,9 @@ class FaultyDevice:
                 return None
         self._watch.sent(packet, packet_class)
         if self._cut_next is not None and packet_class is PacketClass.FRAME:
-            return self._cut_off(packet, self._cut_next, now_ns)
+            cut, self._cut_next = self._cut_next, None
+            self._actions.append((now_ns, Unplug(cut.away_ns)))
+            return packet[: max(round(len(packet) * cut.part_of_frame), 1)]
         if not self.armed and not self._queue:
             return packet
         opportunity = Opportunity(
@@ -599,12 +596,6 @@ class FaultyDevice:
                 armed.packets_since += 1
         self._disarm_what_is_over(now_ns)
         return pieces
-
-    def _cut_off(self, packet: bytes, cut: Unplug, now_ns: int) -> bytes:
-        part = packet[: max(round(len(packet) * cut.part_of_frame), 1)]
-        self._cut_next = None
-        self._actions.append((now_ns, Unplug(cut.away_ns)))
-        return part
 
     # --- moments --------------------------------------------------------------------------------
 

@@ -56,14 +56,14 @@ class DeviceSide:
 
 
 class Plug(Service):
-    """Takes the lines to one module away and brings them back: a service of the loop.
+    """Takes the lines to one module away and brings them back.
 
     Parameters
     ----------
     present
         Whether the module's own port is there at a time, ns.
     tcp
-        Its TCP port; a client is hung up on, and none admitted before the module is back.
+        A client of it is hung up on, and none admitted before the module is back.
     renames
         Whether it returns under another name every time: NAME-2, NAME-3 and so on, so that a host
         finds the module by its serial number only.

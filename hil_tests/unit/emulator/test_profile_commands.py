@@ -92,8 +92,12 @@ def test_zone_limits_and_defaults() -> None:
     assert limits == m.ReplyFloat(content_id=0x96A10A1D, values=expected)
     assert host.ask(m.GetSensitivity()) == m.ReplyInt(content_id=0x10A5112B, values=(5,))
     assert host.ask(m.GetTxCenterFrequency()) == m.ReplyInt(content_id=0x71AF2A2B, values=(3,))
-    assert host.ask(m.AppGetLedControl()) == m.ReplyByte(content_id=0x71AF2A2C, values=b"\x02")
+    assert host.ask(m.AppGetLedControl()) == led(2)
     assert host.ask(m.NoiseMapGetControl()) == m.ReplyInt(content_id=0x11, values=(7,))
+
+
+def led(mode: int) -> m.ReplyByte:
+    return m.ReplyByte(content_id=0x71AF2A2C, values=bytes((mode,)))
 
 
 SETS: list[tuple[m.Command[m.Ack], m.Command[m.Response], m.Response]] = [
@@ -102,16 +106,8 @@ SETS: list[tuple[m.Command[m.Ack], m.Command[m.Response], m.Response]] = [
         m.GetTxCenterFrequency(),
         m.ReplyInt(content_id=0x71AF2A2B, values=(4,)),
     ),
-    (
-        m.AppSetLedControl(mode=1, intensity=50),
-        m.AppGetLedControl(),
-        m.ReplyByte(content_id=0x71AF2A2C, values=b"\x01"),
-    ),
-    (
-        m.SetLedControl(mode=0),
-        m.AppGetLedControl(),
-        m.ReplyByte(content_id=0x71AF2A2C, values=b"\x00"),
-    ),
+    (m.AppSetLedControl(mode=1, intensity=50), m.AppGetLedControl(), led(1)),
+    (m.SetLedControl(mode=0), m.AppGetLedControl(), led(0)),
     (
         m.NoiseMapSetControl(control=3),
         m.NoiseMapGetControl(),

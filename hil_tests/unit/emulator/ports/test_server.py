@@ -93,15 +93,6 @@ def terminal(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bench]:
         yield made
 
 
-def test_commands_are_answered(bench: Bench) -> None:
-    host = bench.host(1)
-    assert host.ask(m.Ping()) == PONG
-
-
-def test_commands_are_answered_through_a_terminal(terminal: Bench) -> None:
-    assert terminal.host(0).ask(m.Ping()) == PONG
-
-
 def test_nothing_is_lost_when_the_host_reads_slowly(asap: Bench) -> None:
     host = asap.host(0)
     host.stream()
