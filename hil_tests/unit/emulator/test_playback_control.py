@@ -325,8 +325,4 @@ def test_an_info_that_makes_no_sense_costs_only_itself(tmp_path: Path) -> None:
 
 def test_a_start_behind_the_end_is_refused() -> None:
     with pytest.raises(RecordingError, match=r"is over after \d+\.\d\d\d s"):
-        played_radars(
-            FIXTURES / "recordings" / "iq",
-            from_ns=10**15,
-            on_fault=lambda fault: None,
-        )
+        played_radars(FIXTURES / "recordings" / "iq", from_ns=10**15, on_fault=lambda fault: None)
