@@ -128,28 +128,6 @@ class Association:
         return float(self.mahalanobis_sq[self.candidate_ids.index(self.landmark_id)])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MapLandmark:
-    """One landmark of the map."""
-
-    landmark_id: int
-    position_m: Array  # shape (2,)
-    covariance: Array  # shape (2, 2)
-    hits: int  # the frames that hit it
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MapWall:
-    """One wall of the map: the line n . x = d, n = [cos phi, sin phi], and its known parts."""
-
-    # Direction of its normal, away from the robot, and distance along it from the origin
-    phi_rad: float
-    d_m: float
-    covariance: Array  # shape (2, 2), of (phi, d), additive errors
-    spans_m: Array  # shape (k, 2, 2): ends of the stretches that answered, map frame [m]
-    hits: int  # the frames that hit it
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictedRange:
     """A range that could have continued a track, as predicted before any was looked at."""
@@ -173,23 +151,16 @@ class UpdateReport:
 
     # (radar, index of the range in its scan, landmark id)
     continued: tuple[tuple[int, int, int], ...]
-    # Ids of landmarks that tracklets made, or were recognised as
-    initialised: tuple[int, ...]
-    seen_again: tuple[int, ...]
-    merged: tuple[tuple[int, int], ...]  # (kept, gone) ids
-    deleted: tuple[int, ...]  # ids
     # Normalised innovation squared of the ranges that continued tracks, before Huber's weights, and
     # its degrees of freedom
     nis: float
     dof: int
-    relinearised: bool  # whether all poses were solved for
     # Every range of a landmark, not of walls, that took part, measured or not
     predicted: tuple[PredictedRange, ...] = ()
     # Whether a kidnapping was detected now; whether the place on the map is unknown, so that pose
-    # and covariance say nothing but that; whether the place was found again now
+    # and covariance say nothing but that
     carried: bool = False
     lost: bool = False
-    relocated: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -311,10 +311,6 @@ def fit_echoes(
     n_bins = len(samples)
     sigma = pulse.envelope_sigma_bins
     first, last = search_bins or (1.5 * sigma, n_bins - 1 - 1.5 * sigma)
-    if not 0 <= first <= last <= n_bins - 1:
-        raise ValueError(f"echoes cannot be searched in bins {first} ... {last} of {n_bins}")
-    if not noise_sigma > 0:
-        raise ValueError("the noise of a window must be more than 0")
     angle = pulse.carrier_rad_per_bin * np.arange(n_bins)
     weight = np.ones(n_bins) if usable is None else usable.astype(np.float64)
     data = Window(

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from slam.geometry import Rig
-from slam.results import MapLandmark, MapWall, PredictedRange, UpdateReport
+from slam.results import PredictedRange, UpdateReport
 from slam.robust.association import (
     Antennas,
     Continuation,
@@ -116,18 +116,6 @@ class RobustBackEnd:
             return self._localisation.lost_covariance
         return self.state.pose_covariance()
 
-    def landmarks(self) -> tuple[MapLandmark, ...]:
-        state, rows = self.state, self.reported_rows()
-        return tuple(
-            MapLandmark(
-                landmark_id=state.landmark_ids[row],
-                position_m=point_m,
-                covariance=state.landmark_covariance(row),
-                hits=self._existence.hits(state.landmark_ids[row]),
-            )
-            for row, point_m in zip(rows, state.landmarks_m[rows], strict=True)
-        )
-
     def reported_rows(self) -> list[int]:
         """Return the rows of landmarks hit often enough; of a submap, none."""
         old_map, lost = self._localisation.old_map, self._localisation.is_lost
@@ -137,12 +125,14 @@ class RobustBackEnd:
             if self._existence.is_reported(id_) and (id_ in old_map or not lost)
         ]
 
-    def walls(self) -> tuple[MapWall, ...]:
-        return tuple(
-            self._walls.reported(row, self._existence.hits(id_))
+    def wall_spans_m(self) -> Array:
+        """Return the ends of the reported stretches of wall, (k, 2, 2) [m], map frame."""
+        spans = [
+            self._walls.spans_m(row)
             for row, id_ in enumerate(self.state.wall_ids)
             if self._existence.is_reported(id_)
-        )
+        ]
+        return np.concatenate([np.empty((0, 2, 2)), *spans])
 
     def predict(self, increment: Array, covariance: Array | None = None) -> None:
         """Move by an odometry increment: dx, dy [m], turn [rad] in the body frame before it.
@@ -159,7 +149,6 @@ class RobustBackEnd:
         """Take in the scans of one time; a radar without a frame is absent, not empty."""
         antennas = antennas_of(self.rig, scans, self.state.calibration)
         self._silent = np.where(antennas.has_frame, 0, self._silent + 1)
-        was_lost = self._localisation.is_lost
         widened = [
             scan.with_added_sigma(self.parameters.ranges.association_sigma_m) for scan in scans
         ]
@@ -171,25 +160,18 @@ class RobustBackEnd:
             self._unassigned.clear()
         used = {(radar, index) for radar, index, _ in continued}
         self._unassigned.keep(self._log.n_poses - 1, antennas, widened, used)
-        initialised, seen_again = self._initialise_landmarks()
-        deleted = self._delete_vanished()
-        merged = self._merge()
-        lost = self._localisation.is_lost
-        relinearised = self._smooth_if_due()
+        self._initialise_landmarks()
+        self._delete_vanished()
+        self._merge()
+        self._smooth_if_due()
         self._log.set_causal(self.state.pose)
         return UpdateReport(
             continued=continued,
-            initialised=initialised,
-            seen_again=seen_again,
-            merged=merged,
-            deleted=deleted,
             nis=nis,
             dof=len(continued),
-            relinearised=relinearised,
             predicted=tuple(matches.predicted),
             carried=carried,
-            lost=lost,
-            relocated=was_lost and not lost,
+            lost=self._localisation.is_lost,
         )
 
     def update_points(
@@ -242,16 +224,13 @@ class RobustBackEnd:
     def _is_located(self) -> bool:
         return not (self._localisation.is_lost or self._localisation.surprise.is_suspicious)
 
-    def _smooth_if_due(self) -> bool:
-        """Give landmarks their radii and solve for all poses; return whether that worked."""
-        relinearised = False
-        if self._is_located():
-            relinearised = self._roundness.give(
-                self.state, self._log, self.parameters, self._existence
-            )
-        if relinearised or is_due(self._log, self.state, self.parameters):
-            relinearised |= self.relinearise()
-        return relinearised
+    def _smooth_if_due(self) -> None:
+        """Give landmarks their radii and solve for all poses."""
+        gave_radii = self._is_located() and self._roundness.give(
+            self.state, self._log, self.parameters, self._existence
+        )
+        if gave_radii or is_due(self._log, self.state, self.parameters):
+            self.relinearise()
 
     def _associate(
         self, scans: Sequence[RangeScan], widened: Sequence[RangeScan], antennas: Antennas
@@ -354,15 +333,10 @@ class RobustBackEnd:
         state.update(rows.at, rows.H, innovations_m, variances)
         return continued, nis
 
-    def _initialise_landmarks(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Make tracklets of unassigned ranges; each becomes a landmark or updates one.
-
-        Returns the ids of new landmarks and walls, and of those seen again.
-        """
+    def _initialise_landmarks(self) -> None:
+        """Make tracklets of unassigned ranges; each becomes a landmark or updates one."""
         state, rule = self.state, self.parameters.tracklets
         newest = self._unassigned.newest()
-        new: list[int] = []
-        again: list[int] = []
         for side in self._sides:
             # A radar without frames for long takes no part.
             radars = [radar for radar in side if self._silent[radar] <= rule.partner_silence]
@@ -379,10 +353,9 @@ class RobustBackEnd:
                 continue
             lost = self._localisation.is_lost
             for wall in () if lost else self._walls.find(self._unassigned, radars):
-                placed = self._walls.place(wall)
-                if placed is not None:
-                    self._use(placed[0], wall.members)
-                    (new if placed[1] else again).append(placed[0])
+                wall_id = self._walls.place(wall)
+                if wall_id is not None:
+                    self._use(wall_id, wall.members)
             offsets = np.arange(state.offsets.start, state.offsets.stop)
             tracker = Tracker(self.parameters, state.offsets_m, state.P.block(offsets))
             n_radars = min(len(radars), 2)
@@ -390,12 +363,10 @@ class RobustBackEnd:
             for tracklet in find_tracklets(
                 tracker, guesses, frames, n_radars, rule, is_point=is_point
             ):
-                landmark_id, is_new = self._place(tracklet)
-                (new if is_new else again).append(landmark_id)
-        return tuple(new), tuple(again)
+                self._place(tracklet)
 
-    def _place(self, tracklet: Tracklet) -> tuple[int, bool]:
-        """Bring a tracklet into the map; return the landmark's id and whether it is new."""
+    def _place(self, tracklet: Tracklet) -> None:
+        """Bring a tracklet into the map."""
         state = self.state
         point = tracklet.body_point()
         if tracklet.label is not None:
@@ -411,7 +382,6 @@ class RobustBackEnd:
             landmark_id = state.landmark_ids[row]
             update_with_point(state, row, point)
         self._use(landmark_id, tracklet.members)
-        return landmark_id, row is None
 
     def _use(self, landmark_id: int, members: Sequence[Member]) -> None:
         """Count and log the ranges of a tracklet as those of a landmark or a wall."""
@@ -428,9 +398,9 @@ class RobustBackEnd:
                 alone=member.measured.alone,
             )
 
-    def _delete_vanished(self) -> tuple[int, ...]:
+    def _delete_vanished(self) -> None:
         if self._localisation.surprise.is_suspicious:
-            return ()
+            return
         vanished = self._existence.lost()
         for landmark_id in vanished:
             self._walls.cells.forget(landmark_id)
@@ -438,18 +408,15 @@ class RobustBackEnd:
         if vanished:
             kept = self._landmark_of_label.items()
             self._landmark_of_label = {label: id_ for label, id_ in kept if id_ not in vanished}
-        return tuple(vanished)
 
-    def _merge(self) -> tuple[tuple[int, int], ...]:
-        """Merge landmarks, or a submap with the old map, where that is certain; (kept, gone)."""
+    def _merge(self) -> None:
+        """Merge landmarks, or a submap with the old map, where that is certain."""
         self._n_updates += 1
         rule = self.parameters.map
         if self._landmark_of_label or self._n_updates % rule.merge_every:
-            return ()
+            return
         localisation = self._localisation
-        if localisation.is_lost and (
-            joined := localisation.find(self.state, self._existence, self._log)
-        ):
+        if localisation.is_lost and localisation.join(self.state, self._existence, self._log):
             self.relinearise()
-            return joined
-        return merge_landmarks(self.state, self._existence, self._log, rule, localisation.old_map)
+        else:
+            merge_landmarks(self.state, self._existence, self._log, rule, localisation.old_map)

@@ -43,7 +43,6 @@ from slam.robust.smoother import relinearise
 from slam.robust.state import (
     HEADING,
     Array,
-    Indices,
     State,
     SymmetricMatrix,
     quarter_turn,
@@ -289,7 +288,10 @@ def _aligned(state: State, pairs: tuple[tuple[int, int], ...]) -> tuple[Array, A
     there = np.array([pair[0] for pair in pairs])
     here = np.array([pair[1] for pair in pairs])
     points, targets = state.landmarks_m[here], state.landmarks_m[there]
-    P = _additive_block(state, np.concatenate([here, there]))
+    rows = np.concatenate([here, there])
+    at = np.concatenate([[HEADING], state.landmark_columns(rows)])
+    T = np.hstack([quarter_turn(state.landmarks_m[rows]).reshape(-1, 1), np.eye(2 * len(rows))])
+    P = np.asarray(T @ state.P.block(at) @ T.T)
     k = 2 * len(pairs)
     motion = align_se2(points, targets)
     for _ in range(5):
@@ -309,14 +311,6 @@ def _aligned(state: State, pairs: tuple[tuple[int, int], ...]) -> tuple[Array, A
             break
     residual = (transform(motion, points) - targets).ravel()
     return motion, residual, S, N
-
-
-def _additive_block(state: State, rows: Indices) -> Array:
-    """Return the covariance of additive errors of landmarks, shape (2 k, 2 k)."""
-    at = np.concatenate([[HEADING], state.landmark_columns(rows)])
-    P = state.P.block(at)
-    T = np.hstack([quarter_turn(state.landmarks_m[rows]).reshape(-1, 1), np.eye(2 * len(rows))])
-    return np.asarray(T @ P @ T.T)
 
 
 def apply_join(state: State, join: Join, submap: Collection[int], sigma_m: float) -> None:
@@ -397,15 +391,15 @@ class Localisation:
         self._first_pose = log.n_poses - 1
         self.surprise.reset()
 
-    def find(self, state: State, existence: Existence, log: RunLog) -> tuple[tuple[int, int], ...]:
-        """Join the submap with the old map if one join stands out; return (kept, gone) ids."""
+    def join(self, state: State, existence: Existence, log: RunLog) -> bool:
+        """Join the submap with the old map if one join stands out; return whether it does."""
         rules = self.parameters
         rows = [r for r, id_ in enumerate(state.landmark_ids) if existence.is_reported(id_)]
         submap = [r for r in rows if state.landmark_ids[r] not in self.old_map]
         old = [r for r in rows if state.landmark_ids[r] in self.old_map]
         join = find_join(state, submap, old, rules.map, rules.relocation)
         if join is None:
-            return ()
+            return False
         ids = [(state.landmark_ids[kept], state.landmark_ids[gone]) for kept, gone in join.pairs]
         whole = [r for r, id_ in enumerate(state.landmark_ids) if id_ not in self.old_map]
         apply_join(state, join, whole, rules.map.merge_sigma_m)
@@ -416,7 +410,7 @@ class Localisation:
         self.old_map = frozenset()
         self.is_lost = False
         self.surprise.reset()
-        return tuple(ids)
+        return True
 
 
 def forget(id_: int, state: State, existence: Existence, log: RunLog) -> None:
@@ -428,14 +422,13 @@ def forget(id_: int, state: State, existence: Existence, log: RunLog) -> None:
 
 def merge_landmarks(
     state: State, existence: Existence, log: RunLog, rule: MapRule, old_map: frozenset[int]
-) -> tuple[tuple[int, int], ...]:
-    """Make the merge that is certain enough now, if any; return (kept, gone) ids."""
+) -> None:
+    """Make the merge that is certain enough now, if any."""
     merge = find_merge(state, existence, rule, old_map)
     if merge is None:
-        return ()
+        return
     ids = tuple((state.landmark_ids[kept], state.landmark_ids[gone]) for kept, gone in merge.pairs)
     apply_merge(state, merge.pairs, rule.merge_sigma_m)
     for kept, gone in ids:
         existence.merge(kept, gone)
         log.rename(gone, kept)
-    return ids

@@ -381,21 +381,6 @@ def _offset_part(sightings: Sightings) -> tuple[Array, Array, tuple[int, ...]]:
     return part, np.asarray(np.linalg.inv(covariance)), tuple(used)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Arc:
-    """Ranges of one target along one piece of way, in the odometry frame of its first pose."""
-
-    # shapes (k, 2), (k,), (k,); ranges without the offsets known
-    antennas_m: Array
-    ranges_m: Array
-    variances: Array
-    # shape (k, 2, q): d(antenna) / d(scale, curvature, offsets, wheel noise in steps)
-    nuisance: Array
-    by_offset: Array  # shape (k, q): d(range) / d(the same), of the offsets alone
-    prior: Array  # shape (q, q): information about all q
-    start_m: Array  # shape (2,): where the landmark is believed to be
-
-
 @dataclass(frozen=True, slots=True)
 class Radius:
     """A radius [m] and its standard deviation; chi-square and its degrees of freedom."""
@@ -406,10 +391,13 @@ class Radius:
     dof: int
 
 
-def arc_of(
+def radius_of(
     log: RunLog, state: State, landmark_id: int, wheels: WheelNoise, rule: RoundnessRule
-) -> Arc | None:
-    """Return the last ranges of a landmark; None if they are too few."""
+) -> Radius | None:
+    """Return the radius that fits the last ranges of a landmark best; None if they are too few.
+
+    Unknown are the axis, the radius, and q: scale, curvature, offsets and wheel noise in steps.
+    """
     seen = log.sightings(landmark_id, rule.window, state.calibration, rule.most_turn_rad)
     k = len(seen.ranges_m)
     if k < rule.min_ranges:
@@ -438,14 +426,34 @@ def arc_of(
     )
     per_step = np.repeat(white * step_m + 1e-12, _KNOTS)
     prior[known:, known:] = np.diag(1.0 / per_step)
-    return Arc(
-        antennas_m=seen.antennas_m,
-        ranges_m=seen.ranges_m - state.offsets_m[seen.radars],
-        variances=np.square(seen.sigmas_m),
-        nuisance=nuisance,
-        by_offset=by_offset,
-        prior=prior,
-        start_m=transform(seen.newest, transform(between(state.pose, np.zeros(3)), place)),
+    ranges_m, variances = seen.ranges_m - state.offsets_m[seen.radars], np.square(seen.sigmas_m)
+    start_m = transform(seen.newest, transform(between(state.pose, np.zeros(3)), place))
+    unknown = np.concatenate([start_m, np.zeros(1 + len(prior))])
+    for _ in range(_RADIUS_STEPS):
+        q = unknown[3:]
+        away = unknown[:2] - seen.antennas_m - nuisance @ q
+        distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-6)
+        u = away / distance[:, None]
+        residual = ranges_m - (distance - unknown[2] + by_offset @ q)
+        by_q = by_offset - np.einsum("ki,kiq->kq", u, nuisance)
+        J = np.hstack([u, -np.ones((len(u), 1)), by_q])
+        information = (J.T / variances) @ J
+        information[3:, 3:] += prior
+        gradient = (J.T / variances) @ residual
+        gradient[3:] -= prior @ q
+        try:
+            covariance = np.linalg.inv(information)
+        except np.linalg.LinAlgError:
+            return None
+        unknown = unknown + covariance @ gradient
+    if not np.isfinite(unknown).all() or covariance[2, 2] <= 0.0:
+        return None
+    q = unknown[3:]
+    return Radius(
+        radius_m=float(unknown[2]),
+        sigma_m=math.sqrt(float(covariance[2, 2])),
+        chi_square=float(residual @ (residual / variances) + q @ prior @ q),
+        dof=len(residual) - 3,
     )
 
 
@@ -467,37 +475,6 @@ def _moved_by_steps(seen: LoggedSightings, step_m: float) -> Array:
     return np.concatenate([each.transpose(0, 2, 1) for each in (turned, *shifted)], axis=2)
 
 
-def radius_of(arc: Arc) -> Radius | None:
-    """Return the radius that fits best; None where the fit fails."""
-    unknown = np.concatenate([arc.start_m, np.zeros(1 + len(arc.prior))])
-    for _ in range(_RADIUS_STEPS):
-        q = unknown[3:]
-        away = unknown[:2] - arc.antennas_m - arc.nuisance @ q
-        distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-6)
-        u = away / distance[:, None]
-        residual = arc.ranges_m - (distance - unknown[2] + arc.by_offset @ q)
-        moved = arc.by_offset - np.einsum("ki,kiq->kq", u, arc.nuisance)
-        J = np.hstack([u, -np.ones((len(u), 1)), moved])
-        information = (J.T / arc.variances) @ J
-        information[3:, 3:] += arc.prior
-        gradient = (J.T / arc.variances) @ residual
-        gradient[3:] -= arc.prior @ q
-        try:
-            covariance = np.linalg.inv(information)
-        except np.linalg.LinAlgError:
-            return None
-        unknown = unknown + covariance @ gradient
-    if not np.isfinite(unknown).all() or covariance[2, 2] <= 0.0:
-        return None
-    q = unknown[3:]
-    return Radius(
-        radius_m=float(unknown[2]),
-        sigma_m=math.sqrt(float(covariance[2, 2])),
-        chi_square=float(residual @ (residual / arc.variances) + q @ arc.prior @ q),
-        dof=len(residual) - 3,
-    )
-
-
 class Roundness:
     """Gives round landmarks their radii."""
 
@@ -517,8 +494,7 @@ class Roundness:
             if count - self._hits.get(id_, 0) < rule.every or log.is_condensed(id_):
                 continue
             self._hits[id_] = count
-            arc = arc_of(log, state, id_, parameters.wheels, rule)
-            radius = None if arc is None else radius_of(arc)
+            radius = radius_of(log, state, id_, parameters.wheels, rule)
             if radius is None or not self._is_news(id_, radius):
                 continue
             self._sigmas_m[id_] = radius.sigma_m

@@ -59,8 +59,7 @@ class RobustSlam:
         return ()
 
     def wall_spans_m(self) -> Array:
-        walls = self.back_end.walls()
-        return np.concatenate([np.empty((0, 2, 2)), *(wall.spans_m for wall in walls)])
+        return self.back_end.wall_spans_m()
 
     def _take(
         self,

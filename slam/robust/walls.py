@@ -25,7 +25,6 @@ from itertools import combinations, product
 import numpy as np
 
 from slam.geometry import wrap_angle
-from slam.results import MapWall
 from slam.robust.association import Antennas, View
 from slam.robust.initialisation import (
     MEMBER_MARGIN_RAD,
@@ -42,7 +41,7 @@ from slam.robust.initialisation import (
 )
 from slam.robust.map import Sightings, compare, fit_wall
 from slam.robust.parameters import BackEndParameters, RangeNoise, TrackletRule, WallRule
-from slam.robust.state import HEADING, Array, State, rotation
+from slam.robust.state import Array, State, rotation
 
 _PRIOR_RAD = 0.3
 
@@ -363,11 +362,8 @@ class WallKeeper:
         tracker = self._tracker()
         return best_first(tracker, guesses, frames, tracker.is_wall)
 
-    def place(self, tracklet: Tracklet) -> tuple[int, bool] | None:
-        """Bring a wall into the map; return its id and whether it is new.
-
-        None: it is another wall, too near to a mapped one.
-        """
+    def place(self, tracklet: Tracklet) -> int | None:
+        """Bring a wall into the map; return its id, or None if it is too near to another one."""
         state = self._state
         phi, d = tracklet.target
         n = np.array([np.cos(phi), np.sin(phi)])
@@ -379,7 +375,6 @@ class WallKeeper:
             feet_m=antennas + np.outer(d - antennas @ n, n),
         )
         row = match_wall(state, seen, self.cells, self._rule)
-        is_new = row is None
         if row is None:
             if is_unresolved(state, seen, self.cells, self._rule):
                 return None
@@ -390,20 +385,11 @@ class WallKeeper:
             wall_id = state.wall_ids[row]
             update_with_wall(state, row, seen)
         self.cells.add(wall_id, along_wall(state, row, seen.in_map(state)))
-        return wall_id, is_new
+        return wall_id
 
-    def reported(self, row: int, hits: int) -> MapWall:
-        state, wall_id = self._state, self._state.wall_ids[row]
-        phi, d = (float(value) for value in state.walls[row])
+    def spans_m(self, row: int) -> Array:
+        """Return the ends of the known stretches of a wall, shape (k, 2, 2), map frame."""
+        phi, d = (float(value) for value in self._state.walls[row])
         n, t = np.array([np.cos(phi), np.sin(phi)]), np.array([-np.sin(phi), np.cos(phi)])
-        columns = state.landmark_columns(np.array([len(state.landmark_ids) + row]))
-        P = state.P.block(np.concatenate([columns, [HEADING]]))
-        T = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
-        spans = np.array(self.cells.spans_m(wall_id)).reshape(-1, 2)
-        return MapWall(
-            phi_rad=phi,
-            d_m=d,
-            covariance=T @ P @ T.T,
-            spans_m=d * n + spans[:, :, None] * t,
-            hits=hits,
-        )
+        spans = np.array(self.cells.spans_m(self._state.wall_ids[row])).reshape(-1, 2)
+        return np.asarray(d * n + spans[:, :, None] * t)

@@ -141,17 +141,7 @@ def expected(landmark_id: int, x_m: float, y_m: float, *, radar: int = 0) -> Pre
 
 
 def ranged(ranges: list[tuple[int, float]], *told: PredictedRange) -> StepResult:
-    report = UpdateReport(
-        continued=(),
-        initialised=(),
-        seen_again=(),
-        merged=(),
-        deleted=(),
-        nis=0.0,
-        dof=0,
-        relinearised=False,
-        predicted=told,
-    )
+    report = UpdateReport(continued=(), nis=0.0, dof=0, predicted=told)
     seen = [Detection(radar=r, t_ns=0, range_m=z, amplitude=0.01) for r, z in ranges]
     return StepResult(
         t_ns=0,

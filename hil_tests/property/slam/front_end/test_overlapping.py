@@ -258,20 +258,6 @@ def test_threshold_bounds_what_noise_reaches() -> None:
         assert 0.7 * probability - band <= exceeded <= probability + band
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"noise_sigma": 0.0}, "noise of a window must be more than 0"),
-        ({"search_bins": (-1.0, 5.0)}, "cannot be searched in bins"),
-        ({"search_bins": (9.0, 200.0)}, "cannot be searched in bins"),
-    ],
-)
-def test_what_cannot_be_searched_is_refused(wrong: dict[str, float], message: str) -> None:
-    arguments = {"pulse": PULSE, "noise_sigma": 1.0, **wrong}
-    with pytest.raises(ValueError, match=message):
-        fit_echoes(np.zeros(N_BINS), **arguments)  # type: ignore[arg-type]
-
-
 MODEL = PulseModel()
 MODEL_SIGMA = MODEL.sigma_bins(BIN_M)
 MODEL_CARRIER = MODEL.carrier_rad(BIN_M)

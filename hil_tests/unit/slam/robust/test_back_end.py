@@ -22,6 +22,7 @@ from slam.robust.association import RangeScan, sides_of
 from slam.robust.back_end import RobustBackEnd
 from slam.robust.initialisation import RangeBearing
 from slam.robust.parameters import BackEndParameters
+from slam.robust.pipeline import belief_of
 
 SIGMA_M = 7.4e-3
 
@@ -47,7 +48,7 @@ def test_a_lap_of_the_lab_gives_a_clean_map() -> None:
     run = cut(simulate(LAB, 0, SIGMA_M), 880)
     back_end, path = drive(run, rig)
     alignment = align_se2(path[:, :2], run.poses[:, :2])
-    landmarks = np.array([mark.position_m for mark in back_end.landmarks()]).reshape(-1, 2)
+    landmarks = belief_of(back_end).landmarks
     counted = run.landmarks[observable_landmarks(rig, run.poses, run.landmarks)]
     score = landmark_metrics(landmarks, counted, alignment)
     assert score.duplicates == 0

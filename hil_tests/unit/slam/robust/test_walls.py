@@ -286,14 +286,18 @@ def test_four_bare_walls_hold_the_robot_and_become_no_points() -> None:
     )
     back_end = RobustBackEnd(paper_rig(), parameters)
     list(follow(back_end, increments, bare_room(path, rng)))
-    assert back_end.landmarks() == ()
+    assert back_end.reported_rows() == []
     rough = dict.fromkeys(back_end.state.wall_ids, WallRule().roughness_m)
     assert back_end.state.shape_sigmas_m == rough
     true_d_m = {0: 3.0, 1: 3.0, 2: 1.0, 3: 1.0}
-    for wall in back_end.walls():
-        quarter = round(wall.phi_rad / (math.pi / 2))
-        away = np.array([wall.phi_rad - quarter * math.pi / 2, wall.d_m - true_d_m[quarter % 4]])
-        assert away @ np.linalg.solve(wall.covariance, away) < 18.4  # 99.99 %, 2 dof
+    state = back_end.state
+    T = state.additive_transform()
+    P = T @ state.P.full() @ T.T
+    for row, (phi_rad, d_m) in enumerate(state.walls.tolist()):
+        quarter = round(phi_rad / (math.pi / 2))
+        away = np.array([phi_rad - quarter * math.pi / 2, d_m - true_d_m[quarter % 4]])
+        at = state.landmark_columns(np.array([row]))
+        assert away @ np.linalg.solve(P[np.ix_(at, at)], away) < 18.4  # 99.99 %, 2 dof
         del true_d_m[quarter % 4]
     assert not true_d_m
     blind_m = odometry_path(increments)[-1, :2] - path[-1, :2]
@@ -339,9 +343,9 @@ def test_the_edge_of_a_wall_turns_neither_wall_nor_robot(seed: int) -> None:
         truth = np.array([k * STEP_M, 0.0, 0.0])
         # Wheels without error are sigma 0 of their model: what is left is the radars' doing.
         assert nees_pose(back_end.pose, back_end.pose_covariance, truth) < 3.0
-    (wall,) = back_end.walls()
-    assert wall.phi_rad == pytest.approx(math.pi / 2, abs=0.01)
-    assert wall.spans_m[:, :, 0].max() < WALL_END_M + 0.2
+    ((phi_rad, _),) = back_end.state.walls
+    assert phi_rad == pytest.approx(math.pi / 2, abs=0.01)
+    assert back_end.wall_spans_m()[:, :, 0].max() < WALL_END_M + 0.2
 
 
 def tracklet_of(shape: Array, offset_sigma_m: float) -> tuple[WallTracker, Tracklet]:

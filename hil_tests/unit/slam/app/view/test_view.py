@@ -287,13 +287,8 @@ def step(*, robust: bool) -> StepResult:
     observation = Observation(x_m=0.3, y_m=0.9, n_fixes=5, n_poses=5, fixes=(fix,))
     report = UpdateReport(
         continued=((0, 0, 7),),  # the first of those given: the other one was unfit
-        initialised=(),
-        seen_again=(),
-        merged=(),
-        deleted=(),
         nis=1.0,
         dof=1,
-        relinearised=False,
     )
     return StepResult(
         t_ns=0,
