@@ -135,15 +135,13 @@ class WeakDirection:
     remedy: str  # a drive that would determine it
 
 
-def weak_directions(
-    calibration: Calibration, names: Sequence[str], limit_m: float = OFFSET_LIMIT_M
-) -> tuple[WeakDirection, ...]:
-    """Return the directions whose standard deviation exceeds a limit, the weakest first."""
+def weak_directions(calibration: Calibration, names: Sequence[str]) -> tuple[WeakDirection, ...]:
+    """Return the directions that are not known to ``OFFSET_LIMIT_M``, the weakest first."""
     variances, vectors = np.linalg.eigh(calibration.covariance_m2)
     found = []
     for index in np.argsort(-variances).tolist():
         sigma_m = float(np.sqrt(max(variances[index], 0.0)))
-        if sigma_m <= limit_m:
+        if sigma_m <= OFFSET_LIMIT_M:
             break
         direction: Array = vectors[:, index]
         found.append(_weak_direction(direction, names, sigma_m))

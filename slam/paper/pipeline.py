@@ -108,7 +108,6 @@ class UwbRadarSlam:
     def _motions(
         self, detections: Sequence[Detection], pose: Array, pose_at: PoseAt, t_ns: int
     ) -> Mapping[int, Array]:
-        """Return the motion from the state to each detection's own time."""
         if self.config.trilateration.sample_time is SampleTime.NOMINAL:
             return NO_MOTIONS
         stamps_ns = {detection.t_ns for detection in detections} - {t_ns}

@@ -73,12 +73,10 @@ class RangeScan:
         return replace(self, sigmas_m=tuple(math.hypot(s, sigma_m) for s in self.sigmas_m))
 
     def is_alone(self, index: int) -> bool:
-        """Return whether no other echo overlaps that of a range."""
         others = (*self.ranges_m[:index], *self.ranges_m[index + 1 :], *self.blurred_m)
         return all(abs(other_m - self.ranges_m[index]) > BLUR_M for other_m in others)
 
     def may_hide(self, range_m: float) -> bool:
-        """Return whether an echo at a range may be part of a blurred one."""
         return any(abs(blurred_m - range_m) <= BLUR_M for blurred_m in self.blurred_m)
 
     def answers(self, range_m: float, reach_m: float) -> bool:
@@ -333,18 +331,6 @@ def landmarks_in_view(
     )
     prior = rows.H @ state.P.block(rows.at) @ rows.H.T
     return SureLandmarks(landmarks=landmarks, rows=rows, prior=prior)
-
-
-def sure_landmarks(
-    state: State,
-    seen: View,
-    radars: Sequence[int],
-    noise: RangeNoise,
-    rule: ContinuationRule,
-) -> SureLandmarks | None:
-    """Return those of them that single ranges may continue; None without any."""
-    near = landmarks_in_view(state, seen, radars, noise, rule)
-    return None if near is None else near.surer_than(rule.tight_sigmas * noise.sigma_m)
 
 
 def continue_tracks(

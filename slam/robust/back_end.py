@@ -174,19 +174,16 @@ class RobustBackEnd:
             lost=self._localisation.is_lost,
         )
 
-    def update_points(
-        self, points: Sequence[RangeBearing], rule: PointRule | None = None
-    ) -> tuple[int | None, ...]:
+    def update_points(self, points: Sequence[RangeBearing]) -> tuple[int | None, ...]:
         """Take in ranges and bearings of points seen from the newest pose.
 
         If all points have labels, each is of the landmark with its label, or new; else they are
         assigned by distance. Returns one landmark id per point, None for an ambiguous one left out.
         """
-        rule = rule or PointRule()
         state = self.state
         rows = named_rows(state, points, self._landmark_of_label)
         if rows is None:
-            rows = assign(state, points, rule.gate, rule.new_gate, rule.reach_m)
+            rows = assign(state, points, PointRule())
         found = [
             None if row is None else self._see_point(point, row)
             for point, row in zip(points, rows, strict=True)
@@ -225,7 +222,6 @@ class RobustBackEnd:
         return not (self._localisation.is_lost or self._localisation.surprise.is_suspicious)
 
     def _smooth_if_due(self) -> None:
-        """Give landmarks their radii and solve for all poses."""
         gave_radii = self._is_located() and self._roundness.give(
             self.state, self._log, self.parameters, self._existence
         )
@@ -366,7 +362,6 @@ class RobustBackEnd:
                 self._place(tracklet)
 
     def _place(self, tracklet: Tracklet) -> None:
-        """Bring a tracklet into the map."""
         state = self.state
         point = tracklet.body_point()
         if tracklet.label is not None:

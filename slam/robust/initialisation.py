@@ -35,6 +35,7 @@ from slam.robust.association import LONGEST_M, Antennas, RangeScan, fix_of_pair
 from slam.robust.parameters import (
     BackEndParameters,
     MapRule,
+    PointRule,
     RangeNoise,
     TrackletRule,
     chi_square_limit,
@@ -641,13 +642,10 @@ def named_rows(
     return [known.get(landmark_of_label.get(label, -1), -1) for label in labels]
 
 
-def assign(
-    state: State, points: Sequence[RangeBearing], gate: float, new_gate: float, reach_m: float
-) -> list[int | None]:
+def assign(state: State, points: Sequence[RangeBearing], rule: PointRule) -> list[int | None]:
     """Return for each point the row of its landmark, -1 for a new one, None if ambiguous.
 
-    A point farther than ``new_gate`` (squared Mahalanobis distance) from every landmark is new; one
-    that is nearer but not assigned is ambiguous.
+    A point nearer than the rule's ``new_gate`` but not assigned is ambiguous.
     """
     if not points:
         return []
@@ -655,12 +653,12 @@ def assign(
     cost = np.full((len(points), n + len(points)), _FORBIDDEN)
     nearest = np.full(len(points), math.inf)
     for i, point in enumerate(points):
-        cost[i, n + i] = gate
-        for row in near_rows(state, point.body_point(0), reach_m):
+        cost[i, n + i] = rule.gate
+        for row in near_rows(state, point.body_point(0), rule.reach_m):
             distance = range_bearing_rows(state, int(row), point).mahalanobis_sq
             nearest[i] = min(nearest[i], distance)
-            if distance < gate:
+            if distance < rule.gate:
                 cost[i, row] = distance
-    new = [-1 if distance > new_gate else None for distance in nearest.tolist()]
+    new = [-1 if distance > rule.new_gate else None for distance in nearest.tolist()]
     columns = linear_sum_assignment(cost)[1].tolist()
     return [column if column < n else new[i] for i, column in enumerate(columns)]

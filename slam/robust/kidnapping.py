@@ -209,7 +209,6 @@ def find_join(
 
 
 def _differ(state: State, one: Join, other: Join, rule: RelocationRule) -> bool:
-    """Return whether two joins put the robot in different places."""
     away = between(compose(one.motion, state.pose), compose(other.motion, state.pose))
     return math.hypot(away[0], away[1]) > rule.reach_m or abs(float(away[2])) > rule.turn_rad
 
@@ -358,7 +357,6 @@ class Localisation:
         return np.diag([sigma_m**2, sigma_m**2, math.pi**2 / 3.0])
 
     def without_old_map(self, seen: View, state: State) -> View:
-        """Return a view in which the landmarks of the old map are out of reach."""
         rows = [row for row, id_ in enumerate(state.feature_ids) if id_ in self.old_map]
         if not rows:
             return seen
@@ -423,7 +421,6 @@ def forget(id_: int, state: State, existence: Existence, log: RunLog) -> None:
 def merge_landmarks(
     state: State, existence: Existence, log: RunLog, rule: MapRule, old_map: frozenset[int]
 ) -> None:
-    """Make the merge that is certain enough now, if any."""
     merge = find_merge(state, existence, rule, old_map)
     if merge is None:
         return

@@ -308,7 +308,6 @@ def compare(sightings: Sightings, toward_rad: float) -> tuple[float, float]:
 
 
 def fit_wall(sightings: Sightings, start: Array) -> Fit:
-    """Return the wall (phi, d) of least chi-square near a start."""
     return _least(sightings, start, _wall_law)
 
 

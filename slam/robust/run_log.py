@@ -78,7 +78,6 @@ class Problem:
 
     @property
     def is_walking(self) -> bool:
-        """Return whether the calibration has one value per pose."""
         return bool(np.any(self.walks > 0.0))
 
     def beginning(self, n_steps: int) -> Problem:
@@ -268,7 +267,6 @@ class RunLog:
 
     @property
     def n_poses(self) -> int:
-        """Return the number of poses so far, the first included."""
         return self._first + len(self._causal)
 
     @property
@@ -345,7 +343,6 @@ class RunLog:
         ranges.alone.append(alone)
 
     def add_point(self, landmark_id: int, point: Array, covariance: Array) -> None:
-        """Append a range and bearing of the newest pose with its covariance."""
         points = self._points
         points.poses.append(self.n_poses - 1)
         points.landmarks.append(landmark_id)

@@ -293,7 +293,6 @@ class NormalEquations:
         self.h[CALIBRATION] += np.einsum("kij,kj->i", transposed, steps.residual)
 
     def add_walking_steps(self, steps: Steps, walk_roots: Array, walks: Array) -> None:
-        """Add motions with the calibration of each pose, and its walk."""
         k = self.n_chain
         before, after = np.zeros((k, 6, 6)), np.zeros((k, 6, 6))
         before[:, :3, :3], before[:, :3, 3:] = steps.by_before, steps.by_calibration

@@ -231,7 +231,6 @@ class SymmetricMatrix:
 
 
 def rotation(angle_rad: float) -> Array:
-    """Return the matrix that turns the plane counter-clockwise, shape (2, 2)."""
     cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
     return np.array([[cosine, -sine], [sine, cosine]])
 
@@ -302,7 +301,6 @@ class State:
 
     @property
     def feature_ids(self) -> list[int]:
-        """Return the ids of landmarks and walls in the order of their columns."""
         return self.landmark_ids + self.wall_ids
 
     @property

@@ -132,7 +132,6 @@ class WallTracker(Tracker):
         return max(max(places) - min(places) for places in of_radar.values())
 
     def is_wall(self, tracklet: Tracklet) -> bool:
-        """Return whether a tracklet is evidence of a wall and not of a point."""
         if len({member.slot.back for member in tracklet.members}) < self._walls.min_frames:
             return False
         if self._way_m(tracklet) < self._walls.min_way_m:
@@ -187,7 +186,6 @@ class WallCells:
         self._cells.setdefault(wall_id, set()).update(cells)
 
     def distance_m(self, wall_id: int, along_m: float) -> float:
-        """Return how far a place is from the nearest cell with an echo."""
         cells = self._cells.get(wall_id)
         if not cells:
             return math.inf
@@ -195,7 +193,6 @@ class WallCells:
         return self._cell_m * min(abs(here - cell) for cell in cells)
 
     def surrounds(self, wall_id: int, along_m: float) -> bool:
-        """Return whether the cell of a place and both its neighbours gave echoes."""
         cells = self._cells.get(wall_id, set())
         here = math.floor(along_m / self._cell_m)
         return {here - 1, here, here + 1} <= cells

@@ -25,7 +25,7 @@ from slam.app.experiments import Result, table
 from slam.app.run.pictures import ESTIMATE, INK, LANDMARK, ODOMETRY, PALE_INK, TRUTH, label, note
 from slam.config import WheelNoise
 from slam.geometry import paper_rig
-from slam.robust.association import antennas_of, rows_of, sides_of, sure_landmarks, view
+from slam.robust.association import antennas_of, landmarks_in_view, rows_of, sides_of, view
 from slam.robust.parameters import ContinuationRule, RangeNoise
 from slam.robust.state import State, SymmetricMatrix, calibrated_motion, predict
 from xethru_protocol.system import StopFlag
@@ -101,7 +101,9 @@ def stepper(state: State) -> Callable[[], None]:
         predict(state, calibrated_motion(increment, state.calibration, wheels), wheels)
         seen = view(state, mounts)
         for side in sides:
-            sure_landmarks(state, seen, side, noise, rule)
+            near = landmarks_in_view(state, seen, side, noise, rule)
+            if near is not None:
+                near.surer_than(rule.tight_sigmas * noise.sigma_m)
         rows = rows_of(state, seen, radars, landmarks)
         state.update(rows.at, rows.H, np.zeros(N_UPDATES), R)
 

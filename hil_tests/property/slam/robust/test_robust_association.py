@@ -24,8 +24,8 @@ from slam.robust.association import (
     cheapest,
     continue_tracks,
     fix_of_pair,
+    landmarks_in_view,
     options_of,
-    sure_landmarks,
     view,
 )
 from slam.robust.back_end import RobustBackEnd
@@ -67,7 +67,8 @@ def ahead_of_the_left_radars(seed: int, n: int) -> State:
 
 def seen_from(state: State, noise: RangeNoise) -> SureLandmarks | None:
     seen = view(state, antennas_of(paper_rig(), (), np.zeros(3)))
-    return sure_landmarks(state, seen, LEFT, noise, RULE)
+    near = landmarks_in_view(state, seen, LEFT, noise, RULE)
+    return None if near is None else near.surer_than(RULE.tight_sigmas * noise.sigma_m)
 
 
 def scans_of(sure: SureLandmarks, rng: np.random.Generator) -> list[RangeScan]:
@@ -231,7 +232,7 @@ def test_true_points_pass_the_gate_of_99_percent_as_often_as_it_says() -> None:
     passed = 0
     for range_m, bearing in noisy.tolist():
         point = RangeBearing(range_m=range_m, bearing_rad=bearing, covariance=C)
-        passed += assign(state, [point], rule.gate, rule.new_gate, rule.reach_m) == [0]
+        passed += assign(state, [point], rule) == [0]
     assert passed / len(noisy) == pytest.approx(0.99, abs=0.006)
 
 
@@ -264,7 +265,7 @@ def test_points_are_assigned_as_the_best_of_all_assignments(
         if len(used := [k for k in choice if k is not None]) == len(set(used))
         and all(k is None or table[i, k] < rule.gate for i, k in enumerate(choice))
     )
-    found = assign(state, points, rule.gate, rule.new_gate, rule.reach_m)
+    found = assign(state, points, rule)
     assert cost([None if k in (None, -1) else k for k in found]) == pytest.approx(best, abs=1e-9)
     for i, k in enumerate(found):
         assert (k == -1) <= (table[i].min() > rule.new_gate)

@@ -30,7 +30,7 @@ from slam.app.run.pictures import picture
 from slam.app.sweep.run import SweepRun, make_case
 from slam.app.sweep.statistics import summarise_groups
 from slam.geometry import paper_rig, transform
-from slam.robust.association import antennas_of, sides_of, sure_landmarks, view
+from slam.robust.association import antennas_of, landmarks_in_view, sides_of, view
 from slam.robust.parameters import ContinuationRule, RangeNoise
 from xethru_protocol.system import StopFlag
 
@@ -134,7 +134,9 @@ def test_the_gate_of_a_step_has_something_to_weigh() -> None:
     state, rig = mapped_state(40), paper_rig()
     seen = view(state, antennas_of(rig, (), np.zeros(3)))
     for side in sides_of(rig):
-        sure = sure_landmarks(state, seen, side, RangeNoise(), ContinuationRule())
+        near = landmarks_in_view(state, seen, side, RangeNoise(), ContinuationRule())
+        assert near is not None
+        sure = near.surer_than(RangeNoise().sigma_m)
         assert sure is not None
         assert {0, 1} & set(sure.landmarks.tolist())
 
