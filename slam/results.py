@@ -45,9 +45,7 @@ class Observation:
     # Position in the body frame of the window's first pose
     x_m: float
     y_m: float
-    # How many fixes, from how many poses, the confirming cluster holds
-    n_fixes: int
-    n_poses: int
+    n_poses: int  # from how many poses the fixes of the confirming cluster are
     fixes: tuple[Fix, ...]  # the fixes whose mean this is
 
     @property

@@ -106,6 +106,12 @@ def random_state(seed: int, n_landmarks: int, heading_rad: float) -> State:
     return state
 
 
+def landmark_covariance(state: State, row: int) -> Array:
+    """Return the covariance of one landmark's position, map frame, (2, 2)."""
+    at, T = state.landmark_columns(np.array([row])), state.additive_transform()
+    return (T @ state.P.full() @ T.T)[np.ix_(at, at)]
+
+
 def near_a_half_turn() -> st.SearchStrategy[float]:
     """Return headings, those around +-pi often."""
     return st.one_of(

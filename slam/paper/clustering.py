@@ -99,7 +99,6 @@ def filter_window(window: Sequence[CollectedState], config: ClusteringConfig) ->
             Observation(
                 x_m=x_m,
                 y_m=y_m,
-                n_fixes=int(members.sum()),
                 n_poses=n_poses,
                 fixes=tuple(fixes[i] for i in np.flatnonzero(used)),
             )

@@ -395,13 +395,6 @@ class State:
         T[:2, 2] = quarter_turn(self.position_m)
         return np.asarray(T @ P @ T.T)
 
-    def landmark_covariance(self, row: int) -> Array:
-        """Return the covariance of one landmark's position, map frame, (2, 2)."""
-        first = self.offsets.stop + 2 * row
-        P = self.P.block(np.array([0, first, first + 1]))
-        T = np.column_stack([quarter_turn(self.landmarks_m[row]), np.eye(2)])
-        return np.asarray(T @ P @ T.T)
-
     def additive_transform(self) -> Array:
         """Return T with e_additive = T e, shape (m, m), at the present mean."""
         T = np.eye(self.P.size)

@@ -18,9 +18,7 @@ TRUE = np.array([[0.0, 1.0], [0.0, -1.0]])
 
 
 def observed(*looks: tuple[tuple[float, float], Association]) -> StepResult:
-    observations = tuple(
-        Observation(x_m=x, y_m=y, n_fixes=9, n_poses=9, fixes=()) for (x, y), _ in looks
-    )
+    observations = tuple(Observation(x_m=x, y_m=y, n_poses=9, fixes=()) for (x, y), _ in looks)
     return StepResult(
         t_ns=0,
         odometry_pose=np.zeros(3),

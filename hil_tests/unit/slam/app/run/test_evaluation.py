@@ -107,7 +107,7 @@ def in_world(point: complex) -> complex:
 def seen(landmark: complex, x_m: float) -> Observation:
     """Observe a landmark of the map frame without error, from x on the path."""
     body = (landmark - x_m) * cmath.rect(1.0, -HEADING_RAD)
-    return Observation(x_m=body.real, y_m=body.imag, n_fixes=4, n_poses=4, fixes=())
+    return Observation(x_m=body.real, y_m=body.imag, n_poses=4, fixes=())
 
 
 def associated(landmark_id: int, *distances_sq: float, is_new: bool = False) -> Association:

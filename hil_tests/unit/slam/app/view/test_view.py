@@ -284,7 +284,7 @@ def step(*, robust: bool) -> StepResult:
     )
     fix = Fix(pair=0, t_ns=0, x_m=0.3, y_m=0.9, detections=(seen[1], seen[1]))
     stray = Fix(pair=0, t_ns=0, x_m=0.1, y_m=0.4, detections=(seen[0], seen[0]))
-    observation = Observation(x_m=0.3, y_m=0.9, n_fixes=5, n_poses=5, fixes=(fix,))
+    observation = Observation(x_m=0.3, y_m=0.9, n_poses=5, fixes=(fix,))
     report = UpdateReport(
         continued=((0, 0, 7),),  # the first of those given: the other one was unfit
         nis=1.0,
