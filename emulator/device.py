@@ -174,7 +174,10 @@ def _is_oversized(command: Command[Response]) -> bool:
 
 
 class ByteDevice(Protocol):
-    """What the owner of a line needs of a device; all times are of one monotonic clock."""
+    """What the owner of a line needs of a device; all times are of one monotonic clock.
+
+    `wake_ns` is when time alone changes something.
+    """
 
     @property
     def wants_data(self) -> bool: ...
@@ -183,13 +186,9 @@ class ByteDevice(Protocol):
 
     def advance(self, now_ns: int) -> None: ...
 
-    def next_packet(self, now_ns: int) -> bytes | None:
-        """Return the next packet to send now."""
-        ...
+    def next_packet(self, now_ns: int) -> bytes | None: ...
 
-    def wake_ns(self, now_ns: int) -> int | None:
-        """Return when time alone changes something."""
-        ...
+    def wake_ns(self, now_ns: int) -> int | None: ...
 
 
 class Device:

@@ -37,7 +37,7 @@ from emulator.ports.tcp import is_loopback
 from emulator.scene.scene import SceneError, UnknownSceneError, empty_room, load_scene
 from emulator.scene.wheels import scene_odometry
 from xethru_protocol.recordings import RecordingError
-from xethru_protocol.recordings.wire_capture import Way, WireCapture
+from xethru_protocol.recordings.wire_capture import WireCapture
 from xethru_protocol.system import StopFlag, flush_streams
 
 NS_PER_MS = 1_000_000
@@ -254,13 +254,6 @@ def proxy(options: Namespace, stop: StopFlag, warn: Warn) -> None:
     CannotServeError
         When the module's port, the scenario or our own port cannot be had, or the module vanishes.
     """
-    lost = False
-
-    def gone() -> None:
-        nonlocal lost
-        lost = True
-        stop.request()
-
     with contextlib.ExitStack() as cleanup:
         try:
             capture = None
@@ -268,14 +261,9 @@ def proxy(options: Namespace, stop: StopFlag, warn: Warn) -> None:
                 capture = cleanup.enter_context(
                     WireCapture(options.wire, {"port": os.fspath(options.port)})
                 )
-
-            def tap(direction: Way, data: bytes) -> None:
-                if capture is not None:
-                    capture.write(direction, data, time.time_ns())
-
             zero_ns = time.monotonic_ns()
             session = FaultSession(options.faults, options.truth, cleanup, zero_ns=zero_ns)
-            module = ModuleLine(open_module(options.port, options.baud), tap, gone)
+            module = ModuleLine(open_module(options.port, options.baud), capture, stop.request)
             cleanup.callback(module.close)
             faulty = session.wrap(module, PROXY_NAME)
             session.check_names()
@@ -289,7 +277,7 @@ def proxy(options: Namespace, stop: StopFlag, warn: Warn) -> None:
             raise CannotServeError(str(error)) from error
         services: list[Service] = [module, control]
         _run(ports, services, stop, cleanup, zero_ns=zero_ns, control=control.path)
-    if lost:
+    if not module.port_present(time.monotonic_ns()):
         raise CannotServeError(f"{options.port}: the module's port vanished")
 
 

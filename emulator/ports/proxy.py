@@ -9,17 +9,17 @@ from __future__ import annotations
 import os
 import selectors
 import termios
+import time
 import tty
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
 
 from emulator.ports.pty import LinkError
 from emulator.ports.server import Service, wait_for
+from xethru_protocol.recordings.wire_capture import WireCapture
 from xethru_protocol.wire.framing import Direction, NeedData, PacketReader
 
-Tap = Callable[[Literal["rx", "tx"], bytes], None]
 HOLD_NS = 50_000_000
 """How long an incomplete packet waits for the rest of it."""
 MOST_UNSENT = 65_536
@@ -34,15 +34,17 @@ class ModuleLine(Service):
     ----------
     descriptor
         Non-blocking, of the open port; closed by `close`.
-    tap
-        Called with the direction and every chunk of bytes as they pass the port.
+    capture
+        Gets all bytes as they pass the port.
     gone
         Called once when the port vanished.
     """
 
-    def __init__(self, descriptor: int, tap: Tap, gone: Callable[[], None]) -> None:
+    def __init__(
+        self, descriptor: int, capture: WireCapture | None, gone: Callable[[], None]
+    ) -> None:
         self._descriptor = descriptor
-        self._tap = tap
+        self._capture = capture
         self._gone = gone
         self._selector: selectors.BaseSelector | None = None
         self._unsent = b""
@@ -63,7 +65,8 @@ class ModuleLine(Service):
     def receive_data(self, data: bytes, now_ns: int) -> None:
         if not self._alive or not data:
             return
-        self._tap("tx", data)
+        if self._capture is not None:
+            self._capture.write("tx", data, time.time_ns())
         self._unsent += data
         self._write()
 
@@ -115,7 +118,8 @@ class ModuleLine(Service):
         if not data:
             self._lost()
             return
-        self._tap("rx", data)
+        if self._capture is not None:
+            self._capture.write("rx", data, time.time_ns())
         self._unjudged += data
         self._reader.receive_data(data)
         while not isinstance(self._reader.next_packet(), NeedData):
