@@ -2,11 +2,11 @@
 
 import math
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hil_tests.unit.slam.robust.range_world import LAB, odometry_path, reported
 from slam.calibration.calibration import (
     UNKNOWN_WHEELS,
     Calibration,
@@ -60,12 +60,11 @@ class World:
     stops: tuple[tuple[float, float], ...] = SQUARE
     rods: Array = field(default_factory=RODS.copy)
     sigma_m: float = 0.0
-    wheel_noise: float = 0.0
+    errs: bool = False  # whether the wheels have the lab's errors
     mount_errors_m: Array | None = None
 
 
 def drive(world: World, seed: int = 0) -> Drive:
-    """Return odometry and ranges of a drive: noise 1 at wheel_noise = 1, 0 without any."""
     random = np.random.default_rng(seed)
     true = course(world.stops)
     rig = paper_rig()
@@ -95,34 +94,8 @@ def drive(world: World, seed: int = 0) -> Drive:
         amplitude=columns[:, 3],
         sigma_m=np.full(len(columns), world.sigma_m or 1e-4),
     )
-    return make_drive(rig, t_ns, reported(true, world.wheel_noise, random), ranges)
-
-
-def reported(true: Array, noise: float, random: np.random.Generator) -> Array:
-    """Return odometry by the wheel model, constants and white noise scaled by `noise`."""
-    scale, turn_scale, curvature = noise * random.normal(size=3) * (0.007, 0.007, 0.0042)
-    poses = [np.zeros(3)]
-    for before, after in pairwise(true):
-        length = math.hypot(*(after - before)[:2])
-        turn = after[2] - before[2]
-        root = math.sqrt(length)
-        white = noise * random.normal(size=3)
-        along = (1 + scale) * length + 2e-3 * root * white[0]
-        across = 6e-4 * root * white[1]
-        x, y, heading = poses[-1]
-        poses.append(
-            np.array(
-                [
-                    x + math.cos(heading) * along - math.sin(heading) * across,
-                    y + math.sin(heading) * along + math.cos(heading) * across,
-                    heading
-                    + (1 + turn_scale) * turn
-                    + curvature * length
-                    + (4.2e-3 * root + 0.01 * abs(turn)) * white[2],
-                ]
-            )
-        )
-    return np.array(poses)
+    odometry = odometry_path(reported(true, LAB, random, 0.0)) if world.errs else true
+    return make_drive(rig, t_ns, odometry, ranges)
 
 
 def words(of: Drive, found: Calibration) -> str:
@@ -144,7 +117,7 @@ def test_exact_ranges_and_odometry_give_the_exact_offsets() -> None:
 
 def test_a_scale_that_is_known_stays_and_a_turn_scale_that_is_not_is_found() -> None:
     priors = CalibrationPriors(wheels=replace(UNKNOWN_WHEELS, scale_sigma=1e-9))
-    found = calibrate(drive(World(wheel_noise=1.0)), priors)
+    found = calibrate(drive(World(errs=True)), priors)
     assert abs(found.wheels[0]) < 1e-7
     assert abs(found.wheels[1]) > 1e-4
 
@@ -162,14 +135,14 @@ def test_errors_are_as_large_as_the_stated_deviations() -> None:
     priors = CalibrationPriors(mount_m=1e-5)  # the mounts are exact here
     squares = []
     for seed in range(12):
-        found = calibrate(drive(World(sigma_m=1.5e-3, wheel_noise=1.0), seed), priors)
+        found = calibrate(drive(World(sigma_m=1.5e-3, errs=True), seed), priors)
         squares.append(((found.offsets_m - OFFSETS_M) / found.offset_sigmas_m) ** 2)
     # the four share most of their error: between 12 and 48 degrees of freedom; 0.1 % tails of 12
     assert 0.18 < float(np.mean(squares)) < 2.75
 
 
 def test_known_reflectors_fix_the_map_and_tell_more() -> None:
-    noisy = drive(World(sigma_m=1.5e-3, wheel_noise=1.0), 3)
+    noisy = drive(World(sigma_m=1.5e-3, errs=True), 3)
     jointly, known = calibrate(noisy), calibrate(noisy, known_m=RODS)
     assert np.all(known.offset_sigmas_m < jointly.offset_sigmas_m)
     np.testing.assert_allclose(known.landmarks_m[: len(RODS)], RODS, atol=4e-3)
@@ -177,7 +150,7 @@ def test_known_reflectors_fix_the_map_and_tell_more() -> None:
 
 
 def test_reflectors_of_another_room_are_told() -> None:
-    noisy = drive(World(sigma_m=1.5e-3, wheel_noise=1.0), 3)
+    noisy = drive(World(sigma_m=1.5e-3, errs=True), 3)
     elsewhere = RODS + 500.0
     found = calibrate(noisy, known_m=elsewhere)
     assert f"only 0 of {len(RODS)} known" in unseen_reflectors(found, len(elsewhere))[0]
@@ -185,7 +158,7 @@ def test_reflectors_of_another_room_are_told() -> None:
 
 
 def test_a_few_wrong_ranges_do_no_harm() -> None:
-    noisy = drive(World(sigma_m=1e-3, wheel_noise=1.0), 1)
+    noisy = drive(World(sigma_m=1e-3, errs=True), 1)
     random = np.random.default_rng(5)
     spoilt = noisy.ranges.range_m.copy()
     wrong = random.random(len(spoilt)) < 0.05
