@@ -134,7 +134,9 @@ def test_a_signal_leaves_a_session_that_replays(
         text=True,
     ) as process:
         session = out / "session.mcap"
+        # The file has its settings and scans; how many go into a kilobyte depends on lost frames.
         wait_until(lambda: session.exists() and session.stat().st_size >= 200_000, process)
+        wait_until(lambda: len(list(open_session(session).scans())) > 10, process)
         process.send_signal(which)
         said = process.communicate(timeout=seconds(30))[1]
     assert process.returncode == code

@@ -191,9 +191,11 @@ def saving_viewer(saved: Path) -> Iterator[str]:
         port = probe.getsockname()[1]
     command = [str(executable()), "--save", str(saved), "--bind", "127.0.0.1", "--port", str(port)]
     with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
-        wait_until(lambda: connects(port))
-        yield f"rerun+http://127.0.0.1:{port}/proxy"
-        process.terminate()
+        try:
+            wait_until(lambda: connects(port), process)
+            yield f"rerun+http://127.0.0.1:{port}/proxy"
+        finally:
+            process.terminate()
 
 
 def test_a_viewer_gets_every_row_that_a_file_gets(

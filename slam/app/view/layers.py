@@ -347,6 +347,7 @@ class MapLayer:
         self._trails: dict[str, deque[Array]] = {
             name: deque(maxlen=TRAIL_STATES) for name, *_ in _POINTS
         }
+        self._has_fixes = False
         self._first_ns: int | None = None
         self._next_map_ns = self._next_path_ns = 0
         self._last: tuple[Snapshot, int | None] | None = None
@@ -453,8 +454,15 @@ class MapLayer:
                     for step, flags in zip(steps, used, strict=True)
                 ]
                 self._send_arcs(f"map/robot/{part(radar.name)}/{name}", stamps, radar, ranges_m)
-        if not any(step.fixes or step.observations for step in steps):
-            return
+        if not self._has_fixes:
+            # Robust SLAM makes none; from the first one on every state has its row, so that the
+            # rows do not depend on how the states are divided into blocks.
+            found_at = [k for k, step in enumerate(steps) if step.fixes or step.observations]
+            if not found_at:
+                return
+            self._has_fixes = True
+            later = range(found_at[0], len(steps))
+            steps, stamps, world = steps[later.start :], stamps.at(later), world[later.start :]
         found: dict[str, list[Sequence[Fix | Observation]]] = {
             "fixes/found": [step.fixes for step in steps],
             "fixes/rejected": [step.rejected for step in steps],

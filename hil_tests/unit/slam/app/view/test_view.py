@@ -334,6 +334,22 @@ def test_fixes_and_clusters_lie_where_the_robot_saw_them(tmp_path: Path) -> None
         np.testing.assert_allclose(shown[-1], expected * [1, -1], rtol=1e-5, atol=1e-6)
 
 
+def test_rows_of_fixes_do_not_depend_on_when_blocks_are_sent(tmp_path: Path) -> None:
+    """Without a fix nothing is drawn; from the first one on, every state has its row."""
+    without = replace(step(robust=False), fixes=(), observations=(), rejected=())
+    steps = [step(robust=False) if k in (4, 5) else without for k in range(10)]
+    counted = []
+    for name, flush_s in (("blocks", None), ("one by one", 0.0)):
+        path = tmp_path / f"{name}.rrd"
+        with RerunView(path, session_info(), flush_s=flush_s) as view:
+            for k, of_state in enumerate(steps):
+                view.on_snapshot(replace(snapshot(k), step=of_state))
+                view.on_scan(scan(k))
+        shown = rows(path, "/map/fixes/found", "Points2D:positions")
+        counted.append([frame for frame, points in shown if points is not None])
+    assert counted[0] == counted[1] == [snapshot(k).counter for k in range(4, 10)]
+
+
 BIN_M = 0.0064255
 
 
