@@ -1,23 +1,15 @@
-"""What ``xethru decode`` finds when some of all bytes are damaged.
+"""What ``xethru decode`` finds of mixed traffic when some of all bytes are damaged.
 
-``python -m hil_tests.bench.corrupted_traffic --megabytes 100 --rate 1e-3`` makes mixed traffic of
-a module, replaces that share of all bytes by other values, decodes what is left by the
-command's own reader and prints how many of the packets that no damage touched were found.
-Each that was not is explained by what stands in its place; ``unexplained`` must be 0.
-``--short`` sends answers of a few bytes only; ``--cli`` also runs the command itself and prints
-its memory. Everything follows from ``--seed``.
+Each packet that no damage touched and that was not found is explained by what stands in its place.
 """
 
-import argparse
 import json
-import math
 import subprocess
 import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field, fields
-from pathlib import Path
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -46,8 +38,6 @@ UNEXPLAINED = "unexplained"
 
 @dataclass(slots=True, kw_only=True)
 class Outcome:
-    """What became of the packets of one run."""
-
     bytes: int = 0
     damaged_bytes: int = 0
     packets: int = 0
@@ -128,7 +118,6 @@ class Corruption:
         self.merged: set[int] = set()  # offsets of packets whose predecessor's end became 7F
 
     def chunks(self) -> Iterator[bytes]:
-        """Yield the damaged stream as the command reads it."""
         base = 0
         rest = b""
         for packets in blocks(self._pool, self._size, self._rng):
@@ -206,7 +195,6 @@ def _carries(sent: bytes, found: Packet) -> bool:
 
 
 def _why(before: Packet | None, offset: int, merged: set[int]) -> str:
-    """Explain why the packet at ``offset`` was not found, by the packet found before it."""
     if before is None:
         return UNEXPLAINED
     if before.framing is Framing.NO_ESCAPE:
@@ -219,10 +207,7 @@ def _why(before: Packet | None, offset: int, merged: set[int]) -> str:
 
 @dataclass(slots=True, kw_only=True)
 class CommandRun:
-    """What the command itself did with the same stream."""
-
     exit_code: int
-    peak_megabytes: float
     lines: int
     faults: int
     statistics: dict[str, object]
@@ -246,46 +231,12 @@ def run_command(size: int, rate: float, seed: int, *, short: bool) -> CommandRun
             process.stdin.write(chunk)
             line.untouched.clear()
             line.merged.clear()
-        process.stdin.flush()
-        peak_megabytes = _peak_megabytes(process.pid)
         _, messages = process.communicate()
         output.seek(0)
         are_faults = Counter(text.startswith(b'{"fault"') for text in output)
     return CommandRun(
         exit_code=process.returncode,
-        peak_megabytes=peak_megabytes,
         lines=are_faults.total(),
         faults=are_faults[True],
         statistics=json.loads(messages),
     )
-
-
-def _peak_megabytes(pid: int) -> float:
-    """Most memory a process held so far; Linux only (ru_maxrss would count its parent's)."""
-    status = Path(f"/proc/{pid}/status")
-    if not status.exists():
-        return math.nan
-    (line,) = [text for text in status.read_text().splitlines() if text.startswith("VmHWM")]
-    return int(line.split()[1]) / 1024
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
-    parser.add_argument("--megabytes", type=float, default=100)
-    parser.add_argument("--rate", type=float, default=1e-3, help="share of bytes to damage")
-    parser.add_argument("--short", action="store_true", help="answers of a few bytes only")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--cli", action="store_true", help="also run the command itself")
-    arguments = parser.parse_args()
-    size = int(arguments.megabytes * 1e6)
-    outcome = run(size, arguments.rate, arguments.seed, short=arguments.short)
-    shown: dict[str, object] = {each.name: getattr(outcome, each.name) for each in fields(outcome)}
-    shown["statistics"] = outcome.statistics.summary()
-    if arguments.cli:
-        command = run_command(size, arguments.rate, arguments.seed, short=arguments.short)
-        shown["command"] = asdict(command)
-    sys.stdout.write(json.dumps(shown, indent=2) + "\n")
-
-
-if __name__ == "__main__":
-    main()

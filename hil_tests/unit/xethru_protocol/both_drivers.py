@@ -72,7 +72,8 @@ class Blocking:
             yield item
 
 
-DriverOn = Callable[..., tuple[X4M300, ScriptedTransport]]
+Scripted = tuple[X4M300, ScriptedTransport]
+DriverOn = Callable[..., Scripted]
 """Returns a driver and its line: the function below."""
 
 
@@ -83,7 +84,7 @@ def driver_factory(kind: str, runner: asyncio.Runner) -> DriverOn:
         ports: dict[str, Callable[[int], ScriptedTransport]] | None = None,
         name: str = "the port",
         **options: Any,  # noqa: ANN401 - those of the drivers
-    ) -> tuple[X4M300, ScriptedTransport]:
+    ) -> Scripted:
         """Return both; ``ports`` are those at which a reconnect may open a line."""
         line = ScriptedTransport(answer or PlainModule(), name)
         known = ports or {}

@@ -5,7 +5,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from hil_tests.unit.xethru_protocol.both_drivers import DriverOn, driver_factory
+from hil_tests.unit.xethru_protocol.both_drivers import DriverOn, Scripted, driver_factory
+from hil_tests.unit.xethru_protocol.emulated import Emulated, EmulatedModule
 from hil_tests.unit.xethru_protocol.pty_module import PtyModule
 
 
@@ -13,6 +14,32 @@ from hil_tests.unit.xethru_protocol.pty_module import PtyModule
 def driver_on(request: pytest.FixtureRequest) -> Iterator[DriverOn]:
     with asyncio.Runner() as runner:
         yield driver_factory(request.param, runner)
+
+
+@pytest.fixture
+def raw(driver_on: DriverOn) -> Scripted:
+    """Return a driver in raw mode, and its line."""
+    radar, line = driver_on()
+    radar.configure_raw()
+    return radar, line
+
+
+@pytest.fixture
+def emulated(driver_on: DriverOn) -> Emulated:
+    module = EmulatedModule()
+    return *driver_on(module), module
+
+
+@pytest.fixture
+def loaded(emulated: Emulated) -> Emulated:
+    emulated[0].presence.load()
+    return emulated
+
+
+@pytest.fixture
+def running(loaded: Emulated) -> Emulated:
+    loaded[0].presence.run()
+    return loaded
 
 
 @pytest.fixture

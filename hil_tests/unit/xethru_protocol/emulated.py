@@ -8,6 +8,8 @@ from emulator.module.memory import FileKey, Identity
 from emulator.module.module import Module
 from emulator.module.settings import DeviceOptions
 from hil_tests.unit.emulator.doubles import RampSource
+from hil_tests.unit.xethru_protocol.scripted import ScriptedTransport
+from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import FileType, SensorMode
 
@@ -46,3 +48,6 @@ class EmulatedModule:
                 return [m.Error(code=self.run_errors.pop(0))]
         reply = answer(self.module, command)
         return [] if reply is None else [reply]
+
+
+Emulated = tuple[X4M300, ScriptedTransport, EmulatedModule]

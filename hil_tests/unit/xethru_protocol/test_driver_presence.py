@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from hil_tests.unit.xethru_protocol.both_drivers import DriverOn
-from hil_tests.unit.xethru_protocol.emulated import EmulatedModule
+from hil_tests.unit.xethru_protocol.both_drivers import DriverOn, Scripted
+from hil_tests.unit.xethru_protocol.emulated import Emulated, EmulatedModule
 from hil_tests.unit.xethru_protocol.scripted import frame
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import LedMode, NoiseMapControl, OutputFeature
@@ -21,10 +21,8 @@ def presence(counter: int, state: int) -> m.PresenceSingle:
     )
 
 
-def test_profile_is_set_up_and_run_by_the_recipe(driver_on: DriverOn) -> None:
-    module = EmulatedModule()
-    radar, _ = driver_on(module)
-    radar.presence.load()
+def test_profile_is_set_up_and_run_by_the_recipe(loaded: Emulated) -> None:
+    radar, _, module = loaded
     radar.presence.set_sensitivity(8)
     radar.presence.set_noise_map(NoiseMapControl.NO_DEFAULT | NoiseMapControl.ADAPTIVE)
     radar.presence.set_led(LedMode.OFF)
@@ -42,9 +40,8 @@ def test_profile_is_set_up_and_run_by_the_recipe(driver_on: DriverOn) -> None:
     ]
 
 
-def test_settings_are_read_as_they_were_set(driver_on: DriverOn) -> None:
-    radar, _ = driver_on(EmulatedModule())
-    radar.presence.load()
+def test_settings_are_read_as_they_were_set(loaded: Emulated) -> None:
+    radar, _, _ = loaded
     radar.presence.set_sensitivity(2)
     radar.presence.set_band(4)
     radar.presence.set_led(LedMode.SIMPLE)
@@ -60,11 +57,9 @@ def test_settings_are_read_as_they_were_set(driver_on: DriverOn) -> None:
 
 
 def test_zone_is_checked_against_the_modules_limits_and_read_back_snapped(
-    driver_on: DriverOn,
+    loaded: Emulated,
 ) -> None:
-    module = EmulatedModule()
-    radar, _ = driver_on(module)
-    radar.presence.load()
+    radar, _, module = loaded
     limits = radar.presence.zone_limits()
     assert (limits.min_m, limits.max_m) == pytest.approx((0.4, 9.4))
     assert limits.step_m == pytest.approx(STEP_M)
@@ -87,19 +82,16 @@ def test_zone_is_checked_against_the_modules_limits_and_read_back_snapped(
 @pytest.mark.parametrize(
     ("verb", "value"), [("set_sensitivity", 10), ("set_sensitivity", -1), ("set_band", 5)]
 )
-def test_values_no_module_has_are_not_sent(driver_on: DriverOn, verb: str, value: int) -> None:
-    module = EmulatedModule()
-    radar, _ = driver_on(module)
-    radar.presence.load()
+def test_values_no_module_has_are_not_sent(loaded: Emulated, verb: str, value: int) -> None:
+    radar, _, module = loaded
     sent = len(module.received)
     with pytest.raises(LocalProtocolError, match="must be"):
         getattr(radar.presence, verb)(value)
     assert len(module.received) == sent
 
 
-def test_without_a_profile_nothing_is_asked_that_gets_no_answer(driver_on: DriverOn) -> None:
-    module = EmulatedModule()
-    radar, line = driver_on(module)
+def test_without_a_profile_nothing_is_asked_that_gets_no_answer(emulated: Emulated) -> None:
+    radar, line, _ = emulated
     for verb in ("zone", "zone_limits", "sensitivity", "led", "noise_map", "run", "idle"):
         with pytest.raises(LocalProtocolError, match=r"no profile is loaded; load\(\) one first"):
             getattr(radar.presence, verb)()
@@ -127,11 +119,8 @@ def test_refusals_are_the_modules_own(driver_on: DriverOn) -> None:
         radar.presence.set_sensitivity(1)
 
 
-def test_messages_come_typed_and_in_order_and_frames_stay_frames(driver_on: DriverOn) -> None:
-    module = EmulatedModule()
-    radar, line = driver_on(module)
-    radar.presence.load()
-    radar.presence.run()
+def test_messages_come_typed_and_in_order_and_frames_stay_frames(running: Emulated) -> None:
+    radar, line, _ = running
     moving = m.PresenceMovingList(
         counter=3,
         state=PRESENCE,
@@ -158,9 +147,8 @@ def test_messages_come_typed_and_in_order_and_frames_stay_frames(driver_on: Driv
         next(radar.presence.messages())
 
 
-def test_messages_of_what_ran_before_are_not_the_loaded_profiles(driver_on: DriverOn) -> None:
-    radar, line = driver_on(EmulatedModule())
-    radar.presence.load()
+def test_messages_of_what_ran_before_are_not_the_loaded_profiles(loaded: Emulated) -> None:
+    radar, line, _ = loaded
     line.say(presence(1, PRESENCE))
     radar.presence.load()
     line.say(presence(2, PRESENCE))
@@ -170,17 +158,15 @@ def test_messages_of_what_ran_before_are_not_the_loaded_profiles(driver_on: Driv
         next(radar.presence.messages(timeout_s=0.0))
 
 
-def test_messages_are_kept_only_if_they_are_asked_for(driver_on: DriverOn) -> None:
-    radar, line = driver_on()
-    radar.configure_raw()
+def test_messages_are_kept_only_if_they_are_asked_for(raw: Scripted) -> None:
+    radar, line = raw
     line.say(*(presence(k, PRESENCE) for k in range(9)), frame(1))
     radar.read_frame()
     assert radar._link.messages is None
 
 
-def test_messages_that_pile_up_are_dropped_and_told_of(driver_on: DriverOn) -> None:
-    radar, line = driver_on(EmulatedModule())
-    radar.presence.load()
+def test_messages_that_pile_up_are_dropped_and_told_of(loaded: Emulated) -> None:
+    radar, line, _ = loaded
     said = presence(1, PRESENCE)
     for _ in range(4100):
         radar._link._take(said, 0)
@@ -192,10 +178,9 @@ def test_messages_that_pile_up_are_dropped_and_told_of(driver_on: DriverOn) -> N
 
 @pytest.mark.parametrize(("control", "limit_s"), [(2, 25.0), (6, 25.0), (3, 125.0), (7, 125.0)])
 def test_start_is_waited_for_as_long_as_it_may_take(
-    driver_on: DriverOn, control: int, limit_s: float
+    loaded: Emulated, control: int, limit_s: float
 ) -> None:
-    radar, line = driver_on(EmulatedModule())
-    radar.presence.load()
+    radar, line, _ = loaded
     radar.presence.set_noise_map(NoiseMapControl(control))
     radar.presence.run()
     for second in range(1, 200):
@@ -205,10 +190,8 @@ def test_start_is_waited_for_as_long_as_it_may_take(
     assert limit_s <= line.now_ns * 1e-9 < limit_s + 2
 
 
-def test_end_of_the_start_is_the_first_message_of_another_state(driver_on: DriverOn) -> None:
-    radar, line = driver_on(EmulatedModule())
-    radar.presence.load()
-    radar.presence.run()
+def test_end_of_the_start_is_the_first_message_of_another_state(running: Emulated) -> None:
+    radar, line, _ = running
     for second in range(1, 19):
         line.say_later(second, presence(second, INITIALIZING))
     line.say_later(19, presence(19, NO_PRESENCE), presence(20, PRESENCE))
@@ -217,11 +200,9 @@ def test_end_of_the_start_is_the_first_message_of_another_state(driver_on: Drive
 
 
 def test_module_that_falls_silent_while_it_starts_is_not_waited_for_all_the_time(
-    driver_on: DriverOn,
+    running: Emulated,
 ) -> None:
-    radar, line = driver_on(EmulatedModule())
-    radar.presence.load()
-    radar.presence.run()
+    radar, line, _ = running
     with pytest.raises(ResponseTimeout, match="does it run, and is an output switched on"):
         radar.presence.wait_until_initialized()
     assert line.now_ns < 4e9
@@ -247,11 +228,8 @@ def test_module_that_restarts_to_change_its_profile_is_waited_for(driver_on: Dri
     assert radar.warnings == ["the module restarts to change its profile"]
 
 
-def test_profile_pauses_goes_on_and_stops(driver_on: DriverOn) -> None:
-    module = EmulatedModule()
-    radar, _ = driver_on(module)
-    radar.presence.load()
-    radar.presence.run()
+def test_profile_pauses_goes_on_and_stops(running: Emulated) -> None:
+    radar, _, module = running
     radar.presence.idle()
     radar.presence.run()
     radar.presence.stop()
@@ -261,9 +239,8 @@ def test_profile_pauses_goes_on_and_stops(driver_on: DriverOn) -> None:
         radar.presence.run()
 
 
-def test_running_profile_is_left_running_at_the_end(driver_on: DriverOn) -> None:
-    module = EmulatedModule()
-    radar, line = driver_on(module)
+def test_running_profile_is_left_running_at_the_end(emulated: Emulated) -> None:
+    radar, line, module = emulated
     with radar:
         radar.presence.load()
         radar.presence.run()
@@ -271,10 +248,8 @@ def test_running_profile_is_left_running_at_the_end(driver_on: DriverOn) -> None
     assert line.closed
 
 
-def test_noise_map_and_factory_preset(driver_on: DriverOn) -> None:
-    module = EmulatedModule()
-    radar, _ = driver_on(module)
-    radar.presence.load()
+def test_noise_map_and_factory_preset(loaded: Emulated) -> None:
+    radar, _, module = loaded
     radar.presence.store_noise_map()
     radar.presence.load_noise_map()
     radar.presence.delete_noise_map()

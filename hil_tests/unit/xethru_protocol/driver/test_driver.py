@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from hil_tests.unit.xethru_protocol.both_drivers import DriverOn
+from hil_tests.unit.xethru_protocol.both_drivers import DriverOn, Scripted
 from hil_tests.unit.xethru_protocol.scripted import READY, PlainModule, frame
 from xethru_protocol.driver.link import ProtocolRecord, RawConfig
 from xethru_protocol.wire import messages as m
@@ -56,9 +56,8 @@ def test_firmware_without_modes_is_tolerated(driver_on: DriverOn) -> None:
     assert radar.configure_raw().n_bins == 1431
 
 
-def test_start_returns_the_real_rate_and_warns_above_the_possible(driver_on: DriverOn) -> None:
-    radar, _ = driver_on()
-    radar.configure_raw()
+def test_start_returns_the_real_rate_and_warns_above_the_possible(raw: Scripted) -> None:
+    radar, _ = raw
     assert radar.start(17.0) == pytest.approx(17.049379, abs=1e-6)
     radar.start(25.0)
     assert radar.warnings == [
@@ -87,9 +86,8 @@ def test_rate_that_is_none_is_the_modules_fault(
         radar.start(17.0)
 
 
-def test_frames_keep_their_samples_counters_and_arrival_times(driver_on: DriverOn) -> None:
-    radar, line = driver_on()
-    radar.configure_raw()
+def test_frames_keep_their_samples_counters_and_arrival_times(raw: Scripted) -> None:
+    radar, line = raw
     line.say(frame(5), frame(6), frame(9))
     frames = list(radar.frames(3))
     assert [f.counter for f in frames] == [5, 6, 9]
@@ -100,9 +98,8 @@ def test_frames_keep_their_samples_counters_and_arrival_times(driver_on: DriverO
     assert radar.frames_lost == 2
 
 
-def test_counters_wrap_without_loss_and_restarts_are_no_loss(driver_on: DriverOn) -> None:
-    radar, line = driver_on()
-    radar.configure_raw()
+def test_counters_wrap_without_loss_and_restarts_are_no_loss(raw: Scripted) -> None:
+    radar, line = raw
     line.say(frame(0xFFFFFFFF), frame(0), frame(1), frame(0))
     assert len(list(radar.frames(4))) == 4
     assert radar.frames_lost == 0
@@ -121,19 +118,15 @@ def test_counters_wrap_without_loss_and_restarts_are_no_loss(driver_on: DriverOn
         ((0xFFFF_FFFE, 0x0FFF_FFFF, 0, 1), 0),  # FFFFFFFF, damaged
     ],
 )
-def test_damaged_counter_is_no_gap(
-    driver_on: DriverOn, counters: tuple[int, ...], lost: int
-) -> None:
-    radar, line = driver_on()
-    radar.configure_raw()
+def test_damaged_counter_is_no_gap(raw: Scripted, counters: tuple[int, ...], lost: int) -> None:
+    radar, line = raw
     line.say(*map(frame, counters))
     assert [got.counter for got in radar.frames(len(counters))] == list(counters)
     assert radar.frames_lost == lost
 
 
-def test_gap_of_the_last_stream_explains_nothing_in_the_next(driver_on: DriverOn) -> None:
-    radar, line = driver_on()
-    radar.configure_raw()
+def test_gap_of_the_last_stream_explains_nothing_in_the_next(raw: Scripted) -> None:
+    radar, line = raw
     line.say(frame(5), frame(100))
     list(radar.frames(2))
     radar.start(17.0)
@@ -142,9 +135,8 @@ def test_gap_of_the_last_stream_explains_nothing_in_the_next(driver_on: DriverOn
     assert radar.frames_lost == 94
 
 
-def test_frames_of_the_last_stream_are_no_part_of_the_next(driver_on: DriverOn) -> None:
-    radar, line = driver_on()
-    radar.configure_raw()
+def test_frames_of_the_last_stream_are_no_part_of_the_next(raw: Scripted) -> None:
+    radar, line = raw
     radar.start(17.0)
     line.say(frame(4), frame(5))
     assert radar.read_frame().counter == 4
@@ -197,10 +189,9 @@ def test_profile_baseband_messages_are_frames_with_their_own_geometry(driver_on:
     ids=["length", "content id"],
 )
 def test_data_that_are_no_radar_frames_are_discarded_and_counted(
-    driver_on: DriverOn, other: m.DataFloat
+    raw: Scripted, other: m.DataFloat
 ) -> None:
-    radar, line = driver_on()
-    radar.configure_raw()
+    radar, line = raw
     line.say(other, frame(2))
     assert radar.read_frame(math.inf).counter == 2  # without a limit
     assert radar.frames_discarded == 1
@@ -325,9 +316,8 @@ def test_module_that_is_not_ready_is_waited_for(driver_on: DriverOn) -> None:
     assert 0.3e9 <= line.now_ns < 0.5e9
 
 
-def test_module_that_stops_is_a_timeout_and_says_if_it_restarted(driver_on: DriverOn) -> None:
-    radar, line = driver_on()
-    radar.configure_raw()
+def test_module_that_stops_is_a_timeout_and_says_if_it_restarted(raw: Scripted) -> None:
+    radar, line = raw
     with pytest.raises(ResponseTimeout, match="no frame from the port within 1 s"):
         radar.read_frame(timeout_s=1.0)
     line.say(m.System(code=0x10))

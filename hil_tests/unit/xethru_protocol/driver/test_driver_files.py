@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import pytest
 
 from hil_tests.unit.xethru_protocol.both_drivers import DriverOn
-from hil_tests.unit.xethru_protocol.emulated import EmulatedModule
+from hil_tests.unit.xethru_protocol.emulated import Emulated, EmulatedModule
 from xethru_protocol.driver.files import FileName
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import FORMAT_KEY, FileType
@@ -15,9 +15,8 @@ USER = 0x80000001
 CONTENT = bytes(range(256)) * 2 + b"the end"
 
 
-def test_file_is_written_in_chunks_and_read_back(driver_on: DriverOn) -> None:
-    module = EmulatedModule()
-    radar, _ = driver_on(module)
+def test_file_is_written_in_chunks_and_read_back(emulated: Emulated) -> None:
+    radar, _, module = emulated
     radar.files.write(USER, 7, CONTENT)
     assert module.files[USER, 7] == CONTENT
     assert module.open == set()
@@ -85,10 +84,9 @@ def test_files_are_listed_found_and_deleted(driver_on: DriverOn) -> None:
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_refusals_have_the_file_systems_own_meaning(
-    driver_on: DriverOn, verb: str, arguments: tuple[object, ...], code: int, meaning: str
+    emulated: Emulated, verb: str, arguments: tuple[object, ...], code: int, meaning: str
 ) -> None:
-    module = EmulatedModule()
-    radar, _ = driver_on(module)
+    radar, _, module = emulated
     radar.files.write(USER, 1, b"there")
     with pytest.raises(DeviceError, match=meaning) as caught:
         getattr(radar.files, verb)(*arguments)
@@ -98,9 +96,8 @@ def test_refusals_have_the_file_systems_own_meaning(
 
 
 @pytest.mark.parametrize("verb", ["read", "write"])
-def test_file_is_closed_after_a_chunk_failed(driver_on: DriverOn, verb: str) -> None:
-    module = EmulatedModule()
-    radar, _ = driver_on(module)
+def test_file_is_closed_after_a_chunk_failed(emulated: Emulated, verb: str) -> None:
+    radar, _, module = emulated
     radar.files.write(USER, 1, CONTENT)
     module.fail_at = 256
     arguments = (USER, 1) if verb == "read" else (USER, 2, CONTENT)
@@ -111,9 +108,8 @@ def test_file_is_closed_after_a_chunk_failed(driver_on: DriverOn, verb: str) -> 
     assert radar.warnings == []
 
 
-def test_file_is_closed_after_the_users_own_exception(driver_on: DriverOn) -> None:
-    module = EmulatedModule()
-    radar, _ = driver_on(module)
+def test_file_is_closed_after_the_users_own_exception(emulated: Emulated) -> None:
+    radar, _, module = emulated
 
     def impatient(done: int, total: int) -> None:
         if done:
@@ -124,9 +120,8 @@ def test_file_is_closed_after_the_users_own_exception(driver_on: DriverOn) -> No
     assert (module.open, module.files) == (set(), {})
 
 
-def test_file_another_host_left_open_is_read(driver_on: DriverOn) -> None:
-    module = EmulatedModule()
-    radar, _ = driver_on(module)
+def test_file_another_host_left_open_is_read(emulated: Emulated) -> None:
+    radar, _, module = emulated
     key = {"file_type": USER, "identifier": 3}
     for command in (m.CreateFile(**key, length=4), m.SetFileData(**key, offset=0, data=b"left")):
         assert module(command) == [m.Ack()]
@@ -134,9 +129,8 @@ def test_file_another_host_left_open_is_read(driver_on: DriverOn) -> None:
     assert module.open == set()
 
 
-def test_short_chunk_is_the_modules_fault_and_the_file_is_closed(driver_on: DriverOn) -> None:
-    module = EmulatedModule()
-    radar, line = driver_on(module)
+def test_short_chunk_is_the_modules_fault_and_the_file_is_closed(emulated: Emulated) -> None:
+    radar, line, module = emulated
     radar.files.write(USER, 1, CONTENT)
 
     def short(command: m.Message) -> Sequence[m.Message | bytes]:
@@ -157,17 +151,15 @@ def test_transfer_is_not_repeated_on_a_new_line(driver_on: DriverOn) -> None:
         radar.files.write(USER, 1, CONTENT)
 
 
-def test_format_needs_its_key(driver_on: DriverOn) -> None:
-    module = EmulatedModule()
-    radar, _ = driver_on(module)
+def test_format_needs_its_key(emulated: Emulated) -> None:
+    radar, _, module = emulated
     radar.files.write(USER, 1, b"x")
     radar.files.format_all(FORMAT_KEY)
     assert module.files == {}
 
 
-def test_crash_dump_is_read_in_chunks_and_cleared(driver_on: DriverOn) -> None:
-    module = EmulatedModule()
-    radar, _ = driver_on(module)
+def test_crash_dump_is_read_in_chunks_and_cleared(emulated: Emulated) -> None:
+    radar, _, module = emulated
     assert radar.files.crash_dump() == b""
     module.leave_crash_dump(CONTENT)
     told: list[tuple[int, int]] = []

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from hil_tests.unit.xethru_protocol.both_drivers import DriverOn
+from hil_tests.unit.xethru_protocol.both_drivers import DriverOn, Scripted
 from hil_tests.unit.xethru_protocol.scripted import PlainModule, frame
 from xethru_protocol.driver.async_radar import AsyncX4M300
 from xethru_protocol.driver.files import AsyncFiles, Files
@@ -21,9 +21,8 @@ class Interrupted(BaseException):
     """As KeyboardInterrupt, which a test runner would take for its own."""
 
 
-def test_interrupt_while_bytes_are_sorted_leaves_a_driver_that_works(driver_on: DriverOn) -> None:
-    radar, line = driver_on()
-    radar.configure_raw()
+def test_interrupt_while_bytes_are_sorted_leaves_a_driver_that_works(raw: Scripted) -> None:
+    radar, line = raw
 
     def interrupt(message: m.Message, arrival_ns: int) -> None:
         raise Interrupted
@@ -57,18 +56,16 @@ def test_interrupted_request_waits_for_nothing_any_more(driver_on: DriverOn) -> 
     assert radar.stray_count == 1
 
 
-def test_answers_to_nothing_are_counted_and_not_kept(driver_on: DriverOn) -> None:
-    radar, line = driver_on()
-    radar.configure_raw()
+def test_answers_to_nothing_are_counted_and_not_kept(raw: Scripted) -> None:
+    radar, line = raw
     line.say(*[m.Ack()] * 1000, frame(1))
     radar.read_frame()
     assert radar.stray_count == 1000
     assert not radar._link.conversation.answers
 
 
-def test_warnings_are_kept_up_to_a_thousand(driver_on: DriverOn) -> None:
-    radar, _ = driver_on()
-    radar.configure_raw()
+def test_warnings_are_kept_up_to_a_thousand(raw: Scripted) -> None:
+    radar, _ = raw
     for _ in range(1000):
         radar.start(25.0)
     radar.start(26.0)

@@ -5,7 +5,7 @@ from typing import Any, cast
 
 import pytest
 
-from hil_tests.unit.xethru_protocol.both_drivers import DriverOn
+from hil_tests.unit.xethru_protocol.both_drivers import DriverOn, Scripted
 from hil_tests.unit.xethru_protocol.machine import Machine, UartModule
 from hil_tests.unit.xethru_protocol.scripted import Answer, PlainModule, ScriptedTransport, frame
 from xethru_protocol.driver.link import RawConfig
@@ -135,9 +135,8 @@ def test_module_that_does_not_come_back_is_disconnected(
 # --- reconnect ----------------------------------------------------------------------------------
 
 
-def test_vanished_module_is_disconnected_unless_asked_otherwise(driver_on: DriverOn) -> None:
-    radar, line = driver_on()
-    radar.configure_raw()
+def test_vanished_module_is_disconnected_unless_asked_otherwise(raw: Scripted) -> None:
+    radar, line = raw
     unplug(line)
     with pytest.raises(Disconnected):
         radar.read_frame()

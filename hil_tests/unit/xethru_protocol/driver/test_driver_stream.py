@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from hil_tests.unit.xethru_protocol.both_drivers import DriverOn
+from hil_tests.unit.xethru_protocol.both_drivers import DriverOn, Scripted
 from hil_tests.unit.xethru_protocol.scripted import BYTE_SETTINGS, READY, PlainModule, frame
 from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.wire import messages as m
@@ -53,9 +53,8 @@ def test_queue_without_room_is_refused(driver_on: DriverOn) -> None:
         driver_on(queue_frames=0)
 
 
-def test_line_is_read_only_when_no_frame_waits(driver_on: DriverOn) -> None:
-    radar, line = driver_on()
-    radar.configure_raw()
+def test_line_is_read_only_when_no_frame_waits(raw: Scripted) -> None:
+    radar, line = raw
     line.say(frame(0), frame(1), frame(2))
     frames = radar.frames()
     next(frames)
@@ -139,9 +138,8 @@ def test_every_setting_is_read_back(driver_on: DriverOn, setting: X4Setting) -> 
         radar.configure_raw()
 
 
-def test_frame_area_is_quantised_and_only_a_strange_one_is_a_warning(driver_on: DriverOn) -> None:
-    radar, _ = driver_on()
-    radar.configure_raw()
+def test_frame_area_is_quantised_and_only_a_strange_one_is_a_warning(raw: Scripted) -> None:
+    radar, _ = raw
     assert radar.warnings == []
     radar.configure_raw(RawConfig(frame_area_m=(0.4, 5.0)))  # the script answers 0.2 ... 9.4
     assert radar.warnings == [
