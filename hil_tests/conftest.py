@@ -51,13 +51,11 @@ def pytest_ignore_collect(collection_path: Path) -> bool | None:
 
 
 def pytest_report_collectionfinish() -> list[str]:
-    """Say what was left out."""
     left_out = "hil_tests: of an installed package the device suite runs, without a source tree"
     return [] if IN_SOURCE_TREE else [left_out]
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Give each test the limit of time that ends it if it hangs."""
     if not config.pluginmanager.hasplugin("timeout") or config.getoption("timeout") is not None:
         return
     usual_s = float(config.getini("timeout") or 0)

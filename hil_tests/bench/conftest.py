@@ -8,7 +8,6 @@ import pytest
 
 
 def processor() -> str:
-    """Name of the processor, as well as this system tells it."""
     listed = Path("/proc/cpuinfo")
     lines = listed.read_text().splitlines() if listed.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
@@ -16,7 +15,6 @@ def processor() -> str:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Print the frames per second of benchmarks that noted their ``frames`` per round."""
     # the plugin shows extra_info only in its JSON
     session = getattr(terminalreporter.config, "_benchmarksession", None)
     timed = [

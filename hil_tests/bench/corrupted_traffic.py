@@ -151,7 +151,6 @@ class Corruption:
 
 
 def run(size: int, rate: float, seed: int, *, short: bool) -> Outcome:
-    """Send, damage, decode and compare ``size`` bytes, of which a share ``rate`` is replaced."""
     line = Corruption(size, rate, seed, short=short)
     outcome = line.outcome
     swallowing: list[tuple[int, Packet]] = []

@@ -16,7 +16,6 @@ FPS = 17.0
 
 
 def lab_radar(pace: Pace) -> tuple[X4M300, LoopbackTransport]:
-    """Return a driver of the lab's first radar, and its line."""
     scene = load_scene("lab")
     identity = Identity(serial=scene.radars[0].serial)
     line = LoopbackTransport(radar_device(identity, echo_source(scene, 0, 0), pace))

@@ -20,8 +20,6 @@ END_LIMIT_S = seconds(10)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Served:
-    """A running emulator and what its ready line says."""
-
     process: subprocess.Popen[str]
     names: tuple[str, ...]
     paths: tuple[str, ...]
@@ -32,7 +30,6 @@ class Served:
     tcp_ports: tuple[int | None, ...]
 
     def end(self, number: signal.Signals = signal.SIGTERM) -> int:
-        """Send a signal; return the exit code."""
         self.process.send_signal(number)
         return self.process.wait(END_LIMIT_S)
 

@@ -284,5 +284,4 @@ _ABBREVIATED: dict[str, Fields] = {
 
 
 def message_of(vector: Vector) -> m.Message:
-    """Message that a vector of a known kind describes."""
     return BUILDERS[vector.message](vector.decoded | _ABBREVIATED.get(vector.name, {}))

@@ -13,8 +13,6 @@ from hil_tests.paths import FIXTURES
 
 
 def with_hashes(manifest: str, folder: Path) -> str:
-    """Return the manifest with the hash of what each of its files holds now."""
-
     def row(found: re.Match[str]) -> str:
         path = folder / found["path"]
         if not path.is_file():

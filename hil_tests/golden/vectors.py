@@ -48,7 +48,6 @@ class Vector:
 
 
 def load(file: str = "protocol_vectors.json") -> tuple[Vector, ...]:
-    """All vectors of one file, in its order."""
     text = (FIXTURES / "wire" / file).read_text("utf-8")
     return tuple(
         Vector(

@@ -21,8 +21,6 @@ DEFAULT_OUTPUTS = {0x723BFA1E: 1}
 
 @dataclass
 class Settings:
-    """Profile settings that the model follows."""
-
     sensitivity: int = 5
     band: int = 3
     outputs: dict[int, int] = field(default_factory=lambda: dict(DEFAULT_OUTPUTS))

@@ -113,7 +113,6 @@ def landmark_covariance(state: State, row: int) -> Array:
 
 
 def near_a_half_turn() -> st.SearchStrategy[float]:
-    """Return headings, those around +-pi often."""
     return st.one_of(
         st.floats(-math.pi, math.pi),
         st.sampled_from([math.pi, -math.pi, math.pi - 1e-9, -math.pi + 1e-9, 0.0]),

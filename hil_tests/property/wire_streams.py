@@ -19,7 +19,6 @@ _NASTY = st.sampled_from([0x7C, 0x7D, 0x7E, 0x7F, 0x00, 0x01, 0x0E, 0x10, 0x12, 
 
 @st.composite
 def packets(draw: st.DrawFn) -> bytes:
-    """Draw an intact packet that a receiver on the host side accepts."""
     payload = bytes(draw(st.lists(_NASTY | st.integers(0, 0xFF), min_size=1, max_size=24)))
     kind = draw(st.sampled_from(["normal", "short", "reply", "frame"]))
     if kind == "normal":
@@ -60,7 +59,6 @@ STREAMS = st.lists(packets() | _damaged() | GARBAGE | st.binary(max_size=9), max
 
 
 def drain(reader: PacketReader) -> list[Packet | FramingFault]:
-    """Take what a receiver has found by now."""
     found: list[Packet | FramingFault] = []
     while not isinstance(item := reader.next_packet(), NeedData):
         found.append(item)

@@ -36,7 +36,6 @@ _SHORTER = ("waypoints_m = [[0.0, 0.0], [0.5, 0.0]]", "waypoints_m = [[0.0, 0.0]
 
 
 def write_shorter_scene(folder: Path) -> Path:
-    """Write the short scene with 0.2 m to drive instead of 0.5."""
     file = write_short_scene(folder)
     text = file.read_text()
     assert text.count(_SHORTER[0]) == 1

@@ -33,14 +33,12 @@ SECONDS = 5.0
 
 
 def cpu_s(pid: int) -> float:
-    """Return user and system time of a process, s."""
     with open(f"/proc/{pid}/stat") as file:
         fields = file.read().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def measure(served: Served, fps: float, config: RawConfig) -> dict[str, float]:
-    """Return what the streams of an emulator cost and how punctual they were."""
     drivers = [X4M300.open(path) for path in served.paths]
     for driver in drivers:
         driver.configure_raw(config)

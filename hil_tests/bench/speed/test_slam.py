@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from pytest_benchmark.fixture import BenchmarkFixture
 from threadpoolctl import threadpool_limits
 
+from hil_tests.unit.slam.simulation import BIN_LENGTH_M, frame_of
 from slam.config import (
     AssociationConfig,
     ClusteringConfig,
@@ -27,7 +28,6 @@ from slam.paper.trilateration import Trilaterator
 from slam.results import Belief, Fix
 
 Array = NDArray[np.float64]
-BIN_LENGTH_M = 299_792_458 / (2 * 23.328e9)
 Q = np.diag([0.15**2, 1.0])
 
 
@@ -38,14 +38,7 @@ def frame(radar: int) -> RadarFrame:
     for range_m in (0.6, 1.0, 2.0, 4.0):
         envelope = 0.015 * np.exp(-0.5 * ((labels - range_m) / 0.0517) ** 2)
         samples += envelope * np.cos(2 * math.pi * (labels - range_m) / 0.02056)
-    return RadarFrame(
-        radar=radar,
-        t_ns=0,
-        counter=0,
-        samples=samples.astype(np.float32),
-        range_start_m=0.2,
-        bin_length_m=BIN_LENGTH_M,
-    )
+    return frame_of(samples.astype(np.float32), radar=radar)
 
 
 def large_belief(n: int) -> Belief:

@@ -6,7 +6,6 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -14,13 +13,11 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
-from hil_tests.unit.slam.app.sessions import FRAME_NS, session_info, snapshot
+from hil_tests.unit.slam.app.sessions import scan, session_info, snapshot
 from slam.app.errors import AppError
-from slam.app.records import Scan
 from slam.app.session.log import SessionLog
 from slam.app.session.reader import open_session, read_entries
 from slam.app.session.repair import KEPT_SUFFIX, repair
-from slam.frames import RadarFrame
 from xethru_protocol.recordings.mcap import CHUNK, FLOAT_ARRAY, Cut
 from xethru_protocol.recordings.mcap import Message as StoredMessage
 from xethru_protocol.system import StopFlag
@@ -59,18 +56,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Content:
     info = replace(info, radars=tuple(replace(radar, n_bins=N_BINS) for radar in info.radars))
     log = SessionLog(path, info, clock_ns=SlowClock())
     for counter in range(N_SCANS):
-        frames = tuple(
-            RadarFrame(
-                radar=radar,
-                t_ns=counter * FRAME_NS,
-                counter=counter,
-                samples=np.random.default_rng((counter, radar)).normal(0, 1, N_BINS).astype("f4"),
-                range_start_m=0.2,
-                bin_length_m=0.0064,
-            )
-            for radar in range(2)
-        )
-        log.on_scan(Scan(counter=counter, t_ns=counter * FRAME_NS, frames=frames))
+        log.on_scan(scan(counter, n_bins=N_BINS))
         log.on_snapshot(snapshot(counter))
     log.close()
     return Content(path.read_bytes())
@@ -181,11 +167,9 @@ def test_damage_in_the_middle_loses_the_chunk_it_is_in(
     assert count_by_rosbags(path) == len(found)
     kept = iter(everything)
     assert all(row in kept for row in found)  # in order, and nothing that was not there
-    for scan, _ in open_session(path).scans():  # whole ones, whatever is lost between them
-        assert [(frame.radar, frame.counter) for frame in scan.frames] == [
-            (0, scan.counter),
-            (1, scan.counter),
-        ]
+    for one, _ in open_session(path).scans():  # whole ones, whatever is lost between them
+        frames = [(frame.radar, frame.counter) for frame in one.frames]
+        assert frames == [(0, one.counter), (1, one.counter)]
     # 40 bytes touch two chunks at most, with eight messages each at most
     assert len(found) >= len(everything) - 2 * 8
 

@@ -52,7 +52,6 @@ class StallingModule:
         self.line = ScriptedTransport(self)
 
     def __call__(self, command: m.Message) -> Sequence[m.Message | bytes]:
-        """Say nothing now; the answer is due when the stall is over."""
         self._count += 1
         now_ns = self.line.now_ns
         end_ns = max((end for begin, end in self._stalls if begin <= now_ns < end), default=now_ns)
@@ -302,7 +301,6 @@ class Line:
         self._flight += [(packet, byte) for byte in wire]
 
     def damage(self, kind: str, where: float, byte: int, count: int) -> None:
-        """Do one thing to the bytes in flight at the part ``where`` of them."""
         self.clean = False
         at = int(where * len(self._flight))
         hit = self._flight[at : at + count]
@@ -330,7 +328,6 @@ class Line:
         return []
 
     def deliver(self, count: int) -> None:
-        """Hand over the next bytes and judge what the receiver makes of them."""
         chunk, self._flight = self._flight[:count], self._flight[count:]
         complete = []
         following = [packet for packet, _ in [*chunk[1:], *self._flight[:1]]] + [None]
@@ -380,7 +377,6 @@ class Line:
         return found, faults
 
     def check_books(self) -> None:
-        """Compare the receiver's totals with what was delivered and heard."""
         statistics = self._receiver.statistics
         assert self._receiver.buffered <= LONGEST_PACKET
         assert statistics.bytes == self._delivered
@@ -436,7 +432,6 @@ class LossyLine(RuleBasedStateMachine):
             line.check_books()
 
     def teardown(self) -> None:
-        """In the end both lines carry every message again."""
         for line, messages in zip(self.lines.values(), (RESPONSES, COMMANDS), strict=True):
             line.silence()
             for message in messages:

@@ -32,7 +32,6 @@ NASTY = st.lists(
 def read(
     stream: bytes, cuts: list[int], direction: Direction = Direction.FROM_MODULE
 ) -> tuple[list[Packet | FramingFault], LinkStatistics]:
-    """Read a stream cut into chunks, watching what is held back."""
     reader = PacketReader(direction)
     found: list[Packet | FramingFault] = []
     previous = 0

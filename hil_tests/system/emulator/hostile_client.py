@@ -37,8 +37,6 @@ WARM_UP = 0.25
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
-    """What a run left behind."""
-
     actions: dict[str, int]  # what the hostile host did, by name
     sent_bytes: int  # by the hostile host
     faults_seen: int  # damaged packets that its module noticed
@@ -75,7 +73,6 @@ class HostileHost:
         )
 
     def step(self, now_ns: int) -> None:
-        """Read, or not, and perhaps do something."""
         self._now_ns = now_ns
         if now_ns >= self._deaf_until_ns:
             self._line.host_read()
@@ -138,8 +135,6 @@ class HostileHost:
 
 
 class GoodHost:
-    """Starts the stream and reads it."""
-
     def __init__(self, line: PairLine) -> None:
         self._line = line
         self._connection = Connection(Role.HOST)
@@ -152,7 +147,6 @@ class GoodHost:
             line.host_write(self._connection.send(command))
 
     def step(self) -> None:
-        """Read all there is; anything that is neither ACK nor a frame is a mistake."""
         while data := self._line.host_read():
             self._connection.receive_data(data)
             while not isinstance(event := self._connection.next_event(), NeedData):
@@ -163,8 +157,6 @@ class GoodHost:
 
 
 class World:
-    """Two modules in one loop, and a clock that goes on by steps."""
-
     def __init__(self, paces: tuple[Pace, Pace], seed: int) -> None:
         scene = empty_room(2)
         self.now_ns = 0
@@ -178,7 +170,6 @@ class World:
         self._server.turn(longest_wait_s=0)
 
     def step(self) -> None:
-        """Let time pass, and every port have its share."""
         self.now_ns += STEP_NS
         self._server.turn(longest_wait_s=0)
 

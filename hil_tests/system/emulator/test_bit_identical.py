@@ -41,7 +41,6 @@ def in_process(index: int, config: RawConfig, count: int, fps: float) -> Content
 
 
 def through_ports(served: Served, config: RawConfig, count: int, fps: float) -> list[Content]:
-    """Read all radars at once, as a host with four modules does."""
     contents: list[Content] = [{} for _ in served.paths]
 
     def one(index: int, path: str) -> None:

@@ -22,7 +22,6 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(autouse=True)
 def announcements(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Keep this test's announcements to itself."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     return tmp_path / "xethru"
 

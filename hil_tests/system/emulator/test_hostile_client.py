@@ -83,7 +83,6 @@ def open_port(path: str) -> int:
 
 
 def ping_through_whatever(path: str) -> bool:
-    """Whether a module answers, behind all that earlier hosts left in its line."""
     line, fd = Connection(Role.HOST), open_port(path)
     end = time.monotonic() + seconds(10)
     try:

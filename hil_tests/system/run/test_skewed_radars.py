@@ -174,7 +174,6 @@ def test_through_ports_stamps_and_samples_are_those_in_process(tmp_path: Path) -
 
 
 def toml_of(scene: Scene) -> str:
-    """Write what `scene_of` sets as a scene file."""
     path = scene.path.model_dump()
     lines = [f"{key} = {json.dumps(getattr(scene, key))}" for key in ("name", "environment")]
     lines += [f"description = {json.dumps(scene.description)}", "[path]"]

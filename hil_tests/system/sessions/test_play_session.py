@@ -36,7 +36,6 @@ def sent(radar: int, counters: range) -> bytes:
 
 
 def heard(paths: tuple[str, ...], size: int) -> list[bytes]:
-    """Return what all ports say while they are read at once, up to a size each."""
     descriptors = [os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK) for path in paths]
     data = {descriptor: b"" for descriptor in descriptors}
     deadline = time.monotonic() + LIMIT_S

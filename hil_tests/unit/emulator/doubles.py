@@ -100,7 +100,6 @@ class BareHost:
         return reply
 
     def command(self, *commands: m.Command[m.Ack]) -> None:
-        """Send commands, each of which must be acknowledged."""
         for one in commands:
             assert self.ask(one) == m.Ack()
 
@@ -116,7 +115,6 @@ class BareHost:
         self.set(X4Setting.FPS, fps)
 
     def at(self, now_ns: int) -> list[m.Message]:
-        """Let time pass until then, and return what the device says."""
         self.now_ns = now_ns
         self.device.advance(now_ns)
         return self.hear()
@@ -209,13 +207,11 @@ class PairLine:
         return os.dup(self._host_end.fileno())
 
     def host_read(self) -> bytes:
-        """Return what the module wrote; ``b""`` when there is nothing."""
         with contextlib.suppress(BlockingIOError):
             return self._host_end.recv(65536)
         return b""
 
     def host_write(self, data: bytes) -> int:
-        """Write to the module what fits; return how much."""
         with contextlib.suppress(BlockingIOError):
             return self._host_end.send(data)
         return 0

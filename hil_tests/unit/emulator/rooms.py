@@ -73,14 +73,11 @@ def room(radar: RadarSpec, **parts: Any) -> Scene:  # noqa: ANN401 - any table
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Heard:
-    """Paths that exist, nearest first."""
-
     range_m: NDArray[np.float64]
     amplitude: NDArray[np.float64]
     phase_rad: NDArray[np.float64]
 
     def at(self, range_m: float, within_m: float = 1e-9) -> NDArray[np.float64]:
-        """Return the amplitudes of the paths of one length."""
         return self.amplitude[np.abs(self.range_m - range_m) <= within_m]
 
     def field(self) -> complex:

@@ -53,7 +53,6 @@ def test_a_closed_stderr_leaves_the_exit_code() -> None:
 
 
 def run(arguments: str, stdout: int | IO[bytes]) -> tuple[int, str]:
-    """Return exit code and stderr of a process of its own."""
     command = [sys.executable, "-m", "emulator.cli", *arguments.split()]
     done = subprocess.run(command, stdout=stdout, stderr=subprocess.PIPE, text=True, check=False)
     return done.returncode, done.stderr

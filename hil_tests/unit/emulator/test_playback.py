@@ -47,7 +47,6 @@ def device_of(recording: Path, rate: float = 0, warnings: list[str] | None = Non
 
 
 def wire_bytes(device: Device) -> bytes:
-    """Everything a host that only listens gets."""
     device.port_opened(0)
     device.advance(SECOND)
     packets = iter(lambda: device.next_packet(SECOND), None)

@@ -1,17 +1,31 @@
 """The world of ranges as frames of detections with odometry, for whole pipelines."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil_tests.unit.slam.robust import range_world
-from slam.frames import Detection
+from slam.frames import Detection, RadarFrame
 from slam.results import PoseAt
 
 Array = NDArray[np.float64]
 
 FRAME_NS = 200_000_000
+BIN_LENGTH_M = 299_792_458 / (2 * 23.328e9)
+
+
+def frame_of(samples: NDArray[Any], **given: Any) -> RadarFrame:  # noqa: ANN401 - its fields
+    """Return a frame of RF bins from 0.2 m, of radar 0 at time 0, but for what is given."""
+    blank = {
+        "radar": 0,
+        "t_ns": 0,
+        "counter": 0,
+        "range_start_m": 0.2,
+        "bin_length_m": BIN_LENGTH_M,
+    }
+    return RadarFrame(samples=samples, **(blank | given))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -52,7 +52,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def run(words: Sequence[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """Return what a command prints, and its exit code."""
     try:
         code = PROGRAMS[words[0]](words[1:])
     except SystemExit as end:

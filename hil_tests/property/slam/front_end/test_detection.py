@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import find_peaks, savgol_filter
 
+from hil_tests.unit.slam.simulation import BIN_LENGTH_M, frame_of
 from slam.config import BackgroundFilter, DetectionConfig, PeakPosition
 from slam.frames import RadarFrame
 from slam.front_end.paper import PaperDetector, SavitzkyGolay
@@ -16,7 +17,6 @@ from slam.front_end.paper import PaperDetector, SavitzkyGolay
 Array = NDArray[np.float64]
 
 N_BINS = 1431
-BIN_LENGTH_M = 299_792_458 / (2 * 23.328e9)
 ENVELOPE_SIGMA_M = 0.0517  # 1.4 GHz at -10 dB, as a range
 CARRIER_PERIOD_M = 299_792_458 / (2 * 7.29e9)
 
@@ -29,14 +29,7 @@ def pulse(range_m: float, amplitude: float, phase: float = 0.0) -> Array:
 
 
 def frame(samples: Array, range_start_m: float = 0.2) -> RadarFrame:
-    return RadarFrame(
-        radar=0,
-        t_ns=0,
-        counter=0,
-        samples=samples.astype(np.float32),
-        range_start_m=range_start_m,
-        bin_length_m=BIN_LENGTH_M,
-    )
+    return frame_of(samples.astype(np.float32), range_start_m=range_start_m)
 
 
 @st.composite
@@ -149,11 +142,4 @@ def test_least_width_removes_the_ripple_of_strong_echoes(range_m: float, phase: 
 
 def test_frame_of_anything_but_real_samples_is_refused() -> None:
     with pytest.raises(ValueError, match="raw RF mode"):
-        RadarFrame(
-            radar=0,
-            t_ns=0,
-            counter=0,
-            samples=np.zeros(5, dtype=np.complex64),
-            range_start_m=0.2,
-            bin_length_m=BIN_LENGTH_M,
-        )
+        frame_of(np.zeros(5, dtype=np.complex64))

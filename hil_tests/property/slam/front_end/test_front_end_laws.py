@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from hil_tests.property.slam.front_end.test_detection import BIN_LENGTH_M, N_BINS, frame, pulse
 from slam.config import DetectionConfig, FrontEnd, MatchedFilterConfig, PeakPosition, SlamConfig
-from slam.frames import Detector, RadarFrame
+from slam.frames import Detector
 from slam.front_end import make_detector
 
 Array = NDArray[np.float64]
@@ -168,16 +169,7 @@ def test_echo_of_twice_the_samplers_window_is_ranged_without_bias(name: FrontEnd
         echo = pulse(range_m, 2 * DAC_WINDOW, rng.uniform(0, math.tau))
         samples = echo + NOISE_SIGMA * rng.standard_normal(N_BINS)
         clipped = frame(np.clip(samples, -DAC_WINDOW, DAC_WINDOW))
-        told = RadarFrame(
-            radar=0,
-            t_ns=0,
-            counter=0,
-            samples=clipped.samples,
-            range_start_m=clipped.range_start_m,
-            bin_length_m=BIN_LENGTH_M,
-            limits=(-DAC_WINDOW, DAC_WINDOW),
-        )
-        (detection,) = detector.detect(told)
+        (detection,) = detector.detect(replace(clipped, limits=(-DAC_WINDOW, DAC_WINDOW)))
         assert detection.saturated
         errors.append(detection.range_m - range_m)
         amplitudes.append(detection.amplitude / (2 * DAC_WINDOW))

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from scipy.special import eval_genlaguerre
 from scipy.stats import ncx2
 
+from hil_tests.unit.slam.simulation import BIN_LENGTH_M as BIN_M
+from hil_tests.unit.slam.simulation import frame_of
 from slam.app.cli import main
 from slam.app.experiments.limits import (
     PULSE,
@@ -32,7 +34,6 @@ Array = NDArray[np.float64]
 TRIALS = 2000
 AMPLITUDE, NOISE_SIGMA = 0.015, 5e-4
 N_BINS, START_M = 1431, 0.2
-BIN_M = 299_792_458 / (2 * 23.328e9)
 # 1.4 GHz at -10 dB and 7.29 GHz, sampled at 23.328 GHz
 S = math.sqrt(math.log(10)) / (math.pi * 1.4e9) * 23.328e9
 CARRIER = math.tau * 7.29 / 23.328
@@ -52,14 +53,7 @@ def frames_of(
         pulses = amplitude * np.exp(-0.5 * (x / (wide * S)) ** 2) * np.cos(CARRIER * x + turn)
         row += pulses.sum(axis=0)
     return [
-        RadarFrame(
-            radar=0,
-            t_ns=200_000_000 * counter,
-            counter=counter,
-            samples=row,
-            range_start_m=START_M,
-            bin_length_m=BIN_M,
-        )
+        frame_of(row, t_ns=200_000_000 * counter, counter=counter)
         for counter, row in enumerate(samples.astype(np.float32))
     ]
 

@@ -51,7 +51,6 @@ def in_body(pose: Array, point: complex) -> complex:
 
 
 def echoes(rig: Rig, poses: Mapping[int, Array], target: complex) -> list[Detection]:
-    """Return exact ranges, each from where the robot was at the radar's own time."""
     return [
         Detection(
             radar=radar,
@@ -77,7 +76,6 @@ def result_of(
 
 @st.composite
 def moments(draw: st.DrawFn, way_m: float = 0.03, turn_rad: float = 0.2) -> dict[int, Array]:
-    """Draw where the robot is at the state's time and at the time of each radar's sample."""
     coordinate = st.floats(-20, 20)
     start = np.array([draw(coordinate), draw(coordinate), draw(st.floats(-3.1, 3.1))])
     poses = {STATE_NS: start}

@@ -199,7 +199,6 @@ def test_left_jacobian_is_the_mean_of_rotations(angle: float) -> None:
 
 
 def small_problem(seed: int) -> tuple[Problem, Estimate]:
-    """Return five poses, two landmarks, ranges and points with values of all unknowns."""
     rng = np.random.default_rng(seed)
     problem = Problem(
         increments=0.3 * rng.standard_normal((4, 3)),

@@ -23,7 +23,6 @@ CARRIER_HZ = {3: 7.290e9, 4: 8.748e9}
 def formula(
     position: float, amplitude: float, phase_rad: float, setting: int, n_samples: int
 ) -> NDArray[np.float64]:
-    """Return the pulse straight from its definition."""
     t = (np.arange(n_samples) - position) / SAMPLING_RATE_HZ
     wave: NDArray[np.float64] = (
         amplitude

@@ -43,7 +43,6 @@ class Expected:
 
 
 def damaged(kind: FaultKind) -> Expected:
-    """Expect that a reply is lost by one damage of a kind."""
     return Expected(keys=READ, faults={kind: 1}, junk_bytes=None, timeouts=1)
 
 

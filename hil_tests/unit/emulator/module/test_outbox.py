@@ -13,8 +13,6 @@ FRAME, REPLY, DEBUG = MessageKind.FRAME, MessageKind.REPLY, MessageKind.DEBUG
 
 @dataclass
 class Ticker(MessageStream):
-    """A stream that is due every ``period_ns``."""
-
     period_ns: int
     counter: int = 0
     taken: int = 0

@@ -32,8 +32,6 @@ PONG = m.Pong(value=0xAAEEAEEA)
 
 
 class Bench:
-    """Served modules under a clock that tests set."""
-
     def __init__(
         self,
         folder: Path,

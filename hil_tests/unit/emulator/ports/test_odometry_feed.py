@@ -64,7 +64,6 @@ def asap(folder: Path) -> Iterator[Loop]:
 
 @pytest.fixture
 def loop(folder: Path) -> Iterator[Loop]:
-    """Return a feed in real time, from time 0 on."""
     feed = OdometryFeed(folder / "o", LINES, Pace.REALTIME)
     yield Loop(feed)
     feed.close()

@@ -40,8 +40,6 @@ PONG = m.Pong(value=0xAAEEAEEA)
 
 
 class TerminalLink(PtyLink):
-    """The real thing."""
-
     def host_fd(self) -> int:
         return os.open(self.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
 
@@ -58,6 +56,11 @@ class Bench:
         host = PortHost(self.links[index].host_fd(), self.server)
         self.hosts.append(host)
         return host
+
+    def turns(self, count: int, each_ns: int = 0) -> None:
+        for _ in range(count):
+            self.clock.now_ns += each_ns
+            self.server.turn(longest_wait_s=0)
 
 
 @contextlib.contextmanager
@@ -99,8 +102,7 @@ def test_nothing_is_lost_when_the_host_reads_slowly(asap: Bench) -> None:
     counters = []
     for step in range(200):
         if step % 10 == 0:
-            for _ in range(20):
-                asap.server.turn(longest_wait_s=0)
+            asap.turns(20)
         message = host.hear()
         assert isinstance(message, m.DataFloat)
         counters.append(message.info)
@@ -110,11 +112,9 @@ def test_nothing_is_lost_when_the_host_reads_slowly(asap: Bench) -> None:
 def test_back_pressure_stops_the_chip(asap: Bench) -> None:
     host = asap.host(0)
     host.stream()
-    for _ in range(100):
-        asap.server.turn(longest_wait_s=0)
+    asap.turns(100)
     made = asap.devices[0].module.chip.timeline.next_counter
-    for _ in range(100):
-        asap.server.turn(longest_wait_s=0)
+    asap.turns(100)
     assert asap.devices[0].module.chip.timeline.next_counter == made
     assert made < 20, "no more than the line holds"
 
@@ -122,8 +122,7 @@ def test_back_pressure_stops_the_chip(asap: Bench) -> None:
 def test_a_reply_overtakes_all_but_what_is_in_the_line(asap: Bench) -> None:
     host = asap.host(0)
     host.stream()
-    for _ in range(50):
-        asap.server.turn(longest_wait_s=0)
+    asap.turns(50)
     made = asap.devices[0].module.chip.timeline.next_counter
     host.send(m.X4DriverSet(setting=X4Setting.FPS, value=0.0))
     frames = 0
@@ -131,8 +130,7 @@ def test_a_reply_overtakes_all_but_what_is_in_the_line(asap: Bench) -> None:
         frames += 1
     assert message == m.Ack()
     assert frames <= made + 2, "what was made before, and a packet that was half sent"
-    for _ in range(20):
-        asap.server.turn(longest_wait_s=0)
+    asap.turns(20)
     with pytest.raises(BlockingIOError):
         os.read(host.fd, 1)
 
@@ -140,14 +138,10 @@ def test_a_reply_overtakes_all_but_what_is_in_the_line(asap: Bench) -> None:
 def test_a_host_that_dies_while_streaming_leaves_a_usable_module(terminal: Bench) -> None:
     first = terminal.host(0)
     first.stream(fps=90.0)
-    for _ in range(200):
-        terminal.clock.now_ns += 10_000_000
-        terminal.server.turn(longest_wait_s=0)
+    terminal.turns(200, 10_000_000)
     terminal.hosts.remove(first)
     first.close()
-    for _ in range(200):
-        terminal.clock.now_ns += 10_000_000
-        terminal.server.turn(longest_wait_s=0)
+    terminal.turns(200, 10_000_000)
     second = terminal.host(0)
     second.send(m.X4DriverSet(setting=X4Setting.FPS, value=0.0))
     deadline = time.monotonic() + LIMIT_S
@@ -216,8 +210,6 @@ def test_stop_ends_a_waiting_loop(asap: Bench) -> None:
 
 
 class Idle:
-    """A device that says nothing and waits for nothing."""
-
     wants_data = True
 
     def receive_data(self, data: bytes, now_ns: int) -> None: ...

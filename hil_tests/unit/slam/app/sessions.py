@@ -46,14 +46,14 @@ def session_info(n_radars: int = 2) -> SessionInfo:
     )
 
 
-def scan(counter: int, n_radars: int = 2) -> Scan:
+def scan(counter: int, n_radars: int = 2, n_bins: int = N_BINS) -> Scan:
     t_ns = counter * FRAME_NS
     frames = tuple(
         RadarFrame(
             radar=radar,
             t_ns=t_ns,
             counter=counter,
-            samples=np.random.default_rng((counter, radar)).normal(0, 1e-3, N_BINS).astype("f4"),
+            samples=np.random.default_rng((counter, radar)).normal(0, 1e-3, n_bins).astype("f4"),
             range_start_m=0.2,
             bin_length_m=0.0064,
         )
@@ -80,8 +80,6 @@ def snapshot(counter: int) -> Snapshot:
 
 
 class Listener(SessionObserver):
-    """Keeps everything that a run produces."""
-
     def __init__(self) -> None:
         self.scans: list[Scan] = []
         self.snapshots: list[Snapshot] = []
@@ -117,7 +115,6 @@ def odometry(n_poses: int) -> OdometryTrack:
 def write_session(
     path: Path, n_scans: int, track: OdometryTrack | None = None, info: SessionInfo | None = None
 ) -> Path:
-    """Write a whole session file, by default of two radars, and return its path."""
     log = SessionLog(path, info or session_info(), track)
     feed(log, n_scans)
     log.close()
@@ -139,7 +136,6 @@ def write_scans(
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    """Run a command of `uwb-slam`; return its exit code, stdout and stderr."""
     code = main([str(argument) for argument in arguments])
     said = capsys.readouterr()
     return code, said.out, said.err

@@ -55,8 +55,6 @@ def course(stops: tuple[tuple[float, float], ...], step_m: float = 0.02) -> Arra
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class World:
-    """What a made-up drive is like."""
-
     stops: tuple[tuple[float, float], ...] = SQUARE
     rods: Array = field(default_factory=RODS.copy)
     sigma_m: float = 0.0

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from hil_tests.unit.slam.simulation import frame_of
 from slam.app.rig.emulated import scene_and_config, wheels_of
 from slam.app.run.runner import make_slam
 from slam.config import RobustConfig, SlamConfig, WheelNoise, load_preset, override
@@ -248,14 +249,7 @@ def test_a_front_end_of_ones_own_gets_the_range_offset_of_each_radar(preset: str
             return [self.detect(*row) for row in zip(frames, offsets_m, strict=True)]
 
     def frame(t_ns: int, radar: int) -> RadarFrame:
-        return RadarFrame(
-            radar=radar,
-            t_ns=t_ns,
-            counter=0,
-            samples=np.zeros(8, dtype=np.float32),
-            range_start_m=0.2,
-            bin_length_m=0.0064,
-        )
+        return frame_of(np.zeros(8, dtype=np.float32), radar=radar, t_ns=t_ns)
 
     mounts = [replace(mount, range_offset_m=0.01 * k) for k, mount in enumerate(RIG.mounts)]
     config = override(load_preset(preset), {"window.size": 1})

@@ -310,7 +310,6 @@ def runs() -> list[SweepRun]:
 
 
 def numbers_of(name: str, folder: Path) -> dict[str, Any]:
-    """Return what an experiment on the sweep of `runs` writes beside its picture."""
     command = ["experiment", name, "--sweep", written(folder, runs()), "--out", str(folder / "out")]
     assert main(command) == 0
     assert (folder / "out" / f"{name}.png").read_bytes().startswith(b"\x89PNG")

@@ -30,7 +30,6 @@ from xethru_protocol.wire.messages import DataFloat
 
 @pytest.fixture
 def fake_emulator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return the file of a shell script that is started in the emulator's place."""
     script = tmp_path / "fake"
     script.touch(mode=stat.S_IRWXU)
     monkeypatch.setattr(sys, "executable", str(script))

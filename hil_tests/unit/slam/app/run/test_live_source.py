@@ -25,6 +25,7 @@ from hil_tests.unit.slam.app.run.virtual_rig import (
     radar_events,
 )
 from hil_tests.unit.slam.app.sessions import Listener
+from hil_tests.unit.slam.simulation import frame_of
 from slam.app.errors import AppError
 from slam.app.odometry.arrival import ClockLine
 from slam.app.odometry.live import LiveOdometry, parse_source
@@ -43,7 +44,6 @@ from slam.app.run.live_source import (
 from slam.app.run.runner import RunRecord, make_slam, run_slam
 from slam.config import load_preset
 from slam.evaluation import ate_rmse_m
-from slam.frames import RadarFrame
 from slam.geometry import Mount
 from xethru_protocol.driver.frames import Frame, FrameGeometry
 from xethru_protocol.system import StopFlag
@@ -155,15 +155,7 @@ START_NS = 3 * NS_PER_S
 
 
 def take_frame(assembler: TickAssembler, radar: int, t_ns: int, counter: int = 0) -> None:
-    frame = RadarFrame(
-        radar=radar,
-        t_ns=t_ns,
-        counter=counter,
-        samples=SAMPLES,
-        range_start_m=0.2,
-        bin_length_m=0.0064,
-    )
-    assembler.take(frame, host_ns=t_ns)
+    assembler.take(frame_of(SAMPLES, radar=radar, t_ns=t_ns, counter=counter), host_ns=t_ns)
 
 
 def odometry_until(end_s: float) -> LiveOdometry:

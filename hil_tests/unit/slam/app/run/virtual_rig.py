@@ -75,7 +75,6 @@ class Words(LiveLog):
 
 
 def drifting(scene: Scene, ppm: tuple[float, ...], skew_ms: tuple[float, ...]) -> Scene:
-    """Return the scene with clocks that are off, and samples that are out of step."""
     radars = [
         radar.model_copy(update={"clock_ppm": each, "start_skew_ms": skew})
         for radar, each, skew in zip(scene.radars, ppm, skew_ms, strict=True)

@@ -10,6 +10,7 @@ import pytest
 
 from emulator.scene.scene import Scene, load_scene
 from emulator.scene.wheels import scene_odometry
+from hil_tests.unit.slam.simulation import frame_of
 from slam.app.odometry.track import OdometryTrack
 from slam.app.records import Scan
 from slam.app.sweep import CLEAN, STRESSES, Stress
@@ -22,14 +23,7 @@ SAMPLES = np.zeros(1, dtype=np.float32)
 
 
 def frame(radar: int, counter: int) -> RadarFrame:
-    return RadarFrame(
-        radar=radar,
-        t_ns=counter * PERIOD_NS,
-        counter=counter,
-        samples=SAMPLES,
-        range_start_m=0.0,
-        bin_length_m=1.0,
-    )
+    return frame_of(SAMPLES, radar=radar, t_ns=counter * PERIOD_NS, counter=counter)
 
 
 @cache

@@ -51,7 +51,6 @@ def started(tmp_path: Path, body: str) -> subprocess.Popen[str]:
 
 
 def ended(tmp_path: Path, body: str) -> tuple[int, str, str]:
-    """Return exit code, output and errors of a fresh interpreter."""
     with started(tmp_path, body) as process:
         output, errors = process.communicate(timeout=LIMIT_S)
     return process.returncode, output, errors

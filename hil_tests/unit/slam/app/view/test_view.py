@@ -61,7 +61,6 @@ def drawn(
     info: SessionInfo | None = None,
     time_of_day_ns: Callable[[], int] | None = None,
 ) -> Path:
-    """Write a view of these events and return its path."""
     with RerunView(path / "s.rrd", info or session_info(), time_of_day_ns=time_of_day_ns) as view:
         for event in events:
             match event:
