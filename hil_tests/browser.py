@@ -1,7 +1,5 @@
 """Pictures of a page as a browser shows it: `python -m hil_tests.browser PAGE.html OUT.png`."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -4,8 +4,6 @@ These limits only end what hangs, so a large factor costs nothing while tests pa
 environment variable ``XETHRU_TEST_PATIENCE`` sets it.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

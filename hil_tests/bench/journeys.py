@@ -6,8 +6,6 @@ runs in a new process, so that no cache of an earlier one saves calls; processes
 itself, such as the demo's emulator, do not count.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import inspect

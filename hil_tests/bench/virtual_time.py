@@ -1,7 +1,5 @@
 """Device time without waiting: a driver and a module in this process, on a virtual clock."""
 
-from __future__ import annotations
-
 from emulator.chip import Pace
 from emulator.device import radar_device
 from emulator.echo.echo import echo_source

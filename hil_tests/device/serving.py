@@ -1,7 +1,5 @@
 """`xethru-emulator` as a process of its own, for tests that go through real ports."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess

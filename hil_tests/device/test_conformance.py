@@ -4,8 +4,6 @@
 ``--hil-cassette FILE`` writes them down; each file in ``fixtures/cassettes`` binds the emulator.
 """
 
-from __future__ import annotations
-
 import datetime
 from pathlib import Path
 

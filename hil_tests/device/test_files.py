@@ -1,7 +1,5 @@
 """Files in the module's flash; what writes there needs --allow-flash on real modules."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

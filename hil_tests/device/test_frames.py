@@ -1,7 +1,5 @@
 """Raw radar frames: how many bins, which counters, when they come, and how they stop."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 

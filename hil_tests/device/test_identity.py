@@ -1,7 +1,5 @@
 """What a module says of itself, and how it answers what it does not know."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,7 +1,5 @@
 """Sensor modes: which one leads where, and what is refused without a profile."""
 
-from __future__ import annotations
-
 import pytest
 
 from xethru_protocol.driver.radar import X4M300

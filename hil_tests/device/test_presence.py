@@ -4,8 +4,6 @@ Loading and setting up a profile changes nothing that outlives it; running it sa
 the module's flash (Protocol reference 8.2), so those tests run on real modules with --allow-flash.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

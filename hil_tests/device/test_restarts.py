@@ -1,7 +1,5 @@
 """A module that restarts, is unplugged, or changes its baud rate."""
 
-from __future__ import annotations
-
 import pytest
 
 from hil_tests.plugin.bench import RadarUnderTest

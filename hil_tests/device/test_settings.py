@@ -1,7 +1,5 @@
 """Every X4 setting reads back as the chip keeps it, whatever bytes it is made of."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

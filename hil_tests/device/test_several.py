@@ -1,7 +1,5 @@
 """Several radars at once: each answers for itself, none disturbs the other's stream."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import pytest

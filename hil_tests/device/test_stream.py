@@ -1,7 +1,5 @@
 """What every source of frames shows, a recording that is played among them."""
 
-from __future__ import annotations
-
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.wire.codes import PongCode
 

@@ -4,8 +4,6 @@ A lap is the first of a scene, through the whole echo chain. The bands span seed
 suite runs three of them. Whole drives over a hundred seeds are `make sweep`.
 """
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import dataclass, replace
 

@@ -4,8 +4,6 @@ The hash is over integer chip counters (int64, little-endian, frame by frame), t
 numbers before float32 normalisation. The cases stand in ``fixtures/baselines/chip_counters.toml``.
 """
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import json

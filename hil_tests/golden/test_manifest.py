@@ -1,7 +1,5 @@
 """``fixtures/MANIFEST.toml`` names every data file, where it comes from, and its exact content."""
 
-from __future__ import annotations
-
 import hashlib
 import tomllib
 

@@ -3,8 +3,6 @@
 Files that are not listed, and rows without a file, are left for `test_manifest` to tell of.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 from pathlib import Path

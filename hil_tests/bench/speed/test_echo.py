@@ -1,7 +1,5 @@
 """Cost of emulated frames, synthesis only; the emulator's bar is in the design's table."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

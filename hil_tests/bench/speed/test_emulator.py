@@ -4,8 +4,6 @@ The bar of the design: four radars at 400 frames/s with synthesis in under a qua
 p99 of the interval error under 5 ms on an idle machine. Nothing is asserted about time here.
 """
 
-from __future__ import annotations
-
 import os
 import select
 import time

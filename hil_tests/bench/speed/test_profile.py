@@ -1,7 +1,5 @@
 """Cost of 20 s of a running profile: synthesis, matrices, noise map and detection."""
 
-from __future__ import annotations
-
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 

@@ -6,8 +6,6 @@ that never come, resets, cuts of its power, a long time without reading, opening
 other has a host that reads its frames. Everything follows from the seed.
 """
 
-from __future__ import annotations
-
 import gc
 import random
 from collections import Counter

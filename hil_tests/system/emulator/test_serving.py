@@ -1,7 +1,5 @@
 """Modules that come back, keep their state, hang on a UART or behind a proxy; faults, control."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Small stand-ins for the parts around the device: a source of known counters, a bare host."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import socket

@@ -1,7 +1,5 @@
 """Small worlds for tests of walls: one radar, no leakage, and what it hears as plain arrays."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Usage, exit codes and clear lines of xethru-emulator, without serving anything."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

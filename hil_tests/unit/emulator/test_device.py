@@ -1,7 +1,5 @@
 """The module's answers, modes, reset and streaming, driven with a virtual clock."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,7 +1,5 @@
 """The real driver on an emulated module in the same process."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

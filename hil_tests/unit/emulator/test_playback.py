@@ -1,7 +1,5 @@
 """What a module that plays a recording sends, when, and what it says of itself meanwhile."""
 
-from __future__ import annotations
-
 import shutil
 import struct
 import tracemalloc

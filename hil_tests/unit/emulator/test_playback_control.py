@@ -1,7 +1,5 @@
 """What each control does to a playback, to the nanosecond, and to sessions of several radars."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Profile settings, noise maps and output control. Protocol reference 4.4 to 4.7, 8.2, 11, 16."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Literal

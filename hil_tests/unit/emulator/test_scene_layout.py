@@ -3,8 +3,6 @@
 Everything here is recomputed from positions in the files, not with the emulator's echo code.
 """
 
-from __future__ import annotations
-
 import math
 from itertools import combinations
 

@@ -1,7 +1,5 @@
 """Answers are compared byte for byte, but through masks; files that are no cassettes are named."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

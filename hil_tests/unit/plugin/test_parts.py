@@ -1,7 +1,5 @@
 """Locks, taps, measurements, frame rates, and a test that cannot run on a radar."""
 
-from __future__ import annotations
-
 import math
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Values of --radar, and the errors for all others."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -5,8 +5,6 @@ its exit code in brackets. The commands run in a folder with the files that `fol
 ``XETHRU_UPDATE_SNAPSHOTS=1`` writes the transcripts anew: read the difference before you commit it.
 """
 
-from __future__ import annotations
-
 import os
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Settings, checks and frames of the chip against the protocol reference's tables."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

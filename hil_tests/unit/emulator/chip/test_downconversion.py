@@ -1,7 +1,5 @@
 """The integer filter against the closed forms of the protocol reference, 9.7 and 9.8."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """A host's view, through the driver and in virtual time: a person in the corridor."""
 
-from __future__ import annotations
-
 import math
 
 from emulator.chip import Pace

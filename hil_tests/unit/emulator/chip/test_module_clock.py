@@ -3,8 +3,6 @@
 And how loud its receiver is.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from fractions import Fraction

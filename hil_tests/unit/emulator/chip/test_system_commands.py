@@ -1,7 +1,5 @@
 """System tests, info, baud rate, bootloader, safe mode, base firmware. Protocol reference 4, 8."""
 
-from __future__ import annotations
-
 import pytest
 
 from emulator.module.settings import DeviceOptions

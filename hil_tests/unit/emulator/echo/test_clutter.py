@@ -1,7 +1,5 @@
 """Clutter has the strength, the band and the memory that its page says, and no other dependence."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Corners of two walls: where their echo is, how strong, and what the image method says."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Echoes against closed forms: where they are, how strong, in which phase, in which counts."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Target-wall multipath against Fermat's principle and closed forms."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

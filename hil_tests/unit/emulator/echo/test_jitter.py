@@ -1,7 +1,5 @@
 """Phase jitter: how large, how slow, selected by what, and common to a frame's echoes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

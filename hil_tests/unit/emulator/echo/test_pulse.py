@@ -1,7 +1,5 @@
 """The pulse has the stated spectrum, and frames are exact sums of shifted pulses."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

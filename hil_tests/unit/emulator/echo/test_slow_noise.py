@@ -1,7 +1,5 @@
 """Slow noise is the stationary process its page describes, from any side it is asked."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Walls, boxes and shadows against closed forms, Kirchhoff's integral and ITU-R P.526."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """For each kind of fault: a driver counts exactly what was injected, or it cannot, and why."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Scenario files: what they may say, and one clear line about what they may not."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """What frames show of a fault that no counter tells: each witness compares them with true ones."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """The file system and its errors. Protocol reference 4.10, 4.11 and 5.1."""
 
-from __future__ import annotations
-
 import pytest
 
 from emulator.chip.chip import Refusal

@@ -1,7 +1,5 @@
 """IO pins. Protocol reference 4.8 and 5.1."""
 
-from __future__ import annotations
-
 import pytest
 
 from emulator.module.module import MessageKind

@@ -1,7 +1,5 @@
 """The tables of modes and permissions, as printed, against those of protocol reference 8.3."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The firmware's 50-slot queue (protocol reference 8.4) and the lossless one."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from emulator.module.module import FirmwareOutbox, LosslessOutbox, MessageKind, MessageStream

@@ -1,7 +1,5 @@
 """Commands that a module answers with ERROR 1 in every mode, and no others, have no handler."""
 
-from __future__ import annotations
-
 import pytest
 
 from emulator.chip.chip import Chip

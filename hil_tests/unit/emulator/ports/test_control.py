@@ -1,7 +1,5 @@
 """Live control: what is asked is done, what cannot be done is one line with the remedy."""
 
-from __future__ import annotations
-
 import json
 import selectors
 import socket

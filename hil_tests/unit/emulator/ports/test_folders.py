@@ -1,7 +1,5 @@
 """Folders of an emulator: its sockets, its announcement, what a module keeps over restarts."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Odometry lines on a unix socket, at once or when due."""
 
-from __future__ import annotations
-
 import errno
 import selectors
 import socket

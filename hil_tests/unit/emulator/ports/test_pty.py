@@ -1,7 +1,5 @@
 """Ports as links: published atomically, raw from the start, removed at the end; who opens them."""
 
-from __future__ import annotations
-
 import os
 import select
 import selectors

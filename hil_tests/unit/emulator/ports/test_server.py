@@ -4,8 +4,6 @@ Most tests use a socket pair as the line: what is written on one side can be rea
 once. A pseudo-terminal moves bytes in a kernel worker of its own, at no certain time.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import threading

@@ -1,7 +1,5 @@
 """A UART bit by bit: what another rate hears, how fast bytes go, what overflows."""
 
-from __future__ import annotations
-
 import itertools
 
 import pytest

@@ -1,7 +1,5 @@
 """A module with its profile alone, rooms with one person, and messages by virtual time."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

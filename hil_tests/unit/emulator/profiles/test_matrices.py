@@ -1,7 +1,5 @@
 """Pulse-Doppler matrices and noise maps against closed forms of a breathing or walking point."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Who is detected, where and which way; and that nobody is in an empty room."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

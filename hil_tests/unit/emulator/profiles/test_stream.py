@@ -1,7 +1,5 @@
 """The profile on the module's clock: baseband, pauses, restarts, silence, catching up."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

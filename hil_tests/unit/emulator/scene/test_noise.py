@@ -1,7 +1,5 @@
 """Noise is Gaussian as far as its page says, and a function of (seed, stream, counter) alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

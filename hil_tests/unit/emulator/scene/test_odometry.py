@@ -1,7 +1,5 @@
 """Wheel odometry follows its model, and its drift is the one that SLAM is judged against."""
 
-from __future__ import annotations
-
 import math
 from decimal import Decimal
 from itertools import pairwise

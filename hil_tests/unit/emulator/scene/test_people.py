@@ -1,7 +1,5 @@
 """People: where they are, how their chest moves, what a radar hears of it, and bad files."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

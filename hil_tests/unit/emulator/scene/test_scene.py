@@ -1,7 +1,5 @@
 """Scene files load into frozen models, or say in one line what is wrong with them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The true path against closed forms and a step-by-step walk."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

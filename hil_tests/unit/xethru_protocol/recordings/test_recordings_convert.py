@@ -1,7 +1,5 @@
 """Conversion among vendor directories, wire captures, MCAP and npz, and each format by itself."""
 
-from __future__ import annotations
-
 import json
 import struct
 import tracemalloc

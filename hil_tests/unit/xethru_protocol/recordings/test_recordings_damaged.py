@@ -1,7 +1,5 @@
 """Recordings that are damaged, incomplete, refused or cut off: those of the vendor first."""
 
-from __future__ import annotations
-
 import shutil
 import signal
 import struct

@@ -1,7 +1,5 @@
 """Recording directories of the vendor: every byte of what its library wrote, read and written."""
 
-from __future__ import annotations
-
 import json
 import struct
 from datetime import UTC
