@@ -1,7 +1,4 @@
-"""A recording made by `xethru record`, printed by `xethru dump`, played by `xethru-emulator play`.
-
-The messages are the same everywhere, byte for byte.
-"""
+"""What `xethru record` made, `dump` prints and `xethru-emulator play` sends, byte for byte."""
 
 import json
 import re

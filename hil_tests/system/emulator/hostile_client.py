@@ -1,9 +1,7 @@
 """A hostile client beside a well-behaved one, in virtual time.
 
-Two bare modules are served in one loop. One has a host that does everything a host must not: random
-bytes, half commands, every command of the golden vectors, whole and damaged, in any order, lengths
-that never come, resets, cuts of its power, a long time without reading, opening and closing. The
-other has a host that reads its frames. Everything follows from the seed.
+Two bare modules are served in one loop. One has a host that does everything a host must not, the
+other one that reads its frames. Everything follows from the seed.
 """
 
 import gc

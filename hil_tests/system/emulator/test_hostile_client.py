@@ -1,4 +1,4 @@
-"""Small runs of two benchmarks, hostile clients and corrupted traffic, and hosts at real ports."""
+"""Hostile clients in virtual time and at real ports, and corrupted traffic."""
 
 import contextlib
 import os
@@ -9,16 +9,16 @@ from pathlib import Path
 import pytest
 
 from emulator.chip import Pace
-from hil_tests.bench import corrupted_traffic
-from hil_tests.bench.corrupted_traffic import (
+from hil_tests.device.serving import Served, emulator
+from hil_tests.patience import seconds
+from hil_tests.system.emulator import corrupted_traffic
+from hil_tests.system.emulator.corrupted_traffic import (
     SWALLOWED_BULK,
     SWALLOWED_MERGED,
     SWALLOWED_NORMAL,
     Outcome,
     run_command,
 )
-from hil_tests.device.serving import Served, emulator
-from hil_tests.patience import seconds
 from hil_tests.system.emulator.hostile_client import run
 from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import PongCode, SensorMode, X4Setting

@@ -64,12 +64,13 @@ class FormulaSource:
         return np.tile(row, (len(frame_counters), 1))
 
 
-def working_point(chip: Chip) -> None:
+def working_point(chip: Chip) -> Chip:
     chip.set(X4Setting.DACMIN, 949)
     chip.set(X4Setting.DACMAX, 1100)
     chip.set(X4Setting.ITERATIONS, 16)
     chip.set(X4Setting.PULSESPERSTEP, 300)
     chip.set(X4Setting.FRAMEAREA, (0.2, 9.4))
+    return chip
 
 
 class BareHost:

@@ -1,8 +1,4 @@
-"""Signals, locks and files that never end.
-
-A signal sets a flag between steps, raises at once while waiting, and ends a loop; nohup is
-respected. A lock has one owner at a time, leaves no trace and is gone with its owner.
-"""
+"""Signals, locks and files that never end."""
 
 import errno
 import os

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hil_tests.property.slam.front_end.test_detection import BIN_LENGTH_M, N_BINS, frame, pulse
+from hil_tests.property.slam.front_end.test_detection import N_BINS, frame, pulse
+from hil_tests.unit.slam.simulation import BIN_LENGTH_M
 from slam.config import DetectionConfig, FrontEnd, MatchedFilterConfig, PeakPosition, SlamConfig
 from slam.frames import Detector
 from slam.front_end import make_detector

@@ -81,8 +81,7 @@ def test_real_frame_rate_is_read_back() -> None:
 
 def test_rf_values_are_counter_times_quantum_minus_half_range_in_float32() -> None:
     """Protocol reference 9.7: n = 2.03450526e-07 and offset 0.07421875 at 16 x 300, 949-1100."""
-    chip = Chip(RampSource())
-    working_point(chip)
+    chip = working_point(Chip(RampSource()))
     frame = chip.next_frame()
     counters = np.arange(1431) % 1000
     expected = counters.astype(np.float32) * np.float32(2.03450526e-07) - np.float32(0.07421875)
@@ -93,8 +92,7 @@ def test_rf_values_are_counter_times_quantum_minus_half_range_in_float32() -> No
 def test_full_counter_range_spans_the_documented_output_range() -> None:
     """0 ... 16 * 300 * 152 counts are -0.07421875 ... +0.07421875."""
     top = 16 * 300 * 152
-    chip = Chip(FormulaSource(lambda index: np.where(index % 2 == 0, 0.0, top)))
-    working_point(chip)
+    chip = working_point(Chip(FormulaSource(lambda index: np.where(index % 2 == 0, 0.0, top))))
     values = chip.next_frame().values
     assert values.min() == np.float32(-0.07421875)
     assert values.max() == pytest.approx(0.07421875, rel=1e-6)
@@ -102,8 +100,7 @@ def test_full_counter_range_spans_the_documented_output_range() -> None:
 
 def test_frame_area_offset_moves_labels_and_not_echoes() -> None:
     source = RampSource()
-    chip = Chip(source)
-    working_point(chip)
+    chip = working_point(Chip(source))
     chip.next_frame()
     # one RF bin further in both request and offset: the same samples under other labels
     step_m = 1.5e8 / 23.328e9
@@ -118,8 +115,7 @@ def test_frame_area_offset_moves_labels_and_not_echoes() -> None:
 
 
 def test_a_setting_takes_effect_with_the_next_frame() -> None:
-    chip = Chip(RampSource())
-    working_point(chip)
+    chip = working_point(Chip(RampSource()))
     lengths: list[int] = []
     for area in ((0.2, 9.4), (0.4, 5.0), (0.0, 1.0)):
         lengths += [len(chip.next_frame().values) for _ in range(3)]
@@ -135,8 +131,7 @@ def test_counter_wraps_at_32_bits() -> None:
 
 def test_a_hundred_all_zero_frames_switch_the_transmitter_off() -> None:
     """Protocol reference 8.4, transmitter guard."""
-    chip = Chip(FormulaSource(lambda index: 0 * index))
-    working_point(chip)
+    chip = working_point(Chip(FormulaSource(lambda index: 0 * index)))
     chip.set(X4Setting.FPS, 17.0)
     for _ in range(99):
         chip.next_frame()
@@ -149,8 +144,7 @@ def test_a_hundred_all_zero_frames_switch_the_transmitter_off() -> None:
 def test_zero_frames_that_do_not_follow_each_other_switch_nothing_off() -> None:
     """Frame 50 alone is not zero: 99 zero frames behind it are allowed, and 50 before it."""
     level = 0
-    chip = Chip(FormulaSource(lambda index: 0 * index + level), largest_block=1)
-    working_point(chip)
+    chip = working_point(Chip(FormulaSource(lambda index: 0 * index + level), largest_block=1))
     chip.set(X4Setting.FPS, 17.0)
     for counter in range(150):
         level = int(counter == 50)
@@ -168,8 +162,7 @@ def test_zero_frames_that_do_not_follow_each_other_switch_nothing_off() -> None:
 def test_settings_without_a_sweep_give_finite_frames(
     setting: X4Setting, value: int, downconversion: int
 ) -> None:
-    chip = Chip(RampSource())
-    working_point(chip)
+    chip = working_point(Chip(RampSource()))
     chip.set(X4Setting.DOWNCONVERSION, downconversion)
     chip.set(setting, value)
     assert np.isfinite(chip.next_frame().values).all()
@@ -197,8 +190,7 @@ REGISTER_WRITES: list[tuple[int, int, X4Setting, X4Value]] = [
 def test_writing_a_coupled_register_sets_its_setting_and_reads_back(
     address: int, byte: int, setting: X4Setting, value: X4Value
 ) -> None:
-    chip = Chip(RampSource())
-    working_point(chip)
+    chip = working_point(Chip(RampSource()))
     chip.set(X4Setting.PIFREGISTER, (address, byte))
     assert chip.get(setting) == value
     assert chip.read_register(X4Setting.PIFREGISTER, address) == byte

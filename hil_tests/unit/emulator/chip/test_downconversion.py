@@ -26,8 +26,7 @@ def test_taps_are_those_the_reference_describes(
 
 
 def baseband_of(setting: int, formula: FormulaSource) -> tuple[NDArray[np.complex128], Chip]:
-    chip = Chip(formula)
-    working_point(chip)
+    chip = working_point(Chip(formula))
     chip.set(X4Setting.TXCENTERFREQUENCY, setting)
     chip.set(X4Setting.DOWNCONVERSION, 1)
     values = chip.next_frame().values.astype(np.float64)

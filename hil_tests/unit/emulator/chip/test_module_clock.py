@@ -1,7 +1,4 @@
-"""A module's clock: when it samples, how short its bins are, when its frames come.
-
-And how loud its receiver is.
-"""
+"""A module's clock: when it samples and how short its bins are; and how loud its receiver is."""
 
 import math
 from dataclasses import replace

@@ -400,18 +400,17 @@ def source_on(
     return source, odometry, words
 
 
-def run(drive: Drive, source: LiveSource, odometry: LiveOdometry, heard: Listener) -> RunRecord:
-    scene = drive.scene
+def run(drive: Drive, source: LiveSource, odometry: LiveOdometry) -> tuple[RunRecord, Listener]:
+    source.settle()
+    scene, heard = drive.scene, Listener()
     slam = make_slam(load_preset("robust"), rig_of(scene), wheels_of(scene))
-    return run_slam(source.scans(), odometry, slam, scene.trajectory().poses, [heard])
+    return run_slam(source.scans(), odometry, slam, scene.trajectory().poses, [heard]), heard
 
 
 def test_through_drift_and_jitter_the_map_is_as_good_as_with_perfect_clocks(drive: Drive) -> None:
     """Measured: ATE 0.77 mm (0.79 without jitter) where wheels have 3.0; stamps to 1.7 ms."""
     source, odometry, words = source_of(drive)
-    source.settle()
-    heard = Listener()
-    record = run(drive, source, odometry, heard)
+    record, heard = run(drive, source, odometry)
     assert source.ended == "odometry ended"
     assert words.said[0] == ("odometry", "ended")
     assert [who for who, _ in words.said[1:]] == [info.name for info in drive.infos]
@@ -452,9 +451,7 @@ def test_a_dead_radar_is_told_and_the_others_go_on(drive: Drive) -> None:
             Timed(back, ("back", 2, "elsewhere")),
         ),
     )
-    source.settle()
-    heard = Listener()
-    run(drive, source, odometry, heard)
+    _, heard = run(drive, source, odometry)
     assert words.about("front_right").startswith(
         "no frame for 3 s; the run goes on with 3 of 4 radars | is back, at elsewhere | clock "
     )
@@ -474,9 +471,7 @@ def test_odometry_that_stops_for_a_while_costs_only_that_while(drive: Drive) -> 
         return row.t_ns < END_S * NS_PER_S and not (is_line and gap[0] < row.t_ns < gap[1])
 
     source, odometry, words = source_of(drive, keep)
-    source.settle()
-    heard = Listener()
-    record = run(drive, source, odometry, heard)
+    record, heard = run(drive, source, odometry)
     assert "s of it are missing; no scan of them is used" in words.about("odometry")
     last_ns = odometry.last_ns - NS_PER_S  # at the end of the events it stops again
     unused = [scan for scan in heard.scans if not scan.used and scan.t_ns < last_ns]
@@ -497,8 +492,7 @@ def test_odometry_that_falls_silent_ends_the_run_with_all_its_states(drive: Driv
             and row.t_ns < END_S * NS_PER_S
         ),
     )
-    source.settle()
-    record = run(drive, source, odometry, Listener())
+    record, _ = run(drive, source, odometry)
     assert isinstance(source.ended, AppError)
     assert str(source.ended) == (
         "odometry from the test: no more line for 10 s; is its sender running?"

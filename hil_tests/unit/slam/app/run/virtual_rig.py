@@ -1,7 +1,4 @@
-"""A rig in virtual time: emulated radars whose clocks drift, on lines that delay, and odometry.
-
-What the threads of a run would put into its inbox, each event at its own virtual time.
-"""
+"""What the threads of a run put into its inbox, in virtual time: clocks drift, lines delay."""
 
 import heapq
 import math
