@@ -276,7 +276,10 @@ def proxy(options: Namespace, stop: StopFlag, warn: Warn) -> None:
         except (RecordingError, LinkError, FaultPlanError) as error:
             raise CannotServeError(str(error)) from error
         services: list[Service] = [module, control]
-        _run(ports, services, stop, cleanup, zero_ns=zero_ns, control=control.path)
+        try:
+            _run(ports, services, stop, cleanup, zero_ns=zero_ns, control=control.path)
+        except RecordingError as error:  # the capture's disk is full
+            raise CannotServeError(str(error)) from error
     if not module.port_present(time.monotonic_ns()):
         raise CannotServeError(f"{options.port}: the module's port vanished")
 

@@ -158,7 +158,7 @@ def factory_preset(link: Link) -> Steps[None]:
 
 def output(link: Link, feature: OutputFeature) -> Steps[int]:
     command = m.OutputGetControl(feature=feature)
-    return (yield from _value(link, command, f"the control of output {feature:#x}")) & 0xFFFFFFFF
+    return (yield from _value(link, command, f"control of output {feature}")) & 0xFFFFFFFF
 
 
 # --- running ------------------------------------------------------------------------------------

@@ -759,11 +759,16 @@ def _entries_of(path: Path, on_fault: FaultHandler | None) -> Iterator[Entry]:
         if stream.read(len(MAGIC)) != MAGIC:
             fault = Damage(0, 0, "it does not begin as an MCAP file")
         else:
-            for found in read_entries(stream, os.fstat(stream.fileno()).st_size):
+            size = os.fstat(stream.fileno()).st_size
+            for found in read_entries(stream, size):
                 if isinstance(found, Cut | Damage):
                     fault = found
                     break
                 yield found
+            else:
+                stream.seek(-len(MAGIC), os.SEEK_END)
+                if stream.read() != MAGIC:
+                    fault = Damage(size, size, "all messages are there, its index is cut off")
     if fault is not None:
         reason = "it ends too early" if isinstance(fault, Cut) else fault.reason
         reason = f"it is cut or damaged: {reason}"

@@ -114,6 +114,19 @@ def test_decoding_in_place_equals_decoding_a_copy(
         assert decode_response_at(whole, start, end) == decode_response(whole[start:end])
 
 
+def test_no_two_rows_share_a_name_per_direction() -> None:
+    for base in (Command, Response):
+        names = [row.name for cls, row in ROWS.items() if issubclass(cls, base)]
+        assert len(names) == len(set(names))
+
+
+def test_every_command_names_its_reply() -> None:
+    for cls, row in ROWS.items():
+        if issubclass(cls, Command):
+            assert row.replies, cls
+            assert all(issubclass(reply, Message) for reply in row.replies)
+
+
 def events(connection: Connection) -> list[Any]:
     found = []
     while (event := connection.next_event()) is not NEED_DATA:

@@ -1,6 +1,8 @@
 """Modules that come back, keep their state, hang on a UART or behind a proxy; faults, control."""
 
+import contextlib
 import json
+import resource
 import signal
 import subprocess
 import sys
@@ -17,7 +19,7 @@ from xethru_protocol.driver.link import RawConfig
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.recordings.wire_capture import read_chunks
 from xethru_protocol.wire.codes import PongCode
-from xethru_protocol.wire.errors import ResponseTimeout
+from xethru_protocol.wire.errors import ResponseTimeout, XeThruError
 
 pytestmark = pytest.mark.slow
 
@@ -124,6 +126,31 @@ def test_no_byte_changes_without_a_fault_and_the_capture_holds_them_all(tmp_path
         captured[chunk.way] += chunk.data
     assert captured["tx"] == passed["tx"]
     assert passed["rx"] in captured["rx"]  # what came before we listened is there, too
+
+
+def test_a_full_disk_under_the_capture_ends_the_proxy_with_one_line(tmp_path: Path) -> None:
+    with emulator("serve", "--bare") as module:
+        command = ["proxy", "--port", module.paths[0], "--wire", str(tmp_path / "a.xtwire")]
+        with subprocess.Popen(
+            [sys.executable, "-m", "emulator.cli", *command],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (3_000, 3_000)),
+        ) as proxy:
+            assert proxy.stdout is not None
+            ready = json.loads(proxy.stdout.readline())
+            with (
+                contextlib.suppress(XeThruError),
+                open_radar(ready["devices"][0]["path"]) as radar,
+            ):
+                radar.configure_raw(SHORT)
+                radar.start(50.0)
+                list(radar.frames(200))
+            printed = proxy.communicate(timeout=seconds(30))[1]
+    assert proxy.returncode == 1
+    assert printed.count("cannot be written") == 1
+    assert "Traceback" not in printed
 
 
 def test_faults_hit_the_line_of_the_module(scenario: str) -> None:

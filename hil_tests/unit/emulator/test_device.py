@@ -253,6 +253,23 @@ def test_realtime_frames_are_due_at_absolute_deadlines() -> None:
     assert arrivals == expected
 
 
+def test_after_lost_frames_none_comes_before_it_is_due() -> None:
+    """A host that does not read for half a second, and then reads."""
+    device = radar_device(IDENTITY, RampSource(), Pace.REALTIME)
+    host = BareHost(device)
+    host.stream(200.0)
+    for _ in range(50):
+        host.now_ns += SECOND // 100 + 1
+        device.advance(host.now_ns)
+    counters = [frame.info for frame in host.frames(100)]
+    for _ in range(10):
+        device.advance(host.now_ns)
+        counters += [frame.info for frame in host.frames(100)]
+        assert counters[-1] * SECOND // 200 <= host.now_ns
+        host.now_ns += SECOND // 500
+    assert counters != list(range(len(counters)))  # some were lost
+
+
 def test_a_late_start_in_realtime_skips_what_is_past() -> None:
     source = RampSource()
     device = radar_device(IDENTITY, source, Pace.REALTIME)

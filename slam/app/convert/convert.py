@@ -51,6 +51,7 @@ def _write_wire(session: RecordedSession, out: Path, radar: str | None, stop: St
 
 
 _SESSION_SUFFIX, _MAT_SUFFIX, _WIRE_SUFFIX = ".mcap", ".mat", ".xtwire"
+_FILE_SUFFIXES = (_SESSION_SUFFIX, _MAT_SUFFIX, _WIRE_SUFFIX, ".bag")  # any other is a folder
 _PRESET = "robust"
 _MAT_PRESET = "paper"  # such ranges are of its front end: they scatter by a bin, 7 mm
 
@@ -123,7 +124,7 @@ def _removing(out: Path) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        if out.is_dir():
+        if out.is_dir() and out.suffix not in _FILE_SUFFIXES:  # a bag of ROS 2
             shutil.rmtree(out, ignore_errors=True)
         else:
             out.unlink(missing_ok=True)

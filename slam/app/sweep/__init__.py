@@ -14,7 +14,7 @@ CLEAN = "clean"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stress:
-    """What a run suffers; random choices depend on the run's seed alone.
+    """The stress of a run; random choices depend on the run's seed alone.
 
     SLAM knows nothing of the stress; frames carry the time at which they were really taken. The
     only stress that enters behind the front end are outliers: no reflector gives such echoes.

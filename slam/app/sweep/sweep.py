@@ -11,9 +11,9 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -152,7 +152,8 @@ def run_sweep(
         part = PartFile(path, _command(cases, presets, n_seeds, settings, bound=bound))
         done = {run.key for run in part.runs}
         missing = [case for case in cases if case.key not in done]
-        _run(cases, part, _results(missing, jobs or cpu_count(), dask, stop), out)
+        with closing(_results(missing, jobs or cpu_count(), dask, stop)) as results:
+            _run(cases, part, results, out)
 
 
 def _cases(
@@ -273,7 +274,7 @@ def _clock(seconds: float) -> str:
 
 def _results(
     cases: Sequence[Case], jobs: int, dask: str | None, stop: StopFlag
-) -> Iterator[SweepRun]:
+) -> Generator[SweepRun]:
     """Run cases here, on worker processes or on a cluster; results in the order of the cases."""
     if not cases:
         return

@@ -458,6 +458,7 @@ class RerunView(SessionObserver):
             self._link.send()
 
     def on_log(self, line: LogLine) -> None:
+        """Draw a line of the log; after `close` it is ignored."""
         self._link.on_log(line)
 
     def close(self) -> None:

@@ -93,7 +93,7 @@ class _DataFile:
                 return self._line(self.kind)
             return self._record(self.kind, listed)
         except OSError as error:  # `reading` would cost a tenth of the time of a line
-            raise RecordingError(f"{self.path} cannot be read: {error.strerror}") from None
+            raise RecordingError(f"{self.path} cannot be read: {error.strerror or error}") from None
 
     def _record(
         self, kind: BinaryKind, listed: int | None

@@ -1,6 +1,7 @@
 """``xethru doctor``: each row of its tables finds its fault, names a remedy, disturbs nobody."""
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -26,7 +27,7 @@ from hil_tests.unit.xethru_protocol.pty_module import (
 )
 from xethru_protocol.cli import main, port_probe
 from xethru_protocol.cli.doctor import MACHINE_CHECKS, PORT_CHECKS
-from xethru_protocol.cli.port_probe import port_users
+from xethru_protocol.cli.port_probe import PortProbe, port_users
 from xethru_protocol.transport import SerialTransport
 from xethru_protocol.wire import messages as m
 
@@ -154,6 +155,19 @@ def test_a_module_at_another_baud_rate(capsys: Capture, monkeypatch: pytest.Monk
     assert (code, finding["check"]) == (1, "usual baud rate")
     assert finding["found"] == "it answers at 460800 baud, not at 115200"
     assert "--baudrate 460800" in finding["remedy"]
+
+
+@pytest.mark.usefixtures("hurried")
+def test_only_uarts_are_tried_at_other_rates(
+    capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried: list[int] = []
+    monkeypatch.setattr(PortProbe, "_reopen", lambda _, baudrate: tried.append(baudrate))
+    for bytes_per_s, is_uart in ((math.inf, False), (11520.0, True)):
+        monkeypatch.setattr(SerialTransport, "bytes_per_s", bytes_per_s)
+        with PtyModule(silent) as module:
+            only_finding(capsys, module.path)
+        assert bool(tried) is is_uart
 
 
 def test_a_module_that_stops_answering_half_way(capsys: Capture) -> None:

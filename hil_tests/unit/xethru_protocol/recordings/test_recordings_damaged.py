@@ -309,6 +309,17 @@ def test_a_damaged_archive_gives_no_message(tmp_path: Path) -> None:
         next(read_recording(tmp_path / "x.npz"))
 
 
+@pytest.mark.parametrize("missing", [1, 8, 100])
+def test_a_cut_index_of_mcap_is_reported_after_all_messages(missing: int, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    convert(copy_of("float", tmp_path), path)
+    expected = list(read_recording(path))
+    path.write_bytes(path.read_bytes()[:-missing])
+    messages, faults = read_with_faults(path)
+    assert len(messages) == len(expected)
+    assert [fault.offset for fault in faults] == [path.stat().st_size]
+
+
 def test_a_record_of_mcap_that_claims_more_than_the_file_is_not_waited_for(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(b"\x89MCAP0\r\n\x06" + struct.pack("<Q", 3_000_000_000))
