@@ -52,7 +52,7 @@ from xethru_protocol.wire.messages import (
     X4DriverSet,
     X4Value,
 )
-from xethru_protocol.wire.table import ROWS, UnknownMessage
+from xethru_protocol.wire.rows import ROWS, UnknownMessage
 
 NS_PER_S = 1_000_000_000
 SLOWEST_RATE = 1e-6

@@ -49,7 +49,7 @@ from xethru_protocol.wire.messages import (
     X4DriverInit,
     X4DriverSet,
 )
-from xethru_protocol.wire.table import ROWS, UnknownMessage
+from xethru_protocol.wire.rows import ROWS, UnknownMessage
 
 NS_PER_S = 1_000_000_000
 PACKETS_PER_CALL = 32

@@ -44,7 +44,7 @@ from emulator.faults.kind import Kind, Parameters, Target
 from emulator.faults.kinds import KINDS
 from emulator.scene.tables import Table, finite, load_table, one_line
 from xethru_protocol.wire.messages import Command
-from xethru_protocol.wire.table import ROWS
+from xethru_protocol.wire.rows import ROWS
 
 _LIMITS = {
     "minimum": "at_least",

@@ -13,7 +13,7 @@ from hil_tests.plugin.bench import RadarUnderTest
 from hil_tests.plugin.cassette import EMULATED, Cassette, ask_all, differences
 from hil_tests.plugin.choices import CHOICES
 from hil_tests.plugin.gate import Measure, leave_out
-from hil_tests.plugin.specs import parse_specs
+from hil_tests.plugin.radar_specs import parse_specs
 
 
 def emulator() -> RadarUnderTest:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from hil_tests.plugin.radar_specs import Kind, RadarSpec
 from hil_tests.plugin.radar_targets import (
     RadarTarget,
     TargetError,
@@ -21,7 +22,6 @@ from hil_tests.plugin.radar_targets import (
     scene_radars,
     target_of,
 )
-from hil_tests.plugin.specs import Kind, RadarSpec
 from xethru_protocol.driver.link import BAUD_RATES, POWER_UP_BAUD
 from xethru_protocol.driver.radar import X4M300
 from xethru_protocol.transport import Transport, set_rate

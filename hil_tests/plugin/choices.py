@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.plugin.specs import Kind, RadarSpec, SpecError, parse_specs
+from hil_tests.plugin.radar_specs import Kind, RadarSpec, SpecError, parse_specs
 
 ENVIRONMENT = "XETHRU_RADARS"
 INI = "xethru_radars"

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from hil_tests.device.serving import Served, emulator
 from hil_tests.paths import FIXTURES
-from hil_tests.plugin.specs import Kind, RadarSpec
+from hil_tests.plugin.radar_specs import Kind, RadarSpec
 from xethru_protocol.driver.radar import X4M300, known_ports
 from xethru_protocol.transport import SerialTransport, Transport, find_ports
 from xethru_protocol.wire.errors import Disconnected, PortUnavailable, XeThruError

@@ -33,7 +33,7 @@ from xethru_protocol.wire import messages as m
 from xethru_protocol.wire.codes import ProfileId
 from xethru_protocol.wire.errors import ResponseTimeout, XeThruError
 from xethru_protocol.wire.framing import LinkStatistics
-from xethru_protocol.wire.table import Response
+from xethru_protocol.wire.rows import Response
 
 
 def files_to_replace(targets: Iterable[Path], *, replace: bool) -> list[Path]:

@@ -45,7 +45,7 @@ from xethru_protocol.wire.framing import (
     PacketReader,
 )
 from xethru_protocol.wire.messages import Ack, Message, Pong, Response, UnknownMessage
-from xethru_protocol.wire.table import ROWS
+from xethru_protocol.wire.rows import ROWS
 
 _CHUNK_BYTES = 65536
 

@@ -35,7 +35,7 @@ from xethru_protocol.wire.errors import (
     ResponseTimeout,
 )
 from xethru_protocol.wire.framing import NEED_DATA, FramingFault, LinkStatistics
-from xethru_protocol.wire.table import ROWS, Command, Response, Row
+from xethru_protocol.wire.rows import ROWS, Command, Response, Row
 
 
 class Read(NamedTuple):  # several per frame: twice as fast to make as a frozen dataclass

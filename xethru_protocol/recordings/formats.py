@@ -28,7 +28,7 @@ from xethru_protocol.recordings.vendor.layouts import PARAMETER_FILE_NAME
 from xethru_protocol.recordings.vendor.reader import is_vendor_file, read_vendor, vendor_facts
 from xethru_protocol.recordings.vendor.writer import RecordingWriter
 from xethru_protocol.wire.connection import Connection, Role
-from xethru_protocol.wire.table import ROWS, Response, UnknownMessage
+from xethru_protocol.wire.rows import ROWS, Response, UnknownMessage
 
 RecordingFormat = Literal["vendor", "wire", "mcap", "npz"]
 

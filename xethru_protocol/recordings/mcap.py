@@ -60,7 +60,7 @@ from xethru_protocol.wire.messages import (
     ReplyInt,
     X4Value,
 )
-from xethru_protocol.wire.table import ROWS, Response, UnknownMessage
+from xethru_protocol.wire.rows import ROWS, Response, UnknownMessage
 from xethru_protocol.wire.x4 import RF_BIN_M
 
 FLOAT_ARRAY = "std_msgs/msg/Float32MultiArray"

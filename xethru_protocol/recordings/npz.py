@@ -48,7 +48,7 @@ from xethru_protocol.recordings.records import (
 )
 from xethru_protocol.recordings.vendor.layouts import BINARY_KINDS, KIND_OF_MESSAGE, BinaryKind
 from xethru_protocol.wire.codec import decode_response, describe, encode
-from xethru_protocol.wire.table import Response
+from xethru_protocol.wire.rows import Response
 
 FORMAT = "xethru-hil recording 1"
 SUFFIX = ".npz"

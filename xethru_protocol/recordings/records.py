@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Self, get_type_hints
 
 from xethru_protocol.wire.errors import XeThruError
-from xethru_protocol.wire.table import Response
+from xethru_protocol.wire.rows import Response
 
 
 class RecordingError(XeThruError):

@@ -17,7 +17,7 @@ from xethru_protocol.wire.framing import (
     encode_no_escape,
     encode_normal,
 )
-from xethru_protocol.wire.table import ROWS, Command, Message, Response, UnknownMessage
+from xethru_protocol.wire.rows import ROWS, Command, Message, Response, UnknownMessage
 
 
 class Role(Enum):

@@ -12,8 +12,8 @@ from hil_tests.plugin import radar_targets
 from hil_tests.plugin.bench import Bench, PortBusyError, PortLock
 from hil_tests.plugin.fixtures import carried_rate_hz
 from hil_tests.plugin.gate import Measure, findings_of, gate
+from hil_tests.plugin.radar_specs import parse_specs
 from hil_tests.plugin.radar_targets import TappedTransport, TcpTransport, WireTap
-from hil_tests.plugin.specs import parse_specs
 from xethru_protocol.wire.errors import PortUnavailable
 
 

@@ -55,7 +55,7 @@ import numpy as np
 from xethru_protocol.recordings.records import EARLIEST_MS, LATEST_MS, MS_NS, RecordingError
 from xethru_protocol.wire import fields, messages
 from xethru_protocol.wire.codec import encode
-from xethru_protocol.wire.table import ROWS, Response
+from xethru_protocol.wire.rows import ROWS, Response
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,7 +37,7 @@ from xethru_protocol.recordings.vendor.layouts import (
 )
 from xethru_protocol.wire.codec import decode_response
 from xethru_protocol.wire.errors import LocalProtocolError
-from xethru_protocol.wire.table import Response
+from xethru_protocol.wire.rows import Response
 
 _LONGEST_USER_HEADER = 4096  # bytes; searched where no index gives its length
 _LARGEST_PLAUSIBLE_RECORD = 1 << 16

@@ -24,7 +24,7 @@ from xethru_protocol.recordings.vendor.layouts import (
     Meta,
     TextKind,
 )
-from xethru_protocol.wire.table import Response
+from xethru_protocol.wire.rows import Response
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

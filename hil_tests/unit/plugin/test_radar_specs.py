@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.plugin.specs import Kind, RadarSpec, SpecError, parse_specs
+from hil_tests.plugin.radar_specs import Kind, RadarSpec, SpecError, parse_specs
 
 
 def one(text: str) -> RadarSpec:

@@ -1,4 +1,4 @@
-"""The message table: what a row is, and the decorators that enter one.
+"""What a row of the message table is, and the decorators that enter one.
 
 A row is a class under a decorator that names the bytes its payload begins with and makes it a
 frozen dataclass; ``Annotated`` fields give their place on the wire. Encoder, decoder, CLI dump and
