@@ -321,10 +321,10 @@ class Outbox(ABC):
     def put(self, kind: MessageKind, message: m.Response, now_ns: int) -> None:
         """Queue one message, or lose one, as the queue's rule demands."""
 
-    def refill_on_time(self, stream: MessageStream, now_ns: int) -> None:  # noqa: B027
+    def refill_on_time(self, stream: MessageStream, now_ns: int) -> None:  # noqa: B027 - optional
         """Fetch what fell due, because time passed."""
 
-    def refill_on_demand(self, stream: MessageStream, now_ns: int) -> None:  # noqa: B027
+    def refill_on_demand(self, stream: MessageStream, now_ns: int) -> None:  # noqa: B027 - likewise
         """Fetch what is due, because the line takes more."""
 
     @abstractmethod

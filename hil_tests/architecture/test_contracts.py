@@ -127,6 +127,8 @@ def loaded(program: str) -> set[str]:
 def test_importing_the_protocol_loads_no_heavy_library() -> None:
     assert not loaded("import xethru_protocol") & HEAVY
     assert not loaded("import xethru_protocol.recordings") & HEAVY - {"numpy"}
+    # decode, dump and convert need no port
+    assert not loaded("import xethru_protocol.cli.recordings") & {"serial", "asyncio"}
 
 
 def test_loading_the_plugin_loads_no_library() -> None:

@@ -6,10 +6,8 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from emulator.faults.kind import ENTERED, Kind, Layer
-
-# each enters its kinds
-from emulator.faults.kinds import bytes as _bytes  # noqa: F401
-from emulator.faults.kinds import commands, device, frames, stream  # noqa: F401
+from emulator.faults.kinds import bytes as _bytes  # noqa: F401 - importing enters its kinds
+from emulator.faults.kinds import commands, device, frames, stream  # noqa: F401 - likewise
 
 _LAYERS = list(Layer)
 KINDS: Mapping[str, Kind] = MappingProxyType(

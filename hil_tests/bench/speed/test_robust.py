@@ -39,7 +39,7 @@ def test_robust_steps(benchmark: BenchmarkFixture, n: int) -> None:
             step()
 
     with threadpool_limits(1):
-        benchmark.pedantic(steps, rounds=4, warmup_rounds=1)  # type: ignore[no-untyped-call]
+        benchmark.pedantic(steps, rounds=4, warmup_rounds=1)  # type: ignore[no-untyped-call]  # no stubs
     benchmark.extra_info["frames"] = STEPS
     assert np.isfinite(state.position_m).all()
 
@@ -62,7 +62,7 @@ def test_relinearisation_of_3000_poses(benchmark: BenchmarkFixture) -> None:
         for increment, scans in zip(run.increments[:2990], run.scans[:2990], strict=True):
             back_end.predict(increment)
             back_end.update(scans)
-        benchmark.pedantic(  # type: ignore[no-untyped-call]
+        benchmark.pedantic(  # type: ignore[no-untyped-call]  # no stubs
             lambda twin: twin.relinearise(),
             setup=lambda: ((copy.deepcopy(back_end),), {}),
             rounds=7,

@@ -70,7 +70,7 @@ def test_view_of_6400_frames(
         view.close()  # counts every row: part of what a view costs
         used_s.append(time.process_time() - began_s)
 
-    benchmark.pedantic(show, rounds=3, warmup_rounds=1)  # type: ignore[no-untyped-call]
+    benchmark.pedantic(show, rounds=3, warmup_rounds=1)  # type: ignore[no-untyped-call]  # no stubs
     n_frames = N_RADARS * len(stream)
     cpu_s = sorted(used_s[1:])[1]
     benchmark.extra_info["frames"] = n_frames

@@ -46,12 +46,12 @@ def box(x_m: float, y_m: float, width_m: float, depth_m: float, **changes: Any) 
     return ObjectSpec.model_validate(values | {"amplitude_1m": 0.5 * MIRROR_AMPLITUDE_1M} | changes)
 
 
-def target(x_m: float, y_m: float, kind: str = "point", **changes: Any) -> TargetSpec:  # noqa: ANN401
+def target(x_m: float, y_m: float, kind: str = "point", **changes: Any) -> TargetSpec:  # noqa: ANN401 - fields of the spec
     values = {"name": "target", "kind": kind, "x_m": x_m, "y_m": y_m, "amplitude_1m": 0.01}
     return TargetSpec.model_validate(values | changes)
 
 
-def radar_at(x_m: float, y_m: float, yaw_deg: float, **changes: Any) -> RadarSpec:  # noqa: ANN401
+def radar_at(x_m: float, y_m: float, yaw_deg: float, **changes: Any) -> RadarSpec:  # noqa: ANN401 - fields of the spec
     values = {"name": "only", "serial": "000000000007", "x_m": x_m, "y_m": y_m, "yaw_deg": yaw_deg}
     return RadarSpec.model_validate(values | changes)
 
@@ -84,7 +84,7 @@ class Heard:
         return complex(waves.sum())
 
 
-def heard(radar: RadarSpec, *, t_ns: int = 0, **parts: Any) -> Heard:  # noqa: ANN401
+def heard(radar: RadarSpec, *, t_ns: int = 0, **parts: Any) -> Heard:  # noqa: ANN401 - fields of the spec
     paths = ScenePaths(room(radar, **parts), radar).reflections(np.array([t_ns]), WAVELENGTH_M)
     there = np.flatnonzero(paths.amplitude[0] > 0)
     there = there[np.argsort(paths.range_m[0, there], kind="stable")]

@@ -125,7 +125,7 @@ def wheel_factor(
     keys: tuple[int, int, int],
     increment: Array,
     sigmas: Array,
-) -> Any:  # noqa: ANN401
+) -> Any:  # noqa: ANN401 - GTSAM's own types
     """Return the factor of one step of the wheels.
 
     ``keys`` are of the pose before, the pose after, and (s, w, kappa); ``increment`` and
@@ -134,7 +134,7 @@ def wheel_factor(
     ux, uy, ua = (float(value) for value in increment)
     before_key, after_key, calibration_key = keys
 
-    def error(_: object, values: Any, jacobians: Any) -> Array:  # noqa: ANN401
+    def error(_: object, values: Any, jacobians: Any) -> Array:  # noqa: ANN401 - GTSAM's own types
         first, second = values.atPose2(before_key), values.atPose2(after_key)
         before = (first.x(), first.y(), first.theta())
         after = (second.x(), second.y(), second.theta())

@@ -461,8 +461,9 @@ class MapLayer:
             if not found_at:
                 return
             self._has_fixes = True
-            later = range(found_at[0], len(steps))
-            steps, stamps, world = steps[later.start :], stamps.at(later), world[later.start :]
+            first = found_at[0]
+            stamps = stamps.at(range(first, len(steps)))
+            steps, world = steps[first:], world[first:]
         found: dict[str, list[Sequence[Fix | Observation]]] = {
             "fixes/found": [step.fixes for step in steps],
             "fixes/rejected": [step.rejected for step in steps],

@@ -71,7 +71,7 @@ def test_a_signal_after_a_commands_last_check_counts_too(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    interrupted = lambda *_, **__: os.kill(os.getpid(), which)  # noqa: E731
+    interrupted = lambda *_, **__: os.kill(os.getpid(), which)  # noqa: E731 - used once, below
     monkeypatch.setattr("slam.app.run.results.run_evaluate", interrupted)
     assert main(["evaluate", "one.tum", "two.tum"]) == code
     assert capsys.readouterr().err == f"uwb-slam: stopped by {which.name}\n"

@@ -67,7 +67,7 @@ def test_jacobians_are_the_complex_step_derivatives(make: type[OdometryTerm], se
     for column in range(len(state)):
         moved = state.astype(np.complex128)
         moved[column] += 1j * step
-        expected[:, column] = np.imag(term.residuals(moved)) / step  # type: ignore[arg-type]
+        expected[:, column] = np.imag(term.residuals(moved)) / step  # type: ignore[arg-type]  # complex step
     np.testing.assert_allclose(term.jacobian(state).toarray(), expected, rtol=1e-10, atol=1e-9)
 
 

@@ -167,7 +167,7 @@ async def test_no_timer_outlives_the_read_that_set_it(
         timers.append(set_timer(delay_s, *what))
         return timers[-1]
 
-    loop.call_later = call_later  # type: ignore[method-assign, assignment]
+    loop.call_later = call_later  # type: ignore[method-assign, assignment]  # a spy
     with closing(AsyncSerialTransport(path)) as line:
         reading = asyncio.create_task(line.read(60.0))
         while not timers:

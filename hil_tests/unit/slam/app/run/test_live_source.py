@@ -82,7 +82,7 @@ class ScriptedDriver:
 
 def link_of(driver: ScriptedDriver) -> RadarLink:
     mount = Mount(name="left", x_m=0.0, y_m=0.0, yaw_rad=0.0)
-    return RadarLink(mount=mount, port="p", serial="s", driver=driver)  # type: ignore[arg-type]
+    return RadarLink(mount=mount, port="p", serial="s", driver=driver)  # type: ignore[arg-type]  # a double
 
 
 def told_until(
