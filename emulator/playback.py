@@ -42,7 +42,7 @@ from xethru_protocol.recordings import (
 )
 from xethru_protocol.recordings.records import TimedMessages
 from xethru_protocol.wire import x4
-from xethru_protocol.wire.codes import ResponseCode, SensorMode, X4Setting
+from xethru_protocol.wire.codes import BootloaderReply, ResponseCode, SensorMode, X4Setting
 from xethru_protocol.wire.messages import (
     Command,
     DataFloat,
@@ -73,6 +73,7 @@ _ANSWERS = frozenset(
         ResponseCode.XTS_SPR_PONG,
         ResponseCode.XTS_SPR_REPLY,
         ResponseCode.XTS_SPR_HIL,
+        *BootloaderReply,
     )
 )
 
@@ -198,7 +199,7 @@ def kinds(names: Iterable[str]) -> frozenset[str]:
 def is_answer(message: Response) -> bool:
     if isinstance(message, UnknownMessage):
         return message.code in _ANSWERS
-    return ROWS[type(message)].prefix[0] in _ANSWERS
+    return not ROWS[type(message)].opcodes.isdisjoint(_ANSWERS)
 
 
 def _slug(name: str) -> str:
@@ -208,7 +209,7 @@ def _slug(name: str) -> str:
 _KINDS = frozenset(
     _slug(row.name)
     for kind, row in ROWS.items()
-    if issubclass(kind, Response) and row.prefix[0] not in _ANSWERS
+    if issubclass(kind, Response) and row.opcodes.isdisjoint(_ANSWERS)
 ) | {_UNKNOWN}
 
 

@@ -274,7 +274,7 @@ def _set_offset(settings: ChipSettings, value: X4Value) -> ChipSettings:
 def _set_dac_step(settings: ChipSettings, value: X4Value) -> ChipSettings:
     step = _integer(value) & 0xFF
     if step > 3:
-        raise Refusal(X4Error.INVALID_DAC_STEP)
+        raise Refusal(X4Error.INVALID_DACSTEP_INPUT)
     return replace(settings, dac_step=step)
 
 

@@ -174,7 +174,7 @@ def _is_command(command: Command[Response] | None, wanted: str | int) -> bool:
         return False
     row = ROWS.get(type(command))
     if row is not None:
-        return row.name == wanted or row.prefix[0] == wanted
+        return row.name == wanted or wanted in row.opcodes
     return isinstance(command, UnknownMessage) and command.code == wanted
 
 

@@ -45,6 +45,7 @@ TEST_REPLY_BYTES = 256
 _TEST_CONTENT_ID = 0x5090
 LONGEST_READ = 4096
 """Register bytes one READ may ask for; the firmware checks nothing, its reply buffer would end."""
+FIRST_PAGE = 128
 _FEATURES: frozenset[int] = frozenset(OutputFeature)
 _BYTE_REPLIES = frozenset(
     {
@@ -56,7 +57,7 @@ _BYTE_REPLIES = frozenset(
     }
 )
 _POSTPROCESSING_DEFAULTS: dict[int, m.PostprocessingValue] = {
-    FramePostprocessing.NORMALIZATION: 1,
+    FramePostprocessing.NORMALISATION: 1,
     FramePostprocessing.PHASE_NOISE_CORRECTION: (0, 0.0),
     FramePostprocessing.DECIMATION_FACTOR: 1,
     FramePostprocessing.NUMBER_FORMAT: 0,
@@ -144,21 +145,36 @@ def _debug_level(module: Module, command: m.DebugLevel) -> None:
     module.trace_level = command.level
 
 
-@answers(m.BootloaderGetDeviceInfo, m.BootloaderWritePage)
-def _bootloader(module: Module, command: m.Message) -> m.Response:
-    # Assumed: written pages are taken and forgotten; the firmware of an emulator is its program.
-    return _status(module)
+@answers(m.BootloaderGetDeviceInfo)
+def _device_info(module: Module, command: m.Message) -> m.Response:
+    text = f"XETHRU OPENBOOTLOADER V:0.1.2 ID:{module.identity.serial:>016} "
+    return m.BootloaderSuccess(data=text.encode())
+
+
+@answers(m.BootloaderWritePage)
+def _write_page(module: Module, command: m.BootloaderWritePage) -> m.Response:
+    return m.BootloaderSuccess(data=b"\x33" if command.page >= FIRST_PAGE else b"")
+
+
+@answers(m.BootloaderPageSize)
+def _page_size(module: Module, command: m.BootloaderPageSize) -> m.Response:
+    return m.BootloaderSuccess(data=(512).to_bytes(2, "little"))
+
+
+@answers(m.BootloaderPageCount)
+def _page_count(module: Module, command: m.BootloaderPageCount) -> m.Response:
+    return m.BootloaderSuccess(data=(3712).to_bytes(2, "little"))
+
+
+@answers(m.BootloaderEcho)
+def _echo(module: Module, command: m.BootloaderEcho) -> m.Response:
+    return m.BootloaderEchoed(data=command.data)
 
 
 @answers(m.BootloaderStartApp)
 def _start_app(module: Module, command: m.BootloaderStartApp) -> m.Response:
     module.request_restart()
-    return _status(module)
-
-
-def _status(module: Module) -> m.Response:
-    status = module.options.bootloader_status
-    return m.UnknownMessage(code=status, payload=bytes([status]))
+    return m.BootloaderSuccess()
 
 
 # --- files (4.10 and 4.11)

@@ -174,7 +174,7 @@ class FileSystem:
 
     def _check_room_to_open(self) -> None:
         if len(self._open) >= MAX_OPEN:
-            raise Refusal(FileError.TOO_MANY_OPEN)
+            raise Refusal(FileError.TOO_MANY_FILES_OPEN)
 
     def _check_exists(self, key: FileKey) -> None:
         if key not in self._files:

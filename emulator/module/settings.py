@@ -107,8 +107,6 @@ class DeviceOptions:
         Sampling-frequency field of baseband messages [Hz] (15, question 9).
     storage_bytes
         Size of the file storage: 0x48000, or 0x18000 with the small microcontroller (4.11).
-    bootloader_status
-        Status byte of the bootloader for a command carried out (15, question 8).
     noise_map_store_ns
         How long a noise map takes to store; another store meanwhile is refused (4.4).
     x4_init_ns
@@ -136,7 +134,6 @@ class DeviceOptions:
     parameter_file_reply: Literal["string", "appdata", "byte"] = "string"
     baseband_sampling_hz: float = 2.916e9
     storage_bytes: int = 0x48000
-    bootloader_status: int = 0
     noise_map_store_ns: int = 100_000_000
     x4_init_ns: int = 0
     file_delete_ns: int = 100_000_000

@@ -26,6 +26,8 @@ def _x4_set(fields: Fields) -> m.Message:
         value = fields["start"], fields["end"]
     elif setting in m.REGISTERS:
         value = fields["address"], fields["value"]
+    elif fields["value"] == "NaN":
+        value = float("nan")
     else:
         value = fields["value"]
     short = "1-byte" in fields.get("note", "")
@@ -67,8 +69,8 @@ def _plain(kind: type[Any], **renamed: str) -> Callable[[Fields], m.Message]:
 
 
 def _postprocessing_set(fields: Fields) -> m.Message:
-    distance = fields.get("reference_distance")
-    value = fields["value"] if distance is None else (fields["value"], distance)
+    switched = "enable" in fields
+    value = (fields["enable"], fields["correction_distance"]) if switched else fields["value"]
     return m.FramePostprocessingSet(setting=FramePostprocessing[fields["id"]], value=value)
 
 
@@ -123,6 +125,30 @@ def _hil(fields: Fields) -> m.Message:
     )
 
 
+def _radar(kind: type[Any], arrays: dict[str, str]) -> Callable[[Fields], m.Message]:
+    def build(fields: Fields) -> m.Message:
+        given = {name: np.array(fields[name], dtype) for name, dtype in arrays.items()}
+        return _plain(
+            kind,
+            bin_length="bin_length_m",
+            sampling_frequency="sampling_frequency_hz",
+            carrier_frequency="carrier_frequency_hz",
+            frames_per_second="frames_per_s",
+            range_offset="range_offset_m",
+        )(fields | given)
+
+    return build
+
+
+def _bootloader_success(fields: Fields) -> m.Message:
+    value = fields.get("value", "")
+    if isinstance(value, int):
+        data = value.to_bytes(2, "little")
+    else:
+        data = bytes.fromhex(value) if len(value) == 2 else value.encode("latin-1")
+    return m.BootloaderSuccess(data=data)
+
+
 def _opaque(kind: type[Any]) -> Callable[[Fields], m.Message]:
     return lambda fields: kind(data=bytes.fromhex(fields["data"]))
 
@@ -157,7 +183,9 @@ BUILDERS: dict[str, Callable[[Fields], m.Message]] = {
     "SYSTEM": lambda fields: m.System(code=fields["code"]),
     "REPLY BYTE": _reply(m.ReplyByte, bytes, "values", "values"),
     "REPLY INT": _reply(m.ReplyInt, tuple, "values", "values"),
-    "REPLY FLOAT": _reply(m.ReplyFloat, tuple, "values", "values"),
+    "REPLY FLOAT": _reply(
+        m.ReplyFloat, lambda values: tuple(map(float, values)), "values", "values"
+    ),
     "REPLY STRING": _reply(m.ReplyString, str, "text", "value"),
     "DATA FLOAT": _reply(m.DataFloat, _floats, "values", "data"),
     "DATA BYTE": _reply(m.DataByte, bytes.fromhex, "values", "data"),
@@ -234,6 +262,12 @@ BUILDERS: dict[str, Callable[[Fields], m.Message]] = {
         page=fields["page_address"], data=bytes.fromhex(fields["data"])
     ),
     "BOOTLOADER_START_APP": _plain(m.BootloaderStartApp),
+    "BOOTLOADER_PAGE_SIZE": _plain(m.BootloaderPageSize),
+    "BOOTLOADER_PAGE_CNT": _plain(m.BootloaderPageCount),
+    "BOOTLOADER_ECHO": lambda fields: m.BootloaderEcho(data=bytes.fromhex(fields["data"])),
+    "BOOTLOADER success": _bootloader_success,
+    "BOOTLOADER framing error": lambda fields: m.BootloaderFramingError(code=fields["code"]),
+    "BOOTLOADER error": _plain(m.BootloaderError),
     "REPLY NONE": _plain(m.ReplyNone),
     "REPLY USER": _reply(m.ReplyUser, bytes, "values", "values"),
     "PULSEDOPPLER_FLOAT": _matrix(m.PulseDopplerFloat),
@@ -267,10 +301,10 @@ BUILDERS: dict[str, Callable[[Fields], m.Message]] = {
     ),
     "PROFILE_PARAMETERFILE": _plain(m.ParameterFile, filename="name"),
     "RESP_STATUS_EXT": _opaque(m.RespStatusExt),
-    "RADAR_RF": _opaque(m.RadarRf),
-    "RADAR_RF_NORMALIZED": _opaque(m.RadarRfNormalized),
-    "RADAR_BASEBAND_FLOAT": _opaque(m.RadarBasebandFloat),
-    "RADAR_BASEBAND_Q15": _opaque(m.RadarBasebandQ15),
+    "RADAR_RF": _radar(m.RadarRf, {"samples": "<u4"}),
+    "RADAR_RF_NORMALIZED": _radar(m.RadarRfNormalized, {"samples": "<f4"}),
+    "RADAR_BASEBAND_FLOAT": _radar(m.RadarBasebandFloat, {"i": "<f4", "q": "<f4"}),
+    "RADAR_BASEBAND_Q15": _radar(m.RadarBasebandQ15, {"i": "<i2", "q": "<i2"}),
     "PRESENCE_STATUS": _opaque(m.PresenceStatus),
     "DECIM_STATUS": _opaque(m.DecimStatus),
 }
@@ -278,10 +312,14 @@ BUILDERS: dict[str, Callable[[Fields], m.Message]] = {
 # Vectors whose fields the file abbreviates; the rest is written out from the rule it gives.
 _ABBREVIATED: dict[str, Fields] = {
     "bl_write_page": {"data": "00 01 02 03 04 05 06 07"},
+    "bl_write_page_0_checksum": {"data": "87 D6 12 00"},
+    "bl_write_page_128": {"data": "00 01 02 03 04 05 06 07 08 09 0A 0B 0C 0D 0E 0F"},
     "reply_system_test_x4_conn_pass": {"values": [1, *[0] * 255]},
     "data_float_baseband_181bins": {"data": [(k - 90) / 1024 for k in range(362)]},
 }
 
 
 def message_of(vector: Vector) -> m.Message:
+    if vector.name == "bl_reply_echo":  # command and answer have one name
+        return m.BootloaderEchoed(data=bytes.fromhex(vector.decoded["data"]))
     return BUILDERS[vector.message](vector.decoded | _ABBREVIATED.get(vector.name, {}))

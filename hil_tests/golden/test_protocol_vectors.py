@@ -32,7 +32,11 @@ VECTORS = (*DOCUMENTED, *HAND_MADE)
 BY_NAME = {vector.name: vector for vector in VECTORS}
 MESSAGES = [v for v in VECTORS if v.valid and not v.is_stream]
 KNOWN = [v for v in MESSAGES if v.message in BUILDERS]
-NAMELESS = [v for v in MESSAGES if v.name in {"doc_noescape_example", "opcode_unknown_EE"}]
+NAMELESS = [
+    v
+    for v in MESSAGES
+    if v.name in {"doc_noescape_example", "opcode_unknown_EE", "bl_unknown_command"}
+]
 STREAMS = [v for v in VECTORS if v.valid and v.is_stream]
 INVALID = [v for v in VECTORS if not v.valid]
 
@@ -54,7 +58,7 @@ def received(vector: Vector) -> Message:
 def test_every_vector_is_in_exactly_one_group() -> None:
     groups = [KNOWN, NAMELESS, STREAMS, INVALID]
     assert Counter(v.name for group in groups for v in group) == Counter(v.name for v in VECTORS)
-    assert [sum(v in DOCUMENTED for v in group) for group in groups] == [267, 2, 11, 5]
+    assert [sum(v in DOCUMENTED for v in group) for group in groups] == [311, 3, 11, 5]
     assert all(v in KNOWN for v in HAND_MADE)
 
 
@@ -64,7 +68,11 @@ def test_every_row_of_the_message_table_has_a_vector() -> None:
 
 @pytest.mark.parametrize("vector", KNOWN, ids=lambda v: v.name)
 def test_wire_decodes_to_the_described_message(vector: Vector) -> None:
-    assert received(vector) == message_of(vector)
+    found, described = received(vector), message_of(vector)
+    if "nan" in vector.name:  # which equals nothing
+        assert str(found) == str(described)
+    else:
+        assert found == described
 
 
 @pytest.mark.parametrize("vector", KNOWN, ids=lambda v: v.name)

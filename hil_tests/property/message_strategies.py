@@ -36,7 +36,8 @@ def of_type(draw: st.DrawFn, cls: type[Message]) -> Any:  # noqa: ANN401 - any r
     fields: dict[str, Any] = {}
     for name, kind in row.kinds:
         if name in COUNTS:
-            fields[name] = sizes[name] = draw(st.integers(0, 40))
+            assert isinstance(kind, wire_kinds.Number)
+            fields[name] = sizes[name] = draw(st.integers(int(kind.least or 0), 40))
         elif (choices := _choices(row.kinds, name)) is not None:
             fields[name] = draw(st.sampled_from(choices))
         elif name not in row.wire_only:
@@ -74,8 +75,8 @@ def _field(  # noqa: PLR0911, PLR0912 - one case per kind of field
             return st.sampled_from([None, 1] if fields[field] in short else [None])
         case wire_kinds.ByDiscriminator():
             return _discriminated(kind, fields)
-        case wire_kinds.Bins(count_field=count):
-            return array(sizes[count])
+        case wire_kinds.Bins(count_field=count, dtype=dtype):
+            return array(sizes[count], dtype)
         case wire_kinds.Floats(count=count, per=per):
             size = sizes[count] * per
             return st.lists(FLOATS, min_size=size, max_size=size).map(tuple)
@@ -113,8 +114,9 @@ def _elements(kind: wire_kinds.Elements) -> st.SearchStrategy[Any]:
     return st.lists(SCALARS[kind.code], max_size=9).map(tuple)
 
 
-def array(size: int) -> st.SearchStrategy[Any]:
-    """Float32 arrays among whose bytes 7C 7D 7E 7F are likely: they are what can go wrong."""
+def array(size: int, dtype: "np.dtype[Any]" = wire_kinds.FLOAT32) -> st.SearchStrategy[Any]:
+    """Arrays among whose bytes 7C 7D 7E 7F are likely: they are what can go wrong."""
     byte = st.sampled_from([0, 1, 0x3F, 0x7C, 0x7D, 0x7E, 0x7F])
-    raw = st.lists(byte, min_size=4 * size, max_size=4 * size).map(bytes)
-    return raw.map(lambda data: np.frombuffer(data, dtype="<f4"))
+    size *= dtype.itemsize
+    raw = st.lists(byte, min_size=size, max_size=size).map(bytes)
+    return raw.map(lambda data: np.frombuffer(data, dtype=dtype))

@@ -5,6 +5,7 @@ becomes an `UnknownMessage`. Bytes behind the last field are ignored, as the fir
 them (Protocol reference 3).
 """
 
+import math
 import struct
 from typing import Any, cast
 
@@ -107,11 +108,16 @@ def decode_response_at(buffer: bytes, start: int, end: int) -> Response:
     return decode_response(buffer[start:end])
 
 
+_NOT_FINITE = {math.inf: "Infinity", -math.inf: "-Infinity"}
+
+
 def describe(message: Message) -> tuple[str, dict[str, Any]]:
     """Name and JSON-able fields of a message, named as in the golden vectors.
 
     >>> describe(decode_response(bytes.fromhex("01 EA AE EE AA")))
     ('PONG', {'value': '0xAAEEAEEA'})
+
+    Floats that are no JSON numbers are shown as "NaN", "Infinity" and "-Infinity".
     """
     if isinstance(message, UnknownMessage):
         return "UNKNOWN", {"code": message.code, "payload": hex_bytes(message.payload)}
@@ -120,9 +126,19 @@ def describe(message: Message) -> tuple[str, dict[str, Any]]:
     shown: dict[str, Any] = {}
     for name, kind in row.kinds:
         shown |= kind.show(name, fields.get(name), fields)
-    for name, derive in row.derived.items():
-        shown[name] = derive(message)
-    return row.name, shown
+    shown |= row.derived(message)
+    return row.name, {name: _json_able(value) for name, value in shown.items()}
+
+
+def _json_able(value: Any) -> Any:  # noqa: ANN401 - any entry of a dump
+    """Spell out floats that JSON has no number for."""
+    if isinstance(value, list) and not all(map(_is_json_able, value)):
+        return [_json_able(item) for item in value]
+    return value if _is_json_able(value) else _NOT_FINITE.get(value, "NaN")
+
+
+def _is_json_able(value: Any) -> bool:  # noqa: ANN401 - likewise
+    return not isinstance(value, float) or math.isfinite(value)
 
 
 def _build(prefixes: Prefixes, payload: bytes) -> Message:

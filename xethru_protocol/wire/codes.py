@@ -132,7 +132,7 @@ class FramePostprocessingCode(IntEnum):
 class FramePostprocessing(IntEnum):
     """Setting id of the frame post-processing command. Protocol reference 16."""
 
-    NORMALIZATION = 0x10
+    NORMALISATION = 0x10
     PHASE_NOISE_CORRECTION = 0x11
     DECIMATION_FACTOR = 0x12
     NUMBER_FORMAT = 0x13
@@ -176,8 +176,32 @@ class BootloaderCode(IntEnum):
     """Second byte of BOOTLOADER. Protocol reference 4.12."""
 
     GET_DEVICE_INFO = 0x00
+    PAGE_SIZE = 0x01
+    PAGE_CNT = 0x02
     WRITE_PAGE = 0x10
     START_APP = 0x20
+    ECHO = 0xEF
+
+
+class BootloaderReply(IntEnum):
+    """First payload byte of what a bootloader answers. Protocol reference 4.12."""
+
+    SUCCESS = 0xE0
+    FRAMING_ERROR = 0xE1
+    UNKNOWN_COMMAND = 0xE2  # from then on writing is refused
+    WRITING_REFUSED = 0xE3
+    WRONG_CHECKSUM = 0xE4
+    PAGE_OUT_OF_BOUNDS = 0xE5
+    ECHO = 0xEF
+
+
+class BootloaderFraming(IntEnum):
+    """What a bootloader's framing error is about. Protocol reference 4.12, 1.2."""
+
+    CRC = 1
+    LOST_BYTES = 2
+    INCOMPLETE_PACKET = 3
+    OUT_OF_BUFFER = 4
 
 
 class ResponseCode(IntEnum):
@@ -590,8 +614,8 @@ class X4Error(IntEnum):
     SRAM_FIFO_TIMEOUT = 8
     FRAME_READY_TIMEOUT = 9
     FRAME_LENGTH_TOO_LOW = 10
-    BUFFER_TOO_SMALL = 11
-    INVALID_DAC_STEP = 12
+    BUFFER_TO_SMALL = 11  # an SPI burst
+    INVALID_DACSTEP_INPUT = 12
     TIMER_CHANGE_FAILED = 13
     COUNTER_TOO_LARGE = 14
     DOWNCONVERSION_REGION_UNSUPPORTED = 15
@@ -627,8 +651,8 @@ class FileError(IntEnum):
     NOT_INITIALIZED = 8
     FULL = 9
     SYSTEM_BUSY = 10
-    TOO_MANY_OPEN = 11
-    UNKNOWN_FAILURE = 12
+    TOO_MANY_FILES_OPEN = 11
+    UNKNOWN_FAILURE = 12  # CREATE with length 0
     LOCK_TIMEOUT = 13
     NOT_SUPPORTED = 14
     OUT_OF_RANGE = 0x21
@@ -645,7 +669,7 @@ class IoPinError(IntEnum):
 
 _ERROR_PREFIXES: dict[type[IntEnum], str] = {
     X4Error: "X4 ",
-    FileError: "FILE ",
+    FileError: "file ",
     IoPinError: "IOPIN ",
 }
 
@@ -659,16 +683,23 @@ def error_name(code: int, errors: type[IntEnum] = ErrorCode) -> str:
         0 ... 2**32 - 1.
     errors
         The failed command's ``Row.errors``. An ERROR does not name the command that failed: without
-        that knowledge the protocol's own names win and the rest is read as the X4 driver's.
+        that knowledge the protocol's own names win, and the rest has the names of the X4 driver's
+        and of the files' codes.
 
     >>> error_name(1), error_name(17), error_name(1, X4Error)
     ('NOT_RECOGNIZED', 'X4 FRAME_AREA_END_OUT_OF_SCOPE', 'X4 GENERAL_FAILURE')
     >>> error_name(6, FileError), error_name(0x22, FileError)
-    ('FILE NOT_OPEN', 'RESTARTING')
+    ('file NOT_OPEN', 'RESTARTING')
+    >>> error_name(6)
+    'X4 LDO_FAILED or file NOT_OPEN'
     """
-    for space in (ErrorCode, X4Error) if errors is ErrorCode else (errors, ErrorCode):
-        name = next((error.name for error in space if error == code), "")
-        if name:
-            signed = " (-1)" if code == X4Error.UNINITIALIZED else ""
-            return _ERROR_PREFIXES.get(space, "") + name.removeprefix("XTS_SPRE_") + signed
-    return ""
+    if errors is not ErrorCode:
+        return _name_in(errors, code) or _name_in(ErrorCode, code)
+    others = (_name_in(space, code) for space in (X4Error, FileError))
+    return _name_in(ErrorCode, code) or " or ".join(name for name in others if name)
+
+
+def _name_in(space: type[IntEnum], code: int) -> str:
+    name = next((error.name for error in space if error == code), "")
+    signed = " (-1)" if code == X4Error.UNINITIALIZED else ""
+    return name and _ERROR_PREFIXES.get(space, "") + name.removeprefix("XTS_SPRE_") + signed

@@ -22,6 +22,8 @@ import numpy.typing as npt
 
 
 FLOAT32 = np.dtype("<f4")
+UINT32 = np.dtype("<u4")
+INT16 = np.dtype("<i2")
 # A message's fields by name; while unpacking, those before this one.
 Fields = Mapping[str, Any]
 
@@ -60,19 +62,26 @@ def hex_bytes(value: bytes) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """One scalar: a ``struct`` code, and how a dump shows it."""
+    """One scalar: a ``struct`` code, how a dump shows it, and the least that is accepted."""
 
     code: str
     label: str = ""
     shown: Callable[[Any], Any] = _plain
     order: str = "<"
+    least: float | None = None
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
+        self._check(value)
         return struct.pack(self.order + self.code, value)
 
     def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
         (value,) = struct.unpack_from(self.order + self.code, data, start)
+        self._check(value)
         return value, start + struct.calcsize(self.order + self.code)
+
+    def _check(self, value: Any) -> None:
+        if self.least is not None and value < self.least:
+            raise ValueError(f"{value} is less than {self.least}")
 
     def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
         return {self.label or name: self.shown(value)}
@@ -112,6 +121,7 @@ class Spelling:
 
     codes: tuple[int, ...]
     usual: int | None = None
+    shown: Callable[[int], Any] = short_hexadecimal
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
         if value not in self.codes:
@@ -123,7 +133,7 @@ class Spelling:
 
     def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
         """Show which code was used, unless it is the usual one."""
-        return {} if value == self.usual else {name: short_hexadecimal(value)}
+        return {} if value == self.usual else {name: self.shown(value)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -279,23 +289,28 @@ class Elements:
 
 @dataclass(frozen=True, slots=True)
 class Bins:
-    """A float32 array with one value per bin; the bin count is the field ``count_field``."""
+    """An array with one value per bin; the bin count is the field ``count_field``.
+
+    ``dtype`` is that of a value; behind the ``last`` array of a message no byte may follow.
+    """
 
     count_field: str
     label: str = ""
+    dtype: np.dtype[Any] = FLOAT32
+    last: bool = False
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
-        array: npt.NDArray[np.float32] = np.ascontiguousarray(value, dtype=FLOAT32)
+        array: npt.NDArray[Any] = np.ascontiguousarray(value, dtype=self.dtype)
         if array.shape != (fields[self.count_field],):
             raise ValueError(f"{array.shape} values for {fields[self.count_field]} bins")
         return array.tobytes()
 
     def unpack(self, data: bytes, start: int, fields: Fields) -> tuple[Any, int]:
         """Unpack the array, as a view on its own copy of the bytes."""
-        end = start + 4 * fields[self.count_field]
-        if end > len(data):
-            raise ValueError("fewer bins than announced")
-        return np.frombuffer(data[start:end], dtype=FLOAT32), end
+        end = start + self.dtype.itemsize * fields[self.count_field]
+        if end > len(data) or (self.last and end < len(data)):
+            raise ValueError("the bins are not as many as announced")
+        return np.frombuffer(data[start:end], dtype=self.dtype), end
 
     def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
         return {self.label or name: value.tolist()}
@@ -307,6 +322,7 @@ class RestBytes:
 
     shown: Callable[[bytes], Any] = hex_bytes
     label: str = ""
+    empty_shown: bool = True
 
     def pack(self, value: Any, fields: Fields, bulk: bool) -> bytes:
         return bytes(value)
@@ -315,7 +331,7 @@ class RestBytes:
         return data[start:], len(data)
 
     def show(self, name: str, value: Any, fields: Fields) -> dict[str, Any]:
-        return {self.label or name: self.shown(value)}
+        return {self.label or name: self.shown(value)} if value or self.empty_shown else {}
 
 
 def text_bytes(value: str | bytes) -> bytes:

@@ -80,6 +80,10 @@ _APPDATA: dict[int, tuple[int, int | None, int]] = {
     AppDataId.XTS_ID_PULSEDOPPLER_BYTE: (57, None, 1),
     AppDataId.XTS_ID_NOISEMAP_FLOAT: (49, None, 4),
     AppDataId.XTS_ID_NOISEMAP_BYTE: (57, None, 1),
+    AppDataId.XTS_ID_RADAR_RF: (33, 9, 4),
+    AppDataId.XTS_ID_RADAR_RF_NORMALIZED: (33, 9, 4),
+    AppDataId.XTS_ID_RADAR_BASEBAND_FLOAT: (49, 9, 8),
+    AppDataId.XTS_ID_RADAR_BASEBAND_Q15: (53, 9, 4),
 }
 
 

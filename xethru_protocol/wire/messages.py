@@ -5,7 +5,7 @@ Names in dumps are those of the golden vectors. Section numbers refer to the Pro
 lengths of files are 0 ... 2**32 - 1.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
@@ -20,6 +20,8 @@ from xethru_protocol.wire.codes import (
     AppDataId,
     AppObject,
     BootloaderCode,
+    BootloaderFraming,
+    BootloaderReply,
     CommandCode,
     DirCode,
     ElementType,
@@ -38,6 +40,7 @@ from xethru_protocol.wire.codes import (
     X4Setting,
     error_name,
 )
+from xethru_protocol.wire.fields import hex_bytes
 from xethru_protocol.wire.rows import ROWS, command, id32, response
 from xethru_protocol.wire.rows import Command as Command
 from xethru_protocol.wire.rows import Message as Message
@@ -55,7 +58,7 @@ class Ack(Response):
 @response(
     ResponseCode.XTS_SPR_ERROR,
     name="ERROR",
-    derived={"code_name": lambda message: error_name(message.code) or None},
+    derived=lambda message: {"code_name": error_name(message.code) or None},
 )
 class Error(Response):
     """The command was refused; ``code`` is 0 ... 2**32 - 1. 5.1."""
@@ -73,8 +76,8 @@ class Pong(Response):
 @response(
     ResponseCode.XTS_SPR_SYSTEM,
     name="SYSTEM",
-    derived={
-        "code_name": lambda message: next(
+    derived=lambda message: {
+        "code_name": next(
             (code.name.removeprefix("XTS_SPRS_") for code in SystemCode if code == message.code),
             None,
         )
@@ -346,16 +349,15 @@ class NoiseMapFloat(_MatrixFloat):
     """Noise power spectrum of one range bin; fields as in `PulseDopplerFloat`. 7.2."""
 
 
-_DECOMPRESSED: Mapping[str, Callable[[Any], Any]] = {
-    "decompressed": lambda message: message.power.tolist()
-}
+def _decompressed(message: _MatrixByte) -> dict[str, Any]:
+    return {"decompressed": message.power.tolist()}
 
 
 @response(
     *appdata(AppDataId.XTS_ID_PULSEDOPPLER_BYTE),
     name="PULSEDOPPLER_BYTE",
     bulk=True,
-    derived=_DECOMPRESSED,
+    derived=_decompressed,
 )
 class PulseDopplerByte(_MatrixByte):
     """Power spectrum of one range bin on a logarithmic scale. 7.2.
@@ -369,7 +371,7 @@ class PulseDopplerByte(_MatrixByte):
     *appdata(AppDataId.XTS_ID_NOISEMAP_BYTE),
     name="NOISEMAP_BYTE",
     bulk=True,
-    derived=_DECOMPRESSED,
+    derived=_decompressed,
 )
 class NoiseMapByte(_MatrixByte):
     """Noise power spectrum of one range bin; fields as in `PulseDopplerByte`. 7.2."""
@@ -527,24 +529,103 @@ class RespStatusExt(_Opaque):
     """Extended breathing state; layout unknown. 7.4."""
 
 
-@response(*appdata(AppDataId.XTS_ID_RADAR_RF), name="RADAR_RF")
-class RadarRf(_Opaque):
-    """RF frame of newer firmware; order of its fields on the wire unproven. 7.5."""
+# The vendor's library drops payloads below 40 bytes (RF) and 64 (baseband): as many bins at least.
+_RF_BINS = _BASEBAND_BINS = fields.Number("I", least=2)
+_Q15_BINS = fields.Number("I", least=3)
+_FRAMES_PER_S = fields.Number("I", "frames_per_second")
 
 
-@response(*appdata(AppDataId.XTS_ID_RADAR_RF_NORMALIZED), name="RADAR_RF_NORMALIZED")
-class RadarRfNormalized(_Opaque):
-    """RF frame of newer firmware, as float; layout unproven. 7.5."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _RadarRf(_Bulk):
+    """Header of the two RF messages. 7.5."""
+
+    counter: Annotated[int, fields.U32]
+    num_bins: Annotated[int, _RF_BINS]
+    bin_length_m: Annotated[float, _BIN_LENGTH]
+    sampling_frequency_hz: Annotated[float, _SAMPLING]
+    carrier_frequency_hz: Annotated[float, _CARRIER]
+    frames_per_s: Annotated[int, _FRAMES_PER_S]
+    range_offset_m: Annotated[float, _OFFSET]
 
 
-@response(*appdata(AppDataId.XTS_ID_RADAR_BASEBAND_FLOAT), name="RADAR_BASEBAND_FLOAT")
-class RadarBasebandFloat(_Opaque):
-    """Baseband frame of newer firmware, as float; layout unproven. 7.5."""
+@response(*appdata(AppDataId.XTS_ID_RADAR_RF), name="RADAR_RF", bulk=True)
+class RadarRf(_RadarRf):
+    """RF frame of newer firmware, as counts of the chip. 7.5.
+
+    ``samples``: shape (num_bins,), uint32, read-only, by increasing range. ``counter`` is the frame
+    counter, ``frames_per_s`` a whole number on the wire. Ranges in module metres;
+    ``range_offset_m`` is the range of bin 0.
+    """
+
+    samples: Annotated[npt.NDArray[np.uint32], fields.Bins("num_bins", "", fields.UINT32, True)]
 
 
-@response(*appdata(AppDataId.XTS_ID_RADAR_BASEBAND_Q15), name="RADAR_BASEBAND_Q15")
-class RadarBasebandQ15(_Opaque):
-    """Baseband frame of newer firmware, as Q15; layout unproven. 7.5."""
+@response(*appdata(AppDataId.XTS_ID_RADAR_RF_NORMALIZED), name="RADAR_RF_NORMALIZED", bulk=True)
+class RadarRfNormalized(_RadarRf):
+    """RF frame of newer firmware; ``samples`` are float32, other fields as in `RadarRf`. 7.5."""
+
+    samples: Annotated[FloatArray, fields.Bins("num_bins", last=True)]
+
+
+@response(*appdata(AppDataId.XTS_ID_RADAR_BASEBAND_FLOAT), name="RADAR_BASEBAND_FLOAT", bulk=True)
+class RadarBasebandFloat(_Bulk):
+    """Baseband frame of newer firmware, as float. 7.5.
+
+    ``i`` and ``q``: shape (num_bins,), float32, read-only. The correction fields belong to the
+    phase-noise correction: a bin, and its I and Q. Other fields as in `RadarRf`.
+    """
+
+    counter: Annotated[int, fields.U32]
+    num_bins: Annotated[int, _BASEBAND_BINS]
+    bin_length_m: Annotated[float, _BIN_LENGTH]
+    sampling_frequency_hz: Annotated[float, _SAMPLING]
+    carrier_frequency_hz: Annotated[float, _CARRIER]
+    frames_per_s: Annotated[int, _FRAMES_PER_S]
+    range_offset_m: Annotated[float, _OFFSET]
+    decimation_factor: Annotated[int, fields.U32]
+    correction_bin: Annotated[int, fields.U32]
+    correction_i: Annotated[float, fields.F32]
+    correction_q: Annotated[float, fields.F32]
+    i: Annotated[FloatArray, fields.Bins("num_bins")]
+    q: Annotated[FloatArray, fields.Bins("num_bins", last=True)]
+
+    @property
+    def iq(self) -> npt.NDArray[np.complex64]:
+        """``i`` + j ``q``, complex64, shape (num_bins,)."""
+        return np.asarray(self.i + np.complex64(1j) * self.q, dtype=np.complex64)
+
+
+@response(*appdata(AppDataId.XTS_ID_RADAR_BASEBAND_Q15), name="RADAR_BASEBAND_Q15", bulk=True)
+class RadarBasebandQ15(_Bulk):
+    """Baseband frame of newer firmware, in 16-bit integers. 7.5.
+
+    ``i`` and ``q``: shape (num_bins,), int16, read-only, as sent; `iq` scales them. Other fields
+    as in `RadarBasebandFloat`.
+    """
+
+    counter: Annotated[int, fields.U32]
+    num_bins: Annotated[int, _Q15_BINS]
+    bin_length_m: Annotated[float, _BIN_LENGTH]
+    sampling_frequency_hz: Annotated[float, _SAMPLING]
+    carrier_frequency_hz: Annotated[float, _CARRIER]
+    frames_per_s: Annotated[int, _FRAMES_PER_S]
+    range_offset_m: Annotated[float, _OFFSET]
+    decimation_factor: Annotated[int, fields.U32]
+    correction_bin: Annotated[int, fields.U32]
+    correction_i: Annotated[float, fields.F32]
+    correction_q: Annotated[float, fields.F32]
+    scaling_factor: Annotated[float, fields.F32]
+    i: Annotated[npt.NDArray[np.int16], fields.Bins("num_bins", "", fields.INT16)]
+    q: Annotated[npt.NDArray[np.int16], fields.Bins("num_bins", "", fields.INT16, True)]
+
+    @property
+    def iq(self) -> npt.NDArray[np.complex64]:
+        """(``i`` + j ``q``) times the scaling factor, complex64, shape (num_bins,).
+
+        That the factor is meant so is inferred, not documented.
+        """
+        samples = self.i.astype(np.float32) + np.complex64(1j) * self.q.astype(np.float32)
+        return np.asarray(samples * np.float32(self.scaling_factor), dtype=np.complex64)
 
 
 @response(*appdata(AppDataId.XTS_ID_PRESENCE_STATUS), name="PRESENCE_STATUS")
@@ -555,6 +636,60 @@ class PresenceStatus(_Opaque):
 @response(*appdata(AppDataId.XTS_ID_DECIM_STATUS), name="DECIM_STATUS")
 class DecimStatus(_Opaque):
     """Legacy message; layout unknown. 7.5."""
+
+
+def _bootloader_data(data: bytes) -> int | str:
+    """Show one byte as it is, two as the number, more as the text they are. 4.12."""
+    if len(data) == 2:
+        return int.from_bytes(data, "little")
+    return hex_bytes(data) if len(data) < 2 else data.decode("latin-1")
+
+
+@response(BootloaderReply.SUCCESS, name="BOOTLOADER success")
+class BootloaderSuccess(Response):
+    """A bootloader's answer E0 and what follows it: nothing, bytes, a number or a text. 4.12.
+
+    Only ``data`` 33 says that a page was written; without data, it was not.
+    """
+
+    data: Annotated[
+        bytes, fields.RestBytes(shown=_bootloader_data, label="value", empty_shown=False)
+    ] = b""
+
+
+@response(
+    BootloaderReply.FRAMING_ERROR,
+    name="BOOTLOADER framing error",
+    derived=lambda message: {
+        "code_name": next((code.name for code in BootloaderFraming if code == message.code), None)
+    },
+)
+class BootloaderFramingError(Response):
+    """A bootloader found a packet damaged: a `BootloaderFraming`. 4.12."""
+
+    code: Annotated[int, fields.U8]
+
+
+_BOOTLOADER_ERRORS = (
+    int(BootloaderReply.UNKNOWN_COMMAND),
+    int(BootloaderReply.WRITING_REFUSED),
+    int(BootloaderReply.WRONG_CHECKSUM),
+    int(BootloaderReply.PAGE_OUT_OF_BOUNDS),
+)
+
+
+@response(name="BOOTLOADER error")
+class BootloaderError(Response):
+    """A bootloader refuses a command: ``code`` is a `BootloaderReply`, E2 to E5. 4.12."""
+
+    code: Annotated[int, fields.Spelling(_BOOTLOADER_ERRORS, shown=int)]
+
+
+@response(BootloaderReply.ECHO, name="BOOTLOADER_ECHO")
+class BootloaderEchoed(Response):
+    """A bootloader sends back what `BootloaderEcho` carried. 4.12."""
+
+    data: Annotated[bytes, fields.RestBytes()]
 
 
 # --- commands ---------------------------------------------------------------------------------
@@ -582,10 +717,8 @@ class ModReset(Command[Ack]):
 @command(
     CommandCode.XTS_SPC_MOD_SETMODE,
     name="SETMODE",
-    derived={
-        "mode_name": lambda message: next(
-            (mode.label for mode in SensorMode if mode == message.mode), None
-        )
+    derived=lambda message: {
+        "mode_name": next((mode.label for mode in SensorMode if mode == message.mode), None)
     },
 )
 class SetMode(Command[Ack]):
@@ -1033,13 +1166,34 @@ _BOOTLOADER = CommandCode.XTS_SPC_BOOTLOADER
 
 
 @command(_BOOTLOADER, BootloaderCode.GET_DEVICE_INFO, name="BOOTLOADER_GET_DEVICE_INFO")
-class BootloaderGetDeviceInfo(Command[Response]):
-    """Ask the bootloader about the device; the form of its answer is not known. 4.12."""
+class BootloaderGetDeviceInfo(Command[BootloaderSuccess]):
+    """Ask which bootloader this is: a text. 4.12."""
 
 
-@command(_BOOTLOADER, BootloaderCode.WRITE_PAGE, name="BOOTLOADER_WRITE_PAGE")
-class BootloaderWritePage(Command[Response]):
-    """Write a page of 512 bytes, the last one padded with FF; answered by one byte. 4.12."""
+@command(_BOOTLOADER, BootloaderCode.PAGE_SIZE, name="BOOTLOADER_PAGE_SIZE")
+class BootloaderPageSize(Command[BootloaderSuccess]):
+    """Ask for the size of a flash page [bytes]. 4.12."""
+
+
+@command(_BOOTLOADER, BootloaderCode.PAGE_CNT, name="BOOTLOADER_PAGE_CNT")
+class BootloaderPageCount(Command[BootloaderSuccess]):
+    """Ask for the number of pages that an application may have. 4.12."""
+
+
+def _image_checksum(message: "BootloaderWritePage") -> dict[str, Any]:
+    announced = message.page == 0 and len(message.data) >= 4
+    return {"image_checksum": int.from_bytes(message.data[:4], "little")} if announced else {}
+
+
+@command(
+    _BOOTLOADER, BootloaderCode.WRITE_PAGE, name="BOOTLOADER_WRITE_PAGE", derived=_image_checksum
+)
+class BootloaderWritePage(Command[BootloaderSuccess]):
+    """Write a page of 512 bytes, the last one padded with FF. 4.12.
+
+    Page 0 is no page of the flash: its first four bytes are the sum of the image's bytes, and it
+    unlocks the flash.
+    """
 
     # The one big-endian number of the protocol, and a zero byte.
     page: Annotated[int, fields.Number("Hx", "page_address", order=">")]
@@ -1047,8 +1201,15 @@ class BootloaderWritePage(Command[Response]):
 
 
 @command(_BOOTLOADER, BootloaderCode.START_APP, name="BOOTLOADER_START_APP")
-class BootloaderStartApp(Command[Response]):
-    """Leave the bootloader for the application. 4.12."""
+class BootloaderStartApp(Command[BootloaderSuccess]):
+    """Compare the flash with the announced sum and leave for the application. 4.12."""
+
+
+@command(_BOOTLOADER, BootloaderCode.ECHO, name="BOOTLOADER_ECHO")
+class BootloaderEcho(Command[BootloaderEchoed]):
+    """Ask the bootloader to send ``data`` back. 4.12."""
+
+    data: Annotated[bytes, fields.RestBytes()] = b""
 
 
 X4Value = int | float | tuple[float, float] | tuple[int, int]
@@ -1160,8 +1321,8 @@ _POSTPROCESSING = CommandCode.XTS_SPC_FRAME_POSTPROCESSING
 PostprocessingValue = int | tuple[int, float]
 # Struct codes and names of what SET carries (16).
 POSTPROCESSING_LAYOUTS: Mapping[int, tuple[str, tuple[str, ...]]] = {
-    FramePostprocessing.NORMALIZATION: ("B", ("value",)),
-    FramePostprocessing.PHASE_NOISE_CORRECTION: ("If", ("value", "reference_distance")),
+    FramePostprocessing.NORMALISATION: ("B", ("value",)),
+    FramePostprocessing.PHASE_NOISE_CORRECTION: ("Bf", ("enable", "correction_distance")),
     FramePostprocessing.DECIMATION_FACTOR: ("I", ("value",)),
     FramePostprocessing.NUMBER_FORMAT: ("B", ("value",)),
     FramePostprocessing.LEGACY_OUTPUT: ("B", ("value",)),
@@ -1172,7 +1333,8 @@ POSTPROCESSING_LAYOUTS: Mapping[int, tuple[str, tuple[str, ...]]] = {
 class FramePostprocessingSet(Command[Ack]):
     """Choose one step between chip and host; newer sensor firmware. 16.
 
-    ``value`` is a number; for PHASE_NOISE_CORRECTION (on, reference distance [m]).
+    ``value`` is a number; for PHASE_NOISE_CORRECTION (1 or 0 for on or off, correction distance
+    [m]).
     """
 
     setting: Annotated[FramePostprocessing, fields.Member(FramePostprocessing, "id")]
@@ -1181,6 +1343,9 @@ class FramePostprocessingSet(Command[Ack]):
 
 @command(_POSTPROCESSING, FramePostprocessingCode.GET, name="FRAME_POSTPROCESSING_GET")
 class FramePostprocessingGet(Command[ReplyByte | ReplyFloat | ReplyInt]):
-    """Ask for one setting between chip and host. 16."""
+    """Ask for one setting between chip and host. 16.
+
+    Of PHASE_NOISE_CORRECTION only the distance is answered, not whether it is on.
+    """
 
     setting: Annotated[FramePostprocessing, fields.Member(FramePostprocessing, "id")]

@@ -7,7 +7,7 @@ follows from the lists it counts. A command's row names its reply by its base, `
 that is what `X4M300.request` returns. The rows are in ``messages``.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from types import UnionType
@@ -71,7 +71,15 @@ class Row:
     replies: tuple[type[Response], ...]
     content_id: Callable[[Any], int] | None  # content id the reply must carry
     errors: type[IntEnum]  # what the codes of an ERROR to this command mean
-    derived: Mapping[str, Callable[[Any], Any]]  # dump entries computed from the message
+    derived: Callable[[Any], dict[str, Any]]  # dump entries computed from the message
+
+    @property
+    def opcodes(self) -> frozenset[int]:
+        """First bytes that its payloads may have."""
+        if self.prefix:
+            return frozenset(self.prefix[:1])
+        first = self.kinds[0][1]
+        return frozenset(first.codes if isinstance(first, fields.Spelling) else ())
 
 
 class Prefixes:
@@ -105,7 +113,7 @@ def command(
     name: str,
     reply_content_id: Callable[[Any], int] | None = None,
     errors: type[IntEnum] = ErrorCode,
-    derived: Mapping[str, Callable[[Any], Any]] | None = None,
+    derived: Callable[[Any], dict[str, Any]] | None = None,
 ) -> Callable[[type[MessageT]], type[MessageT]]:
     """Enter a command into the table; ``prefix`` is the payload's first byte or bytes."""
 
@@ -124,7 +132,7 @@ def response(
     *prefix: int,
     name: str,
     bulk: bool = False,
-    derived: Mapping[str, Callable[[Any], Any]] | None = None,
+    derived: Callable[[Any], dict[str, Any]] | None = None,
 ) -> Callable[[type[MessageT]], type[MessageT]]:
     """Enter a response into the table; ``bulk`` ones travel in NoEscape framing (1.3)."""
 
@@ -143,7 +151,7 @@ def _enter(  # noqa: PLR0917 - the two decorators above are its only callers
     cls: type[MessageT],
     prefix: bytes,
     name: str,
-    derived: Mapping[str, Callable[[Any], Any]] | None,
+    derived: Callable[[Any], dict[str, Any]] | None,
     replies: tuple[type[Response], ...] = (),
     content_id: Callable[[Any], int] | None = None,
     errors: type[IntEnum] = ErrorCode,
@@ -163,6 +171,10 @@ def _enter(  # noqa: PLR0917 - the two decorators above are its only callers
     for code in [b""] if spellings is None else [bytes((code,)) for code in spellings]:
         prefixes.enter(prefix + code, cls)
     ROWS[cls] = Row(
-        name, prefix, kinds, own, wire_only, bulk, replies, content_id, errors, derived or {}
+        name, prefix, kinds, own, wire_only, bulk, replies, content_id, errors, derived or _nothing
     )
     return cls
+
+
+def _nothing(message: Message) -> dict[str, Any]:
+    return {}

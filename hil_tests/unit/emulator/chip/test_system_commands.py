@@ -128,10 +128,11 @@ def test_in_the_bootloader_only_its_commands_answer(host: BareHost) -> None:
     for command in (m.Ping(), m.GetMode(), m.ModReset(), m.Hil()):
         host.send(command)
         assert host.hear() == []
-    ok = m.UnknownMessage(code=0, payload=b"\x00")
-    assert host.ask(m.BootloaderGetDeviceInfo()) == ok
-    assert host.ask(m.BootloaderWritePage(page=1, data=bytes(512))) == ok
-    assert host.ask(m.BootloaderStartApp()) == ok
+    assert isinstance(host.ask(m.BootloaderGetDeviceInfo()), m.BootloaderSuccess)
+    not_written, written = m.BootloaderSuccess(), m.BootloaderSuccess(data=b"\x33")
+    assert host.ask(m.BootloaderWritePage(page=0, data=bytes(512))) == not_written
+    assert host.ask(m.BootloaderWritePage(page=128, data=bytes(512))) == written
+    assert host.ask(m.BootloaderStartApp()) == m.BootloaderSuccess()
     wait(host)
     assert host.hear(2) == BOOTED
     assert host.ask(m.Ping()) == READY
@@ -244,7 +245,7 @@ def test_i2c_and_postprocessing_of_the_sensor_firmware(host: BareHost) -> None:
     assert reply == m.ReplyByte(content_id=0x27, values=b"\x01\x02\x00")
     assert host.ask(m.X4DriverReadI2c(length=10**9)) == m.Error(code=1)
     for setting, value, expected in (
-        (FramePostprocessing.NORMALIZATION, 0, m.ReplyByte(content_id=0x10, values=b"\x00")),
+        (FramePostprocessing.NORMALISATION, 0, m.ReplyByte(content_id=0x10, values=b"\x00")),
         (
             FramePostprocessing.PHASE_NOISE_CORRECTION,
             (1, 0.5),

@@ -115,7 +115,7 @@ def test_lines_are_streams_of_their_own(capsys: pytest.CaptureFixture[str], tmp_
 def test_not_a_number_is_still_json(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     nan = "7C 7C 7C 7C 12 00 00 00 00 A0 12 00 00 00 00 01 00 00 00 01 00 00 00 00 00 C0 7F"
     (found,) = decoded(capsys, tmp_path, [nan])
-    assert found["fields"]["data"] == [None]
+    assert found["fields"]["data"] == ["NaN"]
 
 
 def test_packets_are_printed_as_they_come() -> None:

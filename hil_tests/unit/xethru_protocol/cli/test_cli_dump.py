@@ -91,7 +91,7 @@ def test_answers_and_unknown_messages_in_a_wire_capture(tmp_path: Path, capsys: 
     found = dumped(capsys, wire)
     assert [message["t_ns"] for message in found] == [2_000_000_000, 2_000_000_001, None]
     assert found[1]["payload_hex"] == " ".join(["77"] * 50)
-    assert found[2]["fields"]["data"] == [None, None]
+    assert found[2]["fields"]["data"] == ["NaN", "Infinity"]
 
 
 # --- convert --------------------------------------------------------------------------------------

@@ -74,12 +74,12 @@ def test_files_are_listed_found_and_deleted(driver_on: DriverOn) -> None:
 @pytest.mark.parametrize(
     ("verb", "arguments", "code", "meaning"),
     [
-        ("read", (USER, 9), 5, "FILE NOT_FOUND"),
-        ("length", (USER, 9), 5, "FILE NOT_FOUND"),
-        ("delete", (USER, 9), 5, "FILE NOT_FOUND"),
-        ("write", (USER, 1, b"again"), 3, "FILE ALREADY_EXISTS"),
-        ("write", (USER, 2, bytes(0x18001)), 9, "FILE FULL"),
-        ("format_all", (0x427F00C8,), 1, "FILE INVALID_PARAMETER"),
+        ("read", (USER, 9), 5, "file NOT_FOUND"),
+        ("length", (USER, 9), 5, "file NOT_FOUND"),
+        ("delete", (USER, 9), 5, "file NOT_FOUND"),
+        ("write", (USER, 1, b"again"), 3, "file ALREADY_EXISTS"),
+        ("write", (USER, 2, bytes(0x18001)), 9, "file FULL"),
+        ("format_all", (0x427F00C8,), 1, "file INVALID_PARAMETER"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -101,7 +101,7 @@ def test_file_is_closed_after_a_chunk_failed(emulated: Emulated, verb: str) -> N
     radar.files.write(USER, 1, CONTENT)
     module.fail_at = 256
     arguments = (USER, 1) if verb == "read" else (USER, 2, CONTENT)
-    with pytest.raises(DeviceError, match="FILE UNKNOWN_FAILURE"):
+    with pytest.raises(DeviceError, match="file UNKNOWN_FAILURE"):
         getattr(radar.files, verb)(*arguments)
     assert module.open == set()
     assert list(module.files) == [(USER, 1)]  # no half-written file stays

@@ -38,20 +38,20 @@ PROTOCOL, X4, FILES, PINS = ErrorCode, X4Error, FileError, IoPinError
     [
         (1, PROTOCOL, "NOT_RECOGNIZED"),
         (1, X4, "X4 GENERAL_FAILURE"),
-        (1, FILES, "FILE INVALID_PARAMETER"),
+        (1, FILES, "file INVALID_PARAMETER"),
         (1, PINS, "IOPIN WRONG_PIN"),
         (3, PROTOCOL, "BUSY"),
-        (3, FILES, "FILE ALREADY_EXISTS"),
+        (3, FILES, "file ALREADY_EXISTS"),
         (3, PINS, "IOPIN INTERRUPT_NOT_AVAILABLE"),
-        (4, PROTOCOL, "X4 REGISTER_TIMEOUT"),
-        (4, FILES, "FILE BUSY"),
+        (4, PROTOCOL, "X4 REGISTER_TIMEOUT or file BUSY"),
+        (4, FILES, "file BUSY"),
         (5, PINS, ""),
-        (14, FILES, "FILE NOT_SUPPORTED"),
+        (14, FILES, "file NOT_SUPPORTED"),
         (15, FILES, ""),
         (17, PROTOCOL, "X4 FRAME_AREA_END_OUT_OF_SCOPE"),
         (17, FILES, ""),
         (0x21, PROTOCOL, "COMMAND_FAILED"),
-        (0x21, FILES, "FILE OUT_OF_RANGE"),
+        (0x21, FILES, "file OUT_OF_RANGE"),
         (0x22, X4, "RESTARTING"),
         (999, X4, "X4 HAL_ERROR"),
         (0xFFFFFFFF, X4, "X4 UNINITIALIZED (-1)"),
@@ -96,6 +96,8 @@ def test_replies_are_read_without_their_trailer(vector: Vector) -> None:
     whole, cut = decode_response(vector.payload), decode_response(vector.payload[:-1])
     if isinstance(whole, m.ReplyNone):
         assert cut == m.ReplyNone(content_id=whole.content_id, info=whole.info, trailer=None)
+    elif "nan" in vector.name:  # which equals nothing
+        assert str(cut) == str(whole)
     else:
         assert cut == whole
 
@@ -150,7 +152,7 @@ def test_a_damaged_scale_of_levels_is_no_exception() -> None:
     payload += infinite * 2 + bytes(20) + b"\x00\xff"
     name, fields = describe(decode_response(payload))
     assert name == "PULSEDOPPLER_BYTE"
-    assert [str(power) for power in fields["decompressed"]] == ["nan", "inf"]
+    assert [str(power) for power in fields["decompressed"]] == ["NaN", "Infinity"]
 
 
 def test_either_numbering_switches_the_fast_matrix() -> None:
